@@ -4,6 +4,7 @@ use std::io::IsTerminal;
 use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
@@ -139,7 +140,8 @@ impl ServiceSettings {
         let autopilot = match &args.autopilot {
             Some(address) => address.clone(),
             None => {
-                format!("udpin:127.0.0.1:{}", free_port(|port| UdpSocket::bind((LOOPBACK, port)))?)
+                let (port, _) = free_port(|port| UdpSocket::bind((LOOPBACK, port)))?;
+                format!("udpin:127.0.0.1:{port}")
             }
         };
         let mut simulator = vec![format!("seed={}", args.seed)];
@@ -370,6 +372,8 @@ struct Rendezvous {
     description: String,
     /// Deletes the file at the end.
     _directory: TempDir,
+    /// Keeps the port from other landings until the end.
+    _claim: Option<UdpSocket>,
 }
 
 impl Rendezvous {
@@ -382,33 +386,64 @@ impl Rendezvous {
         if let Some(file) = user_file {
             let file = file.to_owned();
             let description = file.display().to_string();
-            return Ok(Self { file, description, _directory: directory });
+            return Ok(Self { file, description, _directory: directory, _claim: None });
         }
         let usual = node::session::LOCAL_PORT;
-        let usual_is_free = TcpListener::bind((LOOPBACK, usual)).is_ok();
-        let port = if usual_is_free {
-            usual
-        } else {
-            free_port(|port| TcpListener::bind((LOOPBACK, port)))?
+        let (port, lock) = match claim(usual) {
+            Ok(lock) => (usual, lock),
+            Err(_) => free_port(claim)?,
         };
         let file = directory.path().join("zenoh.json5");
         std::fs::write(&file, node::session::local_config(port))
             .with_context(|| format!("writing {file:?}"))?;
         let description = format!("local, rendezvous at port {port}");
-        Ok(Self { file, description, _directory: directory })
+        Ok(Self { file, description, _directory: directory, _claim: Some(lock) })
     }
 }
 
-/// Ports outside of Linux' ephemeral range (`ip_local_port_range` begins at 32768), so that one that is free
-/// now is still free when its service binds it.
-const PORTS: std::ops::Range<u16> = 20_000..32_000;
+/// Locks a free port for a rendezvous. Its TCP port is bound a moment later, by the first of the processes; another landing that
+/// begins meanwhile would find it free, and the two would fly in one network. So the UDP port of the same number is held as a lock
+/// for as long as the landing lasts.
+fn claim(port: u16) -> std::io::Result<UdpSocket> {
+    let lock = UdpSocket::bind((LOOPBACK, port))?;
+    TcpListener::bind((LOOPBACK, port)).map(|_| lock)
+}
 
-/// A free port. Each process begins its search at another one, so that two that start at once do not collide.
-pub(crate) fn free_port<T>(bind: impl Fn(u16) -> std::io::Result<T>) -> anyhow::Result<u16> {
+/// Ports outside of Linux' ephemeral range (`ip_local_port_range` begins at 32768) and of what tests choose from, so that one that is free
+/// now is still free when its service binds it.
+const PORTS: std::ops::Range<u16> = 26_000..32_000;
+
+/// A free port, and what was bound there. No number is returned twice by one process, so a port may be bound later than this
+/// returns; and each process begins its search at another one, so that two that start at once do not collide.
+pub(crate) fn free_port<T>(bind: impl Fn(u16) -> std::io::Result<T>) -> anyhow::Result<(u16, T)> {
+    static TRIED: AtomicU32 = AtomicU32::new(0);
     let first = std::process::id().wrapping_mul(97);
     let port = |offset| PORTS.start + (first.wrapping_add(offset) % PORTS.len() as u32) as u16;
     (0..100)
-        .map(port)
-        .find(|port| bind(*port).is_ok())
+        .map(|_| port(TRIED.fetch_add(1, Ordering::Relaxed)))
+        .find_map(|port| bind(port).ok().map(|bound| (port, bound)))
         .with_context(|| format!("finding a free port from {} to {}", PORTS.start, PORTS.end))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn landings_that_begin_at_once_meet_at_different_ports() -> anyhow::Result<()> {
+        let [first, second] = [Rendezvous::new(None)?, Rendezvous::new(None)?];
+        let [told, other] = [&first, &second].map(|it| std::fs::read_to_string(&it.file));
+        assert_ne!(told?, other?, "{} and {}", first.description, second.description);
+        Ok(())
+    }
+
+    #[test]
+    fn no_port_is_found_twice_although_nobody_binds_it() -> anyhow::Result<()> {
+        let found: Vec<u16> = (0..20)
+            .map(|_| free_port(|port| UdpSocket::bind((LOOPBACK, port))).map(|(port, _)| port))
+            .collect::<anyhow::Result<_>>()?;
+        let different: std::collections::BTreeSet<u16> = found.iter().copied().collect();
+        assert_eq!(different.len(), found.len(), "{found:?}");
+        Ok(())
+    }
 }

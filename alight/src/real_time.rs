@@ -112,18 +112,14 @@ struct RealFlight<'a> {
 impl<'a> RealFlight<'a> {
     async fn begin(planned: &'a Planned, folder: &'a Path) -> anyhow::Result<Self> {
         std::fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
-        let port = |skip: u16| {
-            free_port(|port| {
-                TcpListener::bind((LOOPBACK, port)).and_then(|listener| {
-                    let socket = BlockingSocket::bind((LOOPBACK, port))?;
-                    match port % 4 == skip {
-                        true => Ok((listener, socket)),
-                        false => Err(std::io::Error::other("kept for another use")),
-                    }
-                })
-            })
+        let port = || {
+            let bind = |port| {
+                TcpListener::bind((LOOPBACK, port))?;
+                BlockingSocket::bind((LOOPBACK, port))
+            };
+            anyhow::Ok(free_port(bind)?.0)
         };
-        let (meet, apart, world_port, port) = (port(0)?, port(1)?, port(2)?, port(3)?);
+        let (meet, apart, world_port, port) = (port()?, port()?, port()?, port()?);
         let seed = planned.seed;
         let proxy = Proxy::start(seed, world_port, port).await?;
         let mut flight = Self {
