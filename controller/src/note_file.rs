@@ -20,7 +20,7 @@ pub struct NoteFile<T = Note> {
 
 impl<T: Clone + PartialEq + Serialize + DeserializeOwned> NoteFile<T> {
     /// The file with this name, without its ending, in the [`state_directory`].
-    pub fn new(name: &str) -> Self {
+    fn named(name: &str) -> Self {
         Self { path: state_directory().map(|it| it.join(format!("{name}.json"))), written: None }
     }
 
@@ -45,6 +45,24 @@ impl<T: Clone + PartialEq + Serialize + DeserializeOwned> NoteFile<T> {
             tracing::warn!(%problem, file = ?path, "Note for the next controller not written");
         }
     }
+}
+
+impl NoteFile {
+    /// The file of the controller with this id for the autopilot at this address.
+    pub fn new(id: &str, address: &str) -> Self {
+        Self::named(&file_name(id, address))
+    }
+}
+
+/// Longest part of an address that stands in a file's name; a file system takes 255 bytes.
+const MAX_ADDRESS_CHARS: usize = 120;
+
+/// Controllers of several vehicles on one machine have the same id, and keep their notes apart by the address. What cannot stand
+/// in a file's name becomes a hyphen; the note has the address as it is.
+fn file_name(id: &str, address: &str) -> String {
+    let part = |c: char| if c.is_ascii_alphanumeric() || c == '.' { c } else { '-' };
+    let address: String = address.chars().take(MAX_ADDRESS_CHARS).map(part).collect();
+    format!("controller-{id}-{address}")
 }
 
 fn write(path: &Path, note: Option<&impl Serialize>) -> std::io::Result<()> {
@@ -76,9 +94,9 @@ struct Clocked {
 }
 
 impl PadFile {
-    /// The file of the controller with this name.
-    pub fn new(name: &str) -> Self {
-        let file = NoteFile::new(&format!("controller-{name}-pad"));
+    /// The file of the controller with this id for the autopilot at this address.
+    pub fn new(id: &str, address: &str) -> Self {
+        let file = NoteFile::named(&format!("{}-pad", file_name(id, address)));
         Self { file: Arc::new(Mutex::new(file)), kept: None, writing: None }
     }
 
@@ -125,5 +143,15 @@ mod tests {
         file.keep(None);
         assert_eq!(file.read(), None);
         std::fs::remove_dir_all(directory).unwrap();
+    }
+
+    #[test]
+    fn controllers_of_two_vehicles_on_one_machine_keep_their_notes_apart() {
+        let names = ["udpin:127.0.0.1:14550", "udpin:127.0.0.1:14560", "serial:/dev/ttyACM0:57600"]
+            .map(|address| file_name("main", address));
+        assert_eq!(names[0], "controller-main-udpin-127.0.0.1-14550");
+        assert_eq!(names[2], "controller-main-serial--dev-ttyACM0-57600");
+        assert_ne!(names[0], names[1]);
+        assert!(file_name("main", &"é/".repeat(500)).len() < 200);
     }
 }

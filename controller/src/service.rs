@@ -17,7 +17,6 @@ use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
 use crate::config::Config;
 use crate::flight::Flight;
-use crate::limits::Note;
 use crate::note_file::{NoteFile, PadFile};
 use crate::tape::TapedFlight;
 
@@ -60,8 +59,8 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let mut link = Link::open_for(address, Peering::Autopilot, config.signing()?)
         .await
         .context("opening the link to the autopilot")?;
-    let mut note_file = NoteFile::<Note>::new(&format!("controller-{}", config.id));
-    let mut pad_file = PadFile::new(&config.id);
+    let mut note_file = NoteFile::new(&config.id, &config.autopilot.address);
+    let mut pad_file = PadFile::new(&config.id, &config.autopilot.address);
     let mut flight = TapedFlight::new(now_ns(), config, node.shared_health())?;
     if let Some(note) = note_file.read() {
         flight.take_over(now_ns(), note);
