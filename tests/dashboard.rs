@@ -1,19 +1,5 @@
 //! The page of a landing: what it tells, how it looks in a real browser, and that nothing depends on it.
 
-#![expect(
-    clippy::print_stdout,
-    reason = "what a test measured, or why it is skipped, is for people to read"
-)]
-
-#[path = "dashboard/crowd.rs"]
-mod crowd;
-#[path = "dashboard/film.rs"]
-mod film;
-mod flight;
-#[allow(dead_code, reason = "the film is also sent over a link elsewhere")]
-#[path = "link/site.rs"]
-mod site;
-
 use std::io::{BufRead, BufReader, Write};
 use std::path::PathBuf;
 use std::process::Stdio;
@@ -30,7 +16,8 @@ use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::{WebSocketStream, client_async};
 
 use crate::crowd::{Crowd, memory_mb};
-use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, PATIENCE, output_of};
+use crate::film;
+use crate::flight::{ALIGHT, Landing, PATIENCE, alone, beside_another, output_of};
 
 /// Exit status of a script that lacks a browser or a package.
 const LACKS: i32 = 77;
@@ -65,7 +52,7 @@ fn free_page() -> anyhow::Result<String> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_landing_is_shown_and_goes_on_when_the_page_is_killed() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     with_second_try(async || {
         let page = free_page()?;
         let landing = Landing::start(&["--seed", "4", "--dashboard", &page]).await?;
@@ -105,13 +92,13 @@ async fn a_landing_is_shown_and_goes_on_when_the_page_is_killed() -> anyhow::Res
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_browser_shows_a_landing_and_commands_it() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _alone = alone().await?;
     with_second_try(in_a_browser).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_program_that_knows_only_motion_jpeg_sees_the_landing() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     with_second_try(async || {
         let page = free_page()?;
         let landing = Landing::start(&["--seed", "4", "--dashboard", &page]).await?;
@@ -145,7 +132,7 @@ async fn a_program_that_knows_only_motion_jpeg_sees_the_landing() -> anyhow::Res
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_is_drawn_over_a_picture_was_found_in_that_very_picture() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _alone = alone().await?;
     with_second_try(async || {
         if let Some(read) = film::overlay(200).await? {
             println!("{read}");
@@ -158,7 +145,7 @@ async fn what_is_drawn_over_a_picture_was_found_in_that_very_picture() -> anyhow
 #[tokio::test(flavor = "multi_thread")]
 async fn twenty_browsers_and_a_page_that_is_stopped_and_killed_change_no_decision()
 -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _alone = alone().await?;
     with_second_try(async || {
         let folder = tempfile::tempdir()?;
         let file = folder.path().join("flight.mcap");

@@ -12,7 +12,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use testing::ports;
 use tokio::time::{sleep, timeout};
 
-use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME};
+use crate::flight::{ALIGHT, Landing, alone, beside_another};
 
 /// Longest time until a process that goes on takes its part again.
 const BACK: Duration = Duration::from_secs(2);
@@ -39,7 +39,7 @@ async fn frames_are_used(landing: &Landing, since_ns: i64) -> anyhow::Result<()>
 
 /// Freezes a process of a landing for each of these times, and lands.
 pub(crate) async fn of_a_landing(name: &str, freezes_s: &[f64]) -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     let ([], _, port) = ports::free()?;
     let station = UdpSocket::bind(("127.0.0.1", port))?;
     station.set_read_timeout(Some(Duration::from_secs(20)))?;
@@ -74,7 +74,7 @@ fn is_back(name: &str, seconds: f64, since: Instant) -> anyhow::Result<()> {
 
 /// Freezes a camera's process that publishes images.
 pub(crate) async fn of_a_camera(freezes_s: &[f64]) -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     let folder = tempfile::tempdir()?;
     image::GrayImage::new(64, 48).save(folder.path().join("1.png"))?;
     let paths = format!("source.paths=[{:?}]", folder.path());
@@ -102,7 +102,7 @@ pub(crate) async fn of_a_camera(freezes_s: &[f64]) -> anyhow::Result<()> {
 
 /// Commands a controller that is frozen until its operator has given up, lets it go on, and lands.
 pub(crate) async fn of_a_commanded_controller() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     let landing = Landing::start(&["--seed", "4", "--timeout-s", "300"]).await?;
     landing.descends_below(9.0).await?;
     hold(&landing).await?;
@@ -194,7 +194,7 @@ fn on_board(meet: u16) -> Network {
 
 /// Freezes a relay between two processes on board and one on the ground.
 pub(crate) async fn of_a_relay(freezes_s: &[f64]) -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _alone = alone().await?;
     let ([meet], air, _) = ports::free()?;
     let (meet_text, air) = (meet.to_string(), format!("127.0.0.1:{air}"));
     let first = open("simulator", "main", on_board(meet)).await?;

@@ -1,12 +1,9 @@
 //! A process that is frozen for a while (SIGSTOP) and goes on takes its full part again within 2 s. `measure.rs` freezes
 //! each for longer.
 
-#![expect(clippy::print_stdout, reason = "what a test measured is for people to read")]
-
-mod flight;
-mod freezes;
-
 use testing::with_second_try;
+
+use crate::freezes;
 
 /// For how long each is frozen, in seconds: less than Zenoh's lease is on the air link, about as long, longer.
 const FREEZES_S: [f64; 3] = [0.5, 2.0, 5.0];

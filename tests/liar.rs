@@ -1,8 +1,5 @@
 //! A detector that lies: told at once, and never followed to the ground.
 
-#![expect(clippy::print_stdout, reason = "what a test measured is for people to read")]
-
-mod flight;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -13,7 +10,7 @@ use node::{Identity, Node, ZenohSource};
 use testing::with_second_try;
 use tokio::time::timeout;
 
-use crate::flight::{Landing, ONE_AT_A_TIME};
+use crate::flight::{Landing, beside_another};
 
 /// Publishes what `main` finds under its own name, and 1 m to the side once it lies.
 async fn tell(liar: Node, lies: Arc<AtomicBool>) -> anyhow::Result<()> {
@@ -44,7 +41,7 @@ async fn a_preferred_liar_beside_an_honest_detector_is_told_and_not_followed_dow
 }
 
 async fn a_liar_is_preferred() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     let landing = Landing::start(&["--seed", "5"]).await?;
     landing.status("it begins", |s| s.active_detector.as_deref() == Some("main")).await?;
     let identity = Identity { service: "detector", instance: "liar".into() };

@@ -1,13 +1,7 @@
 //! The whole system as processes: it lands, and losing any process leaves the vehicle safe.
 //!
-//! Each test flies `alight land` in real time, one after the other, and joins its network as one more process.
+//! Each test flies `alight land` in real time, beside another, and joins its network as one more process.
 
-#![expect(
-    clippy::print_stdout,
-    reason = "what a test measured, or why it is skipped, is for people to read"
-)]
-
-mod flight;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
@@ -17,7 +11,7 @@ use node::now_ns;
 use rustix::process::{Pid, Signal, kill_process};
 use testing::{ports, python, python_passes, skip, with_second_try};
 
-use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, descent_m_s, output_of, seconds, speed_m_s};
+use crate::flight::{ALIGHT, Landing, beside_another, descent_m_s, output_of, seconds, speed_m_s};
 
 /// Exit status of a script that lacks a package.
 const LACKS_MAVSDK: i32 = 77;
@@ -29,7 +23,7 @@ async fn it_lands_with_other_programs_watching_and_without_the_ground_station() 
 }
 
 async fn others_watch_and_the_ground_dies() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     let ([], _, ground) = ports::free()?;
     let address = format!("gcs-bridge.ground=udpout:127.0.0.1:{ground}");
     let connect = ["--connect", &format!("udpin:127.0.0.1:{ground}")];
@@ -59,7 +53,7 @@ async fn others_watch_and_the_ground_dies() -> anyhow::Result<()> {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_program_of_mavsdk_finds_the_vehicle_its_parameters_and_its_camera() -> anyhow::Result<()>
 {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     with_second_try(async || {
         let ([], _, ground) = ports::free()?;
         let address = format!("gcs-bridge.ground=udpout:127.0.0.1:{ground}");
@@ -120,7 +114,7 @@ fn says_how_well(result: &serde_json::Value) -> anyhow::Result<()> {
 #[tokio::test(flavor = "multi_thread")]
 async fn without_controller_or_detector_it_stops_and_lands_with_the_next_one() -> anyhow::Result<()>
 {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     with_second_try(controller_and_detector_die_in_turn).await
 }
 
@@ -146,7 +140,7 @@ async fn controller_and_detector_die_in_turn() -> anyhow::Result<()> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_controller_killed_at_any_height_lets_nothing_hit_the_ground() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     with_second_try(the_controller_is_killed_again_and_again).await
 }
 
@@ -231,7 +225,7 @@ async fn without_a_detector_it_stops_descending(landing: &Landing) -> anyhow::Re
 #[tokio::test(flavor = "multi_thread")]
 async fn of_two_detectors_the_chosen_one_is_active_and_the_other_takes_over() -> anyhow::Result<()>
 {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     with_second_try(two_detectors_take_turns).await
 }
 
@@ -313,7 +307,11 @@ async fn command(landing: &Landing, command: ControllerCommand) -> anyhow::Resul
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_second_controller_and_a_port_in_use_are_refused_in_words() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
+    with_second_try(a_second_one_is_refused).await
+}
+
+async fn a_second_one_is_refused() -> anyhow::Result<()> {
     let mut landing = Landing::start(&["--seed", "7"]).await?;
     landing.status("the controller is there", |_| true).await?;
     let second =
@@ -345,7 +343,7 @@ async fn a_second_controller_and_a_port_in_use_are_refused_in_words() -> anyhow:
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_link_whose_port_is_taken_says_so() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     let taken = std::net::UdpSocket::bind("127.0.0.1:0")?;
     let port = taken.local_addr()?.port();
     let directory = tempfile::tempdir()?;

@@ -1,29 +1,23 @@
 //! Recordings of real landings: read by programs that are not ours, with recorders that are killed and disks that fail.
 
-#![expect(
-    clippy::print_stdout,
-    reason = "what a test measured, or why it is skipped, is for people to read"
-)]
-
-#[path = "recording/disks.rs"]
 mod disks;
-mod flight;
-#[path = "recording/played.rs"]
 mod played;
-#[path = "recording/recorders.rs"]
-mod recorders;
 
 use std::process::Command;
 
 use anyhow::{Context, ensure};
 use testing::{node, node_passes, python, python_passes, with_second_try};
 
-use crate::flight::{Landing, ONE_AT_A_TIME, output_of};
-use crate::recorders::{Contents, kills};
+use crate::flight::{ALIGHT, Landing, alone, beside_another, output_of};
+use crate::recorders::{self, Contents, kills};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_landing_is_recorded_and_read_by_other_programs() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
+    with_second_try(others_read_a_landing).await
+}
+
+async fn others_read_a_landing() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("flight.mcap");
     let name = file.to_str().context("a path")?;
@@ -65,16 +59,15 @@ async fn a_landing_is_recorded_and_read_by_other_programs() -> anyhow::Result<()
         let as_it_came = contents.channels.get(&format!("raw/{topic}"));
         ensure!(as_it_came == contents.channels.get(topic), "{topic} in {contents:?}");
     }
-    let repair = output_of(Command::new(flight::ALIGHT).args(["record", "--repair", name]))?;
+    let repair = output_of(Command::new(ALIGHT).args(["record", "--repair", name]))?;
     let said = String::from_utf8_lossy(&repair.stdout).into_owned();
     ensure!(repair.status.success() && said.contains("is whole"), "{said}");
-    let replay = output_of(Command::new(flight::ALIGHT).args(["replay", name, "--verify"]))?;
+    let replay = output_of(Command::new(ALIGHT).args(["replay", name, "--verify"]))?;
     let said = String::from_utf8_lossy(&replay.stdout).into_owned();
     println!("{said}");
     ensure!(replay.status.success() && said.contains("verified"), "{said}");
     let figures = file.with_extension("figures").display().to_string();
-    let report =
-        output_of(Command::new(flight::ALIGHT).args(["report", name, "--figures", &figures]))?;
+    let report = output_of(Command::new(ALIGHT).args(["report", name, "--figures", &figures]))?;
     let said = String::from_utf8_lossy(&report.stdout).into_owned();
     println!("{said}");
     ensure!(report.status.success() && said.contains("landed; "), "{said}");
@@ -103,7 +96,7 @@ async fn a_landing_is_recorded_and_read_by_other_programs() -> anyhow::Result<()
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_landing_is_followed_by_a_client_of_foxglove() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     with_second_try(async || {
         let folder = tempfile::tempdir()?;
         let file = folder.path().join("flight.mcap");
@@ -163,32 +156,32 @@ fn follows(seen: &serde_json::Value) -> anyhow::Result<()> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_recorder_that_is_killed_leaves_a_file_and_the_landing_goes_on() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     with_second_try(|| kills(3, &[])).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_an_overloaded_recorder_loses_is_in_its_file_to_the_frame() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _alone = alone().await?;
     with_second_try(recorders::overload).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_disk_that_is_full_read_only_or_removed_is_told_and_the_landing_goes_on()
 -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     with_second_try(disks::fail).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_waits_for_a_disk_that_stands_still_is_bounded_and_what_fails_is_told_soon()
 -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _alone = alone().await?;
     with_second_try(disks::beside_a_flight).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_recording_is_published_again_to_services_that_run() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     with_second_try(played::to_services).await
 }

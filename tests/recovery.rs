@@ -1,11 +1,8 @@
 //! Whatever is killed comes back by itself, and nothing unsafe happens meanwhile. `measure.rs` kills each process more often.
 
-#![expect(clippy::print_stdout, reason = "what a test measured is for people to read")]
-
-mod flight;
-mod kills;
-
 use testing::with_second_try;
+
+use crate::kills;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn whatever_is_killed_comes_back_and_it_lands() -> anyhow::Result<()> {

@@ -1,7 +1,5 @@
 //! Keys: who has none or a foreign one stays outside, who has one says what its role may, and nobody else notices.
 
-#![expect(clippy::print_stdout, reason = "what was said helps when a test fails")]
-
 use std::io::{BufRead, BufReader};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
@@ -14,6 +12,8 @@ use node::{Identity, Network, Node, Subscriber};
 use testing::ports;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
+
+use crate::flight::{alone, beside_another};
 
 const PATIENCE: Duration = Duration::from_secs(30);
 const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
@@ -141,6 +141,7 @@ async fn is_heard(detector: &Node, controller: &Node) -> anyhow::Result<()> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn each_says_what_its_role_may_and_strangers_nothing() -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
     let mut drone = Drone::start().await?;
     let commands = drone.controller.commands(topic::COMMAND, &[]).await?;
     let (sender, mut commanded) = mpsc::unbounded_channel();
@@ -199,6 +200,7 @@ async fn each_says_what_its_role_may_and_strangers_nothing() -> anyhow::Result<(
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_running_relay_shuts_out_who_is_revoked_and_goes_on() -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
     let drone = Drone::start().await?;
     let commands = drone.controller.commands(topic::COMMAND, &[]).await?;
     let answering = tokio::spawn(async move {
@@ -258,6 +260,7 @@ fn a_relay_without_keys_does_not_start_unless_told_and_keys_are_private() -> any
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_is_insecure_says_so() -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
     let ([meet], air, _) = ports::free()?;
     let (port, air) = (meet.to_string(), format!("0.0.0.0:{air}"));
     let mut relay = Command::new(ALIGHT)
@@ -287,6 +290,7 @@ async fn what_is_insecure_says_so() -> anyhow::Result<()> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_vehicle_that_may_be_real_is_left_on_the_ground() -> anyhow::Result<()> {
+    let _alone = alone().await?;
     let ([meet], _, mavlink) = ports::free()?;
     let vehicle = format!("autopilot.address=udpout:127.0.0.1:{mavlink}");
     let mut simulator = Command::new(ALIGHT)

@@ -1,14 +1,6 @@
 //! Detectors that come, go, are swapped and die in flight; and one that is written in Python.
 //! `measure.rs` swaps them more often.
 
-#![expect(
-    clippy::print_stdout,
-    reason = "what a test measured, or why it is skipped, is for people to read"
-)]
-
-mod flight;
-mod swaps;
-
 use std::process::Command;
 use std::time::Duration;
 
@@ -20,8 +12,8 @@ use node::{Identity, Node, Subscriber, ZenohSource};
 use testing::{python, python_passes, with_second_try};
 use tokio::time::{sleep, timeout};
 
-use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, PATIENCE, output_of};
-use crate::swaps::command;
+use crate::flight::{ALIGHT, Landing, PATIENCE, alone, beside_another, output_of};
+use crate::swaps::{self, command};
 
 fn detectors(landing: &Landing, args: &[&str]) -> anyhow::Result<String> {
     let output = output_of(
@@ -48,7 +40,7 @@ async fn a_detector_in_python_lands_it() -> anyhow::Result<()> {
 }
 
 async fn python_lands_it() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _flight = beside_another().await?;
     let marker = "aruco-4x4-50:7:0.3";
     let script = "detector/examples/python/detector.py";
     let Some(probe) = python(script, &["--help"]) else { return Ok(()) };
@@ -143,7 +135,7 @@ async fn failed_swaps_and_twenty_more_detectors_change_nothing() -> anyhow::Resu
 }
 
 async fn swaps_fail_and_many_speak() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
+    let _alone = alone().await?;
     let landing = Landing::start(&["--seed", "22"]).await?;
     landing.descends_below(9.0).await?;
     command(&landing, ControllerCommand::Hold).await?;

@@ -1,9 +1,5 @@
 //! Two roles on one machine, each under its supervisor: they meet, what dies comes back, and the end is orderly.
 
-#![expect(clippy::print_stdout, reason = "what a test measured is for people to read")]
-
-mod flight;
-
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
@@ -17,7 +13,7 @@ use testing::{ports, with_second_try};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
-use crate::flight::small_camera;
+use crate::flight::{alone, small_camera};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
@@ -152,6 +148,7 @@ async fn two_roles_meet_what_dies_comes_back_and_the_end_is_orderly() -> anyhow:
 }
 
 async fn two_roles_meet() -> anyhow::Result<()> {
+    let _alone = alone().await?;
     let folder = tempfile::tempdir()?;
     let meet = write_site(folder.path())?;
     let mut drone = Up::start(folder.path(), "drone")?;

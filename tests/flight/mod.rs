@@ -11,11 +11,13 @@ use anyhow::{Context, anyhow, bail, ensure};
 use messages::{ControllerStatus, Phase, Truth, topic};
 use node::{Identity, Node, Subscriber, ZenohSource, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
-use tokio::sync::{Mutex, mpsc};
+use tokio::sync::{Semaphore, SemaphorePermit, mpsc};
 use tokio::time::timeout;
 
 /// Longest wait for anything; a landing takes a fifth of it.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
+/// Longest time that a landing which is told to end may take.
+const MAX_END: Duration = Duration::from_secs(15);
 /// Furthest from the pad's centre that a landing may end, whatever happened on the way; 0.05 m is the worst
 /// that `docs/results.md` tells of landings without a fault.
 const MAX_ERROR_M: f64 = 0.1;
@@ -38,8 +40,19 @@ pub(crate) const LONG: [&str; 6] = [
 ];
 pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 
-/// Two landings at once would share the processor.
-pub(crate) static ONE_AT_A_TIME: Mutex<()> = Mutex::const_new(());
+/// Landings with the small camera that keep their time on two processors.
+const MAX_AT_ONCE: u32 = 2;
+static FLIGHTS: Semaphore = Semaphore::const_new(MAX_AT_ONCE as usize);
+
+/// Waits until there is time for one more landing, until what this returns is dropped.
+pub(crate) async fn beside_another() -> anyhow::Result<SemaphorePermit<'static>> {
+    Ok(FLIGHTS.acquire().await?)
+}
+
+/// Waits until no landing is under way, and lets none begin: for what loads the machine by itself, or measures milliseconds.
+pub(crate) async fn alone() -> anyhow::Result<SemaphorePermit<'static>> {
+    Ok(FLIGHTS.acquire_many(MAX_AT_ONCE).await?)
+}
 
 /// The small camera as items of the `set` of a site's file.
 pub(crate) fn small_camera() -> String {
@@ -220,6 +233,14 @@ impl Landing {
 
 impl Drop for Landing {
     fn drop(&mut self) {
+        // In order, with all its processes: those of a landing that is killed would meet with the next one.
+        let began = std::time::Instant::now();
+        if matches!(self.land.try_wait(), Ok(None)) {
+            let _ = kill_process(Pid::from_child(&self.land), Signal::TERM);
+        }
+        while matches!(self.land.try_wait(), Ok(None)) && began.elapsed() < MAX_END {
+            std::thread::sleep(Duration::from_millis(20));
+        }
         let _ = self.land.kill();
         let _ = self.land.wait();
         for child in &mut self.by_hand {

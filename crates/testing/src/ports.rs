@@ -5,9 +5,11 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use anyhow::Context;
 
-/// Ports that Linux gives to nobody who asks for just any, so that what is free there stays so.
+/// Ports that Linux gives to nobody who asks for just any, nor `alight land` to its processes, so that what is free there stays so.
 const FIRST: u32 = 20_000;
-const COUNT: u32 = 12_000;
+const COUNT: u32 = 6_000;
+/// The most neighbouring ports that are asked for.
+const MAX_ROW: u32 = 3;
 /// No port is chosen twice by one process, and processes begin at different ones.
 static CHOSEN: AtomicU32 = AtomicU32::new(0);
 
@@ -26,14 +28,14 @@ pub fn free<const N: usize>() -> anyhow::Result<([u16; N], u16, u16)> {
 /// The first of so many neighbouring ports.
 fn row(len: u16) -> anyhow::Result<u16> {
     let is_free = |port: u16| {
-        TcpListener::bind(("127.0.0.1", port)).is_ok()
-            && UdpSocket::bind(("127.0.0.1", port)).is_ok()
+        UdpSocket::bind(("127.0.0.1", port)).is_ok()
+            && TcpListener::bind(("127.0.0.1", port)).is_ok()
     };
     let begin = std::process::id().wrapping_mul(97);
     (0..1000)
         .map(|_| {
             let chosen = CHOSEN.fetch_add(u32::from(len), Ordering::Relaxed);
-            (FIRST + begin.wrapping_add(chosen) % (COUNT - u32::from(len))) as u16
+            (FIRST + begin.wrapping_add(chosen) % (COUNT - MAX_ROW)) as u16
         })
         .find(|first| (*first..first + len).all(is_free))
         .context("no free port of 1000 that were tried")

@@ -1,5 +1,5 @@
 //! Writes pictures of the calibration board with their truth, for `alight calibrate board` and other programs:
-//! `cargo run -p rendering --example boards -- FOLDER [PROCESSING] [VIEWS] [SEED]`.
+//! `cargo run -p rendering --example board_pictures -- FOLDER [PROCESSING] [VIEWS] [SEED]`.
 //!
 //! The board of A4 (`markers::Board::A4`) lies on the ground; the camera looks at it from all sides, from near and far, so
 //! that it appears everywhere in the image. The camera's truth is in `truth.json`.
