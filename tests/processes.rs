@@ -11,7 +11,9 @@ use node::now_ns;
 use rustix::process::{Pid, Signal, kill_process};
 use testing::{ports, python, python_passes, skip, with_second_try};
 
-use crate::flight::{ALIGHT, Landing, beside_another, descent_m_s, output_of, seconds, speed_m_s};
+use crate::flight::{
+    ALIGHT, Landing, alone, beside_another, descent_m_s, output_of, seconds, speed_m_s,
+};
 
 /// Exit status of a script that lacks a package.
 const LACKS_MAVSDK: i32 = 77;
@@ -339,6 +341,21 @@ async fn a_second_one_is_refused() -> anyhow::Result<()> {
         ensure!(rustix::process::test_kill_process(pid).is_err(), "{pid:?} still runs");
     }
     Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn two_landings_that_begin_at_once_both_land() -> anyhow::Result<()> {
+    let _alone = alone().await?;
+    with_second_try(async || {
+        let landings = ["11", "12"].map(|seed| {
+            tokio::spawn(async move { Landing::start(&["--seed", seed]).await?.lands().await })
+        });
+        for landing in landings {
+            landing.await??;
+        }
+        Ok(())
+    })
+    .await
 }
 
 #[tokio::test(flavor = "multi_thread")]
