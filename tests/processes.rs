@@ -1,6 +1,6 @@
 //! The whole system as processes: it lands, and losing any process leaves the vehicle safe.
 //!
-//! Each test flies `alight land` in real time, beside another, and joins its network as one more process.
+//! Each test flies `alight land` in real time, beside one other at most, and joins its network as one more process.
 
 use std::process::{Command, Stdio};
 use std::time::Duration;

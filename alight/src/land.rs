@@ -140,7 +140,7 @@ impl ServiceSettings {
         let autopilot = match &args.autopilot {
             Some(address) => address.clone(),
             None => {
-                let (port, _) = free_port(|port| UdpSocket::bind((LOOPBACK, port)))?;
+                let (port, _) = free_port()?;
                 format!("udpin:127.0.0.1:{port}")
             }
         };
@@ -391,7 +391,7 @@ impl Rendezvous {
         let usual = node::session::LOCAL_PORT;
         let (port, lock) = match claim(usual) {
             Ok(lock) => (usual, lock),
-            Err(_) => free_port(claim)?,
+            Err(_) => free_port()?,
         };
         let file = directory.path().join("zenoh.json5");
         std::fs::write(&file, node::session::local_config(port))
@@ -409,19 +409,19 @@ fn claim(port: u16) -> std::io::Result<UdpSocket> {
     TcpListener::bind((LOOPBACK, port)).map(|_| lock)
 }
 
-/// Ports outside of Linux' ephemeral range (`ip_local_port_range` begins at 32768) and of what tests choose from, so that one that is free
-/// now is still free when its service binds it.
+/// Ports outside of Linux' ephemeral range (`ip_local_port_range` begins at 32768) and of what tests choose from, so that one
+/// that is free now is still free when its service binds it.
 const PORTS: std::ops::Range<u16> = 26_000..32_000;
 
-/// A free port, and what was bound there. No number is returned twice by one process, so a port may be bound later than this
-/// returns; and each process begins its search at another one, so that two that start at once do not collide.
-pub(crate) fn free_port<T>(bind: impl Fn(u16) -> std::io::Result<T>) -> anyhow::Result<(u16, T)> {
+/// A port that is free for TCP and UDP, and its lock. No number is returned twice by one process, so a port may be bound later than
+/// this returns; and each process begins its search at another one, so that two that start at once do not collide.
+pub(crate) fn free_port() -> anyhow::Result<(u16, UdpSocket)> {
     static TRIED: AtomicU32 = AtomicU32::new(0);
     let first = std::process::id().wrapping_mul(97);
     let port = |offset| PORTS.start + (first.wrapping_add(offset) % PORTS.len() as u32) as u16;
     (0..100)
         .map(|_| port(TRIED.fetch_add(1, Ordering::Relaxed)))
-        .find_map(|port| bind(port).ok().map(|bound| (port, bound)))
+        .find_map(|port| Some((port, claim(port).ok()?)))
         .with_context(|| format!("finding a free port from {} to {}", PORTS.start, PORTS.end))
 }
 
@@ -439,9 +439,8 @@ mod tests {
 
     #[test]
     fn no_port_is_found_twice_although_nobody_binds_it() -> anyhow::Result<()> {
-        let found: Vec<u16> = (0..20)
-            .map(|_| free_port(|port| UdpSocket::bind((LOOPBACK, port))).map(|(port, _)| port))
-            .collect::<anyhow::Result<_>>()?;
+        let found: Vec<u16> =
+            (0..20).map(|_| free_port().map(|(port, _)| port)).collect::<anyhow::Result<_>>()?;
         let different: std::collections::BTreeSet<u16> = found.iter().copied().collect();
         assert_eq!(different.len(), found.len(), "{found:?}");
         Ok(())

@@ -2,7 +2,6 @@
 //! their link to the simulated autopilot through a proxy that fails.
 
 use std::fs::{File, OpenOptions};
-use std::net::{TcpListener, UdpSocket as BlockingSocket};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
@@ -17,7 +16,7 @@ use rustix::process::{Pid, Resource, Rlimit, Signal, kill_process, prlimit};
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use crate::fault_link::Proxy;
-use crate::land::{LOOPBACK, free_port};
+use crate::land::free_port;
 use crate::runtime::tool_identity;
 
 /// Timeout of a flight, in seconds.
@@ -112,13 +111,7 @@ struct RealFlight<'a> {
 impl<'a> RealFlight<'a> {
     async fn begin(planned: &'a Planned, folder: &'a Path) -> anyhow::Result<Self> {
         std::fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
-        let port = || {
-            let bind = |port| {
-                TcpListener::bind((LOOPBACK, port))?;
-                BlockingSocket::bind((LOOPBACK, port))
-            };
-            anyhow::Ok(free_port(bind)?.0)
-        };
+        let port = || free_port().map(|(port, _)| port);
         let (meet, apart, world_port, port) = (port()?, port()?, port()?, port()?);
         let seed = planned.seed;
         let proxy = Proxy::start(seed, world_port, port).await?;
