@@ -111,7 +111,7 @@ struct MarkersArgs {
     #[arg(long, value_name = "DIR")]
     photographs: Option<PathBuf>,
     /// What the camera makes of the light on its sensor: linear (nothing), usb, raspberry-pi, industrial,
-    /// action-camera or phone. May be repeated; then a table compares them.
+    /// action-camera, phone or ip-camera. May be repeated; then a table compares them.
     #[arg(long = "processing", value_name = "NAME", default_value = "linear")]
     processings: Vec<Preset>,
     /// Bin frames by software, 2 x 2 and 4 x 4, from those of the thesis' sensor with all its pixels and its colours

@@ -3,7 +3,7 @@
 //!
 //! The stages are those of an ordinary camera, in its order: `lens` and `unsteady` (on the light behind the
 //! Gaussian blur that the renderer draws with), vignetting, exposure and noise (the sensor's), then `mosaic` (colour filters, interpolation), `denoise`, `local_tone`, `tone` (from
-//! linear to the grey levels of the file), `sharpen`, `jpeg_quality`. Everything is grey: a neutral scene is
+//! linear to the grey levels of the file), `sharpen`, `jpeg_quality`, `video`. Everything is grey: a neutral scene is
 //! grey behind white balance, and the luma of a JPEG with subsampled chroma (YCbCr 4:2:0) is the JPEG of its
 //! luma.
 
@@ -15,6 +15,7 @@ mod local;
 mod mosaic;
 mod preset;
 mod tone;
+mod video;
 
 use serde::{Deserialize, Serialize};
 
@@ -24,6 +25,7 @@ pub(crate) use develop::Developer;
 pub use lens::{Lens, Unsteady};
 pub use preset::Preset;
 pub use tone::ToneCurve;
+pub use video::Video;
 
 /// A camera's processing. Without any stage, frames are linear in light.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -46,6 +48,8 @@ pub struct Processing {
     pub sharpen: Option<Sharpen>,
     /// Quality of JPEG, from 1 to 100, in which the frame crosses the cable or the card.
     pub jpeg_quality: Option<u8>,
+    /// The stream of H.264 in which it comes over a network.
+    pub video: Option<Video>,
 }
 
 /// Noise reduction.
@@ -105,6 +109,7 @@ impl Processing {
         tone: ToneCurve::Linear,
         sharpen: None,
         jpeg_quality: None,
+        video: None,
     };
 
     /// Processes a grey frame that is linear in light, given row by row; returns its grey levels. Lens and
@@ -173,6 +178,10 @@ impl Processing {
             (
                 self.jpeg_quality.is_none_or(|quality| (1..=100).contains(&quality)),
                 "processing.jpeg_quality is not from 1 to 100",
+            ),
+            (
+                self.video.is_none_or(|video| video.is_sound()),
+                "processing.video: quantiser is not from 10 to 51, or key_frame_every is 0",
             ),
         ];
         checks

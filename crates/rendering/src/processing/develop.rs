@@ -3,6 +3,7 @@
 use super::filters::{self, Gaussian};
 use super::jpeg::Jpeg;
 use super::tone::{Table, ToneCurve};
+use super::video::VideoCoder;
 use super::{Denoise, Processing, Sharpen, local, mosaic};
 use crate::error::RenderError;
 use crate::quantise::quantise;
@@ -15,6 +16,7 @@ pub(crate) struct Developer {
     table: Option<Table>,
     mask: Option<(Gaussian, Sharpen)>,
     jpeg: Option<Jpeg>,
+    video: Option<VideoCoder>,
     /// Light on the sensor in levels from 0 to 255, row by row.
     raw: Vec<f32>,
     padded: Vec<f32>,
@@ -32,6 +34,7 @@ impl Developer {
             table: (tone != ToneCurve::Linear).then(|| Table::new(tone)),
             mask: processing.sharpen.map(|sharpen| (Gaussian::new(sharpen.radius_px), sharpen)),
             jpeg: processing.jpeg_quality.map(Jpeg::new),
+            video: processing.video.map(VideoCoder::new),
             raw: Vec::new(),
             padded: Vec::new(),
             work: Vec::new(),
@@ -107,6 +110,9 @@ impl Developer {
         }
         if let Some(jpeg) = &self.jpeg {
             jpeg.apply(out, width);
+        }
+        if let Some(video) = &mut self.video {
+            video.apply(out, width);
         }
         Ok(())
     }

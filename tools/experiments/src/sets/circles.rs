@@ -42,6 +42,16 @@ const KINDS: [(Kind, [f64; 2]); 14] = [
     (("cctag", cctag), [0.05, 0.5]),
 ];
 
+/// Those of the scenes in turn. With another one all scenes would be others.
+const CAMERAS: [Preset; 6] = [
+    Preset::Linear,
+    Preset::Usb,
+    Preset::RaspberryPi,
+    Preset::Industrial,
+    Preset::ActionCamera,
+    Preset::Phone,
+];
+
 pub(super) fn frames(draw: Draw) -> Vec<FrameSpec> {
     (0..SCENES).map(|frame| spec(draw, frame)).collect()
 }
@@ -54,8 +64,7 @@ fn spec(draw: Draw, frame: usize) -> FrameSpec {
     let mut settings = binning.settings().exposed_for(light, rng.random_range(120.0..280.0), 0.004);
     settings.blur_px = rng.random_range(0.3..1.2);
     // Every other scene as cameras show it.
-    let preset =
-        Preset::ALL[if round.is_multiple_of(2) { 0 } else { round / 2 % Preset::ALL.len() }];
+    let preset = CAMERAS[if round.is_multiple_of(2) { 0 } else { round / 2 % CAMERAS.len() }];
     settings.processing = preset.processing();
     let model = settings.model;
     let tilt = Tilt { angle: rng.random_range(0.0..0.9), about: rng.random_range(0.0..TAU) };
