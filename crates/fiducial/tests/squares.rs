@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 
 use fiducial::{Detector, Observation, Settings};
+use geometry::Pixel;
 use imaging::GrayImage;
 use markers::SquareCode;
 use markers::{Family, Marker};
@@ -82,6 +83,58 @@ fn a_border_of_two_cells_is_read_and_its_outer_corners_are_found() {
             assert!(off < 0.15, "{cell_px} px: {off} px off");
         }
     }
+}
+
+/// Of 20 views of a tag from the side, beside another tag in full view, how many are read: pixels of its longer side, the ratio of
+/// the shorter, and the turn of the square before it is squeezed. The reference finds all of them alone (AprilTag 3, no decimation).
+#[test]
+fn tags_that_are_seen_from_the_side_are_read_beside_another_one() {
+    let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
+    let (middle, other) = ([215.3, 190.7], [60.2, 60.8]);
+    let mut missed = Vec::new();
+    for (side_px, ratios) in
+        [(80.0, [0.27, 0.22, 0.18]), (160.0, [0.24, 0.18, 0.15]), (300.0, [0.24, 0.18, 0.15])]
+    {
+        for (ratio, turn) in ratios.into_iter().flat_map(|ratio| [(ratio, 0.0), (ratio, 0.785)]) {
+            for angle in [0.1, 0.35, 0.8, 1.25] {
+                // From pixels to cells of the tag.
+                let cells = |at: [f64; 2]| {
+                    let [u, v] = turned(at, middle, angle, side_px / 8.0);
+                    turned([u, v / ratio], [0.0; 2], turn, 1.0).map(|cell| cell + 4.0)
+                };
+                let image = picture([430, 400], 1.3, |at| {
+                    let [x, y] = cells(at);
+                    let [u, v] = turned(at, other, 0.2, 4.0).map(|cell| cell + 4.0);
+                    let on = |[x, y]: [f64; 2], margin: f64| {
+                        let within = |v: f64| (-margin..8.0 + margin).contains(&v);
+                        within(x) && within(y)
+                    };
+                    if on([u, v], 0.0) {
+                        GREYS[usize::from(is_white(code, 3, 1, [u, v]))]
+                    } else if on([x, y], 0.0) {
+                        GREYS[usize::from(is_white(code, 7, 1, [x, y]))]
+                    } else {
+                        GREYS[if on([x, y], 1.0) || on([u, v], 1.0) { 1 } else { 2 }]
+                    }
+                });
+                let found = find(&image, &["apriltag-36h11"]);
+                let name = format!("{side_px} px, {ratio}, turned by {turn}, {angle}");
+                assert!(found.iter().all(|seen| [Some(3), Some(7)].contains(&seen.id)), "{name}");
+                let Some(seen) = found.iter().find(|seen| seen.id == Some(7)) else {
+                    missed.push(name);
+                    continue;
+                };
+                let off = |corner: &Pixel| {
+                    let [x, y] = cells([corner.x, corner.y]);
+                    // Along the longer axis a cell is this many pixels.
+                    (x.min(8.0 - x).abs()).max(y.min(8.0 - y).abs()) * side_px / 8.0 * ratio
+                };
+                let worst = seen.corners.unwrap().iter().map(off).fold(0.0, f64::max);
+                assert!(worst < 0.5, "{name}: {worst} px off");
+            }
+        }
+    }
+    assert!(missed.is_empty(), "{} missed: {missed:#?}", missed.len());
 }
 
 #[test]

@@ -34,6 +34,20 @@ pub(crate) fn shortest_side_px(corners: &[Pixel; 4]) -> f64 {
     sides_px(corners).into_iter().fold(f64::INFINITY, f64::min)
 }
 
+/// A side by which the level is chosen on which a square is read, in pixels: of a square that is seen from the side, under less than 30
+/// degrees, one and a half times its width across.
+pub(crate) fn at_most_across(side_px: f64, corners: &[Pixel; 4]) -> f64 {
+    const MAX_WIDTHS: f64 = 1.5;
+    let longest = sides_px(corners).into_iter().fold(f64::MIN_POSITIVE, f64::max);
+    side_px.min(MAX_WIDTHS * area_px2(corners) / longest)
+}
+
+/// The area, in square pixels.
+pub(crate) fn area_px2(corners: &[Pixel; 4]) -> f64 {
+    let [a, b, c, d] = corners;
+    ((c.x - a.x) * (d.y - b.y) - (c.y - a.y) * (d.x - b.x)).abs() / 2.0
+}
+
 /// The longer diagonal, in pixels.
 pub(crate) fn diagonal_px(corners: &[Pixel; 4]) -> f64 {
     corners[0].distance(&corners[2]).max(corners[1].distance(&corners[3]))
@@ -144,6 +158,10 @@ const PARALLEL_PX: f32 = 20.0;
 /// a fraction of the outline's size.
 const MAX_CORNER_PX: f32 = 1.6;
 const MAX_CORNER_RATIO: f32 = 0.12;
+/// Minimum sine of the angle at a corner: 7.5 degrees. Seen from the side along a diagonal, at a sixth of its width, a square has 19.
+const MIN_CORNER_SINE: f32 = 0.13;
+/// Maximum ratio of the longest side to the shortest, of a square that is seen from the side under 7 degrees.
+const MAX_SIDE_RATIO: f32 = 8.0;
 /// Part at either end of a side that is left out because corners are rounded: a fraction of the side, plus
 /// pixels.
 const END_RATIO: f32 = 0.1;
@@ -201,8 +219,7 @@ impl Line {
     fn intersection(&self, other: &Self) -> Option<[f32; 2]> {
         let ([a, b], [c, d]) = (self.normal, other.normal);
         let determinant = a * d - b * c;
-        // Corners of less than about 15 degrees are refused.
-        if determinant.abs() < 0.25 {
+        if determinant.abs() < MIN_CORNER_SINE {
             return None;
         }
         let (e, f) = (self.offset, other.offset);
@@ -300,7 +317,7 @@ fn is_plausible(corners: &[[f32; 2]; 4], area: f32) -> bool {
     }
     let quad_area = twice / 2.0;
     let tolerance = 0.12 * quad_area + 1.2 * longest;
-    shortest >= 3.5 && shortest * 5.0 >= longest && (quad_area - area).abs() <= tolerance
+    shortest >= 3.5 && shortest * MAX_SIDE_RATIO >= longest && (quad_area - area).abs() <= tolerance
 }
 
 #[cfg(test)]

@@ -1,9 +1,10 @@
 //! The quiet zone around a marker: quads of its white paper, and how evenly a border stands out from it.
 
+use geometry::Pixel;
 use imaging::pyramid::from_level_0;
 use imaging::{GrayView, Outlines, bilinear};
 
-use crate::candidates::quad::Quad;
+use crate::candidates::quad::{Quad, area_px2};
 use crate::optics::camera_response::CameraResponse;
 
 /// Largest number of quiet zones in one image.
@@ -56,13 +57,15 @@ pub(crate) fn has_dark_border(border: &Quad, view: GrayView<'_>) -> bool {
 pub(crate) fn border_contrast_variation(quad: &Quad, view: GrayView<'_>, level: usize) -> f64 {
     const POINTS: usize = 6;
     let corners = quad.corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);
+    let area = area_px2(&corners.map(|[x, y]| Pixel::new(x, y)));
     let (mut plain, mut logarithms) = (Statistics::default(), Statistics::default());
     for side in 0..4 {
         let ([ax, ay], [bx, by]) = (corners[side], corners[(side + 1) % 4]);
         let (dx, dy) = (bx - ax, by - ay);
         let length = dx.hypot(dy);
-        // The corners go clockwise, so that the outside is on the left.
-        let off = (0.07 * length).max(0.7) / length;
+        // Within the border, which is an eighth of the distance to the side across: that is less than a side where the square is seen
+        // from the side. The corners go clockwise, so that the outside is on the left.
+        let off = (0.07 * length).min(0.09 * area / length).max(0.7) / length;
         let (nx, ny) = (dy * off, -dx * off);
         for k in 0..POINTS {
             let t = (k as f64 + 0.75) / (POINTS as f64 + 0.5);

@@ -10,7 +10,7 @@ use imaging::pyramid::from_level_0;
 use imaging::{GrayView, Pyramid, bilinear};
 use markers::SquareCode;
 
-use crate::candidates::quad::mean_side_px;
+use crate::candidates::quad::{at_most_across, mean_side_px};
 use crate::optics::homography::{Homography, Inverse, pixel_bounds};
 use crate::optics::inverse_tone::{InverseTone, light_of};
 use crate::optics::normal;
@@ -154,14 +154,16 @@ pub(crate) struct SquareImage<'a> {
 }
 
 impl<'a> SquareImage<'a> {
-    /// On the level on which the cells of a square are two or three pixels wide.
+    /// On the level on which the cells of a square are two or three pixels wide; of one that is seen from the side about the same
+    /// across.
     pub(crate) fn new(
         corners: &[Pixel; 4],
         cells: usize,
         view: GrayView<'a>,
         pyramid: &'a Pyramid,
     ) -> Option<Self> {
-        let cell_px = mean_side_px(corners) / cells as f64;
+        let side_px = at_most_across(mean_side_px(corners), corners);
+        let cell_px = side_px / cells as f64;
         let level = ((cell_px / CELL_PX).log2().floor().max(0.0) as usize)
             .min(pyramid.levels().saturating_sub(1));
         let corners = corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);

@@ -157,8 +157,9 @@ struct Decoded {
 
 impl SquareTagDetector {
     /// Largest size of outlines on the finest levels, in pixels of the level: two levels on, the cells of
-    /// markers of ten cells would be narrower than two pixels, and a scratch in a border would open it.
-    const MAX_OUTLINE_PX: u16 = 64;
+    /// markers of ten cells would be narrower than two pixels, and a scratch in a border would open it. Seen from the side, at a sixth
+    /// of its length, a marker is 32 pixels wide.
+    const MAX_OUTLINE_PX: u16 = 192;
 
     /// Looks for these markers; those of other families are left out. With `inverted` it looks for markers
     /// printed in the opposite colours as well.

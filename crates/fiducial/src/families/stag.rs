@@ -14,7 +14,7 @@ use markers::{Codebook, Family, Marker};
 
 use crate::candidates::evidence::{Needs, OutlineNeeds};
 use crate::candidates::overlap::Overlap;
-use crate::candidates::quad::{Quad, shortest_side_px};
+use crate::candidates::quad::{Quad, at_most_across, shortest_side_px};
 use crate::candidates::quiet_zone::{
     MAX_CONTRAST_VARIATION, PaperTone, TONES, border_contrast_variation, has_dark_border,
 };
@@ -136,9 +136,9 @@ const OCCLUDED: SampleBounds = SampleBounds {
 };
 
 impl StagDetector {
-    /// Largest size of outlines that are followed in the image itself, in pixels: on the next level the
-    /// border of a marker, a tenth of its side, is too thin, and out of focus too bright.
-    const MAX_OUTLINE_PX: u16 = 88;
+    /// Largest size of outlines that are followed on the finest levels, in pixels of the level: on the next level the
+    /// border of a marker, a tenth of its side, is too thin, and out of focus too bright. Seen from the side it is thinner.
+    const MAX_OUTLINE_PX: u16 = 192;
 
     /// Looks for these markers; those of other families are left out. With `inverted` it looks for markers
     /// printed white on black as well.
@@ -622,7 +622,9 @@ fn has_rim(input: ImageInput<'_>, quad: &Quad) -> bool {
 /// The level of the pyramid on which a quad's shortest side is between this length and twice this, and its
 /// corners there.
 fn on_level(corners: &[Pixel; 4], side_px: f64, input: ImageInput<'_>) -> (usize, [[f64; 2]; 4]) {
-    let level = ((shortest_side_px(corners) / side_px).log2().floor().max(0.0) as usize)
-        .min(input.pyramid.levels().saturating_sub(1));
+    let level =
+        ((at_most_across(shortest_side_px(corners), corners) / side_px).log2().floor().max(0.0)
+            as usize)
+            .min(input.pyramid.levels().saturating_sub(1));
     (level, corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]))
 }

@@ -215,7 +215,7 @@ impl Search<'_> {
                 word &= word - 1;
                 if !self.places.include(x, y + self.top, usize::from(self.level))
                     || limits.steep && !self.is_steep(x, y, limits.min_step_256ths)
-                    || self.rises(x, y, tops)
+                    || self.is_futile(x, y, tops, limits)
                 {
                     continue;
                 }
@@ -235,10 +235,10 @@ impl Search<'_> {
         true
     }
 
-    /// Whether the region at a top rises above it elsewhere, or begins further right as well, as far as the
-    /// next rows show within half a word to both sides. Its outline, followed from here, would be dropped.
-    fn rises(&self, x: usize, y: usize, tops: &Tops) -> bool {
-        const ROWS: usize = 3;
+    /// Whether the outline from a top would be dropped: as far as the next rows show within half a word to both sides, its region
+    /// rises above the top elsewhere, begins further right as well, or is smaller than wanted.
+    fn is_futile(&self, x: usize, y: usize, tops: &Tops, limits: &Limits) -> bool {
+        const ROWS: usize = 4;
         let (words, place) = (self.bits.bits(), self.bits.place(x, y));
         let mut rows = [0; ROWS];
         for (down, row) in rows.iter_mut().enumerate() {
@@ -254,14 +254,28 @@ impl Search<'_> {
         for (row, from) in
             (1..ROWS).map(|row| (row, row - 1)).chain((1..ROWS).rev().map(|row| (row - 1, row)))
         {
-            let part = parts[from];
-            let touched = (part | part << 1 | part >> 1) & rows[row];
+            let touched = beside(parts[from]) & rows[row];
             if touched & !parts[row] != 0 {
                 parts[row] = flood(rows[row], touched | parts[row]);
             }
         }
         let others = parts[0] & !own;
-        others & !(end - 1) != 0 || others & flooded != 0
+        if others & !(end - 1) != 0 || others & flooded != 0 {
+            return true;
+        }
+        if parts[ROWS - 1] != 0 {
+            return false;
+        }
+        // A region that ends above the last row is known as a whole, if none of its pixels touches a further one.
+        let is_whole = (1..ROWS).all(|row| {
+            let down = beside(parts[row - 1]) & rows[row] & !parts[row];
+            let up = beside(parts[row]) & rows[row - 1] & !parts[row - 1];
+            down | up == 0
+        });
+        let all = parts.iter().fold(0, |all, part| all | part);
+        let width = 64 - all.leading_zeros() - all.trailing_zeros();
+        let height = parts.iter().filter(|part| **part != 0).count() as u32;
+        is_whole && width.max(height) < limits.min_size.unsigned_abs().min(HALF_WORD as u32)
     }
 
     /// Whether the grey values at a top step by this much of their range, on level 1 by half of its logarithm. Two pixels up and
@@ -412,6 +426,12 @@ fn window(words: &[u64], place: usize) -> u64 {
     let (low, shift) = (word(first >> 6), first & 63);
     // Two shifts, as a shift by 64 is undefined.
     low >> shift | word((first >> 6) + 1) << 1 << (63 - shift)
+}
+
+/// The bits of the next row that ones touch.
+#[inline]
+fn beside(bits: u64) -> u64 {
+    bits | bits << 1 | bits >> 1
 }
 
 /// The runs of ones that contain `seeds`.
