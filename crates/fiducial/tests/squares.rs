@@ -85,24 +85,29 @@ fn a_border_of_two_cells_is_read_and_its_outer_corners_are_found() {
     }
 }
 
-/// Of 20 views of a tag from the side, beside another tag in full view, how many are read: pixels of its longer side, the ratio of
-/// the shorter, and the turn of the square before it is squeezed. The reference finds all of them alone (AprilTag 3, no decimation).
+/// Views of a tag from the side beside another one in full view, by the pixels of its longer side and the ratio of the shorter one: squeezed
+/// along a side and, after a turn of 45 degrees, along a diagonal. AprilTag 3 without decimation reads such tags down to 0.15.
 #[test]
 fn tags_that_are_seen_from_the_side_are_read_beside_another_one() {
     let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
-    let (middle, other) = ([215.3, 190.7], [60.2, 60.8]);
-    let mut missed = Vec::new();
+    let (middle, other) = ([310.3, 300.7], [60.2, 560.8]);
     for (side_px, ratios) in
         [(80.0, [0.27, 0.22, 0.18]), (160.0, [0.24, 0.18, 0.15]), (300.0, [0.24, 0.18, 0.15])]
     {
         for (ratio, turn) in ratios.into_iter().flat_map(|ratio| [(ratio, 0.0), (ratio, 0.785)]) {
             for angle in [0.1, 0.35, 0.8, 1.25] {
-                // From pixels to cells of the tag.
+                let name = format!("{side_px} px, {ratio}, turned by {turn}, {angle}");
+                // From pixels to cells of the tag, and back.
                 let cells = |at: [f64; 2]| {
                     let [u, v] = turned(at, middle, angle, side_px / 8.0);
                     turned([u, v / ratio], [0.0; 2], turn, 1.0).map(|cell| cell + 4.0)
                 };
-                let image = picture([430, 400], 1.3, |at| {
+                let pixel = |cell: [f64; 2]| {
+                    let [u, v] = turned(cell, [4.0; 2], -turn, 1.0);
+                    let [x, y] = turned([u, v * ratio], [0.0; 2], -angle, 8.0 / side_px);
+                    Pixel::new(middle[0] + x, middle[1] + y)
+                };
+                let image = picture([620, 620], 1.3, |at| {
                     let [x, y] = cells(at);
                     let [u, v] = turned(at, other, 0.2, 4.0).map(|cell| cell + 4.0);
                     let on = |[x, y]: [f64; 2], margin: f64| {
@@ -117,24 +122,18 @@ fn tags_that_are_seen_from_the_side_are_read_beside_another_one() {
                         GREYS[if on([x, y], 1.0) || on([u, v], 1.0) { 1 } else { 2 }]
                     }
                 });
-                let found = find(&image, &["apriltag-36h11"]);
-                let name = format!("{side_px} px, {ratio}, turned by {turn}, {angle}");
-                assert!(found.iter().all(|seen| [Some(3), Some(7)].contains(&seen.id)), "{name}");
-                let Some(seen) = found.iter().find(|seen| seen.id == Some(7)) else {
-                    missed.push(name);
-                    continue;
-                };
-                let off = |corner: &Pixel| {
-                    let [x, y] = cells([corner.x, corner.y]);
-                    // Along the longer axis a cell is this many pixels.
-                    (x.min(8.0 - x).abs()).max(y.min(8.0 - y).abs()) * side_px / 8.0 * ratio
-                };
-                let worst = seen.corners.unwrap().iter().map(off).fold(0.0, f64::max);
-                assert!(worst < 0.5, "{name}: {worst} px off");
+                let mut found = find(&image, &["apriltag-36h11"]);
+                found.sort_by_key(|seen| seen.id);
+                let ids: Vec<_> = found.iter().map(|seen| seen.id).collect();
+                assert_eq!(ids, [Some(3), Some(7)], "{name}");
+                let truth = [[0.0, 0.0], [8.0, 0.0], [8.0, 8.0], [0.0, 8.0]].map(pixel);
+                let corners = found[1].corners.unwrap().into_iter().zip(truth);
+                let worst =
+                    corners.map(|(corner, truth)| corner.distance(&truth)).fold(0.0, f64::max);
+                assert!(worst < 1.0, "{name}: {worst} px off");
             }
         }
     }
-    assert!(missed.is_empty(), "{} missed: {missed:#?}", missed.len());
 }
 
 #[test]

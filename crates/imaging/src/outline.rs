@@ -455,25 +455,28 @@ mod tests {
     proptest! {
         #[test]
         fn each_region_has_one_outline_whatever_its_shape(
-            (width, bits) in (1_usize..150).prop_flat_map(|w| {
-                (Just(w), (1_usize..12).prop_flat_map(move |h| prop::collection::vec(prop::bool::ANY, w * h)))
-            })
+            (width, greys) in (1_usize..150).prop_flat_map(|w| {
+                (Just(w), (1_usize..24).prop_flat_map(move |h| prop::collection::vec(any::<u8>(), w * h)))
+            }),
+            dark_256ths in 10_u8..160,
+            min_size_px in 1_u16..40,
         ) {
-            let data: Vec<u8> = bits.iter().map(|dark| if *dark { 20 } else { 200 }).collect();
-            let view = GrayView::packed(&data, width, bits.len() / width).unwrap();
+            let data: Vec<u8> =
+                greys.iter().map(|grey| if *grey < dark_256ths { 20 } else { 200 }).collect();
+            let view = GrayView::packed(&data, width, greys.len() / width).unwrap();
             let mut outlines = Outlines::default();
-            outlines.find(view, &ALL);
+            outlines.find(view, &Settings { min_size_px, ..ALL });
             // Flat neighbourhoods are not dark, so the bits themselves are the ground truth.
             let dark = |x: usize, y: usize| outlines.dark.at(x as i32, y as i32);
-            let seen: Vec<bool> = (0..bits.len()).map(|i| dark(i % width, i / width)).collect();
+            let seen: Vec<bool> = (0..greys.len()).map(|i| dark(i % width, i / width)).collect();
             let mut expected = regions(&seen, width);
             let mut found: Vec<_> = outlines
                 .iter()
                 .filter(|o| o.dark && o.level == 0)
                 .map(|o| o.bounds.map(usize::from))
-                .filter(|b| (b[2] - b[0]).max(b[3] - b[1]) >= 2)
                 .collect();
-            expected.retain(|b| (b[2] - b[0]).max(b[3] - b[1]) >= 2);
+            let min_size = usize::from(min_size_px).max(2);
+            expected.retain(|b| (b[2] - b[0]).max(b[3] - b[1]) >= min_size);
             expected.sort_unstable();
             found.sort_unstable();
             prop_assert_eq!(found, expected);

@@ -113,7 +113,7 @@ impl Processing {
     };
 
     /// Processes a grey frame that is linear in light, given row by row; returns its grey levels. Lens and
-    /// mosaic come after the frame's own noise.
+    /// mosaic come after the frame's own noise. Of a video it is a key frame.
     ///
     /// # Errors
     /// [`RenderError`] when a setting is out of range, or the frame does not have full rows.

@@ -280,12 +280,12 @@ impl FrameRenderer {
         };
         let is_video = spec.settings.processing.video.is_some();
         for back in (1..=if is_video { EARLIER_PICTURES } else { 0 }).rev() {
-            let earlier = |pose: &Transform<Camera, MarkerFrame>| {
+            let body_pose = |pose: &Transform<Camera, MarkerFrame>| {
                 ned_from_marker
                     * earlier(pose, &spec.settings.model, back).inverse()
                     * body_from_camera.inverse()
             };
-            let poses: Vec<_> = spec.path.iter().map(earlier).collect();
+            let poses: Vec<_> = spec.path.iter().map(body_pose).collect();
             let seed = spec.seed.wrapping_sub(u64::from(back));
             renderer.render_through(&mut apply, &poses, seed, &mut pixels)?;
         }

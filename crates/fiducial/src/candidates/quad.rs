@@ -34,8 +34,9 @@ pub(crate) fn shortest_side_px(corners: &[Pixel; 4]) -> f64 {
     sides_px(corners).into_iter().fold(f64::INFINITY, f64::min)
 }
 
-/// A side by which the level is chosen on which a square is read, in pixels: of a square that is seen from the side, under less than 30
-/// degrees, one and a half times its width across.
+/// A side by which the level is chosen on which a square is read, in pixels: of a square that is seen from the side no more than one and a
+/// half times its width across, the distance between its longer sides. That is less than the mean side where the ratio of the axes is
+/// below a half, along a diagonal below 0.38.
 pub(crate) fn at_most_across(side_px: f64, corners: &[Pixel; 4]) -> f64 {
     const MAX_WIDTHS: f64 = 1.5;
     let longest = sides_px(corners).into_iter().fold(f64::MIN_POSITIVE, f64::max);

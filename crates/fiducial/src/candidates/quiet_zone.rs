@@ -63,7 +63,7 @@ pub(crate) fn border_contrast_variation(quad: &Quad, view: GrayView<'_>, level: 
         let ([ax, ay], [bx, by]) = (corners[side], corners[(side + 1) % 4]);
         let (dx, dy) = (bx - ax, by - ay);
         let length = dx.hypot(dy);
-        // Within the border, which is an eighth of the distance to the side across: that is less than a side where the square is seen
+        // Within the border, a tenth of the distance to the side across at least, which is less than a side where the square is seen
         // from the side. The corners go clockwise, so that the outside is on the left.
         let off = (0.07 * length).min(0.09 * area / length).max(0.7) / length;
         let (nx, ny) = (dy * off, -dx * off);

@@ -154,8 +154,7 @@ pub(crate) struct SquareImage<'a> {
 }
 
 impl<'a> SquareImage<'a> {
-    /// On the level on which the cells of a square are two or three pixels wide; of one that is seen from the side about the same
-    /// across.
+    /// On the level on which the cells of a square are two or three pixels wide; of one that is seen from the side one to two across.
     pub(crate) fn new(
         corners: &[Pixel; 4],
         cells: usize,
@@ -180,11 +179,16 @@ impl<'a> SquareImage<'a> {
         Self { tone: InverseTone::within(&corners, self.view, curve), ..self }
     }
 
-    /// About how wide a cell is in the middle of a square of `cells` cells, in pixels of the level.
+    /// About how wide a cell is in the middle of a square of `cells` cells, in pixels of the level: the shorter diagonal, over that of a
+    /// square.
     fn cell_px(&self, cells: usize) -> f64 {
         let middle = cells as f64 / 2.0;
-        let [a, b] = [middle - 0.5, middle + 0.5].map(|at| self.homography.project([at, at]).image);
-        (b[0] - a[0]).hypot(b[1] - a[1]) / std::f64::consts::SQRT_2
+        let place = |dx: f64, dy: f64| self.homography.project([middle + dx, middle + dy]).image;
+        let diagonal = |dy: f64| {
+            let [a, b] = [place(-0.5, -dy), place(0.5, dy)];
+            (b[0] - a[0]).hypot(b[1] - a[1])
+        };
+        diagonal(0.5).min(diagonal(-0.5)) / std::f64::consts::SQRT_2
     }
 
     /// Whether the second ring of cells of a square of `cells` cells has the colour of the outermost one.

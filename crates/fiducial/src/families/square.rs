@@ -156,9 +156,8 @@ struct Decoded {
 }
 
 impl SquareTagDetector {
-    /// Largest size of outlines on the finest levels, in pixels of the level: two levels on, the cells of
-    /// markers of ten cells would be narrower than two pixels, and a scratch in a border would open it. Seen from the side, at a sixth
-    /// of its length, a marker is 32 pixels wide.
+    /// Largest size of outlines on the finest levels, in pixels of the level. Seen from the side, at a sixth of its length, a marker of
+    /// 192 px is 32 px across: two levels on, its cells would be a pixel wide. Of one in full view, two levels on, a scratch would open the border from 64 px down.
     const MAX_OUTLINE_PX: u16 = 192;
 
     /// Looks for these markers; those of other families are left out. With `inverted` it looks for markers

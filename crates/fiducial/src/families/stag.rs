@@ -136,8 +136,8 @@ const OCCLUDED: SampleBounds = SampleBounds {
 };
 
 impl StagDetector {
-    /// Largest size of outlines that are followed on the finest levels, in pixels of the level: on the next level the
-    /// border of a marker, a tenth of its side, is too thin, and out of focus too bright. Seen from the side it is thinner.
+    /// Largest size of outlines on the finest levels, in pixels of the level. Seen from the side, at a sixth of its length, the border of
+    /// a marker of 192 px, a tenth of its side, is 3 px wide: on the next level it is too thin, and out of focus too bright.
     const MAX_OUTLINE_PX: u16 = 192;
 
     /// Looks for these markers; those of other families are left out. With `inverted` it looks for markers
@@ -619,8 +619,8 @@ fn has_rim(input: ImageInput<'_>, quad: &Quad) -> bool {
     !contrast.is_finite() || contrast > MIN_RIM
 }
 
-/// The level of the pyramid on which a quad's shortest side is between this length and twice this, and its
-/// corners there.
+/// The level of the pyramid on which a quad's shortest side (where it is narrower, one and a half times its width across) is between this
+/// length and twice this, and its corners there.
 fn on_level(corners: &[Pixel; 4], side_px: f64, input: ImageInput<'_>) -> (usize, [[f64; 2]; 4]) {
     let level =
         ((at_most_across(shortest_side_px(corners), corners) / side_px).log2().floor().max(0.0)

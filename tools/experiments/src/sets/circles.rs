@@ -42,7 +42,7 @@ const KINDS: [(Kind, [f64; 2]); 14] = [
     (("cctag", cctag), [0.05, 0.5]),
 ];
 
-/// Those of the scenes in turn. With another one all scenes would be others.
+/// Those of the scenes in turn; fixed, so that a further kind of camera leaves the scenes of a seed as they are.
 const CAMERAS: [Preset; 6] = [
     Preset::Linear,
     Preset::Usb,

@@ -13,7 +13,7 @@ pub(super) struct Coded {
     pub(super) blocks: u16,
 }
 
-/// Bounds of the steps that are filtered, by the quantiser: across the edge, and on each side of it (Table 8-16).
+/// Bounds of the steps that are filtered, by the QP: across the edge (alpha), and on each side of it (beta; Table 8-16).
 const ACROSS: [u8; 52] = [
     0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 4, 4, 5, 6, 7, 8, 9, 10, 12, 13, 15, 17, 20,
     22, 25, 28, 32, 36, 40, 45, 50, 56, 63, 71, 80, 90, 101, 113, 127, 144, 162, 182, 203, 226,
@@ -23,7 +23,7 @@ const BESIDE: [u8; 52] = [
     0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 6, 6, 7, 7, 8, 8,
     9, 9, 10, 10, 11, 11, 12, 12, 13, 13, 14, 14, 15, 15, 16, 16, 17, 17, 18, 18,
 ];
-/// Maximum change of the pixels at an edge of strengths 1 to 3, from the quantiser 17 on (Table 8-17).
+/// Maximum change (t_C0) of the pixels at an edge of boundary strengths 1 to 3, from QP 17 on (Table 8-17).
 const CHANGES: [[u8; 3]; 35] = [
     [0, 0, 1],
     [0, 0, 1],
@@ -62,7 +62,8 @@ const CHANGES: [[u8; 3]; 35] = [
     [13, 17, 25],
 ];
 
-/// Filters a picture in place; `coded` has its macroblocks by rows.
+/// Filters a picture in place; `coded` has its macroblocks by rows. The boundary strength (bS) is 4 or 3 beside intra prediction, 2 beside
+/// levels, 1 between motions that differ.
 pub(super) fn deblock(plane: &mut Plane, coded: &[Coded], quantiser: u8) {
     let filter = Filter::new(quantiser);
     let columns = plane.width / MACROBLOCK;
@@ -172,5 +173,43 @@ impl Filter {
         if is_flat_after {
             set(1, q1 + ((q2 + middle - 2 * q1) >> 1).clamp(-bound, bound));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The row of pixels across the edge between two macroblocks with a step, filtered.
+    fn across(step: u8, left: Coded, right: Coded) -> [u8; 8] {
+        let mut plane = Plane::default();
+        plane.resize(32, 16);
+        for y in 0..16 {
+            let row = plane.row_mut(0, y, 32);
+            row[..16].fill(100);
+            row[16..].fill(100 + step);
+        }
+        deblock(&mut plane, &[left, right], 30);
+        let row = plane.row(12, 5, 8);
+        std::array::from_fn(|at| row[at])
+    }
+
+    #[test]
+    fn an_edge_is_smoothed_by_how_its_blocks_were_coded() {
+        let intra = Coded { is_intra: true, ..Coded::default() };
+        let levels = Coded { blocks: u16::MAX, ..Coded::default() };
+        let moved = |by: i32| Coded { motion: [by, 0], ..Coded::default() };
+        let still = Coded::default();
+        // At QP 30 a step is filtered below 25; the strong filter reaches three pixels where it is below 8.
+        assert_eq!(across(6, intra, still), [100, 101, 102, 102, 104, 105, 105, 106]);
+        assert_eq!(across(20, intra, still), [100, 100, 100, 105, 115, 120, 120, 120]);
+        for strong in [intra, levels] {
+            assert_eq!(across(25, strong, still), [100, 100, 100, 100, 125, 125, 125, 125]);
+        }
+        // One more at each flat side than t_C0, which is 1 for both.
+        assert_eq!(across(20, levels, still), [100, 100, 101, 103, 117, 119, 120, 120]);
+        assert_eq!(across(20, moved(4), still), [100, 100, 101, 103, 117, 119, 120, 120]);
+        assert_eq!(across(20, moved(3), still), [100, 100, 100, 100, 120, 120, 120, 120]);
+        assert_eq!(across(20, still, still), [100, 100, 100, 100, 120, 120, 120, 120]);
     }
 }

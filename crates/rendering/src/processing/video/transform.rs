@@ -3,8 +3,8 @@
 /// A block of 4 x 4 values, by rows.
 pub(super) type Block = [i32; 16];
 
-/// What a level stands for at quantisers 0 to 5, doubled with every six more: in the corners, in the middle and elsewhere of each
-/// quarter of a block (`normAdjust4x4`).
+/// What a level stands for at QP 0 to 5, doubled with every six more: where row and column are even, where both are odd, and
+/// elsewhere (`normAdjust4x4`).
 const SCALES: [[i32; 3]; 6] =
     [[10, 16, 13], [11, 18, 14], [13, 20, 16], [14, 23, 18], [16, 25, 20], [18, 29, 23]];
 /// The inverse of a scale and of the transform's own gain, as multiples of 2^-15.
@@ -29,7 +29,7 @@ pub(super) struct Quantiser {
 }
 
 impl Quantiser {
-    /// The quantiser of a parameter from 0 to 51.
+    /// The quantiser of a quantisation parameter (QP) from 0 to 51.
     pub(super) fn new(parameter: u8, is_intra: bool) -> Self {
         let (six, rest) = (u32::from(parameter) / 6, usize::from(parameter) % 6);
         let by_place = |table: &[[i32; 3]; 6]| {
@@ -99,7 +99,7 @@ fn inverse(values: &mut Block, at: [usize; 4]) {
 }
 
 /// How much a block of a predicted picture is worth being coded: encoders drop blocks in which single levels of 1 stand alone
-/// (the threshold on coefficient cost of the Joint Model).
+/// (coefficient cost, by the zeros before each level of 1 in the zigzag; as in x264).
 pub(super) fn worth(levels: &Block) -> u32 {
     const BY_ZEROS: [u32; 7] = [3, 2, 2, 1, 1, 1, 0];
     const MUCH: u32 = 9;
