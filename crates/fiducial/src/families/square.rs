@@ -157,7 +157,8 @@ struct Decoded {
 
 impl SquareTagDetector {
     /// Largest size of outlines on the finest levels, in pixels of the level. Seen from the side, at a sixth of its length, a marker of
-    /// 192 px is 32 px across: two levels on, its cells would be a pixel wide. Of one in full view, two levels on, a scratch would open the border from 64 px down.
+    /// 192 px is 32 px across: two levels on, its cells would be a pixel wide. Two levels on, a scratch opens the border of a marker of
+    /// 64 px that is in full view.
     const MAX_OUTLINE_PX: u16 = 192;
 
     /// Looks for these markers; those of other families are left out. With `inverted` it looks for markers
