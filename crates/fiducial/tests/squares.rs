@@ -136,6 +136,45 @@ fn tags_that_are_seen_from_the_side_are_read_beside_another_one() {
     }
 }
 
+/// A grid of three by three tags whose gaps are three cells wide and have a black square at each of their crossings. The squares overlap
+/// the corners of all tags but the first, whose outline alone is closed; a lens bends the grid.
+#[test]
+fn the_tags_of_a_calibration_grid_are_read_beside_the_one_with_an_outline() {
+    const STEP: f64 = 13.0;
+    let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
+    for (cell_px, angle, bend) in [(3.0, 0.1, 0.0), (4.5, 0.5, 0.04), (6.0, -0.3, -0.02)] {
+        let middle = [160.4, 159.8];
+        // From pixels to cells of the grid, from the middle.
+        let cells = |at: [f64; 2]| {
+            let [u, v] = turned(at, middle, angle, cell_px);
+            let bent = 1.0 + bend * (u * u + v * v) / (1.5 * STEP).powi(2);
+            [u * bent, v * bent]
+        };
+        let image = picture([320, 320], 1.2, |at| {
+            let [x, y] = cells(at).map(|v| v + 1.5 * STEP - 1.5);
+            // The tag's number, and the place in it.
+            let [column, row] = [x, y].map(|v| v.div_euclid(STEP));
+            let [u, v] = [x.rem_euclid(STEP), y.rem_euclid(STEP)];
+            let is_tag = |v: f64| (0.0..3.0).contains(&v);
+            if u < 10.0 && v < 10.0 && is_tag(column) && is_tag(row) {
+                return GREYS
+                    [usize::from(is_white(code, (3.0 * row + column) as usize, 2, [u, v]))];
+            }
+            // Around the first tag the squares are smaller.
+            let is_first = x < STEP - 1.0 && y < STEP - 1.0;
+            let gap = |v: f64| v > if is_first { 10.6 } else { 9.6 } && (is_first || v < 13.4);
+            let by_corner = |v: f64| gap(v) || (v < 0.4 && !is_first);
+            let on_grid = |v: f64| (-3.0..3.0 * STEP).contains(&v);
+            let is_square = by_corner(u) && by_corner(v) && on_grid(x) && on_grid(y);
+            GREYS[if is_square { 0 } else { 1 }]
+        });
+        let mut ids: Vec<_> =
+            find(&image, &["apriltag-36h11"]).iter().filter_map(|seen| seen.id).collect();
+        ids.sort_unstable();
+        assert_eq!(ids, (0..9).collect::<Vec<_>>(), "{cell_px} px, bent by {bend}");
+    }
+}
+
 #[test]
 fn a_scratched_border_does_not_hide_a_marker_of_eighty_pixels() {
     let code = SquareCode::for_family(Family::Aruco6x6_250).unwrap();

@@ -4,6 +4,8 @@
 //! Then the corners are refined and give the pose. Fallbacks read quads of segments, of which a part may be
 //! hidden, and the quiet zones of markers whose border blur or a tone curve breaks.
 
+mod grid;
+
 use geometry::Pixel;
 use imaging::GrayView;
 use markers::{Marker, Match, SquareCode};
@@ -237,6 +239,7 @@ impl SquareTagDetector {
         self.found.clear();
         self.doubtful.clear();
         self.decode_all(input, quads, out.trace);
+        self.decode_grid(input, out.trace);
         out.stages.ended("codes");
         self.observe_all(input, 0, out.found);
         out.stages.ended("poses");
@@ -326,19 +329,32 @@ impl SquareTagDetector {
             }
         }
         let best = best.filter(|best| best.r_squared > MIN_ALIGNED_R_SQUARED);
-        let Some(mut best) = best else { return };
+        let Some(best) = best else { return };
         if cell_px > MAX_ALIGNED_CELL_PX || self.aligned >= MAX_ALIGNED {
             return;
         }
         self.aligned += 1;
         // Of cells a pixel or two wide a quad that is off by a third of a pixel shows their neighbours.
-        for step_px in ALIGNING_PX {
+        if let Some(found) = self.decode_aligned(input, best, layout, ALIGNING_PX) {
+            self.accept(found, trace);
+        }
+    }
+
+    /// The marker in a quad that is moved to where its cells explain the pixels best, by ever smaller steps, in pixels.
+    fn decode_aligned(
+        &mut self,
+        input: ImageInput<'_>,
+        mut best: Unread,
+        layout: usize,
+        steps_px: [f64; 4],
+    ) -> Option<Decoded> {
+        for step_px in steps_px {
             for (direction, step_px) in
                 Move::ALL.into_iter().flat_map(|it| [(it, step_px), (it, -step_px)])
             {
                 let quad = direction.of(&best.quad, step_px);
                 match self.decode_shown(input, &quad, layout, best.curve) {
-                    Ok(found) => return self.accept(found, trace),
+                    Ok(found) => return Some(found),
                     Err(r_squared) if r_squared > best.r_squared => {
                         best = Unread { quad, r_squared, ..best };
                     }
@@ -346,6 +362,7 @@ impl SquareTagDetector {
                 }
             }
         }
+        None
     }
 
     /// The marker in a quad as a camera with this tone curve shows it; if there is none, the R² of the word that is nearest to the
