@@ -254,10 +254,7 @@ fn ffmpeg(arguments: &[&str]) -> Command {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_ffmpeg_streams_is_what_ffmpeg_shows() {
-    let encoders = Command::new("ffmpeg").arg("-encoders").output();
-    let has_x264 = encoders.is_ok_and(|o| String::from_utf8_lossy(&o.stdout).contains("libx264"));
-    if !has_x264 {
-        testing::skip("ffmpeg", "it does not start, or has no libx264");
+    if !testing::has_x264() {
         return;
     }
     let raw = ["-frames:v", "100", "-pix_fmt", "yuv420p", "-f", "rawvideo", "-"];

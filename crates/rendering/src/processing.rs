@@ -191,6 +191,13 @@ impl Processing {
     }
 }
 
+/// Root mean square of what two pictures differ by, in grey levels.
+#[cfg(test)]
+fn rms(a: &[u8], b: &[u8]) -> f64 {
+    let squares = a.iter().zip(b).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2));
+    (squares.sum::<f64>() / a.len() as f64).sqrt()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -264,9 +271,7 @@ mod tests {
         let off = |quality| {
             let processing = Processing { jpeg_quality: Some(quality), ..Processing::LINEAR };
             let out = processing.apply(&pixels, WIDTH).unwrap();
-            let squares =
-                out.iter().zip(&pixels).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2));
-            (squares.sum::<f64>() / pixels.len() as f64).sqrt()
+            rms(&out, &pixels)
         };
         let [fine, coarse] = [off(95), off(50)];
         assert!(fine > 0.1 && fine < 2.5 && coarse > 1.5 * fine, "{fine} {coarse}");

@@ -36,12 +36,6 @@ fn pictures(surface: Surface, processing: Processing) -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// Whether ffmpeg is installed, with x264.
-fn has_x264() -> bool {
-    let encoders = Command::new("ffmpeg").arg("-encoders").output();
-    encoders.is_ok_and(|o| String::from_utf8_lossy(&o.stdout).contains("libx264"))
-}
-
 /// What ffmpeg makes of its standard input.
 fn ffmpeg(arguments: &str, input: Vec<u8>) -> Vec<u8> {
     let mut child = Command::new("ffmpeg")
@@ -94,8 +88,7 @@ fn mean(values: &[f64], since: std::ops::Range<usize>) -> f64 {
 
 #[test]
 fn about_as_much_is_lost_and_stays_as_in_x264() {
-    if !has_x264() {
-        testing::skip("ffmpeg", "it does not start, or has no libx264");
+    if !testing::has_x264() {
         return;
     }
     for (surface, quantiser) in [(Surface::Grass, 25), (Surface::Asphalt, 31), (Surface::Tiles, 37)]

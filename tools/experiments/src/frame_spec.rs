@@ -266,11 +266,6 @@ impl FrameRenderer {
         let model = settings.model;
         let is_mosaic = spec.bayer || spec.binned > 1;
         let mut renderer = Renderer::with_ground(ground, &scene, settings, spec.seed)?;
-        let poses: Vec<_> = spec
-            .path
-            .iter()
-            .map(|pose| ned_from_marker * pose.inverse() * body_from_camera.inverse())
-            .collect();
         let mut pixels = vec![0; model.width as usize * model.height as usize];
         let mut apply = |v: usize, light: &mut [f32]| {
             spec.occluder.apply(v, light);
@@ -279,7 +274,7 @@ impl FrameRenderer {
             }
         };
         let is_video = spec.settings.processing.video.is_some();
-        for back in (1..=if is_video { EARLIER_PICTURES } else { 0 }).rev() {
+        for back in (0..=if is_video { EARLIER_PICTURES } else { 0 }).rev() {
             let body_pose = |pose: &Transform<Camera, MarkerFrame>| {
                 ned_from_marker
                     * earlier(pose, &spec.settings.model, back).inverse()
@@ -289,7 +284,6 @@ impl FrameRenderer {
             let seed = spec.seed.wrapping_sub(u64::from(back));
             renderer.render_through(&mut apply, &poses, seed, &mut pixels)?;
         }
-        renderer.render_through(&mut apply, &poses, spec.seed, &mut pixels)?;
         if spec.binned > 1 {
             let size = [model.width as usize, model.height as usize];
             let frame = &spec.settings.model;

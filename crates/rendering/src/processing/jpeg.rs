@@ -156,6 +156,7 @@ mod tests {
     use zune_jpeg::zune_core::options::DecoderOptions;
 
     use super::*;
+    use crate::processing::rms;
 
     /// Through an encoder and a decoder.
     fn through_a_file(pixels: &[u8], width: usize, quality: u8) -> Vec<u8> {
@@ -189,17 +190,13 @@ mod tests {
             let file = through_a_file(&pixels, width, quality);
             let mut own = pixels.clone();
             Jpeg::new(quality).apply(&mut own, width);
-            let off = |a: &[u8], b: &[u8]| -> f64 {
-                let by = a.iter().zip(b).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2));
-                (by.sum::<f64>() / a.len() as f64).sqrt()
-            };
             assert_eq!(own.len(), file.len());
             let near = own.iter().zip(&file).filter(|(a, b)| a.abs_diff(**b) <= 1).count();
             // Encoders compute in whole numbers, so that now and then an amplitude half-way between two steps goes the other
             // way, which a block shows.
             assert!(near * 100 >= 90 * own.len(), "quality {quality}: {near} of {}", own.len());
             let [differs, loses, lost] =
-                [off(&own, &file), off(&own, &pixels), off(&file, &pixels)];
+                [rms(&own, &file), rms(&own, &pixels), rms(&file, &pixels)];
             println!("quality {quality}: {differs:.2} differ, {loses:.2} and {lost:.2} lost");
             assert!(differs < 0.35 * lost.max(1.2), "quality {quality}: {differs}, {lost}");
             assert!((loses - lost).abs() < 0.03 * lost.max(3.0), "{quality}: {loses}, {lost}");

@@ -410,6 +410,7 @@ fn bits(value: i32) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::processing::rms;
 
     const SIZE: [usize; 2] = [150, 90];
 
@@ -423,11 +424,6 @@ mod tests {
                 (128.0 + blots + fine) as u8
             })
             .collect()
-    }
-
-    fn rms(a: &[u8], b: &[u8]) -> f64 {
-        let squares = a.iter().zip(b).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2));
-        (squares.sum::<f64>() / a.len() as f64).sqrt()
     }
 
     /// The pictures of a camera that moves, and what is left of them.

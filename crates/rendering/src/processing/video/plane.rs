@@ -100,15 +100,12 @@ impl Reference {
             let row = |y: usize| &whole.pixels[y * stride..][..stride];
             let here = row(y);
             let out = &mut right.pixels[y * stride..][..stride];
-            six_across(&mut out[2..], here);
+            six_across(&mut out[2..], here, 5);
             let lines = [row(y - 2), row(y - 1), here, row(y + 1), row(y + 2), row(y + 3)];
             let down = &mut below.pixels[y * stride..][..stride];
             six_down(&mut self.sums, down, lines);
             let out = &mut both.pixels[y * stride..][..stride];
-            for (pixel, six) in out[2..].iter_mut().zip(self.sums.windows(6)) {
-                let six = [six[0], six[1], six[2], six[3], six[4], six[5]].map(i32::from);
-                *pixel = rounded(taps(six), 10);
-            }
+            six_across(&mut out[2..], &self.sums, 10);
         }
     }
 
@@ -207,11 +204,11 @@ fn rounded(sum: i32, bits: u32) -> u8 {
     ((sum + (1 << (bits - 1))) >> bits).clamp(0, 255) as u8
 }
 
-/// Filters along a row.
-fn six_across(out: &mut [u8], row: &[u8]) {
+/// Filters along a row of grey levels, or of sums of them; `bits` is the logarithm of the weights' sum.
+fn six_across<T: Copy + Into<i32>>(out: &mut [u8], row: &[T], bits: u32) {
     for (pixel, six) in out.iter_mut().zip(row.windows(6)) {
-        let six = [six[0], six[1], six[2], six[3], six[4], six[5]].map(i32::from);
-        *pixel = rounded(taps(six), 5);
+        let six = [six[0], six[1], six[2], six[3], six[4], six[5]].map(Into::into);
+        *pixel = rounded(taps(six), bits);
     }
 }
 
