@@ -12,7 +12,9 @@ use geometry::CameraModel;
 use imaging::{GrayImage, GrayView, SampleFormat};
 use media::{DecodedImage, frame_bytes, images_in, samples_to_grey};
 use messages::{BayerPattern, CameraInfo, FrameHeader, PixelFormat, topic};
-use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
+use node::{
+    BoxFuture, FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns,
+};
 use tokio::sync::oneshot;
 
 use crate::config::{
@@ -47,7 +49,15 @@ const SUBSCRIBER_POLL: Duration = Duration::from_millis(20);
 /// # Errors
 /// When there is no image to publish, the program cannot be started or exits, the device cannot do what is configured, or
 /// another camera has this name.
-pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
+pub fn run(
+    node: Node,
+    config: Config,
+    shutdown: Shutdown,
+) -> BoxFuture<'static, anyhow::Result<()>> {
+    Box::pin(run_service(node, config, shutdown))
+}
+
+async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name(config.instance()).await?;
     let found = {
         let config = config.clone();

@@ -10,7 +10,7 @@ use autopilot::{Address, Link, LinkEvent, Parser, Peering, Permission};
 use messages::{
     CommandReply, ControllerCommand, ControllerStatus, MavlinkBytes, Tape, VehicleState, topic,
 };
-use node::{HealthCounters, Node, Publisher, Request, Shutdown, Standstill, now_ns};
+use node::{BoxFuture, HealthCounters, Node, Publisher, Request, Shutdown, Standstill, now_ns};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
@@ -52,7 +52,15 @@ const TAPE_END: Duration = Duration::from_millis(200);
 ///
 /// # Errors
 /// When another controller is running, the link cannot be opened, or the network fails.
-pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
+pub fn run(
+    node: Node,
+    config: Config,
+    shutdown: Shutdown,
+) -> BoxFuture<'static, anyhow::Result<()>> {
+    Box::pin(run_service(node, config, shutdown))
+}
+
+async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name("*").await?;
     let address: Address = config.autopilot.address.parse()?;
     let permission: Permission = config.autopilot.ground_may.parse()?;

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use messages::topic;
-use node::{Node, Shutdown, clock_name, now_ns};
+use node::{BoxFuture, Node, Shutdown, clock_name, now_ns};
 use tokio::net::TcpListener;
 use tokio::time::{MissedTickBehavior, interval};
 
@@ -29,7 +29,15 @@ const CLOSED: &str = "the network session was closed";
 ///
 /// # Errors
 /// When another dashboard has this name, the address is taken, or the network session cannot be used.
-pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
+pub fn run(
+    node: Node,
+    config: Config,
+    shutdown: Shutdown,
+) -> BoxFuture<'static, anyhow::Result<()>> {
+    Box::pin(run_service(node, config, shutdown))
+}
+
+async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name(&config.id).await?;
     let address: SocketAddr = config.listen.parse().context("`listen`")?;
     let listener = TcpListener::bind(address).await.with_context(|| {

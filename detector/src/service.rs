@@ -18,7 +18,8 @@ use messages::{
     FrameAck, FrameHeader, PixelFormat, Refusals, topic,
 };
 use node::{
-    Frame, FramePublisher, FrameSubscriber, Loan, Node, Publisher, Shutdown, clock_name, now_ns,
+    BoxFuture, Frame, FramePublisher, FrameSubscriber, Loan, Node, Publisher, Shutdown, clock_name,
+    now_ns,
 };
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
@@ -43,7 +44,15 @@ const FAREWELL: Duration = Duration::from_millis(100);
 ///
 /// # Errors
 /// When another detector has the same name, or the network fails.
-pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
+pub fn run(
+    node: Node,
+    config: Config,
+    shutdown: Shutdown,
+) -> BoxFuture<'static, anyhow::Result<()>> {
+    Box::pin(run_service(node, config, shutdown))
+}
+
+async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name(&config.id).await?;
     let camera = Arc::new(Mutex::new(None));
     let infos = node.subscriber(topic::CAMERA_INFO, &[&config.camera]).await?;

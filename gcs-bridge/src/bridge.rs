@@ -16,7 +16,7 @@ use messages::{
     Configuration, ControllerStatus, Detections, Health, MavlinkBytes, Phase, RecorderStatus,
     TargetEstimate, topic,
 };
-use node::{HealthCounters, INSECURE, Node, OPEN, Shutdown, Standstill, now_ns};
+use node::{BoxFuture, HealthCounters, INSECURE, Node, OPEN, Shutdown, Standstill, now_ns};
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::camera::Camera;
@@ -41,7 +41,15 @@ const GROUND_TIMEOUT_NS: i64 = 10_000_000_000;
 /// # Errors
 /// When the address cannot be opened, another bridge has this name, or the network session ends. A missing
 /// ground station is not an error.
-pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
+pub fn run(
+    node: Node,
+    config: Config,
+    shutdown: Shutdown,
+) -> BoxFuture<'static, anyhow::Result<()>> {
+    Box::pin(run_service(node, config, shutdown))
+}
+
+async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     let address: Address = config.ground.parse()?;
     node.claim_unique_name(&node.identity().instance).await?;
     let mut ground = Link::open_for(address, config.peering(), config.signing()?)

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant, SystemTime};
 use anyhow::{Context, bail, ensure};
 use flightlog::About;
 use messages::{Delivery, FrameHeader, RecorderLoss, RecorderStatus, Row, TOPICS, topic};
-use node::{HealthCounters, Node, Shutdown, Tap, Tapped, now_ns};
+use node::{BoxFuture, HealthCounters, Node, Shutdown, Tap, Tapped, now_ns};
 
 use crate::config::{Config, Frames};
 use crate::frame::{Frame, Pictures, header, received};
@@ -43,7 +43,15 @@ const OTHER_KEYS: &str = "other keys";
 /// # Errors
 /// When another recorder has this name, the address for viewers is taken and there is no file, the network session cannot be used, or the last
 /// file could not be ended.
-pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
+pub fn run(
+    node: Node,
+    config: Config,
+    shutdown: Shutdown,
+) -> BoxFuture<'static, anyhow::Result<()>> {
+    Box::pin(run_service(node, config, shutdown))
+}
+
+async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name(&config.id).await?;
     let frames = node::named(&config.frames).map_err(anyhow::Error::msg)?;
     let has_file = config.has_file();

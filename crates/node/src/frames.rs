@@ -21,6 +21,7 @@ use zenoh::shm::{
     GarbageCollect, PosixShmProviderBackend, ShmProvider, ShmProviderBuilder, ZShmMut,
 };
 
+use crate::boxed::BoxFuture;
 use crate::health::HealthCounters;
 use crate::session::Node;
 use crate::topics::report_refused;
@@ -88,21 +89,23 @@ impl Node {
     ///
     /// # Errors
     /// When the session is closed or a name makes no key.
-    pub async fn frame_publisher(
-        &self,
+    pub fn frame_publisher<'a>(
+        &'a self,
         topic: Topic<FrameHeader>,
-        names: &[&str],
+        names: &'a [&'a str],
         max_frame_bytes: usize,
-    ) -> anyhow::Result<FramePublisher> {
-        let key = topic.key(names);
-        debug_assert_eq!(topic.delivery(), Delivery::Latest);
-        let publisher = self.declare_frames(key, FIRST_PRIORITY).await?;
-        if max_frame_bytes == 0 || !self.has_shared_memory {
-            return Ok(FramePublisher { publisher, pool: None, health: self.shared_health() });
-        }
-        let pool_bytes = FRAMES_IN_POOL * max_frame_bytes.next_multiple_of(4096) + 4096;
-        let pool = Pool::new(pool_bytes).map(Mutex::new);
-        Ok(FramePublisher { publisher, pool, health: self.shared_health() })
+    ) -> BoxFuture<'a, anyhow::Result<FramePublisher>> {
+        Box::pin(async move {
+            let key = topic.key(names);
+            debug_assert_eq!(topic.delivery(), Delivery::Latest);
+            let publisher = self.declare_frames(key, FIRST_PRIORITY).await?;
+            if max_frame_bytes == 0 || !self.has_shared_memory {
+                return Ok(FramePublisher { publisher, pool: None, health: self.shared_health() });
+            }
+            let pool_bytes = FRAMES_IN_POOL * max_frame_bytes.next_multiple_of(4096) + 4096;
+            let pool = Pool::new(pool_bytes).map(Mutex::new);
+            Ok(FramePublisher { publisher, pool, health: self.shared_health() })
+        })
     }
 
     async fn declare_frames(
@@ -123,21 +126,23 @@ impl Node {
     ///
     /// # Errors
     /// When the session is closed.
-    pub async fn frame_subscriber(
-        &self,
+    pub fn frame_subscriber<'a>(
+        &'a self,
         topic: Topic<FrameHeader>,
-        names: &[&str],
-    ) -> anyhow::Result<FrameSubscriber> {
-        let key = topic.key(names);
-        // On the air link an older frame can arrive after a newer one and must not displace it.
-        let capacity = if key == topic::JPEG.key(names) { FRAME_CONNECTIONS } else { 1 };
-        let subscriber = self
-            .session
-            .declare_subscriber(key.clone())
-            .with(RingChannel::new(capacity))
-            .await
-            .map_err(|cause| anyhow!("subscribing to {key}: {cause}"))?;
-        Ok(FrameSubscriber { subscriber, health: self.shared_health() })
+        names: &'a [&'a str],
+    ) -> BoxFuture<'a, anyhow::Result<FrameSubscriber>> {
+        Box::pin(async move {
+            let key = topic.key(names);
+            // On the air link an older frame can arrive after a newer one and must not displace it.
+            let capacity = if key == topic::JPEG.key(names) { FRAME_CONNECTIONS } else { 1 };
+            let subscriber = self
+                .session
+                .declare_subscriber(key.clone())
+                .with(RingChannel::new(capacity))
+                .await
+                .map_err(|cause| anyhow!("subscribing to {key}: {cause}"))?;
+            Ok(FrameSubscriber { subscriber, health: self.shared_health() })
+        })
     }
 }
 
@@ -207,22 +212,24 @@ impl FramePublisher {
     }
 
     /// Publishes a frame that was written into its loan.
-    pub async fn publish(&self, header: &FrameHeader, frame: Loan) {
-        let payload: ZBytes = match frame {
-            Loan::Shared(buffer) => buffer.into(),
-            Loan::Private(buffer) => buffer.into(),
-        };
-        match self.publisher.put(payload).attachment(encode(header)).await {
-            Ok(()) => self.health.count(match header.format {
-                PixelFormat::Jpeg => "JPEG images",
-                _ => "frames",
-            }),
-            Err(cause) => {
-                if self.health.failed("publish frame") {
-                    tracing::warn!(%cause, "Frame not published");
+    pub fn publish<'a>(&'a self, header: &'a FrameHeader, frame: Loan) -> BoxFuture<'a, ()> {
+        Box::pin(async move {
+            let payload: ZBytes = match frame {
+                Loan::Shared(buffer) => buffer.into(),
+                Loan::Private(buffer) => buffer.into(),
+            };
+            match self.publisher.put(payload).attachment(encode(header)).await {
+                Ok(()) => self.health.count(match header.format {
+                    PixelFormat::Jpeg => "JPEG images",
+                    _ => "frames",
+                }),
+                Err(cause) => {
+                    if self.health.failed("publish frame") {
+                        tracing::warn!(%cause, "Frame not published");
+                    }
                 }
             }
-        }
+        })
     }
 
     /// A publisher on the same key that uses the second connection for frames on the air link: its frames do
@@ -230,15 +237,19 @@ impl FramePublisher {
     ///
     /// # Errors
     /// When the session is closed.
-    pub async fn second_publisher(&self, node: &Node) -> anyhow::Result<Self> {
-        let key = self.publisher.key_expr().as_str().to_owned();
-        let publisher = node.declare_frames(key, SECOND_PRIORITY).await?;
-        Ok(Self { publisher, pool: None, health: Arc::clone(&self.health) })
+    pub fn second_publisher<'a>(&'a self, node: &'a Node) -> BoxFuture<'a, anyhow::Result<Self>> {
+        Box::pin(async move {
+            let key = self.publisher.key_expr().as_str().to_owned();
+            let publisher = node.declare_frames(key, SECOND_PRIORITY).await?;
+            Ok(Self { publisher, pool: None, health: Arc::clone(&self.health) })
+        })
     }
 
     /// Whether there is a subscriber; images that are expensive to make are made only then.
-    pub async fn has_subscribers(&self) -> bool {
-        self.publisher.matching_status().await.is_ok_and(|status| status.matching())
+    pub fn has_subscribers(&self) -> BoxFuture<'_, bool> {
+        Box::pin(async move {
+            self.publisher.matching_status().await.is_ok_and(|status| status.matching())
+        })
     }
 }
 
@@ -271,13 +282,15 @@ impl Frame {
 impl FrameSubscriber {
     /// The latest frame, or one of the latest two on the air link; `None` once the session is closed. A frame
     /// with an invalid header, or with a length that does not match its header, is counted, and logged once.
-    pub async fn next(&self) -> Option<Frame> {
-        loop {
-            let sample = self.subscriber.recv_async().await.ok()?;
-            if let Some(frame) = self.frame(&sample) {
-                return Some(frame);
+    pub fn next(&self) -> BoxFuture<'_, Option<Frame>> {
+        Box::pin(async move {
+            loop {
+                let sample = self.subscriber.recv_async().await.ok()?;
+                if let Some(frame) = self.frame(&sample) {
+                    return Some(frame);
+                }
             }
-        }
+        })
     }
 
     /// A frame that has arrived already, without waiting.

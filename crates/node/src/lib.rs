@@ -11,6 +11,7 @@
 //! what survives a reboot.
 
 pub mod access;
+mod boxed;
 pub mod clock;
 pub mod config;
 pub mod denied;
@@ -27,6 +28,7 @@ pub mod stats;
 pub mod tap;
 pub mod topics;
 
+pub use boxed::BoxFuture;
 pub use clock::{boot_ahead_ns, clock_name, host_name, now_ns};
 pub use config::{
     Check, ConfigError, Effective, Layers, Settings, changed, from_toml, named, to_toml,

@@ -10,6 +10,7 @@ use zenoh::handlers::RingChannelHandler;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::sample::{Sample, SampleKind};
 
+use crate::boxed::BoxFuture;
 use crate::clock::{host_name, now_ns};
 use crate::health::HealthCounters;
 use crate::identity::Identity;
@@ -85,20 +86,22 @@ impl Node {
     ///
     /// # Errors
     /// When the configuration cannot be read or the session cannot be opened.
-    pub async fn open(identity: Identity, source: &ZenohSource) -> anyhow::Result<Self> {
-        let mut config = zenoh_config(source)?;
-        let has_shared_memory = share_memory(&mut config)?;
-        let session = zenoh::open(config)
-            .await
-            .map_err(|cause| anyhow!("opening the Zenoh session of {identity}: {cause}"))?;
-        Ok(Self {
-            session,
-            has_shared_memory,
-            identity: Arc::new(identity),
-            health: Arc::default(),
-            token: Arc::default(),
-            claim: Arc::default(),
-            started_ns: now_ns(),
+    pub fn open(identity: Identity, source: &ZenohSource) -> BoxFuture<'_, anyhow::Result<Self>> {
+        Box::pin(async move {
+            let mut config = zenoh_config(source)?;
+            let has_shared_memory = share_memory(&mut config)?;
+            let session = zenoh::open(config)
+                .await
+                .map_err(|cause| anyhow!("opening the Zenoh session of {identity}: {cause}"))?;
+            Ok(Self {
+                session,
+                has_shared_memory,
+                identity: Arc::new(identity),
+                health: Arc::default(),
+                token: Arc::default(),
+                claim: Arc::default(),
+                started_ns: now_ns(),
+            })
         })
     }
 
@@ -125,41 +128,49 @@ impl Node {
     ///
     /// # Errors
     /// Names the other instance.
-    pub async fn claim_unique_name(&self, matches: &str) -> anyhow::Result<()> {
-        let service = self.identity.service;
-        let ours = (self.identity.instance.clone(), self.session.zid().to_string());
-        let claim = self.declare(&topic::claim_key(service, &ours.0, &ours.1)).await?;
-        *self.claim.lock().unwrap_or_else(PoisonError::into_inner) = Some(claim);
-        for delay in CLAIM_CHECK_DELAYS {
-            tokio::time::sleep(delay).await;
-            match self.alive(service, matches).await?.first() {
-                None => {}
-                Some(other) if matches == "*" => bail!(
-                    "another {service} (`{other}`) is running for this vehicle; stop it first, or set another vehicle (`namespace` in the Zenoh configuration)"
-                ),
-                Some(other) => bail!(
-                    "another {service} has the name `{other}` already; choose another with `--set id=...`"
-                ),
+    pub fn claim_unique_name<'a>(&'a self, matches: &'a str) -> BoxFuture<'a, anyhow::Result<()>> {
+        Box::pin(async move {
+            let service = self.identity.service;
+            let ours = (self.identity.instance.clone(), self.session.zid().to_string());
+            let claim = self.declare(&topic::claim_key(service, &ours.0, &ours.1)).await?;
+            *self.claim.lock().unwrap_or_else(PoisonError::into_inner) = Some(claim);
+            for delay in CLAIM_CHECK_DELAYS {
+                tokio::time::sleep(delay).await;
+                match self.alive(service, matches).await?.first() {
+                    None => {}
+                    Some(other) if matches == "*" => bail!(
+                        "another {service} (`{other}`) is running for this vehicle; stop it first, or set another vehicle (`namespace` in the Zenoh configuration)"
+                    ),
+                    Some(other) => bail!(
+                        "another {service} has the name `{other}` already; choose another with `--set id=...`"
+                    ),
+                }
+                let claims = self.tokens(&topic::claim_key(service, matches, "*")).await?;
+                if let Some((other, _)) =
+                    claims.iter().filter_map(|key| last_two(key)).find(|it| *it < ours)
+                {
+                    bail!(
+                        "another {service} (`{other}`) is starting at the same time and has priority"
+                    );
+                }
             }
-            let claims = self.tokens(&topic::claim_key(service, matches, "*")).await?;
-            if let Some((other, _)) =
-                claims.iter().filter_map(|key| last_two(key)).find(|it| *it < ours)
-            {
-                bail!(
-                    "another {service} (`{other}`) is starting at the same time and has priority"
-                );
-            }
-        }
-        Ok(())
+            Ok(())
+        })
     }
 
     /// The instances of a service that are ready, by liveliness.
     ///
     /// # Errors
     /// When the query fails.
-    pub async fn alive(&self, service: &str, instance: &str) -> anyhow::Result<Vec<String>> {
-        let keys = self.tokens(&topic::alive_key(service, instance)).await?;
-        Ok(keys.iter().filter_map(|key| instance_of(key)).collect())
+    pub fn alive<'a>(
+        &'a self,
+        service: &'a str,
+        instance: &'a str,
+    ) -> BoxFuture<'a, anyhow::Result<Vec<String>>> {
+        Box::pin(async move {
+            let keys = self.tokens(&topic::alive_key(service, instance)).await?;
+            Ok(keys.iter().filter_map(|key| instance_of(key)).collect())
+        })
     }
 
     /// The keys of the liveliness tokens that match.
@@ -182,54 +193,62 @@ impl Node {
     ///
     /// # Errors
     /// When the query fails.
-    pub async fn list_peers(&self) -> anyhow::Result<Vec<(String, String)>> {
-        let keys = self.tokens(&topic::alive_key("*", "*")).await?;
-        let mut peers: Vec<_> = keys.iter().filter_map(|key| last_two(key)).collect();
-        peers.sort();
-        peers.dedup();
-        Ok(peers)
+    pub fn list_peers(&self) -> BoxFuture<'_, anyhow::Result<Vec<(String, String)>>> {
+        Box::pin(async move {
+            let keys = self.tokens(&topic::alive_key("*", "*")).await?;
+            let mut peers: Vec<_> = keys.iter().filter_map(|key| last_two(key)).collect();
+            peers.sort();
+            peers.dedup();
+            Ok(peers)
+        })
     }
 
     /// The round-trip time of a query to an instance; `None` without a reply within `timeout`.
-    pub async fn round_trip(
-        &self,
-        service: &str,
-        instance: &str,
+    pub fn round_trip<'a>(
+        &'a self,
+        service: &'a str,
+        instance: &'a str,
         timeout: Duration,
-    ) -> Option<Duration> {
-        let key = topic::HEALTH.key(&[service, instance]);
-        let began = std::time::Instant::now();
-        // With the priority of commands, so that frames do not delay it.
-        let get = self.session.get(key).priority(zenoh::qos::Priority::InteractiveHigh);
-        let replies = get.timeout(timeout).await.ok()?;
-        let reply = replies.recv_async().await.ok()?;
-        reply.result().is_ok().then(|| began.elapsed())
+    ) -> BoxFuture<'a, Option<Duration>> {
+        Box::pin(async move {
+            let key = topic::HEALTH.key(&[service, instance]);
+            let began = std::time::Instant::now();
+            // With the priority of commands, so that frames do not delay it.
+            let get = self.session.get(key).priority(zenoh::qos::Priority::InteractiveHigh);
+            let replies = get.timeout(timeout).await.ok()?;
+            let reply = replies.recv_async().await.ok()?;
+            reply.result().is_ok().then(|| began.elapsed())
+        })
     }
 
     /// Announces that the service is ready.
     ///
     /// # Errors
     /// When the session is closed.
-    pub async fn announce(&self) -> anyhow::Result<()> {
-        let key = topic::alive_key(self.identity.service, &self.identity.instance);
-        let token = self.declare(&key).await?;
-        *self.token.lock().unwrap_or_else(PoisonError::into_inner) = Some(token);
-        // The announcement replaces the claim.
-        drop(self.claim.lock().unwrap_or_else(PoisonError::into_inner).take());
-        tracing::info!(service = self.identity.service, instance = %self.identity.instance, "Ready");
-        Ok(())
+    pub fn announce(&self) -> BoxFuture<'_, anyhow::Result<()>> {
+        Box::pin(async move {
+            let key = topic::alive_key(self.identity.service, &self.identity.instance);
+            let token = self.declare(&key).await?;
+            *self.token.lock().unwrap_or_else(PoisonError::into_inner) = Some(token);
+            // The announcement replaces the claim.
+            drop(self.claim.lock().unwrap_or_else(PoisonError::into_inner).take());
+            tracing::info!(service = self.identity.service, instance = %self.identity.instance, "Ready");
+            Ok(())
+        })
     }
 
     /// Shows another service as ready for as long as the result lives: one of a recording that is published again.
     ///
     /// # Errors
     /// When the session is closed.
-    pub async fn announce_other(
-        &self,
-        service: &str,
-        instance: &str,
-    ) -> anyhow::Result<Announcement> {
-        Ok(Announcement { _token: self.declare(&topic::alive_key(service, instance)).await? })
+    pub fn announce_other<'a>(
+        &'a self,
+        service: &'a str,
+        instance: &'a str,
+    ) -> BoxFuture<'a, anyhow::Result<Announcement>> {
+        Box::pin(async move {
+            Ok(Announcement { _token: self.declare(&topic::alive_key(service, instance)).await? })
+        })
     }
 
     async fn declare(&self, key: &str) -> anyhow::Result<LivelinessToken> {
@@ -241,31 +260,35 @@ impl Node {
     ///
     /// # Errors
     /// When the session is closed.
-    pub async fn presence(&self, service: &str) -> anyhow::Result<Presence> {
-        let key = topic::alive_key(service, "*");
-        let subscriber = self
-            .session
-            .liveliness()
-            .declare_subscriber(&key)
-            .history(true)
-            .with(zenoh::handlers::RingChannel::new(PRESENCE_DEPTH))
-            .await
-            .map_err(|cause| anyhow!("watching {key}: {cause}"))?;
-        Ok(Presence { subscriber })
+    pub fn presence<'a>(&'a self, service: &'a str) -> BoxFuture<'a, anyhow::Result<Presence>> {
+        Box::pin(async move {
+            let key = topic::alive_key(service, "*");
+            let subscriber = self
+                .session
+                .liveliness()
+                .declare_subscriber(&key)
+                .history(true)
+                .with(zenoh::handlers::RingChannel::new(PRESENCE_DEPTH))
+                .await
+                .map_err(|cause| anyhow!("watching {key}: {cause}"))?;
+            Ok(Presence { subscriber })
+        })
     }
 
     /// Publishes the service's health once a second, until it fails.
     ///
     /// # Errors
     /// When the session is closed.
-    pub async fn publish_health(&self) -> anyhow::Result<()> {
-        let names = [self.identity.service, self.identity.instance.as_str()];
-        let publisher = self.publisher(topic::HEALTH, &names).await?;
-        let mut second = tokio::time::interval(Duration::from_secs(1));
-        loop {
-            second.tick().await;
-            publisher.publish(&self.health.report(&self.identity, self.started_ns)).await;
-        }
+    pub fn publish_health(&self) -> BoxFuture<'_, anyhow::Result<()>> {
+        Box::pin(async move {
+            let names = [self.identity.service, self.identity.instance.as_str()];
+            let publisher = self.publisher(topic::HEALTH, &names).await?;
+            let mut second = tokio::time::interval(Duration::from_secs(1));
+            loop {
+                second.tick().await;
+                publisher.publish(&self.health.report(&self.identity, self.started_ns)).await;
+            }
+        })
     }
 
     /// Publishes the service's configuration once it is announced, and every few seconds for those that come late, until
@@ -273,48 +296,58 @@ impl Node {
     ///
     /// # Errors
     /// When the session is closed.
-    pub async fn publish_configuration(&self, toml: String) -> anyhow::Result<()> {
-        while self.token.lock().unwrap_or_else(PoisonError::into_inner).is_none() {
-            tokio::time::sleep(ANNOUNCED_PERIOD).await;
-        }
-        let names = [self.identity.service, self.identity.instance.as_str()];
-        let publisher = self.publisher(topic::CONFIGURATION, &names).await?;
-        let configuration = Configuration {
-            service: self.identity.service.to_owned(),
-            instance: self.identity.instance.clone(),
-            host: host_name(),
-            version: env!("CARGO_PKG_VERSION").to_owned(),
-            toml,
-        };
-        let mut due = tokio::time::interval(CONFIGURATION_PERIOD);
-        loop {
-            due.tick().await;
-            publisher.publish(&configuration).await;
-        }
+    pub fn publish_configuration(&self, toml: String) -> BoxFuture<'_, anyhow::Result<()>> {
+        Box::pin(async move {
+            while self.token.lock().unwrap_or_else(PoisonError::into_inner).is_none() {
+                tokio::time::sleep(ANNOUNCED_PERIOD).await;
+            }
+            let names = [self.identity.service, self.identity.instance.as_str()];
+            let publisher = self.publisher(topic::CONFIGURATION, &names).await?;
+            let configuration = Configuration {
+                service: self.identity.service.to_owned(),
+                instance: self.identity.instance.clone(),
+                host: host_name(),
+                version: env!("CARGO_PKG_VERSION").to_owned(),
+                toml,
+            };
+            let mut due = tokio::time::interval(CONFIGURATION_PERIOD);
+            loop {
+                due.tick().await;
+                publisher.publish(&configuration).await;
+            }
+        })
     }
 
     /// Closes the session.
     ///
     /// A session that still waits for the rendezvous can take long to close; the end of the process then
     /// closes it.
-    pub async fn close(self) {
-        match tokio::time::timeout(CLOSE_TIMEOUT, self.session.close()).await {
-            Ok(Ok(())) => {}
-            Ok(Err(cause)) => tracing::debug!(%cause, "Zenoh session did not close cleanly"),
-            Err(_) => tracing::debug!("Zenoh session left to be closed by the end of the process"),
-        }
+    pub fn close(self) -> BoxFuture<'static, ()> {
+        Box::pin(async move {
+            // All of it is kept until then: its tokens are undeclared by the session's end.
+            let node = self;
+            match tokio::time::timeout(CLOSE_TIMEOUT, node.session.close()).await {
+                Ok(Ok(())) => {}
+                Ok(Err(cause)) => tracing::debug!(%cause, "Zenoh session did not close cleanly"),
+                Err(_) => {
+                    tracing::debug!("Zenoh session left to be closed by the end of the process");
+                }
+            }
+        })
     }
 }
 
 impl Presence {
     /// The next change: an instance, and whether it is ready. `None` once the session is closed.
-    pub async fn next(&self) -> Option<(String, bool)> {
-        loop {
-            let sample = self.subscriber.recv_async().await.ok()?;
-            if let Some(instance) = instance_of(sample.key_expr().as_str()) {
-                return Some((instance, sample.kind() == SampleKind::Put));
+    pub fn next(&self) -> BoxFuture<'_, Option<(String, bool)>> {
+        Box::pin(async move {
+            loop {
+                let sample = self.subscriber.recv_async().await.ok()?;
+                if let Some(instance) = instance_of(sample.key_expr().as_str()) {
+                    return Some((instance, sample.kind() == SampleKind::Put));
+                }
             }
-        }
+        })
     }
 }
 

@@ -8,6 +8,7 @@ use anyhow::anyhow;
 use messages::{Delivery, Row};
 use zenoh::sample::Sample;
 
+use crate::boxed::BoxFuture;
 use crate::clock::now_ns;
 use crate::health::HealthCounters;
 use crate::session::Node;
@@ -68,33 +69,39 @@ impl Node {
     ///
     /// # Errors
     /// When the session is closed.
-    pub async fn tap(&self, topics: &[Row], max_bytes: usize) -> anyhow::Result<Tap> {
-        let shared = Arc::new(Shared::new(max_bytes, self.shared_health()));
-        let mut subscribers = Vec::new();
-        for row in topics {
-            let key = pattern(row.key);
-            let is_state = row.delivery == Delivery::LastValue;
-            let taken = Arc::clone(&shared);
-            let subscriber = self
-                .session
-                .declare_subscriber(key.clone())
-                .callback(move |sample| taken.take(&sample, is_state))
-                .await
-                .map_err(|cause| anyhow!("subscribing to {key}: {cause}"))?;
-            subscribers.push(subscriber);
-            if is_state {
+    pub fn tap<'a>(
+        &'a self,
+        topics: &'a [Row],
+        max_bytes: usize,
+    ) -> BoxFuture<'a, anyhow::Result<Tap>> {
+        Box::pin(async move {
+            let shared = Arc::new(Shared::new(max_bytes, self.shared_health()));
+            let mut subscribers = Vec::new();
+            for row in topics {
+                let key = pattern(row.key);
+                let is_state = row.delivery == Delivery::LastValue;
                 let taken = Arc::clone(&shared);
-                let reply = move |reply: zenoh::query::Reply| {
-                    if let Ok(sample) = reply.result() {
-                        taken.take(sample, is_state);
-                    }
-                };
-                // At the start of a system there is no publisher yet, which is not an error.
-                let query = with_query_qos(self.session.get(&key)).timeout(REPLY_TIMEOUT);
-                drop(query.callback(reply).await);
+                let subscriber = self
+                    .session
+                    .declare_subscriber(key.clone())
+                    .callback(move |sample| taken.take(&sample, is_state))
+                    .await
+                    .map_err(|cause| anyhow!("subscribing to {key}: {cause}"))?;
+                subscribers.push(subscriber);
+                if is_state {
+                    let taken = Arc::clone(&shared);
+                    let reply = move |reply: zenoh::query::Reply| {
+                        if let Ok(sample) = reply.result() {
+                            taken.take(sample, is_state);
+                        }
+                    };
+                    // At the start of a system there is no publisher yet, which is not an error.
+                    let query = with_query_qos(self.session.get(&key)).timeout(REPLY_TIMEOUT);
+                    drop(query.callback(reply).await);
+                }
             }
-        }
-        Ok(Tap { shared, _subscribers: subscribers })
+            Ok(Tap { shared, _subscribers: subscribers })
+        })
     }
 }
 

@@ -19,6 +19,7 @@ use zenoh::query::{Query, Queryable};
 use zenoh::sample::Sample;
 use zenoh::session::SessionGetBuilder;
 
+use crate::boxed::BoxFuture;
 use crate::clock::now_ns;
 use crate::health::HealthCounters;
 use crate::session::Node;
@@ -30,13 +31,23 @@ const RETRY_PAUSE: Duration = Duration::from_millis(100);
 /// The attachment of a query that asks for the recipient's time.
 const ASKS_TIME: &[u8] = b"time?";
 
+/// A mailbox of what is published on the keys that match.
+pub(crate) type SampleMailbox = zenoh::pubsub::Subscriber<RingChannelHandler<Sample>>;
+/// A mailbox of what is asked on a key.
+type QueryMailbox = Queryable<RingChannelHandler<Query>>;
+
 /// Publishes messages of one type on one key.
 pub struct Publisher<M> {
+    bytes: BytesPublisher,
+    message: PhantomData<fn(M)>,
+}
+
+/// Publishes encoded messages on one key.
+struct BytesPublisher {
     publisher: zenoh::pubsub::Publisher<'static>,
     /// Replies to late subscribers; only for states.
     last_value: Option<LastValue>,
     health: Arc<HealthCounters>,
-    message: PhantomData<fn(M)>,
 }
 
 /// The last value, and the queryable that sends it to late subscribers until this is dropped.
@@ -47,7 +58,7 @@ struct LastValue {
 
 /// Receives messages of one type from the keys that match.
 pub struct Subscriber<M> {
-    subscriber: zenoh::pubsub::Subscriber<RingChannelHandler<Sample>>,
+    subscriber: SampleMailbox,
     /// Last values from before the subscription.
     initial: Mutex<Vec<(String, M)>>,
     health: Arc<HealthCounters>,
@@ -105,7 +116,8 @@ impl Node {
         topic: Topic<M>,
         names: &[&str],
     ) -> anyhow::Result<Publisher<M>> {
-        self.declared(topic.key(names), topic.delivery()).await
+        let bytes = self.bytes_publisher(topic.key(names), topic.delivery()).await?;
+        Ok(Publisher { bytes, message: PhantomData })
     }
 
     /// A publisher of messages that are encoded already, on a key of the row's topic.
@@ -117,27 +129,34 @@ impl Node {
         row: &Row,
         key: &str,
     ) -> anyhow::Result<Publisher<Vec<u8>>> {
-        self.declared(key.to_owned(), row.delivery).await
+        let bytes = self.bytes_publisher(key.to_owned(), row.delivery).await?;
+        Ok(Publisher { bytes, message: PhantomData })
     }
 
-    async fn declared<M>(&self, key: String, delivery: Delivery) -> anyhow::Result<Publisher<M>> {
-        let Qos { priority, congestion, .. } = qos(delivery);
-        let publisher = self
-            .session
-            .declare_publisher(key.clone())
-            .priority(priority)
-            .congestion_control(congestion)
-            .await
-            .map_err(|cause| anyhow!("declaring a publisher on {key}: {cause}"))?;
-        let last_value = match delivery {
-            Delivery::LastValue => Some(self.last_value(&key).await?),
-            Delivery::Latest
-            | Delivery::LatestPriority
-            | Delivery::Reliable
-            | Delivery::Record
-            | Delivery::Query => None,
-        };
-        Ok(Publisher { publisher, last_value, health: self.shared_health(), message: PhantomData })
+    fn bytes_publisher(
+        &self,
+        key: String,
+        delivery: Delivery,
+    ) -> BoxFuture<'_, anyhow::Result<BytesPublisher>> {
+        Box::pin(async move {
+            let Qos { priority, congestion, .. } = qos(delivery);
+            let publisher = self
+                .session
+                .declare_publisher(key.clone())
+                .priority(priority)
+                .congestion_control(congestion)
+                .await
+                .map_err(|cause| anyhow!("declaring a publisher on {key}: {cause}"))?;
+            let last_value = match delivery {
+                Delivery::LastValue => Some(self.last_value(&key).await?),
+                Delivery::Latest
+                | Delivery::LatestPriority
+                | Delivery::Reliable
+                | Delivery::Record
+                | Delivery::Query => None,
+            };
+            Ok(BytesPublisher { publisher, last_value, health: self.shared_health() })
+        })
     }
 
     async fn last_value(&self, key: &str) -> anyhow::Result<LastValue> {
@@ -171,40 +190,46 @@ impl Node {
         names: &[&str],
     ) -> anyhow::Result<Subscriber<M>> {
         let key = topic.key(names);
-        let subscriber = self
-            .session
-            .declare_subscriber(key.clone())
-            .with(RingChannel::new(qos(topic.delivery()).depth))
-            .await
-            .map_err(|cause| anyhow!("subscribing to {key}: {cause}"))?;
+        let (subscriber, last_values) = self.samples(key, topic.delivery()).await?;
         let subscriber = Subscriber {
             subscriber,
             initial: Mutex::default(),
             health: self.shared_health(),
             message: PhantomData,
         };
-        if topic.delivery() == Delivery::LastValue {
-            self.fetch_last_values(&key, &subscriber).await;
-        }
+        let last_values = last_values.iter().filter_map(|sample| {
+            Some((sample.key_expr().as_str().to_owned(), subscriber.decode(sample)?))
+        });
+        let last_values = last_values.collect();
+        *subscriber.initial.lock().unwrap_or_else(PoisonError::into_inner) = last_values;
         Ok(subscriber)
     }
 
-    async fn fetch_last_values<M: Message>(&self, key: &str, subscriber: &Subscriber<M>) {
-        // At the start of a system there is no publisher yet, which is not an error.
-        let query = with_query_qos(self.session.get(key));
-        let Ok(replies) = query.timeout(REPLY_TIMEOUT).await else { return };
-        while let Ok(reply) = replies.recv_async().await {
-            if let Ok(sample) = reply.result()
-                && let Some(message) = subscriber.decode(sample)
-            {
-                let key = sample.key_expr().as_str().to_owned();
-                subscriber
-                    .initial
-                    .lock()
-                    .unwrap_or_else(PoisonError::into_inner)
-                    .push((key, message));
+    /// A mailbox, and the last values from before it was there.
+    fn samples(
+        &self,
+        key: String,
+        delivery: Delivery,
+    ) -> BoxFuture<'_, anyhow::Result<(SampleMailbox, Vec<Sample>)>> {
+        Box::pin(async move {
+            let subscriber = self
+                .session
+                .declare_subscriber(key.clone())
+                .with(RingChannel::new(qos(delivery).depth))
+                .await
+                .map_err(|cause| anyhow!("subscribing to {key}: {cause}"))?;
+            let mut last_values = Vec::new();
+            if delivery == Delivery::LastValue {
+                // At the start of a system there is no publisher yet, which is not an error.
+                let query = with_query_qos(self.session.get(key)).timeout(REPLY_TIMEOUT);
+                if let Ok(replies) = query.await {
+                    while let Ok(reply) = replies.recv_async().await {
+                        last_values.extend(reply.into_result());
+                    }
+                }
             }
-        }
+            Ok((subscriber, last_values))
+        })
     }
 
     /// The commands sent to this service on a topic's key.
@@ -216,14 +241,18 @@ impl Node {
         topic: Topic<M>,
         names: &[&str],
     ) -> anyhow::Result<Commands<M>> {
-        let key = topic.key(names);
-        let queryable = self
-            .session
-            .declare_queryable(key.clone())
-            .with(RingChannel::new(qos(topic.delivery()).depth))
-            .await
-            .map_err(|cause| anyhow!("answering on {key}: {cause}"))?;
+        let queryable = self.queryable(topic.key(names), qos(topic.delivery()).depth).await?;
         Ok(Commands { queryable, health: self.shared_health(), message: PhantomData })
+    }
+
+    fn queryable(&self, key: String, depth: usize) -> BoxFuture<'_, anyhow::Result<QueryMailbox>> {
+        Box::pin(async move {
+            self.session
+                .declare_queryable(key.clone())
+                .with(RingChannel::new(depth))
+                .await
+                .map_err(|cause| anyhow!("answering on {key}: {cause}"))
+        })
     }
 
     /// Sends a command on a topic's key and waits for its reply. A new session may not be connected to the
@@ -238,26 +267,35 @@ impl Node {
         names: &[&str],
         command: &M,
     ) -> anyhow::Result<messages::CommandReply> {
-        let key = topic.key(names);
-        let until_ns = now_ns() + REPLY_TIMEOUT.as_nanos() as i64;
-        let mut told = None;
-        while told.is_none() && now_ns() < until_ns {
-            let left_ns = until_ns.saturating_sub(now_ns());
-            told = self.query(&key, &[], ASKS_TIME, nanoseconds(left_ns)).await?;
-            if told.is_none() {
-                tokio::time::sleep(RETRY_PAUSE).await;
+        self.send_command(topic.key(names), encode(command)).await
+    }
+
+    fn send_command(
+        &self,
+        key: String,
+        command: Vec<u8>,
+    ) -> BoxFuture<'_, anyhow::Result<messages::CommandReply>> {
+        Box::pin(async move {
+            let until_ns = now_ns() + REPLY_TIMEOUT.as_nanos() as i64;
+            let mut told = None;
+            while told.is_none() && now_ns() < until_ns {
+                let left_ns = until_ns.saturating_sub(now_ns());
+                told = self.query(&key, &[], ASKS_TIME, nanoseconds(left_ns)).await?;
+                if told.is_none() {
+                    tokio::time::sleep(RETRY_PAUSE).await;
+                }
             }
-        }
-        let sent = match told {
-            Some(Reply::Time(time_ns)) => time_ns.to_le_bytes().to_vec(),
-            // A recipient that tells no time.
-            Some(Reply::Command(_)) => Vec::new(),
-            None => return Err(unanswered(&key)),
-        };
-        match self.query(&key, &encode(command), &sent, REPLY_TIMEOUT).await? {
-            Some(Reply::Command(reply)) => Ok(reply),
-            Some(Reply::Time(_)) | None => Err(unanswered(&key)),
-        }
+            let sent = match told {
+                Some(Reply::Time(time_ns)) => time_ns.to_le_bytes().to_vec(),
+                // A recipient that tells no time.
+                Some(Reply::Command(_)) => Vec::new(),
+                None => return Err(unanswered(&key)),
+            };
+            match self.query(&key, &command, &sent, REPLY_TIMEOUT).await? {
+                Some(Reply::Command(reply)) => Ok(reply),
+                Some(Reply::Time(_)) | None => Err(unanswered(&key)),
+            }
+        })
     }
 
     async fn query(
@@ -308,7 +346,7 @@ pub(crate) fn with_query_qos<'a, 'b, H>(
 
 /// Receives the commands to a service.
 pub struct Commands<M> {
-    queryable: Queryable<RingChannelHandler<Query>>,
+    queryable: QueryMailbox,
     health: Arc<HealthCounters>,
     message: PhantomData<fn() -> M>,
 }
@@ -318,7 +356,7 @@ impl<M: Message> Commands<M> {
     /// command whose requester has given up.
     pub async fn next(&self) -> Option<Request<M>> {
         loop {
-            let query = self.queryable.recv_async().await.ok()?;
+            let query = next_query(&self.queryable).await?;
             let attachment = query.attachment();
             if attachment.is_some_and(|asks| asks.to_bytes().as_ref() == ASKS_TIME) {
                 tell_time(query).await;
@@ -342,7 +380,7 @@ impl<M: Message> Commands<M> {
                 }
             };
             let reply = messages::CommandReply { accepted: false, reason };
-            Request { message: (), sent_ns, query }.answer(&reply).await;
+            answer(query, encode(&reply)).await;
         }
     }
 }
@@ -360,54 +398,81 @@ fn refusal(sent_ns: Option<i64>, now_ns: i64) -> Option<String> {
     })
 }
 
+fn next_query(mailbox: &QueryMailbox) -> BoxFuture<'_, Option<Query>> {
+    Box::pin(async move { mailbox.recv_async().await.ok() })
+}
+
+/// The next sample; `None` once the session is closed.
+pub(crate) fn next_sample(mailbox: &SampleMailbox) -> BoxFuture<'_, Option<Sample>> {
+    Box::pin(async move { mailbox.recv_async().await.ok() })
+}
+
 /// Answers a question for the time.
-async fn tell_time(query: Query) {
-    let key = query.key_expr().clone();
-    let reply = query.reply(key, Vec::<u8>::new()).attachment(now_ns().to_le_bytes().to_vec());
-    if let Err(cause) = reply.await {
-        tracing::debug!(%cause, "The reply to a question for the time was not delivered");
-    }
+fn tell_time(query: Query) -> BoxFuture<'static, ()> {
+    Box::pin(async move {
+        let key = query.key_expr().clone();
+        let reply = query.reply(key, Vec::<u8>::new()).attachment(now_ns().to_le_bytes().to_vec());
+        if let Err(cause) = reply.await {
+            tracing::debug!(%cause, "The reply to a question for the time was not delivered");
+        }
+    })
 }
 
 impl<M> Request<M> {
     /// Answers the command.
     pub async fn answer(self, reply: &messages::CommandReply) {
-        let key = self.query.key_expr().clone();
-        if let Err(cause) = self.query.reply(key, encode(reply)).await {
+        answer(self.query, encode(reply)).await;
+    }
+}
+
+fn answer(query: Query, reply: Vec<u8>) -> BoxFuture<'static, ()> {
+    Box::pin(async move {
+        let key = query.key_expr().clone();
+        if let Err(cause) = query.reply(key, reply).await {
             tracing::debug!(%cause, "The reply to a command was not delivered");
         }
-    }
+    })
 }
 
 impl<M: Message> Publisher<M> {
     /// Publishes a message. A failure is counted, and the stream continues with the next message.
     pub async fn publish(&self, message: &M) {
-        self.put(encode(message)).await;
+        self.bytes.put(encode(message)).await;
     }
 }
 
 impl Publisher<Vec<u8>> {
     /// As [`Publisher::publish`], for the bytes of an encoded message.
     pub async fn publish_encoded(&self, bytes: Vec<u8>) {
-        self.put(bytes).await;
+        self.bytes.put(bytes).await;
     }
 }
 
 impl<M> Publisher<M> {
-    async fn put(&self, bytes: Vec<u8>) {
-        if let Some(last_value) = &self.last_value {
-            last_value.bytes.lock().unwrap_or_else(PoisonError::into_inner).clone_from(&bytes);
-        }
-        if let Err(cause) = self.publisher.put(bytes).await
-            && self.health.failed("publish")
-        {
-            tracing::warn!(key = %self.publisher.key_expr(), %cause, "A message could not be published");
-        }
-    }
-
     /// Whether there is a subscriber.
     pub async fn has_subscribers(&self) -> bool {
-        self.publisher.matching_status().await.is_ok_and(|status| status.matching())
+        self.bytes.has_subscribers().await
+    }
+}
+
+impl BytesPublisher {
+    fn put(&self, bytes: Vec<u8>) -> BoxFuture<'_, ()> {
+        Box::pin(async move {
+            if let Some(last_value) = &self.last_value {
+                last_value.bytes.lock().unwrap_or_else(PoisonError::into_inner).clone_from(&bytes);
+            }
+            if let Err(cause) = self.publisher.put(bytes).await
+                && self.health.failed("publish")
+            {
+                tracing::warn!(key = %self.publisher.key_expr(), %cause, "A message could not be published");
+            }
+        })
+    }
+
+    fn has_subscribers(&self) -> BoxFuture<'_, bool> {
+        Box::pin(async move {
+            self.publisher.matching_status().await.is_ok_and(|status| status.matching())
+        })
     }
 }
 
@@ -424,7 +489,7 @@ impl<M: Message> Subscriber<M> {
             return initial;
         }
         loop {
-            let sample = self.subscriber.recv_async().await.ok()?;
+            let sample = next_sample(&self.subscriber).await?;
             if let Some(message) = self.decode(&sample) {
                 return Some((sample.key_expr().as_str().to_owned(), message));
             }

@@ -20,7 +20,7 @@ use axum::{Extension, Router};
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
-use node::HealthCounters;
+use node::{BoxFuture, HealthCounters};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{Notify, Semaphore};
@@ -108,37 +108,45 @@ impl Default for Limits {
 
 /// Answers whoever connects, with encryption where there is one, and counts in the health what took too long. Each request has
 /// its peer's address as `ConnectInfo<SocketAddr>`.
-pub async fn serve(
+pub fn serve(
     listener: TcpListener,
     router: Router,
     encryption: Option<Encryption>,
     limits: Limits,
     health: Arc<HealthCounters>,
-) -> Infallible {
-    let places = Arc::new(Semaphore::new(limits.connections));
-    loop {
-        // The semaphore is never closed; without a place one waits for the next.
-        let Ok(place) = Arc::clone(&places).acquire_owned().await else { continue };
-        let (stream, peer) = match listener.accept().await {
-            Ok(accepted) => accepted,
-            Err(problem) => {
-                if !is_of_the_peer(problem.kind()) {
-                    health.failed("connections cannot be accepted");
-                    tracing::warn!(%problem, "A connection could not be accepted");
-                    sleep(PAUSE).await;
+) -> BoxFuture<'static, Infallible> {
+    Box::pin(async move {
+        let places = Arc::new(Semaphore::new(limits.connections));
+        loop {
+            // The semaphore is never closed; without a place one waits for the next.
+            let Ok(place) = Arc::clone(&places).acquire_owned().await else { continue };
+            let (stream, peer) = match listener.accept().await {
+                Ok(accepted) => accepted,
+                Err(problem) => {
+                    if !is_of_the_peer(problem.kind()) {
+                        health.failed("connections cannot be accepted");
+                        tracing::warn!(%problem, "A connection could not be accepted");
+                        sleep(PAUSE).await;
+                    }
+                    continue;
                 }
-                continue;
-            }
-        };
-        // Small messages go at once.
-        drop(stream.set_nodelay(true));
-        let answering =
-            begin(stream, peer, router.clone(), encryption.clone(), limits, Arc::clone(&health));
-        tokio::spawn(async move {
-            answering.await;
-            drop(place);
-        });
-    }
+            };
+            // Small messages go at once.
+            drop(stream.set_nodelay(true));
+            let answering = begin(
+                stream,
+                peer,
+                router.clone(),
+                encryption.clone(),
+                limits,
+                Arc::clone(&health),
+            );
+            tokio::spawn(async move {
+                answering.await;
+                drop(place);
+            });
+        }
+    })
 }
 
 /// Answers a connection, after its handshake where it is encrypted.

@@ -16,7 +16,9 @@ use messages::{
     CameraInfo, ControllerStatus, Detections, FrameHeader, MavlinkBytes, PixelFormat, Touchdown,
     Truth, Wind, topic,
 };
-use node::{FramePublisher, Loan, Node, Publisher, Shutdown, Subscriber, clock_name, now_ns};
+use node::{
+    BoxFuture, FramePublisher, Loan, Node, Publisher, Shutdown, Subscriber, clock_name, now_ns,
+};
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 use tokio::time::{MissedTickBehavior, interval};
@@ -54,7 +56,15 @@ const CLEAR_M: f64 = 0.04;
 ///
 /// # Errors
 /// When another simulator has the same name, the link cannot be opened, or the scene is invalid.
-pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
+pub fn run(
+    node: Node,
+    config: Config,
+    shutdown: Shutdown,
+) -> BoxFuture<'static, anyhow::Result<()>> {
+    Box::pin(run_service(node, config, shutdown))
+}
+
+async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name(&config.id).await?;
     let simulation = Arc::new(Simulation::new(&config));
     let camera = Camera::new(&node, &config, Arc::clone(&simulation)).await?;
