@@ -51,6 +51,13 @@ impl SquareCode {
         self.book.rotated(word)
     }
 
+    /// Whether a marker looks the same upside down, so that half a turn of it cannot be seen. The only one is a white bar in a
+    /// black frame, as windows, doors and letters on signs are too.
+    pub fn is_symmetrical(&self, id: u32) -> bool {
+        let codeword = self.codewords.get(id as usize);
+        codeword.is_some_and(|word| self.rotated(self.rotated(*word)) == *word)
+    }
+
     /// Columns and rows that the marker has outside the square on each side: white paper around a black border, the
     /// black ring and the outer bits around a white one.
     pub fn margin(&self) -> u8 {
@@ -133,7 +140,7 @@ mod tests {
                 let mut read = word;
                 for rotation in [0, 3, 2, 1] {
                     let found = code.nearest(read, 0);
-                    let is_symmetrical = code.family == Family::ArucoOriginal && id == 1023;
+                    let is_symmetrical = code.is_symmetrical(id);
                     let rotation = if is_symmetrical { rotation % 2 } else { rotation };
                     assert_eq!(
                         found,
@@ -146,6 +153,15 @@ mod tests {
                 assert_eq!(read, word);
             }
         }
+    }
+
+    #[test]
+    fn one_marker_of_one_family_is_symmetrical() {
+        let symmetrical = codes().flat_map(|code| {
+            let ids = 0..code.codewords.len() as u32;
+            ids.filter(|id| code.is_symmetrical(*id)).map(|id| (code.family, id))
+        });
+        assert_eq!(symmetrical.collect::<Vec<_>>(), [(Family::ArucoOriginal, 1023)]);
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Pyramid};
-use markers::{Family, Marker};
+use markers::{Family, Marker, SquareCode};
 use nalgebra::Matrix2;
 
 use crate::candidates::quad::diagonal_px;
@@ -91,9 +91,11 @@ impl FamilyQuery {
         self.markers.iter().filter_map(|marker| marker.id)
     }
 
-    /// Whether an id is looked for.
+    /// Whether an id is looked for. What looks like a window is looked for only by its number.
     pub(crate) fn includes(&self, id: u32) -> bool {
-        self.markers.iter().any(|marker| marker.id.is_none_or(|wanted| wanted == id))
+        let is_symmetrical =
+            || SquareCode::for_family(self.family).is_some_and(|code| code.is_symmetrical(id));
+        self.ids().any(|wanted| wanted == id) || (self.has_any_id() && !is_symmetrical())
     }
 
     /// Whether a fallback is to look for markers that were not found. With `all` that is any missing one;
@@ -160,4 +162,18 @@ fn is_cut(corners: &[Pixel; 4], view: GrayView<'_>) -> bool {
 /// Standard deviation of corners made of segments, in pixels.
 pub(crate) fn segment_corner_px(corners: &[Pixel; 4]) -> f64 {
     (SEGMENT_CORNER_RATIO * corners[0].distance(&corners[2])).max(MIN_SEGMENT_CORNER_PX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_window_is_looked_for_by_its_number_only() {
+        let query = |text: &str| FamilyQuery::new(text.parse().unwrap());
+        assert!(!query("aruco-original:*").includes(1023));
+        assert!(query("aruco-original:*").includes(1022));
+        assert!(query("aruco-original:1023").includes(1023));
+        assert!(!query("aruco-original:1022").includes(1023));
+    }
 }
