@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use airlink::Unpacker;
+use airlink::picture::jpeg_of_rgb;
 use anyhow::Context;
 use fiducial::overlay::canvas::RgbImageBuf;
 use fiducial::overlay::debug;
@@ -482,13 +483,14 @@ impl Work {
                 "squares" => debug::draw_squares(view, trace, &mut self.overlay),
                 _ => debug::draw_target(view, trace, debug::ALIGNMENT_RADIUS_PX, &mut self.overlay),
             }
-            match jpeg(&self.overlay, self.config.debug_jpeg_quality) {
-                Ok(bytes) => {
+            let RgbImageBuf { data, width, height, .. } = &self.overlay;
+            match jpeg_of_rgb(data, *width, *height, self.config.debug_jpeg_quality) {
+                Some(bytes) => {
                     let format = PixelFormat::Jpeg;
                     let header = FrameHeader { format, parts: Vec::new(), ..header.clone() };
                     publisher.publish(&header, Loan::Private(bytes)).await;
                 }
-                Err(_) => self.node.health().dropped("debug images too large for a JPEG"),
+                None => self.node.health().dropped("debug images too large for a JPEG"),
             }
         }
     }
@@ -497,12 +499,4 @@ impl Work {
 /// How old a frame of this host's clock is.
 fn age(header: &FrameHeader) -> Duration {
     Duration::from_nanos(now_ns().saturating_sub(header.stamp_ns).max(0).unsigned_abs())
-}
-
-fn jpeg(image: &RgbImageBuf, quality: u8) -> anyhow::Result<Vec<u8>> {
-    let (width, height) = (u16::try_from(image.width)?, u16::try_from(image.height)?);
-    let mut bytes = Vec::new();
-    let encoder = jpeg_encoder::Encoder::new(&mut bytes, quality);
-    encoder.encode(&image.data, width, height, jpeg_encoder::ColorType::Rgb)?;
-    Ok(bytes)
 }

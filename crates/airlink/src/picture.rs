@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 
+use jpeg_encoder::{ColorType, Encoder};
 use messages::{FrameHeader, PixelFormat};
 
 /// A frame as a JPEG file; `None` for one that is no whole grey or Bayer image. A Bayer image is shown as it is, grey.
@@ -10,9 +11,18 @@ pub fn jpeg(header: &FrameHeader, pixels: &[u8], quality: u8) -> Option<Vec<u8>>
         return Some(pixels.to_vec());
     }
     let (width, height) = (u16::try_from(header.width).ok()?, u16::try_from(header.height).ok()?);
+    encoded(&grey(header, pixels)?, [width, height], ColorType::Luma, quality)
+}
+
+/// Red, green and blue of each pixel in turn as a JPEG file; `None` for fewer pixels than width by height, or more than a JPEG has.
+pub fn jpeg_of_rgb(pixels: &[u8], width: usize, height: usize, quality: u8) -> Option<Vec<u8>> {
+    let (width, height) = (u16::try_from(width).ok()?, u16::try_from(height).ok()?);
+    encoded(pixels, [width, height], ColorType::Rgb, quality)
+}
+
+fn encoded(pixels: &[u8], size: [u16; 2], colours: ColorType, quality: u8) -> Option<Vec<u8>> {
     let mut file = Vec::new();
-    let encoder = jpeg_encoder::Encoder::new(&mut file, quality);
-    encoder.encode(&grey(header, pixels)?, width, height, jpeg_encoder::ColorType::Luma).ok()?;
+    Encoder::new(&mut file, quality).encode(pixels, size[0], size[1], colours).ok()?;
     Some(file)
 }
 
@@ -51,5 +61,22 @@ mod tests {
             assert!(file.starts_with(&[0xff, 0xd8]), "{format:?}");
             assert_eq!(jpeg(&header(format), &vec![7; bytes - 1], 90), None);
         }
+    }
+
+    #[test]
+    fn a_picture_has_colours() {
+        let pixels = [200, 30, 90].repeat(16 * 8);
+        let file = jpeg_of_rgb(&pixels, 16, 8, 95).unwrap();
+        let (size, read) = decoded(&file);
+        assert_eq!(size, (16, 8));
+        assert!(read.iter().zip(&pixels).all(|(a, b)| a.abs_diff(*b) < 6), "{:?}", &read[..3]);
+        assert_eq!(jpeg_of_rgb(&pixels[1..], 16, 8, 95), None);
+        assert_eq!(jpeg_of_rgb(&pixels, 1 << 16, 8, 95), None);
+    }
+
+    fn decoded(file: &[u8]) -> ((usize, usize), Vec<u8>) {
+        let mut decoder = zune_jpeg::JpegDecoder::new(std::io::Cursor::new(file));
+        let pixels = decoder.decode().unwrap();
+        (decoder.dimensions().unwrap(), pixels)
     }
 }
