@@ -237,6 +237,10 @@ pub(crate) const RATES_HZ: std::ops::RangeInclusive<f64> = 0.01..=1000.0;
 impl Settings for Config {
     const DEFAULTS: &'static str = include_str!("../camera-pub.toml");
 
+    fn from_table(table: node::config::Table) -> Result<Self, node::config::TableError> {
+        table.try_into()
+    }
+
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
         check.range("source.rate_hz", self.source.rate_hz, RATES_HZ);

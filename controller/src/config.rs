@@ -185,6 +185,10 @@ pub enum PreferredPlace {
 impl Settings for Config {
     const DEFAULTS: &'static str = include_str!("../controller.toml");
 
+    fn from_table(table: node::config::Table) -> Result<Self, node::config::TableError> {
+        table.try_into()
+    }
+
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
         check.range("takeoff_height_m", self.takeoff_height_m, 1.0..=100.0);

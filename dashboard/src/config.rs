@@ -87,6 +87,10 @@ pub enum Input {
 impl node::Settings for Config {
     const DEFAULTS: &'static str = include_str!("../dashboard.toml");
 
+    fn from_table(table: node::config::Table) -> Result<Self, node::config::TableError> {
+        table.try_into()
+    }
+
     fn check(&self, check: &mut node::Check<'_>) {
         check.name("id", &self.id);
         let listen = self.listen.parse::<SocketAddr>();

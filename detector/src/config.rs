@@ -61,6 +61,10 @@ pub struct TrackingConfig {
 impl Settings for Config {
     const DEFAULTS: &'static str = include_str!("../detector.toml");
 
+    fn from_table(table: node::config::Table) -> Result<Self, node::config::TableError> {
+        table.try_into()
+    }
+
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
         check.name("camera", &self.camera);

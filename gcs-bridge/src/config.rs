@@ -44,6 +44,10 @@ pub struct Config {
 impl node::Settings for Config {
     const DEFAULTS: &'static str = include_str!("../gcs-bridge.toml");
 
+    fn from_table(table: node::config::Table) -> Result<Self, node::config::TableError> {
+        table.try_into()
+    }
+
     fn check(&self, check: &mut node::Check<'_>) {
         check.name("id", &self.id);
         check.parses("ground", self.ground.parse::<Address>());

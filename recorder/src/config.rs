@@ -60,6 +60,10 @@ pub enum Frames {
 impl node::Settings for Config {
     const DEFAULTS: &'static str = include_str!("../recorder.toml");
 
+    fn from_table(table: node::config::Table) -> Result<Self, node::config::TableError> {
+        table.try_into()
+    }
+
     fn check(&self, check: &mut node::Check<'_>) {
         check.name("id", &self.id);
         check.parses("frames", node::named::<Frames>(&self.frames));

@@ -11,12 +11,21 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use serde::de::value::{Error as ValueError, StrDeserializer};
 use serde::de::{DeserializeOwned, IntoDeserializer};
-use toml::{Table, Value};
+pub use toml::Table;
+use toml::Value;
+pub use toml::de::Error as TableError;
 
 /// A service's configuration.
-pub trait Settings: DeserializeOwned {
+pub trait Settings: Sized {
     /// The TOML file with the defaults of all keys.
     const DEFAULTS: &'static str;
+
+    /// The values of a table with every key: `table.try_into()`. Each service says so itself, so that reading its configuration is
+    /// compiled in its crate, and not anew in every one that loads it.
+    ///
+    /// # Errors
+    /// When the table is of other settings.
+    fn from_table(table: Table) -> Result<Self, TableError>;
 
     /// Checks the values' ranges.
     fn check(&self, check: &mut Check<'_>);
@@ -171,12 +180,11 @@ fn effective<T: Settings>(mut table: Table, layers: &[Layer]) -> Result<Effectiv
     for layer in layers {
         lay_over(&mut table, &layer.table, &layer.name, &mut String::new())?;
     }
-    let settings: T =
-        Value::Table(table.clone()).try_into().map_err(|cause: toml::de::Error| {
-            let message = cause.message().to_owned();
-            let source_name = layers.last().map_or("the defaults".to_owned(), |l| l.name.clone());
-            ConfigError::Syntax { source_name, cause: message }
-        })?;
+    let settings = T::from_table(table.clone()).map_err(|cause| {
+        let message = cause.message().to_owned();
+        let source_name = layers.last().map_or("the defaults".to_owned(), |l| l.name.clone());
+        ConfigError::Syntax { source_name, cause: message }
+    })?;
     let mut check = Check { table: &table, layers, problem: None };
     settings.check(&mut check);
     match check.problem {
@@ -384,6 +392,11 @@ mod tests {
     impl Settings for Camera {
         const DEFAULTS: &'static str =
             "name = \"down\"\nrate_hz = 15.0\n[lens]\nfocal_px = 1818.0\n";
+
+        fn from_table(table: Table) -> Result<Self, TableError> {
+            table.try_into()
+        }
+
         fn check(&self, check: &mut Check<'_>) {
             check.name("name", &self.name);
             check.range("rate_hz", self.rate_hz, 0.1..=1000.0);

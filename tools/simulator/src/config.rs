@@ -240,6 +240,10 @@ table! {
 impl Settings for Config {
     const DEFAULTS: &'static str = include_str!("../simulator.toml");
 
+    fn from_table(table: node::config::Table) -> Result<Self, node::config::TableError> {
+        table.try_into()
+    }
+
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
         check.range("begin_height_m", self.begin_height_m, 0.0..=1000.0);
