@@ -1,4 +1,4 @@
-//! The only two functions that know the wire format: [`encode`] and [`decode`].
+//! The two functions that write and read what is sent: [`encode`] and [`decode`].
 //!
 //! A payload is the letter `A`, the message's type, its version, and the postcard encoding of its fields.
 //! Positional encodings break silently when a type changes; the version makes them break loudly.
@@ -14,6 +14,19 @@ pub trait Message: Serialize + DeserializeOwned {
     const VERSION: u8;
     /// The type's name, for error messages.
     const NAME: &'static str;
+
+    /// The message as postcard writes it, for [`encode`] only. Each type has it and [`Message::read_body`] itself, so that its code is compiled here
+    /// and not in every crate that sends it.
+    ///
+    /// # Errors
+    /// When it has a sequence of unknown length.
+    fn write_body(&self) -> postcard::Result<Vec<u8>>;
+
+    /// The message at the beginning of some bytes, and the bytes after it.
+    ///
+    /// # Errors
+    /// When the bytes are of another type, or too few.
+    fn read_body(body: &[u8]) -> postcard::Result<(Self, &[u8])>;
 }
 
 /// First byte of every payload.
@@ -90,7 +103,7 @@ pub fn encode<M: Message>(message: &M) -> Vec<u8> {
     let mut bytes = vec![MAGIC, M::TYPE, M::VERSION];
     // Postcard fails only on sequences of unknown length, which no message has; were one to appear, the
     // receiver would refuse the header without a body.
-    if let Ok(body) = postcard::to_stdvec(message) {
+    if let Ok(body) = message.write_body() {
         bytes.extend_from_slice(&body);
     }
     bytes
@@ -112,7 +125,7 @@ pub fn decode<M: Message>(bytes: &[u8]) -> Result<M, DecodeError> {
     if found_version != M::VERSION {
         return Err(DecodeError::Version { found: found_version, wanted: M::VERSION, expected });
     }
-    let (message, rest) = postcard::take_from_bytes(body)
+    let (message, rest) = M::read_body(body)
         .map_err(|_cause| DecodeError::Damaged { len: len.max(HEADER_LEN), expected })?;
     match rest.len() {
         0 => Ok(message),
@@ -127,6 +140,14 @@ macro_rules! wire {
             const TYPE: u8 = $number;
             const VERSION: u8 = $version;
             const NAME: &'static str = stringify!($type);
+
+            fn write_body(&self) -> postcard::Result<Vec<u8>> {
+                postcard::to_stdvec(self)
+            }
+
+            fn read_body(body: &[u8]) -> postcard::Result<(Self, &[u8])> {
+                postcard::take_from_bytes(body)
+            }
         }
     )*};
 }
