@@ -2,7 +2,7 @@
 
 use geometry::homography::PlanePair;
 use imaging::GrayView;
-use nalgebra::SMatrix;
+use nalgebra::{SMatrix, SVector};
 
 /// Corners of a square in its own coordinates: x right, y down, from -1 to 1, clockwise from the top left.
 pub(crate) const CORNERS: [[f64; 2]; 4] = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]];
@@ -116,6 +116,12 @@ impl Homography {
         stepped.is_valid().then_some(stepped)
     }
 
+    /// Derivatives of the parameters by the relative size of the square.
+    pub(crate) fn by_scale(&self) -> SVector<f64, 8> {
+        let [a, b, _, d, e, _, g, h] = self.h;
+        SVector::from([a, b, 0.0, d, e, 0.0, g, h])
+    }
+
     /// Largest distance between a corner of this and of another square, in pixels.
     pub(crate) fn distance_px(&self, other: &Self) -> f64 {
         let distances = CORNERS.map(|corner| {
@@ -127,12 +133,20 @@ impl Homography {
 
     /// Shortest side of the square, in pixels.
     pub(crate) fn shortest_side_px(&self) -> f64 {
+        self.sides_px().into_iter().fold(f64::INFINITY, f64::min)
+    }
+
+    /// Longest side of the square, in pixels.
+    pub(crate) fn longest_side_px(&self) -> f64 {
+        self.sides_px().into_iter().fold(0.0, f64::max)
+    }
+
+    fn sides_px(&self) -> [f64; 4] {
         let corners = CORNERS.map(|corner| self.project(corner).relative);
-        let sides = [0, 1, 2, 3].map(|i| {
+        [0, 1, 2, 3].map(|i| {
             let (from, to) = (corners[i], corners[(i + 1) % 4]);
             (to[0] - from[0]).hypot(to[1] - from[1])
-        });
-        sides.into_iter().fold(f64::INFINITY, f64::min)
+        })
     }
 
     /// Distance between opposite sides of the narrowest of the square's cells, in pixels.
@@ -232,6 +246,21 @@ mod tests {
     use super::*;
 
     const QUAD: [[f64; 2]; 4] = [[12.0, 7.0], [61.0, 14.0], [55.0, 70.0], [4.0, 52.0]];
+
+    #[test]
+    fn the_derivative_by_scale_is_that_of_a_larger_square() {
+        let [own, larger] = [1.0, 1.0 - 1e-6].map(|half: f64| {
+            // The same quad as the image of a smaller square: a marker that is larger on its scale.
+            let quad = CORNERS.map(|corner| {
+                Homography::from_square([-1.0, 1.0], &QUAD).unwrap().project(corner).image
+            });
+            Homography::from_square([-half, half], &quad).unwrap()
+        });
+        for (i, by_scale) in own.by_scale().iter().enumerate() {
+            let step = (larger.h[i] - own.h[i]) / 1e-6;
+            assert!((step - by_scale).abs() < 1e-3, "{i}: {step} {by_scale}");
+        }
+    }
 
     #[test]
     fn corners_map_to_corners_and_back() {
