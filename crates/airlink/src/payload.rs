@@ -5,13 +5,14 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use imaging::{GrayImage, GrayView};
-use jpeg_encoder::{ColorType, Encoder};
+use jpeg_encoder::ColorType;
 use messages::{FrameHeader, FramePart, PixelFormat};
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
+use crate::picture::encoded;
 use crate::plan::Plan;
 
 /// Maximum number of parts of a frame.
@@ -102,12 +103,9 @@ fn shrink_row(source: GrayView<'_>, top: usize, scale: usize, out: &mut [u8]) {
 
 fn encode(image: &GrayImage, quality: u8) -> Result<Vec<u8>, PayloadError> {
     let edge = |n: usize| u16::try_from(n).map_err(|_| PayloadError::Size);
-    let (width, height) = (edge(image.width())?, edge(image.height())?);
-    let mut bytes = Vec::new();
-    Encoder::new(&mut bytes, quality)
-        .encode(image.pixels(), width, height, ColorType::Luma)
-        .map_err(|problem| PayloadError::Jpeg(problem.to_string()))?;
-    Ok(bytes)
+    let size = [edge(image.width())?, edge(image.height())?];
+    encoded(image.pixels(), size, ColorType::Luma, quality)
+        .map_err(|problem| PayloadError::Jpeg(problem.to_string()))
 }
 
 fn whole(width: usize, height: usize) -> FramePart {

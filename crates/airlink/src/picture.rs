@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use jpeg_encoder::{ColorType, Encoder};
+use jpeg_encoder::{ColorType, Encoder, EncodingError};
 use messages::{FrameHeader, PixelFormat};
 
 /// A frame as a JPEG file; `None` for one that is no whole grey or Bayer image. A Bayer image is shown as it is, grey.
@@ -11,19 +11,25 @@ pub fn jpeg(header: &FrameHeader, pixels: &[u8], quality: u8) -> Option<Vec<u8>>
         return Some(pixels.to_vec());
     }
     let (width, height) = (u16::try_from(header.width).ok()?, u16::try_from(header.height).ok()?);
-    encoded(&grey(header, pixels)?, [width, height], ColorType::Luma, quality)
+    encoded(&grey(header, pixels)?, [width, height], ColorType::Luma, quality).ok()
 }
 
 /// Red, green and blue of each pixel in turn as a JPEG file; `None` for fewer pixels than width by height, or more than a JPEG has.
 pub fn jpeg_of_rgb(pixels: &[u8], width: usize, height: usize, quality: u8) -> Option<Vec<u8>> {
     let (width, height) = (u16::try_from(width).ok()?, u16::try_from(height).ok()?);
-    encoded(pixels, [width, height], ColorType::Rgb, quality)
+    encoded(pixels, [width, height], ColorType::Rgb, quality).ok()
 }
 
-fn encoded(pixels: &[u8], size: [u16; 2], colours: ColorType, quality: u8) -> Option<Vec<u8>> {
+/// Pixels, width by height, as a JPEG file.
+pub(crate) fn encoded(
+    pixels: &[u8],
+    [width, height]: [u16; 2],
+    colours: ColorType,
+    quality: u8,
+) -> Result<Vec<u8>, EncodingError> {
     let mut file = Vec::new();
-    Encoder::new(&mut file, quality).encode(pixels, size[0], size[1], colours).ok()?;
-    Some(file)
+    Encoder::new(&mut file, quality).encode(pixels, width, height, colours)?;
+    Ok(file)
 }
 
 /// The pixels of a frame with 8 bits each; `None` for one that is no whole grey or Bayer image.
