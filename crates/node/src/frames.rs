@@ -14,7 +14,7 @@ use messages::{Delivery, FrameHeader, PixelFormat, Topic, decode, encode, topic}
 use rustix::process::{Resource, getrlimit};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
-use zenoh::handlers::{RingChannel, RingChannelHandler};
+use zenoh::handlers::RingChannel;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::sample::Sample;
 use zenoh::shm::{
@@ -24,7 +24,7 @@ use zenoh::shm::{
 use crate::boxed::BoxFuture;
 use crate::health::HealthCounters;
 use crate::session::Node;
-use crate::topics::report_refused;
+use crate::topics::{SampleMailbox, report_refused};
 
 /// Capacity of the shared memory pool, in frames: one being written, one in flight, and one each for two slow
 /// readers. Small, because every subscriber keeps the whole pool mapped and locked.
@@ -80,7 +80,7 @@ pub struct Frame {
 
 /// Receives frames, always the latest.
 pub struct FrameSubscriber {
-    subscriber: zenoh::pubsub::Subscriber<RingChannelHandler<Sample>>,
+    subscriber: SampleMailbox,
     health: Arc<HealthCounters>,
 }
 

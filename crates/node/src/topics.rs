@@ -403,7 +403,7 @@ fn next_query(mailbox: &QueryMailbox) -> BoxFuture<'_, Option<Query>> {
 }
 
 /// The next sample; `None` once the session is closed.
-pub(crate) fn next_sample(mailbox: &SampleMailbox) -> BoxFuture<'_, Option<Sample>> {
+fn next_sample(mailbox: &SampleMailbox) -> BoxFuture<'_, Option<Sample>> {
     Box::pin(async move { mailbox.recv_async().await.ok() })
 }
 

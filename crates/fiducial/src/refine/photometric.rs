@@ -33,8 +33,8 @@ struct MinResponse {
 const MIN_RESPONSE: MinResponse = MinResponse { gain: 0.15, response: 0.2 };
 /// The same where an outline was fitted alone, of which a weak tone curve changes the size as well; sharpening moves no edge.
 const MIN_RESPONSE_OF_OUTLINE: MinResponse = MinResponse { gain: 0.05, response: 0.1 };
-/// The form of a camera's tone curve is not quite the model's: each side of a marker of a design may be off by this share of curve
-/// times blur, so that it looks larger or smaller; edges between cells of both senses hold the size of others. From `positions` of seed 7 in `raspberry-pi`,
+/// The form of a camera's tone curve is not quite the model's: each side of an STag may be off by this share of curve
+/// times blur, so that it looks larger or smaller; of codes of square cells edges of both senses hold the size. From `positions` of seed 7 in `raspberry-pi`,
 /// where STags were too small by 0.025 px beyond what their noise explains.
 const CURVE_FORM_ERROR: f64 = 0.006;
 /// One of this many pixels tells.
