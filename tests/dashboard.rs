@@ -17,7 +17,7 @@ use tokio_tungstenite::{WebSocketStream, client_async};
 
 use crate::crowd::{Crowd, memory_mb};
 use crate::film;
-use crate::flight::{ALIGHT, Landing, PATIENCE, alone, beside_another, output_of};
+use crate::flight::{ALIGHT, Landing, PATIENCE, alone, beside_another, output_of, time_for};
 
 /// Exit status of a script that lacks a browser or a package.
 const LACKS: i32 = 77;
@@ -92,7 +92,7 @@ async fn a_landing_is_shown_and_goes_on_when_the_page_is_killed() -> anyhow::Res
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_browser_shows_a_landing_and_commands_it() -> anyhow::Result<()> {
-    let _alone = alone().await?;
+    let _flight = time_for(2).await?;
     with_second_try(in_a_browser).await
 }
 

@@ -12,7 +12,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use testing::ports;
 use tokio::time::{sleep, timeout};
 
-use crate::flight::{ALIGHT, Landing, alone, beside_another};
+use crate::flight::{ALIGHT, Landing, beside_another};
 
 /// Longest time until a process that goes on takes its part again.
 const BACK: Duration = Duration::from_secs(2);
@@ -194,7 +194,7 @@ fn on_board(meet: u16) -> Network {
 
 /// Freezes a relay between two processes on board and one on the ground.
 pub(crate) async fn of_a_relay(freezes_s: &[f64]) -> anyhow::Result<()> {
-    let _alone = alone().await?;
+    let _flight = beside_another().await?;
     let ([meet], air, _) = ports::free()?;
     let (meet_text, air) = (meet.to_string(), format!("127.0.0.1:{air}"));
     let first = open("simulator", "main", on_board(meet)).await?;

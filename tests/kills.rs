@@ -15,7 +15,7 @@ use testing::ports;
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 
-use crate::flight::{alone, small_camera};
+use crate::flight::{small_camera, time_for};
 
 const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 /// Longest wait for anything.
@@ -390,7 +390,7 @@ fn print_times(times: &Times) {
 
 /// Kills each victim so often, in as many flights as that takes.
 pub(crate) async fn kill_each(often: usize) -> anyhow::Result<()> {
-    let _alone = alone().await?;
+    let _flight = time_for(2).await?;
     let mut dice = Dice(1);
     let mut victims: Vec<Victim> = (0..often).flat_map(|_| VICTIMS).collect();
     for last in (1..victims.len()).rev() {

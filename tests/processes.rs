@@ -12,7 +12,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use testing::{ports, python, python_passes, skip, with_second_try};
 
 use crate::flight::{
-    ALIGHT, Landing, alone, beside_another, descent_m_s, output_of, seconds, speed_m_s,
+    ALIGHT, Landing, beside_another, descent_m_s, output_of, seconds, speed_m_s, time_for,
 };
 
 /// Exit status of a script that lacks a package.
@@ -345,7 +345,7 @@ async fn a_second_one_is_refused() -> anyhow::Result<()> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn two_landings_that_begin_at_once_both_land() -> anyhow::Result<()> {
-    let _alone = alone().await?;
+    let _flights = time_for(2).await?;
     with_second_try(async || {
         let landings = ["11", "12"].map(|seed| {
             tokio::spawn(async move { Landing::start(&["--seed", seed]).await?.lands().await })

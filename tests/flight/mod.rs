@@ -40,18 +40,23 @@ pub(crate) const LONG: [&str; 6] = [
 ];
 pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 
-/// Landings with the small camera that keep their time on two processors.
-const MAX_AT_ONCE: u32 = 2;
+/// Landings with the small camera that keep their time on two processors, and load them by half.
+const MAX_AT_ONCE: u32 = 4;
 static FLIGHTS: Semaphore = Semaphore::const_new(MAX_AT_ONCE as usize);
 
 /// Waits until there is time for one more landing, until what this returns is dropped.
 pub(crate) async fn beside_another() -> anyhow::Result<SemaphorePermit<'static>> {
-    Ok(FLIGHTS.acquire().await?)
+    time_for(1).await
+}
+
+/// Waits until there is time for so many more landings, or what loads the machine as they do.
+pub(crate) async fn time_for(landings: u32) -> anyhow::Result<SemaphorePermit<'static>> {
+    Ok(FLIGHTS.acquire_many(landings).await?)
 }
 
 /// Waits until no landing is under way, and lets none begin: for what loads the machine by itself, or measures milliseconds.
 pub(crate) async fn alone() -> anyhow::Result<SemaphorePermit<'static>> {
-    Ok(FLIGHTS.acquire_many(MAX_AT_ONCE).await?)
+    time_for(MAX_AT_ONCE).await
 }
 
 /// The small camera as items of the `set` of a site's file.

@@ -145,7 +145,8 @@ def images(arguments, folder):
 
 
 def main():
-    build = ["cargo", "build", "--release", "-q", "-p", "fiducial", "--example", "stages", "--message-format=json"]
+    # With the features that the whole workspace asks of its dependencies, as `cargo test --workspace` has built it.
+    build = ["cargo", "build", "-q", "--workspace", "--example", "stages", "--message-format=json"]
     built = subprocess.run(build, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     program = next(m["executable"] for m in map(json.loads, built.splitlines()) if m.get("executable"))
     print(f"OpenCV {cv2.__version__}")
