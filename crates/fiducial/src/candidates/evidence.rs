@@ -32,6 +32,12 @@ const fn quiet_zones(threshold_256ths: u8) -> outline::Settings {
     }
 }
 
+/// Share of the image in which the fast passes follow outlines at most, unless more of it has this contrast between places, in
+/// percent; and the minimum contrast, which noise has not. None of 15,397 markers in rendered frames and photographs is lost; with 20 %
+/// one is, of 24 px in murky water.
+const OUTLINED_SHARE: f32 = 0.5;
+const OUTLINED_PERCENT: u8 = 15;
+const MIN_OUTLINED_PERCENT: u8 = 6;
 /// Share of the image in which small paper is searched at most, unless more of it has this contrast between places, in percent.
 /// Paper of markers of 8 to 12 px had 49 % at least on all grounds, texture of grass and asphalt 30 to 44 % in a tenth of its
 /// places.
@@ -103,14 +109,24 @@ impl Evidence {
         if let Some(OutlineNeeds { bright_from, max_size_px }) = needs.quads {
             let mut settings = outline::Settings { bright_from, ..outline::Settings::default() };
             settings.max_size_px = settings.max_size_px.max(max_size_px);
-            self.outlines.find(view, &settings);
+            self.begin_outlines(view);
+            let places = self.contrast.places(self.min_percent);
+            self.outlines.add_at(places, view, &settings, 0..usize::MAX);
             stages.ended("outlines");
             self.outline_quads.find(view, &self.outlines, trace);
             stages.ended("quads");
         } else if needs.pyramid {
-            self.outlines.begin(view);
+            self.begin_outlines(view);
             stages.ended("outlines");
         }
+    }
+
+    /// Begins the outlines of the fast passes, and limits them to places with contrast.
+    fn begin_outlines(&mut self, view: GrayView<'_>) {
+        self.outlines.begin(view);
+        self.measure(view);
+        let reached = self.contrast.reached_in(OUTLINED_SHARE);
+        self.min_percent = reached.clamp(MIN_OUTLINED_PERCENT, OUTLINED_PERCENT);
     }
 
     /// Begins the fallbacks of an image.

@@ -116,7 +116,8 @@ impl ImageQuads {
 
 /// Bounds on the edges of markers, for an image of this brightness.
 fn segment_limits(view: GrayView<'_>) -> SegmentLimits {
-    let brightest = (0..view.height()).flat_map(|y| view.row(y)).copied().max().unwrap_or(0);
+    let brightest = (0..view.height()).filter_map(|y| view.row(y).iter().copied().max()).max();
+    let brightest = brightest.unwrap_or(0);
     let min_gradient = (brightest / BRIGHTEST_PER_GRADIENT).clamp(MIN_GRADIENT, MAX_MIN_GRADIENT);
     SegmentLimits { min_gradient, min_length_px: MIN_LENGTH_PX }
 }
