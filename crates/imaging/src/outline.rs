@@ -352,6 +352,11 @@ mod tests {
         }
         let hole = outlines.iter().find(|o| !o.dark && !o.cut).unwrap();
         assert_eq!((hole.bounds, hole.area, hole.level), ([3, 3, 5, 5], 4, 0));
+        // Nearer to the image's edge, where not all pixels across the sides are in it.
+        let nearer: Vec<&str> = rows[1..7].iter().map(|row| &row[1..7]).collect();
+        let nearer = find(&nearer, &Settings { min_size_px: 2, ..ALL });
+        let moved = nearer.get(0).unwrap().points.iter().map(|p| p.map(|v| v + 1.0));
+        assert!(moved.eq(dark[0].points.iter().copied()));
     }
 
     #[test]

@@ -106,6 +106,12 @@ impl<'a> GrayView<'a> {
         Some(Self { data, width, height, stride: self.stride })
     }
 
+    /// The bytes of all rows, and from row to row.
+    #[inline]
+    pub(crate) fn bytes_and_stride(&self) -> (&'a [u8], usize) {
+        (self.data, self.stride)
+    }
+
     /// Width in pixels.
     #[inline]
     pub fn width(&self) -> usize {

@@ -98,6 +98,24 @@ const DOWN: u8 = 1;
 const LEFT: u8 = 2;
 const UP: u8 = 3;
 
+/// A pixel edge of an outline, which begins at a point.
+struct PixelEdge {
+    /// The pixel inside, from the one to the lower right of the point.
+    inside: [i32; 2],
+    /// From there to the pixel outside.
+    outwards: [i32; 2],
+    /// From the point to the next one.
+    along: [i32; 2],
+}
+
+/// The edges in each direction.
+const EDGES: [PixelEdge; 4] = [
+    PixelEdge { inside: [0, 0], outwards: [0, -1], along: [1, 0] },
+    PixelEdge { inside: [-1, 0], outwards: [1, 0], along: [0, 1] },
+    PixelEdge { inside: [-1, -1], outwards: [0, 1], along: [-1, 0] },
+    PixelEdge { inside: [0, -1], outwards: [-1, 0], along: [0, -1] },
+];
+
 /// A closed outline; the region is to its right.
 struct Trace {
     bounds: [i32; 4],
@@ -338,31 +356,24 @@ impl Search<'_> {
 
     /// Keeps an outline that was just followed from pixel (x, y).
     fn keep(&mut self, x: usize, y: usize, trace: &Trace) {
+        // The pixels that are looked at reach this far beyond the region.
+        const BEYOND: i32 = 2;
         let start = self.points.len();
-        let (mut x, mut y) = (x as i32 + 1, y as i32);
-        let (mut cut, mut contrast) = (false, 0_i64);
-        for step in self.path.iter().take(trace.length) {
-            // The pixels on both sides of the edge.
-            let ([ax, ay], [bx, by], [nx, ny]) = match *step {
-                RIGHT => ([x, y], [x, y - 1], [x + 1, y]),
-                DOWN => ([x - 1, y], [x, y], [x, y + 1]),
-                LEFT => ([x - 1, y - 1], [x - 1, y], [x - 1, y]),
-                _ => ([x, y - 1], [x - 1, y - 1], [x, y - 1]),
-            };
-            let (dx, dy) = (bx - ax, by - ay);
-            let inside = self.grey(ax, ay).unwrap_or(0);
-            let share = if let Some(outside) = self.grey(bx, by) {
-                contrast += i64::from(outside) - i64::from(inside);
-                let inner = self.grey(ax - dx, ay - dy).unwrap_or(inside);
-                let outer = self.grey(bx + dx, by + dy).unwrap_or(outside);
-                crossing([inner, inside, outside, outer], self.dark)
-            } else {
-                cut = true;
-                0.5
-            };
-            self.points.push([ax as f32 + share * dx as f32, ay as f32 + share * dy as f32]);
-            (x, y) = (nx, ny);
-        }
+        let [left, top, right, bottom] = trace.bounds;
+        let (width, height) = (self.view.width() as i32, self.view.height() as i32);
+        let is_inner =
+            left.min(top) >= BEYOND && right + BEYOND <= width && bottom + BEYOND <= height;
+        let (contrast, cut) = if is_inner {
+            // Most are, and spare a check of each pixel's place.
+            let (bytes, stride) = self.view.bytes_and_stride();
+            let grey = |x: i32, y: i32| bytes.get(y as usize * stride + x as usize).copied();
+            self.add_points(x, y, trace.length, grey)
+        } else {
+            let view = self.view;
+            let inside = |x: i32, y: i32| (0..width).contains(&x) && (0..height).contains(&y);
+            let grey = |x: i32, y: i32| inside(x, y).then(|| view.at(x as usize, y as usize));
+            self.add_points(x, y, trace.length, grey)
+        };
         let contrast = contrast as f32 / trace.length.max(1) as f32;
         self.spans.push(Span {
             level: self.level,
@@ -376,21 +387,44 @@ impl Search<'_> {
         });
     }
 
-    #[inline]
-    fn grey(&self, x: i32, y: i32) -> Option<u8> {
-        let inside = x >= 0
-            && y >= 0
-            && (x as usize) < self.view.width()
-            && (y as usize) < self.view.height();
-        inside.then(|| self.view.at(x as usize, y as usize))
+    /// Adds the points of an outline that was followed from pixel (x, y); `grey` of a pixel outside the image is `None`. Returns the
+    /// sum of the differences across it, and whether the image's edge cuts it.
+    #[inline(always)]
+    fn add_points(
+        &mut self,
+        x: usize,
+        y: usize,
+        length: usize,
+        grey: impl Fn(i32, i32) -> Option<u8>,
+    ) -> (i64, bool) {
+        let (mut x, mut y) = (x as i32 + 1, y as i32);
+        let (mut contrast, mut cut) = (0_i64, false);
+        let points = self.path.iter().take(length).map(|step| {
+            let PixelEdge { inside, outwards: [dx, dy], along } = EDGES[usize::from(*step & 3)];
+            let (ax, ay) = (x + inside[0], y + inside[1]);
+            (x, y) = (x + along[0], y + along[1]);
+            let inside = grey(ax, ay).unwrap_or(0);
+            let share = if let Some(outside) = grey(ax + dx, ay + dy) {
+                contrast += i64::from(outside) - i64::from(inside);
+                let inner = grey(ax - dx, ay - dy).unwrap_or(inside);
+                let outer = grey(ax + 2 * dx, ay + 2 * dy).unwrap_or(outside);
+                crossing([inner, inside, outside, outer], self.dark)
+            } else {
+                cut = true;
+                0.5
+            };
+            [ax as f32 + share * dx as f32, ay as f32 + share * dy as f32]
+        });
+        self.points.extend(points);
+        (contrast, cut)
     }
 }
 
 /// Where the grey values of four pixels across an edge cross the middle between the inner and the outer two,
 /// in pixels outwards from the second.
 fn crossing(greys: [u8; 4], dark: bool) -> f32 {
-    let upwards = |grey: u8| f32::from(if dark { grey } else { !grey });
-    let [inner, a, b, outer] = greys.map(upwards);
+    let flip = if dark { 0 } else { u8::MAX };
+    let [inner, a, b, outer] = greys.map(|grey| f32::from(grey ^ flip));
     let middle = (inner.min(a) + outer.max(b)) / 2.0;
     let between = |low: f32, high: f32| (middle - low) / (high - low);
     let share = if b < middle {
