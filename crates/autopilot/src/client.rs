@@ -273,6 +273,11 @@ impl Autopilot {
         self.clock.link_delay_ns(now_ns).map(|ns| Duration::from_nanos(ns.max(0).unsigned_abs()))
     }
 
+    /// Whether another companion on this link uses our ids: probably a second controller of the same vehicle.
+    pub fn shares_our_address(&self) -> bool {
+        self.same_address
+    }
+
     /// Why the vehicle cannot be armed and flown yet, as texts; empty when it can.
     pub fn not_ready_because(&self) -> Vec<String> {
         match &self.vehicle {

@@ -9,6 +9,7 @@ use libm::fmax;
 use crate::client::Autopilot;
 use crate::command::{Command, CommandError, CommandId, CommandStatus, ns};
 use crate::mode::{Firmware, FlightMode};
+use crate::packet::Sender;
 use crate::state::{LandedState, VehicleState};
 
 /// Maximum height error at the end of the climb, in m.
@@ -107,6 +108,17 @@ pub enum TakeoffError {
         SIMULATION_LIMIT.as_secs()
     )]
     NotSimulated,
+    /// Another controller commands the vehicle.
+    #[error(
+        "no takeoff: another companion with our system and component id ({} and {}) is on the autopilot's link, probably a \
+         second controller of this vehicle, which may fly it. End that one, check the address of the autopilot, or change \
+         `autopilot.component_id` on one of them",
+        sender.system, sender.component
+    )]
+    SameAddress {
+        /// Our ids.
+        sender: Sender,
+    },
     /// It did not become ready.
     #[error("no takeoff: not ready after {} s: {}", after.as_secs(), reasons.join("; "))]
     NotReady {
@@ -249,6 +261,9 @@ impl Takeoff {
         autopilot: &mut Autopilot,
         state: Option<&VehicleState>,
     ) -> Result<(), TakeoffError> {
+        if autopilot.shares_our_address() {
+            return Err(TakeoffError::SameAddress { sender: autopilot.our_address() });
+        }
         let connected = state.filter(|state| state.connected);
         if connected.is_some() && !self.may_be_flown(now_ns, autopilot)? {
             return Ok(());

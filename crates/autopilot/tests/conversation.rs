@@ -840,6 +840,23 @@ fn a_vehicle_that_flies_already_needs_no_takeoff() {
 }
 
 #[test]
+fn a_vehicle_of_another_controller_with_our_ids_is_neither_lifted_nor_taken_over() {
+    for mut world in [World::standing(), World::flying()] {
+        let companion = Sender { system: 1, component: 191 };
+        world.receive(companion, &autopilot::compose::heartbeat());
+        let (end, _) = world.take_off(&mut Takeoff::new(10.0), 5);
+        let TakeoffProgress::Failed(TakeoffError::SameAddress { sender }) = &end else {
+            panic!("{end:?}")
+        };
+        assert_eq!(*sender, companion);
+        assert!(end.to_string().contains("End that one"), "{end}");
+        assert!(
+            world.commands(MavCmd::MAV_CMD_DO_SET_MODE) == 0 && world.fake.velocities.is_empty()
+        );
+    }
+}
+
+#[test]
 fn a_vehicle_that_the_pilot_flies_is_left_alone() {
     let mut world = World::flying();
     world.fake.mode = 5;
