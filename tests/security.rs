@@ -13,7 +13,7 @@ use testing::ports;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
-use crate::flight::beside_another;
+use crate::flight::{beside_another, time_for};
 
 const PATIENCE: Duration = Duration::from_secs(30);
 const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
@@ -290,7 +290,7 @@ async fn what_is_insecure_says_so() -> anyhow::Result<()> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_vehicle_that_may_be_real_is_left_on_the_ground() -> anyhow::Result<()> {
-    let _flight = beside_another().await?;
+    let _flight = time_for(2).await?;
     let ([meet], _, mavlink) = ports::free()?;
     let vehicle = format!("autopilot.address=udpout:127.0.0.1:{mavlink}");
     let mut simulator = Command::new(ALIGHT)

@@ -40,7 +40,7 @@ pub(crate) const LONG: [&str; 6] = [
 ];
 pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 
-/// Landings with the small camera that keep their time on two processors, and load them by half.
+/// Landings with the small camera that keep their time on two processors: they need half of it.
 const MAX_AT_ONCE: u32 = 4;
 static FLIGHTS: Semaphore = Semaphore::const_new(MAX_AT_ONCE as usize);
 
@@ -54,7 +54,7 @@ pub(crate) async fn time_for(landings: u32) -> anyhow::Result<SemaphorePermit<'s
     Ok(FLIGHTS.acquire_many(landings).await?)
 }
 
-/// Waits until no landing is under way, and lets none begin: for what loads the machine by itself, or measures milliseconds.
+/// Waits until no landing is under way that waited for its time, and lets none begin: for what loads the machine by itself, or measures milliseconds.
 pub(crate) async fn alone() -> anyhow::Result<SemaphorePermit<'static>> {
     time_for(MAX_AT_ONCE).await
 }

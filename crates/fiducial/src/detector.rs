@@ -179,7 +179,7 @@ impl Detector {
         }
         input.evidence.begin_fallbacks(schedule);
         for step in FallbackStep::ALL.into_iter().filter(|step| schedule.allows_step(*step)) {
-            if !input.evidence.may_help(view, step) {
+            if !input.evidence.may_help(step) {
                 continue;
             }
             let mut is_prepared = false;

@@ -106,7 +106,7 @@ impl<'a> GrayView<'a> {
         Some(Self { data, width, height, stride: self.stride })
     }
 
-    /// The bytes of all rows, and from row to row.
+    /// The bytes from the first pixel on, and their number from row to row.
     #[inline]
     pub(crate) fn bytes_and_stride(&self) -> (&'a [u8], usize) {
         (self.data, self.stride)

@@ -255,6 +255,7 @@ impl RingDetector {
     fn find_arcs(&mut self, view: GrayView<'_>, outlines: &Outlines, first: usize) {
         let mut budget = MAX_ARC_FITS;
         for outline in outlines.iter().skip(first) {
+            // The fast passes saw it; where they follow no outlines of this level, on the next one, where they follow all.
             if complete_ellipse(&outline).is_some() {
                 continue;
             }

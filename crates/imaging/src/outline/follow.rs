@@ -108,7 +108,7 @@ struct PixelEdge {
     along: [i32; 2],
 }
 
-/// The edges in each direction.
+/// The edges by direction: [`RIGHT`], [`DOWN`], [`LEFT`], [`UP`].
 const EDGES: [PixelEdge; 4] = [
     PixelEdge { inside: [0, 0], outwards: [0, -1], along: [1, 0] },
     PixelEdge { inside: [-1, 0], outwards: [1, 0], along: [0, 1] },
@@ -364,14 +364,14 @@ impl Search<'_> {
         let is_inner =
             left.min(top) >= BEYOND && right + BEYOND <= width && bottom + BEYOND <= height;
         let (contrast, cut) = if is_inner {
-            // Most are, and spare a check of each pixel's place.
+            // Most are, and need no check of column and row for each pixel.
             let (bytes, stride) = self.view.bytes_and_stride();
             let grey = |x: i32, y: i32| bytes.get(y as usize * stride + x as usize).copied();
             self.add_points(x, y, trace.length, grey)
         } else {
             let view = self.view;
-            let inside = |x: i32, y: i32| (0..width).contains(&x) && (0..height).contains(&y);
-            let grey = |x: i32, y: i32| inside(x, y).then(|| view.at(x as usize, y as usize));
+            let is_pixel = |x: i32, y: i32| (0..width).contains(&x) && (0..height).contains(&y);
+            let grey = |x: i32, y: i32| is_pixel(x, y).then(|| view.at(x as usize, y as usize));
             self.add_points(x, y, trace.length, grey)
         };
         let contrast = contrast as f32 / trace.length.max(1) as f32;
@@ -400,9 +400,9 @@ impl Search<'_> {
         let (mut x, mut y) = (x as i32 + 1, y as i32);
         let (mut contrast, mut cut) = (0_i64, false);
         let points = self.path.iter().take(length).map(|step| {
-            let PixelEdge { inside, outwards: [dx, dy], along } = EDGES[usize::from(*step & 3)];
-            let (ax, ay) = (x + inside[0], y + inside[1]);
-            (x, y) = (x + along[0], y + along[1]);
+            let edge = &EDGES[usize::from(*step & 3)];
+            let ([ax, ay], [dx, dy]) = ([x + edge.inside[0], y + edge.inside[1]], edge.outwards);
+            (x, y) = (x + edge.along[0], y + edge.along[1]);
             let inside = grey(ax, ay).unwrap_or(0);
             let share = if let Some(outside) = grey(ax + dx, ay + dy) {
                 contrast += i64::from(outside) - i64::from(inside);
