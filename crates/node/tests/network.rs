@@ -160,15 +160,20 @@ async fn of_two_that_start_at_once_one_has_priority() -> anyhow::Result<()> {
     for [first, second] in [["main", "main"], ["a", "b"], ["b", "a"], ["main", "main"]] {
         let port = free_port()?;
         let host = open("simulator", "main", port).await?;
-        let start = async |instance: &str| {
-            let node = open("controller", instance, port).await?;
-            let alone = node.claim_unique_name("*").await;
-            if alone.is_ok() {
-                node.announce().await?;
-            }
-            anyhow::Ok((node, alone))
+        // Each in a task of its own, as in its own process: a call of Zenoh that blocks the thread of one `block_on` takes what wakes
+        // another future there.
+        let start = |instance: &'static str| {
+            tokio::spawn(async move {
+                let node = open("controller", instance, port).await?;
+                let alone = node.claim_unique_name("*").await;
+                if alone.is_ok() {
+                    node.announce().await?;
+                }
+                anyhow::Ok((node, alone))
+            })
         };
-        let both = tokio::try_join!(start(first), start(second))?;
+        let (first_started, second_started) = (start(first), start(second));
+        let both = (first_started.await??, second_started.await??);
         let refusals: Vec<String> = [&both.0, &both.1]
             .iter()
             .filter_map(|it| it.1.as_ref().err())
