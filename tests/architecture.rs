@@ -476,6 +476,17 @@ fn every_queue_has_a_bound() -> anyhow::Result<()> {
     Ok(())
 }
 
+#[test]
+fn only_node_waits_on_a_thread() -> anyhow::Result<()> {
+    for package in workspace()? {
+        for path in package.sources()? {
+            // A runtime's own loses wake-ups where Zenoh blocks the thread.
+            ensure!(!code(&path)?.contains(".block_on("), "{path:?}: use `node::block_on`");
+        }
+    }
+    Ok(())
+}
+
 /// The constants of the topic table: name and key.
 fn topic_constants(workspace: &[Package]) -> anyhow::Result<Vec<(String, String)>> {
     let table = code(&package(workspace, "messages")?.folder.join("src/topic.rs"))?;

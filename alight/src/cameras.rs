@@ -15,7 +15,7 @@ use node::Layers;
 use serde::Serialize;
 
 use crate::args::Format;
-use crate::runtime::runtime;
+use crate::runtime::block_on;
 use crate::terminal::{aligned, print};
 
 /// Where the system has its devices.
@@ -83,7 +83,7 @@ pub(crate) fn run(args: &CamerasArgs) -> anyhow::Result<ExitCode> {
     #[cfg(feature = "genicam")]
     let listing = Listing { genicam: camera_pub::genicam_cameras(), ..listing };
     let mavlink = match &args.mavlink {
-        Some(address) => Some(runtime()?.block_on(announced_cameras(address, ASK_FOR))?),
+        Some(address) => Some(block_on(announced_cameras(address, ASK_FOR))??),
         None => None,
     };
     let listing = Listing { mavlink, ..listing };

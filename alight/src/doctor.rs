@@ -22,7 +22,7 @@ use tokio::time::timeout;
 use self::focus::Focus;
 use crate::args::{Format, NetworkArgs, OPERATOR};
 use crate::keys;
-use crate::runtime::{runtime, tool_identity};
+use crate::runtime::{block_on, tool_identity};
 use crate::services::Service;
 use crate::site::{Job, Role, Site};
 use crate::terminal::print;
@@ -153,7 +153,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     }
     let before = findings.findings.len();
     match network.source(OPERATOR) {
-        Ok(zenoh) => runtime()?.block_on(async {
+        Ok(zenoh) => block_on(async {
             match timeout(OPEN_TIMEOUT, Node::open(tool_identity("doctor"), &zenoh)).await {
                 Ok(Ok(node)) => {
                     let watched = Watched {
@@ -170,7 +170,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
                     "see above",
                 ),
             }
-        }),
+        })?,
         Err(problem) => findings.wrong(
             "network",
             format!("{problem:#}"),

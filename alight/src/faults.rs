@@ -14,7 +14,7 @@ use experiments::landing::plan::Values;
 use crate::args::flight_setting;
 use crate::progress::flights_bar;
 use crate::real_time;
-use crate::runtime::{cores, runtime};
+use crate::runtime::{block_on, cores};
 use crate::terminal::{print, write_error};
 
 /// Numbers of flights.
@@ -124,7 +124,7 @@ fn run_in_real_time(request: &Request) -> anyhow::Result<Findings> {
     let mut outcomes = Vec::new();
     for planned in &flights {
         let folder = request.results_in.join(format!("logs-{}", planned.seed));
-        let outcome = runtime()?.block_on(real_time::fly(planned, &folder))?;
+        let outcome = block_on(real_time::fly(planned, &folder))??;
         write_error(&format!(
             "{} ({}) at {:.1} m: {:?}, {} m/s down, {} {}",
             outcome.kinds,

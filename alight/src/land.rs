@@ -20,7 +20,7 @@ use crate::children::{ChildEvent, Children};
 use crate::outcome::LandingSummary;
 use crate::progress::Progress;
 use crate::record::file_setting;
-use crate::runtime::{runtime, tool_identity};
+use crate::runtime::{block_on, tool_identity};
 use crate::services::Service;
 use crate::terminal::{print, write_error};
 
@@ -99,7 +99,7 @@ pub(crate) fn run(args: &LandArgs) -> anyhow::Result<ExitCode> {
     node::start_logging("warn");
     let settings = ServiceSettings::new(args)?;
     confirm_real_vehicle(args, &settings)?;
-    let outcome = runtime()?.block_on(fly(args, &settings))?.outcome();
+    let outcome = block_on(fly(args, &settings))??.outcome();
     print(&match args.format {
         Format::Text => outcome.table(),
         Format::Json => serde_json::to_string(&outcome)?,

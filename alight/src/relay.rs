@@ -14,7 +14,7 @@ use node::{Identity, Network, Node, Shutdown, denied};
 use tokio::time::MissedTickBehavior;
 
 use crate::args::{NetworkArgs, ParentArgs};
-use crate::runtime::runtime;
+use crate::runtime::block_on;
 use crate::services::{RELAY, tell_if_open};
 
 /// Period at which the process notices that it goes on.
@@ -57,7 +57,7 @@ pub(crate) fn run(args: &RelayArgs) -> anyhow::Result<ExitCode> {
         tell_if_open(&node, &network);
         relay(node, shutdown, holders).await
     };
-    runtime()?.block_on(node::run(identity, &zenoh, serve))?;
+    block_on(node::run(identity, &zenoh, serve))??;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -1,17 +1,20 @@
 //! The asynchronous runtime of a process, and the session of a command-line tool.
 
+use std::future::Future;
+
 use anyhow::Context;
 use node::{Identity, Node};
 
 use crate::args::{NetworkArgs, OPERATOR, ParentArgs};
 
-/// The runtime: two workers, which handle messages only.
-pub(crate) fn runtime() -> anyhow::Result<tokio::runtime::Runtime> {
-    tokio::runtime::Builder::new_multi_thread()
+/// Runs a future to its end. Its runtime has two workers, which handle messages only.
+pub(crate) fn block_on<F: Future>(future: F) -> anyhow::Result<F::Output> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .enable_all()
         .build()
-        .context("starting the asynchronous runtime")
+        .context("starting the asynchronous runtime")?;
+    Ok(node::block_on(runtime.handle(), future))
 }
 
 /// The identity of a tool of this program.
@@ -27,12 +30,12 @@ pub(crate) fn with_node<T>(
 ) -> anyhow::Result<T> {
     node::start_logging("warn");
     let zenoh = network.source(OPERATOR)?;
-    runtime()?.block_on(async {
+    block_on(async {
         let node = Node::open(tool_identity(tool), &zenoh).await?;
         let result = work(&node).await;
         node.close().await;
         result
-    })
+    })?
 }
 
 impl ParentArgs {

@@ -9,7 +9,7 @@ use node::access::key_name;
 use node::{Effective, INSECURE, Identity, Layers, Network, Node, Settings, Shutdown};
 
 use crate::args::ServiceArgs;
-use crate::runtime::runtime;
+use crate::runtime::block_on;
 
 /// The name of the relay as a service.
 pub(crate) const RELAY: &str = "relay";
@@ -117,15 +117,14 @@ where
     let identity = Identity { service: service.name(), instance: instance(&config) };
     let network = args.network.network();
     let zenoh = network.source(&key_name(service.name(), &identity.instance))?;
-    runtime()?
-        .block_on(node::run(identity, &zenoh, async |node, shutdown| {
-            tell_if_open(&node, &network);
-            let told = node.clone();
-            tokio::select! {
-                result = run(node, config, shutdown) => result,
-                result = told.publish_configuration(table.to_string()) => result,
-            }
-        }))
-        .with_context(|| format!("running {}", service.name()))?;
+    block_on(node::run(identity, &zenoh, async |node, shutdown| {
+        tell_if_open(&node, &network);
+        let told = node.clone();
+        tokio::select! {
+            result = run(node, config, shutdown) => result,
+            result = told.publish_configuration(table.to_string()) => result,
+        }
+    }))?
+    .with_context(|| format!("running {}", service.name()))?;
     Ok(ExitCode::SUCCESS)
 }

@@ -14,7 +14,7 @@ use tokio::time::Instant;
 
 use crate::children::{ChildEvent, Children, Exit};
 use crate::peers::{LandingMarkerFile, Peers, Slot};
-use crate::runtime::runtime;
+use crate::runtime::block_on;
 use crate::services::Service;
 use crate::site::{Job, Role, Site};
 use crate::terminal::print;
@@ -53,7 +53,7 @@ pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     node::start_logging("warn");
-    runtime()?.block_on(supervise(&site, args.role, jobs))
+    block_on(supervise(&site, args.role, jobs))?
 }
 
 /// Prints a line. A failure is ignored: the supervisor continues without a terminal.

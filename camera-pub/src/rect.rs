@@ -53,7 +53,7 @@ impl RectPublisher {
         let runtime = Handle::current();
         std::thread::Builder::new()
             .name("rect".to_owned())
-            .spawn(move || runtime.block_on(work.run()))
+            .spawn(move || node::block_on(&runtime, work.run()))
             .context("starting the thread that rectifies frames")?;
         Ok(Self { is_wanted, newest })
     }

@@ -91,7 +91,7 @@ async fn on_own_thread(
     let runtime = tokio::runtime::Handle::current();
     let (mut done, ended) = oneshot::channel();
     let work = move || {
-        let result = runtime.block_on(async {
+        let result = node::block_on(&runtime, async {
             tokio::select! {
                 result = stream.run(source) => result,
                 () = shutdown.requested() => Ok(()),

@@ -295,8 +295,8 @@ impl Work {
         let thread = std::thread::Builder::new()
             .name("detect".to_owned())
             .spawn(move || {
-                while let Some(frame) = runtime.block_on(self.frames.next()) {
-                    runtime.block_on(self.search_newest(frame));
+                while let Some(frame) = node::block_on(&runtime, self.frames.next()) {
+                    node::block_on(&runtime, self.search_newest(frame));
                 }
                 drop(running);
             })

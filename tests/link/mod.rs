@@ -35,7 +35,7 @@ pub(crate) fn run(work: impl AsyncFnOnce(&[String]) -> anyhow::Result<()>) -> Ex
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let result = runtime.context("starting the runtime").and_then(|runtime| {
-        runtime.block_on(async {
+        node::block_on(runtime.handle(), async {
             match args.first().map(String::as_str) {
                 Some("probe") => probe(&args).await,
                 _ => work(&args).await,

@@ -78,7 +78,7 @@ impl AirSender {
         let runtime = Handle::current();
         std::thread::Builder::new()
             .name("air".to_owned())
-            .spawn(move || runtime.block_on(work.run()))
+            .spawn(move || node::block_on(&runtime, work.run()))
             .context("starting the air link's thread")?;
         Ok(Self { offers })
     }

@@ -11,6 +11,7 @@
 //! what survives a reboot.
 
 pub mod access;
+mod block_on;
 mod boxed;
 pub mod clock;
 pub mod config;
@@ -28,6 +29,7 @@ pub mod stats;
 pub mod tap;
 pub mod topics;
 
+pub use block_on::block_on;
 pub use boxed::BoxFuture;
 pub use clock::{boot_ahead_ns, clock_name, host_name, now_ns};
 pub use config::{

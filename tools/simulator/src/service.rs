@@ -440,10 +440,10 @@ impl Camera {
                     let ready_s = exposed_s + TICK.as_secs_f64() * 1.5;
                     while let Some(due_s) = self.next_due_s().filter(|due_s| *due_s < ready_s) {
                         self.sleep_until(due_s);
-                        runtime.block_on(self.publish_delayed());
+                        node::block_on(&runtime, self.publish_delayed());
                     }
                     self.sleep_until(ready_s);
-                    runtime.block_on(self.take(sequence, time_s));
+                    node::block_on(&runtime, self.take(sequence, time_s));
                     let due = (self.simulation.now_s() / self.period_s) as u64;
                     let left_out = due.saturating_sub(sequence + 1);
                     if left_out > 0 {
