@@ -1,5 +1,6 @@
 //! Child processes: starts them, forwards their output, reports their exit, stops them.
 
+use std::fmt;
 use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
@@ -35,9 +36,24 @@ pub(crate) struct Exit {
     pub(crate) status: Option<i32>,
 }
 
-impl std::fmt::Display for Exit {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+impl fmt::Display for Exit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.words)
+    }
+}
+
+/// A service that was started.
+pub(crate) struct Started {
+    service: Service,
+    number: i32,
+    /// The command that starts it again.
+    pub(crate) by_hand: String,
+}
+
+impl fmt::Display for Started {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { service, number, by_hand } = self;
+        write!(f, "{} is process {number}; by hand: {by_hand}", service.name())
     }
 }
 
@@ -49,13 +65,13 @@ pub(crate) struct Children<K> {
 }
 
 impl Children<Service> {
-    /// Starts a service as a process of this program; returns how to start it again by hand.
+    /// Starts a service as a process of this program.
     pub(crate) fn start(
         &mut self,
         service: Service,
         zenoh: &Path,
         settings: &[String],
-    ) -> anyhow::Result<String> {
+    ) -> anyhow::Result<Started> {
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
         command.arg(service.name()).arg("--zenoh").arg(zenoh);
@@ -63,17 +79,18 @@ impl Children<Service> {
         let mut by_hand = format!("alight {} --zenoh {}", service.name(), zenoh.display());
         for setting in settings {
             command.arg("--set").arg(setting);
-            by_hand.push_str(&format!(" --set '{setting}'"));
-        }
-        if service == Service::Controller {
             // A restarted controller resumes the landing, and never takes off a second time.
-            by_hand.push_str(" --set 'start=\"resume\"'");
+            let again = match service == Service::Controller && setting.starts_with("start=") {
+                true => "start=\"resume\"",
+                false => setting,
+            };
+            by_hand.push_str(&format!(" --set '{again}'"));
         }
         if std::env::var_os("ALIGHT_LOG").is_none() {
             command.env("ALIGHT_LOG", "warn");
         }
         let number = self.spawn(service, command, service.name())?;
-        Ok(format!("{} is process {number}; by hand: {by_hand}", service.name()))
+        Ok(Started { service, number, by_hand })
     }
 }
 

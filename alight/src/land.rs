@@ -252,12 +252,17 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         progress.say(&format!("The page is at {scheme}://{address}/"));
     }
     let mut children = Children::new();
+    let mut resume = String::new();
     for (service, settings) in &settings.by_service {
         let started = children.start(*service, &rendezvous.file, settings)?;
-        progress.debug(&started);
+        progress.debug(&started.to_string());
+        if *service == Service::Controller {
+            resume = started.by_hand;
+        }
     }
     let deadline = Instant::now() + Duration::from_secs_f64(args.timeout_s);
-    let watched = watch(&node, settings, &mut children, &mut progress, shutdown, deadline).await;
+    let limits = Limits { shutdown, deadline };
+    let watched = watch(&node, settings, &mut children, &resume, &mut progress, limits).await;
     progress.finish();
     let mut recorders_end = None;
     let note_end = |event: &ChildEvent<Service>| match event {
@@ -275,14 +280,20 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     Ok(landing)
 }
 
-/// Follows the landing until it is over.
+/// What ends the watch of a landing that is not over.
+struct Limits {
+    shutdown: Shutdown,
+    deadline: Instant,
+}
+
+/// Follows the landing until it is over. `resume` is the command of a controller that resumes it.
 async fn watch(
     node: &Node,
     settings: &ServiceSettings,
     children: &mut Children<Service>,
+    resume: &str,
     progress: &mut Progress,
-    shutdown: Shutdown,
-    deadline: Instant,
+    Limits { shutdown, deadline }: Limits,
 ) -> anyhow::Result<LandingSummary> {
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     let truths = node.subscriber(topic::TRUTH, &[]).await?;
@@ -290,6 +301,7 @@ async fn watch(
     let recorders = node.subscriber(topic::RECORDER_STATUS, &[]).await?;
     let mut landing = LandingSummary::default();
     let mut over: Option<Instant> = None;
+    let mut controllers_exit = None;
     let mut redraw = tokio::time::interval(Duration::from_millis(200));
     loop {
         let end = over.unwrap_or(deadline);
@@ -315,6 +327,12 @@ async fn watch(
                         return Ok(landing);
                     }
                     progress.say(&format!("{} exited: {exit}{}", service.name(), consequence(service)));
+                    if service == Service::Controller {
+                        controllers_exit = Some(exit.to_string());
+                        if !landing.never_flew() {
+                            progress.say(&format!("To resume the landing: {resume}"));
+                        }
+                    }
                     // The landing needs no ground station, recording or page.
                     let is_needed = landing.never_flew()
                         && match service {
@@ -337,7 +355,8 @@ async fn watch(
             }
             () = tokio::time::sleep_until(end) => {
                 if over.is_none() {
-                    landing.interrupted("timeout before the landing (--timeout-s)");
+                    let is_alone = node.alive("controller", "*").await.is_ok_and(|it| it.is_empty());
+                    landing.timed_out(controllers_exit.as_deref().filter(|_| is_alone));
                 }
                 return Ok(landing);
             }
@@ -356,9 +375,7 @@ async fn another_detector(node: &Node, settings: &ServiceSettings) -> anyhow::Re
 fn consequence(service: Service) -> &'static str {
     match service {
         Service::Detector => "; another detector is used as soon as one is ready",
-        Service::Controller => {
-            "; the autopilot stops the vehicle, and a restarted controller resumes the landing"
-        }
+        Service::Controller => "; the autopilot stops a vehicle that flies",
         Service::GcsBridge => "; the landing continues without the ground station",
         Service::Recorder => "; the landing continues, and is recorded no more",
         Service::Dashboard => "; the landing continues without the page",

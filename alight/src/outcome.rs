@@ -115,6 +115,16 @@ impl LandingSummary {
         self.interrupted = Some(why.to_owned());
     }
 
+    /// Notes that the landing took too long; `exit` is that of the controller if none has taken its place.
+    pub(crate) fn timed_out(&mut self, exit: Option<&str>) {
+        self.interrupted(&match exit {
+            Some(exit) => format!(
+                "the controller exited ({exit}), and none resumed the landing before the timeout (--timeout-s)"
+            ),
+            None => "timeout before the landing (--timeout-s)".to_owned(),
+        });
+    }
+
     /// True while no landing has begun.
     pub(crate) fn never_flew(&self) -> bool {
         self.started_ns.is_none()
@@ -311,5 +321,10 @@ mod tests {
         let outcome = landing.outcome();
         assert!(!outcome.landed);
         assert_eq!(outcome.outcome, "interrupted; it was in `search`: because");
+        landing.timed_out(None);
+        assert!(landing.outcome().outcome.starts_with("timeout before the landing"));
+        landing.timed_out(Some("signal: 9 (SIGKILL)"));
+        let outcome = landing.outcome().outcome;
+        assert!(outcome.starts_with("the controller exited (signal: 9 (SIGKILL))"), "{outcome}");
     }
 }

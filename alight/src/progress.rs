@@ -14,6 +14,8 @@ pub(crate) struct Progress {
     /// `None` where standard error is not a terminal.
     live: Option<ProgressBar>,
     phase: Option<Phase>,
+    /// The last reason of the phase that was shown, without digits.
+    why: String,
     active_detector: Option<String>,
     /// The warnings that were shown and still hold, without digits.
     warnings: Vec<String>,
@@ -33,7 +35,7 @@ impl Progress {
             bar.enable_steady_tick(Duration::from_millis(200));
             bar
         });
-        Self { live, phase: None, active_detector: None, warnings: Vec::new() }
+        Self { live, phase: None, why: String::new(), active_detector: None, warnings: Vec::new() }
     }
 
     /// Shows a line that stays.
@@ -53,16 +55,22 @@ impl Progress {
 
     /// Shows a change of phase or of detector.
     pub(crate) fn status(&mut self, status: &ControllerStatus) {
-        if self.phase.replace(status.phase) != Some(status.phase) {
+        // A change of numbers alone, as of a distance, is not shown.
+        let matter = |text: &String| text.chars().filter(|c| !c.is_ascii_digit()).collect();
+        let why: String = matter(&status.why);
+        // An autopilot may take a minute until it lets the vehicle take off, and says what it waits for.
+        let is_other_reason = self.live.is_none()
+            && matches!(status.phase, Phase::Idle | Phase::Takeoff)
+            && self.why != why;
+        if self.phase.replace(status.phase) != Some(status.phase) || is_other_reason {
             self.say(&format!("{}: {}", status.phase, status.why));
+            self.why = why;
         }
         if status.active_detector != self.active_detector {
             self.active_detector.clone_from(&status.active_detector);
             let name = status.active_detector.as_deref().unwrap_or("none");
             self.say(&format!("active detector: {name}: {}", status.detector_why));
         }
-        // A change of numbers alone, as of a distance, is not shown.
-        let matter = |text: &String| text.chars().filter(|c| !c.is_ascii_digit()).collect();
         let matters: Vec<String> = status.warnings.iter().map(matter).collect();
         for (text, matter) in status.warnings.iter().zip(&matters) {
             if !self.warnings.contains(matter) {

@@ -161,8 +161,8 @@ impl Simulation {
 #[derive(Default)]
 struct TouchdownMonitor {
     was_in_air: bool,
-    /// The last state clear of the ground: contact brakes the vehicle faster than the ticks resolve.
-    clear: Option<VehicleTruth>,
+    /// The last state clear of the ground, or the fastest one down since: contact brakes the vehicle faster than the ticks resolve.
+    before_contact: Option<VehicleTruth>,
     touchdown: Option<Touchdown>,
     max_tilt_rad: f64,
     frames: u64,
@@ -180,7 +180,7 @@ impl TouchdownMonitor {
         }
         if self.was_in_air && truth.on_ground {
             self.was_in_air = false;
-            let before = self.clear.unwrap_or(*truth);
+            let before = self.before_contact.unwrap_or(*truth);
             let speed = before.velocity - pad.velocity;
             self.touchdown = Some(Touchdown {
                 stamp_ns,
@@ -189,8 +189,9 @@ impl TouchdownMonitor {
                 lateral_speed_m_s: speed.horizontal_norm(),
             });
         }
-        if truth.height_m > CLEAR_M {
-            self.clear = Some(*truth);
+        let is_faster = |than: VehicleTruth| truth.velocity.z() > than.velocity.z();
+        if truth.height_m > CLEAR_M || self.before_contact.is_some_and(is_faster) {
+            self.before_contact = Some(*truth);
         }
     }
 
@@ -572,12 +573,13 @@ mod tests {
         assert!(monitor.touchdown.is_none(), "it has not flown yet");
         monitor.update(&at(5.0, 1.0, false), &pad, 1);
         monitor.update(&at(0.1, 0.5, false), &pad, 2);
-        // The last state before contact is too low to count.
-        monitor.update(&at(0.001, 0.0, false), &pad, 3);
-        monitor.update(&at(0.0, 0.0, true), &pad, 4);
+        // A gust just above the ground counts; a vehicle that contact has slowed down does not.
+        monitor.update(&at(0.02, 0.7, false), &pad, 3);
+        monitor.update(&at(0.001, 0.0, false), &pad, 4);
+        monitor.update(&at(0.0, 0.0, true), &pad, 5);
         let touchdown = monitor.touchdown.unwrap();
-        assert!((touchdown.error_m - 0.1).abs() < 1e-9 && touchdown.stamp_ns == 4);
-        assert!((touchdown.vertical_speed_m_s - 0.5).abs() < 1e-9);
+        assert!((touchdown.error_m - 0.1).abs() < 1e-9 && touchdown.stamp_ns == 5);
+        assert!((touchdown.vertical_speed_m_s - 0.7).abs() < 1e-9);
         assert!((touchdown.lateral_speed_m_s - 0.1).abs() < 1e-9);
     }
 }
