@@ -300,7 +300,7 @@ fn files_that_are_no_images_are_named_and_the_rest_is_looked_at() {
         ("missing.png", Err("cannot be read")),
         ("cut.jpg", Err("ends in the middle")),
         ("cut.png", Err("damaged or cut short")),
-        ("empty.png", Err("neither a PNG nor a JPEG")),
+        ("empty.png", Err("is empty")),
         ("text.png", Err("neither a PNG nor a JPEG")),
         ("claims-much.png", Err("65535 x 65535 pixels; the limit is")),
         ("claims-all.png", Err("")),

@@ -105,8 +105,8 @@ const MARGIN: f64 = 0.25;
 /// Lower bound of a prediction's uncertainty: the sum of a part in pixels and a part in units of the marker's size.
 const MIN_UNCERTAINTY_PX: f64 = 4.0;
 const MIN_UNCERTAINTY_RATIO: f64 = 0.1;
-/// Regions begin and end at multiples of this, in pixels, so that processing by tiles gives what it gives in the whole
-/// image.
+/// Regions begin and end at multiples of this, in pixels, so that what is computed by tiles, such as thresholds, has the tiles that
+/// it has in the whole image.
 const TILE: usize = 16;
 /// Largest share of the image that regions may cover; above it the whole image is searched.
 const MAX_COVERED: f64 = 0.4;

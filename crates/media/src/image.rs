@@ -43,6 +43,12 @@ pub enum ImageError {
         /// The file extensions of images.
         extensions: String,
     },
+    /// A file without bytes.
+    #[error("{path:?} is empty; was it still being written, or was the disk full?")]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
     /// Bytes that are neither PNG nor JPEG.
     #[error("{path:?} is neither a PNG nor a JPEG image; convert it to one of them")]
     Format {
@@ -383,6 +389,9 @@ fn decoder<'a>(
         path: path.to_owned(),
         cause: cause.to_string(),
     };
+    if bytes.is_empty() {
+        return Err(ImageError::Empty { path: path.to_owned() });
+    }
     let mut reader = ImageReader::new(Cursor::new(bytes))
         .with_guessed_format()
         .map_err(|cause| damaged(&cause))?;
@@ -564,6 +573,8 @@ mod tests {
         let text = folder.path().join("notes.png");
         std::fs::write(&text, "not an image").unwrap();
         assert!(problem(&text).contains("neither a PNG nor a JPEG"));
+        std::fs::write(&text, "").unwrap();
+        assert!(problem(&text).contains("is empty"), "{}", problem(&text));
         std::fs::write(&text, "GIF89a").unwrap();
         assert!(problem(&text).contains("neither a PNG nor a JPEG"), "{}", problem(&text));
     }
