@@ -109,10 +109,10 @@ settings! {
         /// Random walk of that drift, in m/s per square root of a second.
         drift_change: f64 = 0.01, 0.0..=1.0;
         /// Maximum random walk of that drift while detections show that the autopilot's position wanders, in
-        /// m/s per square root of a second. At most 15 times `drift_change`; the random walk of tilts grows
+        /// m/s per square root of a second. At most 30 times `drift_change`; the random walk of tilts grows
         /// in the same proportion. Values up to `drift_change`, or a `drift_change` of 0, turn the adaptation
         /// off.
-        max_drift_change: f64 = 0.15, 0.0..=1.0;
+        max_drift_change: f64 = 0.3, 0.0..=1.0;
         /// Initial standard deviation of the drift of the autopilot's height, in m/s.
         height_drift_m_s: f64 = 0.1, 0.0..=1.0;
         /// Random walk of that drift, in m/s per square root of a second.
@@ -341,7 +341,7 @@ settings! {
         /// Image margin for the vehicle's attitude changes, in rad.
         view_margin_rad: f64 = 0.07, 0.0..=0.5;
         /// Time constant of the observer of the autopilot's velocity bias, in s.
-        drift_time_s: f64 = 0.4, 0.2..=60.0;
+        drift_time_s: f64 = 0.3, 0.1..=60.0;
         /// Maximum bias of the autopilot's velocity, in m/s; 0 turns the observer off.
         max_drift_m_s: f64 = 0.8, 0.0..=1.0;
         /// Maximum speed of a pad that is followed, in m/s.

@@ -162,8 +162,8 @@ impl Estimator {
             return Err(Rejection::Stale);
         };
         let mut state = before.state.clone();
-        state.predict(&self.config, stamp.seconds_since(before.measurement.stamp));
-        let nis = state.nis(&measurement);
+        let dt_s = stamp.seconds_since(before.measurement.stamp);
+        let nis = state.predict_to(&self.config, dt_s, &measurement);
         self.nis = Some(nis);
         // Also an outlier: what is not a number, and what a covariance that is none makes negative.
         let is_inlier = (0.0..=self.config.gate).contains(&nis);
@@ -194,7 +194,8 @@ impl Estimator {
             };
             let (mut state, stamp) = (before.state.clone(), before.measurement.stamp);
             if let Some(fused) = self.past.get_mut(index) {
-                state.predict(&self.config, fused.measurement.stamp.seconds_since(stamp));
+                let dt_s = fused.measurement.stamp.seconds_since(stamp);
+                state.predict_to(&self.config, dt_s, &fused.measurement);
                 state.update(&self.config, &fused.measurement);
                 fused.state = state;
             }
