@@ -30,6 +30,9 @@
 //! | the reported velocity without its bias | 0.024, 0.070 | 0.08 |
 //! | an autopilot without estimation errors | 0.014, 0.067 | 0.15 |
 //!
+//! PX4 follows a velocity setpoint without a path, with a gain of 1.8 per second on the error of its own velocity
+//! (`MPC_XY_VEL_P_ACC`), which is near enough to the same time constant.
+//!
 //! Below `blind_height_m` the vehicle continues down on the estimate when the marker leaves the view. LAND
 //! follows no target and drifts by a decimetre in a second of gusts, so it takes over only at
 //! `land_height_m`, and only from a vehicle that hardly moves sideways.
@@ -40,7 +43,7 @@ use libm::{fmax, fmin, tan};
 use crate::config::MetricConfig;
 use crate::decision::{Reason, TargetEstimate};
 use crate::guidance::observer::{Observer, horizontal, limited};
-use crate::guidance::path::time_constant_s;
+use crate::guidance::path::{Path, time_constant_s};
 use crate::guidance::situation::{Guidance, Progress, Situation};
 use crate::time::Timestamp;
 
@@ -96,6 +99,10 @@ const ROOM_GAIN: f64 = 2.0;
 /// from a climb.
 const PUSHING_M_S: f64 = 0.15;
 const STANDING_S: [f64; 2] = [0.4, 0.9];
+
+/// Time for which a vehicle near the ground that is commanded down has not sunk until it is steered sideways no more, in seconds:
+/// one that stands, and whose reported velocity errs, would be commanded faster and faster, and slide.
+const TOUCHING_S: f64 = 0.25;
 
 /// Height below which the rest of the descent takes less time than another try, in metres, and the factor by
 /// which the allowed deviation grows there.
@@ -191,8 +198,16 @@ impl Guidance for Metric {
         let step_s = situation.now.seconds_since(before.stamp).clamp(0.0, MAX_STEP_S);
         let mut observer = before.after(&self.config, situation, step_s);
         self.observer = Some(observer);
-        let lateral = self.lateral(&observer, situation, &target);
-        let (descent_m_s, why) = self.descent(situation, &target);
+        let (mut lateral, (mut descent_m_s, why)) =
+            (self.lateral(&observer, situation, &target), self.descent(situation, &target));
+        if let Some(touching_s) = self.touching_s(situation, &target) {
+            // Whether it stands shows while it is pushed down.
+            descent_m_s = fmax(descent_m_s, 2.0 * PUSHING_M_S);
+            if touching_s >= TOUCHING_S {
+                lateral = horizontal(target.velocity);
+                observer.path = Path::new(lateral);
+            }
+        }
         let down = approach_speed(
             before.setpoint.z(),
             descent_m_s + target.velocity.z(),
@@ -367,6 +382,12 @@ impl Metric {
         } else {
             self.standing_since = None;
         }
+    }
+
+    /// For how long a vehicle near the ground has not sunk although it is commanded down; `None` if it sinks.
+    fn touching_s(&self, situation: &Situation<'_>, target: &TargetEstimate) -> Option<f64> {
+        let since = self.standing_since.filter(|_| self.height_m(target) <= NEAR_M)?;
+        Some(situation.now.seconds_since(since))
     }
 
     fn stands(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {

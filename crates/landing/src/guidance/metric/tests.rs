@@ -139,3 +139,27 @@ fn waiting_ends_also_for_a_vehicle_that_sways_about_the_waiting_height() {
     let climbs = |s: f64| LOW_M - 0.1 + 0.5 * f64::from(u8::from(s > 6.0));
     assert!(!matches!(hovered(0.6, 12.0, climbs), Progress::Stuck));
 }
+
+#[test]
+fn a_vehicle_that_stands_is_pushed_down_and_not_steered_whatever_it_says_of_its_velocity() {
+    let mut metric = Metric::new(MetricConfig::default());
+    let (mut fastest_m_s, mut stands) = (0.0f64, None);
+    for i in 0..80u32 {
+        // It sinks until it stands, at 0.08 m, while its reported velocity errs by 0.15 m/s.
+        let s = f64::from(i) / 40.0;
+        let (height_m, sinking_m_s) = if s < 1.0 { (0.48 - 0.4 * s, 0.4) } else { (0.08, 0.0) };
+        let drift = Vector::new(0.15, 0.0, sinking_m_s);
+        let vehicle = vehicle(s, Point::new(0.03, 0.0, -height_m), drift);
+        let situation = situation(&vehicle);
+        if matches!(metric.progress(&situation), Progress::Ready(Reason::TouchedEarly)) {
+            stands.get_or_insert(s - 1.0);
+        }
+        let (setpoint, _) = metric.velocity(&situation);
+        if s > 1.0 + TOUCHING_S + 0.05 {
+            fastest_m_s = fastest_m_s.max(setpoint.horizontal_norm());
+            assert!(setpoint.z() >= PUSHING_M_S, "{s}: {setpoint:?}");
+        }
+    }
+    assert!(fastest_m_s < 0.01, "{fastest_m_s} m/s sideways");
+    assert!(stands.is_some_and(|s| s < 0.5), "{stands:?} s");
+}
