@@ -6,9 +6,10 @@
     reason = "a test says what it found, and where it fails"
 )]
 
+use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
 use autopilot::{
-    Autopilot, Command, CommandStatus, Config, Event, FlightMode, Parser, Takeoff, TakeoffError,
-    TakeoffProgress,
+    Autopilot, Command, CommandStatus, Config, Event, FlightMode, Parser, Sender, Takeoff,
+    TakeoffError, TakeoffProgress,
 };
 use geometry::Vector;
 use world::ardupilot::Firmware;
@@ -157,5 +158,33 @@ fn a_vehicle_that_may_be_real_is_never_armed() {
         assert_eq!(commands.count(), 0, "{firmware:?}");
         assert!(!pair.client.state().is_some_and(|state| state.armed));
         assert!(pair.world.truth().on_ground);
+    }
+}
+
+#[test]
+fn px4_takes_no_command_that_is_addressed_to_all_systems() {
+    for (firmware, taken) in [(Firmware::ArduPilot, [true, true]), (Firmware::Px4, [false, true])] {
+        let mut config = WorldConfig::default();
+        config.autopilot.firmware = firmware;
+        let answers = [0, 1].map(|target_system| {
+            let mut world = World::new(&config, 4);
+            let request = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+                param1: 30.0,
+                param2: 10_000.0,
+                command: MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
+                target_system,
+                target_component: 1,
+                ..COMMAND_LONG_DATA::default()
+            });
+            let sender = Sender { system: 255, component: 192 };
+            for packet in Parser::new().push(&autopilot::packet::encode(sender, 0, &request)) {
+                world.handle(&packet);
+            }
+            let sent: Vec<u8> = world.outgoing().flatten().collect();
+            Parser::new().push(&sent).iter().any(|packet| {
+                matches!(&packet.message, Some(MavMessage::COMMAND_ACK(ack)) if ack.command == MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL)
+            })
+        });
+        assert_eq!(answers, taken, "{firmware:?}");
     }
 }

@@ -45,6 +45,11 @@ const TOO_LONG: &str = "frames that took too long to render";
 const REQUEST_PERIOD: Duration = Duration::from_secs(1);
 /// Ids of the messages with the truth of a simulated ArduPilot (SIM_STATE) and PX4 (HIL_STATE_QUATERNION).
 const TRUTH_MESSAGES: [f32; 2] = [108.0, 115.0];
+/// Number of such requests without an answer after which it is told.
+const MAX_UNANSWERED: u32 = 5;
+const NO_TRUTH: &str = "the autopilot sends no truth of its simulation (SIM_STATE, HIL_STATE_QUATERNION), so the camera and the touchdown's error follow its estimate";
+/// The MAVLink component id of an autopilot.
+const AUTOPILOT: u8 = 1;
 /// Requested interval of these messages, in microseconds.
 const TRUTH_INTERVAL_US: f32 = 10_000.0;
 /// Height above which the vehicle has been in the air, in metres.
@@ -265,6 +270,10 @@ enum AutopilotSide {
         packets: Subscriber<MavlinkBytes>,
         requests: Publisher<MavlinkBytes>,
         requested_s: f64,
+        /// Requests since the truth came last.
+        unanswered: u32,
+        /// The autopilot's MAVLink system id, once it has spoken.
+        system: Option<u8>,
     },
 }
 
@@ -285,6 +294,8 @@ impl AutopilotSide {
                 packets: node.subscriber(topic::FROM_AUTOPILOT, &[]).await?,
                 requests: node.publisher(topic::TO_AUTOPILOT, &[]).await?,
                 requested_s: f64::NEG_INFINITY,
+                unanswered: 0,
+                system: None,
             },
         })
     }
@@ -300,7 +311,7 @@ impl AutopilotSide {
                     world.handle(&packet);
                 }
             }
-            Self::Topics { packets, .. } => {
+            Self::Topics { packets, system, .. } => {
                 let Some(message) = packets.next().await else {
                     return std::future::pending().await;
                 };
@@ -308,6 +319,8 @@ impl AutopilotSide {
                 let mut packets = parser.push(&message.packet);
                 packets.extend(parser.finish());
                 let now_s = simulation.now_s();
+                let newest = packets.iter().rev().find(|it| it.sender.component == AUTOPILOT);
+                *system = newest.map(|it| it.sender.system).or(*system);
                 if let VehicleSource::Reported(reported) = &mut *simulation.source() {
                     packets.iter().for_each(|packet| reported.handle(now_s, packet));
                 }
@@ -333,31 +346,39 @@ impl AutopilotSide {
                     }
                 }
             }
-            Self::Topics { requests, requested_s, .. } => {
+            Self::Topics { requests, requested_s, unanswered, system: Some(system), .. } => {
                 let now_s = simulation.now_s();
                 let is_true = match &*simulation.source() {
                     VehicleSource::Reported(reported) => reported.is_true(now_s),
                     VehicleSource::Simulated(_) => true,
                 };
-                if !is_true && now_s - *requested_s > REQUEST_PERIOD.as_secs_f64() {
+                if is_true {
+                    *unanswered = 0;
+                } else if now_s - *requested_s > REQUEST_PERIOD.as_secs_f64() {
                     *requested_s = now_s;
+                    *unanswered += 1;
+                    if *unanswered > MAX_UNANSWERED && node.health().failed(NO_TRUTH) {
+                        tracing::warn!("{NO_TRUTH}");
+                    }
                     for message in TRUTH_MESSAGES {
-                        requests.publish(&MavlinkBytes { packet: request_for(message) }).await;
+                        let packet = request_for(message, *system);
+                        requests.publish(&MavlinkBytes { packet }).await;
                     }
                 }
             }
+            Self::Topics { system: None, .. } => {}
         }
     }
 }
 
-/// SET_MESSAGE_INTERVAL for a message, to any system.
-fn request_for(message: f32) -> Vec<u8> {
+/// SET_MESSAGE_INTERVAL for a message. PX4 takes no command that is addressed to all systems.
+fn request_for(message: f32, system: u8) -> Vec<u8> {
     let message = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
         param1: message,
         param2: TRUTH_INTERVAL_US,
         command: MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
-        target_system: 0,
-        target_component: 1,
+        target_system: system,
+        target_component: AUTOPILOT,
         ..COMMAND_LONG_DATA::default()
     });
     autopilot::packet::encode(Sender { system: 255, component: 192 }, 0, &message)

@@ -93,10 +93,16 @@ impl SimulatedAutopilot {
         }
     }
 
-    /// Addressed to this autopilot, to all, or to nobody.
+    /// Addressed to this autopilot, to all, or to nobody. PX4 takes no command that is addressed to all systems
+    /// (`evaluate_target_ok` of its `mavlink_receiver.cpp`).
     fn is_addressed(&self, message: &MavMessage) -> bool {
         let sender = self.sender();
         let system = message.target_system_id().unwrap_or(0);
+        let is_command =
+            matches!(message, MavMessage::COMMAND_LONG(_) | MavMessage::COMMAND_INT(_));
+        if system == 0 && is_command && self.is_px4() {
+            return false;
+        }
         let component = message.target_component_id().unwrap_or(0);
         (system == 0 || system == sender.system)
             && (component == 0 || component == sender.component)
