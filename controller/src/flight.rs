@@ -336,6 +336,7 @@ impl Flight {
         if !std::mem::replace(&mut self.is_ending, true) && self.is_landing() {
             let result = self.setpoints.stop(now_ns, &mut self.autopilot);
             self.log_setpoint(result);
+            self.setpoints.hold_px4(now_ns, &mut self.autopilot);
         }
         let is_pending = self.limits.restore(&mut self.autopilot);
         self.autopilot.tick(now_ns);

@@ -27,6 +27,11 @@ const MPC_LAND_SPEED: [Scaled; 1] = [scaled("MPC_LAND_SPEED", 1.0)];
 /// PX4's time without setpoints until it leaves OFFBOARD, in s.
 const COM_OF_LOSS_T: &str = "COM_OF_LOSS_T";
 
+/// What PX4 does when setpoints stop, and its value for holding the place. By the default, position mode, a vehicle without a remote
+/// control descends and drifts.
+const COM_OBL_RC_ACT: &str = "COM_OBL_RC_ACT";
+const HOLDS: f64 = 5.0;
+
 /// Difference of two timeouts that count as the same, in seconds.
 const SAME_S: f64 = 1e-3;
 /// Longest timeout that is put back from a note: PX4 takes up to 60 s, ArduPilot 5 s.
@@ -78,6 +83,7 @@ pub struct Limits {
     is_refused: bool,
     active_ns: Option<i64>,
     known: Option<AutopilotLimits>,
+    is_told_of_silence: bool,
 }
 
 impl Limits {
@@ -91,6 +97,7 @@ impl Limits {
             is_refused: false,
             active_ns: None,
             known: None,
+            is_told_of_silence: false,
         }
     }
 
@@ -111,7 +118,7 @@ impl Limits {
                 }
             }
             Some(Firmware::Px4) => {
-                autopilot.read_parameters(&[COM_OF_LOSS_T, MPC_LAND_SPEED[0].name]);
+                autopilot.read_parameters(&[COM_OF_LOSS_T, COM_OBL_RC_ACT, MPC_LAND_SPEED[0].name]);
             }
             _ => {}
         }
@@ -141,6 +148,14 @@ impl Limits {
                     self.restore(autopilot);
                 }
             }
+        }
+        if let Some(action) = value(autopilot, COM_OBL_RC_ACT)
+            && action != HOLDS
+            && !std::mem::replace(&mut self.is_told_of_silence, true)
+        {
+            tracing::warn!(
+                "{COM_OBL_RC_ACT} is {action}: should this process die, a PX4 without a remote control descends and drifts; set it to {HOLDS} (hold)"
+            );
         }
         let mut limits = read(autopilot);
         // A setpoint that arrives once more, late, makes the autopilot wait once more.

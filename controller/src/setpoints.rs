@@ -42,7 +42,11 @@ impl Setpoints {
         autopilot: &mut Autopilot,
     ) -> Option<Result<(), SetpointError>> {
         match action {
-            Action::None => self.last = None,
+            Action::None => {
+                if self.last.take().is_some() {
+                    self.hold_px4(now_ns, autopilot);
+                }
+            }
             Action::Guided | Action::Disarm | Action::Land if !is_ours(autopilot) => {
                 self.last = None;
                 autopilot.withdraw();
@@ -76,6 +80,17 @@ impl Setpoints {
         autopilot: &mut Autopilot,
     ) -> Option<Result<(), SetpointError>> {
         self.last.map(|_| self.send(now_ns, Vector::zero(), 0.0, autopilot))
+    }
+
+    /// Has a PX4 hold its place once no setpoint is sent any more: in OFFBOARD it takes that for a failure of its companion, and
+    /// without a remote control it then descends and drifts with the wind (`COM_OBL_RC_ACT`). ArduPilot stops.
+    pub fn hold_px4(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
+        let is_followed = autopilot
+            .state()
+            .is_some_and(|state| state.connected && state.armed && state.mode.is_guided());
+        if is_followed && autopilot.firmware() == Some(Firmware::Px4) {
+            self.request(now_ns, Command::SetMode(FlightMode::AUTO_HOLD), autopilot);
+        }
     }
 
     /// Stops a vehicle of which only the system id is known.

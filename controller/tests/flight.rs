@@ -332,7 +332,7 @@ fn hover(flight: &mut Flight, from_ms: i64, to_ms: i64, mode: u32) -> Sent {
     sent
 }
 
-#[derive(Default)]
+#[derive(Debug, Default)]
 struct Sent {
     setpoints: usize,
     targets: Vec<LANDING_TARGET_DATA>,
@@ -515,6 +515,34 @@ fn landing_here_needs_neither_detections_nor_a_landing() {
     receive(&mut flight, 1000 * MS, &heartbeat(4, true));
     hover(&mut flight, 1020, 1500, 4);
     assert_eq!(flight.status(1500 * MS).phase, Phase::Search);
+}
+
+#[test]
+fn a_px4_is_asked_to_hold_its_place_when_setpoints_end() {
+    const GUIDED: u32 = 4;
+    const OFFBOARD: u32 = 0x0006_0000;
+    let begun = |mode| {
+        let mut flight = flight("airborne");
+        receive(&mut flight, 0, &heartbeat(mode, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        assert!(hover(&mut flight, 20, 1000, mode).setpoints > 20);
+        flight
+    };
+    // 4 is AUTO; without an answer the command is sent again.
+    for (mode, asked) in [(GUIDED, None), (OFFBOARD, Some(&4.0))] {
+        let mut flight = begun(mode);
+        assert!(flight.command(1000 * MS, &ControllerCommand::Abort).accepted);
+        let sent = hover(&mut flight, 1020, 5900, mode);
+        assert!(sent.setpoints > 100 && sent.modes.is_empty(), "{sent:?}");
+        let sent = hover(&mut flight, 5920, 7500, mode);
+        assert!(sent.setpoints < 20 && sent.modes.first() == asked, "{sent:?}");
+        // A controller that is asked to stop.
+        let mut flight = begun(mode);
+        flight.shutdown(1000 * MS);
+        let mut sent = Sent::default();
+        sent.take(&mut flight);
+        assert_eq!((sent.setpoints, sent.modes.first()), (1, asked), "{sent:?}");
+    }
 }
 
 #[test]

@@ -23,12 +23,17 @@ pub(crate) fn receive(flight: &mut Flight, now_ns: i64, message: &MavMessage) {
     }
 }
 
+/// A heartbeat in a mode of ArduPilot, or of PX4, whose modes are two numbers in the upper half.
 pub(crate) fn heartbeat(mode: u32, armed: bool) -> MavMessage {
+    let autopilot = match mode >> 16 {
+        0 => MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        _ => MavAutopilot::MAV_AUTOPILOT_PX4,
+    };
     let armed = if armed { MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED } else { MavModeFlag::empty() };
     MavMessage::HEARTBEAT(HEARTBEAT_DATA {
         custom_mode: mode,
         mavtype: MavType::MAV_TYPE_QUADROTOR,
-        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        autopilot,
         base_mode: armed,
         ..Default::default()
     })
