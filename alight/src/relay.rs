@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use clap::Args;
 use node::access::{HOLDERS, Holders};
 use node::{Identity, Network, Node, Shutdown, denied};
@@ -24,6 +24,8 @@ const BEAT: Duration = Duration::from_millis(100);
 const FROZEN: Duration = Duration::from_millis(1200);
 /// Period at which the list of holders is read.
 const HOLDERS_PERIOD: Duration = Duration::from_millis(500);
+/// Time after which a port that another process has is not waited for any more.
+const PORTS_PATIENCE: Duration = Duration::from_secs(2);
 /// Pause before it starts anew after a panic, so that one at every start does not use all of a core.
 const RELAUNCH_PAUSE: Duration = Duration::from_millis(200);
 
@@ -51,6 +53,7 @@ pub(crate) fn run(args: &RelayArgs) -> anyhow::Result<ExitCode> {
     let role = if config.as_os_str() == "drone" { "drone" } else { RELAY };
     let identity = Identity { service: RELAY, instance: args.id.clone() };
     let zenoh = network.source(role)?;
+    wait_for_ports(&network, role)?;
     let holders = HoldersFile::new(&network);
     relaunch_after_panics();
     let serve = async |node, shutdown| {
@@ -59,6 +62,20 @@ pub(crate) fn run(args: &RelayArgs) -> anyhow::Result<ExitCode> {
     };
     block_on(node::run(identity, &zenoh, serve))??;
     Ok(ExitCode::SUCCESS)
+}
+
+/// Waits until no other process has the relay's ports, which one that ends now may have for a moment.
+fn wait_for_ports(network: &Network, role: &str) -> anyhow::Result<()> {
+    let begun = Instant::now();
+    while let Some(endpoint) = network.taken_endpoint(role)? {
+        ensure!(
+            begun.elapsed() < PORTS_PATIENCE,
+            "another process listens at the relay's address {endpoint}, so nobody on the ground would reach this one. Stop it \
+             (another relay?), or choose another port: `address` of the site, or `--listen`"
+        );
+        std::thread::sleep(BEAT);
+    }
+    Ok(())
 }
 
 /// Starts anew when a thread panics: one of Zenoh's that did leaves its routing tables locked, and the process

@@ -157,7 +157,7 @@ impl Site {
             Role::Relay => &self.relay,
             Role::Local => &self.local,
         };
-        let mut jobs: Vec<Job> = self.relay_job(role).into_iter().collect();
+        let mut jobs: Vec<Job> = self.relay_job(role)?.into_iter().collect();
         for (number, entry) in entries.iter().enumerate() {
             let job = self
                 .job(role, entry)
@@ -182,21 +182,22 @@ impl Site {
         Ok(jobs)
     }
 
-    fn relay_job(&self, role: Role) -> Option<Job> {
-        let (config, reached_at) = match role {
-            Role::Drone => (Role::Drone, &self.address),
-            Role::Relay => (Role::Relay, &self.relay_address),
-            Role::Ground | Role::Local => return None,
+    fn relay_job(&self, role: Role) -> anyhow::Result<Option<Job>> {
+        let (config, key, reached_at) = match role {
+            Role::Drone => (Role::Drone, "address", &self.address),
+            Role::Relay => (Role::Relay, "relay_address", &self.relay_address),
+            Role::Ground | Role::Local => return Ok(None),
         };
         // It listens at the port to which others connect.
-        let address = reached_at.as_deref().map(Address::parse).transpose().ok().flatten();
+        let address = reached_at.as_deref().map(Address::parse).transpose();
+        let address = address.with_context(|| format!("`{key}` of the site"))?;
         let port = address.and_then(|address| address.port);
         let network = Network {
             config: Some(config.name().into()),
             listen: port.map(|port| format!("0.0.0.0:{port}")),
             ..self.network(role)
         };
-        Some(Job {
+        Ok(Some(Job {
             name: RELAY.to_owned(),
             service: None,
             command: vec![
@@ -208,7 +209,7 @@ impl Site {
             network,
             key: if role == Role::Drone { "drone" } else { RELAY }.to_owned(),
             layers: Layers::default(),
-        })
+        }))
     }
 
     fn job(&self, role: Role, entry: &Entry) -> anyhow::Result<Job> {

@@ -158,6 +158,23 @@ impl Network {
         Ok(config)
     }
 
+    /// The first endpoint at which this process is to listen whose port another one has. Zenoh would wait for it without a word.
+    ///
+    /// # Errors
+    /// As [`Network::source`].
+    pub fn taken_endpoint(&self, key_name: &str) -> anyhow::Result<Option<String>> {
+        let config = self.configuration(key_name)?;
+        let is_taken = |endpoint: &&str| {
+            // Port 0 is any that is free.
+            let Some(Endpoint { host, port: port @ 1.., .. }) = Endpoint::parse(endpoint) else {
+                return false;
+            };
+            let bound = std::net::TcpListener::bind(format!("{host}:{port}"));
+            bound.is_err_and(|problem| problem.kind() == std::io::ErrorKind::AddrInUse)
+        };
+        Ok(endpoints(&config, "listen").find(is_taken).map(str::to_owned))
+    }
+
     fn text(&self) -> anyhow::Result<(String, String)> {
         let Some(path) = &self.config else {
             return Ok(("the built-in `local`".to_owned(), LOCAL_CONFIG.to_owned()));
@@ -496,6 +513,21 @@ mod tests {
             Network { keys, connect, ..built_in("ground") },
             "alight keys issue --role detector",
         );
+    }
+
+    #[test]
+    fn a_port_that_another_process_has_is_named() {
+        let held = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = held.local_addr().unwrap().port();
+        let network = Network {
+            listen: Some(format!("127.0.0.1:{port}")),
+            insecure: true,
+            ..built_in("drone")
+        };
+        let taken = || network.taken_endpoint("drone").unwrap();
+        assert!(taken().is_some_and(|it| it.starts_with(&format!("tcp/127.0.0.1:{port}"))));
+        drop(held);
+        assert_ne!(taken().map(|it| it.contains(&format!(":{port}?"))), Some(true));
     }
 
     #[test]
