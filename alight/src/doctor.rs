@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use clap::Args;
 use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, topic};
-use node::access::Holder;
+use node::access::{HOLDERS, Holder, Holders};
 use node::network::{AIR_PORT, AUTHORITY, Address, check_private};
 use node::{INSECURE, Network, Node, clock_name, stats};
 use rustix::process::{Resource, getrlimit};
@@ -241,11 +241,30 @@ fn check_site(findings: &mut Findings, role: Role, jobs: &[Job]) {
             && !checked.contains(&job.key)
         {
             check_certificate(findings, keys, &job.key);
+            if checked.is_empty() {
+                check_holders(findings, keys, job.network.vehicle.as_deref().unwrap_or("drone"));
+            }
             checked.push(job.key.clone());
         }
         if let Some(service) = job.service {
             check_devices(findings, job, service);
         }
+    }
+}
+
+/// Checks that a list of holders among the keys names the drone: processes beside an older one refuse its relay.
+fn check_holders(findings: &mut Findings, keys: &Path, vehicle: &str) {
+    let path = keys.join(HOLDERS);
+    let Ok(text) = std::fs::read_to_string(&path) else { return };
+    let copy = "copy it from the authority's folder again, and start what reads it anew";
+    match text.parse::<Holders>() {
+        Err(problem) => findings.wrong("keys", format!("{}: {problem:#}", path.display()), copy),
+        Ok(holders) if !holders.has("drone", vehicle) => findings.wrong(
+            "keys",
+            format!("{} does not name `drone@{vehicle}`, which is refused", path.display()),
+            copy,
+        ),
+        Ok(_) => {}
     }
 }
 
@@ -393,7 +412,7 @@ async fn check_network(findings: &mut Findings, node: Node, watched: Watched, ex
     let mut seen = Seen::default();
     match watch(&node, &mut seen, watched).await {
         Ok(()) => {
-            check_presence(findings, &seen, expected);
+            check_presence(findings, &seen, expected, watched);
             check_replies(findings, &node, &seen).await;
             check_healths(findings, &seen);
             cameras::check(findings, &seen, watched.duration.as_secs());
@@ -453,7 +472,15 @@ fn keep<T>(kept: &mut Vec<T>, new: T, same: impl Fn(&T, &T) -> bool) {
     }
 }
 
-fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job]) {
+fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job], watched: Watched) {
+    if seen.peers.is_empty() && expected.is_empty() && watched.has_raw_frames {
+        findings.doubtful(
+            "services",
+            "no service runs on this machine".to_owned(),
+            "start them (`alight up`, `alight land`), or name a site (`alight doctor drone --config site.toml`)",
+        );
+        return;
+    }
     if seen.peers.is_empty() {
         findings.wrong(
             "services",

@@ -114,8 +114,11 @@ fn describe_frames(camera: &str, frames: &[&ReceivedFrame], seconds: u64) -> Str
     let is_raw = frames.iter().any(|frame| frame.header.format != PixelFormat::Jpeg);
     let bytes: usize = frames.iter().map(|frame| frame.bytes).sum();
     let megabits_s = bytes as f64 * 8e-6 / seconds as f64;
-    let kind = if is_raw { "raw frames" } else { "frames" };
+    let kind = if is_raw { "raw frames" } else { "JPEG frames" };
     let mut text = format!("camera `{camera}`: {rate_hz:.1} {kind}/s, {megabits_s:.2} Mbit/s");
+    if !is_raw {
+        text.push_str(" (it takes more: they are few where no detector acknowledges them)");
+    }
     match stats::quantile(&ages_ms(frames), 0.5) {
         Some(median_ms) => {
             // Writing to a string cannot fail.

@@ -131,6 +131,11 @@ impl Holders {
         Ok(())
     }
 
+    /// True when a vehicle's key in this role is among them.
+    pub fn has(&self, role: &str, vehicle: &str) -> bool {
+        self.of(role, vehicle).next().is_some()
+    }
+
     /// The holders of a vehicle's keys in a role.
     fn of<'a>(&'a self, role: &'a str, vehicle: &'a str) -> impl Iterator<Item = &'a Holder> {
         let of_both = move |holder: &&Holder| holder.role == role && holder.vehicle == vehicle;
