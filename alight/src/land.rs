@@ -207,7 +207,11 @@ impl ServiceSettings {
             settings.push(key.to_owned());
         }
         for (service, settings) in &by_service {
-            service.effective_config(&Layers { file: None, set: settings.clone() })?;
+            let checked = service.effective_config(&Layers { file: None, set: settings.clone() });
+            checked.map_err(|problem| match problem.downcast::<node::ConfigError>() {
+                Ok(problem) => problem.of_service(service.name()).into(),
+                Err(problem) => problem,
+            })?;
         }
         Ok(Self { by_service })
     }
@@ -245,6 +249,13 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         rendezvous.description,
         rendezvous.file.display()
     ));
+    if let Some(port) = rendezvous.unusual_port {
+        progress.say(&format!(
+            "Port {} is in use, by another landing or a detector that was left running: other commands find this landing with \
+             `export ALIGHT_MEET={port}`",
+            node::session::LOCAL_PORT
+        ));
+    }
     if let Some(address) = args.dashboard {
         let layers = Layers { file: None, set: settings.of(Service::Dashboard).to_vec() };
         let is_encrypted = layers.load::<dashboard::Config>()?.settings.certificate().is_some();
@@ -272,6 +283,14 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         ChildEvent::Exited(..) | ChildEvent::Line(..) => {}
     };
     children.stop(note_end).await;
+    let left = node.alive("detector", "*").await.unwrap_or_default();
+    if !left.is_empty() {
+        progress.say(&format!(
+            "Still running, and in the network of the next landing: detector {}. To end one: Ctrl-C where it was started, or \
+             `pkill -f 'alight detector'`",
+            left.join(", ")
+        ));
+    }
     node.close().await;
     let mut landing = watched?;
     if let Some(exit) = recorders_end {
@@ -375,7 +394,9 @@ async fn another_detector(node: &Node, settings: &ServiceSettings) -> anyhow::Re
 fn consequence(service: Service) -> &'static str {
     match service {
         Service::Detector => "; another detector is used as soon as one is ready",
-        Service::Controller => "; the autopilot stops a vehicle that flies",
+        Service::Controller => {
+            "; ArduPilot stops a vehicle that flies, PX4 does what its COM_OBL_RC_ACT says"
+        }
         Service::GcsBridge => "; the landing continues without the ground station",
         Service::Recorder => "; the landing continues, and is recorded no more",
         Service::Dashboard => "; the landing continues without the page",
@@ -387,6 +408,8 @@ fn consequence(service: Service) -> &'static str {
 struct Rendezvous {
     file: PathBuf,
     description: String,
+    /// The port, if it is not the usual one of a machine.
+    unusual_port: Option<u16>,
     /// Deletes the file at the end.
     _directory: TempDir,
     /// Keeps the port from other landings until the end.
@@ -403,7 +426,13 @@ impl Rendezvous {
         if let Some(file) = user_file {
             let file = file.to_owned();
             let description = file.display().to_string();
-            return Ok(Self { file, description, _directory: directory, _claim: None });
+            return Ok(Self {
+                file,
+                description,
+                unusual_port: None,
+                _directory: directory,
+                _claim: None,
+            });
         }
         let usual = node::session::LOCAL_PORT;
         let (port, lock) = match claim(usual) {
@@ -414,7 +443,8 @@ impl Rendezvous {
         std::fs::write(&file, node::session::local_config(port))
             .with_context(|| format!("writing {file:?}"))?;
         let description = format!("local, rendezvous at port {port}");
-        Ok(Self { file, description, _directory: directory, _claim: Some(lock) })
+        let unusual_port = (port != usual).then_some(port);
+        Ok(Self { file, description, unusual_port, _directory: directory, _claim: Some(lock) })
     }
 }
 

@@ -99,7 +99,13 @@ impl LandingSummary {
     }
 
     pub(crate) fn recorder(&mut self, recorder: RecorderStatus) {
-        self.recorder = Some(recorder);
+        // One that fails goes on without a file; what it kept is in the last one.
+        let before = self.recorder.replace(recorder).map(|before| before.file);
+        if let (Some(now), Some(before)) = (&mut self.recorder, before)
+            && now.file.is_empty()
+        {
+            now.file = before;
+        }
     }
 
     /// Notes that the recorder failed when it was to end its file.
@@ -153,7 +159,7 @@ impl LandingSummary {
             }
             (Some(why), None) => format!("{why}; no controller was running"),
             (None, _) if landed => "landed".to_owned(),
-            (None, Some(status)) => format!("{}: {}", status.phase, status.why),
+            (None, Some(status)) => phase_and_reason(status),
             (None, None) => "no controller was running".to_owned(),
         };
         Outcome {
@@ -238,11 +244,18 @@ impl Outcome {
                 count => format!("; {count} frames never came"),
             };
             let problem = problem.as_ref().map_or_else(String::new, |it| format!("; {it}"));
+            let file = if file.is_empty() { "no file" } else { file };
             line(format_args!("recorded {kept} messages, lost {dropped}{unseen}: {file}{problem}"));
         }
         text.truncate(text.trim_end().len());
         text
     }
+}
+
+/// A phase and its reason, which may begin with the phase's name.
+pub(crate) fn phase_and_reason(status: &ControllerStatus) -> String {
+    let phase = format!("{}: ", status.phase);
+    if status.why.starts_with(&phase) { status.why.clone() } else { phase + &status.why }
 }
 
 #[cfg(test)]

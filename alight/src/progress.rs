@@ -6,7 +6,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use messages::{ControllerStatus, Phase};
 
 use crate::args::Format;
-use crate::outcome::LandingSummary;
+use crate::outcome::{LandingSummary, phase_and_reason};
 use crate::terminal::write_error;
 
 /// The display of a landing.
@@ -63,7 +63,7 @@ impl Progress {
             && matches!(status.phase, Phase::Idle | Phase::Takeoff)
             && self.why != why;
         if self.phase.replace(status.phase) != Some(status.phase) || is_other_reason {
-            self.say(&format!("{}: {}", status.phase, status.why));
+            self.say(&phase_and_reason(status));
             self.why = why;
         }
         if status.active_detector != self.active_detector {

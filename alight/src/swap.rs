@@ -142,6 +142,12 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
                 "swapped: {new} is used instead of {old}; it agreed in {} of {} frames",
                 report.agreed, report.compared
             );
+            if let (Some(pid), Some(log), true) = (report.pid, &report.log, swap.is_verbose) {
+                let log = log.display();
+                report.why.push_str(&format!(
+                    "\n{new} is process {pid} (`kill {pid}` ends it), its log {log}"
+                ));
+            }
             if args.wait {
                 swap.wait().await;
             }

@@ -44,9 +44,7 @@ pub struct Layers {
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// A file that cannot be read.
-    #[error(
-        "reading the configuration file {path:?}: {cause}; check the path, or omit `--config` for the defaults"
-    )]
+    #[error("reading the configuration file {path:?}: {cause}; check the path")]
     Unreadable {
         /// The file.
         path: PathBuf,
@@ -103,6 +101,41 @@ pub enum ConfigError {
         /// What it must be.
         limit: String,
     },
+}
+
+impl ConfigError {
+    /// The same of a setting of several services, whose keys begin with the service's name.
+    #[must_use]
+    pub fn of_service(self, service: &str) -> Self {
+        let source = |name: String| match name.strip_prefix("--set ") {
+            Some(setting) => format!("--set {service}.{setting}"),
+            None => name,
+        };
+        match self {
+            Self::UnknownKey { source_name, key, hint } => Self::UnknownKey {
+                source_name: source(source_name),
+                key: format!("{service}.{key}"),
+                hint: hint.replace("did you mean `", &format!("did you mean `{service}.")),
+            },
+            Self::WrongType { source_name, key, value, found, wanted } => Self::WrongType {
+                source_name: source(source_name),
+                key: format!("{service}.{key}"),
+                value,
+                found,
+                wanted,
+            },
+            Self::Refused { source_name, key, value, limit } => Self::Refused {
+                source_name: source(source_name),
+                key: format!("{service}.{key}"),
+                value,
+                limit,
+            },
+            Self::Syntax { source_name, cause } => {
+                Self::Syntax { source_name: source(source_name), cause }
+            }
+            other => other,
+        }
+    }
 }
 
 /// A configuration as values and as TOML.
