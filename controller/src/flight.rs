@@ -331,16 +331,16 @@ impl Flight {
     }
 
     /// Stops the vehicle where it is: without a last setpoint it would stop only after its setpoint timeout, which
-    /// is put back. True while the autopilot has not confirmed that.
+    /// is put back. True while the autopilot has not confirmed that, or a PX4 is not yet asked to hold its place.
     pub fn shutdown(&mut self, now_ns: i64) -> bool {
-        if !std::mem::replace(&mut self.is_ending, true) && self.is_landing() {
+        if !std::mem::replace(&mut self.is_ending, true) {
             let result = self.setpoints.stop(now_ns, &mut self.autopilot);
             self.log_setpoint(result);
-            self.setpoints.hold_px4(now_ns, &mut self.autopilot);
         }
+        let waits = self.setpoints.end(now_ns, &mut self.autopilot);
         let is_pending = self.limits.restore(&mut self.autopilot);
         self.autopilot.tick(now_ns);
-        is_pending
+        is_pending || waits
     }
 
     /// The next packet for the autopilot.

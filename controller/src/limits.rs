@@ -154,7 +154,7 @@ impl Limits {
             && !std::mem::replace(&mut self.is_told_of_silence, true)
         {
             tracing::warn!(
-                "{COM_OBL_RC_ACT} is {action}: should this process die, a PX4 without a remote control descends and drifts; set it to {HOLDS} (hold)"
+                "{COM_OBL_RC_ACT} is {action}: should this process die, PX4 does that instead of holding its place, and in the modes 0 to 2 it descends and drifts without a remote control; set it to {HOLDS} (hold)"
             );
         }
         let mut limits = read(autopilot);

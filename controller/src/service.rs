@@ -22,8 +22,9 @@ use crate::tape::TapedFlight;
 
 /// Period of the flight's ticks.
 const TICK: Duration = Duration::from_millis(25);
-/// Longest wait at shutdown for the autopilot to confirm that its parameter is put back.
-const SHUTDOWN_TIMEOUT: Duration = Duration::from_millis(500);
+/// Longest wait at shutdown for the autopilot to confirm that its parameter is put back, and for the heartbeat, one a second, after
+/// which a PX4 is asked to hold its place.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_millis(1200);
 /// Period of the status while nothing changes, in nanoseconds.
 const STATUS_PERIOD_NS: i64 = 200_000_000;
 /// Period of the check whether the status has changed, in nanoseconds.

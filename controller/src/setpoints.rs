@@ -14,12 +14,26 @@ pub struct Setpoints {
     sent_ns: i64,
     /// The change to the mode that follows setpoints, or the disarming, that was requested last.
     request: Option<CommandId>,
+    /// When LAND was requested last.
+    land_ns: Option<i64>,
 }
+
+/// Time after a request in which LAND may not show yet, in nanoseconds.
+const LAND_SHOWS_NS: i64 = 3_000_000_000;
+/// Age up to which a position is of now, and a mode can hardly have been changed by a pilot since its heartbeat, in nanoseconds.
+const FRESH_NS: i64 = 500_000_000;
+const NEW_MODE_NS: i64 = 200_000_000;
 
 impl Setpoints {
     /// Nothing was sent yet.
     pub fn new(rate_hz: f64) -> Self {
-        Self { period_ns: (1e9 / rate_hz) as i64, last: None, sent_ns: i64::MIN, request: None }
+        Self {
+            period_ns: (1e9 / rate_hz) as i64,
+            last: None,
+            sent_ns: i64::MIN,
+            request: None,
+            land_ns: None,
+        }
     }
 
     /// The last setpoint; `None` while none is sent.
@@ -42,11 +56,10 @@ impl Setpoints {
         autopilot: &mut Autopilot,
     ) -> Option<Result<(), SetpointError>> {
         match action {
-            Action::None => {
-                if self.last.take().is_some() {
-                    self.hold_px4(now_ns, autopilot);
-                }
+            Action::None if self.last.is_some() && self.needs_hold(now_ns, autopilot) => {
+                return self.hold_when_known(now_ns, autopilot);
             }
+            Action::None => self.last = None,
             Action::Guided | Action::Disarm | Action::Land if !is_ours(autopilot) => {
                 self.last = None;
                 autopilot.withdraw();
@@ -59,6 +72,7 @@ impl Setpoints {
             }
             Action::Disarm => self.request(now_ns, Command::Disarm, autopilot),
             Action::Land => {
+                self.land_ns = Some(now_ns);
                 let mode = autopilot.firmware().and_then(Firmware::land);
                 autopilot.request(now_ns, Command::SetMode(mode.unwrap_or(FlightMode::Land)));
                 // Sent at once: at half a metre every tick counts.
@@ -82,15 +96,44 @@ impl Setpoints {
         self.last.map(|_| self.send(now_ns, Vector::zero(), 0.0, autopilot))
     }
 
-    /// Has a PX4 hold its place once no setpoint is sent any more: in OFFBOARD it takes that for a failure of its companion, and
-    /// without a remote control it then descends and drifts with the wind (`COM_OBL_RC_ACT`). ArduPilot stops.
-    pub fn hold_px4(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
-        let is_followed = autopilot
-            .state()
-            .is_some_and(|state| state.connected && state.armed && state.mode.is_guided());
-        if is_followed && autopilot.firmware() == Some(Firmware::Px4) {
-            self.request(now_ns, Command::SetMode(FlightMode::AUTO_HOLD), autopilot);
+    /// Ends the setpoints, after the last one has stopped the vehicle; true while it waits for the heartbeat after which a PX4 is
+    /// asked to hold its place.
+    pub fn end(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
+        if self.last.is_none() || !self.needs_hold(now_ns, autopilot) {
+            self.last = None;
+            return false;
         }
+        self.hold_when_known(now_ns, autopilot);
+        self.last.is_some()
+    }
+
+    /// Asks for HOLD once a heartbeat has just told that the mode is ours; until then it may be the pilot's already, and zero
+    /// setpoints go on.
+    fn hold_when_known(
+        &mut self,
+        now_ns: i64,
+        autopilot: &mut Autopilot,
+    ) -> Option<Result<(), SetpointError>> {
+        if autopilot.heartbeat_age_ns(now_ns).is_some_and(|age_ns| age_ns < NEW_MODE_NS) {
+            self.last = None;
+            self.request(now_ns, Command::SetMode(FlightMode::AUTO_HOLD), autopilot);
+            return None;
+        }
+        let is_due = now_ns.saturating_sub(self.sent_ns) >= self.period_ns;
+        is_due.then(|| self.send(now_ns, Vector::zero(), 0.0, autopilot))
+    }
+
+    /// Whether silence would be a failure: a PX4 in OFFBOARD takes it for that of its companion, and without a remote control it
+    /// then descends and drifts with the wind (`COM_OBL_RC_ACT`). ArduPilot stops.
+    fn needs_hold(&self, now_ns: i64, autopilot: &Autopilot) -> bool {
+        let lands =
+            self.land_ns.is_some_and(|land_ns| now_ns.saturating_sub(land_ns) < LAND_SHOWS_NS);
+        let is_followed = autopilot.state().is_some_and(|state| {
+            let is_fresh =
+                state.position.is_some_and(|it| now_ns.saturating_sub(it.stamp_ns) < FRESH_NS);
+            state.connected && state.armed && state.mode.is_guided() && is_fresh
+        });
+        is_followed && !lands && autopilot.firmware() == Some(Firmware::Px4)
     }
 
     /// Stops a vehicle of which only the system id is known.

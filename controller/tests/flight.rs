@@ -535,13 +535,26 @@ fn a_px4_is_asked_to_hold_its_place_when_setpoints_end() {
         let sent = hover(&mut flight, 1020, 5900, mode);
         assert!(sent.setpoints > 100 && sent.modes.is_empty(), "{sent:?}");
         let sent = hover(&mut flight, 5920, 7500, mode);
-        assert!(sent.setpoints < 20 && sent.modes.first() == asked, "{sent:?}");
-        // A controller that is asked to stop.
+        assert!(sent.setpoints < 30 && sent.modes.first() == asked, "{sent:?}");
+        // A controller that is asked to stop, and knows the mode of almost a second ago only.
         let mut flight = begun(mode);
-        flight.shutdown(1000 * MS);
+        assert_eq!(flight.shutdown(1000 * MS), asked.is_some());
         let mut sent = Sent::default();
         sent.take(&mut flight);
-        assert_eq!((sent.setpoints, sent.modes.first()), (1, asked), "{sent:?}");
+        assert!(sent.setpoints == 1 && sent.modes.is_empty(), "{sent:?}");
+        pose(&mut flight, 1040 * MS);
+        receive(&mut flight, 1050 * MS, &heartbeat(mode, true));
+        assert!(!flight.shutdown(1060 * MS));
+        sent.take(&mut flight);
+        assert_eq!(sent.modes.first(), asked, "{sent:?}");
+        // The pilot has taken over meanwhile.
+        let mut flight = begun(mode);
+        flight.shutdown(1000 * MS);
+        receive(&mut flight, 1050 * MS, &heartbeat(mode + (1 << 16), true));
+        assert!(!flight.shutdown(1060 * MS));
+        let mut sent = Sent::default();
+        sent.take(&mut flight);
+        assert!(sent.modes.is_empty(), "{sent:?}");
     }
 }
 

@@ -342,6 +342,11 @@ impl Autopilot {
         outcome.map_or(CommandStatus::Unknown, |(_, status)| status.clone())
     }
 
+    /// Time since the last heartbeat, which tells mode and motors, in ns; `None` before the first.
+    pub fn heartbeat_age_ns(&self, now_ns: i64) -> Option<i64> {
+        self.vehicle.as_ref().map(|vehicle| now_ns.saturating_sub(vehicle.heartbeat_ns))
+    }
+
     /// Sends a velocity in m/s, with a yaw rate in rad/s (0 holds the heading): at least twice a second,
     /// because the autopilot flies on with the last one for 3 s. Zeros stop the vehicle.
     ///
