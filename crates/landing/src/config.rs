@@ -341,7 +341,7 @@ settings! {
         /// Image margin for the vehicle's attitude changes, in rad.
         view_margin_rad: f64 = 0.07, 0.0..=0.5;
         /// Time constant of the observer of the autopilot's velocity bias, in s.
-        drift_time_s: f64 = 0.3, 0.1..=60.0;
+        drift_time_s: f64 = 0.3, 0.2..=60.0;
         /// Maximum bias of the autopilot's velocity, in m/s; 0 turns the observer off.
         max_drift_m_s: f64 = 0.8, 0.0..=1.0;
         /// Maximum speed of a pad that is followed, in m/s.

@@ -47,7 +47,8 @@ const NOISE_GAIN: f64 = 0.08;
 const MAX_NOISE_SCALE: f64 = 30.0;
 
 /// How far the autopilot's position may have wandered since the last detection, in metres: at once, and per second up to a longest
-/// time. Velocities of PX4 in its own simulation err by up to 0.6 m/s for seconds.
+/// time. Half a metre a second is more than the 0.07 to 0.23 m/s by which PX4's position drifts in its own simulation; from frame to
+/// frame it jumps as well.
 const WANDER_M: f64 = 0.02;
 const WANDER_M_S: f64 = 0.5;
 const MAX_WANDER_S: f64 = 0.3;

@@ -103,6 +103,8 @@ const STANDING_S: [f64; 2] = [0.4, 0.9];
 /// Time for which a vehicle near the ground that is commanded down has not sunk until it is steered sideways no more, in seconds:
 /// one that stands, and whose reported velocity errs, would be commanded faster and faster, and slide.
 const TOUCHING_S: f64 = 0.25;
+/// Maximum climb speed of a vehicle that may stand, in m/s: the reported one errs.
+const MAX_RISING_M_S: f64 = 0.1;
 
 /// Height below which the rest of the descent takes less time than another try, in metres, and the factor by
 /// which the allowed deviation grows there.
@@ -200,11 +202,15 @@ impl Guidance for Metric {
         self.observer = Some(observer);
         let (mut lateral, (mut descent_m_s, why)) =
             (self.lateral(&observer, situation, &target), self.descent(situation, &target));
-        if let Some(touching_s) = self.touching_s(situation, &target) {
+        // A vehicle that is out of its funnel is to climb, also from the ground.
+        if descent_m_s >= 0.0
+            && let Some(touching_s) = self.touching_s(situation, &target)
+        {
             // Whether it stands shows while it is pushed down.
             descent_m_s = fmax(descent_m_s, 2.0 * PUSHING_M_S);
             if touching_s >= TOUCHING_S {
-                lateral = horizontal(target.velocity);
+                // The velocity that the autopilot reports of a vehicle that stands.
+                lateral = horizontal(target.velocity) - observer.bias;
                 observer.path = Path::new(lateral);
             }
         }
@@ -384,9 +390,10 @@ impl Metric {
         }
     }
 
-    /// For how long a vehicle near the ground has not sunk although it is commanded down; `None` if it sinks.
+    /// For how long a vehicle near the ground has not sunk although it is commanded down; `None` if it sinks, or rises as in a gust.
     fn touching_s(&self, situation: &Situation<'_>, target: &TargetEstimate) -> Option<f64> {
-        let since = self.standing_since.filter(|_| self.height_m(target) <= NEAR_M)?;
+        let rises = target.velocity.z() - situation.vehicle.velocity.z() > MAX_RISING_M_S;
+        let since = self.standing_since.filter(|_| self.height_m(target) <= NEAR_M && !rises)?;
         Some(situation.now.seconds_since(since))
     }
 
