@@ -166,9 +166,13 @@ impl Network {
         let config = self.configuration(key_name)?;
         let is_taken = |endpoint: &&str| {
             // Port 0 is any that is free.
-            let Some(Endpoint { host, port: port @ 1.., .. }) = Endpoint::parse(endpoint) else {
+            let Some(Endpoint { protocol, host, port: port @ 1.., .. }) = Endpoint::parse(endpoint)
+            else {
                 return false;
             };
+            if !["tcp", "tls"].contains(&protocol.as_str()) {
+                return false;
+            }
             let bound = std::net::TcpListener::bind(format!("{host}:{port}"));
             bound.is_err_and(|problem| problem.kind() == std::io::ErrorKind::AddrInUse)
         };

@@ -84,10 +84,14 @@ where
         // The process can be stopped also while it cannot join the network.
         () = shutdown.requested() => return Ok(()),
     };
+    // In a task of its own: it goes on however busy the service is.
+    let told = node.clone();
+    let mut health = tokio::spawn(async move { told.publish_health().await });
     let result = tokio::select! {
         result = service(node.clone(), shutdown.clone()) => result,
-        result = node.publish_health() => result,
+        result = &mut health => result.context("reporting the health").flatten(),
     };
+    health.abort();
     tracing::info!(service = node.identity().service, "Stopping");
     node.close().await;
     result
