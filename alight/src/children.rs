@@ -77,14 +77,17 @@ impl Children<Service> {
         command.arg(service.name()).arg("--zenoh").arg(zenoh);
         command.arg("--stop-with-parent").arg(std::process::id().to_string());
         let mut by_hand = format!("alight {} --zenoh {}", service.name(), zenoh.display());
+        let is_start =
+            |setting: &str| setting.split('=').next().is_some_and(|key| key.trim() == "start");
         for setting in settings {
             command.arg("--set").arg(setting);
+            if service != Service::Controller || !is_start(setting) {
+                by_hand.push_str(&format!(" --set '{setting}'"));
+            }
+        }
+        if service == Service::Controller {
             // A restarted controller resumes the landing, and never takes off a second time.
-            let again = match service == Service::Controller && setting.starts_with("start=") {
-                true => "start=\"resume\"",
-                false => setting,
-            };
-            by_hand.push_str(&format!(" --set '{again}'"));
+            by_hand.push_str(" --set 'start=\"resume\"'");
         }
         if std::env::var_os("ALIGHT_LOG").is_none() {
             command.env("ALIGHT_LOG", "warn");

@@ -283,13 +283,21 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         ChildEvent::Exited(..) | ChildEvent::Line(..) => {}
     };
     children.stop(note_end).await;
-    let left = node.alive("detector", "*").await.unwrap_or_default();
-    if !left.is_empty() {
-        progress.say(&format!(
-            "Still running, and in the network of the next landing: detector {}. To end one: Ctrl-C where it was started, or \
-             `pkill -f 'alight detector'`",
-            left.join(", ")
-        ));
+    // In a user's own network, and beside another landing, detectors may be meant to go on.
+    if args.zenoh.is_none()
+        && rendezvous.unusual_port.is_none()
+        && let Ok(landing) = &watched
+    {
+        for left in node.alive("detector", "*").await.unwrap_or_default() {
+            let end = landing
+                .pid_of("detector", &left)
+                .map_or("Ctrl-C where it was started ends it".to_owned(), |pid| {
+                    format!("`kill {pid}` ends it")
+                });
+            progress.say(&format!(
+                "Detector {left} still runs, and will be in the network of the next landing; {end}"
+            ));
+        }
     }
     node.close().await;
     let mut landing = watched?;
@@ -349,7 +357,7 @@ async fn watch(
                     if service == Service::Controller {
                         controllers_exit = Some(exit.to_string());
                         if !landing.never_flew() {
-                            progress.say(&format!("To resume the landing: {resume}"));
+                            progress.say(&format!("To resume the landing, while the vehicle is in GUIDED or OFFBOARD: {resume}"));
                         }
                     }
                     // The landing needs no ground station, recording or page.

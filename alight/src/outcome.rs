@@ -131,6 +131,18 @@ impl LandingSummary {
         });
     }
 
+    /// The newest process number of a service, from its health.
+    pub(crate) fn pid_of(&self, service: &str, instance: &str) -> Option<u32> {
+        let is_its = |((name, _), (_, last)): &(&(String, u32), &(Health, Health))| {
+            name == service && last.instance == instance
+        };
+        self.healths
+            .iter()
+            .filter(is_its)
+            .max_by_key(|(_, (_, last))| last.stamp_ns)
+            .map(|((_, pid), _)| *pid)
+    }
+
     /// True while no landing has begun.
     pub(crate) fn never_flew(&self) -> bool {
         self.started_ns.is_none()
