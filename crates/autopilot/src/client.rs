@@ -569,18 +569,16 @@ impl Autopilot {
     }
 
     fn check_silence(&mut self, now_ns: i64) {
-        let limit_ns = ns(self.config.heartbeat_timeout);
         let Some(vehicle) = &mut self.vehicle else { return };
         let silence_ns = now_ns.saturating_sub(vehicle.heartbeat_ns);
-        if vehicle.state.connected && silence_ns > limit_ns {
+        if vehicle.state.connected && silence_ns > ns(self.config.heartbeat_timeout) {
             vehicle.state.connected = false;
             // It may have restarted when it returns, or be another one, so what it said does not hold.
             vehicle.readiness = Readiness::default();
             vehicle.simulation = Simulation::default();
             vehicle.state.ready = false;
-            let silence = Duration::from_nanos(silence_ns.max(0) as u64);
-            let state = vehicle.state;
-            self.push(Event::Lost { silence });
+            let (silence_ns, state) = (silence_ns.max(0) as u64, vehicle.state);
+            self.push(Event::Lost { silence: Duration::from_nanos(silence_ns) });
             self.push(Event::Status(state));
             self.fail_requests(|command| CommandError::NoAutopilot { command });
         }
