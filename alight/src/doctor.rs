@@ -473,6 +473,7 @@ fn keep<T>(kept: &mut Vec<T>, new: T, same: impl Fn(&T, &T) -> bool) {
 }
 
 fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job], watched: Watched) {
+    // Without a site, and on this machine, nothing need run yet.
     if seen.peers.is_empty() && expected.is_empty() && watched.has_raw_frames {
         findings.doubtful(
             "services",
