@@ -19,13 +19,14 @@ use crate::compose;
 use crate::config::Config;
 use crate::contact::Contact;
 use crate::dialect::{
-    COMMAND_ACK_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag, MavSeverity,
-    MavType, TIMESYNC_DATA,
+    COMMAND_ACK_DATA, EVENT_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag,
+    MavSeverity, MavType, TIMESYNC_DATA,
 };
 use crate::event::Event;
 use crate::mode::{Firmware, FlightMode};
 use crate::packet::{self, Packet, Sender};
 use crate::parameter::{Parameter, Parameters};
+use crate::px4_events;
 use crate::simulation::Simulation;
 use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
 use crate::stream::{Stream, Streams};
@@ -146,6 +147,9 @@ impl Autopilot {
                 for (severity, text) in texts.unwrap_or_default() {
                     self.take_text(severity, text);
                 }
+            }
+            MavMessage::EVENT(event) if self.firmware() == Some(Firmware::Px4) => {
+                self.take_px4_event(event);
             }
             MavMessage::TIMESYNC(sync) => self.take_time(now_ns, packet.sender, sync),
             MavMessage::PARAM_VALUE(value) => {
@@ -595,6 +599,14 @@ impl Autopilot {
             vehicle.readiness.take_text(&text);
         }
         self.push(Event::Text { severity, text });
+    }
+
+    fn take_px4_event(&mut self, event: &EVENT_DATA) {
+        let Some(told) = px4_events::told(event) else { return };
+        if let Some(vehicle) = self.vehicle.as_mut().filter(|_| told.is_check) {
+            vehicle.readiness.take_failed_check(&told.text);
+        }
+        self.take_text(told.severity, told.text);
     }
 
     fn take_acknowledgement(&mut self, now_ns: i64, ack: &COMMAND_ACK_DATA) {

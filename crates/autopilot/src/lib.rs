@@ -37,6 +37,7 @@ pub mod packet;
 pub mod parameter;
 pub mod peers;
 pub mod permission;
+mod px4_events;
 pub mod signing;
 mod simulation;
 pub mod state;

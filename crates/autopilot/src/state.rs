@@ -274,6 +274,11 @@ impl Readiness {
         }
     }
 
+    /// A check before arming has failed.
+    pub(crate) fn take_failed_check(&mut self, text: &str) {
+        self.complaint = Some(text.to_owned());
+    }
+
     pub(crate) fn is_ready(&self) -> bool {
         let estimates = match (self.ekf, self.estimator) {
             (Some(flags), _) => ekf_is_ready(flags),

@@ -9,10 +9,10 @@
 use std::collections::BTreeMap;
 
 use autopilot::dialect::{
-    ATTITUDE_DATA, COMMAND_ACK_DATA, COMMAND_LONG_DATA, ESTIMATOR_STATUS_DATA,
+    ATTITUDE_DATA, COMMAND_ACK_DATA, COMMAND_LONG_DATA, ESTIMATOR_STATUS_DATA, EVENT_DATA,
     EXTENDED_SYS_STATE_DATA, EstimatorStatusFlags, GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA,
     LOCAL_POSITION_NED_DATA, MavAutopilot, MavCmd, MavLandedState, MavMessage, MavModeFlag,
-    MavResult, MavType,
+    MavResult, MavSysStatusSensor, MavType, SYS_STATUS_DATA,
 };
 use autopilot::packet::{self, Sender};
 use autopilot::{
@@ -246,6 +246,29 @@ fn it_becomes_ready_by_px4s_own_messages() {
     assert_eq!(world.client.firmware(), Some(Firmware::Px4));
     assert!(world.client.state().unwrap().ready, "{:?}", world.client.not_ready_because());
     assert!(!world.px4.intervals.contains_key(&193), "EKF_STATUS_REPORT is ArduPilot's");
+}
+
+#[test]
+fn why_it_does_not_arm_is_told_from_its_events() {
+    let mut world = World::new();
+    let failing = MavSysStatusSensor::MAV_SYS_STATUS_PREARM_CHECK;
+    world.px4.queue.push(MavMessage::SYS_STATUS(SYS_STATUS_DATA {
+        onboard_control_sensors_present: failing,
+        ..Default::default()
+    }));
+    let mut arguments = [0; 40];
+    arguments[..4].copy_from_slice(&[0xff; 4]);
+    for (id, log_levels) in [(0x0106_ed29, 0x44), (0x0102_089d, 0x62)] {
+        let event = EVENT_DATA { id, log_levels, arguments, ..Default::default() };
+        world.px4.queue.push(MavMessage::EVENT(event));
+    }
+    world.step();
+    assert_eq!(world.client.not_ready_because(), ["prearm: No manual control input"]);
+    let texts: Vec<_> = std::iter::from_fn(|| world.client.poll_event())
+        .filter_map(|event| if let Event::Text { text, .. } = event { Some(text) } else { None })
+        .collect();
+    let denied = "Arming denied: Resolve system health failures first";
+    assert_eq!(texts, ["No manual control input", denied]);
 }
 
 #[test]

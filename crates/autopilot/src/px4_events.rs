@@ -1,0 +1,381 @@
+//! What PX4 tells in EVENT messages: why it does not arm, failsafes and the like.
+//!
+//! PX4 sends texts (STATUSTEXT) only over links on which it hears a ground station; events it sends over all of them, as numbers with
+//! arguments (<https://mavlink.io/en/services/events.html>). The texts here are of the metadata that PX4 v1.17.0-alpha1 is built
+//! with (`events/all_events.json`; BSD 3-clause): the checks before arming and of the health, and what the commander says of arming,
+//! failsafes, modes, take-off and landing. An event that is not among them is told by its number.
+
+use crate::dialect::{EVENT_DATA, MavSeverity};
+
+/// Bits of an event's id that tell the event; those above tell the component.
+const EVENT_BITS: u32 = 0x00ff_ffff;
+/// The least severe of PX4's levels that is told, and that of a check. What is above has no text, or is for programs.
+const INFORMATION: u8 = 6;
+const WARNING: u8 = 4;
+/// PX4's modes to hold, to take off and to land, as a check before arming tells for which it fails.
+const OUR_MODES: u32 = 0x10 | 0x2_0000 | 0x4_0000;
+
+/// What an event says.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Told {
+    pub(crate) severity: MavSeverity,
+    pub(crate) text: String,
+    /// A check before arming that fails.
+    pub(crate) is_check: bool,
+}
+
+/// An argument in a text.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum Kind {
+    U8,
+    U16,
+    I16,
+    F32,
+    Action,
+    Cause,
+    Mode,
+    Reason,
+}
+
+use Kind::{Action, Cause, F32, I16, Mode, Reason, U8, U16};
+
+/// An event's number, whether it is a check before arming, its text, and the arguments in it with their place in bytes.
+type Row = (u32, bool, &'static str, &'static [(Kind, usize)]);
+
+/// What PX4 does in a failsafe, why, its modes, and why it arms and disarms, by number.
+const ACTIONS: [&str; 11] = [
+    "nothing",
+    "a warning",
+    "Position mode",
+    "Altitude mode",
+    "Stabilized mode",
+    "Hold",
+    "RTL",
+    "Land",
+    "Descend",
+    "disarm",
+    "terminate",
+];
+const CAUSES: [&str; 7] = [
+    "Failsafe",
+    "Manual control loss",
+    "GCS connection loss",
+    "Low battery level",
+    "Critical battery level",
+    "Emergency battery level",
+    "Remaining flight time low",
+];
+const MODES: [&str; 16] = [
+    "Manual",
+    "Altitude control",
+    "Position control",
+    "Mission",
+    "Hold",
+    "RTL",
+    "Acro",
+    "Offboard",
+    "Stabilized",
+    "Position Slow",
+    "Takeoff",
+    "Land",
+    "Follow Target",
+    "Precision Landing",
+    "Orbit",
+    "Vtol Takeoff",
+];
+const REASONS: [&str; 15] = [
+    "transition to standby",
+    "stick gesture",
+    "RC switch",
+    "internal command",
+    "external command",
+    "mission start",
+    "landing",
+    "auto preflight disarming",
+    "kill switch",
+    "lockdown",
+    "failure detector",
+    "shutdown request",
+    "unit tests",
+    "RC (button)",
+    "failsafe",
+];
+
+/// What an event says; `None` for one that is for programs, or a check for a mode that no landing needs.
+pub(crate) fn told(event: &EVENT_DATA) -> Option<Told> {
+    let level = event.log_levels & 0x0f;
+    let severity = severity(level)?;
+    let number = event.id & EVENT_BITS;
+    let row = TABLE.binary_search_by_key(&number, |row| row.0).ok().and_then(|at| TABLE.get(at));
+    let Some((_, is_check, text, arguments)) = row else {
+        let text = format!("PX4's event {number}, whose text is not known here");
+        return (level <= WARNING).then_some(Told { severity, text, is_check: false });
+    };
+    let modes = u32::from_le_bytes(bytes(event, 0));
+    if *is_check && (level > WARNING || modes & OUR_MODES == 0) {
+        return None;
+    }
+    let mut text = (*text).to_owned();
+    for (kind, at) in *arguments {
+        text = text.replacen("{}", &argument(event, *kind, *at), 1);
+    }
+    Some(Told { severity, text, is_check: *is_check })
+}
+
+fn severity(level: u8) -> Option<MavSeverity> {
+    Some(match level {
+        0 => MavSeverity::MAV_SEVERITY_EMERGENCY,
+        1 => MavSeverity::MAV_SEVERITY_ALERT,
+        2 => MavSeverity::MAV_SEVERITY_CRITICAL,
+        3 => MavSeverity::MAV_SEVERITY_ERROR,
+        WARNING => MavSeverity::MAV_SEVERITY_WARNING,
+        5 => MavSeverity::MAV_SEVERITY_NOTICE,
+        INFORMATION => MavSeverity::MAV_SEVERITY_INFO,
+        _ => return None,
+    })
+}
+
+fn argument(event: &EVENT_DATA, kind: Kind, at: usize) -> String {
+    let [byte] = bytes(event, at);
+    let named = |names: &[&str]| {
+        names.get(usize::from(byte)).map_or_else(|| byte.to_string(), |name| (*name).to_owned())
+    };
+    match kind {
+        U8 => byte.to_string(),
+        U16 => u16::from_le_bytes(bytes(event, at)).to_string(),
+        I16 => i16::from_le_bytes(bytes(event, at)).to_string(),
+        F32 => format!("{:.1}", f32::from_le_bytes(bytes(event, at))),
+        Action => named(&ACTIONS),
+        Cause => named(&CAUSES),
+        Mode => named(&MODES),
+        Reason => named(&REASONS),
+    }
+}
+
+/// Bytes of the arguments; those that are not there are zero.
+fn bytes<const N: usize>(event: &EVENT_DATA, at: usize) -> [u8; N] {
+    std::array::from_fn(|i| event.arguments.get(at + i).copied().unwrap_or(0))
+}
+
+#[rustfmt::skip] // A line for each event.
+const TABLE: [Row; 165] = [
+    (51327, false, "Emergency battery level, land immediately", &[]),
+    (79408, true, "Home position not set", &[]),
+    (124285, true, "Geofence RTL requires valid home", &[]),
+    (133277, false, "Arming denied: Resolve system health failures first", &[]),
+    (143019, true, "Geofence violation: approaching or outside geofence", &[]),
+    (276785, true, "Press safety button first", &[]),
+    (377561, true, "No valid mission available", &[]),
+    (453929, true, "No manual control input", &[]),
+    (516062, true, "GPS Vertical Position Error too high", &[]),
+    (666479, true, "Motor failure detected", &[]),
+    (713405, false, "Manual control regained after {} s", &[(F32, 0)]),
+    (810921, true, "Waypoint above maximum height", &[]),
+    (961599, false, "Pilot took over using sticks", &[]),
+    (1049276, true, "GPS Horizontal Position Error too high", &[]),
+    (1058956, true, "CPU load too high: {}%", &[(F32, 5)]),
+    (1326449, true, "Gyro {} uncalibrated", &[(U8, 5)]),
+    (1670367, true, "Avionics Power low: {} Volt", &[(F32, 5)]),
+    (1746622, false, "Pilot took over using sticks", &[]),
+    (1749061, false, "Arming denied: throttle above center", &[]),
+    (1802995, true, "Airspeed too high", &[]),
+    (1871713, true, "Mode not suitable for arming", &[]),
+    (1914663, true, "Health report summary event", &[]),
+    (1917030, true, "RC calibration for channel {} invalid: TRIM greater than MAX", &[(U8, 5)]),
+    (2066387, false, "Arming denied: calibrating", &[]),
+    (2088119, true, "Poor GPS Quality", &[]),
+    (2228586, true, "Remaining flight time low", &[]),
+    (2229864, true, "Power redundancy not met", &[]),
+    (2308551, false, "Low remaining flight time, return advised", &[]),
+    (2474944, false, "Critical battery level, land now", &[]),
+    (2481841, true, "Gyro {} inconsistent", &[(U8, 5)]),
+    (2627595, true, "Critical battery", &[]),
+    (3061044, true, "Accel {} inconsistent", &[(U8, 5)]),
+    (3087815, true, "No offboard signal", &[]),
+    (3092229, false, "Unsupported auto mode", &[]),
+    (3189229, true, "No valid data from barometer {}", &[(U8, 5)]),
+    (3322590, false, "Landing at current position", &[]),
+    (3484900, false, "Returning to launch", &[]),
+    (3568720, true, "Gyro sensor {} missing", &[(U8, 5)]),
+    (3603209, true, "Stopping compass use", &[]),
+    (3613628, true, "High Accelerometer Bias", &[]),
+    (4065583, true, "Geofence violation: exceeding maximum distance to Home", &[]),
+    (4261821, true, "Failure triggered by external system", &[]),
+    (4277609, false, "Takeoff detected", &[]),
+    (4448091, true, "Crash dumps present on SD card", &[]),
+    (4502496, false, "Failsafe activated: switching to {} in {} seconds", &[(Action, 4), (U16, 5)]),
+    (4549029, true, "Altitude failure detected", &[]),
+    (4643123, true, "Airspeed invalid", &[]),
+    (4877352, true, "Imbalanced propeller detected", &[]),
+    (4975227, true, "GPS Horizontal Speed Drift too high", &[]),
+    (5049764, true, "Low battery", &[]),
+    (5095593, true, "Barometer {} missing", &[(U8, 5)]),
+    (5273740, true, "Compass inconsistent by {} degrees", &[(I16, 5)]),
+    (5444856, true, "Accelerometer {} uncalibrated", &[(U8, 5)]),
+    (5623108, false, "Manual control lost", &[]),
+    (5699115, true, "Overcurrent detected for the peripheral 5V supply", &[]),
+    (5704353, true, "Arm authorization denied", &[]),
+    (5717196, true, "GPS Horizontal Position Drift too high", &[]),
+    (5847165, false, "Dangerously low battery! System shut down failed", &[]),
+    (5874720, false, "Arming denied: high throttle", &[]),
+    (5943233, true, "Found {} compass (required: {})", &[(U8, 5), (U8, 6)]),
+    (6054338, true, "Waiting for estimator to initialize", &[]),
+    (6258044, true, "Estimator fault due to Compass {}", &[(U8, 5)]),
+    (6410608, true, "No valid data from Compass {}", &[(U8, 5)]),
+    (6491364, true, "Home position required", &[]),
+    (6558257, true, "GPS Vertical Speed Drift too high", &[]),
+    (6659180, true, "RC calibration for channel {} invalid: DZ greater than {}", &[(U8, 5), (U16, 6)]),
+    (6801787, true, "No connection to the ground control station", &[]),
+    (6880628, false, "Approaching max flight time (system will RTL in {} minutes)", &[(I16, 0)]),
+    (6948489, true, "ESC {}", &[(U8, 5)]),
+    (6962647, true, "Overcurrent detected for the hipower 5V supply", &[]),
+    (6979701, true, "RC calibration for channel {} invalid: MIN less than {}", &[(U8, 5), (U16, 6)]),
+    (7214714, true, "System power unavailable", &[]),
+    (7662152, true, "USB connected", &[]),
+    (7714236, false, "Approaching max flight time (system will RTL in {} seconds)", &[(I16, 0)]),
+    (7847312, true, "RC calibration for channel {} invalid: MAX greater than {}", &[(U8, 5), (U16, 6)]),
+    (7884377, true, "RTL switch engaged", &[]),
+    (7908333, true, "Power module not connected", &[]),
+    (7959667, true, "Vehicle is in safety configuration", &[]),
+    (8227839, true, "Accelerometer sensor {} missing", &[(U8, 5)]),
+    (8310204, false, "Landing using precision landing", &[]),
+    (8441780, true, "Open Drone ID system not ready", &[]),
+    (8495477, true, "RC calibration for channel {} invalid: TRIM less than MIN", &[(U8, 5)]),
+    (8538897, true, "Attitude failure detected", &[]),
+    (8544646, true, "No valid data from distance sensor {}", &[(U8, 5)]),
+    (8557551, false, "Failsafe warning: {}", &[(Cause, 4)]),
+    (8713942, true, "GPS signal spoofed", &[]),
+    (8792768, true, "Optical flow sensor missing", &[]),
+    (8799553, true, "Battery {} disconnected", &[(U8, 5)]),
+    (8902208, true, "Horizontal velocity unstable", &[]),
+    (9077977, true, "Kill switch engaged", &[]),
+    (9091509, false, "Disarming denied: not landed", &[]),
+    (9171208, true, "Vertical velocity unstable", &[]),
+    (9191449, true, "ESC telemetry missing", &[]),
+    (9266821, true, "No CPU and RAM load information", &[]),
+    (9307221, true, "High Gyro Bias", &[]),
+    (9489139, false, "Armed by {}", &[(Reason, 0)]),
+    (9493632, true, "No airspeed data", &[]),
+    (9608226, true, "Estimator not using GPS", &[]),
+    (9634798, true, "Height estimate not stable", &[]),
+    (9643369, true, "Angular velocity not valid", &[]),
+    (9697819, true, "Horizontal position unstable", &[]),
+    (9751178, false, "{}: switching to {}", &[(Cause, 5), (Action, 4)]),
+    (9815168, true, "Mode is unresponsive", &[]),
+    (9844908, false, "Landing detected", &[]),
+    (9965819, true, "GNSS heading not reliable", &[]),
+    (10011251, true, "Navigation error: No valid global position estimate", &[]),
+    (10161216, true, "Open Drone ID system missing", &[]),
+    (10198977, true, "GPS PDOP too high", &[]),
+    (10318274, true, "Battery {} missing", &[(U8, 5)]),
+    (10450063, true, "No valid attitude estimate", &[]),
+    (10503063, false, "Switching to mode '{}' is currently not possible", &[(Mode, 4)]),
+    (10678671, true, "GPS Speed Accuracy too low", &[]),
+    (10716939, false, "Onboard controller regained", &[]),
+    (10794072, false, "Connection to ground control station lost", &[]),
+    (10960133, true, "Position estimate has low accuracy", &[]),
+    (10996333, true, "Missing FMU SD Card", &[]),
+    (11047904, true, "Arming check summary event", &[]),
+    (11123101, false, "Connection to mission computer lost", &[]),
+    (11125932, true, "No valid data from optical flow sensor", &[]),
+    (11290563, false, "Kill engaged", &[]),
+    (11344647, true, "Emergency battery level", &[]),
+    (11413600, true, "Wind speed is above limit ({}m/s)", &[(F32, 5)]),
+    (11478328, true, "No valid data from Gyro {}", &[(U8, 5)]),
+    (11497430, true, "GPS Vertical Position Drift too high", &[]),
+    (12216659, false, "Low battery level, return advised", &[]),
+    (12276004, true, "Global position estimate required", &[]),
+    (12369553, true, "GPS fix too low", &[]),
+    (12420351, false, "Arming denied: switch to manual mode first", &[]),
+    (12689900, true, "Navigation error: No valid altitude estimate", &[]),
+    (12754954, true, "Flight termination active", &[]),
+    (12770418, false, "Failsafe activated: Autopilot disengaged, switching to {}", &[(Action, 4)]),
+    (12780289, true, "GPS reports critical jamming state", &[]),
+    (12805643, true, "Mission cannot be completed", &[]),
+    (13094458, true, "Not enough GPS Satellites", &[]),
+    (13277401, false, "Failsafe warning:", &[]),
+    (13344346, true, "Battery unhealthy", &[]),
+    (13372152, true, "Parachute system not ready", &[]),
+    (13528143, true, "Vehicle is in transition state", &[]),
+    (13704694, false, "{}: switching to {} in {} seconds", &[(Cause, 7), (Action, 4), (U16, 5)]),
+    (13835193, true, "Navigation error: No valid position estimate", &[]),
+    (13923616, true, "Geofence violation: exceeding maximum altitude above Home", &[]),
+    (14200647, true, "Vehicle is not in multicopter mode", &[]),
+    (14221469, true, "Distance sensor {} missing", &[(U8, 5)]),
+    (14234660, false, "GCS connection regained", &[]),
+    (14421482, true, "RAM usage too high: {}%", &[(F32, 5)]),
+    (14566046, true, "ESC {} offline", &[(U8, 5)]),
+    (14605264, false, "Failsafe activated: switching to {}", &[(Action, 4)]),
+    (14644618, true, "Maximum flight time reached", &[]),
+    (14748737, true, "Mode is not registered", &[]),
+    (15180799, true, "VTOL fixed-wing system failure detected. Verify reason for failure, and reboot the vehicle once confirmed safe", &[]),
+    (15289843, true, "Avionics Power high: {} Volt", &[(F32, 5)]),
+    (15388760, true, "Compass sensor {} missing", &[(U8, 5)]),
+    (15536452, false, "External mode is unresponsive, falling back to internal", &[]),
+    (15602498, true, "Battery {}", &[(U8, 5)]),
+    (15603271, false, "Dangerously low battery! Shutting system down", &[]),
+    (15713375, true, "Strong magnetic interference", &[]),
+    (15793174, true, "ESC failure", &[]),
+    (15965684, true, "Parachute system missing", &[]),
+    (16017271, false, "Disarmed by {}", &[(Reason, 0)]),
+    (16158540, true, "Landing gear switch set in UP position", &[]),
+    (16230031, true, "No valid data from Accelerometer {}", &[(U8, 5)]),
+    (16642797, true, "Heading estimate not stable", &[]),
+    (16682655, false, "Kill disengaged", &[]),
+    (16716537, true, "Compass {} uncalibrated", &[(U8, 5)]),
+    (16745468, true, "Attitude failure detected", &[]),
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An event with arguments as PX4 packs them.
+    fn event(id: u32, level: u8, arguments: &[u8]) -> EVENT_DATA {
+        let mut event = EVENT_DATA { id, log_levels: level, ..EVENT_DATA::default() };
+        event.arguments.iter_mut().zip(arguments).for_each(|(to, of)| *to = *of);
+        event
+    }
+
+    fn text(id: u32, level: u8, arguments: &[u8]) -> String {
+        told(&event(id, level, arguments)).unwrap().text
+    }
+
+    #[test]
+    fn every_event_is_found_and_all_its_arguments_are_shown() {
+        assert!(TABLE.is_sorted_by_key(|row| row.0));
+        for (id, _, text, arguments) in &TABLE {
+            assert_eq!(text.matches("{}").count(), arguments.len(), "{text}");
+            let told = told(&event(0x0100_0000 | id, 2, &[0xff; 40])).unwrap();
+            assert!(!told.text.contains("{}"), "{}", told.text);
+        }
+    }
+
+    #[test]
+    fn events_as_px4_sent_them_are_told() {
+        // Recorded from 1.17.
+        assert_eq!(
+            text(0x0102_089d, 0x62, &[]),
+            "Arming denied: Resolve system health failures first"
+        );
+        assert_eq!(text(0x0190_caf3, 0x66, &[4]), "Armed by external command");
+        let no_stick = told(&event(0x0106_ed29, 0x44, &[0xff, 0xff, 0xff, 0xff, 7])).unwrap();
+        assert_eq!((no_stick.text.as_str(), no_stick.is_check), ("No manual control input", true));
+        // A check for OFFBOARD before it has setpoints, one that is for information only, and a summary for programs.
+        assert_eq!(told(&event(0x012f_1dc7, 0x33, &[0, 0x40, 0, 0, 0x14])), None);
+        assert_eq!(told(&event(0x0105_c2d9, 0x66, &[8, 0, 0, 0, 0x14])), None);
+        assert_eq!(told(&event(0x01a8_93e0, 0x88, &[])), None);
+    }
+
+    #[test]
+    fn failsafes_name_cause_and_action_and_strangers_their_number() {
+        let enter = &[0, 0, 0, 0, 5, 2];
+        assert_eq!(text(9_751_178, 2, enter), "GCS connection loss: switching to Hold");
+        let wait = &[0, 0, 0, 0, 6, 5, 0, 3];
+        assert_eq!(text(13_704_694, 4, wait), "Low battery level: switching to RTL in 5 seconds");
+        assert_eq!(text(16_017_271, 6, &[77]), "Disarmed by 77");
+        assert_eq!(text(1, 3, &[]), "PX4's event 1, whose text is not known here");
+        assert_eq!(told(&event(1, 6, &[])), None);
+        assert_eq!(told(&event(1, 0xff, &[])), None);
+    }
+}
