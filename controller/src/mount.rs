@@ -30,7 +30,7 @@ pub fn warnings(found: &MountFindings) -> Vec<Warning> {
     let focal = |ratio: Measured| Warning {
         matter: "focal-length".to_owned(),
         text: format!(
-            "the camera's focal length is {} {} than configured: check its calibration and its zoom",
+            "the image moves as if the camera's focal length were {} {} than configured: where further flights tell it as well, check its calibration and its zoom; else the autopilot's attitude or velocity was wrong",
             percent(ratio),
             larger(ratio)
         ),

@@ -172,8 +172,8 @@ named! {
         Descending = "descending", "descending over the marker";
         /// The marker left the view low over it, and the estimate is good.
         DescendingUnseen = "descending-unseen", "descending on the estimate, the marker is out of view";
-        /// No recent detection: the descent stops until there is one.
-        TargetAging = "target-aging", "no recent detection, descent stopped";
+        /// No recent detection was used: the descent stops until there is one.
+        TargetAging = "target-aging", "no recent detection that could be used, descent stopped";
         /// The marker is seen at two places, and it is undecided which is the pad.
         Ambiguous = "ambiguous", "the marker is seen at two places, descent stopped until one is seen in most frames";
         /// Two detectors see the marker at two places, and nobody says which is right.
@@ -196,10 +196,14 @@ named! {
         OperatorHold = "operator-hold", "held by the operator";
         /// The marker was lost.
         TargetLost = "target-lost", "marker lost, holding";
+        /// The marker is seen, but its detections are refused.
+        TargetRefused = "target-refused", "the marker is seen, but not where it is expected, holding";
         /// The marker was never seen.
         TargetNotFound = "target-not-found", "marker not found, holding";
         /// The marker was lost; the vehicle climbs to find it.
         Retrying = "retrying", "marker lost, climbing to see it again";
+        /// The marker is seen, but its detections are refused; the vehicle climbs.
+        RetryingRefused = "retrying-refused", "the marker is seen, but not where it is expected, climbing to look again";
         /// Low over the marker for too long without reaching its centre.
         NotSettling = "not-settling", "cannot settle over the marker, climbing to try again";
         /// The battery is low.
@@ -230,8 +234,8 @@ named! {
         HeldTooLong = "held-too-long", "aborted: held too long";
         /// The whole landing lasted too long.
         LandingTooLong = "landing-too-long", "aborted: the landing took too long";
-        /// The marker was lost too often.
-        RetriesUsed = "retries-used", "aborted: the marker was lost too often";
+        /// No retry is left.
+        RetriesUsed = "retries-used", "aborted: the marker was lost, or the vehicle did not settle over it, too often";
         /// The autopilot does not enter LAND, too low to stay.
         LandingBySetpoints = "landing-by-setpoints", "the autopilot refuses LAND, descending by setpoints: be ready to disarm";
         /// The axes of camera and autopilot do not match.

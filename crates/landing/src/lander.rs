@@ -89,6 +89,8 @@ pub struct Lander {
     guidance: ActiveGuidance,
     axis_check: AxisConsistencyCheck,
     mount_check: MountCheck,
+    /// Stamp of the newest detection that was refused because it is too far from the estimate.
+    refused: Option<Timestamp>,
     /// Stamp of the landing's first marker.
     first_seen: Option<Timestamp>,
     state_machine: StateMachine,
@@ -137,6 +139,7 @@ impl Lander {
             guidance: ActiveGuidance::new(config.guidance),
             axis_check: AxisConsistencyCheck::default(),
             mount_check: MountCheck::default(),
+            refused: None,
             first_seen: None,
             state_machine: StateMachine::new(config.phases),
             land_requested: None,
@@ -192,6 +195,7 @@ impl Lander {
             target_age_s: self.sightings.age_s(now),
             target_confirmed: self.sightings.in_a_row >= self.config.target.confirm_after,
             target_known: self.has_target(now),
+            target_refused: self.is_target_refused(now),
             progress: self.progress(now),
             axis_mismatch: self.axis_mismatch(),
             may_descend: self.is_axis_check_done(now),
@@ -393,7 +397,11 @@ impl Lander {
         self.first_seen.get_or_insert(frame.stamp);
         match self.target_filter.observe(frame, marker, &self.history) {
             Err(Rejection::NoPose) if !self.guidance.needs_pose() => {}
-            Err(rejection) => return Err(rejection),
+            Err(rejection) => {
+                let is_elsewhere = rejection == Rejection::Outlier;
+                self.refused = is_elsewhere.then_some(frame.stamp).or(self.refused);
+                return Err(rejection);
+            }
             Ok(()) => {}
         }
         self.sightings.add(frame.stamp, self.config.phases.lost_target_s);
@@ -495,6 +503,12 @@ impl Lander {
         let waited_s = self.first_seen.map_or(0.0, |seen| now.seconds_since(seen));
         let is_over = waited_s > self.config.phases.axis_check_s;
         !self.checks_axes() || is_over || self.axis_check.verdict() == Verdict::Consistent
+    }
+
+    /// True while the marker is seen, too far from the estimate to be used.
+    fn is_target_refused(&self, now: Timestamp) -> bool {
+        self.refused
+            .is_some_and(|stamp| now.seconds_since(stamp) <= self.config.phases.stale_target_s)
     }
 
     fn has_target(&self, now: Timestamp) -> bool {
@@ -736,8 +750,9 @@ impl Lander {
     /// `regain_height_m`. So it does where the link has become slow, or a sway would touch the ground.
     fn hold(&self, now: Timestamp) -> Action {
         let phases = &self.config.phases;
-        let lost = self.state_machine.reason() == Reason::TargetLost
-            && self.state_machine.elapsed_s(now) > phases.regain_after_s;
+        let is_lost =
+            matches!(self.state_machine.reason(), Reason::TargetLost | Reason::TargetRefused);
+        let lost = is_lost && self.state_machine.elapsed_s(now) > phases.regain_after_s;
         let low = self.history.newest().is_some_and(|vehicle| {
             let age_s = now.seconds_since(vehicle.stamp);
             let target = self.target(now);

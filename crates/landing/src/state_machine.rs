@@ -97,6 +97,8 @@ pub struct Inputs {
     pub target_confirmed: bool,
     /// True when the marker's place is known well enough to wait for it there.
     pub target_known: bool,
+    /// True when the marker is being seen, and its detections are refused.
+    pub target_refused: bool,
     /// The progress of the guidance.
     pub progress: Progress,
     /// How the axes of camera and autopilot differ; `None` while nothing shows it.
@@ -509,8 +511,14 @@ impl StateMachine {
 
     /// A retry while one is left; a hold where the marker's place is unknown.
     fn retry_or_abort(&mut self, inputs: &Inputs, reason: Reason) -> (Phase, Reason) {
+        let (lost, reason) = match reason {
+            Reason::Retrying if inputs.target_refused => {
+                (Reason::TargetRefused, Reason::RetryingRefused)
+            }
+            reason => (Reason::TargetLost, reason),
+        };
         if !inputs.target_known {
-            return (Phase::Hold, Reason::TargetLost);
+            return (Phase::Hold, lost);
         }
         if self.retries >= self.config.retries {
             return (Phase::Aborted, Reason::RetriesUsed);
@@ -520,7 +528,7 @@ impl StateMachine {
     }
 
     fn after_retry(&self, inputs: &Inputs) -> Option<(Phase, Reason)> {
-        let rested = self.reason == Reason::Retrying || self.elapsed_s(inputs.now) > MIN_RETRY_S;
+        let rested = self.reason != Reason::NotSettling || self.elapsed_s(inputs.now) > MIN_RETRY_S;
         if self.target_visible(inputs) && rested {
             return Some((Phase::Approach, Reason::Aligning));
         }
@@ -549,7 +557,9 @@ impl StateMachine {
             return Some((Phase::Aborted, Reason::HeldTooLong));
         }
         let resumes = match self.reason {
-            Reason::TargetLost | Reason::TargetNotFound => self.target_visible(inputs) && !is_stale,
+            Reason::TargetLost | Reason::TargetRefused | Reason::TargetNotFound => {
+                self.target_visible(inputs) && !is_stale
+            }
             Reason::VehicleStale | Reason::ModeUnknown | Reason::AutopilotLost => !is_stale,
             Reason::LinkSlow => !is_stale && !inputs.is_link_slow,
             _ => false,

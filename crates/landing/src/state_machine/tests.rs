@@ -22,6 +22,7 @@ fn at(seconds: f64) -> Inputs {
         target_age_s: f64::INFINITY,
         target_confirmed: false,
         target_known: false,
+        target_refused: false,
         progress: Progress::Unchanged,
         axis_mismatch: None,
         may_descend: true,
@@ -317,6 +318,17 @@ fn a_lost_vehicle_or_target_holds() {
 }
 
 #[test]
+fn a_marker_that_is_seen_and_refused_is_not_called_lost() {
+    let [a, b, c] = [start(), seen(1.0, Progress::Unchanged), seen(2.0, Progress::Descending)];
+    let refused = Inputs { target_refused: true, ..at(4.0) };
+    check(&[a, b, c, refused], Phase::Hold, Reason::TargetRefused);
+    check(&[a, b, c, refused, seen(5.0, Progress::Unchanged)], Phase::Search, Reason::Searching);
+    let known = Inputs { target_known: true, ..refused };
+    check(&[a, b, c, known], Phase::Retry, Reason::RetryingRefused);
+    check(&[a, b, c, known, seen(4.5, Progress::Unchanged)], Phase::Approach, Reason::Aligning);
+}
+
+#[test]
 fn a_vehicle_that_may_stand_on_the_pad_does_not_climb() {
     let [a, b, c] = [start(), seen(1.0, Progress::Unchanged), seen(2.0, Progress::Descending)];
     let stale = flown(3.0, |v| v.age_s = 0.6);
@@ -532,6 +544,7 @@ mod every_transition {
                                 target_age_s,
                                 target_confirmed: true,
                                 target_known,
+                                target_refused: false,
                                 progress,
                                 axis_mismatch: None,
                                 may_descend: true,
@@ -545,6 +558,7 @@ mod every_transition {
         }
         let turned = Some(Reason::CameraTurned);
         all.push(Inputs { is_link_slow: true, now: now(), ..at(0.0) });
+        all.push(Inputs { target_refused: true, target_known: true, now: now(), ..at(0.0) });
         all.push(Inputs { may_stand: true, now: now(), ..at(0.0) });
         all.push(Inputs { may_stand: true, target_known: true, now: now(), ..at(0.0) });
         all.push(Inputs { axis_mismatch: turned, may_descend: false, now: now(), ..at(0.0) });
