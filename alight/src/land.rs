@@ -357,7 +357,8 @@ async fn watch(
                     if service == Service::Controller {
                         controllers_exit = Some(exit.to_string());
                         if !landing.never_flew() {
-                            progress.say(&format!("To resume the landing, while the vehicle is in GUIDED or OFFBOARD: {resume}"));
+                            progress.say(&format!("To resume the landing of an ArduPilot that is still in GUIDED: {resume}"));
+                            progress.say("A PX4 has left OFFBOARD half a second later and takes it only while setpoints come: land it by a mode of its own (Land, Return) or by hand");
                         }
                     }
                     // The landing needs no ground station, recording or page.
