@@ -29,7 +29,7 @@ use crate::parameter::{Parameter, Parameters};
 use crate::px4_events;
 use crate::simulation::Simulation;
 use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
-use crate::stream::{Stream, Streams};
+use crate::stream::{self, Streams};
 use crate::text::Joiner;
 
 /// The component id of every autopilot.
@@ -49,11 +49,6 @@ const MAX_SPEED_AGE_NS: i64 = 500_000_000;
 const PROOF_NS: i64 = 1_300_000_000;
 /// Period of these setpoints, in nanoseconds.
 const PROOF_PERIOD_NS: i64 = 50_000_000;
-/// PX4 sends ESTIMATOR_STATUS instead of ArduPilot's EKF_STATUS_REPORT, and its takeoff needs an altitude
-/// above mean sea level, from GLOBAL_POSITION_INT.
-const EKF_STATUS_REPORT: u32 = 193;
-const ESTIMATOR_STATUS: u32 = 230;
-const GLOBAL_POSITION_INT: u32 = 33;
 
 /// The conversation with one autopilot.
 #[derive(Clone, Debug)]
@@ -530,7 +525,7 @@ impl Autopilot {
             amsl_m: None,
             joiner: Joiner::default(),
         });
-        self.streams = Streams::new(&streams_of(firmware, &self.config.streams));
+        self.streams = Streams::new(&stream::of_firmware(firmware, &self.config.streams));
         self.push(Event::Found { system, firmware });
         self.push(Event::ModeChanged { from: None, to: mode });
     }
@@ -846,16 +841,4 @@ fn timesync(tc1: i64, ts1: i64, to: Sender) -> MavMessage {
         target_system: to.system,
         target_component: to.component,
     })
-}
-
-/// The streams with the message ids of this firmware.
-fn streams_of(firmware: Firmware, streams: &[Stream]) -> Vec<Stream> {
-    let mut streams = streams.to_vec();
-    if firmware == Firmware::Px4 {
-        for stream in streams.iter_mut().filter(|s| s.message_id == EKF_STATUS_REPORT) {
-            stream.message_id = ESTIMATOR_STATUS;
-        }
-        streams.push(Stream { message_id: GLOBAL_POSITION_INT, rate_hz: 2.0, required: true });
-    }
-    streams
 }

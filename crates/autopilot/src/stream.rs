@@ -4,6 +4,13 @@
 //! begin long after their acknowledgement; so only the measured rate counts.
 
 use crate::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage, MavResult, Message};
+use crate::mode::Firmware;
+
+/// PX4 sends ESTIMATOR_STATUS instead of ArduPilot's EKF_STATUS_REPORT, and its takeoff needs an altitude
+/// above mean sea level, from GLOBAL_POSITION_INT.
+const EKF_STATUS_REPORT: u32 = 193;
+const ESTIMATOR_STATUS: u32 = 230;
+const GLOBAL_POSITION_INT: u32 = 33;
 
 const SECOND_NS: i64 = 1_000_000_000;
 /// Minimum measured rate, relative to the requested rate.
@@ -201,6 +208,18 @@ fn request(stream: Stream) -> MavMessage {
 
 fn message_name(id: u32) -> &'static str {
     MavMessage::default_message_from_id(id).map_or("unknown message", |m| m.message_name())
+}
+
+/// The streams with the message ids of this firmware.
+pub(crate) fn of_firmware(firmware: Firmware, streams: &[Stream]) -> Vec<Stream> {
+    let mut streams = streams.to_vec();
+    if firmware == Firmware::Px4 {
+        for stream in streams.iter_mut().filter(|s| s.message_id == EKF_STATUS_REPORT) {
+            stream.message_id = ESTIMATOR_STATUS;
+        }
+        streams.push(Stream { message_id: GLOBAL_POSITION_INT, rate_hz: 2.0, required: true });
+    }
+    streams
 }
 
 #[cfg(test)]

@@ -89,8 +89,6 @@ pub struct Lander {
     guidance: ActiveGuidance,
     axis_check: AxisConsistencyCheck,
     mount_check: MountCheck,
-    /// Stamp of the newest detection that was refused because it is too far from the estimate.
-    refused: Option<Timestamp>,
     /// Stamp of the landing's first marker.
     first_seen: Option<Timestamp>,
     state_machine: StateMachine,
@@ -139,7 +137,6 @@ impl Lander {
             guidance: ActiveGuidance::new(config.guidance),
             axis_check: AxisConsistencyCheck::default(),
             mount_check: MountCheck::default(),
-            refused: None,
             first_seen: None,
             state_machine: StateMachine::new(config.phases),
             land_requested: None,
@@ -195,7 +192,7 @@ impl Lander {
             target_age_s: self.sightings.age_s(now),
             target_confirmed: self.sightings.in_a_row >= self.config.target.confirm_after,
             target_known: self.has_target(now),
-            target_refused: self.is_target_refused(now),
+            target_refused: self.sightings.is_refused(now, self.config.phases.stale_target_s),
             progress: self.progress(now),
             axis_mismatch: self.axis_mismatch(),
             may_descend: self.is_axis_check_done(now),
@@ -398,8 +395,7 @@ impl Lander {
         match self.target_filter.observe(frame, marker, &self.history) {
             Err(Rejection::NoPose) if !self.guidance.needs_pose() => {}
             Err(rejection) => {
-                let is_elsewhere = rejection == Rejection::Outlier;
-                self.refused = is_elsewhere.then_some(frame.stamp).or(self.refused);
+                self.sightings.refuse(frame.stamp, rejection);
                 return Err(rejection);
             }
             Ok(()) => {}
@@ -503,12 +499,6 @@ impl Lander {
         let waited_s = self.first_seen.map_or(0.0, |seen| now.seconds_since(seen));
         let is_over = waited_s > self.config.phases.axis_check_s;
         !self.checks_axes() || is_over || self.axis_check.verdict() == Verdict::Consistent
-    }
-
-    /// True while the marker is seen, too far from the estimate to be used.
-    fn is_target_refused(&self, now: Timestamp) -> bool {
-        self.refused
-            .is_some_and(|stamp| now.seconds_since(stamp) <= self.config.phases.stale_target_s)
     }
 
     fn has_target(&self, now: Timestamp) -> bool {

@@ -24,6 +24,8 @@ pub(crate) struct Sightings {
     pub(crate) newest: Option<Timestamp>,
     /// Number of markers without a long gap.
     pub(crate) in_a_row: u32,
+    /// When one was seen too far from the estimate to be used.
+    refused: Option<Timestamp>,
 }
 
 impl TargetFilter {
@@ -80,6 +82,18 @@ impl Sightings {
         }
         self.in_a_row = if gap_s > max_gap_s { 1 } else { self.in_a_row.saturating_add(1) };
         self.newest = Some(stamp);
+    }
+
+    /// Notes a marker that was refused.
+    pub(crate) fn refuse(&mut self, stamp: Timestamp, why: Rejection) {
+        if why == Rejection::Outlier {
+            self.refused = Some(stamp);
+        }
+    }
+
+    /// True while the marker is seen, too far from the estimate to be used.
+    pub(crate) fn is_refused(&self, now: Timestamp, max_age_s: f64) -> bool {
+        self.refused.is_some_and(|stamp| now.seconds_since(stamp) <= max_age_s)
     }
 
     pub(crate) fn age_s(&self, now: Timestamp) -> f64 {
