@@ -1,22 +1,24 @@
 //! `alight experiment`: repeats the thesis' experiments.
 
+use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, ensure};
 use clap::{Args, Subcommand, ValueEnum};
 use experiments::Preset;
-use experiments::landing;
 use experiments::landing::fault::Fault;
 use experiments::landing::plan::{self, Plan, Values, Vision};
-use experiments::markers::{self, Request};
+use experiments::landing::{self, Watch};
+use experiments::markers::{self, Request, Step};
+use experiments::results;
 use experiments::set::Set;
 use experiments::sets::Variant;
-use indicatif::ProgressBar;
 
 use crate::args::flight_setting;
 use crate::faults::{self, FaultsArgs};
-use crate::progress::flights_bar;
+use crate::interruption::{FLIGHTS_END, Interruption};
+use crate::progress::Steps;
 use crate::runtime::cores;
 use crate::terminal::{print, write_error};
 
@@ -29,14 +31,15 @@ pub(crate) struct ExperimentArgs {
 #[derive(Subcommand)]
 enum Experiment {
     /// Find markers in rendered frames with ground truth (section 4.3 of the thesis, extended), and write
-    /// tables and figures.
+    /// tables and figures. Ctrl-C ends it with those of the sets that were searched, exit status 130.
     Markers(MarkersArgs),
     /// Fly hundreds of landings in lock-step, faster than real time: every combination of the listed values,
     /// with several seeds each; write tables, plots, and the command that repeats each failure (section 4.4
-    /// of the thesis, extended).
+    /// of the thesis, extended). Ctrl-C ends it with the results of the flights that were flown, exit status 130.
     Landing(LandingArgs),
     /// Fly landings in which a process dies or stands still, a link fails, or somebody lies; write a table of
-    /// the worst touchdowns, and the command that repeats each. Fails when one was unsafe.
+    /// the worst touchdowns, and the command that repeats each. Exit status 1 when one was unsafe or did not end. Ctrl-C ends
+    /// it with the results of the flights that were flown, exit status 130.
     Faults(FaultsArgs),
 }
 
@@ -45,6 +48,9 @@ struct LandingArgs {
     /// Output folder: report, every flight as CSV and JSON lines, plots.
     #[arg(short, long, value_name = "DIR", default_value = "experiment-landing")]
     output: PathBuf,
+    /// Replace the results of an experiment that are in the output folder; without it they are refused.
+    #[arg(long)]
+    replace: bool,
     /// Number of flights of each combination.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     flights: u64,
@@ -163,16 +169,25 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
         jobs: args.jobs.unwrap_or_else(cores),
         recordings: args.recordings,
     };
-    let bar = flights_bar();
-    let report = landing::run(&request, &|done, of| {
-        bar.set_length(of as u64);
-        bar.set_position(done as u64);
+    let folder = &request.results_in;
+    let doing = || format!("working in {}", folder.display());
+    results::claim(folder, args.replace)?;
+    let interruption = Interruption::on_signals(FLIGHTS_END)?;
+    let steps = Steps::of_flights();
+    let watch = Watch {
+        progress: &|done, of| steps.flown(done, of),
+        is_interrupted: &|| interruption.is_requested(),
+    };
+    let landings = landing::run(&request, watch).with_context(doing)?;
+    steps.finish();
+    print(landings.report.trim_end())?;
+    if landings.flown > 0 {
+        write_error(&format!("flights, plots and this report: {}", folder.display()));
+    }
+    Ok(match interruption.is_requested() {
+        true => interruption.exit_code(),
+        false => ExitCode::SUCCESS,
     })
-    .with_context(|| format!("working in {}", request.results_in.display()))?;
-    bar.finish_and_clear();
-    print(&report)?;
-    write_error(&format!("flights, plots and this report: {}", request.results_in.display()));
-    Ok(ExitCode::SUCCESS)
 }
 
 fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
@@ -201,19 +216,32 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
             }
         })
         .collect();
-    let progress = ProgressBar::new_spinner();
-    for request in &requests {
-        let report = markers::run(request, &mut |doing| {
-            progress.set_message(format!("{} {doing}", request.variant.processing));
-            progress.tick();
-        })
-        .with_context(|| format!("working in {}", args.output.display()))?;
-        progress.suspend(|| print(&report))?;
+    let interruption = Interruption::on_signals("the set under way is still searched")?;
+    let steps = Steps::of_names();
+    let mut done = Vec::new();
+    for request in requests {
+        let mut begins = |step: Step<'_>| {
+            if interruption.is_requested() {
+                return ControlFlow::Break(());
+            }
+            steps.begins(&format!("{} {step}", request.variant.processing));
+            ControlFlow::Continue(())
+        };
+        let findings = markers::run(&request, &mut begins)
+            .with_context(|| format!("working in {}", args.output.display()))?;
+        steps.beside(|| print(&findings.report))?;
         write_error(&format!("tables and figures: {}", request.results_in.display()));
+        done.push(request);
+        if findings.is_interrupted {
+            break;
+        }
     }
-    progress.finish_and_clear();
-    if requests.len() > 1 {
-        print(&markers::compared(&requests)?)?;
+    steps.finish();
+    if done.len() > 1 {
+        print(&markers::compared(&done)?)?;
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(match interruption.is_requested() {
+        true => interruption.exit_code(),
+        false => ExitCode::SUCCESS,
+    })
 }

@@ -9,10 +9,13 @@ use experiments::faults::kind::Kind;
 use experiments::faults::plan::{Plan, Request, Second};
 use experiments::faults::report;
 use experiments::faults::{self, Findings};
+use experiments::landing::Watch;
 use experiments::landing::plan::Values;
+use experiments::results;
 
 use crate::args::flight_setting;
-use crate::progress::flights_bar;
+use crate::interruption::{FLIGHTS_END, Interruption};
+use crate::progress::Steps;
 use crate::real_time;
 use crate::runtime::{block_on, cores};
 use crate::terminal::{print, write_error};
@@ -26,6 +29,9 @@ pub(crate) struct FaultsArgs {
     /// Output folder: report, every flight as CSV and JSON lines.
     #[arg(short, long, value_name = "DIR", default_value = "experiment-faults")]
     output: PathBuf,
+    /// Replace the results of an experiment that are in the output folder; without it they are refused.
+    #[arg(long)]
+    replace: bool,
     /// Number of flights [default: 1000, in real time 25].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     flights: Option<u64>,
@@ -115,16 +121,30 @@ impl FaultsArgs {
     }
 }
 
-/// Flies the campaign in real time, one flight after the other.
-fn run_in_real_time(request: &Request) -> anyhow::Result<Findings> {
+/// Flies the campaign in real time, one flight after the other; one that is interrupted does not count.
+fn run_in_real_time(request: &Request, interruption: &Interruption) -> anyhow::Result<Findings> {
     node::start_logging("error");
     let flights = request.plan.flights();
-    let bar = flights_bar();
-    bar.set_length(flights.len() as u64);
-    let mut outcomes = Vec::new();
-    for planned in &flights {
-        let folder = request.results_in.join(format!("logs-{}", planned.seed));
-        let outcome = block_on(real_time::fly(planned, &folder))??;
+    let planned = flights.len();
+    let steps = Steps::of_flights();
+    let title = format!("Flights in real time, seeds from {}", request.plan.seed);
+    let mut findings = Findings { report: String::new(), outcomes: Vec::new(), planned };
+    for flight in &flights {
+        let folder = request.results_in.join(format!("logs-{}", flight.seed));
+        let flown = block_on(async {
+            tokio::select! {
+                outcome = real_time::fly(flight, &folder) => outcome.map(Some),
+                () = interruption.requested() => Ok(None),
+            }
+        })?;
+        // The services of a terminal's Ctrl-C end at once, and the flight with an error.
+        let Some(outcome) = flown.or_else(|problem| match interruption.is_requested() {
+            true => Ok(None),
+            false => Err(problem),
+        })?
+        else {
+            break;
+        };
         write_error(&format!(
             "{} ({}) at {:.1} m: {:?}, {} m/s down, {} {}",
             outcome.kinds,
@@ -135,41 +155,54 @@ fn run_in_real_time(request: &Request) -> anyhow::Result<Findings> {
             outcome.phase,
             outcome.why,
         ));
-        outcomes.push(outcome);
-        bar.inc(1);
-        // What there is, should the next one be interrupted.
-        report::write(&request.results_in, "In real time, unfinished", &outcomes)?;
+        findings.outcomes.push(outcome);
+        steps.flown(findings.outcomes.len(), planned);
+        // What there is, should the next one end this process.
+        findings.report = report::write(&request.results_in, &title, &findings.outcomes, planned)?;
     }
-    bar.finish_and_clear();
-    let title = format!("{} flights in real time, seeds from {}", flights.len(), request.plan.seed);
-    let report = report::write(&request.results_in, &title, &outcomes)?;
-    Ok(Findings { report, outcomes })
+    steps.finish();
+    if findings.outcomes.is_empty() {
+        findings.report = results::interrupted(0, planned);
+    }
+    Ok(findings)
 }
 
 /// Flies the campaign in lock-step, several flights at once.
-fn run_in_lockstep(request: &Request) -> anyhow::Result<Findings> {
-    let bar = flights_bar();
-    let findings = faults::run(request, &|done, of| {
-        bar.set_length(of as u64);
-        bar.set_position(done as u64);
-    })?;
-    bar.finish_and_clear();
+fn run_in_lockstep(request: &Request, interruption: &Interruption) -> anyhow::Result<Findings> {
+    let steps = Steps::of_flights();
+    let watch = Watch {
+        progress: &|done, of| steps.flown(done, of),
+        is_interrupted: &|| interruption.is_requested(),
+    };
+    let findings = faults::run(request, watch)?;
+    steps.finish();
     Ok(findings)
 }
 
 /// Flies the campaign and prints its report; a failure when a touchdown was unsafe or a flight did not end.
 pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
     let (results_in, jobs) = (args.output.clone(), args.jobs.unwrap_or_else(cores));
-    let (real_time, tapes_in) = (args.real_time, args.record_tapes.clone());
+    let (real_time, tapes_in, replaces) = (args.real_time, args.record_tapes.clone(), args.replace);
     let plan = args.plan().map_err(anyhow::Error::msg)?;
     let request = Request { plan, results_in, tapes_in, jobs };
+    results::claim(&request.results_in, replaces)?;
+    request.tapes_in.as_deref().map_or(Ok(()), results::claim_for_recordings)?;
+    let interruption = Interruption::on_signals(match real_time {
+        true => "the flight under way does not count, and those before it are kept",
+        false => FLIGHTS_END,
+    })?;
     let findings = match real_time {
-        true => run_in_real_time(&request),
-        false => run_in_lockstep(&request),
+        true => run_in_real_time(&request, &interruption),
+        false => run_in_lockstep(&request, &interruption),
     }
     .with_context(|| format!("working in {}", request.results_in.display()))?;
-    print(&findings.report)?;
-    write_error(&format!("flights and this report: {}", request.results_in.display()));
+    print(findings.report.trim_end())?;
+    if !findings.outcomes.is_empty() {
+        write_error(&format!("flights and this report: {}", request.results_in.display()));
+    }
+    if interruption.is_requested() {
+        return Ok(interruption.exit_code());
+    }
     let is_bad =
         findings.outcomes.iter().any(|outcome| outcome.is_unsafe() || outcome.is_unended());
     Ok(ExitCode::from(u8::from(is_bad)))

@@ -23,6 +23,7 @@ mod experiment;
 mod fault_link;
 mod faults;
 mod grey;
+mod interruption;
 mod keys;
 mod land;
 mod marker;

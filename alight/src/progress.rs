@@ -1,6 +1,8 @@
-//! The display of a landing: a few lines that are redrawn on a terminal, else a line for each change.
+//! The display of a landing and of long work: a few lines that are redrawn on a terminal, else a line for each change, or now
+//! and then.
 
-use std::time::Duration;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use messages::{ControllerStatus, Phase};
@@ -123,18 +125,105 @@ fn live_lines(status: &ControllerStatus, frame_rate_hz: Option<f64>) -> String {
     )
 }
 
-/// The progress of many flights.
-pub(crate) fn flights_bar() -> ProgressBar {
-    ProgressBar::no_length().with_style(
-        ProgressStyle::with_template("{bar:40} {pos} of {len} flights, {elapsed}, {eta} left")
-            .unwrap_or_else(|_| ProgressStyle::default_bar()),
-    )
+/// The progress of long work: a bar on a terminal, else a line now and then.
+pub(crate) struct Steps {
+    bar: ProgressBar,
+    lines: Seldom,
+}
+
+impl Steps {
+    /// Of many flights.
+    pub(crate) fn of_flights() -> Self {
+        Self::new("{bar:40} {pos} of {len} flights, {elapsed}, {eta} left")
+    }
+
+    /// Of steps that have names.
+    pub(crate) fn of_names() -> Self {
+        let steps = Self::new("{spinner:.cyan} {elapsed_precise} {msg}");
+        if !steps.bar.is_hidden() {
+            steps.bar.enable_steady_tick(Duration::from_millis(200));
+        }
+        steps
+    }
+
+    fn new(template: &str) -> Self {
+        let bar = ProgressBar::no_length().with_style(
+            ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()),
+        );
+        Self { bar, lines: Seldom::new(Instant::now()) }
+    }
+
+    /// `done` flights of `of` were flown.
+    pub(crate) fn flown(&self, done: usize, of: usize) {
+        self.bar.set_length(of as u64);
+        self.bar.set_position(done as u64);
+        self.line(|| format!("{done} of {of} flights"));
+    }
+
+    /// The step with this name begins.
+    pub(crate) fn begins(&self, name: &str) {
+        self.bar.set_message(name.to_owned());
+        self.line(|| name.to_owned());
+    }
+
+    /// Prints beside the bar.
+    pub(crate) fn beside<T>(&self, print: impl FnOnce() -> T) -> T {
+        self.bar.suspend(print)
+    }
+
+    fn line(&self, text: impl FnOnce() -> String) {
+        if self.bar.is_hidden()
+            && let Some(passed) = self.lines.passed(Instant::now())
+        {
+            write_error(&format!("{} after {} s", text(), passed.as_secs()));
+        }
+    }
+
+    /// Clears the bar.
+    pub(crate) fn finish(&self) {
+        self.bar.finish_and_clear();
+    }
+}
+
+/// When lines are due that nobody waits for: the longer the work has taken already, the rarer.
+struct Seldom {
+    began: Instant,
+    next: Mutex<Duration>,
+}
+
+impl Seldom {
+    const FIRST: Duration = Duration::from_secs(10);
+    const RAREST: Duration = Duration::from_secs(300);
+
+    fn new(began: Instant) -> Self {
+        Self { began, next: Mutex::new(Self::FIRST) }
+    }
+
+    /// The time that has passed, if a line is due: after 10 s, 20 s, 40 s and so on, and then every five minutes.
+    fn passed(&self, now: Instant) -> Option<Duration> {
+        let passed = now.saturating_duration_since(self.began);
+        let mut next = self.next.lock().unwrap_or_else(PoisonError::into_inner);
+        if passed < *next {
+            return None;
+        }
+        *next = passed + passed.min(Self::RAREST);
+        Some(passed)
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use messages::Candidate;
+
+    #[test]
+    fn lines_become_rarer_the_longer_it_takes() {
+        let began = Instant::now();
+        let lines = Seldom::new(began);
+        let told: Vec<u64> =
+            (0..2000).filter(|s| lines.passed(began + Duration::from_secs(*s)).is_some()).collect();
+        assert_eq!(told, [10, 20, 40, 80, 160, 320, 620, 920, 1220, 1520, 1820]);
+    }
 
     #[test]
     fn the_live_view_has_phase_height_error_and_detectors() {

@@ -3,9 +3,10 @@
 //! [photographs=FOLDER] [processing=NAME] [seed=N] [every=N]...`.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "a program for people at a terminal")]
 
+use std::ops::ControlFlow;
 use std::path::PathBuf;
 
-use experiments::markers::{Request, run};
+use experiments::markers::{Request, Step, run};
 use experiments::set::Set;
 use experiments::sets::Variant;
 
@@ -36,7 +37,11 @@ fn main() -> anyhow::Result<()> {
     if request.sets.is_empty() {
         request.sets = Set::ALL.to_vec();
     }
-    let report = run(&request, &mut |doing| eprintln!("{doing}"))?;
+    let mut begins = |step: Step<'_>| {
+        eprintln!("{step}");
+        ControlFlow::Continue(())
+    };
+    let report = run(&request, &mut begins)?.report;
     println!("{report}");
     Ok(())
 }

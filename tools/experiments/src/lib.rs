@@ -7,7 +7,8 @@
 //! one frame, whose marker may be a poor [`mod@print`]; [`set`] names the sets and [`sets`] has their frames; [`store`] keeps them on disk; [`record`]
 //! has a detector's results, and [`score`] their errors; [`photographs`] has the results on real images;
 //! [`report`] is the report, with the [`tables`] and [`figures`] of the [`thesis`]. [`landing`] is the
-//! experiment with landings, [`faults`] the campaign in which something dies, lies or falls silent.
+//! experiment with landings, [`faults`] the campaign in which something dies, lies or falls silent; [`results`] is the folder of
+//! their results.
 
 pub mod faults;
 pub mod figures;
@@ -18,6 +19,7 @@ pub mod photographs;
 pub mod print;
 pub mod record;
 pub mod report;
+pub mod results;
 pub mod score;
 pub mod set;
 pub mod sets;

@@ -2,6 +2,8 @@
 //! report.
 
 use std::collections::BTreeMap;
+use std::fmt;
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -56,11 +58,41 @@ impl Request {
 /// Number of runs of timed sets; the shortest time of each frame counts.
 const TIMED_RUNS: usize = 5;
 
-/// Runs the experiment, with messages to `progress`; returns the report.
+/// Where an experiment is, before each of its steps.
+#[derive(Clone, Debug)]
+pub struct Step<'a> {
+    /// The set and the family.
+    pub what: &'a str,
+    /// Its number, from 1 on, and that of all.
+    pub number: usize,
+    /// See `number`.
+    pub of: usize,
+}
+
+impl fmt::Display for Step<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { what, number, of } = self;
+        write!(f, "{what} ({number} of {of})")
+    }
+}
+
+/// What an experiment with markers gave.
+#[derive(Clone, Debug)]
+pub struct Findings {
+    /// The report, in Markdown.
+    pub report: String,
+    /// Whether it was interrupted before its last step.
+    pub is_interrupted: bool,
+}
+
+/// Runs the experiment; `begins` is told of each step, and may break it off before that one. The report is of what was done.
 ///
 /// # Errors
 /// When a file cannot be read or written.
-pub fn run(request: &Request, progress: &mut dyn FnMut(&str)) -> anyhow::Result<String> {
+pub fn run(
+    request: &Request,
+    begins: &mut dyn FnMut(Step<'_>) -> ControlFlow<()>,
+) -> anyhow::Result<Findings> {
     let Request { sets_in, results_in, .. } = request;
     std::fs::create_dir_all(results_in)
         .with_context(|| format!("making {}", results_in.display()))?;
@@ -70,30 +102,46 @@ pub fn run(request: &Request, progress: &mut dyn FnMut(&str)) -> anyhow::Result<
     }
     let mut renderer = FrameRenderer::default();
     let mut extra = String::new();
+    let mut steps = Vec::new();
     for set in &request.sets {
-        for marker in markers(request, *set)? {
-            let name = marker.family.name();
-            progress(&format!("{} {name}", set.name()));
-            store::make(sets_in, *set, marker, request.variant, &mut renderer)?;
-            let folder = store::folder(sets_in, *set, marker);
-            if set.has_marker() {
-                let any = Marker { id: None, ..marker };
-                detect(results_in, *set, name, &folder, &[any])?;
-                time(results_in, *set, any, &folder)?;
-            } else {
-                for (name, families) in photographs::families_for_negatives() {
-                    let markers = sized(&families);
-                    detect(results_in, *set, name, &folder, &markers)?;
-                }
+        steps.extend(markers(request, *set)?.into_iter().map(|marker| (*set, marker)));
+    }
+    let of = steps.len() + usize::from(request.photographs.is_some());
+    let mut done = 0;
+    for (set, marker) in steps {
+        let name = marker.family.name();
+        let what = format!("{} {name}", set.name());
+        if begins(Step { what: &what, number: done + 1, of }).is_break() {
+            break;
+        }
+        store::make(sets_in, set, marker, request.variant, &mut renderer)?;
+        let folder = store::folder(sets_in, set, marker);
+        if set.has_marker() {
+            let any = Marker { id: None, ..marker };
+            detect(results_in, set, name, &folder, &[any])?;
+            time(results_in, set, any, &folder)?;
+        } else {
+            for (name, families) in photographs::families_for_negatives() {
+                let markers = sized(&families);
+                detect(results_in, set, name, &folder, &markers)?;
             }
         }
+        done += 1;
     }
-    if let Some(folder) = &request.photographs {
-        progress("photographs");
+    if let Some(folder) = &request.photographs
+        && done + 1 == of
+        && begins(Step { what: "photographs", number: of, of }).is_continue()
+    {
         extra = run_photographs(folder, results_in)?;
+        done += 1;
     }
+    let is_interrupted = done < of;
     let runs = report::runs(sets_in, results_in)?;
-    let mut text = report::text(&runs) + &extra;
+    let mut text = match is_interrupted {
+        true => format!("Interrupted after {done} of {of} sets and families.\n\n"),
+        false => String::new(),
+    };
+    text += &(report::text(&runs) + &extra);
     for table in tables::all(&runs) {
         text.push_str(&format!("\n{}", table.markdown));
         std::fs::write(results_in.join(format!("{}.csv", table.name)), table.csv)?;
@@ -105,7 +153,7 @@ pub fn run(request: &Request, progress: &mut dyn FnMut(&str)) -> anyhow::Result<
     }
     std::fs::write(results_in.join("report.md"), &text)?;
     std::fs::write(results_in.join("scores.jsonl"), report::json_lines(&runs)?)?;
-    Ok(text)
+    Ok(Findings { report: text, is_interrupted })
 }
 
 /// Our recall and accuracy in several requests that were run, by processing, family and set.

@@ -1,15 +1,17 @@
 //! Landings in lock-step: repeatable to the bit, alike with rendered and with modelled vision, and safe
 //! whatever goes wrong.
 
-use experiments::landing::fault::Fault;
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
+use experiments::landing::fault::Fault;
 use experiments::landing::flight::{fly, fly_recorded};
-use experiments::landing::in_parallel;
 use experiments::landing::outcome::{Ending, Outcome};
 use experiments::landing::plan::{Plan, Planned, Request, Values, Vision};
+use experiments::landing::{self, Watch, in_parallel};
+use experiments::results;
 
 fn plan(vision: Vision, flights: u64) -> Plan {
     let one = |value| Values::List(vec![value]);
@@ -154,10 +156,12 @@ fn late_detections_are_used() {
 #[test]
 fn the_worst_flight_of_each_row_is_written_as_a_recording() {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("worst-flights");
+    results::claim(&folder, true).unwrap();
     let wind = Values::List(vec![0.0, 3.0]);
     let plan = Plan { wind, ..plan(Vision::Modelled, 2) };
     let request = Request { plan, results_in: folder.clone(), jobs: 2, recordings: 1 };
-    let report = experiments::landing::run(&request, &|_, _| {}).unwrap();
+    let watch = Watch { progress: &|_, _| {}, is_interrupted: &|| false };
+    let report = landing::run(&request, watch).unwrap().report;
     let names: Vec<&str> = report
         .lines()
         .filter_map(|line| line.strip_prefix("- `row-")?.split_once('`').map(|(name, _)| name))
@@ -178,4 +182,28 @@ fn the_worst_flight_of_each_row_is_written_as_a_recording() {
         tapes.read(&recording).unwrap();
         assert_eq!(tapes.tapes().len(), 1, "{name}");
     }
+}
+
+#[test]
+fn an_interruption_leaves_the_results_of_the_flights_that_were_flown() {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("interrupted-flights");
+    results::claim(&folder, true).unwrap();
+    let plan = plan(Vision::Modelled, 5);
+    let request = Request { plan, results_in: folder.clone(), jobs: 1, recordings: 1 };
+    let flown = AtomicUsize::new(0);
+    let run = |flights: usize| {
+        flown.store(0, Ordering::Relaxed);
+        let watch = Watch {
+            progress: &|done, _| flown.store(done, Ordering::Relaxed),
+            is_interrupted: &|| flown.load(Ordering::Relaxed) >= flights,
+        };
+        landing::run(&request, watch).unwrap()
+    };
+    let landings = run(2);
+    assert_eq!((landings.flown, landings.planned), (2, 5));
+    assert!(landings.report.contains("after 2 of 5 flights"), "{}", landings.report);
+    let lines = std::fs::read_to_string(folder.join("flights.jsonl")).unwrap();
+    assert_eq!(lines.lines().count(), 2);
+    assert_eq!(std::fs::read_to_string(folder.join("report.md")).unwrap(), landings.report);
+    assert_eq!(run(0).flown, 0);
 }

@@ -21,9 +21,7 @@ pub mod tape_file;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use anyhow::Context;
-
-use crate::landing::in_parallel;
+use crate::landing::{Watch, in_parallel_until};
 use flight::{fly, fly_with_tape};
 use outcome::Outcome;
 use plan::Request;
@@ -33,22 +31,21 @@ use plan::Request;
 pub struct Findings {
     /// The report, in Markdown.
     pub report: String,
-    /// Every flight.
+    /// Every flight that was flown.
     pub outcomes: Vec<Outcome>,
+    /// Number of flights that were planned: more, when they were interrupted.
+    pub planned: usize,
 }
 
-/// Flies all, and writes every flight and the report. `progress` gets the number of finished flights and of
-/// all.
+/// Flies all, and writes every flight and the report. Of flights that are interrupted it writes those that were flown.
 ///
 /// # Errors
 /// When a setting is invalid or a file cannot be written.
-pub fn run(
-    request: &Request,
-    progress: &(dyn Fn(usize, usize) + Sync),
-) -> anyhow::Result<Findings> {
+pub fn run(request: &Request, watch: Watch<'_>) -> anyhow::Result<Findings> {
     let flights = request.plan.flights();
+    let planned = flights.len();
     let done = AtomicUsize::new(0);
-    let outcomes = in_parallel(&flights, request.jobs, |planned| {
+    let outcomes = in_parallel_until(&flights, request.jobs, watch.is_interrupted, |planned| {
         let outcome = match &request.tapes_in {
             None => fly(planned)?,
             Some(folder) => {
@@ -58,13 +55,12 @@ pub fn run(
                 outcome
             }
         };
-        progress(done.fetch_add(1, Ordering::Relaxed) + 1, flights.len());
+        (watch.progress)(done.fetch_add(1, Ordering::Relaxed) + 1, flights.len());
         Ok(outcome)
     })?;
-    std::fs::create_dir_all(&request.results_in)
-        .with_context(|| format!("making {}", request.results_in.display()))?;
+    let outcomes: Vec<Outcome> = outcomes.into_iter().flatten().collect();
     let title =
         format!("{} flights in lock-step, seeds from {}", outcomes.len(), request.plan.seed);
-    let report = report::write(&request.results_in, &title, &outcomes)?;
-    Ok(Findings { report, outcomes })
+    let report = report::write(&request.results_in, &title, &outcomes, planned)?;
+    Ok(Findings { report, outcomes, planned })
 }

@@ -5,7 +5,8 @@ use std::path::Path;
 
 use super::kind::Kind;
 use super::outcome::{Ending, MAX_HOP_M, MAX_SINK_M_S, MAX_SLIDE_M_S, Outcome};
-use crate::landing::report::{csv, json_lines, put};
+use crate::landing::report::{csv, json_lines};
+use crate::results::{self, put};
 
 /// Upper ends of the bands of height, in metres.
 const BANDS_M: [f64; 7] = [0.5, 1.0, 2.0, 3.0, 4.5, 6.0, f64::INFINITY];
@@ -14,22 +15,31 @@ const MAX_LISTED: usize = 60;
 /// What two faults at once are called in the table.
 const TWO: &str = "two at once";
 
-/// Writes all files and returns the report.
+/// Writes the files of the flights that were flown, of `planned` ones, and returns the report.
 ///
 /// # Errors
 /// When a file cannot be written.
-pub fn write(folder: &Path, title: &str, outcomes: &[Outcome]) -> anyhow::Result<String> {
+pub fn write(
+    folder: &Path,
+    title: &str,
+    outcomes: &[Outcome],
+    planned: usize,
+) -> anyhow::Result<String> {
+    if outcomes.is_empty() {
+        return Ok(results::interrupted(0, planned));
+    }
     put(folder, "flights.jsonl", &json_lines(outcomes)?)?;
     put(folder, "flights.csv", &csv(outcomes)?)?;
-    let text = format!("{}{}{}", head(title, outcomes), table(outcomes), lists(outcomes));
+    let text = format!("{}{}{}", head(title, outcomes, planned), table(outcomes), lists(outcomes));
     put(folder, "report.md", &text)?;
     Ok(text)
 }
 
-fn head(title: &str, outcomes: &[Outcome]) -> String {
+fn head(title: &str, outcomes: &[Outcome], planned: usize) -> String {
+    let interrupted = results::interrupted(outcomes.len(), planned);
     let count = |of: fn(&Outcome) -> bool| outcomes.iter().filter(|outcome| of(outcome)).count();
     format!(
-        "# Faults\n\n{title}: {} unsafe, {} did not end; {} landed, {} hovered at the end; {} left the \
+        "# Faults\n\n{interrupted}{title}: {} unsafe, {} did not end; {} landed, {} hovered at the end; {} left the \
          ground again after a touch (by more than {MAX_HOP_M} m).\n\n\
          Unsafe: a touch of the ground faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways. Not ended: \
          neither at rest nor in a terminal phase. A cell has the worst speed down at a touch in m/s, by the height at \

@@ -14,12 +14,17 @@ use super::flight::{fly, fly_recorded};
 use super::outcome::{Ending, Outcome};
 use super::plan::{Planned, Request};
 use super::table::{markdown, share_interval};
-use super::{in_parallel, plots, thesis_figures};
+use super::{in_parallel_until, plots, thesis_figures};
+use crate::results::{self, put};
 
 /// Maximum number of failures in the report; the CSV has all.
 const MAX_LISTED: usize = 50;
+/// What the report of an interrupted experiment lacks.
+const NOT_AGAIN: &str =
+    "\nThe worst flights were not flown again for figures and recordings, as it was interrupted.\n";
 
-/// Writes all files and returns the report.
+/// Writes the files of the flights that were flown, of `planned` ones, and returns the report. Nothing is flown again for
+/// figures and recordings once `is_interrupted`.
 ///
 /// # Errors
 /// When a file cannot be written.
@@ -27,40 +32,41 @@ pub fn write(
     request: &Request,
     flights: &[Planned],
     outcomes: &[Outcome],
+    planned: usize,
+    is_interrupted: &(dyn Fn() -> bool + Sync),
 ) -> anyhow::Result<String> {
+    if outcomes.is_empty() {
+        return Ok(results::interrupted(0, planned));
+    }
     let folder = &request.results_in;
     put(folder, "flights.jsonl", &json_lines(outcomes)?)?;
     put(folder, "flights.csv", &csv(outcomes)?)?;
     for (name, svg) in plots::all(outcomes)? {
         put(folder, name, &svg)?;
     }
-    let mut text = head(request, outcomes);
+    let mut text = head(request, outcomes, planned);
     text.push_str(&markdown(outcomes));
     text.push_str(&failures(flights, outcomes));
-    text.push_str(&one_flight(folder, flights, outcomes)?);
-    text.push_str(&recordings(request, flights, outcomes)?);
+    if is_interrupted() {
+        text.push_str(NOT_AGAIN);
+    } else {
+        text.push_str(&one_flight(folder, flights, outcomes)?);
+        text.push_str(&recordings(request, flights, outcomes, is_interrupted)?);
+    }
     put(folder, "report.md", &text)?;
     Ok(text)
 }
 
-/// Writes a file into the folder of the results.
-///
-/// # Errors
-/// When it cannot be written.
-pub fn put(folder: &Path, name: &str, text: &str) -> anyhow::Result<()> {
-    let path = folder.join(name);
-    std::fs::write(&path, text).with_context(|| format!("writing {}", path.display()))
-}
-
-fn head(request: &Request, outcomes: &[Outcome]) -> String {
+fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
     let plan = &request.plan;
     let within = outcomes.iter().filter(|o| o.is_within(0.1)).count();
     let [low, high] = share_interval(within, outcomes.len());
     let dangerous = outcomes.iter().filter(|o| o.is_unsafe()).count();
     format!(
-        "# Landings\n\n{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe.\n\n\
+        "# Landings\n\n{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe.\n\n\
          Unsafe: touched down, without having given up, more than 0.3 m off, faster than 0.8 m/s down or 0.5 m/s sideways. Times count from the start of the landing. \
          Numbers of error, time, speed and tilt are of those that landed.\n\n",
+        results::interrupted(outcomes.len(), planned),
         outcomes.len(),
         plan.vision.name(),
         plan.seed,
@@ -115,6 +121,7 @@ fn recordings(
     request: &Request,
     flights: &[Planned],
     outcomes: &[Outcome],
+    is_interrupted: &(dyn Fn() -> bool + Sync),
 ) -> anyhow::Result<String> {
     let mut rows: Vec<Vec<(&Planned, &Outcome)>> = Vec::new();
     for pair in flights.iter().zip(outcomes) {
@@ -141,19 +148,22 @@ fn recordings(
     if chosen.is_empty() {
         return Ok(String::new());
     }
-    let folder = request.results_in.join("recordings");
+    let folder = request.results_in.join(results::RECORDINGS);
     std::fs::create_dir_all(&folder).with_context(|| format!("making {}", folder.display()))?;
     let name = |number: usize, planned: &Planned| {
         format!("row-{number}-{}-seed-{}.mcap", planned.fault.name(), planned.seed)
     };
-    in_parallel(&chosen, request.jobs, |(number, planned, _)| {
-        let path = folder.join(name(*number, planned));
-        let doing = || format!("writing {}", path.display());
-        let file = File::create(&path).with_context(doing)?;
-        fly_recorded(planned, BufWriter::new(file)).with_context(doing)
-    })?;
+    let written =
+        in_parallel_until(&chosen, request.jobs, is_interrupted, |(number, planned, _)| {
+            let path = folder.join(name(*number, planned));
+            let doing = || format!("writing {}", path.display());
+            let file = File::create(&path).with_context(doing)?;
+            fly_recorded(planned, BufWriter::new(file)).with_context(doing)
+        })?;
     let mut text = "\n## Recordings of the worst flights\n\nIn `recordings`, for `alight report FILE`, `alight replay FILE --verify` and Foxglove.\n\n".to_owned();
-    for (number, planned, outcome) in &chosen {
+    text.push_str(&results::interrupted(written.iter().flatten().count(), chosen.len()));
+    let there = chosen.iter().zip(&written).filter(|(_, written)| written.is_some());
+    for ((number, planned, outcome), _) in there {
         let error = outcome.error_m.map_or("no touch".to_owned(), |error| format!("{error:.3} m"));
         let name = name(*number, planned);
         // Writing to a string cannot fail.
