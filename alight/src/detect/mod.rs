@@ -8,12 +8,12 @@ mod source;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::process::ExitCode;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Instant;
 
 use fiducial::{Detector, Settings, Tracker};
 use geometry::CameraModel;
-use imaging::{BayerPattern, GrayImage};
+use imaging::{BayerPattern, GrayImage, GrayView};
 use markers::{Marker, Pad};
 use media::read_calibration;
 
@@ -53,6 +53,9 @@ enum Lens {
     Calibrated(CameraModel),
 }
 
+/// Maximum number of images without a marker that are searched again without the camera.
+const MAX_LOOKS_WITHOUT_CAMERA: usize = 20;
+
 /// Finds markers in images.
 struct Examiner {
     markers: Vec<Marker>,
@@ -62,6 +65,11 @@ struct Examiner {
     tracks: bool,
     gallery: Option<Gallery>,
     was_warned: AtomicBool,
+    /// How many more are searched without the camera, in doubt of it.
+    looks_without_camera: AtomicUsize,
+    was_doubted: AtomicBool,
+    /// The option that gives the camera.
+    camera_option: String,
 }
 
 /// The state of a thread.
@@ -86,6 +94,12 @@ impl Examiner {
             tracks: args.track,
             gallery: args.draw.as_deref().map(Gallery::new).transpose()?,
             was_warned: AtomicBool::new(false),
+            looks_without_camera: AtomicUsize::new(MAX_LOOKS_WITHOUT_CAMERA),
+            was_doubted: AtomicBool::new(false),
+            camera_option: match (&args.camera, args.focal_px) {
+                (Some(file), _) => format!("--camera {}", file.display()),
+                (None, focal_px) => format!("--focal-px {}", focal_px.unwrap_or_default()),
+            },
         })
     }
 
@@ -144,6 +158,12 @@ impl Examiner {
             None => detector.detect(view, camera.as_ref(), &mut ()),
         };
         let detect_ms = began.elapsed().as_secs_f64() * 1e3;
+        if camera.is_some()
+            && found.is_empty()
+            && let Some(warning) = self.doubt_of_camera(view, name)
+        {
+            write_error(&warning);
+        }
         if let Some(gallery) = &self.gallery {
             gallery
                 .add(name, image, found, camera.as_ref())
@@ -155,6 +175,29 @@ impl Examiner {
         });
         let detections = found.iter().map(Detection::from).chain(pads).collect();
         Ok(Found { width: image.width(), height: image.height(), detect_ms, detections })
+    }
+
+    /// A warning where a marker is found without the camera only: what is no circle or square in space, as the camera would show
+    /// it, is no marker. That others are found says little of the camera: seen head-on they fit any focal length.
+    fn doubt_of_camera(&self, view: GrayView<'_>, name: &str) -> Option<String> {
+        let looks = &self.looks_without_camera;
+        let one_less = |left: usize| left.checked_sub(1);
+        looks.fetch_update(Ordering::Relaxed, Ordering::Relaxed, one_less).ok()?;
+        let mut detector = Detector::new(&self.markers, Settings::default()).ok()?;
+        let found = detector.detect(view, None, &mut ()).first()?;
+        looks.store(0, Ordering::Relaxed);
+        if self.was_doubted.swap(true, Ordering::Relaxed) {
+            return None;
+        }
+        let id = found.id.map_or_else(String::new, |id| format!(":{id}"));
+        Some(format!(
+            "warning: {name} shows {}{id}, but not as a camera with `{}` would show it, so it is not counted: the focal length must be in \
+             pixels of images of {} x {}; correct the option, or leave it out to find markers without their poses",
+            found.family,
+            self.camera_option,
+            view.width(),
+            view.height()
+        ))
     }
 
     fn camera(&self, image: &GrayImage, name: &str) -> Option<CameraModel> {
@@ -289,6 +332,53 @@ mod tests {
         assert!((number(&found["pose"]["translation_m"][2]) - 0.4).abs() < 0.01, "{found}");
         assert_eq!(found["pose"]["rotation_wxyz"].as_array().unwrap().len(), 4);
         assert!(number(&found["pose"]["reprojection_rms_px"]) < 1.0);
+    }
+
+    /// The thesis' marker, 0.2 m wide and tilted by 50 degrees, as a camera with a focal length of 300 px shows it.
+    fn picture_of_tilted_rings() -> image::GrayImage {
+        let drawing = markers::Drawing::new(&"rings".parse().unwrap(), 0.2).unwrap();
+        let (sin, cos) = 50_f64.to_radians().sin_cos();
+        image::GrayImage::from_fn(320, 240, |x, y| {
+            let sample = |i: u32| {
+                let ray = |px: u32, d: u32, middle: f64| {
+                    (f64::from(px) + (f64::from(d) - 1.5) / 4.0 - middle) / 300.0
+                };
+                let (across, down) = (ray(x, i % 4, 159.5), ray(y, i / 4, 119.5));
+                let below = down * 0.3 / (cos - down * sin);
+                let (right, up) = (across * (0.3 + below * sin), -below);
+                match drawing.ink_at(right, up) {
+                    _ if right.abs().max(up.abs()) > drawing.half_extent_m => 120,
+                    markers::Ink::Black => 20,
+                    markers::Ink::White => 220,
+                }
+            };
+            image::Luma([((0..16).map(sample).sum::<u32>() / 16) as u8])
+        })
+    }
+
+    #[test]
+    fn a_camera_that_hides_a_marker_is_doubted_once() {
+        let mut image = GrayImage::filled(320, 240, 0);
+        image.pixels_mut().copy_from_slice(&picture_of_tilted_rings());
+        let examiner = |focal: &str| {
+            let args = args(&["--marker", "rings:0.2", "--focal-px", focal, "a.png"]).unwrap();
+            Examiner::new(&args, Lens::Ideal { focal_px: args.focal_px.unwrap() }).unwrap()
+        };
+        let found = |examiner: &Examiner| {
+            let mut worker = examiner.worker().unwrap();
+            examiner.detect(&image, "a.png", 0.0, &mut worker).unwrap().detections.len()
+        };
+        assert_eq!(found(&examiner("300")), 1);
+        let wrong = examiner("30");
+        let view = image.view().unwrap();
+        let told = wrong.doubt_of_camera(view, "a.png").unwrap();
+        for part in ["a.png", "rings", "`--focal-px 30`", "320 x 240"] {
+            assert!(told.contains(part), "`{part}` is not in: {told}");
+        }
+        assert_eq!(wrong.doubt_of_camera(view, "a.png"), None);
+        let other = examiner("30");
+        assert_eq!(found(&other), 0);
+        assert!(other.was_doubted.load(Ordering::Relaxed));
     }
 
     #[test]
