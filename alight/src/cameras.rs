@@ -15,6 +15,7 @@ use node::Layers;
 use serde::Serialize;
 
 use crate::args::Format;
+use crate::ending::png_file;
 use crate::runtime::block_on;
 use crate::terminal::{aligned, print};
 
@@ -41,7 +42,7 @@ const MAX_SIZES: usize = 6;
 #[derive(Args)]
 pub(crate) struct CamerasArgs {
     /// Take a picture (PNG) with the camera that is listed first, or with `--device`.
-    #[arg(long, value_name = "FILE.png")]
+    #[arg(long, value_name = "FILE.png", value_parser = png_file)]
     picture: Option<PathBuf>,
     /// Only this device.
     #[arg(long, value_name = "PATH")]

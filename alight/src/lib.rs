@@ -7,7 +7,7 @@
 //! for the display and `outcome` for the result; `command` sends a command, `detectors` lists the
 //! running detectors and `swap` replaces one; `detect`, `calibrate`, `rectify`, `marker` and `experiment` with
 //! its campaign of `faults`, flown in `real_time` over a `fault_link` as well, are tools.
-//! `runtime` and `terminal` serve all of them.
+//! `runtime`, `terminal`, `interruption` and `ending` serve all of them.
 
 mod args;
 mod calibrate;
@@ -19,6 +19,7 @@ mod dashboard;
 mod detect;
 mod detectors;
 mod doctor;
+mod ending;
 mod experiment;
 mod fault_link;
 mod faults;

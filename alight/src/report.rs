@@ -7,6 +7,7 @@ use anyhow::{Context, ensure};
 use clap::{Args, ValueEnum};
 use report::{Flight, FlightReader, comparison, document, figures, page, replay_tapes, summary};
 
+use crate::ending::{Ending, format_of};
 use crate::terminal::{print, write_error};
 
 #[derive(Args)]
@@ -18,10 +19,10 @@ pub(crate) struct ReportArgs {
     /// Which landing of each recording, from 1 on, where it has several [default: the last].
     #[arg(long, value_name = "N")]
     landing: Option<usize>,
-    /// The page [default: the first recording's name with `.html` or `.pdf`, beside it]. A name that ends with `.pdf` is
-    /// that of a PDF document.
+    /// The page [default: the first recording's name with `.html` or `.pdf`, beside it]. Its name ends in .html, or in .pdf
+    /// for a PDF document.
     #[arg(short, long, value_name = "FILE")]
-    output: Option<PathBuf>,
+    output: Option<Page>,
     /// A folder for the charts as SVG files, with title and legend, for papers and slides; of two flights in
     /// the folders `1` and `2` in it.
     #[arg(long, value_name = "FOLDER")]
@@ -43,11 +44,31 @@ enum Format {
     Pdf,
 }
 
+/// A file for the page, and whether it is a PDF document, from its ending.
+#[derive(Clone, Debug)]
+struct Page {
+    path: PathBuf,
+    is_pdf: bool,
+}
+
+impl std::str::FromStr for Page {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let path = PathBuf::from(text);
+        let endings =
+            [Ending::new("html", false), Ending::new("htm", false), Ending::new("pdf", true)];
+        let is_pdf = format_of(&path, &endings)?;
+        Ok(Self { path, is_pdf })
+    }
+}
+
 /// Maximum number of flights on a page.
 const MAX_FLIGHTS: usize = 2;
 
 /// Writes the page, and prints the summary.
 pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
+    let is_pdf = args.is_pdf()?;
     let mut flights = flights(&args.files)?;
     for flight in &mut flights {
         let (name, number) = (flight.name.clone(), args.landing.unwrap_or(0));
@@ -55,8 +76,6 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
             anyhow::anyhow!("`--landing {number}`: {name} has {of} landings, counted from 1")
         })?;
     }
-    let named_pdf = |path: &PathBuf| path.extension().is_some_and(|it| it == "pdf");
-    let is_pdf = args.format == Format::Pdf || args.output.as_ref().is_some_and(named_pdf);
     let written = match flights.as_slice() {
         [one] if is_pdf => document(one, None)?,
         [one, other] if is_pdf => document(one, Some(other))?,
@@ -70,7 +89,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     };
     let extension = if is_pdf { "pdf" } else { "html" };
     let beside = args.files.first().map(|file| file.with_extension(extension)).unwrap_or_default();
-    let output = args.output.as_ref().unwrap_or(&beside);
+    let output = args.output.as_ref().map_or(&beside, |page| &page.path);
     ensure!(
         !args.files.iter().any(|file| is_same_file(file, output)),
         "{output:?} is a recording; name another file for the page with `--output`"
@@ -92,6 +111,19 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     }
     write_error(&format!("the page: {}", output.display()));
     Ok(ExitCode::SUCCESS)
+}
+
+impl ReportArgs {
+    /// Whether the page is a PDF document.
+    fn is_pdf(&self) -> anyhow::Result<bool> {
+        let wants_pdf = self.format == Format::Pdf;
+        let Some(Page { path, is_pdf }) = &self.output else { return Ok(wants_pdf) };
+        ensure!(
+            *is_pdf || !wants_pdf,
+            "`--format pdf` writes a PDF document, and {path:?} is the name of a page: let it end in .pdf"
+        );
+        Ok(*is_pdf)
+    }
 }
 
 fn write_figures(flight: &Flight, folder: &Path) -> anyhow::Result<()> {
@@ -143,6 +175,28 @@ fn name(file: &Path) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Program {
+        #[command(flatten)]
+        args: ReportArgs,
+    }
+
+    #[test]
+    fn the_ending_chooses_between_page_and_document() {
+        let is_pdf = |text: &[&str]| {
+            let text = ["report", "flight.mcap"].iter().chain(text);
+            let parsed = Program::try_parse_from(text).map_err(|problem| problem.to_string());
+            parsed.and_then(|it| it.args.is_pdf().map_err(|problem| problem.to_string()))
+        };
+        assert_eq!(is_pdf(&[]), Ok(false));
+        assert_eq!(is_pdf(&["--format", "pdf"]), Ok(true));
+        assert_eq!(is_pdf(&["-o", "why.PDF"]), Ok(true));
+        assert_eq!(is_pdf(&["-o", "why.html"]), Ok(false));
+        assert!(is_pdf(&["-o", "why.txt"]).unwrap_err().contains(".html, .htm or .pdf"));
+        assert!(is_pdf(&["-o", "why.html", "--format", "pdf"]).unwrap_err().contains("why.html"));
+    }
 
     fn refusal(contents: Option<&[u8]>) -> String {
         let folder = tempfile::tempdir().unwrap();

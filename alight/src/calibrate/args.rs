@@ -1,6 +1,6 @@
 //! The arguments of `alight calibrate board`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use calibration::{Lens, Options};
 use clap::{Args, ValueEnum};
@@ -9,6 +9,7 @@ use markers::{Board, BoardError};
 use media::{CalibrationFormat, CalibrationWriteError, OnSensor, SensorMode, SensorRegion};
 
 use crate::args::{Format, NetworkArgs};
+use crate::ending::{Ending, format_of};
 use crate::marker::{Output, Paper};
 
 /// The arguments of `alight calibrate board`.
@@ -44,8 +45,8 @@ pub(crate) struct BoardArgs {
     /// Bayer pattern of grey images with a sensor's raw samples: RGGB, GRBG, GBRG or BGGR.
     #[arg(long, value_name = "PATTERN")]
     pub(super) bayer: Option<BayerPattern>,
-    /// The calibration file to write.
-    #[arg(short, long, value_name = "FILE")]
+    /// The calibration file to write. Its name ends in .yaml, or in .json or .xml for OpenCV's.
+    #[arg(short, long, value_name = "FILE", value_parser = calibration_file)]
     pub(super) output: Option<PathBuf>,
     /// The sensor's size, kept in the file, when the images show it binned or a part of it; other modes of the same camera are
     /// then calculated from this calibration.
@@ -57,9 +58,9 @@ pub(crate) struct BoardArgs {
     /// How many pixels of the sensor, across and down, are one of the images'.
     #[arg(long, value_name = "N", requires = "sensor", default_value_t = 1)]
     binning: u32,
-    /// The calibration file's format.
-    #[arg(long, value_enum, default_value_t = FileFormat::Ros)]
-    pub(super) file_format: FileFormat,
+    /// The calibration file's format [default: ros, or opencv where the file's name ends in .json or .xml].
+    #[arg(long, value_enum)]
+    file_format: Option<FileFormat>,
     /// Format of what is printed: text, or JSON, one object for the result and with --live one for each frame that was taken.
     #[arg(long, value_enum, default_value_t)]
     pub(super) format: Format,
@@ -84,13 +85,24 @@ impl BoardArgs {
     /// Whether the file can hold what will be found; it would be a pity to learn that afterwards.
     ///
     /// # Errors
-    /// Brown-Conrady with more than four numbers for Kalibr.
+    /// Brown-Conrady with more than four numbers for Kalibr, and an ending that only OpenCV's files have.
     pub(super) fn check(&self) -> Result<(), CalibrationWriteError> {
         let is_long = matches!(self.lens, LensName::BrownConrady5 | LensName::BrownConrady8);
-        match self.file_format {
-            FileFormat::Kalibr if is_long => Err(CalibrationWriteError::Lens),
-            FileFormat::Kalibr | FileFormat::Ros | FileFormat::Opencv => Ok(()),
+        match (self.file_format(), &self.output) {
+            (FileFormat::Kalibr, _) if is_long => Err(CalibrationWriteError::Lens),
+            (FileFormat::Kalibr | FileFormat::Ros, Some(path)) if is_of_open_cv(path) => {
+                Err(CalibrationWriteError::Ending { path: path.clone() })
+            }
+            (FileFormat::Kalibr | FileFormat::Ros | FileFormat::Opencv, _) => Ok(()),
         }
+    }
+
+    /// The file's format: as it was said, or as its name's ending says.
+    pub(super) fn file_format(&self) -> FileFormat {
+        self.file_format.unwrap_or(match &self.output {
+            Some(path) if is_of_open_cv(path) => FileFormat::Opencv,
+            _ => FileFormat::Ros,
+        })
     }
 
     /// How to solve.
@@ -105,6 +117,24 @@ impl BoardArgs {
         let mode = SensorMode { region, binning: self.binning };
         Some(OnSensor { sensor_px: [width, height], mode })
     }
+}
+
+/// The endings of calibration files, and whether only those of OpenCV have them.
+const ENDINGS: [Ending<bool>; 4] = [
+    Ending::new("yaml", false),
+    Ending::new("yml", false),
+    Ending::new("json", true),
+    Ending::new("xml", true),
+];
+
+fn calibration_file(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    format_of(&path, &ENDINGS)?;
+    Ok(path)
+}
+
+fn is_of_open_cv(path: &Path) -> bool {
+    format_of(path, &ENDINGS).unwrap_or(false)
 }
 
 fn sensor_px(text: &str) -> Result<[u32; 2], String> {
@@ -164,5 +194,36 @@ impl FileFormat {
             Self::Kalibr => CalibrationFormat::Kalibr,
             Self::Opencv => CalibrationFormat::OpenCv,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Program {
+        #[command(flatten)]
+        args: BoardArgs,
+    }
+
+    #[test]
+    fn the_ending_of_the_file_and_its_format_agree() {
+        let format = |text: &[&str]| {
+            let text = ["board", "."].iter().chain(text);
+            let args = Program::try_parse_from(text).map_err(|problem| problem.to_string())?.args;
+            args.check().map(|()| args.file_format()).map_err(|problem| problem.to_string())
+        };
+        assert_eq!(format(&["-o", "camera.yaml"]), Ok(FileFormat::Ros));
+        assert_eq!(format(&["-o", "camera.json"]), Ok(FileFormat::Opencv));
+        assert_eq!(format(&["-o", "camera.XML"]), Ok(FileFormat::Opencv));
+        assert_eq!(
+            format(&["-o", "camera.yml", "--file-format", "opencv"]),
+            Ok(FileFormat::Opencv)
+        );
+        let refused = format(&["-o", "camera.json", "--file-format", "ros"]).unwrap_err();
+        assert!(refused.contains("camera.json") && refused.contains(".yaml"), "{refused}");
+        assert!(format(&["-o", "camera.txt"]).unwrap_err().contains(".yaml, .yml, .json or .xml"));
     }
 }

@@ -11,6 +11,7 @@ use serde_json::{Value, json};
 use super::corrected;
 use super::recorded::{self, RecordedFlight, Wanted};
 use crate::args::Format;
+use crate::ending::toml_file;
 use crate::terminal::{print, write_error};
 
 /// The arguments of `alight calibrate flight`.
@@ -29,7 +30,7 @@ pub(crate) struct FlightArgs {
     #[arg(long, value_name = "MARKER")]
     marker: Option<String>,
     /// Write what changes, as tables of camera-pub's configuration (TOML).
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE.toml", value_parser = toml_file)]
     output: Option<PathBuf>,
     /// Format of what is printed: a table, or one JSON object.
     #[arg(long, value_enum, default_value_t)]

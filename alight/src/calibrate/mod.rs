@@ -113,7 +113,7 @@ fn accept(
     };
     if let Some(path) = &args.output {
         let details = CalibrationDetails { sensor: args.on_sensor(), note: Some(note) };
-        write_calibration(path, &calibration.camera, args.file_format.format(), &details)?;
+        write_calibration(path, &calibration.camera, args.file_format().format(), &details)?;
     }
     match args.format {
         Format::Text => {

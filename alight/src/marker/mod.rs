@@ -13,6 +13,7 @@ use anyhow::Context;
 use clap::Args;
 use markers::{Marker, Pad};
 
+use crate::ending::{Ending, format_of};
 use crate::terminal::print;
 pub(crate) use sheet::{Paper, Sheet, SheetError};
 
@@ -58,13 +59,12 @@ impl std::str::FromStr for Output {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let path = PathBuf::from(text);
-        let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
-        let format = match ending.to_ascii_lowercase().as_str() {
-            "pdf" => FileFormat::Pdf,
-            "svg" => FileFormat::Svg,
-            "png" => FileFormat::Png,
-            _ => return Err("the name must end in .pdf, .svg or .png".to_owned()),
-        };
+        let formats = [
+            Ending::new("pdf", FileFormat::Pdf),
+            Ending::new("svg", FileFormat::Svg),
+            Ending::new("png", FileFormat::Png),
+        ];
+        let format = format_of(&path, &formats)?;
         Ok(Self { path, format })
     }
 }

@@ -68,6 +68,14 @@ pub enum CalibrationWriteError {
          with four numbers or Kannala-Brandt"
     )]
     Lens,
+    /// An ending that only files of OpenCV have.
+    #[error(
+        "{path:?}: files of ROS and Kalibr are YAML: let its name end in .yaml, or write OpenCV"
+    )]
+    Ending {
+        /// The file.
+        path: PathBuf,
+    },
     /// A mode that does not give these images.
     #[error(
         "{} of a sensor of {} x {} pixels, binned by {}, gives no images of {image_width} x {image_height}: correct the sensor's \
@@ -123,6 +131,9 @@ pub fn write_calibration(
         (CalibrationFormat::OpenCv, "xml") => Syntax::Xml,
         (CalibrationFormat::OpenCv, "json") => Syntax::Json,
         (CalibrationFormat::OpenCv, _) => Syntax::OpenCvYaml,
+        (CalibrationFormat::Ros | CalibrationFormat::Kalibr, "xml" | "json") => {
+            return Err(CalibrationWriteError::Ending { path: path.to_owned() });
+        }
         (CalibrationFormat::Ros | CalibrationFormat::Kalibr, _) => Syntax::Yaml,
     };
     let text = syntax.text(&entries(camera, format, details)?);
