@@ -1,5 +1,6 @@
 //! Arguments that several subcommands share.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::builder::FalseyValueParser;
@@ -75,6 +76,14 @@ impl NetworkArgs {
     }
 }
 
+/// An address at which a service is to listen.
+pub(crate) fn address(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| {
+        let port: u16 = text.trim_start_matches(':').parse().unwrap_or(8080);
+        format!("write IP:PORT, such as 127.0.0.1:{port}, or 0.0.0.0:{port} for all of this machine's addresses")
+    })
+}
+
 /// A setting of the simulator or the controller.
 pub(crate) fn flight_setting(text: &str) -> Result<String, String> {
     let is_known = ["simulator.", "controller."].iter().any(|service| text.starts_with(service));
@@ -93,4 +102,18 @@ pub(crate) enum Format {
     Text,
     /// For programs.
     Json,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_port_alone_is_answered_with_the_address_that_was_meant() {
+        assert!(address("127.0.0.1:8080").is_ok() && address("[::1]:8080").is_ok());
+        for (text, meant) in [("8765", "127.0.0.1:8765"), (":99", "127.0.0.1:99"), ("x", ":8080")] {
+            let problem = address(text).unwrap_err();
+            assert!(problem.contains(meant), "`{meant}` is not in: {problem}");
+        }
+    }
 }

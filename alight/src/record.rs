@@ -9,7 +9,8 @@ use std::process::ExitCode;
 use anyhow::{Context, ensure};
 use clap::Args;
 
-use crate::args::ServiceArgs;
+use crate::args::{ServiceArgs, address};
+use crate::ending::recording;
 use crate::services::{self, Service};
 use crate::terminal::print;
 
@@ -21,11 +22,11 @@ const NICENESS: i32 = 5;
 pub(crate) struct RecordArgs {
     /// The recording, an MCAP file: short for `--set file=FILE`. With `--repair`: the repaired copy [default:
     /// NAME-repaired.mcap beside it].
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE.mcap", value_parser = recording)]
     output: Option<PathBuf>,
     /// Let Foxglove and Lichtblick follow the flight at this address, such as 127.0.0.1:8765 (`docs/recording.md`): short for
     /// `--set serve=IP:PORT`. Beyond this machine it needs `--insecure`: anyone in reach can then follow.
-    #[arg(long, value_name = "IP:PORT")]
+    #[arg(long, value_name = "IP:PORT", value_parser = address)]
     serve: Option<SocketAddr>,
     /// Only serve, and write no file: short for `--set file=`.
     #[arg(long, requires = "serve", conflicts_with = "output")]

@@ -41,7 +41,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     node.claim_unique_name(&config.id).await?;
     let address: SocketAddr = config.listen.parse().context("`listen`")?;
     let listener = TcpListener::bind(address).await.with_context(|| {
-        format!("listening at {address} for browsers; another program has the port, or the address is of another machine: choose another with `--set listen=IP:PORT`")
+        format!("listening at {address} for browsers; another program has the port, or the address is of another machine: choose another with `listen`: `alight dashboard --set listen=IP:PORT`, `alight land --dashboard IP:PORT`")
     })?;
     let state = Arc::new(Mutex::new(State::new(clock_name())));
     let texts = Texts::default();

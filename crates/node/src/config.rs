@@ -60,7 +60,7 @@ pub enum ConfigError {
         cause: String,
     },
     /// A setting without `=`.
-    #[error("the setting `{text}` is not of the form key=value")]
+    #[error("the setting `{text}` is not of the form key=value; write `{text}=VALUE`")]
     Form {
         /// The setting.
         text: String,
@@ -133,7 +133,8 @@ impl ConfigError {
             Self::Syntax { source_name, cause } => {
                 Self::Syntax { source_name: source(source_name), cause }
             }
-            other => other,
+            Self::Form { text } => Self::Form { text: format!("{service}.{text}") },
+            other @ Self::Unreadable { .. } => other,
         }
     }
 }
@@ -257,7 +258,19 @@ fn setting_layer(text: &str, defaults: &Table) -> Result<Layer, ConfigError> {
         Ok(table) => table,
         // An unknown key is reported when the layers are merged, before its value.
         Err(_) if default_is_text || default.is_none() => quoted()?,
-        Err(problem) => return Err(problem),
+        Err(problem) => {
+            return Err(match default {
+                // Of a list or a table the parser knows better what is wrong.
+                None | Some(Value::Array(_) | Value::Table(_)) => problem,
+                Some(default) => ConfigError::WrongType {
+                    source_name: name,
+                    key: key.to_owned(),
+                    value: value.to_owned(),
+                    found: "no value that TOML has",
+                    wanted: kind(default),
+                },
+            });
+        }
     };
     Ok(Layer { name, table })
 }
@@ -485,7 +498,12 @@ mod tests {
         );
         check(None, &["rate_hz"], &["not of the form key=value"]);
         check(None, &["nam=a b"], &["no key `nam`", "did you mean `name`?"]);
-        check(None, &["rate_hz=1 2"], &["--set rate_hz=1 2 is not valid TOML"]);
+        check(
+            None,
+            &["rate_hz=1 2"],
+            &["`rate_hz` = 1 2 is no value that TOML has, where a number is needed"],
+        );
+        check(None, &["rate_hz=fast"], &["--set rate_hz=fast", "where a number is needed"]);
         check(Some("rate_hz = = 1"), &[], &["is not valid TOML", ".toml"]);
         check(None, &["name=a/b"], &["letters, digits"]);
     }
@@ -505,6 +523,15 @@ mod tests {
         ] {
             let problem = changed(setting).unwrap_err();
             assert!(problem.contains(part), "`{part}` is not in: {problem}");
+        }
+    }
+
+    #[test]
+    fn a_setting_of_several_services_is_named_with_its_service() {
+        for setting in ["rate_hz", "rate_hz=fast", "rate_hz=0", "rate_hx=1", "rate_hz=[]"] {
+            let layers = Layers { file: None, set: vec![setting.to_owned()] };
+            let problem = layers.load::<Camera>().unwrap_err().of_service("camera").to_string();
+            assert!(problem.contains(&format!("camera.{setting}")), "{problem}");
         }
     }
 

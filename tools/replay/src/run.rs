@@ -167,10 +167,9 @@ pub fn run_with(
                     end.stop = damaged(Some(record.event.name()));
                     return Ok(end);
                 };
-                let config = from_toml("the recorded configuration", configuration, set)
-                    .with_context(|| {
-                        format!("of {program}; this is {}", controller::tape::program())
-                    })?;
+                let read = |set| from_toml("the recorded configuration", configuration, set);
+                read(&[]).with_context(|| recorded_by(program))?;
+                let config = read(set)?;
                 let mut new = TapedFlight::new(record.now_ns, config.settings, Arc::default())?;
                 drop(new.take_tape());
                 flight = Some(new);
@@ -206,4 +205,26 @@ pub fn run_with(
         end.stop = Some(Stop::NoBeginning { first: 0 });
     }
     Ok(end)
+}
+
+/// What a recorded configuration is that cannot be read, which settings have no part in.
+fn recorded_by(program: &str) -> String {
+    let ours = controller::tape::program();
+    if program == ours {
+        return format!("the recording is of another build of {ours}; replay it with that one");
+    }
+    format!("the recording is of {program}, and this is {ours}; replay it with that one")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_configuration_that_cannot_be_read_names_who_recorded_it_once() {
+        let ours = controller::tape::program();
+        assert_eq!(recorded_by(&ours).matches(&ours).count(), 1);
+        let other = recorded_by("alight 9.9.9");
+        assert!(other.contains("alight 9.9.9") && other.contains(&ours), "{other}");
+    }
 }
