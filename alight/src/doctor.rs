@@ -5,6 +5,7 @@
 mod cameras;
 mod focus;
 
+use std::collections::BTreeSet;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -232,19 +233,19 @@ fn check_machine(findings: &mut Findings) {
 fn check_site(findings: &mut Findings, role: Role, jobs: &[Job]) {
     let names: Vec<_> = jobs.iter().map(|job| job.name.as_str()).collect();
     findings.good("site", format!("{} runs {}", role.name(), names.join(", ")));
-    let mut checked = Vec::new();
+    let (mut certificates, mut holders) = (BTreeSet::new(), BTreeSet::new());
     for job in jobs {
         if job.network.is_open().unwrap_or(false) {
             findings.doubtful("security", format!("{}: {INSECURE}", job.name), MAKE_KEYS);
         }
         if let Some(keys) = job.network.keys.as_deref().filter(|_| job.needs_key())
-            && !checked.contains(&job.key)
+            && certificates.insert((keys, &job.key))
         {
             check_certificate(findings, keys, &job.key);
-            if checked.is_empty() {
-                check_holders(findings, keys, job.network.vehicle.as_deref().unwrap_or("drone"));
+            let vehicle = job.network.vehicle.as_deref().unwrap_or("drone");
+            if holders.insert((keys, vehicle)) {
+                check_holders(findings, keys, vehicle);
             }
-            checked.push(job.key.clone());
         }
         if let Some(service) = job.service {
             check_devices(findings, job, service);
