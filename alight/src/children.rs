@@ -65,18 +65,24 @@ pub(crate) struct Children<K> {
 }
 
 impl Children<Service> {
-    /// Starts a service as a process of this program.
+    /// Starts a service as a process of this program; `state` is where it keeps its notes, if not at the usual place.
     pub(crate) fn start(
         &mut self,
         service: Service,
         zenoh: &Path,
         settings: &[String],
+        state: Option<&Path>,
     ) -> anyhow::Result<Started> {
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
         command.arg(service.name()).arg("--zenoh").arg(zenoh);
         command.arg("--stop-with-parent").arg(std::process::id().to_string());
-        let mut by_hand = format!("alight {} --zenoh {}", service.name(), zenoh.display());
+        let mut by_hand = String::new();
+        if let Some(state) = state {
+            command.env(node::STATE_VARIABLE, state);
+            by_hand = format!("{}={} ", node::STATE_VARIABLE, state.display());
+        }
+        by_hand.push_str(&format!("alight {} --zenoh {}", service.name(), zenoh.display()));
         let is_start =
             |setting: &str| setting.split('=').next().is_some_and(|key| key.trim() == "start");
         for setting in settings {

@@ -15,8 +15,9 @@ use node::{Layers, Network, Node, Shutdown};
 use tempfile::TempDir;
 use tokio::time::Instant;
 
-use crate::args::{Format, OPERATOR};
+use crate::args::{Format, OPERATOR, address};
 use crate::children::{ChildEvent, Children};
+use crate::ending::recording;
 use crate::outcome::LandingSummary;
 use crate::progress::Progress;
 use crate::record::file_setting;
@@ -26,6 +27,7 @@ use crate::terminal::{print, write_error};
 
 /// The arguments of a landing.
 #[derive(Args, Clone)]
+#[command(after_help = EXIT_STATUS)]
 pub(crate) struct LandArgs {
     /// Seed of everything random: wind, noise, ground.
     #[arg(long, default_value_t = 1, value_name = "N")]
@@ -63,10 +65,10 @@ pub(crate) struct LandArgs {
     timeout_s: f64,
     /// Record the landing to this file (MCAP, `docs/recording.md`); one that is there is kept, and the new one gets a
     /// number.
-    #[arg(long, value_name = "FILE.mcap")]
+    #[arg(long, value_name = "FILE.mcap", value_parser = recording)]
     record: Option<PathBuf>,
     /// Show the landing on a page at this address, such as 127.0.0.1:8080, which also commands (`docs/dashboard.md`).
-    #[arg(long, value_name = "IP:PORT")]
+    #[arg(long, value_name = "IP:PORT", value_parser = address)]
     dashboard: Option<SocketAddr>,
     /// Format of the result: a table, or one JSON object on the last line.
     #[arg(long, value_enum, default_value_t)]
@@ -81,6 +83,9 @@ fn timeout_s(text: &str) -> Result<f64, String> {
         Err("must be from 1 to 86400".to_owned())
     }
 }
+
+const EXIT_STATUS: &str = "Exit status of a landing: 0 when it landed, 1 when it did not, 2 for a wrong command line or setting, and 3 when it landed \
+                           but the recording of `--record` failed (its problem is in the result).";
 
 /// The loopback interface.
 pub(crate) const LOOPBACK: &str = "127.0.0.1";
@@ -105,7 +110,7 @@ pub(crate) fn run(args: &LandArgs) -> anyhow::Result<ExitCode> {
         Format::Json => serde_json::to_string(&outcome)?,
     })
     .context("printing the result")?;
-    Ok(ExitCode::from(u8::from(!outcome.landed)))
+    Ok(ExitCode::from(outcome.exit_status()))
 }
 
 /// Asks before the motors of a vehicle may start that may be a real one.
@@ -132,18 +137,19 @@ fn confirm_real_vehicle(args: &LandArgs, settings: &ServiceSettings) -> anyhow::
 /// The settings of each service, in starting order.
 struct ServiceSettings {
     by_service: Vec<(Service, Vec<String>)>,
+    /// The address at which the simulated autopilot of this landing alone is, if it has one.
+    simulated_at: Option<String>,
 }
 
 impl ServiceSettings {
     /// Sorts the settings of the command line by service, and checks all of them before anything starts.
     fn new(args: &LandArgs) -> anyhow::Result<Self> {
-        let autopilot = match &args.autopilot {
-            Some(address) => address.clone(),
-            None => {
-                let (port, _) = free_port()?;
-                format!("udpin:127.0.0.1:{port}")
-            }
+        let simulated_at = match &args.autopilot {
+            Some(_) => None,
+            None => Some(format!("udpin:127.0.0.1:{}", free_port()?.0)),
         };
+        let autopilot = args.autopilot.as_ref().or(simulated_at.as_ref());
+        let autopilot = autopilot.cloned().unwrap_or_default();
         let mut simulator = vec![format!("seed={}", args.seed)];
         match &args.autopilot {
             Some(_) => simulator.push("vehicle=\"reported\"".to_owned()),
@@ -213,7 +219,24 @@ impl ServiceSettings {
                 Err(problem) => problem,
             })?;
         }
-        Ok(Self { by_service })
+        Ok(Self { by_service, simulated_at })
+    }
+
+    /// The name of the recorder, if there is one.
+    fn recorder(&self) -> anyhow::Result<Option<String>> {
+        let set = self.of(Service::Recorder).to_vec();
+        if set.is_empty() {
+            return Ok(None);
+        }
+        Ok(Some(Layers { file: None, set }.load::<recorder::Config>()?.settings.id))
+    }
+
+    /// Whether the controller's vehicle is the simulated one of this landing, which nobody meets again.
+    fn is_simulated(&self) -> bool {
+        let layers = Layers { file: None, set: self.of(Service::Controller).to_vec() };
+        let config = layers.load::<controller::Config>();
+        let address = config.ok().map(|config| config.settings.autopilot.address);
+        address.is_some() && address == self.simulated_at
     }
 
     fn of(&self, service: Service) -> &[String] {
@@ -262,10 +285,13 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         let scheme = if is_encrypted { "https" } else { "http" };
         progress.say(&format!("The page is at {scheme}://{address}/"));
     }
+    // What a controller notes of a simulated vehicle is of use to those that resume this landing, and to nobody after it.
+    let notes_in = settings.is_simulated().then(|| rendezvous.directory.path());
     let mut children = Children::new();
     let mut resume = String::new();
     for (service, settings) in &settings.by_service {
-        let started = children.start(*service, &rendezvous.file, settings)?;
+        let notes = notes_in.filter(|_| *service == Service::Controller);
+        let started = children.start(*service, &rendezvous.file, settings, notes)?;
         progress.debug(&started.to_string());
         if *service == Service::Controller {
             resume = started.by_hand;
@@ -326,7 +352,10 @@ async fn watch(
     let truths = node.subscriber(topic::TRUTH, &[]).await?;
     let healths = node.subscriber(topic::HEALTH, &[]).await?;
     let recorders = node.subscriber(topic::RECORDER_STATUS, &[]).await?;
-    let mut landing = LandingSummary::default();
+    let mut landing = match settings.recorder()? {
+        Some(recorder) => LandingSummary::recorded_by(recorder),
+        None => LandingSummary::default(),
+    };
     let mut over: Option<Instant> = None;
     let mut controllers_exit = None;
     let mut redraw = tokio::time::interval(Duration::from_millis(200));
@@ -354,6 +383,9 @@ async fn watch(
                         return Ok(landing);
                     }
                     progress.say(&format!("{} exited: {exit}{}", service.name(), consequence(service)));
+                    if service == Service::Recorder {
+                        landing.recording_without_end(&exit.to_string());
+                    }
                     if service == Service::Controller {
                         controllers_exit = Some(exit.to_string());
                         if !landing.never_flew() {
@@ -419,8 +451,8 @@ struct Rendezvous {
     description: String,
     /// The port, if it is not the usual one of a machine.
     unusual_port: Option<u16>,
-    /// Deletes the file at the end.
-    _directory: TempDir,
+    /// Is deleted at the end, with what is in it.
+    directory: TempDir,
     /// Keeps the port from other landings until the end.
     _claim: Option<UdpSocket>,
 }
@@ -435,13 +467,7 @@ impl Rendezvous {
         if let Some(file) = user_file {
             let file = file.to_owned();
             let description = file.display().to_string();
-            return Ok(Self {
-                file,
-                description,
-                unusual_port: None,
-                _directory: directory,
-                _claim: None,
-            });
+            return Ok(Self { file, description, unusual_port: None, directory, _claim: None });
         }
         let usual = node::session::LOCAL_PORT;
         let (port, lock) = match claim(usual) {
@@ -453,7 +479,7 @@ impl Rendezvous {
             .with_context(|| format!("writing {file:?}"))?;
         let description = format!("local, rendezvous at port {port}");
         let unusual_port = (port != usual).then_some(port);
-        Ok(Self { file, description, unusual_port, _directory: directory, _claim: Some(lock) })
+        Ok(Self { file, description, unusual_port, directory, _claim: Some(lock) })
     }
 }
 

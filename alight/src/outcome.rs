@@ -24,6 +24,8 @@ pub(crate) struct LandingSummary {
     /// Detections used by earlier controllers.
     detections_before: u64,
     recorder: Option<RecorderStatus>,
+    /// The name of the recorder that is to record it.
+    recorded_by: Option<String>,
 }
 
 /// The result of a landing.
@@ -43,6 +45,9 @@ pub(crate) struct Outcome {
     guidance: String,
     processes: Vec<Process>,
     recording: Option<Recording>,
+    /// Whether it was to be recorded: others may have recorded it as well.
+    #[serde(skip)]
+    is_to_be_recorded: bool,
 }
 
 /// What was recorded of it.
@@ -73,7 +78,20 @@ struct Process {
     cpu_percent: f64,
 }
 
+/// The problem of a recorder until it reports.
+const UNHEARD: &str = "the recorder has not reported";
+
+/// Exit status of a landing whose recording failed.
+const RECORDING_FAILED: u8 = 3;
+
 impl LandingSummary {
+    /// Of a landing that the recorder with this name is to record.
+    pub(crate) fn recorded_by(recorder: String) -> Self {
+        let unheard =
+            RecorderStatus { problem: Some(UNHEARD.to_owned()), ..RecorderStatus::default() };
+        Self { recorder: Some(unheard), recorded_by: Some(recorder), ..Self::default() }
+    }
+
     /// Adds a status; true when the controller has finished.
     pub(crate) fn status(&mut self, status: ControllerStatus) -> bool {
         self.started_ns = self.started_ns.or(status.started_ns);
@@ -99,6 +117,10 @@ impl LandingSummary {
     }
 
     pub(crate) fn recorder(&mut self, recorder: RecorderStatus) {
+        // Others may run beside it.
+        if self.recorded_by.as_ref().is_some_and(|ours| *ours != recorder.recorder) {
+            return;
+        }
         // One that fails goes on without a file; what it kept is in the last one.
         let before = self.recorder.replace(recorder).map(|before| before.file);
         if let (Some(now), Some(before)) = (&mut self.recorder, before)
@@ -108,12 +130,13 @@ impl LandingSummary {
         }
     }
 
-    /// Notes that the recorder failed when it was to end its file.
+    /// Notes that the recorder exited before it had ended its file.
     pub(crate) fn recording_without_end(&mut self, exit: &str) {
         let recorder = self.recorder.get_or_insert_default();
-        recorder.problem.get_or_insert_with(|| {
-            format!("the recorder exited: {exit}; `alight record --repair` ends its file")
-        });
+        let is_begun = !recorder.file.is_empty();
+        let repair = if is_begun { "; `alight record --repair` ends its file" } else { "" };
+        let known = recorder.problem.take().filter(|problem| problem != UNHEARD);
+        recorder.problem = known.or_else(|| Some(format!("the recorder exited: {exit}{repair}")));
     }
 
     /// Notes why the landing was not watched to its end.
@@ -167,7 +190,7 @@ impl LandingSummary {
         let landed = self.disarmed_ns.is_some() && touchdown.is_some();
         let outcome = match (&self.interrupted, status) {
             (Some(why), Some(status)) => {
-                format!("{why}; it was in `{}`: {}", status.phase, status.why)
+                format!("{why}; it was in {}", phase_and_reason(status))
             }
             (Some(why), None) => format!("{why}; no controller was running"),
             (None, _) if landed => "landed".to_owned(),
@@ -197,6 +220,7 @@ impl LandingSummary {
                 never_came: recorder.never_came(),
                 problem: recorder.problem.clone(),
             }),
+            is_to_be_recorded: self.recorded_by.is_some(),
         }
     }
 
@@ -212,6 +236,16 @@ impl LandingSummary {
 }
 
 impl Outcome {
+    /// The exit status of `alight land`: 0, 1 without a landing, and another where only the recording failed.
+    pub(crate) fn exit_status(&self) -> u8 {
+        let problem = self.recording.as_ref().and_then(|recording| recording.problem.as_ref());
+        match self.landed {
+            false => 1,
+            true if self.is_to_be_recorded && problem.is_some() => RECORDING_FAILED,
+            true => 0,
+        }
+    }
+
     /// The result beside that of the thesis, as a table.
     pub(crate) fn table(&self) -> String {
         let mut text = String::new();
@@ -339,13 +373,47 @@ mod tests {
     }
 
     #[test]
+    fn a_landing_whose_recording_failed_has_an_exit_status_of_its_own() {
+        let landed = |mut landing: LandingSummary| {
+            landing.disarmed_ns = Some(2);
+            let touchdown = Touchdown {
+                stamp_ns: 1,
+                error_m: 0.02,
+                vertical_speed_m_s: 0.5,
+                lateral_speed_m_s: 0.0,
+            };
+            landing.truth(truth(Some(touchdown)));
+            landing
+        };
+        let status = |landing: &LandingSummary| landing.outcome().exit_status();
+        assert_eq!(status(&LandingSummary::default()), 1);
+        assert_eq!(status(&landed(LandingSummary::default())), 0);
+        let told = |recorder: &str, file: &str, problem: Option<&str>| RecorderStatus {
+            recorder: recorder.into(),
+            file: file.into(),
+            problem: problem.map(str::to_owned),
+            ..RecorderStatus::default()
+        };
+        let mut landing = landed(LandingSummary::recorded_by("main".into()));
+        assert_eq!(status(&landing), RECORDING_FAILED, "nobody knows of a recording");
+        landing.recorder(told("main", "", Some("No space left")));
+        assert_eq!(status(&landing), RECORDING_FAILED);
+        landing.recorder(told("main", "flight-2.mcap", None));
+        landing.recorder(told("another", "", Some("No space left")));
+        assert_eq!(status(&landing), 0, "another file took its place");
+        landing.recording_without_end("exit status: 1");
+        assert_eq!(status(&landing), RECORDING_FAILED);
+        assert!(landing.outcome().table().contains("--repair"));
+    }
+
+    #[test]
     fn an_interrupted_landing_names_its_phase() {
         let mut landing = LandingSummary::default();
         landing.status(status(Phase::Search));
         landing.interrupted("interrupted");
         let outcome = landing.outcome();
         assert!(!outcome.landed);
-        assert_eq!(outcome.outcome, "interrupted; it was in `search`: because");
+        assert_eq!(outcome.outcome, "interrupted; it was in search: because");
         landing.timed_out(None);
         assert!(landing.outcome().outcome.starts_with("timeout before the landing"));
         landing.timed_out(Some("signal: 9 (SIGKILL)"));

@@ -191,6 +191,8 @@ impl<'a> RealFlight<'a> {
         for setting in settings {
             command.args(["--set", setting]);
         }
+        // What a controller notes of this vehicle is of use in this flight only.
+        command.env(node::STATE_VARIABLE, self.folder);
         let log = if self.has(|kind| kind == Kind::FullDisk) && part != Part::World {
             command.env("ALIGHT_LOG", "debug");
             File::create("/dev/full").context("opening /dev/full")?

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, SystemTime};
 
 use node::{clock_name, state_directory};
 use serde::de::DeserializeOwned;
@@ -78,6 +79,44 @@ fn write(path: &Path, note: Option<&impl Serialize>) -> std::io::Result<()> {
     std::fs::rename(&new, path)
 }
 
+/// The end of the name of a file with a pad's place.
+const OF_A_PAD: &str = "-pad";
+/// Age from which the place of a pad is of use to nobody, also where several hosts share the directory.
+const MAX_PAD_AGE: Duration = Duration::from_secs(24 * 3600);
+
+/// Removes the places of pads, for any autopilot, that no controller can use: those of an earlier boot, as a flight leaves them whose
+/// controller was killed. The notes of parameters stay, as only their vehicle can tell whether it needs them.
+pub fn remove_useless_pads() {
+    if let Some(directory) = state_directory() {
+        remove_pads_of_earlier_boots(&directory, clock_name(), SystemTime::now());
+    }
+}
+
+fn remove_pads_of_earlier_boots(directory: &Path, clock: &str, now: SystemTime) {
+    let Ok(entries) = std::fs::read_dir(directory) else { return };
+    let ending = format!("{OF_A_PAD}.json");
+    for entry in entries.flatten() {
+        let name = entry.file_name();
+        let name = name.to_string_lossy();
+        let is_old = || {
+            let modified = entry.metadata().and_then(|it| it.modified()).ok()?;
+            Some(now.duration_since(modified).ok()? >= MAX_PAD_AGE)
+        };
+        let is_of_another_boot = || {
+            let text = std::fs::read(entry.path()).ok()?;
+            Some(serde_json::from_slice::<Clocked>(&text).ok()?.clock != clock)
+        };
+        if name.starts_with("controller-")
+            && name.ends_with(&ending)
+            && is_old() == Some(true)
+            && is_of_another_boot() == Some(true)
+        {
+            // Another controller may have removed it meanwhile.
+            let _ = std::fs::remove_file(entry.path());
+        }
+    }
+}
+
 /// The file with the pad's place. It is written while the vehicle descends, so nothing waits for it.
 #[derive(Debug)]
 pub struct PadFile {
@@ -96,7 +135,7 @@ struct Clocked {
 impl PadFile {
     /// The file of the controller with this id for the autopilot at this address.
     pub fn new(id: &str, address: &str) -> Self {
-        let file = NoteFile::named(&format!("{}-pad", file_name(id, address)));
+        let file = NoteFile::named(&format!("{}{OF_A_PAD}", file_name(id, address)));
         Self { file: Arc::new(Mutex::new(file)), kept: None, writing: None }
     }
 
@@ -142,6 +181,42 @@ mod tests {
         assert_eq!(file.read(), Some(note));
         file.keep(None);
         assert_eq!(file.read(), None);
+        std::fs::remove_dir_all(directory).unwrap();
+    }
+
+    #[test]
+    fn only_places_of_pads_of_an_earlier_boot_are_removed() {
+        let directory =
+            std::env::temp_dir().join(format!("alight-old-notes-{}", std::process::id()));
+        std::fs::create_dir_all(&directory).unwrap();
+        let pad = |clock: &str| {
+            let pad = PadNote {
+                address: "udpin:127.0.0.1:14550".into(),
+                system: 1,
+                stamp_ns: 1,
+                position_ned_m: [0.0; 3],
+                deviation_m: 0.1,
+            };
+            serde_json::to_string(&Clocked { clock: clock.into(), pad }).unwrap()
+        };
+        let files = [
+            ("controller-main-a-pad.json", pad("monotonic/earlier")),
+            ("controller-main-b-pad.json", pad("monotonic/now")),
+            ("controller-main-c-pad.json", "no pad".to_owned()),
+            ("controller-main-a.json", pad("monotonic/earlier")),
+            ("notes-pad.json", pad("monotonic/earlier")),
+        ];
+        for (name, text) in &files {
+            std::fs::write(directory.join(name), text).unwrap();
+        }
+        let left = |age: Duration| -> Vec<&str> {
+            remove_pads_of_earlier_boots(&directory, "monotonic/now", SystemTime::now() + age);
+            let names = files.iter().map(|(name, _)| *name);
+            names.filter(|name| directory.join(name).exists()).collect()
+        };
+        let all = files.each_ref().map(|(name, _)| *name);
+        assert_eq!(left(MAX_PAD_AGE / 2), all);
+        assert_eq!(left(MAX_PAD_AGE * 2), all[1..]);
         std::fs::remove_dir_all(directory).unwrap();
     }
 

@@ -17,7 +17,7 @@ use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
 use crate::config::Config;
 use crate::flight::Flight;
-use crate::note_file::{NoteFile, PadFile};
+use crate::note_file::{NoteFile, PadFile, remove_useless_pads};
 use crate::tape::TapedFlight;
 
 /// Period of the flight's ticks.
@@ -68,6 +68,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let mut link = Link::open_for(address, Peering::Autopilot, config.signing()?)
         .await
         .context("opening the link to the autopilot")?;
+    drop(tokio::task::spawn_blocking(remove_useless_pads));
     let mut note_file = NoteFile::new(&config.id, &config.autopilot.address);
     let mut pad_file = PadFile::new(&config.id, &config.autopilot.address);
     let mut flight = TapedFlight::new(now_ns(), config, node.shared_health())?;

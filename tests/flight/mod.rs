@@ -96,6 +96,8 @@ pub(crate) struct Service {
     pub(crate) name: String,
     pub(crate) pid: Pid,
     pub(crate) by_hand: Vec<String>,
+    /// Where it keeps its notes, if not at the usual place.
+    state: Option<String>,
 }
 
 impl Landing {
@@ -154,7 +156,9 @@ impl Landing {
     /// Starts a service again as a person would, with more settings.
     pub(crate) fn start_by_hand(&mut self, name: &str, settings: &[&str]) -> anyhow::Result<Pid> {
         let mut command = Command::new(ALIGHT);
-        command.args(&self.service(name)?.by_hand);
+        let Service { by_hand, state, .. } = self.service(name)?;
+        command.args(by_hand);
+        command.envs(state.iter().map(|state| ("STATE_DIRECTORY", state)));
         for setting in settings {
             command.args(["--set", setting]);
         }
@@ -259,12 +263,15 @@ impl Drop for Landing {
     }
 }
 
-/// The service in a line such as `detector is process 12; by hand: alight detector --zenoh FILE --set 'a=b'`.
+/// The service in a line such as `detector is process 12; by hand: alight detector --zenoh FILE --set 'a=b'`; that of a controller
+/// may begin with where it keeps its notes.
 pub(crate) fn service_in(line: &str) -> Option<Service> {
-    let (start, by_hand) = line.split_once("; by hand: alight ")?;
+    let (start, by_hand) = line.split_once("; by hand: ")?;
+    let (before, by_hand) = by_hand.split_once("alight ")?;
     let (name, pid) = start.split_once(" is process ")?;
     let by_hand = by_hand.split(' ').map(|word| word.trim_matches('\'').to_owned()).collect();
-    Some(Service { name: name.into(), pid: Pid::from_raw(pid.parse().ok()?)?, by_hand })
+    let state = before.trim_end().strip_prefix("STATE_DIRECTORY=").map(str::to_owned);
+    Some(Service { name: name.into(), pid: Pid::from_raw(pid.parse().ok()?)?, by_hand, state })
 }
 
 pub(crate) fn descent_m_s(truth: &Truth) -> f64 {

@@ -42,6 +42,6 @@ pub use network::{INSECURE, Network, OPEN};
 pub use service::{Options, Shutdown, relaunch, relaunch_with_zenoh_threads, run, start_logging};
 pub use session::{Announcement, Node, Presence, ZenohSource};
 pub use standstill::Standstill;
-pub use state::state_directory;
+pub use state::{STATE_VARIABLE, state_directory};
 pub use tap::{Tap, Tapped};
 pub use topics::{Commands, Publisher, Request, Subscriber};
