@@ -298,3 +298,23 @@ fn a_small_marker_beside_a_large_one_is_found_by_who_is_thorough() {
     assert_eq!(count(Settings::default()), 1);
     assert_eq!(count(Settings { thorough: true, ..Settings::default() }), 2);
 }
+
+#[test]
+fn every_marker_of_a_board_of_hundreds_is_found() {
+    const ALONG: usize = 20;
+    const PITCH: f64 = 48.0;
+    let code = SquareCode::for_family(Family::Aruco6x6_1000).unwrap();
+    let side = 16 + ALONG * PITCH as usize;
+    let image = picture([side, side], 1.0, |place| {
+        let [column, row] = place.map(|at| ((at - 8.0) / PITCH).floor());
+        let inside = |index: f64| (0.0..ALONG as f64).contains(&index);
+        let cells = [place[0] - 8.0 - PITCH * column, place[1] - 8.0 - PITCH * row];
+        let cells = cells.map(|along| (along - 8.0) / 4.0);
+        let is_marker = inside(column) && inside(row);
+        let within = is_marker && cells.iter().all(|along| (0.0..8.0).contains(along));
+        let id = if within { row as usize * ALONG + column as usize } else { 0 };
+        GREYS[usize::from(!within || is_white(&code, id, 1, cells))]
+    });
+    let all: Vec<u32> = (0..(ALONG * ALONG) as u32).collect();
+    assert_eq!(ids(&image, &["aruco-6x6-1000"], Settings::default()), all);
+}

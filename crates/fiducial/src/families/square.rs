@@ -30,9 +30,10 @@ use crate::refine::pattern::Pattern;
 use crate::schedule::FallbackStep;
 use crate::trace::{Reason, Trace};
 
-/// Bounds on the work in one image, far above what frames with markers need.
+/// Bounds on the work in one image, far above what frames with markers need: quads that are solved for and are none, and markers,
+/// of which a calibration board has hundreds.
 const MAX_SOLVED: usize = 500;
-const MAX_FOUND: usize = 256;
+const MAX_FOUND: usize = 1024;
 const MAX_DOUBTFUL: usize = 64;
 
 /// Cells up to this width, in pixels, are read by their quiet zone: blur or a tone curve may break their border.
@@ -445,7 +446,7 @@ impl SquareTagDetector {
                     }
                 }
             }
-            if solved >= MAX_SOLVED || self.found.len() >= MAX_FOUND {
+            if solved >= MAX_SOLVED + self.found.len() || self.found.len() >= MAX_FOUND {
                 break;
             }
         }
