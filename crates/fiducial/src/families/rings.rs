@@ -10,6 +10,7 @@
 pub(crate) mod circle_pose;
 mod dot;
 mod edges;
+mod flatness;
 mod focal_guess;
 mod measure;
 mod photometric;

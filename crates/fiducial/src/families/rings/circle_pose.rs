@@ -34,10 +34,10 @@ pub(crate) struct EdgePoint {
 /// Points sampled on an ellipse to map it through a lens.
 const ELLIPSE_POINTS: u32 = 24;
 /// Huber limit of edge residuals, in pixels.
-const HUBER_PX: f64 = 0.3;
+pub(crate) const HUBER_PX: f64 = 0.3;
 /// Lower bound of the edges' standard deviation, in pixels. Errors common to all edges, such as the blur of
 /// thin rings, do not show in their scatter.
-const MIN_EDGE_ERROR_PX: f64 = 0.05;
+pub(crate) const MIN_EDGE_ERROR_PX: f64 = 0.05;
 /// Circles that differ by more, as a ratio of variances, do so by no chance: one of a thousand sets of six does.
 const MAX_CHANCE: f64 = 4.0;
 /// Fewer edge points do not determine a pose.
@@ -208,6 +208,7 @@ impl CirclePose {
         let of_step =
             equations.matrix.try_inverse()? * (error_px * error_px * wider.unwrap_or(1.0));
         let covariance = self.full_covariance(&of_step);
+        let covariance = self.widened_by_form(covariance, points, camera);
         covariance.iter().all(|c| c.is_finite()).then_some(covariance)
     }
 
@@ -230,16 +231,21 @@ impl CirclePose {
     /// Covariance of centre (m) and rotation vector (rad), from that of the centre and of the normal along
     /// [`CirclePose::basis`].
     pub(crate) fn full_covariance(&self, of_step: &SMatrix<f64, 5, 5>) -> Matrix6<f64> {
+        let mut covariance = self.propagated(of_step);
+        let about_normal = self.normal * self.normal.transpose() * UNKNOWN_ANGLE_VARIANCE;
+        covariance.fixed_view_mut::<3, 3>(3, 3).add_assign(about_normal);
+        covariance
+    }
+
+    /// The same without the rotation about the normal.
+    pub(crate) fn propagated(&self, of_step: &SMatrix<f64, 5, 5>) -> Matrix6<f64> {
         let (u, v) = self.basis();
         // The rotation vector v moves the normal along u, and -u along v.
         let mut full_from_step = SMatrix::<f64, 6, 5>::zeros();
         full_from_step.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
         full_from_step.fixed_view_mut::<3, 1>(3, 3).copy_from(&v);
         full_from_step.fixed_view_mut::<3, 1>(3, 4).copy_from(&-u);
-        let mut covariance = full_from_step * of_step * full_from_step.transpose();
-        let about_normal = self.normal * self.normal.transpose() * UNKNOWN_ANGLE_VARIANCE;
-        covariance.fixed_view_mut::<3, 3>(3, 3).add_assign(about_normal);
-        covariance
+        full_from_step * of_step * full_from_step.transpose()
     }
 
     /// The largest median residual of one circle's edge points, in pixels. It is large when the radii are not
@@ -482,9 +488,15 @@ impl CirclePlane {
         }
     }
 
+    /// Where a viewing ray meets the plane: from the centre along [`CirclePose::basis`], in metres.
+    pub(crate) fn place(&self, ray: &Vector3<f64>) -> [f64; 2] {
+        let along = self.distance / self.normal.dot(ray);
+        [self.u.dot(ray) * along - self.centre[0], self.v.dot(ray) * along - self.centre[1]]
+    }
+
     /// Distance in pixels from an edge point to its circle, positive outside, with its gradient by the pose.
     #[inline]
-    fn residual(&self, point: &EdgePoint) -> Option<(f64, SVector<f64, 5>)> {
+    pub(crate) fn residual(&self, point: &EdgePoint) -> Option<(f64, SVector<f64, 5>)> {
         let at = self.intersect(&point.ray);
         let residual = (at.rho - point.radius) * at.px_per_metre;
         (at.is_valid() && residual.is_finite()).then_some((residual, at.by_pose.into()))

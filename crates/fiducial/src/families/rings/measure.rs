@@ -160,7 +160,9 @@ impl EdgeSearch<'_> {
             && let Some(fit) =
                 self.photometric_poses(&found.pose, diameter_px, &mut buffers.samples)
         {
-            return from_photometric(&fit, confidence(&found.support)).ok_or(Reason::Pose);
+            let measured =
+                from_photometric(&fit, confidence(&found.support)).ok_or(Reason::Pose)?;
+            return Ok(self.with_form(measured, &buffers.edges));
         }
         let edges = &mut buffers.edges;
         self.locate(&found.pose, Reach::Near, edges);
@@ -304,7 +306,8 @@ impl EdgeSearch<'_> {
         }
         let support = self.locate(&fit.best.pose, Reach::Sparse, &mut buffers.edges);
         let measured = from_photometric(&fit, confidence(&support))?;
-        (self.completeness(&fit.best.pose, &support) == Completeness::Full).then_some(measured)
+        (self.completeness(&fit.best.pose, &support) == Completeness::Full)
+            .then(|| self.with_form(measured, &buffers.edges))
     }
 
     /// A marker too small for edges: its grey values decide.
@@ -371,7 +374,14 @@ impl EdgeSearch<'_> {
         let completeness = self.completeness(&fit.best.pose, &support);
         let is_marker = completeness != Completeness::Insufficient
             && !self.is_likely_target(&fit.best.pose, &buffers.edges);
-        is_marker.then_some(measured)
+        is_marker.then(|| self.with_form(measured, &buffers.edges))
+    }
+
+    /// The same, less sure where its edges show that the print is not flat.
+    fn with_form(&self, mut measured: MeasuredMarker, edges: &[EdgePoint]) -> MeasuredMarker {
+        let MeasuredMarker { pose, covariance, .. } = measured;
+        measured.covariance = pose.widened_by_form(covariance, edges, self.camera);
+        measured
     }
 
     /// The pose of all edges, from a rough pose or from another start.
