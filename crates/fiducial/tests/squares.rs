@@ -313,7 +313,7 @@ fn every_marker_of_a_board_of_hundreds_is_found() {
         let is_marker = inside(column) && inside(row);
         let within = is_marker && cells.iter().all(|along| (0.0..8.0).contains(along));
         let id = if within { row as usize * ALONG + column as usize } else { 0 };
-        GREYS[usize::from(!within || is_white(&code, id, 1, cells))]
+        GREYS[usize::from(!within || is_white(code, id, 1, cells))]
     });
     let all: Vec<u32> = (0..(ALONG * ALONG) as u32).collect();
     assert_eq!(ids(&image, &["aruco-6x6-1000"], Settings::default()), all);
