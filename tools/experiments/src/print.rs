@@ -45,7 +45,7 @@ pub enum BendForm {
 /// Number of flat pieces along the edge of bent paper.
 const PIECES: usize = 12;
 /// Dots along the edge of each piece: finer than the image.
-const DOTS: usize = 32;
+const DOTS: usize = 128;
 /// The size of pieces over the distance between them: they overlap by more than the blur, so that nothing shows between them.
 const OVERLAP: f64 = 1.5;
 
