@@ -26,11 +26,11 @@ use crate::event::Event;
 use crate::mode::{Firmware, FlightMode};
 use crate::packet::{self, Packet, Sender};
 use crate::parameter::{Parameter, Parameters};
-use crate::px4_events;
+use crate::px4_listener::{About, Heard, Listener};
 use crate::simulation::Simulation;
 use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
 use crate::stream::{self, Streams};
-use crate::text::Joiner;
+use crate::text::{Joiner, Text};
 
 /// The component id of every autopilot.
 pub const AUTOPILOT: u8 = 1;
@@ -89,6 +89,7 @@ struct Vehicle {
     /// Altitude above mean sea level, in m.
     amsl_m: Option<f64>,
     joiner: Joiner,
+    listener: Listener,
 }
 
 impl Autopilot {
@@ -139,8 +140,8 @@ impl Autopilot {
             MavMessage::COMMAND_ACK(ack) => self.take_acknowledgement(now_ns, ack),
             MavMessage::STATUSTEXT(text) => {
                 let texts = self.vehicle.as_mut().map(|v| v.joiner.push(now_ns, text));
-                for (severity, text) in texts.unwrap_or_default() {
-                    self.take_text(severity, text);
+                for text in texts.unwrap_or_default() {
+                    self.take_statustext(text);
                 }
             }
             MavMessage::EVENT(event) if self.firmware() == Some(Firmware::Px4) => {
@@ -166,8 +167,8 @@ impl Autopilot {
         }
         self.check_silence(now_ns);
         let late = self.vehicle.as_mut().and_then(|vehicle| vehicle.joiner.tick(now_ns));
-        if let Some((severity, text)) = late {
-            self.take_text(severity, text);
+        if let Some(text) = late {
+            self.take_statustext(text);
         }
         if self.is_connected() {
             let (notices, request) = self.streams.tick(now_ns);
@@ -524,6 +525,7 @@ impl Autopilot {
             batteries: [Battery::default(); 2],
             amsl_m: None,
             joiner: Joiner::default(),
+            listener: Listener::default(),
         });
         self.streams = Streams::new(&stream::of_firmware(firmware, &self.config.streams));
         self.push(Event::Found { system, firmware });
@@ -574,6 +576,7 @@ impl Autopilot {
             vehicle.state.connected = false;
             // It may have restarted when it returns, or be another one, so what it said does not hold.
             vehicle.readiness = Readiness::default();
+            vehicle.listener = Listener::default();
             vehicle.simulation = Simulation::default();
             vehicle.state.ready = false;
             let (silence_ns, state) = (silence_ns.max(0) as u64, vehicle.state);
@@ -596,12 +599,30 @@ impl Autopilot {
         self.push(Event::Text { severity, text });
     }
 
-    fn take_px4_event(&mut self, event: &EVENT_DATA) {
-        let Some(told) = px4_events::told(event) else { return };
-        if let Some(vehicle) = self.vehicle.as_mut().filter(|_| told.is_check) {
-            vehicle.readiness.take_failed_check(&told.text);
+    fn take_statustext(&mut self, Text { severity, text, is_event }: Text) {
+        // PX4 sends it twice where it hears a ground station.
+        let is_told = is_event && self.vehicle.as_ref().is_some_and(|it| it.listener.has_heard());
+        if !is_told {
+            self.take_text(severity, text);
         }
-        self.take_text(told.severity, told.text);
+    }
+
+    fn take_px4_event(&mut self, event: &EVENT_DATA) {
+        let Some(vehicle) = &mut self.vehicle else { return };
+        let heard = vehicle.listener.take(event);
+        vehicle.readiness.take_checks(vehicle.listener.why_not_armed());
+        let Some(Heard { severity, text, about }) = heard else { return };
+        let is_new = match about {
+            About::Else => return self.take_text(severity, text),
+            About::Arming { is_new } => {
+                self.requests.iter_mut().for_each(|request| request.add_check(&text));
+                is_new
+            }
+            About::Health { is_new } => is_new,
+        };
+        if is_new {
+            self.push(Event::Text { severity, text });
+        }
     }
 
     fn take_acknowledgement(&mut self, now_ns: i64, ack: &COMMAND_ACK_DATA) {
@@ -753,6 +774,7 @@ impl Autopilot {
     fn restarted(&mut self) {
         let Some(vehicle) = &mut self.vehicle else { return };
         vehicle.readiness = Readiness::default();
+        vehicle.listener = Listener::default();
         vehicle.contact = Contact::default();
         vehicle.state.attitude = None;
         vehicle.state.position = None;

@@ -368,6 +368,13 @@ impl Request {
         }
     }
 
+    /// A check before arming failed while this was pending.
+    pub(crate) fn add_check(&mut self, text: &str) {
+        if self.command == Command::Arm {
+            self.add_text(text);
+        }
+    }
+
     /// The autopilot acknowledged.
     pub(crate) fn acknowledge(&mut self, now_ns: i64, result: MavResult, timeouts: &Timeouts) {
         let after = |wait: Duration| now_ns.saturating_add(ns(wait));

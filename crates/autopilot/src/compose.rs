@@ -127,7 +127,7 @@ fn angles(sight: Vector<Body>) -> Option<(f32, f32)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::text::Joiner;
+    use crate::text::{Joiner, Text};
     use proptest::prelude::*;
 
     proptest! {
@@ -137,11 +137,11 @@ mod tests {
             let mut arrived = String::new();
             for message in status_text(MavSeverity::MAV_SEVERITY_INFO, &text, 0) {
                 let MavMessage::STATUSTEXT(part) = message else { unreachable!() };
-                for (_, text) in joiner.push(0, &part) {
+                for Text { text, .. } in joiner.push(0, &part) {
                     arrived.push_str(&text);
                 }
             }
-            arrived.extend(joiner.tick(i64::MAX).map(|text| text.1));
+            arrived.extend(joiner.tick(i64::MAX).map(|text| text.text));
             prop_assert!(text.len() > 450 || arrived == text.trim_end());
         }
     }

@@ -38,6 +38,7 @@ pub mod parameter;
 pub mod peers;
 pub mod permission;
 mod px4_events;
+mod px4_listener;
 pub mod signing;
 mod simulation;
 pub mod state;

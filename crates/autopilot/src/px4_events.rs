@@ -3,26 +3,55 @@
 //! PX4 sends texts (STATUSTEXT) only over links on which it hears a ground station; events it sends over all of them, as numbers with
 //! arguments (<https://mavlink.io/en/services/events.html>). The texts here are of the metadata that PX4 v1.17.0-alpha1 is built
 //! with (`events/all_events.json`; BSD 3-clause): the checks before arming and of the health, and what the commander says of arming,
-//! failsafes, modes, take-off and landing. An event that is not among them is told by its number.
+//! failsafes, modes, take-off and landing, and what it says of setpoints and landing targets. An event that is not among them is
+//! told by its number.
 
 use crate::dialect::{EVENT_DATA, MavSeverity};
 
 /// Bits of an event's id that tell the event; those above tell the component.
 const EVENT_BITS: u32 = 0x00ff_ffff;
-/// The least severe of PX4's levels that is told, and that of a check. What is above has no text, or is for programs.
+/// The least severe of PX4's levels that is told. What is above has no text, or is for programs.
 const INFORMATION: u8 = 6;
+/// The least severe level of an event whose text is not known that is told.
 const WARNING: u8 = 4;
-/// PX4's modes to hold, to take off and to land, as a check before arming tells for which it fails.
-const OUR_MODES: u32 = 0x10 | 0x2_0000 | 0x4_0000;
+/// The events for programs that begin and end a report of all failing checks.
+const CHECKS_BEGIN: u32 = 11_047_904;
+const CHECKS_END: u32 = 1_914_663;
+/// Where the first of them has the modes in which the vehicle can be armed, in bytes.
+const CAN_ARM_AT: usize = 9;
+
+/// What an event is.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Px4Event {
+    /// The first of a report of all failing checks.
+    ChecksBegin {
+        /// The modes in which it can be armed, as bits.
+        can_arm: u32,
+    },
+    /// The end of such a report.
+    ChecksEnd,
+    /// It has a text.
+    Told(Told),
+}
 
 /// What an event says.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Told {
     pub(crate) severity: MavSeverity,
     pub(crate) text: String,
-    /// A check before arming that fails.
-    pub(crate) is_check: bool,
+    pub(crate) check: Option<Check>,
 }
+
+/// A check before arming or of the health that fails.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Check {
+    pub(crate) id: CheckId,
+    /// The modes for which it fails, as bits; all of them also where it prevents arming in none.
+    pub(crate) modes: u32,
+}
+
+/// A check's event, and the number of the sensor, battery or motor.
+pub(crate) type CheckId = (u32, u8);
 
 /// An argument in a text.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -35,14 +64,18 @@ enum Kind {
     Cause,
     Mode,
     Reason,
+    BatteryFault,
+    EscFault,
+    Advice,
 }
 
-use Kind::{Action, Cause, F32, I16, Mode, Reason, U8, U16};
+use Kind::{Action, Advice, BatteryFault, Cause, EscFault, F32, I16, Mode, Reason, U8, U16};
 
 /// An event's number, whether it is a check before arming, its text, and the arguments in it with their place in bytes.
 type Row = (u32, bool, &'static str, &'static [(Kind, usize)]);
 
-/// What PX4 does in a failsafe, why, its modes, and why it arms and disarms, by number.
+/// What PX4 does in a failsafe, why, its modes, why it arms and disarms, faults of batteries and motors, and what to do about
+/// them, by number.
 const ACTIONS: [&str; 11] = [
     "nothing",
     "a warning",
@@ -101,25 +134,67 @@ const REASONS: [&str; 15] = [
     "failsafe",
 ];
 
-/// What an event says; `None` for one that is for programs, or a check for a mode that no landing needs.
-pub(crate) fn told(event: &EVENT_DATA) -> Option<Told> {
+const BATTERY_FAULTS: [&str; 11] = [
+    "Battery has deep discharged",
+    "Battery detected voltage spikes",
+    "One or more battery cells have failed",
+    "Battery reported over-current",
+    "Battery has reached a critical temperature which can result in a critical failure",
+    "Battery temperature is below operating range",
+    "Voltage mismatch, use equally charged batteries",
+    "Battery firmware is not compatible with current autopilot firmware",
+    "Battery model is not supported by the system",
+    "Battery reported an hardware problem",
+    "Battery failed to arm",
+];
+const ESC_FAULTS: [&str; 10] = [
+    "detected over current",
+    "detected over voltage",
+    "Motor has reached a critical temperature",
+    "Motor RPM is exceeding the limits",
+    "received an invalid control command",
+    "Motor stalled",
+    "detected a generic hardware failure",
+    "Motor is over-heating",
+    "is over-heating",
+    "reached a critical temperature",
+];
+const ADVICE: [&str; 3] = ["", "Land now!", "Reduce throttle!"];
+
+/// What an event is; `None` for one that is for programs only. `in_report` after the beginning of a report of all failing
+/// checks: there, an event whose text is not known is a check as well.
+pub(crate) fn read(event: &EVENT_DATA, in_report: bool) -> Option<Px4Event> {
+    let number = event.id & EVENT_BITS;
+    match number {
+        CHECKS_BEGIN => {
+            let can_arm = u32::from_le_bytes(bytes(event, CAN_ARM_AT));
+            return Some(Px4Event::ChecksBegin { can_arm });
+        }
+        CHECKS_END => return Some(Px4Event::ChecksEnd),
+        _ => {}
+    }
     let level = event.log_levels & 0x0f;
     let severity = severity(level)?;
-    let number = event.id & EVENT_BITS;
+    let modes = u32::from_le_bytes(bytes(event, 0));
     let row = TABLE.binary_search_by_key(&number, |row| row.0).ok().and_then(|at| TABLE.get(at));
     let Some((_, is_check, text, arguments)) = row else {
-        let text = format!("PX4's event {number}, whose text is not known here");
-        return (level <= WARNING).then_some(Told { severity, text, is_check: false });
+        let text = format!(
+            "PX4's event {number}, whose text is not known here: look the number up in all_events.json of PX4's build"
+        );
+        let check = in_report.then_some(Check { id: (number, 0), modes });
+        return (level <= WARNING).then_some(Px4Event::Told(Told { severity, text, check }));
     };
-    let modes = u32::from_le_bytes(bytes(event, 0));
-    if *is_check && (level > WARNING || modes & OUR_MODES == 0) {
-        return None;
-    }
     let mut text = (*text).to_owned();
     for (kind, at) in *arguments {
         text = text.replacen("{}", &argument(event, *kind, *at), 1);
     }
-    Some(Told { severity, text, is_check: *is_check })
+    let text = text.trim_end().to_owned();
+    let [instance] = match arguments.first() {
+        Some((U8, at)) => bytes(event, *at),
+        _ => [0],
+    };
+    let check = is_check.then_some(Check { id: (number, instance), modes });
+    Some(Px4Event::Told(Told { severity, text, check }))
 }
 
 fn severity(level: u8) -> Option<MavSeverity> {
@@ -149,6 +224,9 @@ fn argument(event: &EVENT_DATA, kind: Kind, at: usize) -> String {
         Cause => named(&CAUSES),
         Mode => named(&MODES),
         Reason => named(&REASONS),
+        BatteryFault => named(&BATTERY_FAULTS),
+        EscFault => named(&ESC_FAULTS),
+        Advice => named(&ADVICE),
     }
 }
 
@@ -158,7 +236,7 @@ fn bytes<const N: usize>(event: &EVENT_DATA, at: usize) -> [u8; N] {
 }
 
 #[rustfmt::skip] // A line for each event.
-const TABLE: [Row; 165] = [
+const TABLE: [Row; 169] = [
     (51327, false, "Emergency battery level, land immediately", &[]),
     (79408, true, "Home position not set", &[]),
     (124285, true, "Geofence RTL requires valid home", &[]),
@@ -171,16 +249,17 @@ const TABLE: [Row; 165] = [
     (666479, true, "Motor failure detected", &[]),
     (713405, false, "Manual control regained after {} s", &[(F32, 0)]),
     (810921, true, "Waypoint above maximum height", &[]),
+    (929525, false, "Estimated position error is approaching the failsafe threshold", &[]),
     (961599, false, "Pilot took over using sticks", &[]),
     (1049276, true, "GPS Horizontal Position Error too high", &[]),
     (1058956, true, "CPU load too high: {}%", &[(F32, 5)]),
     (1326449, true, "Gyro {} uncalibrated", &[(U8, 5)]),
+    (1604295, false, "Terrain collision risk, descent is stopped", &[]),
     (1670367, true, "Avionics Power low: {} Volt", &[(F32, 5)]),
     (1746622, false, "Pilot took over using sticks", &[]),
     (1749061, false, "Arming denied: throttle above center", &[]),
     (1802995, true, "Airspeed too high", &[]),
     (1871713, true, "Mode not suitable for arming", &[]),
-    (1914663, true, "Health report summary event", &[]),
     (1917030, true, "RC calibration for channel {} invalid: TRIM greater than MAX", &[(U8, 5)]),
     (2066387, false, "Arming denied: calibrating", &[]),
     (2088119, true, "Poor GPS Quality", &[]),
@@ -213,6 +292,7 @@ const TABLE: [Row; 165] = [
     (5273740, true, "Compass inconsistent by {} degrees", &[(I16, 5)]),
     (5444856, true, "Accelerometer {} uncalibrated", &[(U8, 5)]),
     (5623108, false, "Manual control lost", &[]),
+    (5650341, false, "SET_POSITION_TARGET_LOCAL_NED: invalid, missing position, velocity or acceleration", &[]),
     (5699115, true, "Overcurrent detected for the peripheral 5V supply", &[]),
     (5704353, true, "Arm authorization denied", &[]),
     (5717196, true, "GPS Horizontal Position Drift too high", &[]),
@@ -227,7 +307,7 @@ const TABLE: [Row; 165] = [
     (6659180, true, "RC calibration for channel {} invalid: DZ greater than {}", &[(U8, 5), (U16, 6)]),
     (6801787, true, "No connection to the ground control station", &[]),
     (6880628, false, "Approaching max flight time (system will RTL in {} minutes)", &[(I16, 0)]),
-    (6948489, true, "ESC {}", &[(U8, 5)]),
+    (6948489, true, "ESC {}: {}. {}", &[(U8, 5), (EscFault, 6), (Advice, 7)]),
     (6962647, true, "Overcurrent detected for the hipower 5V supply", &[]),
     (6979701, true, "RC calibration for channel {} invalid: MIN less than {}", &[(U8, 5), (U16, 6)]),
     (7214714, true, "System power unavailable", &[]),
@@ -275,7 +355,6 @@ const TABLE: [Row; 165] = [
     (10794072, false, "Connection to ground control station lost", &[]),
     (10960133, true, "Position estimate has low accuracy", &[]),
     (10996333, true, "Missing FMU SD Card", &[]),
-    (11047904, true, "Arming check summary event", &[]),
     (11123101, false, "Connection to mission computer lost", &[]),
     (11125932, true, "No valid data from optical flow sensor", &[]),
     (11290563, false, "Kill engaged", &[]),
@@ -283,7 +362,9 @@ const TABLE: [Row; 165] = [
     (11413600, true, "Wind speed is above limit ({}m/s)", &[(F32, 5)]),
     (11478328, true, "No valid data from Gyro {}", &[(U8, 5)]),
     (11497430, true, "GPS Vertical Position Drift too high", &[]),
+    (11552065, false, "SET_POSITION_TARGET_LOCAL_NED: coordinate frame {} unsupported", &[(U8, 0)]),
     (12216659, false, "Low battery level, return advised", &[]),
+    (12221094, false, "Landing target: unsupported coordinate frame {}", &[(U8, 0)]),
     (12276004, true, "Global position estimate required", &[]),
     (12369553, true, "GPS fix too low", &[]),
     (12420351, false, "Arming denied: switch to manual mode first", &[]),
@@ -293,7 +374,7 @@ const TABLE: [Row; 165] = [
     (12780289, true, "GPS reports critical jamming state", &[]),
     (12805643, true, "Mission cannot be completed", &[]),
     (13094458, true, "Not enough GPS Satellites", &[]),
-    (13277401, false, "Failsafe warning:", &[]),
+    (13277401, false, "Failsafe warning, no action", &[]),
     (13344346, true, "Battery unhealthy", &[]),
     (13372152, true, "Parachute system not ready", &[]),
     (13528143, true, "Vehicle is in transition state", &[]),
@@ -311,8 +392,9 @@ const TABLE: [Row; 165] = [
     (15180799, true, "VTOL fixed-wing system failure detected. Verify reason for failure, and reboot the vehicle once confirmed safe", &[]),
     (15289843, true, "Avionics Power high: {} Volt", &[(F32, 5)]),
     (15388760, true, "Compass sensor {} missing", &[(U8, 5)]),
+    (15456613, false, "Accel {} clipping, not safe to fly!", &[(U8, 0)]),
     (15536452, false, "External mode is unresponsive, falling back to internal", &[]),
-    (15602498, true, "Battery {}", &[(U8, 5)]),
+    (15602498, true, "Battery {}: {}. {}", &[(U8, 5), (BatteryFault, 6), (Advice, 7)]),
     (15603271, false, "Dangerously low battery! Shutting system down", &[]),
     (15713375, true, "Strong magnetic interference", &[]),
     (15793174, true, "ESC failure", &[]),
@@ -337,17 +419,25 @@ mod tests {
         event
     }
 
+    fn told(id: u32, level: u8, arguments: &[u8]) -> Told {
+        match read(&event(id, level, arguments), false) {
+            Some(Px4Event::Told(told)) => told,
+            other => panic!("{other:?}"),
+        }
+    }
+
     fn text(id: u32, level: u8, arguments: &[u8]) -> String {
-        told(&event(id, level, arguments)).unwrap().text
+        told(id, level, arguments).text
     }
 
     #[test]
     fn every_event_is_found_and_all_its_arguments_are_shown() {
         assert!(TABLE.is_sorted_by_key(|row| row.0));
-        for (id, _, text, arguments) in &TABLE {
+        for (id, is_check, text, arguments) in &TABLE {
             assert_eq!(text.matches("{}").count(), arguments.len(), "{text}");
-            let told = told(&event(0x0100_0000 | id, 2, &[0xff; 40])).unwrap();
+            let told = told(0x0100_0000 | id, 2, &[0xff; 40]);
             assert!(!told.text.contains("{}"), "{}", told.text);
+            assert_eq!(told.check.is_some(), *is_check, "{}", told.text);
         }
     }
 
@@ -359,12 +449,27 @@ mod tests {
             "Arming denied: Resolve system health failures first"
         );
         assert_eq!(text(0x0190_caf3, 0x66, &[4]), "Armed by external command");
-        let no_stick = told(&event(0x0106_ed29, 0x44, &[0xff, 0xff, 0xff, 0xff, 7])).unwrap();
-        assert_eq!((no_stick.text.as_str(), no_stick.is_check), ("No manual control input", true));
-        // A check for OFFBOARD before it has setpoints, one that is for information only, and a summary for programs.
-        assert_eq!(told(&event(0x012f_1dc7, 0x33, &[0, 0x40, 0, 0, 0x14])), None);
-        assert_eq!(told(&event(0x0105_c2d9, 0x66, &[8, 0, 0, 0, 0x14])), None);
-        assert_eq!(told(&event(0x01a8_93e0, 0x88, &[])), None);
+        let no_stick = told(0x0106_ed29, 0x44, &[0xff, 0xff, 0xff, 0xff, 7]);
+        let check = Check { id: (453_929, 0), modes: u32::MAX };
+        assert_eq!(
+            (no_stick.text.as_str(), no_stick.check),
+            ("No manual control input", Some(check))
+        );
+    }
+
+    #[test]
+    fn a_report_of_the_checks_tells_in_which_modes_it_can_be_armed() {
+        let mut summary = [0; 17];
+        summary[9..13].copy_from_slice(&0x0002_8010_u32.to_le_bytes());
+        let begin = read(&event(0x01a8_93e0, 0x88, &summary), false);
+        assert_eq!(begin, Some(Px4Event::ChecksBegin { can_arm: 0x0002_8010 }));
+        assert_eq!(read(&event(0x011d_3727, 0x88, &[]), true), Some(Px4Event::ChecksEnd));
+        let stranger = |in_report| match read(&event(1, 3, &[0x10]), in_report) {
+            Some(Px4Event::Told(told)) => told.check,
+            other => panic!("{other:?}"),
+        };
+        assert_eq!(stranger(true), Some(Check { id: (1, 0), modes: 0x10 }));
+        assert_eq!(stranger(false), None);
     }
 
     #[test]
@@ -374,8 +479,24 @@ mod tests {
         let wait = &[0, 0, 0, 0, 6, 5, 0, 3];
         assert_eq!(text(13_704_694, 4, wait), "Low battery level: switching to RTL in 5 seconds");
         assert_eq!(text(16_017_271, 6, &[77]), "Disarmed by 77");
-        assert_eq!(text(1, 3, &[]), "PX4's event 1, whose text is not known here");
-        assert_eq!(told(&event(1, 6, &[])), None);
-        assert_eq!(told(&event(1, 0xff, &[])), None);
+        let stranger = text(1, 3, &[]);
+        assert!(
+            stranger.starts_with("PX4's event 1, whose text is not known here: look"),
+            "{stranger}"
+        );
+        assert_eq!(read(&event(1, 6, &[]), false), None);
+        assert_eq!(read(&event(1, 0xff, &[]), false), None);
+    }
+
+    #[test]
+    fn faults_name_what_failed_and_what_to_do() {
+        let battery = text(15_602_498, 0x40, &[0xff, 0xff, 0xff, 0xff, 11, 1, 2, 1]);
+        assert_eq!(battery, "Battery 1: One or more battery cells have failed. Land now!");
+        let esc = text(6_948_489, 0x33, &[0xff, 0xff, 0xff, 0xff, 8, 4, 5, 0]);
+        assert_eq!(esc, "ESC 4: Motor stalled.");
+        assert_eq!(
+            text(11_552_065, 3, &[8]),
+            "SET_POSITION_TARGET_LOCAL_NED: coordinate frame 8 unsupported"
+        );
     }
 }

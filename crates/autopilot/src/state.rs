@@ -110,8 +110,10 @@ pub(crate) struct Readiness {
     /// The same of PX4.
     estimator: Option<EstimatorStatusFlags>,
     has_position: bool,
-    /// The last text about the pre-arm checks.
+    /// ArduPilot's last text about the pre-arm checks.
     complaint: Option<String>,
+    /// What PX4's checks tell of them. It stays while they pass: those of another mode may fail without a new report.
+    checks: Option<String>,
 }
 
 impl LandedState {
@@ -274,9 +276,9 @@ impl Readiness {
         }
     }
 
-    /// A check before arming has failed.
-    pub(crate) fn take_failed_check(&mut self, text: &str) {
-        self.complaint = Some(text.to_owned());
+    /// Why PX4 cannot be armed, by its checks.
+    pub(crate) fn take_checks(&mut self, why: Option<String>) {
+        self.checks = why;
     }
 
     pub(crate) fn is_ready(&self) -> bool {
@@ -307,7 +309,8 @@ impl Readiness {
             _ => {}
         }
         if self.prearm == Some(false) {
-            let complaint = self.complaint.as_deref().unwrap_or("checks not passed yet");
+            let complaint = self.checks.as_deref().or(self.complaint.as_deref());
+            let complaint = complaint.unwrap_or("checks not passed yet");
             reasons.push(format!("prearm: {complaint}"));
         }
         reasons

@@ -26,7 +26,22 @@ struct Partial {
 }
 
 /// A whole text.
-pub(crate) type Text = (MavSeverity, String);
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Text {
+    pub(crate) severity: MavSeverity,
+    pub(crate) text: String,
+    /// PX4 sends it as an event as well.
+    pub(crate) is_event: bool,
+}
+
+impl Text {
+    fn new(severity: MavSeverity, bytes: &[u8]) -> Self {
+        // PX4 marks them by a tab at the end.
+        let without = bytes.strip_suffix(b"\t");
+        let text = clean(without.unwrap_or(bytes));
+        Self { severity, text, is_event: without.is_some() }
+    }
+}
 
 impl Joiner {
     /// Adds a packet and returns the texts that it completes, an interrupted one first.
@@ -40,7 +55,7 @@ impl Joiner {
             texts.extend(self.take());
         }
         if message.id == 0 {
-            texts.push((message.severity, clean(part)));
+            texts.push(Text::new(message.severity, part));
             return texts;
         }
         let partial = self.partial.get_or_insert_with(|| Partial {
@@ -69,7 +84,7 @@ impl Joiner {
     }
 
     fn take(&mut self) -> Option<Text> {
-        self.partial.take().map(|partial| (partial.severity, clean(&partial.bytes)))
+        self.partial.take().map(|partial| Text::new(partial.severity, &partial.bytes))
     }
 }
 
@@ -94,8 +109,20 @@ mod tests {
         let first = "Arm: AHRS: EKF3 Yaw inconsistent 77 deg. Wait or r";
         assert!(joiner.push(0, &part(3, 0, first)).is_empty());
         let texts = joiner.push(1, &part(3, 1, "eboot"));
-        assert_eq!(texts[0].1, format!("{first}eboot"));
-        assert_eq!(joiner.push(2, &part(0, 0, "short\u{7}"))[0].1, "short ");
+        assert_eq!(texts[0].text, format!("{first}eboot"));
+        assert_eq!(joiner.push(2, &part(0, 0, "short\u{7}"))[0].text, "short ");
+    }
+
+    #[test]
+    fn a_tab_at_the_end_marks_a_text_that_is_an_event_as_well() {
+        let mut joiner = Joiner::default();
+        let text = &joiner.push(0, &part(0, 0, "Takeoff detected\t"))[0];
+        assert_eq!((text.text.as_str(), text.is_event), ("Takeoff detected", true));
+        let long = "x".repeat(PART);
+        joiner.push(0, &part(3, 0, &long));
+        let text = &joiner.push(1, &part(3, 1, "\t"))[0];
+        assert_eq!((text.text.as_str(), text.is_event), (long.as_str(), true));
+        assert!(!joiner.push(2, &part(0, 0, "a\tb"))[0].is_event);
     }
 
     #[test]
@@ -104,11 +131,14 @@ mod tests {
         let long = "x".repeat(PART);
         joiner.push(0, &part(3, 0, &long));
         let texts = joiner.push(1, &part(4, 0, "next"));
-        assert_eq!(texts.iter().map(|text| text.1.as_str()).collect::<Vec<_>>(), [&long, "next"]);
+        assert_eq!(
+            texts.iter().map(|text| text.text.as_str()).collect::<Vec<_>>(),
+            [&long, "next"]
+        );
         joiner.push(2, &part(5, 0, &long));
         assert!(joiner.tick(2 + PART_TIMEOUT_NS).is_none());
-        assert_eq!(joiner.tick(3 + PART_TIMEOUT_NS).unwrap().1, long);
+        assert_eq!(joiner.tick(3 + PART_TIMEOUT_NS).unwrap().text, long);
         joiner.push(2, &part(6, 0, &long));
-        assert!(joiner.push(3, &part(6, 2, "end"))[0].1.contains(" ... end"));
+        assert!(joiner.push(3, &part(6, 2, "end"))[0].text.contains(" ... end"));
     }
 }

@@ -12,7 +12,7 @@ use autopilot::dialect::{
     ATTITUDE_DATA, COMMAND_ACK_DATA, COMMAND_LONG_DATA, ESTIMATOR_STATUS_DATA, EVENT_DATA,
     EXTENDED_SYS_STATE_DATA, EstimatorStatusFlags, GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA,
     LOCAL_POSITION_NED_DATA, MavAutopilot, MavCmd, MavLandedState, MavMessage, MavModeFlag,
-    MavResult, MavSysStatusSensor, MavType, SYS_STATUS_DATA,
+    MavResult, MavSysStatusSensor, MavType, STATUSTEXT_DATA, SYS_STATUS_DATA,
 };
 use autopilot::packet::{self, Sender};
 use autopilot::{
@@ -38,6 +38,7 @@ struct Px4 {
     streaming: Option<(i64, i64)>,
     setpoints: Vec<[f32; 3]>,
     mode_requests: usize,
+    refuses: bool,
     landing_targets: Vec<(u8, [f32; 3])>,
     queue: Vec<MavMessage>,
 }
@@ -74,6 +75,9 @@ impl Px4 {
     }
 
     fn carry_out(&mut self, now: i64, command: &COMMAND_LONG_DATA) -> MavResult {
+        if self.refuses {
+            return MavResult::MAV_RESULT_DENIED;
+        }
         match command.command {
             MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL => {
                 let interval = (f64::from(command.param2) * 1e3) as i64;
@@ -191,6 +195,7 @@ impl World {
             streaming: None,
             setpoints: Vec::new(),
             mode_requests: 0,
+            refuses: false,
             landing_targets: Vec::new(),
             queue: Vec::new(),
         };
@@ -248,6 +253,33 @@ fn it_becomes_ready_by_px4s_own_messages() {
     assert!(!world.px4.intervals.contains_key(&193), "EKF_STATUS_REPORT is ArduPilot's");
 }
 
+/// An event with arguments as PX4 packs them.
+fn event(sequence: u16, id: u32, log_levels: u8, of: &[u8]) -> MavMessage {
+    let mut event = EVENT_DATA { id, log_levels, sequence, ..Default::default() };
+    event.arguments.iter_mut().zip(of).for_each(|(to, of)| *to = *of);
+    MavMessage::EVENT(event)
+}
+
+/// PX4's report that it can be armed in no mode of a landing: it has no position, and without sticks it can be armed.
+fn report(sequence: u16) -> [MavMessage; 4] {
+    let mut summary = [0; 17];
+    summary[9] = 1;
+    [
+        event(sequence, 0x01a8_93e0, 0x88, &summary),
+        event(sequence + 1, 0x0106_ed29, 0x44, &[0xff, 0xff, 0xff, 0xff, 7]),
+        event(sequence + 2, 0x01d3_1bb9, 0x33, &[0x38, 0x40, 0x16, 0, 0x14]),
+        event(sequence + 3, 0x011d_3727, 0x88, &[]),
+    ]
+}
+
+fn texts(client: &mut Autopilot) -> Vec<String> {
+    std::iter::from_fn(|| client.poll_event())
+        .filter_map(|event| if let Event::Text { text, .. } = event { Some(text) } else { None })
+        .collect()
+}
+
+const NO_POSITION: &str = "Navigation error: No valid position estimate";
+
 #[test]
 fn why_it_does_not_arm_is_told_from_its_events() {
     let mut world = World::new();
@@ -256,19 +288,61 @@ fn why_it_does_not_arm_is_told_from_its_events() {
         onboard_control_sensors_present: failing,
         ..Default::default()
     }));
-    let mut arguments = [0; 40];
-    arguments[..4].copy_from_slice(&[0xff; 4]);
-    for (id, log_levels) in [(0x0106_ed29, 0x44), (0x0102_089d, 0x62)] {
-        let event = EVENT_DATA { id, log_levels, arguments, ..Default::default() };
-        world.px4.queue.push(MavMessage::EVENT(event));
+    world.px4.queue.extend(report(1));
+    world.px4.queue.push(event(5, 0x0102_089d, 0x62, &[]));
+    world.step();
+    let why = world.client.not_ready_because();
+    assert_eq!(why, [format!("prearm: {NO_POSITION}")]);
+    let denied = "Arming denied: Resolve system health failures first";
+    assert_eq!(texts(&mut world.client), ["No manual control input", NO_POSITION, denied]);
+    // It is cured.
+    world.px4.queue.push(event(6, 0x01a8_93e0, 0x88, &[0xff; 17]));
+    world.step();
+    assert_eq!(world.client.not_ready_because(), ["prearm: checks not passed yet"]);
+}
+
+#[test]
+fn what_it_tells_again_is_told_once() {
+    let mut world = World::new();
+    world.px4.queue.extend(report(1));
+    world.px4.queue.extend(report(5));
+    // Sent again for a ground station.
+    world.px4.queue.push(event(9, 0x0102_089d, 0x62, &[]));
+    world.px4.queue.push(event(9, 0x0102_089d, 0x62, &[]));
+    world.px4.queue.extend(report(1));
+    for text in ["Arming denied: checks\t", "Only a text"] {
+        let text = STATUSTEXT_DATA { text: text.into(), ..Default::default() };
+        world.px4.queue.push(MavMessage::STATUSTEXT(text));
     }
     world.step();
-    assert_eq!(world.client.not_ready_because(), ["prearm: No manual control input"]);
-    let texts: Vec<_> = std::iter::from_fn(|| world.client.poll_event())
-        .filter_map(|event| if let Event::Text { text, .. } = event { Some(text) } else { None })
-        .collect();
     let denied = "Arming denied: Resolve system health failures first";
-    assert_eq!(texts, ["No manual control input", denied]);
+    let told = ["No manual control input", NO_POSITION, denied, "Only a text"];
+    assert_eq!(texts(&mut world.client), told);
+}
+
+#[test]
+fn checks_explain_why_it_does_not_arm_and_no_other_request() {
+    for (command, explained) in
+        [(Command::Arm, true), (Command::SetMode(FlightMode::AUTO_LAND), false)]
+    {
+        let mut world = World::new();
+        world.px4.queue.extend(report(1));
+        world.step();
+        world.px4.refuses = true;
+        let id = world.client.request(world.now, command);
+        world.step();
+        // The request was sent, and its refusal comes with the next step.
+        world.px4.queue.extend(report(5));
+        while world.client.status(id) == CommandStatus::Pending {
+            world.step();
+        }
+        let CommandStatus::Failed(CommandError::Refused { texts, .. }) = world.client.status(id)
+        else {
+            panic!("{:?}", world.client.status(id));
+        };
+        let expected: &[&str] = if explained { &[NO_POSITION] } else { &[] };
+        assert_eq!(texts, expected, "{command}");
+    }
 }
 
 #[test]
