@@ -24,8 +24,8 @@ pub(crate) struct Sightings {
     pub(crate) newest: Option<Timestamp>,
     /// Number of markers without a long gap.
     pub(crate) in_a_row: u32,
-    /// When one was seen too far from the estimate to be used.
-    refused: Option<Timestamp>,
+    /// When one was last seen too far from the estimate to be used, and when before that.
+    refused: [Option<Timestamp>; 2],
 }
 
 impl TargetFilter {
@@ -84,19 +84,69 @@ impl Sightings {
         self.newest = Some(stamp);
     }
 
-    /// Notes a marker that was refused.
+    /// Notes a marker that was refused; frames may come late and twice.
     pub(crate) fn refuse(&mut self, stamp: Timestamp, why: Rejection) {
-        if why == Rejection::Outlier {
-            self.refused = Some(stamp);
+        let stamp = Some(stamp);
+        if why != Rejection::Outlier || self.refused.contains(&stamp) {
+            return;
         }
+        let [newest, before] = self.refused;
+        self.refused = if stamp > newest { [stamp, newest] } else { [newest, before.max(stamp)] };
     }
 
-    /// True while the marker is seen, too far from the estimate to be used.
+    /// True while the marker is seen, too far from the estimate to be used. A single outlier may be something else.
     pub(crate) fn is_refused(&self, now: Timestamp, max_age_s: f64) -> bool {
-        self.refused.is_some_and(|stamp| now.seconds_since(stamp) <= max_age_s)
+        let [Some(newest), Some(before)] = self.refused else { return false };
+        let is_recent =
+            now.seconds_since(newest) <= max_age_s && newest.seconds_since(before) <= max_age_s;
+        is_recent && self.newest.is_none_or(|used| before > used)
     }
 
     pub(crate) fn age_s(&self, now: Timestamp) -> f64 {
         self.newest.map_or(f64::INFINITY, |newest| now.seconds_since(newest))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(seconds: f64) -> Timestamp {
+        Timestamp::from_seconds(seconds)
+    }
+
+    /// Markers refused at these times, after one that was used at 1 s; whether that is a marker that is refused, at 2 s.
+    fn is_refused(stamps: &[f64]) -> bool {
+        let mut sightings = Sightings::default();
+        sightings.add(at(1.0), 1.0);
+        stamps.iter().for_each(|stamp| sightings.refuse(at(*stamp), Rejection::Outlier));
+        sightings.is_refused(at(2.0), 0.4)
+    }
+
+    #[test]
+    fn two_outliers_after_the_last_marker_used_are_a_marker_that_is_refused() {
+        assert!(is_refused(&[1.8, 1.9]));
+        assert!(is_refused(&[1.7, 1.9, 1.5, 1.2]), "late frames change nothing");
+        assert!(is_refused(&[1.9, 1.7]), "nor does their order");
+        assert!(!is_refused(&[1.9]), "one");
+        assert!(!is_refused(&[1.9, 1.9]), "one frame twice");
+        assert!(!is_refused(&[1.2, 1.9]), "one, and one of long ago");
+        assert!(!is_refused(&[1.3, 1.4]), "long ago");
+        assert!(!Sightings::default().is_refused(at(0.0), 0.4));
+    }
+
+    #[test]
+    fn a_marker_used_since_or_refused_for_another_reason_is_not_refused() {
+        let mut sightings = Sightings::default();
+        for stamp in [1.8, 1.9] {
+            sightings.refuse(at(stamp), Rejection::LowConfidence);
+        }
+        assert!(!sightings.is_refused(at(2.0), 0.4));
+        for stamp in [1.8, 1.9] {
+            sightings.refuse(at(stamp), Rejection::Outlier);
+        }
+        assert!(sightings.is_refused(at(2.0), 0.4));
+        sightings.add(at(1.85), 1.0);
+        assert!(!sightings.is_refused(at(2.0), 0.4));
     }
 }
