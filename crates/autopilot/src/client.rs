@@ -5,6 +5,8 @@
 //! Only the heartbeat shows the state: an acknowledgement is a promise, and the pilot may have changed the mode
 //! since.
 
+mod texts;
+
 use std::collections::VecDeque;
 use std::time::Duration;
 
@@ -19,18 +21,18 @@ use crate::compose;
 use crate::config::Config;
 use crate::contact::Contact;
 use crate::dialect::{
-    COMMAND_ACK_DATA, EVENT_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag,
-    MavSeverity, MavType, TIMESYNC_DATA,
+    COMMAND_ACK_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag, MavType,
+    TIMESYNC_DATA,
 };
 use crate::event::Event;
 use crate::mode::{Firmware, FlightMode};
 use crate::packet::{self, Packet, Sender};
 use crate::parameter::{Parameter, Parameters};
-use crate::px4_listener::{About, Heard, Listener};
+use crate::px4_listener::Listener;
 use crate::simulation::Simulation;
 use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
 use crate::stream::{self, Streams};
-use crate::text::{Joiner, Text};
+use crate::text::Joiner;
 
 /// The component id of every autopilot.
 pub const AUTOPILOT: u8 = 1;
@@ -583,45 +585,6 @@ impl Autopilot {
             self.push(Event::Lost { silence: Duration::from_nanos(silence_ns) });
             self.push(Event::Status(state));
             self.fail_requests(|command| CommandError::NoAutopilot { command });
-        }
-    }
-
-    fn take_text(&mut self, severity: MavSeverity, text: String) {
-        // Information ("Arming motors") does not explain a refusal.
-        if (severity as u8) <= MavSeverity::MAV_SEVERITY_WARNING as u8 {
-            for request in &mut self.requests {
-                request.add_text(&text);
-            }
-        }
-        if let Some(vehicle) = &mut self.vehicle {
-            vehicle.readiness.take_text(&text);
-        }
-        self.push(Event::Text { severity, text });
-    }
-
-    fn take_statustext(&mut self, Text { severity, text, is_event }: Text) {
-        // PX4 sends it twice where it hears a ground station.
-        let is_told = is_event && self.vehicle.as_ref().is_some_and(|it| it.listener.has_heard());
-        if !is_told {
-            self.take_text(severity, text);
-        }
-    }
-
-    fn take_px4_event(&mut self, event: &EVENT_DATA) {
-        let Some(vehicle) = &mut self.vehicle else { return };
-        let heard = vehicle.listener.take(event);
-        vehicle.readiness.take_checks(vehicle.listener.why_not_armed());
-        let Some(Heard { severity, text, about }) = heard else { return };
-        let is_new = match about {
-            About::Else => return self.take_text(severity, text),
-            About::Arming { is_new } => {
-                self.requests.iter_mut().for_each(|request| request.add_check(&text));
-                is_new
-            }
-            About::Health { is_new } => is_new,
-        };
-        if is_new {
-            self.push(Event::Text { severity, text });
         }
     }
 
