@@ -11,7 +11,7 @@ use experiments::landing::fault::Fault;
 use experiments::landing::plan::{self, Plan, Values, Vision};
 use experiments::landing::{self, Watch};
 use experiments::markers::{self, Request, Step};
-use experiments::results;
+use experiments::results::Folder;
 use experiments::set::Set;
 use experiments::sets::Variant;
 
@@ -48,7 +48,7 @@ struct LandingArgs {
     /// Output folder: report, every flight as CSV and JSON lines, plots.
     #[arg(short, long, value_name = "DIR", default_value = "experiment-landing")]
     output: PathBuf,
-    /// Replace the results of an experiment that are in the output folder; without it they are refused.
+    /// Replace the results of an experiment that are in the output folder, once there are new ones; without it they are refused.
     #[arg(long)]
     replace: bool,
     /// Number of flights of each combination.
@@ -165,24 +165,22 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
             faults,
             set: args.set,
         },
-        results_in: args.output,
         jobs: args.jobs.unwrap_or_else(cores),
         recordings: args.recordings,
     };
-    let folder = &request.results_in;
-    let doing = || format!("working in {}", folder.display());
-    results::claim(folder, args.replace)?;
+    let mut folder = Folder::claim(&args.output, args.replace)?;
     let interruption = Interruption::on_signals(FLIGHTS_END)?;
     let steps = Steps::of_flights();
     let watch = Watch {
         progress: &|done, of| steps.flown(done, of),
         is_interrupted: &|| interruption.is_requested(),
     };
-    let landings = landing::run(&request, watch).with_context(doing)?;
+    let landings = landing::run(&request, &mut folder, watch)
+        .with_context(|| format!("working in {}", folder.path().display()))?;
     steps.finish();
     print(landings.report.trim_end())?;
     if landings.flown > 0 {
-        write_error(&format!("flights, plots and this report: {}", folder.display()));
+        write_error(&format!("flights, plots and this report: {}", folder.path().display()));
     }
     Ok(match interruption.is_requested() {
         true => interruption.exit_code(),
@@ -244,4 +242,69 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
         true => interruption.exit_code(),
         false => ExitCode::SUCCESS,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use clap::Parser;
+    use experiments::faults::kind::Kind;
+    use experiments::faults::plan::Plan as FaultsPlan;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Tool {
+        #[command(subcommand)]
+        command: ToolCommand,
+    }
+
+    #[derive(Subcommand)]
+    enum ToolCommand {
+        Experiment(ExperimentArgs),
+    }
+
+    /// The folder into which such a command writes.
+    fn output(command: &str) -> PathBuf {
+        let tool = Tool::try_parse_from(command.split(' ')).unwrap_or_else(|problem| {
+            panic!("{command}: {problem}");
+        });
+        let ToolCommand::Experiment(args) = tool.command;
+        match args.experiment {
+            Experiment::Landing(args) => args.output,
+            Experiment::Faults(args) => args.output,
+            Experiment::Markers(args) => args.output,
+        }
+    }
+
+    #[test]
+    fn the_command_that_repeats_a_flight_is_accepted_and_has_a_folder_of_its_own() {
+        let landings = Plan {
+            flights: 2,
+            faults: Fault::all().collect(),
+            set: vec!["simulator.camera.rate_hz=20".to_owned()],
+            ..Plan::default()
+        };
+        let lockstep =
+            FaultsPlan { flights: 60, durations_s: vec![f64::INFINITY], ..FaultsPlan::default() };
+        let real_time = FaultsPlan {
+            flights: 30,
+            kinds: Kind::in_real_time().collect(),
+            second: experiments::faults::plan::Second::None,
+            real_time: true,
+            ..FaultsPlan::default()
+        };
+        let commands: [(&str, Vec<String>); 3] = [
+            ("experiment landing", landings.flights().iter().map(plan::Planned::command).collect()),
+            ("experiment faults", lockstep.flights().iter().map(|it| it.command()).collect()),
+            ("experiment faults", real_time.flights().iter().map(|it| it.command()).collect()),
+        ];
+        for (campaign, commands) in commands {
+            let of_campaign = output(&format!("alight {campaign}"));
+            let outputs: BTreeSet<PathBuf> = commands.iter().map(|it| output(it)).collect();
+            assert!(!outputs.contains(&of_campaign), "{outputs:?}");
+            assert_eq!(outputs.len(), commands.len(), "two have one folder");
+        }
+    }
 }

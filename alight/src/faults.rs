@@ -11,7 +11,7 @@ use experiments::faults::report;
 use experiments::faults::{self, Findings};
 use experiments::landing::Watch;
 use experiments::landing::plan::Values;
-use experiments::results;
+use experiments::results::{self, Folder};
 
 use crate::args::flight_setting;
 use crate::interruption::{FLIGHTS_END, Interruption};
@@ -28,8 +28,8 @@ const REAL_TIME_FLIGHTS: u64 = 25;
 pub(crate) struct FaultsArgs {
     /// Output folder: report, every flight as CSV and JSON lines.
     #[arg(short, long, value_name = "DIR", default_value = "experiment-faults")]
-    output: PathBuf,
-    /// Replace the results of an experiment that are in the output folder; without it they are refused.
+    pub(crate) output: PathBuf,
+    /// Replace the results of an experiment that are in the output folder, once there are new ones; without it they are refused.
     #[arg(long)]
     replace: bool,
     /// Number of flights [default: 1000, in real time 25].
@@ -122,7 +122,11 @@ impl FaultsArgs {
 }
 
 /// Flies the campaign in real time, one flight after the other; one that is interrupted does not count.
-fn run_in_real_time(request: &Request, interruption: &Interruption) -> anyhow::Result<Findings> {
+fn run_in_real_time(
+    request: &Request,
+    folder: &mut Folder,
+    interruption: &Interruption,
+) -> anyhow::Result<Findings> {
     node::start_logging("error");
     let flights = request.plan.flights();
     let planned = flights.len();
@@ -130,10 +134,10 @@ fn run_in_real_time(request: &Request, interruption: &Interruption) -> anyhow::R
     let title = format!("Flights in real time, seeds from {}", request.plan.seed);
     let mut findings = Findings { report: String::new(), outcomes: Vec::new(), planned };
     for flight in &flights {
-        let folder = request.results_in.join(format!("logs-{}", flight.seed));
+        let logs = folder.begin_logs(flight.seed)?;
         let flown = block_on(async {
             tokio::select! {
-                outcome = real_time::fly(flight, &folder) => outcome.map(Some),
+                outcome = real_time::fly(flight, &logs) => outcome.map(Some),
                 () = interruption.requested() => Ok(None),
             }
         })?;
@@ -158,47 +162,49 @@ fn run_in_real_time(request: &Request, interruption: &Interruption) -> anyhow::R
         findings.outcomes.push(outcome);
         steps.flown(findings.outcomes.len(), planned);
         // What there is, should the next one end this process.
-        findings.report = report::write(&request.results_in, &title, &findings.outcomes, planned)?;
+        report::write(folder, &title, &findings.outcomes, planned, true)?;
     }
     steps.finish();
-    if findings.outcomes.is_empty() {
-        findings.report = results::interrupted(0, planned);
-    }
+    findings.report = report::write(folder, &title, &findings.outcomes, planned, false)?;
     Ok(findings)
 }
 
 /// Flies the campaign in lock-step, several flights at once.
-fn run_in_lockstep(request: &Request, interruption: &Interruption) -> anyhow::Result<Findings> {
+fn run_in_lockstep(
+    request: &Request,
+    folder: &mut Folder,
+    interruption: &Interruption,
+) -> anyhow::Result<Findings> {
     let steps = Steps::of_flights();
     let watch = Watch {
         progress: &|done, of| steps.flown(done, of),
         is_interrupted: &|| interruption.is_requested(),
     };
-    let findings = faults::run(request, watch)?;
+    let findings = faults::run(request, folder, watch)?;
     steps.finish();
     Ok(findings)
 }
 
 /// Flies the campaign and prints its report; a failure when a touchdown was unsafe or a flight did not end.
 pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
-    let (results_in, jobs) = (args.output.clone(), args.jobs.unwrap_or_else(cores));
+    let (output, jobs) = (args.output.clone(), args.jobs.unwrap_or_else(cores));
     let (real_time, tapes_in, replaces) = (args.real_time, args.record_tapes.clone(), args.replace);
     let plan = args.plan().map_err(anyhow::Error::msg)?;
-    let request = Request { plan, results_in, tapes_in, jobs };
-    results::claim(&request.results_in, replaces)?;
+    let request = Request { plan, tapes_in, jobs };
+    let mut folder = Folder::claim(&output, replaces)?;
     request.tapes_in.as_deref().map_or(Ok(()), results::claim_for_recordings)?;
     let interruption = Interruption::on_signals(match real_time {
         true => "the flight under way does not count, and those before it are kept",
         false => FLIGHTS_END,
     })?;
     let findings = match real_time {
-        true => run_in_real_time(&request, &interruption),
-        false => run_in_lockstep(&request, &interruption),
+        true => run_in_real_time(&request, &mut folder, &interruption),
+        false => run_in_lockstep(&request, &mut folder, &interruption),
     }
-    .with_context(|| format!("working in {}", request.results_in.display()))?;
+    .with_context(|| format!("working in {}", output.display()))?;
     print(findings.report.trim_end())?;
     if !findings.outcomes.is_empty() {
-        write_error(&format!("flights and this report: {}", request.results_in.display()));
+        write_error(&format!("flights and this report: {}", output.display()));
     }
     if interruption.is_requested() {
         return Ok(interruption.exit_code());

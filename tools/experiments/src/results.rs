@@ -1,40 +1,134 @@
 //! The folder with the results of landings or faults. It is claimed before the first flight: hours of flying are neither lost to
-//! a folder that cannot be written, nor mixed with the results of another run.
+//! a folder that cannot be written, nor mixed with the results of another run. What it has of an earlier run is kept until the
+//! first of the new results is written: there may be none.
 
 use std::fs::DirEntry;
-use std::path::Path;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 
-/// The files by which results are told.
-const TELLING: [&str; 3] = ["flights.jsonl", "flights.csv", "report.md"];
+use crate::landing::{plots, thesis_figures};
+
+/// Every flight, as lines of JSON and as comma-separated values.
+pub const FLIGHTS_AS_JSON: &str = "flights.jsonl";
+/// See [`FLIGHTS_AS_JSON`].
+pub const FLIGHTS_AS_CSV: &str = "flights.csv";
+/// The report.
+pub const REPORT: &str = "report.md";
+/// The report's first lines, by which it is told from one of another origin.
+pub const LANDINGS_HEADING: &str = "# Landings\n";
+/// See [`LANDINGS_HEADING`].
+pub const FAULTS_HEADING: &str = "# Faults\n";
 /// The folder of the recordings in that of the results.
 pub const RECORDINGS: &str = "recordings";
+/// The begin of the name of the folder with the logs of one flight in real time; its seed follows.
+const LOGS: &str = "logs-";
+/// What the logs are called, without their ending.
+const PARTS: [&str; 5] = ["world", "camera", "detector", "controller", "bridge"];
 
-/// Makes the folder. Results of an earlier run are refused, or with `replaces` removed, with what came with them.
-///
-/// # Errors
-/// When there are such results, or the folder cannot be made or emptied.
-pub fn claim(folder: &Path, replaces: bool) -> anyhow::Result<()> {
-    std::fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
-    let names = names(folder)?;
-    if let Some(name) = names.iter().find(|name| is_telling(name))
-        && !replaces
-    {
-        bail!(
-            "{} has the results of an experiment already ({name}); name another folder with `-o`, or replace them with `--replace`",
-            folder.display()
+/// The claimed folder.
+#[derive(Debug)]
+pub struct Folder {
+    path: PathBuf,
+    /// What it has of an earlier run.
+    old: Vec<PathBuf>,
+}
+
+impl Folder {
+    /// Makes the folder. What an earlier run has written there is refused, or with `replaces` removed before the first new result.
+    ///
+    /// # Errors
+    /// When there is such, or a report of another origin that would be overwritten, or the folder cannot be made or read.
+    pub fn claim(path: &Path, replaces: bool) -> anyhow::Result<Self> {
+        std::fs::create_dir_all(path).with_context(|| format!("making {}", path.display()))?;
+        let report = path.join(REPORT);
+        ensure!(
+            !report.exists() || is_of_an_experiment(&report),
+            "{} is not the report of an experiment, and would be overwritten; name another folder with `-o`",
+            report.display()
         );
+        let old = written(path)?;
+        if let Some(first) = old.first()
+            && !replaces
+        {
+            bail!(
+                "{} has the results of an experiment already ({}); name another folder with `-o`, or replace them with `--replace`",
+                path.display(),
+                first.strip_prefix(path).unwrap_or(first).display()
+            );
+        }
+        Ok(Self { path: path.to_owned(), old })
     }
-    let recordings = folder.join(RECORDINGS);
-    let is_old = |name: &&String| is_telling(name) || is_figure(name);
-    let old = names.iter().filter(is_old).map(|name| folder.join(name));
-    let of_rows = self::names(&recordings)?.into_iter().filter(|it| is_of_a_row(it));
-    for path in old.chain(of_rows.map(|name| recordings.join(name))) {
-        std::fs::remove_file(&path)
-            .with_context(|| format!("removing {} of an earlier run", path.display()))?;
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Writes a file into it.
+    ///
+    /// # Errors
+    /// When it cannot be written, or what is old cannot be removed.
+    pub fn put(&mut self, name: &str, text: &str) -> anyhow::Result<()> {
+        remove(std::mem::take(&mut self.old))?;
+        let path = self.path.join(name);
+        std::fs::write(&path, text).with_context(|| format!("writing {}", path.display()))
+    }
+
+    /// The folder for the logs of the flight with this seed, made and without those of an earlier run.
+    ///
+    /// # Errors
+    /// When it cannot be made or emptied.
+    pub fn begin_logs(&mut self, seed: u64) -> anyhow::Result<PathBuf> {
+        let logs = self.path.join(format!("{LOGS}{seed}"));
+        let (of_this_flight, others) =
+            std::mem::take(&mut self.old).into_iter().partition(|old| old.starts_with(&logs));
+        self.old = others;
+        remove(of_this_flight)?;
+        std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
+        Ok(logs)
+    }
+}
+
+/// All that an experiment has written into a folder.
+fn written(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let mut old = Vec::new();
+    let mut add = |folder: PathBuf, is_ours: &dyn Fn(&str) -> bool| -> anyhow::Result<()> {
+        let ours = names(&folder)?.into_iter().filter(|name| is_ours(name));
+        old.extend(ours.map(|name| folder.join(name)));
+        Ok(())
+    };
+    add(folder.to_owned(), &is_result)?;
+    add(folder.join(RECORDINGS), &is_of_a_row)?;
+    for logs in names(folder)?.iter().filter(|name| is_of_logs(name)) {
+        add(folder.join(logs), &is_of_a_process)?;
+    }
+    Ok(old)
+}
+
+fn remove(old: Vec<PathBuf>) -> anyhow::Result<()> {
+    for path in old {
+        match std::fs::remove_file(&path) {
+            Err(problem) if problem.kind() != ErrorKind::NotFound => {
+                return Err(problem)
+                    .with_context(|| format!("removing {} of an earlier run", path.display()));
+            }
+            _ => {}
+        }
+        if let Some(logs) = path.parent()
+            && logs.file_name().is_some_and(|name| is_of_logs(&name.to_string_lossy()))
+        {
+            // One with files of the user stays.
+            let _ = std::fs::remove_dir(logs);
+        }
     }
     Ok(())
+}
+
+fn is_of_an_experiment(report: &Path) -> bool {
+    let text = std::fs::read_to_string(report).unwrap_or_default();
+    [LANDINGS_HEADING, FAULTS_HEADING].iter().any(|heading| text.starts_with(heading))
 }
 
 /// Makes the folder for recordings of every flight; one that has recordings is refused.
@@ -67,13 +161,22 @@ fn names(folder: &Path) -> anyhow::Result<Vec<String>> {
     Ok(names)
 }
 
-fn is_telling(name: &str) -> bool {
-    TELLING.contains(&name)
+/// Whether it is a file that an experiment writes into its folder.
+fn is_result(name: &str) -> bool {
+    [FLIGHTS_AS_JSON, FLIGHTS_AS_CSV, REPORT].contains(&name)
+        || plots::NAMES.contains(&name)
+        || thesis_figures::NAMES.contains(&name)
 }
 
-/// Whether it is one of the thesis' figures, which an interrupted run does not draw anew.
-fn is_figure(name: &str) -> bool {
-    name.starts_with("figure-4-") && name.ends_with(".svg")
+/// Whether it is the folder with the logs of a flight.
+fn is_of_logs(name: &str) -> bool {
+    name.strip_prefix(LOGS).is_some_and(|seed| seed.parse::<u64>().is_ok())
+}
+
+/// Whether a process of a flight in real time writes it: its log, or what a controller notes of the vehicle.
+fn is_of_a_process(name: &str) -> bool {
+    let is_note = || name.starts_with("controller-") && name.ends_with(".json");
+    name.strip_suffix(".log").is_some_and(|part| PARTS.contains(&part)) || is_note()
 }
 
 fn is_recording(name: &str) -> bool {
@@ -82,7 +185,7 @@ fn is_recording(name: &str) -> bool {
 
 /// Whether it is one of the recordings that landings write of their rows.
 fn is_of_a_row(name: &str) -> bool {
-    name.starts_with("row-") && is_recording(name)
+    name.starts_with("row-") && name.contains("-seed-") && is_recording(name)
 }
 
 /// A sentence of what an interruption left, with an empty line after it; nothing when all is there.
@@ -94,66 +197,121 @@ pub fn interrupted(done: usize, of: usize) -> String {
     }
 }
 
-/// Writes a file into the folder of the results.
-///
-/// # Errors
-/// When it cannot be written.
-pub fn put(folder: &Path, name: &str, text: &str) -> anyhow::Result<()> {
-    let path = folder.join(name);
-    std::fs::write(&path, text).with_context(|| format!("writing {}", path.display()))
+/// A sentence of what there is while more is to come, with an empty line after it; nothing when all is there.
+pub fn so_far(done: usize, of: usize) -> String {
+    match done {
+        _ if done == of => String::new(),
+        _ => format!("So far {done} of {of} flights: all here is of those.\n\n"),
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn folder() -> tempfile::TempDir {
+    /// What an experiment writes.
+    const OURS: [&str; 7] = [
+        "flights.csv",
+        "flights.jsonl",
+        "success.svg",
+        "figure-4-16.svg",
+        "recordings/row-1-none-seed-1.mcap",
+        "logs-7/world.log",
+        "logs-7/controller-main.json",
+    ];
+
+    fn write(folder: &Path, name: &str, text: &str) {
+        let path = folder.join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, text).unwrap();
+    }
+
+    fn refusal(folder: &Path, replaces: bool) -> String {
+        Folder::claim(folder, replaces).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn whatever_would_be_removed_is_refused_and_stays() {
+        for name in OURS {
+            let folder = tempfile::tempdir().unwrap();
+            let folder = folder.path();
+            Folder::claim(folder, false).unwrap();
+            write(folder, name, "old");
+            let problem = refusal(folder, false);
+            for part in [folder.to_str().unwrap(), name, "`-o`", "`--replace`"] {
+                assert!(problem.contains(part), "`{part}` is not in: {problem}");
+            }
+            assert!(folder.join(name).exists(), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_report_is_an_experiments_or_kept() {
         let folder = tempfile::tempdir().unwrap();
-        std::fs::create_dir(folder.path().join(RECORDINGS)).unwrap();
-        folder
-    }
-
-    #[test]
-    fn results_of_another_run_are_refused_before_they_are_mixed_with_new_ones() {
-        let folder = folder();
         let folder = folder.path();
-        claim(folder, false).unwrap();
-        put(folder, "flights.csv", "seed\n1\n").unwrap();
-        let problem = claim(folder, false).unwrap_err().to_string();
-        for part in [folder.to_str().unwrap(), "flights.csv", "`-o`", "`--replace`"] {
-            assert!(problem.contains(part), "`{part}` is not in: {problem}");
+        write(folder, REPORT, "# My notes\n");
+        for replaces in [false, true] {
+            assert!(refusal(folder, replaces).contains("not the report of an experiment"));
         }
-        assert!(folder.join("flights.csv").exists());
+        write(folder, REPORT, &format!("{FAULTS_HEADING}\n"));
+        assert!(refusal(folder, false).contains("--replace"));
+        Folder::claim(folder, true).unwrap();
     }
 
     #[test]
-    fn what_is_replaced_is_of_an_experiment_and_nothing_else() {
-        let folder = folder();
-        let old =
-            ["flights.csv", "report.md", "figure-4-16.svg", "recordings/row-1-none-seed-1.mcap"];
-        let kept = ["notes.md", "logo.svg", "recordings/flight.mcap"];
-        for name in old.iter().chain(&kept) {
-            put(folder.path(), name, "old").unwrap();
+    fn old_results_are_kept_until_the_first_new_one_and_files_of_the_user_for_ever() {
+        let folder = tempfile::tempdir().unwrap();
+        let kept = [
+            "notes.md",
+            "logo.svg",
+            "figure-4-2.svg",
+            "recordings/flight.mcap",
+            "logs-old/world.log",
+            "logs-8/mine.log",
+        ];
+        for name in OURS.iter().chain(&kept) {
+            write(folder.path(), name, "old");
         }
-        claim(folder.path(), true).unwrap();
         let is_there = |name: &&&str| folder.path().join(name).exists();
-        assert_eq!(old.iter().filter(is_there).count(), 0);
+        let mut claimed = Folder::claim(folder.path(), true).unwrap();
+        assert_eq!(OURS.iter().filter(is_there).count(), OURS.len());
+        claimed.put(FLIGHTS_AS_CSV, "new").unwrap();
+        claimed.put(REPORT, "new").unwrap();
+        let left: Vec<&&str> = OURS.iter().filter(is_there).collect();
+        assert_eq!(left, [&FLIGHTS_AS_CSV]);
         assert_eq!(kept.iter().filter(is_there).count(), kept.len());
+        assert!(folder.path().join(REPORT).exists() && !folder.path().join("logs-7").exists());
+    }
+
+    #[test]
+    fn the_logs_of_a_flight_are_its_own_and_outlast_the_first_result() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["logs-1/world.log", "logs-2/world.log"] {
+            write(folder.path(), name, "old");
+        }
+        let mut claimed = Folder::claim(folder.path(), true).unwrap();
+        let logs = claimed.begin_logs(1).unwrap();
+        assert!(!logs.join("world.log").exists() && folder.path().join("logs-2").exists());
+        write(&logs, "world.log", "new");
+        claimed.put(FLIGHTS_AS_CSV, "new").unwrap();
+        assert!(logs.join("world.log").exists() && !folder.path().join("logs-2").exists());
     }
 
     #[test]
     fn a_folder_with_recordings_takes_none_of_another_campaign() {
-        let folder = folder();
+        let folder = tempfile::tempdir().unwrap();
         claim_for_recordings(folder.path()).unwrap();
-        put(folder.path(), "bridge-killed-1.mcap", "").unwrap();
+        write(folder.path(), "bridge-killed-1.mcap", "");
         let problem = claim_for_recordings(folder.path()).unwrap_err().to_string();
         assert!(problem.contains("bridge-killed-1.mcap") && problem.contains("--record-tapes"));
     }
 
     #[test]
-    fn an_interruption_is_told_and_only_that() {
+    fn what_is_missing_is_told_and_only_that() {
         assert_eq!(interrupted(3, 3), "");
         assert!(interrupted(2, 3).contains("after 2 of 3 flights"));
         assert!(interrupted(0, 3).contains("before any of 3 flights"));
+        assert_eq!(so_far(3, 3), "");
+        assert!(so_far(2, 3).starts_with("So far 2 of 3 flights"));
     }
 }

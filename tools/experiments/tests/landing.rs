@@ -11,7 +11,7 @@ use experiments::landing::flight::{fly, fly_recorded};
 use experiments::landing::outcome::{Ending, Outcome};
 use experiments::landing::plan::{Plan, Planned, Request, Values, Vision};
 use experiments::landing::{self, Watch, in_parallel};
-use experiments::results;
+use experiments::results::Folder;
 
 fn plan(vision: Vision, flights: u64) -> Plan {
     let one = |value| Values::List(vec![value]);
@@ -156,12 +156,12 @@ fn late_detections_are_used() {
 #[test]
 fn the_worst_flight_of_each_row_is_written_as_a_recording() {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("worst-flights");
-    results::claim(&folder, true).unwrap();
+    let mut results = Folder::claim(&folder, true).unwrap();
     let wind = Values::List(vec![0.0, 3.0]);
     let plan = Plan { wind, ..plan(Vision::Modelled, 2) };
-    let request = Request { plan, results_in: folder.clone(), jobs: 2, recordings: 1 };
+    let request = Request { plan, jobs: 2, recordings: 1 };
     let watch = Watch { progress: &|_, _| {}, is_interrupted: &|| false };
-    let report = landing::run(&request, watch).unwrap().report;
+    let report = landing::run(&request, &mut results, watch).unwrap().report;
     let names: Vec<&str> = report
         .lines()
         .filter_map(|line| line.strip_prefix("- `row-")?.split_once('`').map(|(name, _)| name))
@@ -187,17 +187,17 @@ fn the_worst_flight_of_each_row_is_written_as_a_recording() {
 #[test]
 fn an_interruption_leaves_the_results_of_the_flights_that_were_flown() {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("interrupted-flights");
-    results::claim(&folder, true).unwrap();
+    let mut results = Folder::claim(&folder, true).unwrap();
     let plan = plan(Vision::Modelled, 5);
-    let request = Request { plan, results_in: folder.clone(), jobs: 1, recordings: 1 };
+    let request = Request { plan, jobs: 1, recordings: 1 };
     let flown = AtomicUsize::new(0);
-    let run = |flights: usize| {
+    let mut run = |flights: usize| {
         flown.store(0, Ordering::Relaxed);
         let watch = Watch {
             progress: &|done, _| flown.store(done, Ordering::Relaxed),
             is_interrupted: &|| flown.load(Ordering::Relaxed) >= flights,
         };
-        landing::run(&request, watch).unwrap()
+        landing::run(&request, &mut results, watch).unwrap()
     };
     let landings = run(2);
     assert_eq!((landings.flown, landings.planned), (2, 5));
@@ -206,4 +206,24 @@ fn an_interruption_leaves_the_results_of_the_flights_that_were_flown() {
     assert_eq!(lines.lines().count(), 2);
     assert_eq!(std::fs::read_to_string(folder.join("report.md")).unwrap(), landings.report);
     assert_eq!(run(0).flown, 0);
+}
+
+#[test]
+fn old_results_outlast_a_run_that_gives_none() {
+    let folder = tempfile::tempdir().unwrap();
+    let old = folder.path().join("flights.csv");
+    std::fs::write(&old, "old").unwrap();
+    let run = |set: &[&str], is_interrupted: bool| {
+        let set = set.iter().map(|&it| it.to_owned()).collect();
+        let plan = Plan { set, ..plan(Vision::Modelled, 1) };
+        let request = Request { plan, jobs: 1, recordings: 0 };
+        let watch = Watch { progress: &|_, _| {}, is_interrupted: &|| is_interrupted };
+        let mut results = Folder::claim(folder.path(), true).unwrap();
+        landing::run(&request, &mut results, watch)
+    };
+    run(&["simulator.no_such_key=1"], false).unwrap_err();
+    assert_eq!(run(&[], true).unwrap().flown, 0);
+    assert_eq!(std::fs::read_to_string(&old).unwrap(), "old");
+    assert_eq!(run(&[], false).unwrap().flown, 1);
+    assert_ne!(std::fs::read_to_string(&old).unwrap(), "old");
 }

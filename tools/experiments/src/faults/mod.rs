@@ -22,6 +22,7 @@ pub mod tape_file;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use crate::landing::{Watch, in_parallel_until};
+use crate::results::Folder;
 use flight::{fly, fly_with_tape};
 use outcome::Outcome;
 use plan::Request;
@@ -37,11 +38,11 @@ pub struct Findings {
     pub planned: usize,
 }
 
-/// Flies all, and writes every flight and the report. Of flights that are interrupted it writes those that were flown.
+/// Flies all, and writes every flight and the report into the folder. Of flights that are interrupted it writes those that were flown.
 ///
 /// # Errors
 /// When a setting is invalid or a file cannot be written.
-pub fn run(request: &Request, watch: Watch<'_>) -> anyhow::Result<Findings> {
+pub fn run(request: &Request, folder: &mut Folder, watch: Watch<'_>) -> anyhow::Result<Findings> {
     let flights = request.plan.flights();
     let planned = flights.len();
     let done = AtomicUsize::new(0);
@@ -61,6 +62,6 @@ pub fn run(request: &Request, watch: Watch<'_>) -> anyhow::Result<Findings> {
     let outcomes: Vec<Outcome> = outcomes.into_iter().flatten().collect();
     let title =
         format!("{} flights in lock-step, seeds from {}", outcomes.len(), request.plan.seed);
-    let report = report::write(&request.results_in, &title, &outcomes, planned)?;
+    let report = report::write(folder, &title, &outcomes, planned, false)?;
     Ok(Findings { report, outcomes, planned })
 }

@@ -72,8 +72,6 @@ impl Default for Plan {
 pub struct Request {
     /// The flights.
     pub plan: Plan,
-    /// Folder of the results.
-    pub results_in: PathBuf,
     /// Folder of the recordings with the controllers' tapes, where they are wanted.
     pub tapes_in: Option<PathBuf>,
     /// Number of flights in parallel.
@@ -220,15 +218,15 @@ impl Planned {
         names.join(" + ")
     }
 
-    /// The command that repeats it.
+    /// The command that repeats it, in a folder of its own: that of the campaign is taken.
     pub fn command(&self) -> String {
+        let kind = self.faults.first().map_or("none", |first| first.kind.name());
         let mut command = format!(
-            "alight experiment faults --flights 1 --seed {} --height {} --wind {}",
-            self.seed, self.height_m, self.wind_m_s
+            "alight experiment faults -o again-{kind}-{seed} --flights 1 --seed {seed} --height {} --wind {} --kind {kind}",
+            self.height_m,
+            self.wind_m_s,
+            seed = self.seed,
         );
-        if let Some(first) = self.faults.first() {
-            command.push_str(&format!(" --kind {}", first.kind.name()));
-        }
         match self.faults.get(1) {
             Some(second) => command.push_str(&format!(" --with {}", second.kind.name())),
             None => command.push_str(" --with none"),

@@ -1,12 +1,11 @@
 //! The files of a campaign: every flight as CSV and JSON lines, and the table of the worst touchdowns.
 
 use std::fmt::Write as _;
-use std::path::Path;
 
 use super::kind::Kind;
 use super::outcome::{Ending, MAX_HOP_M, MAX_SINK_M_S, MAX_SLIDE_M_S, Outcome};
 use crate::landing::report::{csv, json_lines};
-use crate::results::{self, put};
+use crate::results::{self, FAULTS_HEADING, FLIGHTS_AS_CSV, FLIGHTS_AS_JSON, Folder, REPORT};
 
 /// Upper ends of the bands of height, in metres.
 const BANDS_M: [f64; 7] = [0.5, 1.0, 2.0, 3.0, 4.5, 6.0, f64::INFINITY];
@@ -15,31 +14,36 @@ const MAX_LISTED: usize = 60;
 /// What two faults at once are called in the table.
 const TWO: &str = "two at once";
 
-/// Writes the files of the flights that were flown, of `planned` ones, and returns the report.
+/// Writes the files of the flights that were flown, of `planned` ones, and returns the report. `is_under_way` while more of them
+/// are to come.
 ///
 /// # Errors
 /// When a file cannot be written.
 pub fn write(
-    folder: &Path,
+    folder: &mut Folder,
     title: &str,
     outcomes: &[Outcome],
     planned: usize,
+    is_under_way: bool,
 ) -> anyhow::Result<String> {
     if outcomes.is_empty() {
         return Ok(results::interrupted(0, planned));
     }
-    put(folder, "flights.jsonl", &json_lines(outcomes)?)?;
-    put(folder, "flights.csv", &csv(outcomes)?)?;
-    let text = format!("{}{}{}", head(title, outcomes, planned), table(outcomes), lists(outcomes));
-    put(folder, "report.md", &text)?;
+    folder.put(FLIGHTS_AS_JSON, &json_lines(outcomes)?)?;
+    folder.put(FLIGHTS_AS_CSV, &csv(outcomes)?)?;
+    let missing = match is_under_way {
+        true => results::so_far(outcomes.len(), planned),
+        false => results::interrupted(outcomes.len(), planned),
+    };
+    let text = head(title, outcomes, &missing) + &table(outcomes) + &lists(outcomes);
+    folder.put(REPORT, &text)?;
     Ok(text)
 }
 
-fn head(title: &str, outcomes: &[Outcome], planned: usize) -> String {
-    let interrupted = results::interrupted(outcomes.len(), planned);
+fn head(title: &str, outcomes: &[Outcome], missing: &str) -> String {
     let count = |of: fn(&Outcome) -> bool| outcomes.iter().filter(|outcome| of(outcome)).count();
     format!(
-        "# Faults\n\n{interrupted}{title}: {} unsafe, {} did not end; {} landed, {} hovered at the end; {} left the \
+        "{FAULTS_HEADING}\n{missing}{title}: {} unsafe, {} did not end; {} landed, {} hovered at the end; {} left the \
          ground again after a touch (by more than {MAX_HOP_M} m).\n\n\
          Unsafe: a touch of the ground faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways. Not ended: \
          neither at rest nor in a terminal phase. A cell has the worst speed down at a touch in m/s, by the height at \

@@ -23,6 +23,8 @@ use flight::fly;
 use outcome::Outcome;
 use plan::{Planned, Request};
 
+use crate::results::Folder;
+
 /// How flights are watched.
 #[derive(Copy, Clone)]
 pub struct Watch<'a> {
@@ -43,11 +45,11 @@ pub struct Landings {
     pub planned: usize,
 }
 
-/// Flies all, writes results, plots and the report. Of flights that are interrupted it writes those that were flown.
+/// Flies all, writes results, plots and the report into the folder. Of flights that are interrupted it writes those that were flown.
 ///
 /// # Errors
 /// When a setting is invalid or a file cannot be written.
-pub fn run(request: &Request, watch: Watch<'_>) -> anyhow::Result<Landings> {
+pub fn run(request: &Request, folder: &mut Folder, watch: Watch<'_>) -> anyhow::Result<Landings> {
     let flights = request.plan.flights();
     let planned = flights.len();
     let done = AtomicUsize::new(0);
@@ -62,7 +64,8 @@ pub fn run(request: &Request, watch: Watch<'_>) -> anyhow::Result<Landings> {
         .filter_map(|(planned, outcome)| Some((planned, outcome?)))
         .unzip();
     let flown = outcomes.len();
-    let report = report::write(request, &flights, &outcomes, planned, watch.is_interrupted)?;
+    let report =
+        report::write(request, folder, &flights, &outcomes, planned, watch.is_interrupted)?;
     Ok(Landings { report, flown, planned })
 }
 

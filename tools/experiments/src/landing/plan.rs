@@ -1,6 +1,5 @@
 //! The flights: every combination of the listed values, with several seeds each.
 
-use std::path::PathBuf;
 use std::str::FromStr;
 
 use super::fault::{Change, Fault, START_ANGLE, drawn, drawn_angle};
@@ -126,8 +125,6 @@ impl Default for Plan {
 pub struct Request {
     /// The flights.
     pub plan: Plan,
-    /// Folder of the results.
-    pub results_in: PathBuf,
     /// Number of flights in parallel.
     pub jobs: usize,
     /// Number of the worst flights of each combination that are written as recordings.
@@ -139,6 +136,8 @@ pub struct Request {
 pub struct Planned {
     /// The name of its cell.
     pub cell: String,
+    /// The number of the cell, as the table's rows are counted.
+    pub row: usize,
     /// The options of its command.
     pub options: String,
     /// The vision of a flight.
@@ -165,11 +164,13 @@ impl Plan {
     /// Its flights, cell after cell.
     pub fn flights(&self) -> Vec<Planned> {
         let mut flights = Vec::new();
+        let mut row = 0;
         for fault in &self.faults {
             for [wind, turbulence, latency, height, offset] in self.cells() {
+                row += 1;
                 let axes = [&wind, &turbulence, &latency, &height, &offset];
                 for seed in (0..self.flights).map(|i| self.seed.wrapping_add(i)) {
-                    flights.push(self.flight(seed, *fault, axes));
+                    flights.push(Planned { row, ..self.flight(seed, *fault, axes) });
                 }
             }
         }
@@ -196,6 +197,7 @@ impl Plan {
     fn flight(&self, seed: u64, fault: Fault, axes: [&Values; 5]) -> Planned {
         let [wind, turbulence, latency, height, offset] = axes;
         let mut planned = Planned {
+            row: 0,
             cell: format!(
                 "{}, wind {wind} m/s, turbulence {turbulence}, {latency} ms, from {height} m, {offset} m aside",
                 fault.name()
@@ -258,11 +260,11 @@ impl Plan {
 }
 
 impl Planned {
-    /// The command that repeats and draws it.
+    /// The command that repeats and draws it, in a folder of its own: that of the campaign is taken.
     pub fn command(&self) -> String {
         format!(
-            "alight experiment landing -o DIR {} --flights 1 --seed {}",
-            self.options, self.seed
+            "alight experiment landing -o again-row-{}-seed-{} {} --flights 1 --seed {}",
+            self.row, self.seed, self.options, self.seed
         )
     }
 }

@@ -25,6 +25,15 @@ pub type DrawError = Box<dyn std::error::Error>;
 pub type Chart<'a, 'b> =
     ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
+/// The names of the plots.
+pub const NAMES: [&str; 5] = [
+    "error-against-wind.svg",
+    "time-against-wind.svg",
+    "touchdowns.svg",
+    "success.svg",
+    "worst.svg",
+];
+
 /// The plots: file names and contents.
 ///
 /// # Errors
@@ -32,23 +41,18 @@ pub type Chart<'a, 'b> =
 pub fn all(outcomes: &[Outcome]) -> anyhow::Result<Vec<(&'static str, String)>> {
     let error: Column = |o| o.error_m.map(|error| 100.0 * error);
     let time: Column = |o| o.disarm_s;
-    Ok(vec![
-        (
-            "error-against-wind.svg",
-            picture([900, 560], |area| {
-                against_wind(area, outcomes, error, "Touchdown error", "error, cm")
-            })?,
-        ),
-        (
-            "time-against-wind.svg",
-            picture([900, 560], |area| {
-                against_wind(area, outcomes, time, "Time to disarm", "time, s")
-            })?,
-        ),
-        ("touchdowns.svg", picture([700, 720], |area| touchdowns(area, outcomes))?),
-        ("success.svg", picture(success_size(outcomes), |area| success(area, outcomes))?),
-        ("worst.svg", picture([900, 560], |area| worst(area, outcomes))?),
-    ])
+    let plots = [
+        picture([900, 560], |area| {
+            against_wind(area, outcomes, error, "Touchdown error", "error, cm")
+        })?,
+        picture([900, 560], |area| {
+            against_wind(area, outcomes, time, "Time to disarm", "time, s")
+        })?,
+        picture([700, 720], |area| touchdowns(area, outcomes))?,
+        picture(success_size(outcomes), |area| success(area, outcomes))?,
+        picture([900, 560], |area| worst(area, outcomes))?,
+    ];
+    Ok(NAMES.into_iter().zip(plots).collect())
 }
 
 /// An SVG of a size in pixels.

@@ -4,7 +4,6 @@
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::BufWriter;
-use std::path::Path;
 
 use anyhow::Context;
 use serde::Serialize;
@@ -15,7 +14,7 @@ use super::outcome::{Ending, Outcome};
 use super::plan::{Planned, Request};
 use super::table::{markdown, share_interval};
 use super::{in_parallel_until, plots, thesis_figures};
-use crate::results::{self, put};
+use crate::results::{self, FLIGHTS_AS_CSV, FLIGHTS_AS_JSON, Folder, LANDINGS_HEADING, REPORT};
 
 /// Maximum number of failures in the report; the CSV has all.
 const MAX_LISTED: usize = 50;
@@ -30,6 +29,7 @@ const NOT_AGAIN: &str =
 /// When a file cannot be written.
 pub fn write(
     request: &Request,
+    folder: &mut Folder,
     flights: &[Planned],
     outcomes: &[Outcome],
     planned: usize,
@@ -38,11 +38,10 @@ pub fn write(
     if outcomes.is_empty() {
         return Ok(results::interrupted(0, planned));
     }
-    let folder = &request.results_in;
-    put(folder, "flights.jsonl", &json_lines(outcomes)?)?;
-    put(folder, "flights.csv", &csv(outcomes)?)?;
+    folder.put(FLIGHTS_AS_JSON, &json_lines(outcomes)?)?;
+    folder.put(FLIGHTS_AS_CSV, &csv(outcomes)?)?;
     for (name, svg) in plots::all(outcomes)? {
-        put(folder, name, &svg)?;
+        folder.put(name, &svg)?;
     }
     let mut text = head(request, outcomes, planned);
     text.push_str(&markdown(outcomes));
@@ -51,9 +50,9 @@ pub fn write(
         text.push_str(NOT_AGAIN);
     } else {
         text.push_str(&one_flight(folder, flights, outcomes)?);
-        text.push_str(&recordings(request, flights, outcomes, is_interrupted)?);
+        text.push_str(&recordings(request, folder, flights, outcomes, is_interrupted)?);
     }
-    put(folder, "report.md", &text)?;
+    folder.put(REPORT, &text)?;
     Ok(text)
 }
 
@@ -63,7 +62,7 @@ fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
     let [low, high] = share_interval(within, outcomes.len());
     let dangerous = outcomes.iter().filter(|o| o.is_unsafe()).count();
     format!(
-        "# Landings\n\n{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe.\n\n\
+        "{LANDINGS_HEADING}\n{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe.\n\n\
          Unsafe: touched down, without having given up, more than 0.3 m off, faster than 0.8 m/s down or 0.5 m/s sideways. Times count from the start of the landing. \
          Numbers of error, time, speed and tilt are of those that landed.\n\n",
         results::interrupted(outcomes.len(), planned),
@@ -97,7 +96,11 @@ fn failures(flights: &[Planned], outcomes: &[Outcome]) -> String {
 }
 
 /// Repeats the flight with the largest error and draws the thesis' figures.
-fn one_flight(folder: &Path, flights: &[Planned], outcomes: &[Outcome]) -> anyhow::Result<String> {
+fn one_flight(
+    folder: &mut Folder,
+    flights: &[Planned],
+    outcomes: &[Outcome],
+) -> anyhow::Result<String> {
     let error = |outcome: &Outcome| outcome.error_m.unwrap_or(-1.0);
     let pairs = flights.iter().zip(outcomes);
     let Some((planned, _)) = pairs.max_by(|a, b| error(a.1).total_cmp(&error(b.1))) else {
@@ -107,7 +110,7 @@ fn one_flight(folder: &Path, flights: &[Planned], outcomes: &[Outcome]) -> anyho
     let again = fly(planned, Some(&mut samples))?;
     let title = format!("seed {}", planned.seed);
     for (name, svg) in thesis_figures::all(&title, &samples)? {
-        put(folder, &name, &svg)?;
+        folder.put(name, &svg)?;
     }
     Ok(format!(
         "\n## The worst flight\n\nFigures 4.10 to 4.16 of the thesis, for the flight with the largest error ({}): `{}`\n",
@@ -119,6 +122,7 @@ fn one_flight(folder: &Path, flights: &[Planned], outcomes: &[Outcome]) -> anyho
 /// The worst flights of each combination, flown again with a recorder.
 fn recordings(
     request: &Request,
+    folder: &Folder,
     flights: &[Planned],
     outcomes: &[Outcome],
     is_interrupted: &(dyn Fn() -> bool + Sync),
@@ -148,7 +152,7 @@ fn recordings(
     if chosen.is_empty() {
         return Ok(String::new());
     }
-    let folder = request.results_in.join(results::RECORDINGS);
+    let folder = folder.path().join(results::RECORDINGS);
     std::fs::create_dir_all(&folder).with_context(|| format!("making {}", folder.display()))?;
     let name = |number: usize, planned: &Planned| {
         format!("row-{number}-{}-seed-{}.mcap", planned.fault.name(), planned.seed)

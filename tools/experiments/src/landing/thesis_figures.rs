@@ -11,12 +11,23 @@ use super::plots::{COLOURS, Chart, DrawError, legend, picture};
 /// The axes with their names in the thesis, in the order of its figures.
 const AXES: [&str; 3] = ["x (north)", "y (east)", "z (down)"];
 
+/// The names of the figures.
+pub const NAMES: [&str; 7] = [
+    "figure-4-10.svg",
+    "figure-4-11.svg",
+    "figure-4-12.svg",
+    "figure-4-13.svg",
+    "figure-4-14.svg",
+    "figure-4-15.svg",
+    "figure-4-16.svg",
+];
+
 /// The figures: file names and contents. `title` names the flight.
 ///
 /// # Errors
 /// When one cannot be drawn.
-pub fn all(title: &str, samples: &[Sample]) -> anyhow::Result<Vec<(String, String)>> {
-    let mut figures = vec![("figure-4-10.svg".to_owned(), trajectory(title, samples)?)];
+pub fn all(title: &str, samples: &[Sample]) -> anyhow::Result<Vec<(&'static str, String)>> {
+    let mut figures = vec![trajectory(title, samples)?];
     for (axis, name) in AXES.into_iter().enumerate() {
         let position = |s: &Sample| Some(component(s.position.coords.coords.into(), axis));
         let pad = |s: &Sample| Some(component(s.pad.coords.coords.into(), axis));
@@ -27,7 +38,7 @@ pub fn all(title: &str, samples: &[Sample]) -> anyhow::Result<Vec<(String, Strin
             Curve { name: "command velocity, m/s", of: &command },
         ];
         let caption = format!("Position and command velocity, {name}: {title}");
-        figures.push((format!("figure-4-{}.svg", 11 + axis), curves(&caption, samples, &motion)?));
+        figures.push(curves(&caption, samples, &motion)?);
     }
     for (axis, name) in AXES.into_iter().enumerate() {
         let command = |s: &Sample| s.command.map(|command| component(command, axis));
@@ -37,9 +48,9 @@ pub fn all(title: &str, samples: &[Sample]) -> anyhow::Result<Vec<(String, Strin
             Curve { name: "command velocity, m/s", of: &command },
         ];
         let caption = format!("Wind and command velocity, {name}: {title}");
-        figures.push((format!("figure-4-{}.svg", 14 + axis), curves(&caption, samples, &air)?));
+        figures.push(curves(&caption, samples, &air)?);
     }
-    Ok(figures)
+    Ok(NAMES.into_iter().zip(figures).collect())
 }
 
 struct Curve<'a> {
