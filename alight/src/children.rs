@@ -80,9 +80,9 @@ impl Children<Service> {
         let mut by_hand = String::new();
         if let Some(state) = state {
             command.env(node::STATE_VARIABLE, state);
-            by_hand = format!("{}={} ", node::STATE_VARIABLE, state.display());
+            by_hand = format!("{}={} ", node::STATE_VARIABLE, for_shell(state));
         }
-        by_hand.push_str(&format!("alight {} --zenoh {}", service.name(), zenoh.display()));
+        by_hand.push_str(&format!("alight {} --zenoh {}", service.name(), for_shell(zenoh)));
         let is_start =
             |setting: &str| setting.split('=').next().is_some_and(|key| key.trim() == "start");
         for setting in settings {
@@ -101,6 +101,12 @@ impl Children<Service> {
         let number = self.spawn(service, command, service.name())?;
         Ok(Started { service, number, by_hand })
     }
+}
+
+/// A path as a shell takes it for one word.
+pub(crate) fn for_shell(path: &Path) -> String {
+    let text = path.to_string_lossy();
+    shlex::try_quote(&text).unwrap_or_else(|_| text.clone()).into_owned()
 }
 
 impl<K: Clone + PartialEq + Send + 'static> Children<K> {
@@ -207,4 +213,17 @@ async fn follow<K: Clone>(key: K, mut child: Child, events: mpsc::Sender<ChildEv
     };
     // There is no receiver left when all children are being stopped.
     drop(events.send(ChildEvent::Exited(key, exit)).await);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_path_is_one_word_of_a_shell() {
+        assert_eq!(for_shell(Path::new("/tmp/alight-1/zenoh.json5")), "/tmp/alight-1/zenoh.json5");
+        for path in ["/tmp/my flights/zenoh.json5", "/tmp/it's/$HOME"] {
+            assert_eq!(shlex::split(&for_shell(Path::new(path))), Some(vec![path.to_owned()]));
+        }
+    }
 }

@@ -16,9 +16,9 @@ use tempfile::TempDir;
 use tokio::time::Instant;
 
 use crate::args::{Format, OPERATOR, address};
-use crate::children::{ChildEvent, Children};
+use crate::children::{ChildEvent, Children, for_shell};
 use crate::ending::recording;
-use crate::outcome::LandingSummary;
+use crate::outcome::{LandingSummary, OurRecorder};
 use crate::progress::Progress;
 use crate::record::file_setting;
 use crate::runtime::{block_on, tool_identity};
@@ -222,13 +222,14 @@ impl ServiceSettings {
         Ok(Self { by_service, simulated_at })
     }
 
-    /// The name of the recorder, if there is one.
-    fn recorder(&self) -> anyhow::Result<Option<String>> {
+    /// The recorder, if there is one.
+    fn recorder(&self) -> anyhow::Result<Option<OurRecorder>> {
         let set = self.of(Service::Recorder).to_vec();
         if set.is_empty() {
             return Ok(None);
         }
-        Ok(Some(Layers { file: None, set }.load::<recorder::Config>()?.settings.id))
+        let recorder = Layers { file: None, set }.load::<recorder::Config>()?.settings;
+        Ok(Some(OurRecorder { name: recorder.id, file: recorder.file }))
     }
 
     /// Whether the controller's vehicle is the simulated one of this landing, which nobody meets again.
@@ -270,7 +271,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     progress.say(&format!(
         "Zenoh: {}. To add a second detector: alight detector --zenoh {} --set id=spare",
         rendezvous.description,
-        rendezvous.file.display()
+        for_shell(&rendezvous.file)
     ));
     if let Some(port) = rendezvous.unusual_port {
         progress.say(&format!(
@@ -304,7 +305,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     let mut recorders_end = None;
     let note_end = |event: &ChildEvent<Service>| match event {
         ChildEvent::Exited(Service::Recorder, exit) if exit.status != Some(0) => {
-            recorders_end = Some(exit.to_string());
+            recorders_end = Some(exit.clone());
         }
         ChildEvent::Exited(..) | ChildEvent::Line(..) => {}
     };
@@ -328,7 +329,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     node.close().await;
     let mut landing = watched?;
     if let Some(exit) = recorders_end {
-        landing.recording_without_end(&exit);
+        landing.recording_ended_early(&exit);
     }
     Ok(landing)
 }
@@ -384,7 +385,7 @@ async fn watch(
                     }
                     progress.say(&format!("{} exited: {exit}{}", service.name(), consequence(service)));
                     if service == Service::Recorder {
-                        landing.recording_without_end(&exit.to_string());
+                        landing.recording_ended_early(&exit);
                     }
                     if service == Service::Controller {
                         controllers_exit = Some(exit.to_string());
@@ -509,7 +510,28 @@ pub(crate) fn free_port() -> anyhow::Result<(u16, UdpSocket)> {
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser;
+
     use super::*;
+
+    #[derive(Parser)]
+    struct Tool {
+        #[command(flatten)]
+        land: LandArgs,
+    }
+
+    #[test]
+    fn notes_of_a_real_vehicles_parameters_are_kept_after_the_landing() {
+        let is_simulated = |options: &[&str]| {
+            let args = [&["land"], options].concat();
+            ServiceSettings::new(&Tool::parse_from(args).land).unwrap().is_simulated()
+        };
+        assert!(is_simulated(&[]));
+        assert!(is_simulated(&["--set", "controller.phases.landing_timeout_s=300"]));
+        assert!(!is_simulated(&["--autopilot", "udpin:127.0.0.1:14551"]));
+        let address = "controller.autopilot.address=\"udpin:127.0.0.1:14551\"";
+        assert!(!is_simulated(&["--set", address]));
+    }
 
     #[test]
     fn landings_that_begin_at_once_meet_at_different_ports() -> anyhow::Result<()> {

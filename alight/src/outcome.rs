@@ -2,9 +2,12 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
+use std::path::{Path, PathBuf};
 
 use messages::{ControllerStatus, Health, RecorderStatus, Truth};
 use serde::Serialize;
+
+use crate::children::Exit;
 
 /// The thesis' one simulated flight (section 4.4.3).
 const THESIS_TIME_S: f64 = 55.0;
@@ -24,8 +27,8 @@ pub(crate) struct LandingSummary {
     /// Detections used by earlier controllers.
     detections_before: u64,
     recorder: Option<RecorderStatus>,
-    /// The name of the recorder that is to record it.
-    recorded_by: Option<String>,
+    /// The recorder that is to record it.
+    recorded_by: Option<OurRecorder>,
 }
 
 /// The result of a landing.
@@ -78,6 +81,41 @@ struct Process {
     cpu_percent: f64,
 }
 
+/// The recorder of a landing.
+pub(crate) struct OurRecorder {
+    /// Its name.
+    pub(crate) name: String,
+    /// The file that it is to write.
+    pub(crate) file: PathBuf,
+}
+
+impl OurRecorder {
+    /// Whether it tells this, and not one of the same name that others started. Without a file it tells why there is none.
+    fn tells(&self, status: &RecorderStatus) -> bool {
+        let is_of_its_file = match status.file.as_str() {
+            "" => status.problem.is_some(),
+            file => self.may_write(Path::new(file)),
+        };
+        status.recorder == self.name && is_of_its_file
+    }
+
+    /// Whether it is the file, or one with a number after its name: a recorder takes those when the first is taken or fails.
+    fn may_write(&self, other: &Path) -> bool {
+        let whole = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+        let (wanted, other) = (whole(&self.file), whole(other));
+        let stem = |path: &Path| path.file_stem().map(|it| it.to_string_lossy().into_owned());
+        let (Some(wanted_stem), Some(other_stem)) = (stem(&wanted), stem(&other)) else {
+            return false;
+        };
+        let number = other_stem.strip_prefix(&wanted_stem).map(|rest| rest.strip_prefix('-'));
+        let has_number =
+            number.flatten().is_some_and(|number| number.parse::<u64>().is_ok_and(|it| it > 1));
+        wanted.parent() == other.parent()
+            && wanted.extension() == other.extension()
+            && (wanted_stem == other_stem || has_number)
+    }
+}
+
 /// The problem of a recorder until it reports.
 const UNHEARD: &str = "the recorder has not reported";
 
@@ -85,8 +123,8 @@ const UNHEARD: &str = "the recorder has not reported";
 const RECORDING_FAILED: u8 = 3;
 
 impl LandingSummary {
-    /// Of a landing that the recorder with this name is to record.
-    pub(crate) fn recorded_by(recorder: String) -> Self {
+    /// Of a landing that this recorder is to record.
+    pub(crate) fn recorded_by(recorder: OurRecorder) -> Self {
         let unheard =
             RecorderStatus { problem: Some(UNHEARD.to_owned()), ..RecorderStatus::default() };
         Self { recorder: Some(unheard), recorded_by: Some(recorder), ..Self::default() }
@@ -118,7 +156,7 @@ impl LandingSummary {
 
     pub(crate) fn recorder(&mut self, recorder: RecorderStatus) {
         // Others may run beside it.
-        if self.recorded_by.as_ref().is_some_and(|ours| *ours != recorder.recorder) {
+        if self.recorded_by.as_ref().is_some_and(|ours| !ours.tells(&recorder)) {
             return;
         }
         // One that fails goes on without a file; what it kept is in the last one.
@@ -130,13 +168,23 @@ impl LandingSummary {
         }
     }
 
-    /// Notes that the recorder exited before it had ended its file.
-    pub(crate) fn recording_without_end(&mut self, exit: &str) {
+    /// Notes that the recorder exited before it was to: what follows is not in its file, which lacks its end unless it was ended
+    /// in good order.
+    pub(crate) fn recording_ended_early(&mut self, exit: &Exit) {
         let recorder = self.recorder.get_or_insert_default();
         let is_begun = !recorder.file.is_empty();
-        let repair = if is_begun { "; `alight record --repair` ends its file" } else { "" };
+        let what = match (exit.status, is_begun) {
+            (Some(0), true) => {
+                "the recorder ended before the landing; its file is whole".to_owned()
+            }
+            (Some(0), false) => "the recorder ended before the landing".to_owned(),
+            (_, true) => {
+                format!("the recorder exited: {exit}; `alight record --repair` ends its file")
+            }
+            (_, false) => format!("the recorder exited: {exit}"),
+        };
         let known = recorder.problem.take().filter(|problem| problem != UNHEARD);
-        recorder.problem = known.or_else(|| Some(format!("the recorder exited: {exit}{repair}")));
+        recorder.problem = known.or(Some(what));
     }
 
     /// Notes why the landing was not watched to its end.
@@ -394,16 +442,38 @@ mod tests {
             problem: problem.map(str::to_owned),
             ..RecorderStatus::default()
         };
-        let mut landing = landed(LandingSummary::recorded_by("main".into()));
+        let ours = || OurRecorder { name: "main".into(), file: "flight.mcap".into() };
+        let mut landing = landed(LandingSummary::recorded_by(ours()));
         assert_eq!(status(&landing), RECORDING_FAILED, "nobody knows of a recording");
         landing.recorder(told("main", "", Some("No space left")));
         assert_eq!(status(&landing), RECORDING_FAILED);
         landing.recorder(told("main", "flight-2.mcap", None));
         landing.recorder(told("another", "", Some("No space left")));
         assert_eq!(status(&landing), 0, "another file took its place");
-        landing.recording_without_end("exit status: 1");
+        let exit = |words: &str, status| Exit { words: words.into(), status };
+        landing.recording_ended_early(&exit("exit status: 1", Some(1)));
         assert_eq!(status(&landing), RECORDING_FAILED);
         assert!(landing.outcome().table().contains("--repair"));
+        landing.recorder(told("main", "", None));
+        landing.recorder(told("main", "elsewhere/flight.mcap", None));
+        assert_eq!(status(&landing), RECORDING_FAILED, "one of the same name says nothing of it");
+        let mut landing = landed(LandingSummary::recorded_by(ours()));
+        landing.recorder(told("main", "flight.mcap", None));
+        landing.recording_ended_early(&exit("exit status: 0", Some(0)));
+        assert_eq!(status(&landing), RECORDING_FAILED, "the landing is not in it");
+        let table = landing.outcome().table();
+        assert!(table.contains("its file is whole") && !table.contains("--repair"), "{table}");
+    }
+
+    #[test]
+    fn a_recorder_writes_its_file_or_one_with_a_number() {
+        let ours = OurRecorder { name: "main".into(), file: "a/flight.mcap".into() };
+        for file in ["a/flight.mcap", "./a/flight-2.mcap", "a/flight-11.mcap"] {
+            assert!(ours.may_write(Path::new(file)), "{file}");
+        }
+        for file in ["flight.mcap", "a/flights.mcap", "a/flight-x.mcap", "a/flight-2", "a/b.mcap"] {
+            assert!(!ours.may_write(Path::new(file)), "{file}");
+        }
     }
 
     #[test]
