@@ -250,7 +250,7 @@ mod tests {
 
     use clap::Parser;
     use experiments::faults::kind::Kind;
-    use experiments::faults::plan::Plan as FaultsPlan;
+    use experiments::faults::plan as faults_plan;
 
     use super::*;
 
@@ -286,19 +286,25 @@ mod tests {
             set: vec!["simulator.camera.rate_hz=20".to_owned()],
             ..Plan::default()
         };
-        let lockstep =
-            FaultsPlan { flights: 60, durations_s: vec![f64::INFINITY], ..FaultsPlan::default() };
-        let real_time = FaultsPlan {
+        let lockstep = faults_plan::Plan {
+            flights: 60,
+            durations_s: vec![f64::INFINITY],
+            ..faults_plan::Plan::default()
+        };
+        let real_time = faults_plan::Plan {
             flights: 30,
             kinds: Kind::in_real_time().collect(),
-            second: experiments::faults::plan::Second::None,
+            second: faults_plan::Second::None,
             real_time: true,
-            ..FaultsPlan::default()
+            ..faults_plan::Plan::default()
+        };
+        let commands = |plan: &faults_plan::Plan| {
+            plan.flights().iter().map(faults_plan::Planned::command).collect()
         };
         let commands: [(&str, Vec<String>); 3] = [
             ("experiment landing", landings.flights().iter().map(plan::Planned::command).collect()),
-            ("experiment faults", lockstep.flights().iter().map(|it| it.command()).collect()),
-            ("experiment faults", real_time.flights().iter().map(|it| it.command()).collect()),
+            ("experiment faults", commands(&lockstep)),
+            ("experiment faults", commands(&real_time)),
         ];
         for (campaign, commands) in commands {
             let of_campaign = output(&format!("alight {campaign}"));

@@ -11,6 +11,7 @@ use crate::terminal::write_error;
 
 /// What shells add to a signal's number for the exit status of a process that it ended.
 const BY_SIGNAL: u8 = 128;
+const HANGUP: u8 = 1;
 const INTERRUPT: u8 = 2;
 const TERMINATE: u8 = 15;
 
@@ -26,7 +27,7 @@ pub(crate) struct Interruption {
 }
 
 impl Interruption {
-    /// By SIGINT (Ctrl-C) or SIGTERM. `what_is_kept` is told at the first; a second one ends the process at once.
+    /// By SIGINT (Ctrl-C), SIGTERM, or SIGHUP (the end of a terminal) unless that is ignored, as `nohup` does. `what_is_kept` is told at the first; a second one ends the process at once.
     ///
     /// # Errors
     /// When the signals cannot be listened to.
@@ -37,19 +38,15 @@ impl Interruption {
             .build()
             .context("starting the runtime that listens to Ctrl-C")?;
         let (sender, receiver) = watch::channel(None);
-        let (mut interrupts, mut terminations) = {
+        let mut signals = {
             let _in_it = runtime.enter();
-            let listening = "listening to Ctrl-C";
-            (
-                signal(SignalKind::interrupt()).context(listening)?,
-                signal(SignalKind::terminate()).context(listening)?,
-            )
+            Signals::listen().context("listening to Ctrl-C")?
         };
         runtime.spawn(async move {
-            let number = next(&mut interrupts, &mut terminations).await;
+            let number = signals.next().await;
             write_error(&format!("interrupted: {what_is_kept}; Ctrl-C again ends it at once"));
             sender.send_replace(Some(number));
-            let number = next(&mut interrupts, &mut terminations).await;
+            let number = signals.next().await;
             std::process::exit(i32::from(BY_SIGNAL + number));
         });
         Ok(Self { signal: receiver, _runtime: runtime })
@@ -76,9 +73,90 @@ impl Interruption {
     }
 }
 
-async fn next(interrupts: &mut Signal, terminations: &mut Signal) -> u8 {
-    tokio::select! {
-        _ = interrupts.recv() => INTERRUPT,
-        _ = terminations.recv() => TERMINATE,
+/// The signals that interrupt.
+struct Signals {
+    interrupts: Signal,
+    terminations: Signal,
+    hangups: Option<Signal>,
+}
+
+impl Signals {
+    fn listen() -> std::io::Result<Self> {
+        // Whoever listens would undo that it is ignored.
+        let hangups = match ignores_hangups() {
+            true => None,
+            false => Some(signal(SignalKind::hangup())?),
+        };
+        Ok(Self {
+            interrupts: signal(SignalKind::interrupt())?,
+            terminations: signal(SignalKind::terminate())?,
+            hangups,
+        })
+    }
+
+    /// The number of the next one.
+    async fn next(&mut self) -> u8 {
+        let hangup = async {
+            match &mut self.hangups {
+                Some(hangups) => hangups.recv().await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            _ = self.interrupts.recv() => INTERRUPT,
+            _ = self.terminations.recv() => TERMINATE,
+            _ = hangup => HANGUP,
+        }
+    }
+}
+
+/// Whether this process was started with SIGHUP ignored.
+fn ignores_hangups() -> bool {
+    std::fs::read_to_string("/proc/self/status").is_ok_and(|status| is_ignored(&status, HANGUP))
+}
+
+/// Whether a process with this status (`/proc/PID/status`) ignores a signal.
+fn is_ignored(status: &str, signal: u8) -> bool {
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let ignored = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    ignored.is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use rustix::process::{Signal, getpid, kill_process};
+
+    use super::*;
+
+    const PATIENCE: Duration = Duration::from_secs(20);
+
+    /// One test sends them all: what listens in this process gets each.
+    #[test]
+    fn a_signal_asks_for_the_end_and_gives_the_exit_status() {
+        let waiting = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
+        for (signal, status) in [(Signal::INT, 130), (Signal::TERM, 143), (Signal::HUP, 129)] {
+            if signal == Signal::HUP && ignores_hangups() {
+                continue;
+            }
+            let interruption = Interruption::on_signals("nothing is kept").unwrap();
+            assert!(!interruption.is_requested());
+            kill_process(getpid(), signal).unwrap();
+            let requested =
+                async { tokio::time::timeout(PATIENCE, interruption.requested()).await };
+            waiting.block_on(requested).unwrap();
+            assert!(interruption.is_requested());
+            assert_eq!(interruption.exit_code(), ExitCode::from(status), "{signal:?}");
+        }
+    }
+
+    #[test]
+    fn an_ignored_signal_is_told_from_the_status_of_the_process() {
+        let status =
+            "SigBlk:\t0000000000000000\nSigIgn:\t0000000000001001\nSigCgt:\t0000000000004002\n";
+        assert!(is_ignored(status, HANGUP));
+        assert!(!is_ignored(status, INTERRUPT) && !is_ignored(status, TERMINATE));
+        assert!(!is_ignored("", HANGUP));
     }
 }
