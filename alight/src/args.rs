@@ -79,7 +79,7 @@ impl NetworkArgs {
 /// An address at which a service is to listen.
 pub(crate) fn address(text: &str) -> Result<SocketAddr, String> {
     text.parse().map_err(|_| {
-        let port: u16 = text.trim_start_matches(':').parse().unwrap_or(8080);
+        let port: u16 = text.rsplit(':').next().unwrap_or_default().parse().unwrap_or(8080);
         format!("write IP:PORT, such as 127.0.0.1:{port}, or 0.0.0.0:{port} for all of this machine's addresses")
     })
 }
@@ -111,7 +111,13 @@ mod tests {
     #[test]
     fn a_port_alone_is_answered_with_the_address_that_was_meant() {
         assert!(address("127.0.0.1:8080").is_ok() && address("[::1]:8080").is_ok());
-        for (text, meant) in [("8765", "127.0.0.1:8765"), (":99", "127.0.0.1:99"), ("x", ":8080")] {
+        let meant = [
+            ("8765", "127.0.0.1:8765"),
+            (":99", "127.0.0.1:99"),
+            ("localhost:9000", "127.0.0.1:9000"),
+            ("x", ":8080"),
+        ];
+        for (text, meant) in meant {
             let problem = address(text).unwrap_err();
             assert!(problem.contains(meant), "`{meant}` is not in: {problem}");
         }

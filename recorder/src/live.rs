@@ -122,7 +122,7 @@ impl Live {
 
 async fn bind(address: SocketAddr) -> anyhow::Result<TcpListener> {
     TcpListener::bind(address).await.with_context(|| {
-        format!("listening at {address} for viewers; another program has the port, or the address is of another machine: choose another with `serve`: `alight record --serve IP:PORT`, `alight land --set recorder.serve=IP:PORT`")
+        format!("listening at {address} for viewers; another program has the port, or the address is of another machine: choose another with `serve`: `alight record --serve IP:PORT`, `alight land --record FILE.mcap --set recorder.serve=IP:PORT`")
     })
 }
 

@@ -191,13 +191,24 @@ impl Examiner {
         }
         let id = found.id.map_or_else(String::new, |id| format!(":{id}"));
         Some(format!(
-            "warning: {name} shows {}{id}, but not as a camera with `{}` would show it, so it is not counted: the focal length must be in \
-             pixels of images of {} x {}; correct the option, or leave it out to find markers without their poses",
+            "warning: {name} shows what may be {}{id}, but not as a camera with `{}` would show it, so it is not counted: either it is no \
+             marker, or the option is wrong, which must be {}; leave it out to find markers without their poses",
             found.family,
             self.camera_option,
-            view.width(),
-            view.height()
+            self.camera_needs(view)
         ))
+    }
+
+    /// What the option that gives the camera must be for an image.
+    fn camera_needs(&self, view: GrayView<'_>) -> String {
+        match self.lens {
+            Lens::Calibrated(_) => {
+                "the calibration of the camera that took it, with its zoom and focus".to_owned()
+            }
+            Lens::Unknown | Lens::Ideal { .. } => {
+                format!("in pixels of images of {} x {}", view.width(), view.height())
+            }
+        }
     }
 
     fn camera(&self, image: &GrayImage, name: &str) -> Option<CameraModel> {
@@ -376,6 +387,12 @@ mod tests {
             assert!(told.contains(part), "`{part}` is not in: {told}");
         }
         assert_eq!(wrong.doubt_of_camera(view, "a.png"), None);
+        let args = args(&["--marker", "rings:0.2", "--camera", "wide.yaml", "a.png"]).unwrap();
+        let camera = CameraModel::pinhole(320, 240, 30.0);
+        let calibrated = Examiner::new(&args, Lens::Calibrated(camera)).unwrap();
+        let told = calibrated.doubt_of_camera(view, "a.png").unwrap();
+        assert!(told.contains("`--camera wide.yaml`") && told.contains("calibration"), "{told}");
+        assert!(!told.contains("in pixels"), "{told}");
         let other = examiner("30");
         assert_eq!(found(&other), 0);
         assert!(other.was_doubted.load(Ordering::Relaxed));

@@ -58,7 +58,7 @@ pub enum ImageError {
     /// An image larger than the limit.
     #[error(
         "{path:?} has {width} x {height} pixels; the limit is {max_pixels} pixels, and {edge} for an edge; make it \
-         smaller, or of a camera raise `max_megapixels` in its configuration",
+         smaller, or of a camera raise `source.max_megapixels` in its configuration",
         edge = GrayView::MAX_EDGE_PX
     )]
     TooLarge {
