@@ -221,8 +221,8 @@ mod tests {
 
     #[test]
     fn a_path_is_one_word_of_a_shell() {
-        assert_eq!(for_shell(Path::new("/tmp/alight-1/zenoh.json5")), "/tmp/alight-1/zenoh.json5");
-        for path in ["/tmp/my flights/zenoh.json5", "/tmp/it's/$HOME"] {
+        assert_eq!(for_shell(Path::new("a/zenoh.json5")), "a/zenoh.json5");
+        for path in ["my flights/zenoh.json5", "it's/$HOME"] {
             assert_eq!(shlex::split(&for_shell(Path::new(path))), Some(vec![path.to_owned()]));
         }
     }

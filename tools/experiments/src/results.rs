@@ -8,8 +8,6 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
 
-use crate::landing::{plots, thesis_figures};
-
 /// Every flight, as lines of JSON and as comma-separated values.
 pub const FLIGHTS_AS_JSON: &str = "flights.jsonl";
 /// See [`FLIGHTS_AS_JSON`].
@@ -20,6 +18,24 @@ pub const REPORT: &str = "report.md";
 pub const LANDINGS_HEADING: &str = "# Landings\n";
 /// See [`LANDINGS_HEADING`].
 pub const FAULTS_HEADING: &str = "# Faults\n";
+/// The names of the plots of landings.
+pub const PLOTS: [&str; 5] = [
+    "error-against-wind.svg",
+    "time-against-wind.svg",
+    "touchdowns.svg",
+    "success.svg",
+    "worst.svg",
+];
+/// The names of the thesis' figures of one landing.
+pub const FIGURES: [&str; 7] = [
+    "figure-4-10.svg",
+    "figure-4-11.svg",
+    "figure-4-12.svg",
+    "figure-4-13.svg",
+    "figure-4-14.svg",
+    "figure-4-15.svg",
+    "figure-4-16.svg",
+];
 /// The folder of the recordings in that of the results.
 pub const RECORDINGS: &str = "recordings";
 /// The begin of the name of the folder with the logs of one flight in real time; its seed follows.
@@ -164,8 +180,8 @@ fn names(folder: &Path) -> anyhow::Result<Vec<String>> {
 /// Whether it is a file that an experiment writes into its folder.
 fn is_result(name: &str) -> bool {
     [FLIGHTS_AS_JSON, FLIGHTS_AS_CSV, REPORT].contains(&name)
-        || plots::NAMES.contains(&name)
-        || thesis_figures::NAMES.contains(&name)
+        || PLOTS.contains(&name)
+        || FIGURES.contains(&name)
 }
 
 /// Whether it is the folder with the logs of a flight.

@@ -7,6 +7,7 @@ use plotters::prelude::*;
 
 use super::outcome::{Ending, FAR_M, Outcome};
 use super::table::{Column, cells, median_interval, numbers, share_interval};
+use crate::results::PLOTS;
 
 /// The colours of curves.
 pub const COLOURS: [RGBColor; 6] = [
@@ -24,15 +25,6 @@ pub type DrawError = Box<dyn std::error::Error>;
 /// A chart with numeric axes.
 pub type Chart<'a, 'b> =
     ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
-
-/// The names of the plots.
-pub const NAMES: [&str; 5] = [
-    "error-against-wind.svg",
-    "time-against-wind.svg",
-    "touchdowns.svg",
-    "success.svg",
-    "worst.svg",
-];
 
 /// The plots: file names and contents.
 ///
@@ -52,7 +44,7 @@ pub fn all(outcomes: &[Outcome]) -> anyhow::Result<Vec<(&'static str, String)>> 
         picture(success_size(outcomes), |area| success(area, outcomes))?,
         picture([900, 560], |area| worst(area, outcomes))?,
     ];
-    Ok(NAMES.into_iter().zip(plots).collect())
+    Ok(PLOTS.into_iter().zip(plots).collect())
 }
 
 /// An SVG of a size in pixels.

@@ -7,20 +7,10 @@ use plotters::prelude::*;
 
 use super::flight::Sample;
 use super::plots::{COLOURS, Chart, DrawError, legend, picture};
+use crate::results::FIGURES;
 
 /// The axes with their names in the thesis, in the order of its figures.
 const AXES: [&str; 3] = ["x (north)", "y (east)", "z (down)"];
-
-/// The names of the figures.
-pub const NAMES: [&str; 7] = [
-    "figure-4-10.svg",
-    "figure-4-11.svg",
-    "figure-4-12.svg",
-    "figure-4-13.svg",
-    "figure-4-14.svg",
-    "figure-4-15.svg",
-    "figure-4-16.svg",
-];
 
 /// The figures: file names and contents. `title` names the flight.
 ///
@@ -50,7 +40,7 @@ pub fn all(title: &str, samples: &[Sample]) -> anyhow::Result<Vec<(&'static str,
         let caption = format!("Wind and command velocity, {name}: {title}");
         figures.push(curves(&caption, samples, &air)?);
     }
-    Ok(NAMES.into_iter().zip(figures).collect())
+    Ok(FIGURES.into_iter().zip(figures).collect())
 }
 
 struct Curve<'a> {
