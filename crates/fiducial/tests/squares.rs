@@ -317,4 +317,6 @@ fn every_marker_of_a_board_of_hundreds_is_found() {
     });
     let all: Vec<u32> = (0..(ALONG * ALONG) as u32).collect();
     assert_eq!(ids(&image, &["aruco-6x6-1000"], Settings::default()), all);
+    let with_others = ["aruco-4x4-50", "aruco-6x6-1000", "apriltag-16h5"];
+    assert_eq!(ids(&image, &with_others, Settings::default()), all);
 }

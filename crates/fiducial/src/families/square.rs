@@ -30,8 +30,8 @@ use crate::refine::pattern::Pattern;
 use crate::schedule::FallbackStep;
 use crate::trace::{Reason, Trace};
 
-/// Bounds on the work in one image, far above what frames with markers need: quads that are solved for and are none, and markers,
-/// of which a calibration board has hundreds.
+/// Bounds on the work in one image, far above what frames with markers need: layouts that are solved for in quads that are no
+/// markers, and markers, of which a calibration board has hundreds.
 const MAX_SOLVED: usize = 500;
 const MAX_FOUND: usize = 1024;
 const MAX_DOUBTFUL: usize = 64;
@@ -422,6 +422,7 @@ impl SquareTagDetector {
     ) {
         let mut solved = 0;
         for quad in quads {
+            let (solved_before, found_before) = (solved, self.found.len());
             for layout in 0..self.layouts.len() {
                 if self.is_known(quad, layout) {
                     continue;
@@ -446,7 +447,10 @@ impl SquareTagDetector {
                     }
                 }
             }
-            if solved >= MAX_SOLVED + self.found.len() || self.found.len() >= MAX_FOUND {
+            if self.found.len() > found_before {
+                solved = solved_before;
+            }
+            if solved >= MAX_SOLVED || self.found.len() >= MAX_FOUND {
                 break;
             }
         }
