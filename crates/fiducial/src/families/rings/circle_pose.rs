@@ -208,7 +208,6 @@ impl CirclePose {
         let of_step =
             equations.matrix.try_inverse()? * (error_px * error_px * wider.unwrap_or(1.0));
         let covariance = self.full_covariance(&of_step);
-        let covariance = self.widened_by_form(covariance, points, camera);
         covariance.iter().all(|c| c.is_finite()).then_some(covariance)
     }
 

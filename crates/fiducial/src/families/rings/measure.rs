@@ -216,7 +216,7 @@ impl EdgeSearch<'_> {
             // Light or an occluder shifts the edges of one side together.
             measured.covariance *= DISTURBED;
         }
-        Ok(Some(measured))
+        Ok(Some(self.with_form(measured, edges)))
     }
 
     /// Whether edges lie further in the black than a camera's processing moves them in an image as sharp as this one.
@@ -475,6 +475,7 @@ impl EdgeSearch<'_> {
         is_marker
             .then(|| self.at_edge_pose(pose, rms_px, edges, 0.5 * confidence(&support)))
             .flatten()
+            .map(|measured| self.with_form(measured, edges))
     }
 
     /// The marker at a pose fitted to edges.
