@@ -27,7 +27,7 @@ pub(crate) struct Interruption {
 }
 
 impl Interruption {
-    /// By SIGINT (Ctrl-C), SIGTERM, or SIGHUP (the end of a terminal) unless that is ignored, as `nohup` does. `what_is_kept` is told at the first; a second one ends the process at once.
+    /// By SIGINT (Ctrl-C), SIGTERM, or SIGHUP (the end of a terminal) unless that is ignored, as `nohup` does. `what_is_kept` is told at the first; a second one, but SIGHUP, ends the process at once.
     ///
     /// # Errors
     /// When the signals cannot be listened to.
@@ -46,7 +46,13 @@ impl Interruption {
             let number = signals.next().await;
             write_error(&format!("interrupted: {what_is_kept}; Ctrl-C again ends it at once"));
             sender.send_replace(Some(number));
-            let number = signals.next().await;
+            // The end of a terminal is told by the shell and by the kernel, one after the other.
+            let number = loop {
+                let number = signals.next().await;
+                if number != HANGUP {
+                    break number;
+                }
+            };
             std::process::exit(i32::from(BY_SIGNAL + number));
         });
         Ok(Self { signal: receiver, _runtime: runtime })
@@ -147,6 +153,11 @@ mod tests {
                 async { tokio::time::timeout(PATIENCE, interruption.requested()).await };
             waiting.block_on(requested).unwrap();
             assert!(interruption.is_requested());
+            if signal == Signal::HUP {
+                // Were a second one the end, this process would end.
+                kill_process(getpid(), signal).unwrap();
+                std::thread::sleep(Duration::from_millis(200));
+            }
             assert_eq!(interruption.exit_code(), ExitCode::from(status), "{signal:?}");
         }
     }

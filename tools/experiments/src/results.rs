@@ -2,6 +2,7 @@
 //! a folder that cannot be written, nor mixed with the results of another run. What it has of an earlier run is kept until the
 //! first of the new results is written: there may be none.
 
+use std::collections::BTreeSet;
 use std::fs::DirEntry;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -61,7 +62,7 @@ impl Folder {
         let report = path.join(REPORT);
         ensure!(
             !report.exists() || is_of_an_experiment(&report),
-            "{} is not the report of an experiment, and would be overwritten; name another folder with `-o`",
+            "{} is not the report of landings or faults, and would be overwritten; name another folder with `-o`",
             report.display()
         );
         let old = written(path)?;
@@ -74,6 +75,15 @@ impl Folder {
                 first.strip_prefix(path).unwrap_or(first).display()
             );
         }
+        // Also those from which old files are removed.
+        let folders: BTreeSet<_> =
+            old.iter().filter_map(|old| old.parent()).chain([path]).collect();
+        for folder in folders {
+            let tried = folder.join(".writable");
+            std::fs::write(&tried, "")
+                .and_then(|()| std::fs::remove_file(&tried))
+                .with_context(|| format!("writing into the folder {}", folder.display()))?;
+        }
         Ok(Self { path: path.to_owned(), old })
     }
 
@@ -82,14 +92,20 @@ impl Folder {
         &self.path
     }
 
-    /// Writes a file into it.
+    /// Writes a file into it, whole or not at all: what is there is kept where a disk is full.
     ///
     /// # Errors
     /// When it cannot be written, or what is old cannot be removed.
     pub fn put(&mut self, name: &str, text: &str) -> anyhow::Result<()> {
-        remove(std::mem::take(&mut self.old))?;
-        let path = self.path.join(name);
-        std::fs::write(&path, text).with_context(|| format!("writing {}", path.display()))
+        let (path, new) = (self.path.join(name), self.path.join(format!(".{name}.new")));
+        let written = std::fs::write(&new, text)
+            .with_context(|| format!("writing {}", path.display()))
+            .and_then(|()| remove(std::mem::take(&mut self.old)));
+        if let Err(problem) = written {
+            let _ = std::fs::remove_file(&new);
+            return Err(problem);
+        }
+        std::fs::rename(&new, &path).with_context(|| format!("writing {}", path.display()))
     }
 
     /// The folder for the logs of the flight with this seed, made and without those of an earlier run.
@@ -267,11 +283,25 @@ mod tests {
         let folder = folder.path();
         write(folder, REPORT, "# My notes\n");
         for replaces in [false, true] {
-            assert!(refusal(folder, replaces).contains("not the report of an experiment"));
+            assert!(refusal(folder, replaces).contains("not the report of landings or faults"));
         }
         write(folder, REPORT, &format!("{FAULTS_HEADING}\n"));
         assert!(refusal(folder, false).contains("--replace"));
         Folder::claim(folder, true).unwrap();
+    }
+
+    #[test]
+    fn what_cannot_be_written_is_found_at_the_start_and_removes_nothing_later() {
+        let folder = tempfile::tempdir().unwrap();
+        let folder = folder.path();
+        write(folder, FLIGHTS_AS_CSV, "old");
+        // Stands for a disk that is full.
+        std::fs::create_dir(folder.join(".flights.csv.new")).unwrap();
+        Folder::claim(folder, true).unwrap().put(FLIGHTS_AS_CSV, "new").unwrap_err();
+        assert_eq!(std::fs::read_to_string(folder.join(FLIGHTS_AS_CSV)).unwrap(), "old");
+        // And this for one that this user may not write.
+        std::fs::create_dir(folder.join(".writable")).unwrap();
+        assert!(refusal(folder, true).starts_with("writing into the folder"));
     }
 
     #[test]
