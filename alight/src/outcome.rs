@@ -92,9 +92,11 @@ pub(crate) struct OurRecorder {
 impl OurRecorder {
     /// Whether it tells this, and not one of the same name that others started. Without a file it tells why there is none.
     fn tells(&self, status: &RecorderStatus) -> bool {
+        let wanted = self.file.to_string_lossy();
         let is_of_its_file = match status.file.as_str() {
-            "" => status.problem.is_some(),
-            file => self.may_write(Path::new(file)),
+            "" => status.problem.is_some() || wanted.is_empty(),
+            // The time in a name is that at which the recorder began it.
+            file => wanted.contains("{time}") || self.may_write(Path::new(file)),
         };
         status.recorder == self.name && is_of_its_file
     }
@@ -457,6 +459,12 @@ mod tests {
         landing.recorder(told("main", "", None));
         landing.recorder(told("main", "elsewhere/flight.mcap", None));
         assert_eq!(status(&landing), RECORDING_FAILED, "one of the same name says nothing of it");
+        for (wanted, file) in [("flight-{time}.mcap", "flight-20261122T105011Z.mcap"), ("", "")] {
+            let ours = OurRecorder { name: "main".into(), file: wanted.into() };
+            let mut landing = landed(LandingSummary::recorded_by(ours));
+            landing.recorder(told("main", file, None));
+            assert_eq!(status(&landing), 0, "{wanted}");
+        }
         let mut landing = landed(LandingSummary::recorded_by(ours()));
         landing.recorder(told("main", "flight.mcap", None));
         landing.recording_ended_early(&exit("exit status: 0", Some(0)));
