@@ -39,6 +39,8 @@ pub(crate) enum Px4Event {
 pub(crate) struct Told {
     pub(crate) severity: MavSeverity,
     pub(crate) text: String,
+    /// Whether the text is PX4's own; else it names the number.
+    pub(crate) is_known: bool,
     pub(crate) check: Option<Check>,
 }
 
@@ -50,8 +52,8 @@ pub(crate) struct Check {
     pub(crate) modes: u32,
 }
 
-/// A check's event, and the number of the sensor, battery or motor.
-pub(crate) type CheckId = (u32, u8);
+/// A check's event, and the number of the sensor, battery or motor, its fault and the like: one battery may have several.
+pub(crate) type CheckId = (u32, [u8; 3]);
 
 /// An argument in a text.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -181,20 +183,23 @@ pub(crate) fn read(event: &EVENT_DATA, in_report: bool) -> Option<Px4Event> {
         let text = format!(
             "PX4's event {number}, whose text is not known here: look the number up in all_events.json of PX4's build"
         );
-        let check = in_report.then_some(Check { id: (number, 0), modes });
-        return (level <= WARNING).then_some(Px4Event::Told(Told { severity, text, check }));
+        let check = in_report.then_some(Check { id: (number, [0; 3]), modes });
+        let told = Told { severity, text, is_known: false, check };
+        return (level <= WARNING).then_some(Px4Event::Told(told));
     };
     let mut text = (*text).to_owned();
     for (kind, at) in *arguments {
         text = text.replacen("{}", &argument(event, *kind, *at), 1);
     }
     let text = text.trim_end().to_owned();
-    let [instance] = match arguments.first() {
-        Some((U8, at)) => bytes(event, *at),
-        _ => [0],
-    };
-    let check = is_check.then_some(Check { id: (number, instance), modes });
-    Some(Px4Event::Told(Told { severity, text, check }))
+    let mut which = [0; 3];
+    // Measured values change, and the check is the same.
+    let bytes_of = arguments.iter().filter(|(kind, _)| !matches!(kind, U16 | I16 | F32));
+    for (slot, (_, at)) in which.iter_mut().zip(bytes_of) {
+        [*slot] = bytes(event, *at);
+    }
+    let check = is_check.then_some(Check { id: (number, which), modes });
+    Some(Px4Event::Told(Told { severity, text, is_known: true, check }))
 }
 
 fn severity(level: u8) -> Option<MavSeverity> {
@@ -450,7 +455,7 @@ mod tests {
         );
         assert_eq!(text(0x0190_caf3, 0x66, &[4]), "Armed by external command");
         let no_stick = told(0x0106_ed29, 0x44, &[0xff, 0xff, 0xff, 0xff, 7]);
-        let check = Check { id: (453_929, 0), modes: u32::MAX };
+        let check = Check { id: (453_929, [0; 3]), modes: u32::MAX };
         assert_eq!(
             (no_stick.text.as_str(), no_stick.check),
             ("No manual control input", Some(check))
@@ -468,7 +473,7 @@ mod tests {
             Some(Px4Event::Told(told)) => told.check,
             other => panic!("{other:?}"),
         };
-        assert_eq!(stranger(true), Some(Check { id: (1, 0), modes: 0x10 }));
+        assert_eq!(stranger(true), Some(Check { id: (1, [0; 3]), modes: 0x10 }));
         assert_eq!(stranger(false), None);
     }
 

@@ -4,8 +4,10 @@
 //! one that fails in all modes (`HealthAndArmingChecks/Common.cpp: reportedModes`), like one that prevents it in all: what tells
 //! them apart is that after the latter it can be armed in no mode, and the level.
 
+use std::collections::VecDeque;
+
 use crate::dialect::{EVENT_DATA, MavSeverity};
-use crate::px4_events::{self, Check, CheckId, Px4Event, Told};
+use crate::px4_events::{self, Check, Px4Event, Told};
 
 /// PX4's modes to hold, to take off and to land, as a check tells for which it fails.
 const OUR_MODES: u32 = 0x10 | 0x2_0000 | 0x4_0000;
@@ -26,7 +28,8 @@ pub(crate) struct Listener {
     can_arm: u32,
     checks: Vec<Failing>,
     /// The checks that failed by the report before.
-    before: Vec<CheckId>,
+    before: Vec<Failing>,
+    texts: Twins,
 }
 
 #[derive(Clone, Debug)]
@@ -42,6 +45,8 @@ pub(crate) struct Heard {
     pub(crate) severity: MavSeverity,
     pub(crate) text: String,
     pub(crate) about: About,
+    /// Whether it was told as a text already, or is: where PX4 hears a ground station it sends most both ways.
+    pub(crate) is_told: bool,
 }
 
 /// What a text is about.
@@ -63,29 +68,54 @@ impl Listener {
         if behind.is_some_and(|behind| behind < MAX_BEHIND) {
             return None;
         }
+        if self.newest.is_some_and(|newest| event.sequence != newest.wrapping_add(1)) {
+            // The end of a report may be among what was lost.
+            self.in_report = false;
+        }
         self.newest = Some(event.sequence);
         match px4_events::read(event, self.in_report)? {
             Px4Event::ChecksBegin { can_arm } => {
-                self.in_report = true;
                 self.can_arm = can_arm;
-                self.before = self.checks.drain(..).map(|failing| failing.check.id).collect();
+                self.begin_report();
                 None
             }
             Px4Event::ChecksEnd => {
                 self.in_report = false;
                 None
             }
-            Px4Event::Told(Told { severity, text, check: None }) => {
-                Some(Heard { severity, text, about: About::Else })
+            Px4Event::Told(Told { severity, text, is_known, check: None }) => {
+                let is_told = self.texts.is_told(Form::Event { is_known }, &text);
+                Some(Heard { severity, text, about: About::Else, is_told })
             }
-            Px4Event::Told(Told { severity, text, check: Some(check) }) => {
-                self.take_check(Failing { check, severity, text })
+            Px4Event::Told(Told { severity, text, is_known, check: Some(check) }) => {
+                let about = self.take_check(Failing { check, severity, text: text.clone() })?;
+                let is_told = self.texts.is_told(Form::Event { is_known }, &text);
+                Some(Heard { severity, text, about, is_told })
             }
         }
     }
 
-    fn take_check(&mut self, failing: Failing) -> Option<Heard> {
-        let Failing { check, severity, text } = failing.clone();
+    /// Whether a text that PX4 marks as one that it sends as an event too was told as that.
+    pub(crate) fn is_told(&mut self, text: &str) -> bool {
+        self.texts.is_told(Form::Text, text)
+    }
+
+    /// True between the two summaries of a report.
+    pub(crate) fn in_report(&self) -> bool {
+        self.in_report
+    }
+
+    fn begin_report(&mut self) {
+        self.in_report = true;
+        self.before = std::mem::take(&mut self.checks);
+    }
+
+    fn take_check(&mut self, failing: Failing) -> Option<About> {
+        if !self.in_report {
+            // The summary before it was lost.
+            self.begin_report();
+        }
+        let Failing { check, severity, .. } = failing;
         let prevents_arming = self.prevents_arming(&failing);
         let is_information = severity as u8 > MavSeverity::MAV_SEVERITY_WARNING as u8;
         let may_prevent_arming = check.modes == u32::MAX && self.can_arm == 0;
@@ -94,15 +124,13 @@ impl Listener {
         {
             return None;
         }
-        let id = check.id;
-        let is_new = !self.before.contains(&id) && !self.checks.iter().any(|it| it.check.id == id);
-        self.checks.retain(|it| it.check.id != id);
+        let is_same = |it: &Failing| it.check.id == check.id && it.severity as u8 <= severity as u8;
+        let is_new = !self.before.iter().chain(&self.checks).any(is_same);
+        self.checks.retain(|it| it.check.id != check.id);
         if self.checks.len() < MAX_CHECKS {
             self.checks.push(failing);
         }
-        let about =
-            if prevents_arming { About::Arming { is_new } } else { About::Health { is_new } };
-        Some(Heard { severity, text, about })
+        Some(if prevents_arming { About::Arming { is_new } } else { About::Health { is_new } })
     }
 
     fn prevents_arming(&self, failing: &Failing) -> bool {
@@ -111,11 +139,6 @@ impl Listener {
             return self.can_arm == 0 && *severity as u8 <= MavSeverity::MAV_SEVERITY_ERROR as u8;
         }
         check.modes & OUR_MODES & !self.can_arm != 0
-    }
-
-    /// True once an event was heard.
-    pub(crate) fn has_heard(&self) -> bool {
-        self.newest.is_some()
     }
 
     /// Why it cannot be armed, as far as the checks tell.
@@ -127,6 +150,44 @@ impl Listener {
         }
         let also = format!("checks not passed yet; PX4 also says: {}", named(&others));
         (!others.is_empty()).then_some(also)
+    }
+}
+
+/// How something is told.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum Form {
+    Text,
+    Event { is_known: bool },
+}
+
+/// What was told in one form and may come in the other.
+#[derive(Clone, Debug, Default)]
+struct Twins {
+    /// Whether texts come that are events as well.
+    has_texts: bool,
+    waiting: VecDeque<(Form, String)>,
+}
+
+impl Twins {
+    /// Maximum number of those that wait.
+    const MAX_WAITING: usize = 16;
+
+    /// Whether it was told in the other form, or, an event whose text is not known, is.
+    fn is_told(&mut self, form: Form, words: &str) -> bool {
+        self.has_texts |= form == Form::Text;
+        if form == (Form::Event { is_known: false }) {
+            return self.has_texts;
+        }
+        let is_twin = |(other, its): &(Form, String)| *other != form && its == words;
+        if let Some(at) = self.waiting.iter().position(is_twin) {
+            self.waiting.remove(at);
+            return true;
+        }
+        if self.waiting.len() >= Self::MAX_WAITING {
+            self.waiting.pop_front();
+        }
+        self.waiting.push_back((form, words.to_owned()));
+        false
     }
 }
 
@@ -239,6 +300,57 @@ mod tests {
         }
         px4.sequence = u16::MAX - 10;
         assert!(px4.send(TAKEN_OVER, 4, &[]).is_some());
+    }
+
+    #[test]
+    fn a_check_that_gets_worse_is_told_again_and_so_is_another_fault_of_a_battery() {
+        const BATTERY: u32 = 15_602_498;
+        let mut px4 = Px4::default();
+        let about = |heard: Option<Heard>| heard.map(|heard| heard.about);
+        let new = Some(About::Arming { is_new: true });
+        px4.report(0, &[(NO_POSITION, 4, OUR_MODES)]);
+        assert_eq!(px4.report(0, &[(NO_POSITION, 3, OUR_MODES)]), [new]);
+        assert_eq!(
+            px4.report(0, &[(NO_POSITION, 3, OUR_MODES)]),
+            [Some(About::Arming { is_new: false })]
+        );
+        let fault = |fault| [0xff, 0xff, 0xff, 0xff, 11, 1, fault, 1];
+        for kind in [2, 3] {
+            assert_eq!(about(px4.send(BATTERY, 0, &fault(kind))), new, "{kind}");
+        }
+        assert!(px4.why().contains("; Battery 1: "), "{}", px4.why());
+    }
+
+    #[test]
+    fn a_report_of_which_the_ends_were_lost_is_not_mixed_with_the_next() {
+        let mut px4 = Px4::default();
+        px4.report(0, &[(NO_POSITION, 3, OUR_MODES)]);
+        // Its first summary is lost.
+        px4.sequence += 1;
+        px4.send(SAFETY_BUTTON, 3, &ALL.to_le_bytes());
+        assert_eq!(px4.why(), "Press safety button first");
+        // And its last one: what follows is no check.
+        px4.sequence += 1;
+        let stranger = px4.send(1, 3, &[]).map(|heard| heard.about);
+        assert_eq!(stranger, Some(About::Else));
+    }
+
+    #[test]
+    fn what_comes_as_a_text_and_as_an_event_is_told_once_in_either_order_and_each_time() {
+        let mut px4 = Px4::default();
+        let words = px4.send(TAKEN_OVER, 4, &[]).map(|heard| heard.text).unwrap_or_default();
+        assert!(px4.listener.is_told(&words));
+        for _ in 0..2 {
+            assert!(!px4.listener.is_told(&words));
+            assert!(px4.send(TAKEN_OVER, 4, &[]).is_some_and(|heard| heard.is_told));
+        }
+        // Its own words are a text where it sends texts.
+        assert!(px4.send(1, 3, &[]).is_some_and(|heard| heard.is_told));
+        assert!(!Px4::default().send(1, 3, &[]).is_some_and(|heard| heard.is_told));
+        for number in 0..100 {
+            assert!(!px4.listener.is_told(&number.to_string()));
+        }
+        assert_eq!(px4.listener.texts.waiting.len(), Twins::MAX_WAITING);
     }
 
     #[test]

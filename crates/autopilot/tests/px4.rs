@@ -298,6 +298,9 @@ fn why_it_does_not_arm_is_told_from_its_events() {
     // It is cured.
     world.px4.queue.push(event(6, 0x01a8_93e0, 0x88, &[0xff; 17]));
     world.step();
+    assert_eq!(world.client.not_ready_because(), why);
+    world.px4.queue.push(event(7, 0x011d_3727, 0x88, &[]));
+    world.step();
     assert_eq!(world.client.not_ready_because(), ["prearm: checks not passed yet"]);
 }
 
@@ -310,13 +313,14 @@ fn what_it_tells_again_is_told_once() {
     world.px4.queue.push(event(9, 0x0102_089d, 0x62, &[]));
     world.px4.queue.push(event(9, 0x0102_089d, 0x62, &[]));
     world.px4.queue.extend(report(1));
-    for text in ["Arming denied: checks\t", "Only a text"] {
+    let words = "Navigation error: No valid position estimate\t";
+    for text in [words, "Its words differ\t", "Only a text"] {
         let text = STATUSTEXT_DATA { text: text.into(), ..Default::default() };
         world.px4.queue.push(MavMessage::STATUSTEXT(text));
     }
     world.step();
     let denied = "Arming denied: Resolve system health failures first";
-    let told = ["No manual control input", NO_POSITION, denied, "Only a text"];
+    let told = ["No manual control input", NO_POSITION, denied, "Its words differ", "Only a text"];
     assert_eq!(texts(&mut world.client), told);
 }
 

@@ -21,8 +21,8 @@ impl Autopilot {
     }
 
     pub(super) fn take_statustext(&mut self, Text { severity, text, is_event }: Text) {
-        // PX4 sends it twice where it hears a ground station.
-        let is_told = is_event && self.vehicle.as_ref().is_some_and(|it| it.listener.has_heard());
+        let is_told =
+            is_event && self.vehicle.as_mut().is_some_and(|it| it.listener.is_told(&text));
         if !is_told {
             self.take_text(severity, text);
         }
@@ -31,9 +31,14 @@ impl Autopilot {
     pub(super) fn take_px4_event(&mut self, event: &EVENT_DATA) {
         let Some(vehicle) = &mut self.vehicle else { return };
         let heard = vehicle.listener.take(event);
-        vehicle.readiness.take_checks(vehicle.listener.why_not_armed());
-        let Some(Heard { severity, text, about }) = heard else { return };
+        let why = vehicle.listener.why_not_armed();
+        // The old reason stands until the next report has one, or has ended.
+        if why.is_some() || !vehicle.listener.in_report() {
+            vehicle.readiness.take_checks(why);
+        }
+        let Some(Heard { severity, text, about, is_told }) = heard else { return };
         let is_new = match about {
+            About::Else if is_told => return,
             About::Else => return self.take_text(severity, text),
             About::Arming { is_new } => {
                 self.requests.iter_mut().for_each(|request| request.add_check(&text));
@@ -41,7 +46,7 @@ impl Autopilot {
             }
             About::Health { is_new } => is_new,
         };
-        if is_new {
+        if is_new && !is_told {
             self.push(Event::Text { severity, text });
         }
     }
