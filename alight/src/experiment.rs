@@ -182,10 +182,7 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
     if landings.flown > 0 {
         write_error(&format!("flights, plots and this report: {}", folder.path().display()));
     }
-    Ok(match interruption.is_requested() {
-        true => interruption.exit_code(),
-        false => ExitCode::SUCCESS,
-    })
+    Ok(interruption.exit_code())
 }
 
 fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
@@ -238,10 +235,7 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
     if done.len() > 1 {
         print(&markers::compared(&done)?)?;
     }
-    Ok(match interruption.is_requested() {
-        true => interruption.exit_code(),
-        false => ExitCode::SUCCESS,
-    })
+    Ok(interruption.exit_code())
 }
 
 #[cfg(test)]

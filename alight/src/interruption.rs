@@ -72,10 +72,9 @@ impl Interruption {
         }
     }
 
-    /// The exit status of work that was cut short: that of a process which the signal ended.
+    /// Success, or the exit status of work that was cut short: that of a process which the signal ended.
     pub(crate) fn exit_code(&self) -> ExitCode {
-        let number = self.signal.borrow().unwrap_or(INTERRUPT);
-        ExitCode::from(BY_SIGNAL + number)
+        self.signal.borrow().map_or(ExitCode::SUCCESS, |number| ExitCode::from(BY_SIGNAL + number))
     }
 }
 

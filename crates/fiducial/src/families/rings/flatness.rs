@@ -20,7 +20,7 @@ const SECTORS: usize = 8;
 const MIN_FREE: usize = 8;
 /// The parts of three rings.
 const PARTS: usize = 3 * SECTORS;
-/// Circles of the outermost ring, and of each other one.
+/// Circles that bound a ring.
 const CIRCLES_OF_RING: usize = 2;
 /// The unknowns of a flat print's pose.
 const FLAT: usize = 5;
