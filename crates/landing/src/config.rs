@@ -242,6 +242,9 @@ settings! {
         /// Height to which an aborted landing climbs with `on_abort = "climb"`, in m, over the same as
         /// `search_height_m`.
         abort_height_m: f64 = 10.0, 0.0..=100.0;
+        /// Least height at which an aborted landing hovers, in m, over the same as `search_height_m`: lower, it first
+        /// climbs, but not above the height where the landing started. 0 never climbs.
+        abort_hover_m: f64 = 2.5, 0.0..=20.0;
         /// Hover time of an aborted landing before setpoints stop, in s.
         release_after_s: f64 = 5.0, 0.0..=60.0;
         /// Reaction to a low battery.
@@ -259,7 +262,8 @@ settings! {
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum OnAbort {
-    /// Hover for `release_after_s`, then stop sending setpoints: the autopilot holds its position by itself.
+    /// Hover for `release_after_s`, at `abort_hover_m` or higher, then stop sending setpoints: the autopilot holds its
+    /// position by itself.
     Hover,
     /// Land where it is, by the autopilot's LAND mode.
     Land,

@@ -813,7 +813,7 @@ impl Lander {
         }
         let elapsed_s = self.state_machine.elapsed_s(now);
         match phases.on_abort {
-            OnAbort::Hover if elapsed_s <= phases.release_after_s => Action::hover(),
+            OnAbort::Hover if elapsed_s <= phases.release_after_s => self.hover_aborted(now),
             OnAbort::Land if elapsed_s <= phases.land_timeout_s => self.request_land(now),
             OnAbort::Climb if elapsed_s <= CLIMB_AWAY_S => self.climb_away(now),
             OnAbort::Hover | OnAbort::Land | OnAbort::Climb => Action::None,
@@ -827,6 +827,20 @@ impl Lander {
         }
         self.land_requested = Some(now);
         Action::Guided
+    }
+
+    /// Hovers, at `abort_hover_m` or higher: where the autopilot's velocity errs, a vehicle that hovers low drifts onto the
+    /// ground.
+    fn hover_aborted(&self, now: Timestamp) -> Action {
+        let Some(vehicle) = self.history.newest() else { return Action::hover() };
+        if self.landed(now) == Landed::OnGround {
+            return Action::hover();
+        }
+        let phases = &self.config.phases;
+        let wanted_m = self.altitude_m(now, phases.abort_hover_m);
+        let to_m = libm::fmin(wanted_m, self.altitude_of(self.start));
+        let climb_m_s = (2.0 * (to_m + vehicle.position.z())).clamp(0.0, phases.retry_climb_m_s);
+        self.climb(climb_m_s)
     }
 
     /// Climbs to `abort_height_m` and stays there.

@@ -287,6 +287,28 @@ fn an_abort_climbs_over_the_pad() {
 }
 
 #[test]
+fn a_landing_aborted_low_hovers_where_a_drift_does_not_touch_the_ground() {
+    let hovers_m = |config, started_m, aborted_m: f64| {
+        let mut told = Told::started(config, started_m);
+        told.pad = Some(Point::origin());
+        while told.position.z() < -aborted_m {
+            told.fly(STEP_S);
+        }
+        told.tell(Event::Operator(OperatorCommand::Abort));
+        told.fly(4.5);
+        -told.position.z()
+    };
+    let config = Config::default();
+    assert!((hovers_m(config, 6.0, 0.8) - 2.5).abs() < 0.2);
+    let high_m = hovers_m(config, 6.0, 4.0);
+    assert!((3.5..=4.0).contains(&high_m), "{high_m} m");
+    assert!((hovers_m(config, 1.8, 0.8) - 1.8).abs() < 0.2, "it was not higher before");
+    let mut never = config;
+    never.phases.abort_hover_m = 0.0;
+    assert!(hovers_m(never, 6.0, 0.8) < 0.9);
+}
+
+#[test]
 fn a_retry_stays_below_the_fence() {
     let mut config = Config::default();
     config.phases.fence_height_m = 4.0;
