@@ -391,7 +391,7 @@ async fn watch(
                         controllers_exit = Some(exit.to_string());
                         if !landing.never_flew() {
                             progress.say(&format!("To resume the landing of an ArduPilot that is still in GUIDED: {resume}"));
-                            progress.say("A PX4 leaves OFFBOARD by itself when the setpoints stop, and its landing cannot be resumed: land it in Land or Return, or by hand");
+                            progress.say("A PX4 leaves OFFBOARD by itself when the setpoints stop: land it in Land or Return, or by hand");
                         }
                     }
                     // The landing needs no ground station, recording or page.

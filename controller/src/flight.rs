@@ -23,7 +23,7 @@ use crate::frames::{Arrival, Frames};
 use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
 use crate::limits::{Limits, Note};
-use crate::mission::{Mission, Trigger, is_flying_guided};
+use crate::mission::{self, Mission, Trigger, is_flying_guided, is_holding_px4};
 use crate::pad_note::{PadNote, PadNotes};
 use crate::setpoints::Setpoints;
 use crate::status::{Used, View};
@@ -411,6 +411,11 @@ impl Flight {
         if self.mission.is_taking_off() {
             return Err("the vehicle is taking off; the landing begins by itself".to_owned());
         }
+        if self.mission.is_taking_control() {
+            return Err(
+                "the vehicle is changing to OFFBOARD; the landing begins by itself".to_owned()
+            );
+        }
         if self.autopilot.state().and_then(wire::vehicle).is_none() {
             return Err("attitude and position of the vehicle are not known".to_owned());
         }
@@ -419,6 +424,15 @@ impl Flight {
         }
         if self.landing_target.is_some() {
             return self.start_landing_target(now_ns);
+        }
+        if is_holding_px4(&self.autopilot) {
+            self.mission.take_control(now_ns, &mut self.autopilot);
+            return Ok(self.view().phase(now_ns).1);
+        }
+        if let Some(mode) = mission::pilots_px4_mode(&self.autopilot) {
+            return Err(format!(
+                "no landing was started: the vehicle is in {mode}; change to HOLD, from which it is asked to follow setpoints"
+            ));
         }
         let awaits_takeoff = self.mission.is_awaiting_takeoff();
         self.begin(now_ns);
@@ -482,6 +496,14 @@ impl Flight {
             self.mission.fail(&mut self.autopilot, why.clone());
             return Ok(why);
         }
+        if self.mission.is_taking_control() {
+            if command == OperatorCommand::Resume {
+                return Err("the landing has not begun; there is nothing to resume".to_owned());
+            }
+            let why = "ended by the operator before the vehicle followed setpoints".to_owned();
+            self.mission.give_up_control(now_ns, &mut self.autopilot, why.clone());
+            return Ok(why);
+        }
         if !self.is_landing() {
             let (phase, _) = self.view().phase(now_ns);
             return Err(format!("no landing is active (phase `{phase}`)"));
@@ -542,6 +564,7 @@ impl Flight {
         let steers = self.landing_target.is_none();
         let trigger = self.mission.step(now_ns, &mut self.autopilot, obstacle.as_deref(), steers);
         let Some(trigger) = trigger else { return };
+        let before = (trigger == Trigger::InControl).then(|| self.mission.clone());
         if trigger == Trigger::InFlight && self.config.start == Start::Resume {
             let address = &self.config.autopilot.address;
             self.lander.resume(self.pad_notes.pad(address, self.autopilot.system()));
@@ -556,6 +579,9 @@ impl Flight {
             (Trigger::ArmedAgain, phase) if phase.is_terminal() => self.mission.stay_landed(),
             // The mode may be newer than the state that the lander has.
             (Trigger::TakenOff, Phase::Idle) => self.mission.stand_down(true),
+            (Trigger::InControl, phase) if phase.is_terminal() => {
+                self.mission = before.unwrap_or_else(|| self.mission.clone());
+            }
             _ => {}
         }
     }

@@ -1,12 +1,19 @@
 //! The mission: when a landing begins, and what comes before and after it.
 
-use autopilot::{Autopilot, FlightMode, LandedState, Takeoff, TakeoffError, TakeoffProgress};
+use autopilot::{
+    Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, LandedState, Takeoff,
+    TakeoffError, TakeoffProgress,
+};
 
 use crate::config::Start;
 
 /// Time within which motors that run again mean that a landing had not ended, in nanoseconds: nobody prepares the next
 /// flight so soon, and the autopilot's heartbeat may have been wrong.
 const MAX_REARMED_NS: i64 = 10_000_000_000;
+
+/// Time within which a PX4 must have changed to OFFBOARD, with its heartbeat once a second and repeated requests, in
+/// nanoseconds.
+const MAX_CONTROL_NS: i64 = 10_000_000_000;
 
 /// The mission of a flight.
 #[derive(Clone, Debug)]
@@ -35,6 +42,13 @@ pub enum State {
         /// What it waits for.
         why: String,
     },
+    /// A PX4 that holds its place is asked for OFFBOARD, which it enters only while setpoints come.
+    TakingControl {
+        /// The request.
+        request: CommandId,
+        /// Until when it must follow setpoints, in nanoseconds.
+        until_ns: i64,
+    },
     /// The lander decides.
     Landing,
     /// The autopilot's own precision landing decides; it gets the landing target.
@@ -55,6 +69,8 @@ pub enum Trigger {
     ArmedAgain,
     /// The take-off is done.
     TakenOff,
+    /// The vehicle follows setpoints, as was asked of it.
+    InControl,
     /// The vehicle was found in LAND instead: the end of a landing that an earlier controller began.
     LandInsteadOfTakeoff,
 }
@@ -98,6 +114,19 @@ impl Mission {
     /// True while the vehicle takes off.
     pub fn is_taking_off(&self) -> bool {
         matches!(self.state, State::TakingOff { .. })
+    }
+
+    /// True while a PX4 that holds its place is asked for OFFBOARD.
+    pub fn is_taking_control(&self) -> bool {
+        matches!(self.state, State::TakingControl { .. })
+    }
+
+    /// Asks a PX4 that holds its place to follow setpoints: nobody can choose OFFBOARD by hand before setpoints come, and
+    /// none are sent before a landing begins. The landing begins once it follows.
+    pub fn take_control(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
+        let request = autopilot.request(now_ns, Command::SetMode(FlightMode::OFFBOARD));
+        let until_ns = now_ns.saturating_add(MAX_CONTROL_NS);
+        self.state = State::TakingControl { request, until_ns };
     }
 
     /// True while a landing begins by itself once the vehicle flies.
@@ -222,10 +251,51 @@ impl Mission {
                     None
                 }
             },
+            State::TakingControl { request, until_ns } => {
+                let (request, until_ns) = (*request, *until_ns);
+                self.advance_control(now_ns, autopilot, request, until_ns)
+            }
             State::Idle | State::Landing | State::SendingLandingTarget | State::Failed { .. } => {
                 None
             }
         }
+    }
+
+    /// Waits for OFFBOARD. Another mode is the pilot's, and nothing more is asked then.
+    fn advance_control(
+        &mut self,
+        now_ns: i64,
+        autopilot: &mut Autopilot,
+        request: CommandId,
+        until_ns: i64,
+    ) -> Option<Trigger> {
+        // Whatever cannot be seen now: in OFFBOARD setpoints must follow at once, and the lander holds or searches.
+        if now_ns <= until_ns && is_flying_guided(autopilot) {
+            return Some(Trigger::InControl);
+        }
+        let not_begun = |why: String| format!("the landing did not begin: {why}");
+        let mode = autopilot.state().map(|state| state.mode);
+        match (mode, autopilot.status(request)) {
+            (Some(mode), _) if !mode.is_guided() && mode != FlightMode::AUTO_HOLD => {
+                self.fail(autopilot, not_begun(format!("the pilot took over, in {mode}")));
+            }
+            (_, CommandStatus::Failed(error)) => {
+                self.give_up_control(now_ns, autopilot, not_begun(error.to_string()));
+            }
+            _ if now_ns > until_ns => {
+                let why = not_begun("the vehicle does not follow setpoints in OFFBOARD".to_owned());
+                self.give_up_control(now_ns, autopilot, why);
+            }
+            _ => {}
+        }
+        None
+    }
+
+    /// Ends the mission before the vehicle was seen to follow setpoints. It may have changed to OFFBOARD all the same, which it
+    /// would leave by its failsafe, so it is asked for HOLD.
+    pub fn give_up_control(&mut self, now_ns: i64, autopilot: &mut Autopilot, why: String) {
+        self.fail(autopilot, why);
+        autopilot.request(now_ns, Command::SetMode(FlightMode::AUTO_HOLD));
     }
 
     /// The motors were armed or disarmed; `is_finished` says that the landing had ended.
@@ -253,6 +323,21 @@ impl Mission {
 /// True when the vehicle flies in the mode that follows setpoints.
 pub fn is_flying_guided(autopilot: &Autopilot) -> bool {
     autopilot.state().is_some_and(|s| s.armed && s.mode.is_guided() && s.landed.is_flying())
+}
+
+/// True when it is a PX4 that flies and holds its place.
+pub fn is_holding_px4(autopilot: &Autopilot) -> bool {
+    autopilot.firmware() == Some(Firmware::Px4)
+        && autopilot.state().is_some_and(|s| {
+            s.connected && s.armed && s.mode == FlightMode::AUTO_HOLD && s.landed.is_flying()
+        })
+}
+
+/// The mode in which a pilot, a mission or a failsafe flies a PX4 now.
+pub fn pilots_px4_mode(autopilot: &Autopilot) -> Option<FlightMode> {
+    let state = autopilot.state().filter(|_| autopilot.firmware() == Some(Firmware::Px4))?;
+    let is_ours = state.mode.is_guided() || state.mode.is_landing();
+    (state.armed && state.landed.is_flying() && !is_ours).then_some(state.mode)
 }
 
 /// True when there is no landing to resume: it has ended, though the motors may still run, or the pilot flies. A vehicle

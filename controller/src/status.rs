@@ -138,6 +138,11 @@ impl View<'_> {
                 (Phase::Idle, "waiting for the vehicle to fly in GUIDED".to_owned())
             }
             (State::TakingOff { why, .. }, _) => (Phase::Takeoff, why.clone()),
+            (State::TakingControl { .. }, _) => (
+                Phase::Idle,
+                "changing to OFFBOARD; the landing begins once the vehicle follows setpoints"
+                    .to_owned(),
+            ),
             (State::Failed { why }, _) => (Phase::Failed, why.clone()),
             (State::Landing, _) => (wire::phase(self.lander.phase()), self.reason()),
         }
@@ -173,7 +178,10 @@ impl View<'_> {
             State::SendingLandingTarget => {
                 self.landing_target.is_none_or(LandingTargetMode::is_finished)
             }
-            State::Idle | State::AwaitingTakeoff | State::TakingOff { .. } => false,
+            State::Idle
+            | State::AwaitingTakeoff
+            | State::TakingOff { .. }
+            | State::TakingControl { .. } => false,
         }
     }
 

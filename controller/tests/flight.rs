@@ -559,6 +559,85 @@ fn a_px4_is_asked_to_hold_its_place_when_setpoints_end() {
 }
 
 #[test]
+fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_started() {
+    const POSITION: u32 = 0x0003_0000;
+    const HOLD: u32 = 0x0304_0000;
+    const OFFBOARD: u32 = 0x0006_0000;
+    let holding = |mode| {
+        let mut flight = flight("command");
+        flight.camera(0, CameraInfo::sample());
+        flight.presence(0, "main", true);
+        receive(&mut flight, 0, &heartbeat(mode, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        assert_eq!(hover(&mut flight, 20, 1000, mode).setpoints, 0);
+        flight
+    };
+    let started = || {
+        let mut flight = holding(HOLD);
+        let reply = flight.command(1000 * MS, &ControllerCommand::Start);
+        assert!(reply.accepted && reply.reason.contains("OFFBOARD"), "{reply:?}");
+        let sent = hover(&mut flight, 1020, 2400, HOLD);
+        assert!(sent.setpoints > 5 && sent.modes.first() == Some(&6.0), "{sent:?}");
+        assert_eq!(flight.status(2400 * MS).phase, Phase::Idle);
+        flight
+    };
+    let mut flight = started();
+    assert!(!flight.command(2400 * MS, &ControllerCommand::Start).accepted, "it is under way");
+    receive(&mut flight, 2400 * MS, &heartbeat(OFFBOARD, true));
+    let sent = hover(&mut flight, 2420, 3000, OFFBOARD);
+    let status = flight.status(3000 * MS);
+    assert!(sent.setpoints > 10, "{sent:?}");
+    assert!(matches!(status.phase, Phase::Approach | Phase::Descend), "{status:?}");
+
+    // The markers are of no use any more when it has changed.
+    let mut flight = started();
+    receive(&mut flight, 2400 * MS, &heartbeat(OFFBOARD, true));
+    for ms in (2420..4000).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(&mut flight, ms * MS, &heartbeat(OFFBOARD, true));
+        }
+        pose(&mut flight, ms * MS);
+        flight.tick(ms * MS + 3);
+    }
+    let mut sent = Sent::default();
+    sent.take(&mut flight);
+    assert!(sent.setpoints > 30, "{sent:?} {:?}", flight.status(4000 * MS));
+
+    // The pilot takes over before it changed.
+    let mut flight = started();
+    receive(&mut flight, 2400 * MS, &heartbeat(POSITION, true));
+    let sent = hover(&mut flight, 2420, 6000, POSITION);
+    let status = flight.status(6000 * MS);
+    assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
+    assert!(status.phase == Phase::Failed && status.why.contains("pilot"), "{status:?}");
+
+    // The operator changes their mind; it may have changed by now.
+    for command in [ControllerCommand::Abort, ControllerCommand::Hold] {
+        let mut flight = started();
+        assert!(!flight.command(2400 * MS, &ControllerCommand::Resume).accepted);
+        assert!(flight.command(2400 * MS, &command).accepted);
+        let sent = hover(&mut flight, 2420, 3900, HOLD);
+        assert_eq!((sent.setpoints, sent.modes.first()), (0, Some(&4.0)), "{sent:?}");
+        assert_eq!(flight.status(3900 * MS).phase, Phase::Failed);
+    }
+
+    // It never changes.
+    let mut flight = started();
+    hover(&mut flight, 2420, 14_000, HOLD);
+    let status = flight.status(14_000 * MS);
+    assert!(status.phase == Phase::Failed && status.why.contains("did not begin"), "{status:?}");
+    assert_eq!(hover(&mut flight, 14_020, 20_000, HOLD).setpoints, 0);
+    assert!(flight.command(20_000 * MS, &ControllerCommand::Start).accepted, "once more");
+
+    // A pilot is not disturbed.
+    let mut flight = holding(POSITION);
+    let reply = flight.command(1000 * MS, &ControllerCommand::Start);
+    assert!(!reply.accepted && reply.reason.contains("HOLD"), "{reply:?}");
+    let sent = hover(&mut flight, 1020, 3000, POSITION);
+    assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
+}
+
+#[test]
 fn a_strangers_calibration_is_refused_in_flight_and_told() {
     let mut flight = in_flight("airborne");
     flight.camera(0, CameraInfo::sample());

@@ -258,6 +258,12 @@ impl Command {
         matches!(self, Self::Takeoff { .. })
     }
 
+    /// Whether it is sent whatever the state shows. The mode is known from a heartbeat, and a PX4 that is told to hold its
+    /// place may have followed an earlier request for OFFBOARD since.
+    pub(crate) fn is_always_sent(&self) -> bool {
+        self.is_done_when_accepted() || *self == Self::SetMode(FlightMode::AUTO_HOLD)
+    }
+
     pub(crate) fn problem(&self, state: Option<&VehicleState>) -> Option<&'static str> {
         match self {
             Self::Takeoff { height_m } if !(0.5..=500.0).contains(height_m) => {
@@ -395,7 +401,7 @@ impl Request {
     pub(crate) fn step(&mut self, now_ns: i64, state: &VehicleState, timeouts: &Timeouts) -> Step {
         let command = self.command;
         let sent = self.attempts > 0;
-        if command.is_shown_by(state) && (sent || !command.is_done_when_accepted()) {
+        if command.is_shown_by(state) && (sent || !command.is_always_sent()) {
             return Step::Finish(Ok(()));
         }
         match self.phase {
