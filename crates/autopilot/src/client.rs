@@ -181,6 +181,7 @@ impl Autopilot {
                 self.send_to_vehicle(request);
             }
             self.send_requests(now_ns);
+            self.ask_for_checks(now_ns);
             self.prove_setpoints(now_ns);
         }
         self.step_requests(now_ns);
@@ -600,6 +601,10 @@ impl Autopilot {
         }
         if ack.command == MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL {
             self.streams.acknowledged(now_ns, ack.result);
+            return;
+        }
+        if let MavCmd::MAV_CMD_RUN_PREARM_CHECKS = ack.command {
+            self.vehicle.iter_mut().for_each(|vehicle| vehicle.listener.acknowledged(ack.result));
             return;
         }
         let timeouts = self.config.timeouts;

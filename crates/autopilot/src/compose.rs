@@ -36,6 +36,14 @@ pub fn request_message(id: u32) -> MavMessage {
     })
 }
 
+/// Asks an autopilot to report the checks that fail before arming; the recipient is added when it is sent.
+pub fn run_prearm_checks() -> MavMessage {
+    MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_RUN_PREARM_CHECKS,
+        ..Default::default()
+    })
+}
+
 /// A text for the ground station's message window, in as many packets as it needs.
 ///
 /// `id` joins the packets of one text: a different number from 1 to 65535 for each text.

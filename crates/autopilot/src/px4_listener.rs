@@ -2,11 +2,14 @@
 //!
 //! Whenever one check changes PX4 sends all that fail, between two summaries. It sends a check that does not prevent arming as
 //! one that fails in all modes (`HealthAndArmingChecks/Common.cpp: reportedModes`), like one that prevents it in all: what tells
-//! them apart is that after the latter it can be armed in no mode, and the level.
+//! them apart is that after the latter it can be armed in no mode, and the level. Who comes after that is told nothing until the next
+//! change, so a disarmed PX4 is asked to report what fails now (MAV_CMD_RUN_PREARM_CHECKS): `Commander.cpp:
+//! handle_command` then sends its report once more.
 
 use std::collections::VecDeque;
 
-use crate::dialect::{EVENT_DATA, MavSeverity};
+use crate::compose;
+use crate::dialect::{EVENT_DATA, MavMessage, MavResult, MavSeverity};
 use crate::px4_events::{self, Check, Px4Event, Told};
 
 /// PX4's modes to hold, to take off and to land, as a check tells for which it fails.
@@ -18,6 +21,9 @@ const MAX_NAMED: usize = 4;
 /// How far behind the newest an event may be that is sent again: PX4 keeps 20 for ground stations that lost some. One farther
 /// behind comes from a PX4 that has started again.
 const MAX_BEHIND: u16 = 32;
+/// Maximum number of times that a PX4 is asked for its report, and the pause between them, in nanoseconds: a packet may be lost.
+const MAX_QUESTIONS: u8 = 3;
+const QUESTION_PERIOD_NS: i64 = 2_000_000_000;
 
 /// The events of one PX4.
 #[derive(Clone, Debug, Default)]
@@ -30,6 +36,16 @@ pub(crate) struct Listener {
     /// The checks that failed by the report before.
     before: Vec<Failing>,
     texts: Twins,
+    question: Question,
+}
+
+/// What came of the question for a report.
+#[derive(Copy, Clone, Debug, Default)]
+struct Question {
+    /// A report came, asked for or not, or the question was refused.
+    is_over: bool,
+    asked: u8,
+    due_ns: Option<i64>,
 }
 
 #[derive(Clone, Debug)]
@@ -75,6 +91,7 @@ impl Listener {
         self.newest = Some(event.sequence);
         match px4_events::read(event, self.in_report)? {
             Px4Event::ChecksBegin { can_arm } => {
+                self.question.is_over = true;
                 self.can_arm = can_arm;
                 self.begin_report();
                 None
@@ -98,6 +115,23 @@ impl Listener {
     /// Whether a text that PX4 marks as one that it sends as an event too was told as that.
     pub(crate) fn is_told(&mut self, text: &str) -> bool {
         self.texts.is_told(Form::Text, text)
+    }
+
+    /// The question for a report of all failing checks, when it is due.
+    pub(crate) fn question(&mut self, now_ns: i64, is_armed: bool) -> Option<MavMessage> {
+        let Question { is_over, asked, due_ns } = &mut self.question;
+        let is_due = due_ns.is_none_or(|due_ns| now_ns >= due_ns);
+        if *is_over || is_armed || !is_due || *asked >= MAX_QUESTIONS {
+            return None;
+        }
+        *asked += 1;
+        *due_ns = Some(now_ns.saturating_add(QUESTION_PERIOD_NS));
+        Some(compose::run_prearm_checks())
+    }
+
+    /// The question was acknowledged. A PX4 that refuses it does so each time; of one that accepted it the report may be lost.
+    pub(crate) fn acknowledged(&mut self, result: MavResult) {
+        self.question.is_over |= result != MavResult::MAV_RESULT_ACCEPTED;
     }
 
     /// True between the two summaries of a report.

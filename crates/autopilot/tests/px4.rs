@@ -39,6 +39,11 @@ struct Px4 {
     setpoints: Vec<[f32; 3]>,
     mode_requests: usize,
     refuses: bool,
+    /// What it answers to the question for its checks, if anything, and how often it was asked.
+    answers_checks: Option<MavResult>,
+    checks_requests: usize,
+    /// What it then reports.
+    checks: Vec<MavMessage>,
     landing_targets: Vec<(u8, [f32; 3])>,
     queue: Vec<MavMessage>,
 }
@@ -48,7 +53,7 @@ impl Px4 {
         for packet in Parser::new().push(packet) {
             match packet.message.unwrap() {
                 MavMessage::COMMAND_LONG(command) => {
-                    let result = self.carry_out(now, &command);
+                    let Some(result) = self.carry_out(now, &command) else { continue };
                     self.queue.push(MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
                         command: command.command,
                         result,
@@ -74,7 +79,19 @@ impl Px4 {
         }
     }
 
-    fn carry_out(&mut self, now: i64, command: &COMMAND_LONG_DATA) -> MavResult {
+    /// What is acknowledged; `None` for a command whose acknowledgement is lost.
+    fn carry_out(&mut self, now: i64, command: &COMMAND_LONG_DATA) -> Option<MavResult> {
+        if command.command == MavCmd::MAV_CMD_RUN_PREARM_CHECKS {
+            self.checks_requests += 1;
+            if self.answers_checks == Some(MavResult::MAV_RESULT_ACCEPTED) {
+                self.queue.append(&mut self.checks);
+            }
+            return self.answers_checks;
+        }
+        Some(self.result(now, command))
+    }
+
+    fn result(&mut self, now: i64, command: &COMMAND_LONG_DATA) -> MavResult {
         if self.refuses {
             return MavResult::MAV_RESULT_DENIED;
         }
@@ -186,7 +203,12 @@ struct World {
 
 impl World {
     fn new() -> Self {
-        let px4 = Px4 {
+        Self::with(|_| {})
+    }
+
+    /// With a PX4 that is different.
+    fn with(differs: impl FnOnce(&mut Px4)) -> Self {
+        let mut px4 = Px4 {
             mode: FlightMode::AUTO_HOLD,
             armed: false,
             height_m: 0.0,
@@ -196,9 +218,13 @@ impl World {
             setpoints: Vec::new(),
             mode_requests: 0,
             refuses: false,
+            answers_checks: Some(MavResult::MAV_RESULT_ACCEPTED),
+            checks_requests: 0,
+            checks: Vec::new(),
             landing_targets: Vec::new(),
             queue: Vec::new(),
         };
+        differs(&mut px4);
         let mut world = Self { now: 100 * SECOND, client: Autopilot::new(Config::default()), px4 };
         world.run(5);
         world
@@ -283,11 +309,7 @@ const NO_POSITION: &str = "Navigation error: No valid position estimate";
 #[test]
 fn why_it_does_not_arm_is_told_from_its_events() {
     let mut world = World::new();
-    let failing = MavSysStatusSensor::MAV_SYS_STATUS_PREARM_CHECK;
-    world.px4.queue.push(MavMessage::SYS_STATUS(SYS_STATUS_DATA {
-        onboard_control_sensors_present: failing,
-        ..Default::default()
-    }));
+    world.px4.queue.push(status_of_failing_checks());
     world.px4.queue.extend(report(1));
     world.px4.queue.push(event(5, 0x0102_089d, 0x62, &[]));
     world.step();
@@ -302,6 +324,62 @@ fn why_it_does_not_arm_is_told_from_its_events() {
     world.px4.queue.push(event(7, 0x011d_3727, 0x88, &[]));
     world.step();
     assert_eq!(world.client.not_ready_because(), ["prearm: checks not passed yet"]);
+}
+
+/// Its status, with checks before arming that fail.
+fn status_of_failing_checks() -> MavMessage {
+    MavMessage::SYS_STATUS(SYS_STATUS_DATA {
+        onboard_control_sensors_present: MavSysStatusSensor::MAV_SYS_STATUS_PREARM_CHECK,
+        ..Default::default()
+    })
+}
+
+#[test]
+fn who_comes_after_its_events_or_was_away_learns_why_it_does_not_arm() {
+    let mut world = World::with(|px4| px4.checks = report(40).to_vec());
+    world.px4.queue.push(status_of_failing_checks());
+    world.step();
+    let why = [format!("prearm: {NO_POSITION}")];
+    assert_eq!(world.client.not_ready_because(), why);
+    assert_eq!(world.px4.checks_requests, 1);
+    // Nothing is heard of it for a while, and its checks stay as they are.
+    world.now += 10 * SECOND;
+    world.client.tick(world.now);
+    assert!(!world.client.is_connected());
+    world.px4.checks = report(44).to_vec();
+    world.run(10);
+    world.px4.queue.push(status_of_failing_checks());
+    world.step();
+    assert_eq!(world.client.not_ready_because(), why);
+    assert_eq!(world.px4.checks_requests, 2);
+}
+
+#[test]
+fn a_question_for_its_checks_that_nobody_answers_or_that_is_refused_changes_nothing() {
+    let refusals = [MavResult::MAV_RESULT_DENIED, MavResult::MAV_RESULT_UNSUPPORTED];
+    for (answer, asked) in [(None, 3), (Some(refusals[0]), 1), (Some(refusals[1]), 1)] {
+        let mut world = World::with(|px4| px4.answers_checks = answer);
+        world.run(30);
+        assert_eq!(world.px4.checks_requests, asked, "{answer:?}");
+        assert!(world.client.state().unwrap().ready, "{:?}", world.client.not_ready_because());
+        assert_eq!(texts(&mut world.client), [""; 0]);
+        world.request(Command::Arm).unwrap();
+    }
+    // Accepted, and its report was lost on the way.
+    let mut world = World::new();
+    world.run(30);
+    assert_eq!(world.px4.checks_requests, 3);
+}
+
+#[test]
+fn an_armed_one_is_asked_for_its_checks_once_it_is_disarmed() {
+    let mut world = World::with(|px4| (px4.armed, px4.height_m) = (true, 5.0));
+    world.run(10);
+    assert_eq!(world.px4.checks_requests, 0);
+    (world.px4.armed, world.px4.height_m) = (false, 0.0);
+    world.px4.checks = report(1).to_vec();
+    world.run(10);
+    assert_eq!(world.px4.checks_requests, 1);
 }
 
 #[test]

@@ -188,3 +188,26 @@ fn px4_takes_no_command_that_is_addressed_to_all_systems() {
         assert_eq!(answers, taken, "{firmware:?}");
     }
 }
+
+#[test]
+fn a_px4_whose_events_came_too_early_tells_again_why_it_does_not_arm() {
+    let mut config = WorldConfig::default();
+    config.autopilot.firmware = Firmware::Px4;
+    config.autopilot.ready_after_s = 20.0;
+    let mut world = World::new(&config, 4);
+    // Nobody hears it until it waits for its position.
+    world.advance_to(12.0);
+    assert!(world.outgoing().count() > 0);
+    let mut pair = Pair { world, ..Pair::new(&config, 4) };
+    let run_to = |pair: &mut Pair, end_s: f64| {
+        while pair.world.now_s() < end_s {
+            pair.tick();
+        }
+    };
+    run_to(&mut pair, 16.0);
+    let why = pair.client.not_ready_because();
+    let is_told = |text: &String| text == "prearm: Navigation error: No valid position estimate";
+    assert!(why.iter().any(is_told), "{why:?}");
+    run_to(&mut pair, 25.0);
+    assert_eq!(pair.client.not_ready_because(), [""; 0]);
+}

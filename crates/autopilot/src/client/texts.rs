@@ -3,6 +3,7 @@
 use super::Autopilot;
 use crate::dialect::{EVENT_DATA, MavSeverity};
 use crate::event::Event;
+use crate::mode::Firmware;
 use crate::px4_listener::{About, Heard};
 use crate::text::Text;
 
@@ -25,6 +26,15 @@ impl Autopilot {
             is_event && self.vehicle.as_mut().is_some_and(|it| it.listener.is_told(&text));
         if !is_told {
             self.take_text(severity, text);
+        }
+    }
+
+    /// A disarmed PX4 that was found, returned or started again is asked which checks fail. ArduPilot repeats its reasons by itself.
+    pub(super) fn ask_for_checks(&mut self, now_ns: i64) {
+        let is_px4 = |vehicle: &&mut super::Vehicle| vehicle.firmware == Firmware::Px4;
+        let Some(vehicle) = self.vehicle.as_mut().filter(is_px4) else { return };
+        if let Some(question) = vehicle.listener.question(now_ns, vehicle.state.armed) {
+            self.send_to_vehicle(question);
         }
     }
 

@@ -152,6 +152,10 @@ impl SimulatedAutopilot {
                 self.send_message(148);
                 ACCEPTED
             }
+            MavCmd::MAV_CMD_RUN_PREARM_CHECKS if self.is_px4() => {
+                self.report_checks();
+                ACCEPTED
+            }
             _ => MavResult::MAV_RESULT_UNSUPPORTED,
         };
         self.acknowledge(command as u16, result, from);

@@ -240,6 +240,7 @@ impl SimulatedAutopilot {
         let info = MavSeverity::MAV_SEVERITY_INFO;
         if self.readiness == Readiness::Booting && part >= ALIGNED {
             self.readiness = Readiness::Aligned;
+            self.report_checks();
             for text in
                 ["ArduPilot Ready", "AHRS: EKF3 active", "EKF3 IMU0 tilt alignment complete"]
             {
@@ -255,6 +256,16 @@ impl SimulatedAutopilot {
         if self.readiness == Readiness::OriginSet && part >= 1.0 {
             self.readiness = Readiness::Ready;
             self.text(info, "EKF3 IMU0 is using GPS");
+            self.report_checks();
+        }
+    }
+
+    /// A PX4 reports the checks that fail.
+    fn report_checks(&mut self) {
+        if self.is_px4() {
+            for event in self.px4.checks(self.ready()) {
+                self.send(&event);
+            }
         }
     }
 

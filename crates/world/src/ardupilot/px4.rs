@@ -1,16 +1,27 @@
 //! The same vehicle under PX4's rules, taken from its documentation and not measured: modes by two numbers,
 //! OFFBOARD only with a stream of setpoints before and during
-//! (<https://docs.px4.io/main/en/flight_modes/offboard.html>), a takeoff to an altitude over the sea, and a
-//! heartbeat that says so once a second.
+//! (<https://docs.px4.io/main/en/flight_modes/offboard.html>), a takeoff to an altitude over the sea, a heartbeat that says so once a
+//! second, and events that tell which checks before arming fail: when that changes, and when it is asked.
 
 use autopilot::FlightMode;
-use autopilot::dialect::{ESTIMATOR_STATUS_DATA, EstimatorStatusFlags, MavMessage};
+use autopilot::dialect::{ESTIMATOR_STATUS_DATA, EVENT_DATA, EstimatorStatusFlags, MavMessage};
 
 use super::flight::{Landed, Mode};
 
 /// Minimum time for which setpoints must have arrived at 2 Hz or more, in seconds.
 const STREAM_S: f64 = 1.0;
 const STREAM_GAP_S: f64 = 0.5;
+/// The events that begin and end a report of all failing checks, and the check of a position.
+const CHECKS_BEGIN: u32 = 0x01a8_93e0;
+const CHECKS_END: u32 = 0x011d_3727;
+const NO_POSITION: u32 = 0x01d3_1bb9;
+/// Their levels, for the log and for others: those of events for programs, and of an error.
+const FOR_PROGRAMS: u8 = 0x88;
+const ERROR: u8 = 0x33;
+/// The modes for which the check of a position fails: those of a landing are among them.
+const WITH_POSITION: u32 = 0x0016_4038;
+/// Where the first event has the modes in which it can be armed, in bytes.
+const CAN_ARM_AT: usize = 9;
 
 /// The state of a PX4 in addition to ArduPilot's.
 #[derive(Clone, Debug, Default)]
@@ -19,9 +30,36 @@ pub(super) struct Px4 {
     stream: Option<(f64, f64)>,
     offboard: bool,
     pub(super) precision: bool,
+    /// Number of its events so far.
+    events: u16,
 }
 
 impl Px4 {
+    /// The events of a report of all failing checks.
+    pub(super) fn checks(&mut self, has_position: bool) -> Vec<MavMessage> {
+        let can_arm = if has_position { u32::MAX } else { !WITH_POSITION };
+        let mut summary = [0; CAN_ARM_AT + 4];
+        summary
+            .iter_mut()
+            .skip(CAN_ARM_AT)
+            .zip(can_arm.to_le_bytes())
+            .for_each(|(to, of)| *to = of);
+        let mut events = vec![self.event(CHECKS_BEGIN, FOR_PROGRAMS, &summary)];
+        if !has_position {
+            events.push(self.event(NO_POSITION, ERROR, &WITH_POSITION.to_le_bytes()));
+        }
+        events.push(self.event(CHECKS_END, FOR_PROGRAMS, &[]));
+        events
+    }
+
+    fn event(&mut self, id: u32, log_levels: u8, arguments: &[u8]) -> MavMessage {
+        self.events = self.events.wrapping_add(1);
+        let sequence = self.events;
+        let mut event = EVENT_DATA { id, log_levels, sequence, ..EVENT_DATA::default() };
+        event.arguments.iter_mut().zip(arguments).for_each(|(to, of)| *to = *of);
+        MavMessage::EVENT(event)
+    }
+
     pub(super) fn on_setpoint(&mut self, now_s: f64) {
         let lasts = self.stream.filter(|(_, last_s)| now_s - last_s <= STREAM_GAP_S);
         self.stream = Some((lasts.map_or(now_s, |(since_s, _)| since_s), now_s));
