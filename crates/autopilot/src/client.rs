@@ -798,6 +798,7 @@ impl Autopilot {
                 }
                 Step::Finish(result) => {
                     let request = self.requests.remove(index);
+                    let result = result.map_err(|error| self.explained(error));
                     self.finish(request.id, request.command, result);
                 }
             }

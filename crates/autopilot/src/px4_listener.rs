@@ -175,6 +175,12 @@ impl Listener {
         check.modes & OUR_MODES & !self.can_arm != 0
     }
 
+    /// The texts of the checks that prevent arming, as many as are named.
+    pub(crate) fn preventing(&self) -> impl Iterator<Item = &str> {
+        let preventing = self.checks.iter().filter(|failing| self.prevents_arming(failing));
+        preventing.take(MAX_NAMED).map(|failing| failing.text.as_str())
+    }
+
     /// Why it cannot be armed, as far as the checks tell.
     pub(crate) fn why_not_armed(&self) -> Option<String> {
         let (preventing, others): (Vec<_>, Vec<_>) =

@@ -428,6 +428,27 @@ fn checks_explain_why_it_does_not_arm_and_no_other_request() {
 }
 
 #[test]
+fn a_refusal_to_arm_has_the_checks_that_were_told_before() {
+    let mut world = World::with(|px4| px4.checks = report(1).to_vec());
+    world.px4.refuses = true;
+    let denied = "Arming denied: Resolve system health failures first";
+    let id = world.client.request(world.now, Command::Arm);
+    world.step();
+    world.px4.queue.push(event(5, 0x0102_089d, 0x62, &[]));
+    while world.client.status(id) == CommandStatus::Pending {
+        world.step();
+    }
+    let CommandStatus::Failed(error) = world.client.status(id) else { panic!("it is armed") };
+    assert!(error.to_string().contains(&format!("{denied}; {NO_POSITION}")), "{error}");
+    // One whose checks are passed has no such reason.
+    let [begin, .., end] = report(6);
+    world.px4.queue.extend([begin, end]);
+    world.step();
+    let error = world.request(Command::Arm).unwrap_err();
+    assert!(!error.to_string().contains(NO_POSITION), "{error}");
+}
+
+#[test]
 fn a_takeoff_arms_rises_to_an_altitude_and_ends_in_offboard() {
     let mut world = World::new();
     let mut takeoff = Takeoff::new(10.0);

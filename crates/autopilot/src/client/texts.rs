@@ -1,6 +1,7 @@
 //! What the autopilot says in texts, and PX4 in events.
 
 use super::Autopilot;
+use crate::command::{Command, CommandError};
 use crate::dialect::{EVENT_DATA, MavSeverity};
 use crate::event::Event;
 use crate::mode::Firmware;
@@ -36,6 +37,21 @@ impl Autopilot {
         if let Some(question) = vehicle.listener.question(now_ns, vehicle.state.armed) {
             self.send_to_vehicle(question);
         }
+    }
+
+    /// A refusal to arm with the checks that prevent it: PX4 need not tell again what it told before.
+    pub(super) fn explained(&self, error: CommandError) -> CommandError {
+        let (CommandError::Refused { command: Command::Arm, result, mut texts }, Some(vehicle)) =
+            (error.clone(), &self.vehicle)
+        else {
+            return error;
+        };
+        for check in vehicle.listener.preventing() {
+            if !texts.iter().any(|text| text == check) {
+                texts.push(check.to_owned());
+            }
+        }
+        CommandError::Refused { command: Command::Arm, result, texts }
     }
 
     pub(super) fn take_px4_event(&mut self, event: &EVENT_DATA) {
