@@ -44,6 +44,7 @@ struct Px4 {
     checks_requests: usize,
     /// What it then reports.
     checks: Vec<MavMessage>,
+    boot_ns: i64,
     landing_targets: Vec<(u8, [f32; 3])>,
     queue: Vec<MavMessage>,
 }
@@ -164,7 +165,7 @@ impl Px4 {
     }
 
     fn report(&self, id: u32, now: i64) -> Option<MavMessage> {
-        let time_boot_ms = (now / 1_000_000) as u32;
+        let time_boot_ms = ((now - self.boot_ns) / 1_000_000) as u32;
         Some(match id {
             30 => MavMessage::ATTITUDE(ATTITUDE_DATA { time_boot_ms, ..Default::default() }),
             32 => MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
@@ -221,6 +222,7 @@ impl World {
             answers_checks: Some(MavResult::MAV_RESULT_ACCEPTED),
             checks_requests: 0,
             checks: Vec::new(),
+            boot_ns: 0,
             landing_targets: Vec::new(),
             queue: Vec::new(),
         };
@@ -299,9 +301,16 @@ fn report(sequence: u16) -> [MavMessage; 4] {
 }
 
 fn texts(client: &mut Autopilot) -> Vec<String> {
-    std::iter::from_fn(|| client.poll_event())
-        .filter_map(|event| if let Event::Text { text, .. } = event { Some(text) } else { None })
-        .collect()
+    let events: Vec<Event> = std::iter::from_fn(|| client.poll_event()).collect();
+    texts_of(&events)
+}
+
+fn texts_of(events: &[Event]) -> Vec<String> {
+    let text = |event: &Event| match event {
+        Event::Text { text, .. } => Some(text.clone()),
+        _ => None,
+    };
+    events.iter().filter_map(text).collect()
 }
 
 const NO_POSITION: &str = "Navigation error: No valid position estimate";
@@ -352,6 +361,28 @@ fn who_comes_after_its_events_or_was_away_learns_why_it_does_not_arm() {
     world.step();
     assert_eq!(world.client.not_ready_because(), why);
     assert_eq!(world.px4.checks_requests, 2);
+}
+
+#[test]
+fn after_it_started_again_its_events_count_from_the_first_and_old_checks_are_forgotten() {
+    let mut world = World::with(|px4| px4.checks = report(10).to_vec());
+    world.px4.queue.push(status_of_failing_checks());
+    world.step();
+    assert_eq!(world.client.not_ready_because(), [format!("prearm: {NO_POSITION}")]);
+    assert_eq!(texts(&mut world.client), ["No manual control input", NO_POSITION]);
+    world.px4.boot_ns = world.now;
+    // Asked, it reports only one of them, with a number that is not far behind those from before.
+    let [begin, sticks, _, end] = report(1);
+    world.px4.checks = vec![begin, sticks, end];
+    world.run(2);
+    world.px4.queue.push(status_of_failing_checks());
+    world.step();
+    let events: Vec<Event> = std::iter::from_fn(|| world.client.poll_event()).collect();
+    let restarts = events.iter().filter(|event| matches!(event, Event::Restarted));
+    assert_eq!(restarts.count(), 1);
+    assert_eq!(texts_of(&events), ["No manual control input"]);
+    let also = "prearm: checks not passed yet; PX4 also says: No manual control input";
+    assert_eq!(world.client.not_ready_because(), [also]);
 }
 
 #[test]
