@@ -159,6 +159,7 @@ fn run_in_real_time(
             outcome.phase,
             outcome.why,
         ));
+        folder.keep_logs(flight.seed)?;
         findings.outcomes.push(outcome);
         steps.flown(findings.outcomes.len(), planned);
         // What there is, should the next one end this process.

@@ -41,6 +41,8 @@ pub const FIGURES: [&str; 7] = [
 pub const RECORDINGS: &str = "recordings";
 /// The begin of the name of the folder with the logs of one flight in real time; its seed follows.
 const LOGS: &str = "logs-";
+/// The end of that name while it is flown, and after an interruption: no result, which neither counts nor is refused.
+const UNFINISHED: &str = "-unfinished";
 /// What the logs are called, without their ending.
 const PARTS: [&str; 5] = ["world", "camera", "detector", "controller", "bridge"];
 
@@ -108,18 +110,39 @@ impl Folder {
         std::fs::rename(&new, &path).with_context(|| format!("writing {}", path.display()))
     }
 
-    /// The folder for the logs of the flight with this seed, made and without those of an earlier run.
+    /// The folder for the logs of the flight with this seed while it is flown, made and without those of one that was not finished.
     ///
     /// # Errors
     /// When it cannot be made or emptied.
-    pub fn begin_logs(&mut self, seed: u64) -> anyhow::Result<PathBuf> {
-        let logs = self.path.join(format!("{LOGS}{seed}"));
-        let (of_this_flight, others) =
-            std::mem::take(&mut self.old).into_iter().partition(|old| old.starts_with(&logs));
-        self.old = others;
-        remove(of_this_flight)?;
+    pub fn begin_logs(&self, seed: u64) -> anyhow::Result<PathBuf> {
+        let logs = self.unfinished_logs(seed);
+        let leftover = names(&logs)?.into_iter().filter(|name| is_of_a_process(name));
+        remove(leftover.map(|name| logs.join(name)).collect())?;
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
         Ok(logs)
+    }
+
+    /// Gives the logs of a flight that counts their place, instead of those of an earlier run.
+    ///
+    /// # Errors
+    /// When those cannot be removed, or these not be moved.
+    pub fn keep_logs(&mut self, seed: u64) -> anyhow::Result<()> {
+        let (from, to) = (self.unfinished_logs(seed), self.path.join(format!("{LOGS}{seed}")));
+        let (of_this_flight, others) =
+            std::mem::take(&mut self.old).into_iter().partition(|old| old.starts_with(&to));
+        self.old = others;
+        remove(of_this_flight)?;
+        // One by one: the folder stays where it has files of the user.
+        std::fs::create_dir_all(&to).with_context(|| format!("making {}", to.display()))?;
+        for name in names(&from)? {
+            std::fs::rename(from.join(&name), to.join(&name))
+                .with_context(|| format!("moving {name} into {}", to.display()))?;
+        }
+        std::fs::remove_dir(&from).with_context(|| format!("removing {}", from.display()))
+    }
+
+    fn unfinished_logs(&self, seed: u64) -> PathBuf {
+        self.path.join(format!("{LOGS}{seed}{UNFINISHED}"))
     }
 }
 
@@ -332,15 +355,40 @@ mod tests {
     #[test]
     fn the_logs_of_a_flight_are_its_own_and_outlast_the_first_result() {
         let folder = tempfile::tempdir().unwrap();
-        for name in ["logs-1/world.log", "logs-2/world.log"] {
+        for name in ["logs-1/world.log", "logs-1/camera.log", "logs-1/mine", "logs-2/world.log"] {
             write(folder.path(), name, "old");
         }
         let mut claimed = Folder::claim(folder.path(), true).unwrap();
         let logs = claimed.begin_logs(1).unwrap();
-        assert!(!logs.join("world.log").exists() && folder.path().join("logs-2").exists());
         write(&logs, "world.log", "new");
+        claimed.keep_logs(1).unwrap();
         claimed.put(FLIGHTS_AS_CSV, "new").unwrap();
-        assert!(logs.join("world.log").exists() && !folder.path().join("logs-2").exists());
+        assert_eq!(names(folder.path()).unwrap(), [FLIGHTS_AS_CSV, "logs-1"]);
+        let kept = folder.path().join("logs-1");
+        assert_eq!(names(&kept).unwrap(), ["mine", "world.log"]);
+        assert_eq!(std::fs::read_to_string(kept.join("world.log")).unwrap(), "new");
+    }
+
+    #[test]
+    fn a_flight_that_was_not_finished_costs_no_old_logs_and_is_no_result() {
+        let folder = tempfile::tempdir().unwrap();
+        let interrupt = |replaces: bool| {
+            let logs = Folder::claim(folder.path(), replaces).unwrap().begin_logs(1).unwrap();
+            assert_eq!(names(&logs).unwrap(), [""; 0]);
+            write(&logs, "world.log", "new");
+            logs
+        };
+        // Where there is nothing else, the next run is not refused.
+        let logs = interrupt(false);
+        assert_eq!(interrupt(false), logs);
+        for name in ["logs-1/world.log", FLIGHTS_AS_CSV] {
+            write(folder.path(), name, "old");
+        }
+        interrupt(true);
+        for name in ["logs-1/world.log", FLIGHTS_AS_CSV] {
+            assert_eq!(std::fs::read_to_string(folder.path().join(name)).unwrap(), "old", "{name}");
+        }
+        assert!(refusal(folder.path(), false).contains("--replace"));
     }
 
     #[test]
