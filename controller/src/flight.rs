@@ -4,6 +4,7 @@
 //! returns.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use autopilot::dialect::{MavMessage, MavType};
 use autopilot::{Autopilot, Event, FlightMode, LandedState, Packet};
@@ -90,7 +91,10 @@ impl Flight {
             mission: Mission::new(config.start, config.takeoff()),
             frames: Frames::new(&config),
             used: Used::default(),
-            setpoints: Setpoints::new(settings.setpoint_rate_hz),
+            setpoints: Setpoints::new(
+                settings.setpoint_rate_hz,
+                Duration::from_secs_f64(config.phases.stale_vehicle_s),
+            ),
             landing_target: is_autopilots.then(|| {
                 LandingTargetMode::new(config.landing_target, config.phases.search_timeout_s)
             }),

@@ -1,5 +1,7 @@
 //! The lander's actions, sent to the autopilot as they are: what guidance believes is what was sent.
 
+use std::time::Duration;
+
 use autopilot::command::SetpointError;
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode};
 use geometry::{Ned, Vector};
@@ -10,6 +12,8 @@ use messages::Setpoint;
 #[derive(Debug)]
 pub struct Setpoints {
     period_ns: i64,
+    /// Age up to which a position is of now.
+    stale_ns: i64,
     last: Option<Setpoint>,
     sent_ns: i64,
     /// The change to the mode that follows setpoints, or the disarming, that was requested last.
@@ -20,15 +24,15 @@ pub struct Setpoints {
 
 /// Time after a request in which LAND may not show yet, in nanoseconds.
 const LAND_SHOWS_NS: i64 = 3_000_000_000;
-/// Age up to which a position is of now, and a mode can hardly have been changed by a pilot since its heartbeat, in nanoseconds.
-const FRESH_NS: i64 = 500_000_000;
+/// Age up to which a mode can hardly have been changed by a pilot since its heartbeat, in nanoseconds.
 const NEW_MODE_NS: i64 = 200_000_000;
 
 impl Setpoints {
-    /// Nothing was sent yet.
-    pub fn new(rate_hz: f64) -> Self {
+    /// Nothing was sent yet. `stale_after` is the age from which the vehicle's state is not of now.
+    pub fn new(rate_hz: f64, stale_after: Duration) -> Self {
         Self {
             period_ns: (1e9 / rate_hz) as i64,
+            stale_ns: i64::try_from(stale_after.as_nanos()).unwrap_or(i64::MAX),
             last: None,
             sent_ns: i64::MIN,
             request: None,
@@ -129,8 +133,9 @@ impl Setpoints {
         let lands =
             self.land_ns.is_some_and(|land_ns| now_ns.saturating_sub(land_ns) < LAND_SHOWS_NS);
         let is_followed = autopilot.state().is_some_and(|state| {
-            let is_fresh =
-                state.position.is_some_and(|it| now_ns.saturating_sub(it.stamp_ns) < FRESH_NS);
+            let is_fresh = state
+                .position
+                .is_some_and(|it| now_ns.saturating_sub(it.stamp_ns) <= self.stale_ns);
             state.connected && state.armed && state.mode.is_guided() && is_fresh
         });
         is_followed && !lands && autopilot.firmware() == Some(Firmware::Px4)

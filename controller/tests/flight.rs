@@ -638,6 +638,21 @@ fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_sta
 }
 
 #[test]
+fn a_px4_is_asked_to_hold_its_place_only_while_its_position_is_no_older_than_configured() {
+    const OFFBOARD: u32 = 0x0006_0000;
+    for (set, is_asked) in
+        [("phases.stale_vehicle_s=0.5", false), ("phases.stale_vehicle_s=0.9", true)]
+    {
+        let mut flight = flight_with("airborne", &[set]);
+        receive(&mut flight, 0, &heartbeat(OFFBOARD, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        assert!(hover(&mut flight, 20, 1000, OFFBOARD).setpoints > 20);
+        // It is told to stop 0.7 s after the last position.
+        assert_eq!(flight.shutdown(1680 * MS), is_asked, "{set}");
+    }
+}
+
+#[test]
 fn a_strangers_calibration_is_refused_in_flight_and_told() {
     let mut flight = in_flight("airborne");
     flight.camera(0, CameraInfo::sample());
