@@ -27,6 +27,8 @@ pub(crate) struct LandingSummary {
     /// Detections used by earlier controllers.
     detections_before: u64,
     recorder: Option<RecorderStatus>,
+    /// How the recorder exited before it was to.
+    recorders_exit: Option<Exit>,
     /// The recorder that is to record it.
     recorded_by: Option<OurRecorder>,
 }
@@ -173,9 +175,15 @@ impl LandingSummary {
     /// Notes that the recorder exited before it was to: what follows is not in its file, which lacks its end unless it was ended
     /// in good order.
     pub(crate) fn recording_ended_early(&mut self, exit: &Exit) {
-        let recorder = self.recorder.get_or_insert_default();
+        self.recorder.get_or_insert_default();
+        self.recorders_exit = Some(exit.clone());
+    }
+
+    /// Why the recording lacks something. What it told before it exited may be heard later, and does not undo that.
+    fn recording_problem(&self, recorder: &RecorderStatus) -> Option<String> {
+        let Some(exit) = &self.recorders_exit else { return recorder.problem.clone() };
         let is_begun = !recorder.file.is_empty();
-        let what = match (exit.status, is_begun) {
+        let ended_early = match (exit.status, is_begun) {
             (Some(0), true) => {
                 "the recorder ended before the landing; its file is whole".to_owned()
             }
@@ -185,8 +193,8 @@ impl LandingSummary {
             }
             (_, false) => format!("the recorder exited: {exit}"),
         };
-        let known = recorder.problem.take().filter(|problem| problem != UNHEARD);
-        recorder.problem = known.or(Some(what));
+        let known = recorder.problem.clone().filter(|problem| problem != UNHEARD);
+        Some(known.unwrap_or(ended_early))
     }
 
     /// Notes why the landing was not watched to its end.
@@ -268,7 +276,7 @@ impl LandingSummary {
                 kept: recorder.kept,
                 dropped: recorder.lost(),
                 never_came: recorder.never_came(),
-                problem: recorder.problem.clone(),
+                problem: self.recording_problem(recorder),
             }),
             is_to_be_recorded: self.recorded_by.is_some(),
         }
@@ -455,6 +463,9 @@ mod tests {
         let exit = |words: &str, status| Exit { words: words.into(), status };
         landing.recording_ended_early(&exit("exit status: 1", Some(1)));
         assert_eq!(status(&landing), RECORDING_FAILED);
+        assert!(landing.outcome().table().contains("--repair"));
+        landing.recorder(told("main", "flight-2.mcap", None));
+        assert_eq!(status(&landing), RECORDING_FAILED, "what it told before comes late");
         assert!(landing.outcome().table().contains("--repair"));
         landing.recorder(told("main", "", None));
         landing.recorder(told("main", "elsewhere/flight.mcap", None));
