@@ -163,11 +163,9 @@ impl Estimator {
         };
         let mut state = before.state.clone();
         let dt_s = stamp.seconds_since(before.measurement.stamp);
-        let nis = state.predict_to(&self.config, dt_s, &measurement);
-        self.nis = Some(nis);
-        // Also an outlier: what is not a number, and what a covariance that is none makes negative.
-        let is_inlier = (0.0..=self.config.gate).contains(&nis);
-        if !is_inlier {
+        let fit = state.predict_to(&self.config, dt_s, &measurement);
+        self.nis = Some(fit.nis);
+        if !fit.is_inlier {
             let place = self.place_at(stamp);
             self.hypotheses.count_outlier(&self.config, &measurement, motion, place);
             return if self.resolve(stamp) { Ok(()) } else { Err(Rejection::Outlier) };

@@ -68,6 +68,15 @@ pub(crate) struct State {
     log_noise_scale: f64,
 }
 
+/// How a detection fits the state.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub(crate) struct Fit {
+    /// Its normalised innovation squared before anything was widened for it.
+    pub(crate) nis: f64,
+    /// Whether it is fused.
+    pub(crate) is_inlier: bool,
+}
+
 impl State {
     /// The state before the first detection, around this position of the pad.
     pub(crate) fn new(config: &EstimatorConfig, position: Vector3<f64>) -> Self {
@@ -155,7 +164,7 @@ impl State {
         s.try_inverse().map_or(f64::INFINITY, |inverse| innovation.dot(&(inverse * innovation)))
     }
 
-    /// Advances the state by `dt_s` to a detection, and returns its normalised innovation squared. A detection beyond the gate that
+    /// Advances the state by `dt_s` to a detection, and returns how it fits. A detection beyond the gate that
     /// is as near as the autopilot's position may have wandered since the last one is none of another place: the covariance of
     /// position and velocity is widened by the factor by which it is beyond (a fading factor: Xia, Rao, Ying, Shen: Adaptive Fading
     /// Kalman Filter with an Application, Automatica 30, 1994).
@@ -164,13 +173,15 @@ impl State {
         config: &EstimatorConfig,
         dt_s: f64,
         measurement: &Measurement,
-    ) -> f64 {
+    ) -> Fit {
         self.predict(config, dt_s);
         let nis = self.nis(measurement);
+        // What is not a number, and what a covariance that is none makes negative, is no inlier.
+        let is_inlier = |nis: f64| (0.0..=config.gate).contains(&nis);
         let wander_m = WANDER_M + WANDER_M_S * fmin(dt_s, MAX_WANDER_S);
         let is_near = self.innovation(measurement).norm() <= wander_m;
         if !(nis > config.gate && nis.is_finite() && is_near) {
-            return nis;
+            return Fit { nis, is_inlier: is_inlier(nis) };
         }
         let factor = (nis / config.gate).sqrt();
         let factor_of = |state: usize| if state < TILT { factor } else { 1.0 };
@@ -179,7 +190,8 @@ impl State {
                 self.covariance[(i, j)] *= factor_of(i) * factor_of(j);
             }
         }
-        fmin(self.nis(measurement), config.gate)
+        // Now it is at the gate, or beyond it by the noise of the detection, which is not widened.
+        Fit { nis, is_inlier: is_inlier(fmin(self.nis(measurement), config.gate)) }
     }
 
     /// Fuses a detection.

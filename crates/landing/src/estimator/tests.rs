@@ -312,18 +312,24 @@ fn a_position_that_wanders_low_over_the_pad_is_followed() {
     let fly = |step_m: f64| {
         let mut scene = Scene::new(EstimatorConfig::default(), 5);
         scene.noise_m = [0.001; 3];
-        let mut refused = 0;
+        let (mut refused, mut max_nis) = (0, 0.0f64);
         for i in 0..310 {
             scene.advance(0.07);
             if i >= 290 {
                 scene.pad = scene.pad + Vector::new(0.0, step_m, 0.0);
             }
-            refused += u32::from(scene.see(0.03).is_err());
+            let is_refused = scene.see(0.03).is_err();
+            refused += u32::from(is_refused);
+            if !is_refused {
+                max_nis = max_nis.max(scene.estimate().nis.unwrap_or(0.0));
+            }
         }
-        (refused, scene.error().horizontal_norm())
+        (refused, scene.error().horizontal_norm(), max_nis)
     };
-    let (refused, error_m) = fly(0.02);
+    let (refused, error_m, nis) = fly(0.02);
     assert!(refused <= 2 && error_m < 0.02, "{refused} refused, {error_m} m off");
+    // What is followed is told to be as surprising as it was.
+    assert!(nis > 1.5 * EstimatorConfig::default().gate, "{nis}");
     // No autopilot's position is as quick as this.
     assert!(fly(0.2).0 > 10, "{:?}", fly(0.2));
 }
