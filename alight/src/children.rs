@@ -1,5 +1,6 @@
 //! Child processes: starts them, forwards their output, reports their exit, stops them.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::path::Path;
 use std::process::Stdio;
@@ -18,6 +19,9 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 /// Maximum number of queued output lines; further ones are dropped, so that a service never waits for a
 /// terminal.
 const MAX_QUEUED_LINES: usize = 256;
+
+/// A restarted controller resumes the landing, and never takes off a second time.
+const RESUME: &str = "start=\"resume\"";
 
 /// An event of a child.
 pub(crate) enum ChildEvent<K> {
@@ -77,36 +81,48 @@ impl Children<Service> {
         let mut command = Command::new(program);
         command.arg(service.name()).arg("--zenoh").arg(zenoh);
         command.arg("--stop-with-parent").arg(std::process::id().to_string());
-        let mut by_hand = String::new();
         if let Some(state) = state {
             command.env(node::STATE_VARIABLE, state);
-            by_hand = format!("{}={} ", node::STATE_VARIABLE, for_shell(state));
         }
-        by_hand.push_str(&format!("alight {} --zenoh {}", service.name(), for_shell(zenoh)));
-        let is_start =
-            |setting: &str| setting.split('=').next().is_some_and(|key| key.trim() == "start");
         for setting in settings {
             command.arg("--set").arg(setting);
-            if service != Service::Controller || !is_start(setting) {
-                by_hand.push_str(&format!(" --set '{setting}'"));
-            }
-        }
-        if service == Service::Controller {
-            // A restarted controller resumes the landing, and never takes off a second time.
-            by_hand.push_str(" --set 'start=\"resume\"'");
         }
         if std::env::var_os("ALIGHT_LOG").is_none() {
             command.env("ALIGHT_LOG", "warn");
         }
         let number = self.spawn(service, command, service.name())?;
-        Ok(Started { service, number, by_hand })
+        Ok(Started { service, number, by_hand: by_hand(service, zenoh, settings, state) })
     }
+}
+
+/// The command that starts a service again.
+fn by_hand(service: Service, zenoh: &Path, settings: &[String], state: Option<&Path>) -> String {
+    let mut command = String::new();
+    if let Some(state) = state {
+        command = format!("{}={} ", node::STATE_VARIABLE, for_shell(state));
+    }
+    command.push_str(&format!("alight {} --zenoh {}", service.name(), for_shell(zenoh)));
+    let is_start =
+        |setting: &str| setting.split('=').next().is_some_and(|key| key.trim() == "start");
+    let mut set = |setting: &str| command.push_str(&format!(" --set {}", word(setting)));
+    if service == Service::Controller {
+        settings.iter().filter(|setting| !is_start(setting)).for_each(|setting| set(setting));
+        set(RESUME);
+    } else {
+        settings.iter().for_each(|setting| set(setting));
+    }
+    command
 }
 
 /// A path as a shell takes it for one word.
 pub(crate) fn for_shell(path: &Path) -> String {
-    let text = path.to_string_lossy();
-    shlex::try_quote(&text).unwrap_or_else(|_| text.clone()).into_owned()
+    word(&path.to_string_lossy())
+}
+
+/// A text as a shell takes it for one word.
+fn word(text: &str) -> String {
+    // Only a zero byte cannot be quoted, and no argument has one.
+    shlex::try_quote(text).map_or_else(|_| text.to_owned(), Cow::into_owned)
 }
 
 impl<K: Clone + PartialEq + Send + 'static> Children<K> {
@@ -225,5 +241,20 @@ mod tests {
         for path in ["my flights/zenoh.json5", "it's/$HOME"] {
             assert_eq!(shlex::split(&for_shell(Path::new(path))), Some(vec![path.to_owned()]));
         }
+    }
+
+    #[test]
+    fn the_command_by_hand_has_each_setting_as_it_was_given() {
+        let zenoh = Path::new("my flights/zenoh.json5");
+        let settings = ["id=\"it's $HOME\"", "start=\"airborne\"", "file=/a b"].map(str::to_owned);
+        let words = |service| shlex::split(&by_hand(service, zenoh, &settings, None)).unwrap();
+        let start = ["alight", "detector", "--zenoh", "my flights/zenoh.json5"];
+        let set = settings.each_ref().map(|setting| ["--set", setting]);
+        assert_eq!(words(Service::Detector), [&start[..], &set.concat()].concat());
+        // A controller resumes, however it was started.
+        let words = words(Service::Controller);
+        assert_eq!(words[4..], ["--set", &settings[0], "--set", &settings[2], "--set", RESUME]);
+        let with_notes = by_hand(Service::Detector, zenoh, &[], Some(Path::new("a b")));
+        assert!(with_notes.starts_with(&format!("{}='a b' alight ", node::STATE_VARIABLE)));
     }
 }

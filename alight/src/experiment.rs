@@ -259,9 +259,13 @@ mod tests {
         Experiment(ExperimentArgs),
     }
 
+    /// A setting that a shell would take apart.
+    const QUOTED: &str = "controller.detectors.preferred=\"it's main\"";
+
     /// The folder into which such a command writes.
     fn output(command: &str) -> PathBuf {
-        let tool = Tool::try_parse_from(command.split(' ')).unwrap_or_else(|problem| {
+        let words = shlex::split(command).unwrap_or_default();
+        let tool = Tool::try_parse_from(words).unwrap_or_else(|problem| {
             panic!("{command}: {problem}");
         });
         let ToolCommand::Experiment(args) = tool.command;
@@ -277,12 +281,13 @@ mod tests {
         let landings = Plan {
             flights: 2,
             faults: Fault::all().collect(),
-            set: vec!["simulator.camera.rate_hz=20".to_owned()],
+            set: vec!["simulator.camera.rate_hz=20".to_owned(), QUOTED.to_owned()],
             ..Plan::default()
         };
         let lockstep = faults_plan::Plan {
             flights: 60,
             durations_s: vec![f64::INFINITY],
+            set: vec![QUOTED.to_owned()],
             ..faults_plan::Plan::default()
         };
         let real_time = faults_plan::Plan {

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::kind::{Kind, LIAR};
 use crate::landing::fault::{START_ANGLE, drawn, drawn_angle};
-use crate::landing::plan::Values;
+use crate::landing::plan::{Values, set_option};
 
 /// Durations that are drawn, in seconds; infinity is for ever.
 pub const DURATIONS_S: [f64; 4] = [0.5, 2.0, 5.0, f64::INFINITY];
@@ -170,7 +170,7 @@ impl Plan {
             options.push_str(&format!(" --for {}", durations.join(",")));
         }
         for setting in &self.set {
-            options.push_str(&format!(" --set {setting}"));
+            options.push_str(&set_option(setting));
         }
         if self.real_time {
             options.push_str(" --real-time");
@@ -275,6 +275,14 @@ mod tests {
         }
         let twice = flights.iter().filter(|planned| planned.faults.len() == 2).count();
         assert!((20..60).contains(&twice), "{twice}");
+    }
+
+    #[test]
+    fn the_command_of_a_flight_has_each_setting_as_it_was_given() {
+        let set = vec!["controller.detectors.preferred=\"it's main\"".to_owned()];
+        let command = Plan { set: set.clone(), ..Plan::default() }.flights()[0].command();
+        let words = shlex::split(&command).unwrap();
+        assert!(words.windows(2).any(|pair| pair == ["--set", &set[0]]), "{command}");
     }
 
     #[test]

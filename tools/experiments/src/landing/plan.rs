@@ -1,5 +1,6 @@
 //! The flights: every combination of the listed values, with several seeds each.
 
+use std::borrow::Cow;
 use std::str::FromStr;
 
 use super::fault::{Change, Fault, START_ANGLE, drawn, drawn_angle};
@@ -219,7 +220,7 @@ impl Plan {
             change: Change::default(),
         };
         for setting in &self.set {
-            planned.options.push_str(&format!(" --set {setting}"));
+            planned.options.push_str(&set_option(setting));
         }
         planned.change = self.change(&planned);
         planned
@@ -269,6 +270,13 @@ impl Planned {
     }
 }
 
+/// The option that sets this, for a shell.
+pub(crate) fn set_option(setting: &str) -> String {
+    // Only a zero byte cannot be quoted, and no argument has one.
+    let word = shlex::try_quote(setting).unwrap_or(Cow::Borrowed(setting));
+    format!(" --set {word}")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -304,5 +312,13 @@ mod tests {
         assert_eq!((alone.wind_m_s, &alone.options), (sixth.wind_m_s, &sixth.options));
         assert_eq!(alone.change.simulator, sixth.change.simulator);
         assert!(alone.command().contains("--wind 0..8") && alone.command().ends_with("--seed 8"));
+    }
+
+    #[test]
+    fn the_command_of_a_flight_has_each_setting_as_it_was_given() {
+        let set = vec!["controller.detectors.preferred=\"it's main\"".to_owned()];
+        let command = Plan { set: set.clone(), ..Plan::default() }.flights()[0].command();
+        let words = shlex::split(&command).unwrap();
+        assert!(words.windows(2).any(|pair| pair == ["--set", &set[0]]), "{command}");
     }
 }
