@@ -243,6 +243,12 @@ impl FromStr for Kind {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
+        if name == "none" {
+            return Err(
+                "here each flight has a fault; those of `alight experiment landing` have none"
+                    .to_owned(),
+            );
+        }
         let found = TABLE.iter().find(|row| row.1 == name).map(|row| row.0);
         found.ok_or_else(|| {
             let names: Vec<&str> = TABLE.iter().map(|row| row.1).collect();
@@ -262,6 +268,7 @@ mod tests {
             assert_eq!(kind.name().parse(), Ok(kind));
             assert!(!kind.words().is_empty());
         }
+        assert!("none".parse::<Kind>().unwrap_err().contains("`alight experiment landing`"));
         assert!("nothing".parse::<Kind>().unwrap_err().contains("controller-killed"));
     }
 }

@@ -220,18 +220,16 @@ impl Planned {
 
     /// The command that repeats it, in a folder of its own: that of the campaign is taken.
     pub fn command(&self) -> String {
-        let kind = self.faults.first().map_or("none", |first| first.kind.name());
-        let mut command = format!(
-            "alight experiment faults -o again-{kind}-{seed} --flights 1 --seed {seed} --height {} --wind {} --kind {kind}",
+        let mut kinds = self.faults.iter().map(|fault| fault.kind.name());
+        // There is always a first.
+        let (kind, second) = (kinds.next().unwrap_or_default(), kinds.next().unwrap_or("none"));
+        format!(
+            "alight experiment faults -o again-{kind}-{seed} --flights 1 --seed {seed} --height {} --wind {} --kind {kind} --with {second}{}",
             self.height_m,
             self.wind_m_s,
+            self.options,
             seed = self.seed,
-        );
-        match self.faults.get(1) {
-            Some(second) => command.push_str(&format!(" --with {}", second.kind.name())),
-            None => command.push_str(" --with none"),
-        }
-        command + &self.options
+        )
     }
 }
 
