@@ -21,6 +21,8 @@ use rcgen::{
 };
 use sha2::{Digest, Sha256};
 
+use crate::terminal::print;
+
 /// The authority's private key, which is not copied to other machines.
 const AUTHORITY_KEY: &str = "authority.key";
 /// Certificates are valid a day early, as a drone's clock may be slow before it is synchronised.
@@ -155,9 +157,8 @@ pub(crate) fn run(args: &KeysArgs) -> anyhow::Result<ExitCode> {
         Action::Signing { output } => vec![passphrase(output)?],
         Action::Revoke { holder, authority } => vec![revoke(holder, authority)?],
     };
-    let mut out = std::io::stdout().lock();
     for path in written {
-        writeln!(out, "{}", path.display())?;
+        print(&path.display().to_string())?;
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -1,14 +1,43 @@
 //! Output to the terminal.
 
 use std::fmt::Write as _;
-use std::io::{self, ErrorKind, Write as _};
+use std::fs::File;
+use std::io::{self, ErrorKind, Write};
+use std::os::fd::AsFd;
+use std::os::unix::fs::FileTypeExt;
 
-/// Prints a line to standard output. A closed pipe (`| head`) is not an error.
+/// Prints a line to standard output. That nobody reads it any more is not an error.
 pub(crate) fn print(line: &str) -> io::Result<()> {
-    match writeln!(io::stdout(), "{line}") {
+    match writeln!(Output, "{line}") {
         Err(problem) if problem.kind() == ErrorKind::BrokenPipe => Ok(()),
         result => result,
     }
+}
+
+/// Standard output. Where nobody reads it any more, because a pipe was closed (`| head`) or a terminal hung up, its error is a
+/// broken pipe.
+pub(crate) struct Output;
+
+impl Write for Output {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        io::stdout().write(bytes).map_err(|problem| told(problem, &io::stdout()))
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        io::stdout().flush().map_err(|problem| told(problem, &io::stdout()))
+    }
+}
+
+/// The error of a file, as [`Output`] tells it. A terminal that hung up gives the same as a disk that fails, and no longer says that it
+/// is a terminal.
+fn told(problem: io::Error, file: &impl AsFd) -> io::Error {
+    let is_device = || -> io::Result<bool> {
+        let file = File::from(file.as_fd().try_clone_to_owned()?);
+        Ok(file.metadata()?.file_type().is_char_device())
+    };
+    let has_hung_up = problem.raw_os_error() == Some(rustix::io::Errno::IO.raw_os_error())
+        && is_device().unwrap_or(false);
+    if has_hung_up { ErrorKind::BrokenPipe.into() } else { problem }
 }
 
 /// Writes a line to standard error. A failure is ignored, as there is no other place to report it.
@@ -33,4 +62,22 @@ pub(crate) fn aligned<const N: usize>(rows: &[[String; N]]) -> String {
         text.push('\n');
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use rustix::io::Errno;
+
+    use super::*;
+
+    #[test]
+    fn a_terminal_that_hung_up_is_a_broken_pipe_and_a_disk_that_fails_is_none() {
+        let (disk, device) = (tempfile::tempfile().unwrap(), File::open("/dev/null").unwrap());
+        let is_unread = |errno: Errno, file: &File| {
+            let problem = io::Error::from_raw_os_error(errno.raw_os_error());
+            told(problem, file).kind() == ErrorKind::BrokenPipe
+        };
+        assert!(is_unread(Errno::IO, &device) && is_unread(Errno::PIPE, &disk));
+        assert!(!is_unread(Errno::IO, &disk) && !is_unread(Errno::NOSPC, &device));
+    }
 }

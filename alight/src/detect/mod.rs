@@ -17,7 +17,7 @@ use imaging::{BayerPattern, GrayImage, GrayView};
 use markers::{Marker, Pad};
 use media::read_calibration;
 
-use crate::terminal::write_error;
+use crate::terminal::{Output, write_error};
 pub(crate) use args::DetectArgs;
 use picture::Gallery;
 pub(crate) use picture::file_name;
@@ -39,7 +39,7 @@ pub(crate) fn run(args: &DetectArgs) -> anyhow::Result<ExitCode> {
     let threads = if args.track { 1 } else { args.threads.map_or_else(processors, usize::from) };
     let examiner = Examiner::new(args, lens)?;
     let source = Source::new(&args.images);
-    let printed = examiner.examine_all(source, threads, args.format, std::io::stdout())?;
+    let printed = examiner.examine_all(source, threads, args.format, Output)?;
     Ok(if printed.unreadable == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
