@@ -454,9 +454,10 @@ impl Flight {
         if let Some(problem) = landing_target::problem(&self.autopilot) {
             return Err(problem);
         }
-        if !is_flying_guided(&self.autopilot) {
+        if !is_flying_guided(&self.autopilot) && !is_holding_px4(&self.autopilot) {
             return Err(
-                "the vehicle does not fly in a mode from which LAND may be requested".into()
+                "the vehicle does not fly in a mode from which LAND may be requested (GUIDED; PX4: HOLD or OFFBOARD)"
+                    .into(),
             );
         }
         self.begin(now_ns);

@@ -116,9 +116,7 @@ impl LandingTargetMode {
                 self.state = State::Landing;
                 return true;
             }
-            State::Stabilising(_) | State::Commanding(_)
-                if !state.mode.is_guided() || !state.armed =>
-            {
+            State::Stabilising(_) | State::Commanding(_) if !waits(state.mode) || !state.armed => {
                 autopilot.withdraw();
                 self.state = State::Ended(format!("the pilot flies, in {}", state.mode));
             }
@@ -230,6 +228,12 @@ impl LandingTargetMode {
         let steady_ns = (self.settings.steady_s * 1e9) as i64;
         self.active_stream(now_ns).is_some_and(|s| s.last_ns - s.first_ns >= steady_ns)
     }
+}
+
+/// True in the modes in which the vehicle hovers until LAND is requested. A PX4 hovers in HOLD: no setpoint is sent here, so its
+/// failsafe ends OFFBOARD.
+fn waits(mode: FlightMode) -> bool {
+    mode.is_guided() || mode == FlightMode::AUTO_HOLD
 }
 
 /// What keeps this autopilot from using landing targets, and what to do about it.

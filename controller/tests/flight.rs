@@ -406,6 +406,29 @@ fn precision_landing_gets_the_target_and_no_setpoint() {
 }
 
 #[test]
+fn a_px4_that_holds_its_place_is_asked_to_land_by_itself() {
+    const POSITION: u32 = 0x0003_0000;
+    const HOLD: u32 = 0x0304_0000;
+    const PRECISION_LAND: u32 = 0x0904_0000;
+    let mut flight = flight_with("command", &["mode=landing-target"]);
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(POSITION, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    hover(&mut flight, 20, 1000, POSITION);
+    let reply = flight.command(1000 * MS, &ControllerCommand::Start);
+    assert!(!reply.accepted && reply.reason.contains("HOLD"), "{reply:?}");
+    receive(&mut flight, 1010 * MS, &heartbeat(HOLD, true));
+    assert!(flight.command(1015 * MS, &ControllerCommand::Start).accepted);
+    let sent = hover(&mut flight, 1020, 4900, HOLD);
+    assert_eq!((sent.setpoints, sent.modes.first()), (0, Some(&4.0)), "{sent:?}");
+    assert!(sent.targets.len() > 30, "{sent:?}");
+    receive(&mut flight, 4900 * MS, &heartbeat(PRECISION_LAND, true));
+    hover(&mut flight, 4920, 5500, PRECISION_LAND);
+    assert_eq!(flight.status(5500 * MS).phase, Phase::Final);
+}
+
+#[test]
 fn a_precision_landing_that_is_off_is_reported_with_what_to_set() {
     let mut flight = landing_target("command");
     let requested = hover(&mut flight, 1000, 1500, 4).requested;
