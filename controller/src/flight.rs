@@ -20,11 +20,12 @@ use node::HealthCounters;
 use crate::alarms::Alarms;
 use crate::cameras::Reception;
 use crate::config::{Config, Mode, Start};
+use crate::control::{is_holding_px4, pilots_px4_mode};
 use crate::frames::{Arrival, Frames};
 use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
 use crate::limits::{Limits, Note};
-use crate::mission::{self, Mission, Trigger, is_flying_guided, is_holding_px4};
+use crate::mission::{Mission, Trigger, is_flying_guided};
 use crate::pad_note::{PadNote, PadNotes};
 use crate::setpoints::Setpoints;
 use crate::status::{Used, View};
@@ -341,10 +342,12 @@ impl Flight {
             let result = self.setpoints.stop(now_ns, &mut self.autopilot);
             self.log_setpoint(result);
         }
+        let why = "the controller was ended";
+        let releases = self.mission.give_up_control(now_ns, &mut self.autopilot, why);
         let waits = self.setpoints.end(now_ns, &mut self.autopilot);
         let is_pending = self.limits.restore(&mut self.autopilot);
         self.autopilot.tick(now_ns);
-        is_pending || waits
+        is_pending || releases || waits
     }
 
     /// The next packet for the autopilot.
@@ -433,7 +436,7 @@ impl Flight {
             self.mission.take_control(now_ns, &mut self.autopilot);
             return Ok(self.view().phase(now_ns).1);
         }
-        if let Some(mode) = mission::pilots_px4_mode(&self.autopilot) {
+        if let Some(mode) = pilots_px4_mode(&self.autopilot) {
             return Err(format!(
                 "no landing was started: the vehicle is in {mode}; change to HOLD, from which it is asked to follow setpoints"
             ));
@@ -505,9 +508,9 @@ impl Flight {
             if command == OperatorCommand::Resume {
                 return Err("the landing has not begun; there is nothing to resume".to_owned());
             }
-            let why = "ended by the operator before the vehicle followed setpoints".to_owned();
-            self.mission.give_up_control(now_ns, &mut self.autopilot, why.clone());
-            return Ok(why);
+            let why = "ended by the operator before the vehicle followed setpoints";
+            self.mission.give_up_control(now_ns, &mut self.autopilot, why);
+            return Ok(why.to_owned());
         }
         if !self.is_landing() {
             let (phase, _) = self.view().phase(now_ns);
@@ -541,7 +544,7 @@ impl Flight {
         self.alarms.begin();
         self.mission.begin(now_ns, self.landing_target.is_some());
         match &mut self.landing_target {
-            Some(landing_target) => landing_target.begin(now_ns),
+            Some(landing_target) => landing_target.begin(now_ns, is_holding_px4(&self.autopilot)),
             None => self.decide(now_ns, LanderEvent::Operator(OperatorCommand::Start)),
         }
     }
@@ -556,18 +559,19 @@ impl Flight {
         }
         // The lander refuses a start without a fresh state, and the mission would not try again.
         let state = self.autopilot.state().and_then(wire::vehicle);
-        let is_known = state.is_some_and(|state| {
+        let is_fresh = state.is_some_and(|state| {
             let age_s = Timestamp::from_nanos(now_ns).seconds_since(state.stamp);
             age_s <= self.config.phases.stale_vehicle_s
         });
         // A landing that would see nothing waits; what it waits for stands in the status.
-        let obstacle = if is_known {
+        let obstacle = if is_fresh {
             self.frames.obstacle(now_ns)
         } else {
             Some("waiting for attitude and position".to_owned())
         };
         let steers = self.landing_target.is_none();
-        let trigger = self.mission.step(now_ns, &mut self.autopilot, obstacle.as_deref(), steers);
+        let obstacle = obstacle.as_deref();
+        let trigger = self.mission.step(now_ns, &mut self.autopilot, is_fresh, obstacle, steers);
         let Some(trigger) = trigger else { return };
         let before = (trigger == Trigger::InControl).then(|| self.mission.clone());
         if trigger == Trigger::InFlight && self.config.start == Start::Resume {

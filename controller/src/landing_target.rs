@@ -27,6 +27,8 @@ pub struct LandingTargetMode {
     timeout_s: f64,
     stream: Option<Stream>,
     state: State,
+    /// The landing began with a PX4 that holds its place. Where it did not, HOLD is a pilot's choice.
+    from_hold: bool,
 }
 
 /// Landing targets sent without a gap.
@@ -57,7 +59,7 @@ enum State {
 impl LandingTargetMode {
     /// A mode in which nothing was sent yet; a landing that begins waits `timeout_s` for the marker.
     pub fn new(settings: LandingTargetSettings, timeout_s: f64) -> Self {
-        Self { settings, timeout_s, stream: None, state: State::Idle }
+        Self { settings, timeout_s, stream: None, state: State::Idle, from_hold: false }
     }
 
     /// Sends the landing target of a frame that was used; false when there is nothing to send.
@@ -87,8 +89,10 @@ impl LandingTargetMode {
         is_sent
     }
 
-    /// Begins a landing: LAND is requested once the autopilot has had the target long enough.
-    pub fn begin(&mut self, now_ns: i64) {
+    /// Begins a landing, perhaps of a PX4 that holds its place: LAND is requested once the autopilot has had the target long
+    /// enough.
+    pub fn begin(&mut self, now_ns: i64, from_hold: bool) {
+        self.from_hold = from_hold;
         self.state = State::Stabilising(now_ns);
     }
 
@@ -116,7 +120,9 @@ impl LandingTargetMode {
                 self.state = State::Landing;
                 return true;
             }
-            State::Stabilising(_) | State::Commanding(_) if !waits(state.mode) || !state.armed => {
+            State::Stabilising(_) | State::Commanding(_)
+                if !self.is_waiting_in(state.mode) || !state.armed =>
+            {
                 autopilot.withdraw();
                 self.state = State::Ended(format!("the pilot flies, in {}", state.mode));
             }
@@ -220,6 +226,11 @@ impl LandingTargetMode {
         matches!(self.state, State::Landed | State::Ended(_))
     }
 
+    /// True in the modes in which the vehicle hovers until LAND is requested.
+    fn is_waiting_in(&self, mode: FlightMode) -> bool {
+        mode.is_guided() || self.from_hold && mode == FlightMode::AUTO_HOLD
+    }
+
     fn active_stream(&self, now_ns: i64) -> Option<Stream> {
         self.stream.filter(|stream| now_ns.saturating_sub(stream.last_ns) < MAX_GAP_NS)
     }
@@ -228,12 +239,6 @@ impl LandingTargetMode {
         let steady_ns = (self.settings.steady_s * 1e9) as i64;
         self.active_stream(now_ns).is_some_and(|s| s.last_ns - s.first_ns >= steady_ns)
     }
-}
-
-/// True in the modes in which the vehicle hovers until LAND is requested. A PX4 hovers in HOLD: no setpoint is sent here, so its
-/// failsafe ends OFFBOARD.
-fn waits(mode: FlightMode) -> bool {
-    mode.is_guided() || mode == FlightMode::AUTO_HOLD
 }
 
 /// What keeps this autopilot from using landing targets, and what to do about it.

@@ -19,6 +19,7 @@ pub mod agreement;
 pub mod alarms;
 pub mod cameras;
 pub mod config;
+pub mod control;
 pub mod flight;
 pub mod frames;
 pub mod journal;

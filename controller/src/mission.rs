@@ -1,19 +1,13 @@
 //! The mission: when a landing begins, and what comes before and after it.
 
-use autopilot::{
-    Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, LandedState, Takeoff,
-    TakeoffError, TakeoffProgress,
-};
+use autopilot::{Autopilot, FlightMode, LandedState, Takeoff, TakeoffError, TakeoffProgress};
 
 use crate::config::Start;
+use crate::control::{ControlProgress, TakingControl};
 
 /// Time within which motors that run again mean that a landing had not ended, in nanoseconds: nobody prepares the next
 /// flight so soon, and the autopilot's heartbeat may have been wrong.
 const MAX_REARMED_NS: i64 = 10_000_000_000;
-
-/// Time within which a PX4 must have changed to OFFBOARD, with its heartbeat once a second and repeated requests, in
-/// nanoseconds.
-const MAX_CONTROL_NS: i64 = 10_000_000_000;
 
 /// The mission of a flight.
 #[derive(Clone, Debug)]
@@ -42,12 +36,12 @@ pub enum State {
         /// What it waits for.
         why: String,
     },
-    /// A PX4 that holds its place is asked for OFFBOARD, which it enters only while setpoints come.
+    /// A PX4 that holds its place is asked for OFFBOARD.
     TakingControl {
-        /// The request.
-        request: CommandId,
-        /// Until when it must follow setpoints, in nanoseconds.
-        until_ns: i64,
+        /// The change.
+        control: TakingControl,
+        /// The mission waited for the vehicle to fly, and does so again if the change fails.
+        awaits_takeoff: bool,
     },
     /// The lander decides.
     Landing,
@@ -121,12 +115,20 @@ impl Mission {
         matches!(self.state, State::TakingControl { .. })
     }
 
-    /// Asks a PX4 that holds its place to follow setpoints: nobody can choose OFFBOARD by hand before setpoints come, and
-    /// none are sent before a landing begins. The landing begins once it follows.
+    /// Asks a PX4 that holds its place to follow setpoints. The landing begins once it does.
     pub fn take_control(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
-        let request = autopilot.request(now_ns, Command::SetMode(FlightMode::OFFBOARD));
-        let until_ns = now_ns.saturating_add(MAX_CONTROL_NS);
-        self.state = State::TakingControl { request, until_ns };
+        let awaits_takeoff = self.is_awaiting_takeoff();
+        let control = TakingControl::begin(now_ns, autopilot);
+        self.state = State::TakingControl { control, awaits_takeoff };
+    }
+
+    /// Gives up a change to OFFBOARD; true while one goes on, or may still have to be undone.
+    pub fn give_up_control(&mut self, now_ns: i64, autopilot: &mut Autopilot, why: &str) -> bool {
+        if let State::TakingControl { control, .. } = &mut self.state {
+            control.give_up(now_ns, autopilot, why.to_owned());
+            self.advance_control(now_ns, autopilot, false);
+        }
+        self.is_taking_control()
     }
 
     /// True while a landing begins by itself once the vehicle flies.
@@ -192,6 +194,7 @@ impl Mission {
         &mut self,
         now_ns: i64,
         autopilot: &mut Autopilot,
+        is_fresh: bool,
         obstacle: Option<&str>,
         steers: bool,
     ) -> Option<Trigger> {
@@ -251,51 +254,34 @@ impl Mission {
                     None
                 }
             },
-            State::TakingControl { request, until_ns } => {
-                let (request, until_ns) = (*request, *until_ns);
-                self.advance_control(now_ns, autopilot, request, until_ns)
-            }
+            State::TakingControl { .. } => self.advance_control(now_ns, autopilot, is_fresh),
             State::Idle | State::Landing | State::SendingLandingTarget | State::Failed { .. } => {
                 None
             }
         }
     }
 
-    /// Waits for OFFBOARD. Another mode is the pilot's, and nothing more is asked then.
+    /// Advances a change to OFFBOARD. Whatever is seen of markers then, the lander holds or searches.
     fn advance_control(
         &mut self,
         now_ns: i64,
         autopilot: &mut Autopilot,
-        request: CommandId,
-        until_ns: i64,
+        is_fresh: bool,
     ) -> Option<Trigger> {
-        // Whatever cannot be seen now: in OFFBOARD setpoints must follow at once, and the lander holds or searches.
-        if now_ns <= until_ns && is_flying_guided(autopilot) {
-            return Some(Trigger::InControl);
+        let State::TakingControl { control, awaits_takeoff } = &mut self.state else { return None };
+        let awaits_takeoff = *awaits_takeoff;
+        match control.step(now_ns, autopilot) {
+            ControlProgress::InControl => is_fresh.then_some(Trigger::InControl),
+            ControlProgress::Waiting => None,
+            ControlProgress::Ended(why) => {
+                tracing::warn!(why, "The landing did not begin");
+                self.fail(autopilot, format!("the landing did not begin: {why}"));
+                if awaits_takeoff {
+                    self.stand_down(true);
+                }
+                None
+            }
         }
-        let not_begun = |why: String| format!("the landing did not begin: {why}");
-        let mode = autopilot.state().map(|state| state.mode);
-        match (mode, autopilot.status(request)) {
-            (Some(mode), _) if !mode.is_guided() && mode != FlightMode::AUTO_HOLD => {
-                self.fail(autopilot, not_begun(format!("the pilot took over, in {mode}")));
-            }
-            (_, CommandStatus::Failed(error)) => {
-                self.give_up_control(now_ns, autopilot, not_begun(error.to_string()));
-            }
-            _ if now_ns > until_ns => {
-                let why = not_begun("the vehicle does not follow setpoints in OFFBOARD".to_owned());
-                self.give_up_control(now_ns, autopilot, why);
-            }
-            _ => {}
-        }
-        None
-    }
-
-    /// Ends the mission before the vehicle was seen to follow setpoints. It may have changed to OFFBOARD all the same, which it
-    /// would leave by its failsafe, so it is asked for HOLD.
-    pub fn give_up_control(&mut self, now_ns: i64, autopilot: &mut Autopilot, why: String) {
-        self.fail(autopilot, why);
-        autopilot.request(now_ns, Command::SetMode(FlightMode::AUTO_HOLD));
     }
 
     /// The motors were armed or disarmed; `is_finished` says that the landing had ended.
@@ -323,21 +309,6 @@ impl Mission {
 /// True when the vehicle flies in the mode that follows setpoints.
 pub fn is_flying_guided(autopilot: &Autopilot) -> bool {
     autopilot.state().is_some_and(|s| s.armed && s.mode.is_guided() && s.landed.is_flying())
-}
-
-/// True when it is a PX4 that flies and holds its place.
-pub fn is_holding_px4(autopilot: &Autopilot) -> bool {
-    autopilot.firmware() == Some(Firmware::Px4)
-        && autopilot.state().is_some_and(|s| {
-            s.connected && s.armed && s.mode == FlightMode::AUTO_HOLD && s.landed.is_flying()
-        })
-}
-
-/// The mode in which a pilot, a mission or a failsafe flies a PX4 now.
-pub fn pilots_px4_mode(autopilot: &Autopilot) -> Option<FlightMode> {
-    let state = autopilot.state().filter(|_| autopilot.firmware() == Some(Firmware::Px4))?;
-    let is_ours = state.mode.is_guided() || state.mode.is_landing();
-    (state.armed && state.landed.is_flying() && !is_ours).then_some(state.mode)
 }
 
 /// True when there is no landing to resume: it has ended, though the motors may still run, or the pilot flies. A vehicle

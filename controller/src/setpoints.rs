@@ -24,8 +24,6 @@ pub struct Setpoints {
 
 /// Time after a request in which LAND may not show yet, in nanoseconds.
 const LAND_SHOWS_NS: i64 = 3_000_000_000;
-/// Age up to which a mode can hardly have been changed by a pilot since its heartbeat, in nanoseconds.
-const NEW_MODE_NS: i64 = 200_000_000;
 
 impl Setpoints {
     /// Nothing was sent yet. `stale_after` is the age from which the vehicle's state is not of now.
@@ -118,7 +116,7 @@ impl Setpoints {
         now_ns: i64,
         autopilot: &mut Autopilot,
     ) -> Option<Result<(), SetpointError>> {
-        if autopilot.heartbeat_age_ns(now_ns).is_some_and(|age_ns| age_ns < NEW_MODE_NS) {
+        if autopilot.shows_mode_of_now(now_ns) {
             self.last = None;
             self.request(now_ns, Command::SetMode(FlightMode::AUTO_HOLD), autopilot);
             return None;

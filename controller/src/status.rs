@@ -138,11 +138,11 @@ impl View<'_> {
                 (Phase::Idle, "waiting for the vehicle to fly in GUIDED".to_owned())
             }
             (State::TakingOff { why, .. }, _) => (Phase::Takeoff, why.clone()),
-            (State::TakingControl { .. }, _) => (
-                Phase::Idle,
-                "changing to OFFBOARD; the landing begins once the vehicle follows setpoints"
-                    .to_owned(),
-            ),
+            (State::TakingControl { control, .. }, _) => {
+                let waits =
+                    "changing to OFFBOARD; the landing begins once the vehicle follows setpoints";
+                (Phase::Idle, control.given_up().unwrap_or(waits).to_owned())
+            }
             (State::Failed { why }, _) => (Phase::Failed, why.clone()),
             (State::Landing, _) => (wire::phase(self.lander.phase()), self.reason()),
         }

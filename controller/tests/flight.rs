@@ -407,8 +407,6 @@ fn precision_landing_gets_the_target_and_no_setpoint() {
 
 #[test]
 fn a_px4_that_holds_its_place_is_asked_to_land_by_itself() {
-    const POSITION: u32 = 0x0003_0000;
-    const HOLD: u32 = 0x0304_0000;
     const PRECISION_LAND: u32 = 0x0904_0000;
     let mut flight = flight_with("command", &["mode=landing-target"]);
     flight.camera(0, CameraInfo::sample());
@@ -426,6 +424,18 @@ fn a_px4_that_holds_its_place_is_asked_to_land_by_itself() {
     receive(&mut flight, 4900 * MS, &heartbeat(PRECISION_LAND, true));
     hover(&mut flight, 4920, 5500, PRECISION_LAND);
     assert_eq!(flight.status(5500 * MS).phase, Phase::Final);
+
+    // Of one that began in OFFBOARD, HOLD is a pilot's choice.
+    let mut flight = flight_with("command", &["mode=landing-target"]);
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(OFFBOARD, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    hover(&mut flight, 20, 1000, OFFBOARD);
+    assert!(flight.command(1000 * MS, &ControllerCommand::Start).accepted);
+    let sent = hover(&mut flight, 2000, 6000, HOLD);
+    assert!(sent.modes.is_empty(), "{sent:?}");
+    assert_eq!(flight.status(6000 * MS).phase, Phase::Aborted);
 }
 
 #[test]
@@ -543,7 +553,6 @@ fn landing_here_needs_neither_detections_nor_a_landing() {
 #[test]
 fn a_px4_is_asked_to_hold_its_place_when_setpoints_end() {
     const GUIDED: u32 = 4;
-    const OFFBOARD: u32 = 0x0006_0000;
     let begun = |mode| {
         let mut flight = flight("airborne");
         receive(&mut flight, 0, &heartbeat(mode, true));
@@ -581,41 +590,49 @@ fn a_px4_is_asked_to_hold_its_place_when_setpoints_end() {
     }
 }
 
+const POSITION: u32 = 0x0003_0000;
+const HOLD: u32 = 0x0304_0000;
+const OFFBOARD: u32 = 0x0006_0000;
+
+/// A PX4 that flies in this mode, one second long.
+fn px4_in(mode: u32, start: &str) -> Flight {
+    let mut flight = flight(start);
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(mode, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    assert_eq!(hover(&mut flight, 20, 1000, mode).setpoints, 0);
+    flight
+}
+
+/// One that holds its place was asked for OFFBOARD at 3 s, and has not shown it.
+fn px4_asked_for_offboard(start: &str) -> Flight {
+    let mut flight = px4_in(HOLD, start);
+    let reply = flight.command(1000 * MS, &ControllerCommand::Start);
+    assert!(reply.accepted && reply.reason.contains("OFFBOARD"), "{reply:?}");
+    let sent = hover(&mut flight, 1000, 2980, HOLD);
+    assert!(sent.setpoints > 15, "{sent:?}");
+    assert!(sent.modes.is_empty(), "2 s is too early, and then the mode is not known: {sent:?}");
+    let sent = hover(&mut flight, 2980, 3100, HOLD);
+    assert_eq!(sent.modes, [6.0], "{sent:?}");
+    assert_eq!(flight.status(3100 * MS).phase, Phase::Idle);
+    flight
+}
+
 #[test]
 fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_started() {
-    const POSITION: u32 = 0x0003_0000;
-    const HOLD: u32 = 0x0304_0000;
-    const OFFBOARD: u32 = 0x0006_0000;
-    let holding = |mode| {
-        let mut flight = flight("command");
-        flight.camera(0, CameraInfo::sample());
-        flight.presence(0, "main", true);
-        receive(&mut flight, 0, &heartbeat(mode, true));
-        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
-        assert_eq!(hover(&mut flight, 20, 1000, mode).setpoints, 0);
-        flight
-    };
-    let started = || {
-        let mut flight = holding(HOLD);
-        let reply = flight.command(1000 * MS, &ControllerCommand::Start);
-        assert!(reply.accepted && reply.reason.contains("OFFBOARD"), "{reply:?}");
-        let sent = hover(&mut flight, 1020, 2400, HOLD);
-        assert!(sent.setpoints > 5 && sent.modes.first() == Some(&6.0), "{sent:?}");
-        assert_eq!(flight.status(2400 * MS).phase, Phase::Idle);
-        flight
-    };
-    let mut flight = started();
-    assert!(!flight.command(2400 * MS, &ControllerCommand::Start).accepted, "it is under way");
-    receive(&mut flight, 2400 * MS, &heartbeat(OFFBOARD, true));
-    let sent = hover(&mut flight, 2420, 3000, OFFBOARD);
-    let status = flight.status(3000 * MS);
+    let mut flight = px4_asked_for_offboard("command");
+    assert!(!flight.command(3100 * MS, &ControllerCommand::Start).accepted, "it is under way");
+    receive(&mut flight, 3100 * MS, &heartbeat(OFFBOARD, true));
+    let sent = hover(&mut flight, 3120, 3700, OFFBOARD);
+    let status = flight.status(3700 * MS);
     assert!(sent.setpoints > 10, "{sent:?}");
     assert!(matches!(status.phase, Phase::Approach | Phase::Descend), "{status:?}");
 
     // The markers are of no use any more when it has changed.
-    let mut flight = started();
-    receive(&mut flight, 2400 * MS, &heartbeat(OFFBOARD, true));
-    for ms in (2420..4000).step_by(20) {
+    let mut flight = px4_asked_for_offboard("command");
+    receive(&mut flight, 3100 * MS, &heartbeat(OFFBOARD, true));
+    for ms in (3120..5000).step_by(20) {
         if ms % 1000 == 0 {
             receive(&mut flight, ms * MS, &heartbeat(OFFBOARD, true));
         }
@@ -624,36 +641,30 @@ fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_sta
     }
     let mut sent = Sent::default();
     sent.take(&mut flight);
-    assert!(sent.setpoints > 30, "{sent:?} {:?}", flight.status(4000 * MS));
+    assert!(sent.setpoints > 30, "{sent:?} {:?}", flight.status(5000 * MS));
 
-    // The pilot takes over before it changed.
-    let mut flight = started();
-    receive(&mut flight, 2400 * MS, &heartbeat(POSITION, true));
-    let sent = hover(&mut flight, 2420, 6000, POSITION);
-    let status = flight.status(6000 * MS);
-    assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
-    assert!(status.phase == Phase::Failed && status.why.contains("pilot"), "{status:?}");
-
-    // The operator changes their mind; it may have changed by now.
-    for command in [ControllerCommand::Abort, ControllerCommand::Hold] {
-        let mut flight = started();
-        assert!(!flight.command(2400 * MS, &ControllerCommand::Resume).accepted);
-        assert!(flight.command(2400 * MS, &command).accepted);
-        let sent = hover(&mut flight, 2420, 3900, HOLD);
-        assert_eq!((sent.setpoints, sent.modes.first()), (0, Some(&4.0)), "{sent:?}");
-        assert_eq!(flight.status(3900 * MS).phase, Phase::Failed);
+    // The pilot takes over before it changed; a controller that lands flight after flight waits for the next one.
+    for (start, phase) in [("command", Phase::Failed), ("airborne", Phase::Idle)] {
+        let mut flight = px4_asked_for_offboard(start);
+        receive(&mut flight, 3100 * MS, &heartbeat(POSITION, true));
+        let sent = hover(&mut flight, 3220, 6000, POSITION);
+        assert!(sent.setpoints <= 1 && sent.modes.is_empty(), "{sent:?}");
+        let status = flight.status(6000 * MS);
+        assert_eq!(status.phase, phase, "{status:?}");
+        assert!(phase == Phase::Idle || status.why.contains("pilot"), "{status:?}");
     }
 
     // It never changes.
-    let mut flight = started();
-    hover(&mut flight, 2420, 14_000, HOLD);
-    let status = flight.status(14_000 * MS);
+    let mut flight = px4_asked_for_offboard("command");
+    hover(&mut flight, 3100, 25_000, HOLD);
+    let status = flight.status(25_000 * MS);
     assert!(status.phase == Phase::Failed && status.why.contains("did not begin"), "{status:?}");
-    assert_eq!(hover(&mut flight, 14_020, 20_000, HOLD).setpoints, 0);
-    assert!(flight.command(20_000 * MS, &ControllerCommand::Start).accepted, "once more");
+    let sent = hover(&mut flight, 25_000, 30_000, HOLD);
+    assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
+    assert!(flight.command(30_000 * MS, &ControllerCommand::Start).accepted, "once more");
 
     // A pilot is not disturbed.
-    let mut flight = holding(POSITION);
+    let mut flight = px4_in(POSITION, "command");
     let reply = flight.command(1000 * MS, &ControllerCommand::Start);
     assert!(!reply.accepted && reply.reason.contains("HOLD"), "{reply:?}");
     let sent = hover(&mut flight, 1020, 3000, POSITION);
@@ -661,8 +672,81 @@ fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_sta
 }
 
 #[test]
+fn a_px4_that_may_have_changed_to_offboard_is_not_left_there_when_the_start_is_given_up() {
+    let given_up = |command: &ControllerCommand| {
+        let mut flight = px4_asked_for_offboard("command");
+        assert!(!flight.command(3100 * MS, &ControllerCommand::Resume).accepted);
+        assert!(flight.command(3100 * MS, command).accepted);
+        let sent = hover(&mut flight, 3120, 3980, HOLD);
+        assert!(sent.setpoints > 10 && sent.modes.is_empty(), "it is not known yet: {sent:?}");
+        flight
+    };
+    for command in [ControllerCommand::Abort, ControllerCommand::Hold] {
+        // It has not changed.
+        let mut flight = given_up(&command);
+        let sent = hover(&mut flight, 3980, 6000, HOLD);
+        assert!(sent.setpoints <= 2 && sent.modes.is_empty(), "{sent:?}");
+        assert_eq!(flight.status(6000 * MS).phase, Phase::Failed);
+        // It has changed, and the first request for HOLD is lost.
+        let mut flight = given_up(&command);
+        let sent = hover(&mut flight, 3980, 5900, OFFBOARD);
+        assert!(sent.setpoints > 30 && sent.modes.len() >= 2, "{sent:?}");
+        assert!(sent.modes.iter().all(|mode| *mode == 4.0), "{sent:?}");
+        let sent = hover(&mut flight, 6000, 8000, HOLD);
+        assert!(sent.setpoints <= 2 && sent.modes.is_empty(), "{sent:?}");
+        assert_eq!(flight.status(8000 * MS).phase, Phase::Failed);
+        // The pilot has taken over.
+        let mut flight = given_up(&command);
+        let sent = hover(&mut flight, 4000, 8000, POSITION);
+        assert!(sent.setpoints <= 1 && sent.modes.is_empty(), "{sent:?}");
+        assert_eq!(flight.status(8000 * MS).phase, Phase::Failed);
+    }
+
+    // The controller is ended, before it asked and after.
+    let mut flight = px4_in(HOLD, "command");
+    flight.command(1000 * MS, &ControllerCommand::Start);
+    hover(&mut flight, 1020, 1900, HOLD);
+    assert!(flight.shutdown(1900 * MS));
+    receive(&mut flight, 2200 * MS, &heartbeat(HOLD, true));
+    assert!(!flight.shutdown(2210 * MS));
+    let mut sent = Sent::default();
+    sent.take(&mut flight);
+    assert!(sent.modes.is_empty(), "{sent:?}");
+    let mut flight = px4_asked_for_offboard("command");
+    assert!(flight.shutdown(3100 * MS));
+    receive(&mut flight, 3500 * MS, &heartbeat(OFFBOARD, true));
+    assert!(flight.shutdown(3510 * MS));
+    assert!(flight.shutdown(3520 * MS));
+    let mut sent = Sent::default();
+    sent.take(&mut flight);
+    assert_eq!(sent.modes, [4.0], "{sent:?}");
+    receive(&mut flight, 4000 * MS, &heartbeat(HOLD, true));
+    assert!(!flight.shutdown(4010 * MS));
+}
+
+#[test]
+fn a_px4_whose_state_is_not_known_in_offboard_gets_zeros_and_is_taken_back() {
+    let mut flight = px4_asked_for_offboard("command");
+    let mut sent = Sent::default();
+    for ms in (3120..9000).step_by(20) {
+        if ms % 1000 == 700 {
+            let is_asked = sent.modes.contains(&4.0);
+            let mode = if is_asked { HOLD } else { OFFBOARD };
+            receive(&mut flight, ms * MS, &heartbeat(mode, true));
+        }
+        flight.tick(ms * MS + 3);
+        sent.take(&mut flight);
+        if ms == 5200 {
+            assert!(sent.setpoints > 30 && sent.modes.is_empty(), "{sent:?}");
+        }
+    }
+    assert_eq!(sent.modes.first(), Some(&4.0), "{sent:?}");
+    let status = flight.status(9000 * MS);
+    assert!(status.phase == Phase::Failed && status.why.contains("not known"), "{status:?}");
+}
+
+#[test]
 fn a_px4_is_asked_to_hold_its_place_only_while_its_position_is_no_older_than_configured() {
-    const OFFBOARD: u32 = 0x0006_0000;
     for (set, is_asked) in
         [("phases.stale_vehicle_s=0.5", false), ("phases.stale_vehicle_s=0.9", true)]
     {

@@ -15,7 +15,8 @@ use geometry::{Body, Ned, Point, Vector};
 use crate::boot::{BootClock, BootTime};
 use crate::clock::Clock;
 use crate::command::{
-    Command, CommandError, CommandId, CommandStatus, Request, SetpointError, Step, ns,
+    Command, CommandError, CommandId, CommandStatus, MODE_OF_NOW_NS, Request, SetpointError, Step,
+    ns,
 };
 use crate::compose;
 use crate::config::Config;
@@ -60,6 +61,7 @@ pub struct Autopilot {
     clock: Clock,
     parameters: Parameters,
     proof_due_ns: i64,
+    zeros_until_ns: i64,
     streams: Streams,
     requests: Vec<Request>,
     outcomes: VecDeque<(CommandId, CommandStatus)>,
@@ -102,6 +104,7 @@ impl Autopilot {
             clock: Clock::default(),
             parameters: Parameters::new(&config.parameters),
             proof_due_ns: i64::MIN,
+            zeros_until_ns: i64::MIN,
             config,
             vehicle: None,
             requests: Vec::new(),
@@ -321,7 +324,7 @@ impl Autopilot {
             let error = CommandError::Replaced { command: old.command, by: command };
             self.finish(old.id, old.command, Err(error));
         }
-        let proven = command != Command::SetMode(FlightMode::OFFBOARD);
+        let proven = !command.needs_mode_of_now();
         let from_ns = if proven { now_ns } else { now_ns.saturating_add(PROOF_NS) };
         match self.refusal(command) {
             Some(error) => self.finish(id, command, Err(error)),
@@ -348,6 +351,17 @@ impl Autopilot {
     /// Time since the last heartbeat, which tells mode and motors, in ns; `None` before the first.
     pub fn heartbeat_age_ns(&self, now_ns: i64) -> Option<i64> {
         self.vehicle.as_ref().map(|vehicle| now_ns.saturating_sub(vehicle.heartbeat_ns))
+    }
+
+    /// True just after a heartbeat: a pilot can hardly have changed the mode since.
+    pub fn shows_mode_of_now(&self, now_ns: i64) -> bool {
+        self.heartbeat_age_ns(now_ns).is_some_and(|age_ns| age_ns < MODE_OF_NOW_NS)
+    }
+
+    /// Sends setpoints of zero velocity until then: before OFFBOARD, and until it shows whether a PX4 has changed to it. All other
+    /// modes ignore them.
+    pub fn send_zeros_until(&mut self, until_ns: i64) {
+        self.zeros_until_ns = until_ns;
     }
 
     /// Sends a velocity in m/s, with a yaw rate in rad/s (0 holds the heading): at least twice a second,
@@ -443,11 +457,10 @@ impl Autopilot {
         }
     }
 
-    /// While OFFBOARD is requested, PX4 gets setpoints of zero velocity.
+    /// While OFFBOARD is requested, and as long as asked for, PX4 gets setpoints of zero velocity.
     fn prove_setpoints(&mut self, now_ns: i64) {
-        let offboard = Command::SetMode(FlightMode::OFFBOARD);
-        let is_requested = self.requests.iter().any(|request| request.command == offboard);
-        if !is_requested || now_ns < self.proof_due_ns {
+        let is_requested = self.requests.iter().any(|request| request.command.needs_mode_of_now());
+        if !(is_requested || now_ns < self.zeros_until_ns) || now_ns < self.proof_due_ns {
             return;
         }
         self.proof_due_ns = now_ns.saturating_add(PROOF_PERIOD_NS);
@@ -786,10 +799,11 @@ impl Autopilot {
 
     fn step_requests(&mut self, now_ns: i64) {
         let Some(state) = self.state().copied() else { return };
+        let is_of_now = self.shows_mode_of_now(now_ns);
         let timeouts = self.config.timeouts;
         let mut index = 0;
         while let Some(request) = self.requests.get_mut(index) {
-            match request.step(now_ns, &state, &timeouts) {
+            match request.step(now_ns, &state, is_of_now, &timeouts) {
                 Step::Wait => index += 1,
                 Step::Send(command, attempt) => {
                     index += 1;

@@ -258,10 +258,9 @@ impl Command {
         matches!(self, Self::Takeoff { .. })
     }
 
-    /// Whether it is sent whatever the state shows. The mode is known from a heartbeat, and a PX4 that is told to hold its
-    /// place may have followed an earlier request for OFFBOARD since.
-    pub(crate) fn is_always_sent(&self) -> bool {
-        self.is_done_when_accepted() || *self == Self::SetMode(FlightMode::AUTO_HOLD)
+    /// Whether it is sent only just after a heartbeat that shows the mode: OFFBOARD takes the vehicle from whoever flies it.
+    pub(crate) fn needs_mode_of_now(&self) -> bool {
+        *self == Self::SetMode(FlightMode::OFFBOARD)
     }
 
     pub(crate) fn problem(&self, state: Option<&VehicleState>) -> Option<&'static str> {
@@ -331,6 +330,8 @@ impl Default for Timeouts {
     }
 }
 
+/// Maximum age of a heartbeat whose mode is the one of now, in nanoseconds.
+pub(crate) const MODE_OF_NOW_NS: i64 = 200_000_000;
 /// Maximum number of texts kept as an explanation.
 const MAX_TEXTS: usize = 8;
 
@@ -398,17 +399,25 @@ impl Request {
         };
     }
 
-    pub(crate) fn step(&mut self, now_ns: i64, state: &VehicleState, timeouts: &Timeouts) -> Step {
+    /// The next step, where `is_of_now` says that the state's mode has just been shown by a heartbeat.
+    pub(crate) fn step(
+        &mut self,
+        now_ns: i64,
+        state: &VehicleState,
+        is_of_now: bool,
+        timeouts: &Timeouts,
+    ) -> Step {
         let command = self.command;
+        let waits = command.needs_mode_of_now() && !is_of_now;
         let sent = self.attempts > 0;
-        if command.is_shown_by(state) && (sent || !command.is_always_sent()) {
+        if command.is_shown_by(state) && (sent || !command.is_done_when_accepted()) {
             return Step::Finish(Ok(()));
         }
         match self.phase {
-            Phase::Due(at) if now_ns >= at => self.send(now_ns, timeouts),
+            Phase::Due(at) if now_ns >= at && !waits => self.send(now_ns, timeouts),
             Phase::Sent(until) if now_ns >= until => {
                 if self.attempts < timeouts.attempts {
-                    return self.send(now_ns, timeouts);
+                    return if waits { Step::Wait } else { self.send(now_ns, timeouts) };
                 }
                 Step::Finish(Err(CommandError::NoAnswer { command, attempts: self.attempts }))
             }

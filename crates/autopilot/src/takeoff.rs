@@ -91,7 +91,7 @@ pub enum TakeoffProgress {
 pub enum TakeoffError {
     /// The pilot flies, or has taken over.
     #[error(
-        "no takeoff: the vehicle is {landed} in {mode}, so the pilot is in command; change to GUIDED (OFFBOARD on PX4) to hand over"
+        "no takeoff: the vehicle is {landed} in {mode}, so the pilot is in command; change to GUIDED to hand over (a PX4: to HOLD, and start the landing by command)"
     )]
     PilotInCommand {
         /// The pilot's mode.

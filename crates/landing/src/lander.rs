@@ -1,9 +1,11 @@
 //! The landing decision as one function of time and events.
 
+mod aborted;
+
 use geometry::{Ned, Odometry, Point, Vector};
 
 use crate::axis_check::{AxisConsistencyCheck, AxisError, Verdict};
-use crate::config::{AlarmAction, Config, GuidanceConfig, OnAbort};
+use crate::config::{AlarmAction, Config, GuidanceConfig};
 use crate::decision::{Action, Decision, Phase, Reason, Rejection, TargetEstimate};
 use crate::envelope;
 use crate::event::{
@@ -32,9 +34,6 @@ const HAND_OVER_S: f64 = 1.0;
 /// Height over the one at which it waits for detectors to agree, at which the vehicle counts as waiting, in
 /// metres.
 const DISPUTE_MARGIN_M: f64 = 0.5;
-
-/// Time an aborted landing climbs and holds before it stops sending setpoints, in seconds.
-const CLIMB_AWAY_S: f64 = 60.0;
 
 /// Maximum height over the target or the ground, in metres, at which the autopilot's report of the ground is
 /// believed: estimates of the height err by decimetres.
@@ -95,6 +94,8 @@ pub struct Lander {
     land_requested: Option<Timestamp>,
     /// Height over the local origin to which a retry climbs, in metres.
     retry_to_m: Option<f64>,
+    /// Since when an aborted landing hovers at its height.
+    hovers_since: Option<Timestamp>,
     /// Smallest angle from the image's centre to its edge, in radians.
     half_view_rad: Option<f64>,
     /// The expanding square that is being flown.
@@ -141,6 +142,7 @@ impl Lander {
             state_machine: StateMachine::new(config.phases),
             land_requested: None,
             retry_to_m: None,
+            hovers_since: None,
             half_view_rad: None,
             square: None,
             limits: AutopilotLimits::default(),
@@ -584,6 +586,9 @@ impl Lander {
         if !retrying {
             self.retry_to_m = None;
         }
+        if self.state_machine.phase() != Phase::Aborted {
+            self.hovers_since = None;
+        }
         if !guided && !handing_over && !retrying {
             self.guidance.reset();
         }
@@ -673,8 +678,7 @@ impl Lander {
         let to_m = *self.retry_to_m.get_or_insert(climbed_m);
         let situation = self.situation(now, &vehicle);
         let (wanted, _) = self.guidance.velocity(&situation);
-        // Over the last half metre the climb slows down.
-        let climb_m_s = (2.0 * (to_m - altitude_m)).clamp(0.0, phases.retry_climb_m_s);
+        let climb_m_s = self.climb_speed(to_m - altitude_m);
         let wanted = Vector::new(wanted.x(), wanted.y(), -climb_m_s);
         let wanted = envelope::below_fence(&phases, vehicle.position, wanted);
         let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
@@ -798,55 +802,8 @@ impl Lander {
         self.land_requested.is_none_or(is_due)
     }
 
-    fn aborted(&mut self, now: Timestamp) -> Action {
-        let phases = self.config.phases;
-        if self.state_machine.is_recalling() {
-            return self.recall(now);
-        }
-        let follows = self
-            .history
-            .newest()
-            .is_some_and(|state| now.seconds_since(state.stamp) <= phases.stale_vehicle_s)
-            && self.status.is_some_and(|status| status.armed && status.mode == Mode::Guided);
-        if self.state_machine.is_released() || !follows {
-            return Action::None;
-        }
-        let elapsed_s = self.state_machine.elapsed_s(now);
-        match phases.on_abort {
-            OnAbort::Hover if elapsed_s <= phases.release_after_s => self.hover_aborted(now),
-            OnAbort::Land if elapsed_s <= phases.land_timeout_s => self.request_land(now),
-            OnAbort::Climb if elapsed_s <= CLIMB_AWAY_S => self.climb_away(now),
-            OnAbort::Hover | OnAbort::Land | OnAbort::Climb => Action::None,
-        }
-    }
-
-    /// Requests the mode that follows setpoints, at once and at intervals.
-    fn recall(&mut self, now: Timestamp) -> Action {
-        if !self.is_ours() || !self.is_land_request_due(now) {
-            return Action::None;
-        }
-        self.land_requested = Some(now);
-        Action::Guided
-    }
-
-    /// Hovers, at `abort_hover_m` or higher: where the autopilot's velocity errs, a vehicle that hovers low drifts onto the
-    /// ground.
-    fn hover_aborted(&self, now: Timestamp) -> Action {
-        let Some(vehicle) = self.history.newest() else { return Action::hover() };
-        if self.landed(now) == Landed::OnGround {
-            return Action::hover();
-        }
-        let phases = &self.config.phases;
-        let wanted_m = self.altitude_m(now, phases.abort_hover_m);
-        let to_m = libm::fmin(wanted_m, self.altitude_of(self.start));
-        let climb_m_s = (2.0 * (to_m + vehicle.position.z())).clamp(0.0, phases.retry_climb_m_s);
-        self.climb(climb_m_s)
-    }
-
-    /// Climbs to `abort_height_m` and stays there.
-    fn climb_away(&self, now: Timestamp) -> Action {
-        let altitude_m = self.history.newest().map_or(f64::MAX, |state| -state.position.z());
-        let to_m = self.altitude_m(now, self.config.phases.abort_height_m);
-        self.climb((to_m - altitude_m).clamp(0.0, self.config.envelope.climb_m_s))
+    /// The speed of a climb by so much, in m/s: over the last half metre it slows down.
+    fn climb_speed(&self, missing_m: f64) -> f64 {
+        (2.0 * missing_m).clamp(0.0, self.config.phases.retry_climb_m_s)
     }
 }

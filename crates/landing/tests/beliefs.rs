@@ -306,6 +306,39 @@ fn a_landing_aborted_low_hovers_where_a_drift_does_not_touch_the_ground() {
     let mut never = config;
     never.phases.abort_hover_m = 0.0;
     assert!(hovers_m(never, 6.0, 0.8) < 0.9);
+
+    // A long climb is flown to its end, hovers as long as configured, and ends with a setpoint that stops.
+    let mut high = config;
+    high.phases.abort_hover_m = 7.0;
+    let mut told = Told::started(high, 9.0);
+    told.pad = Some(Point::origin());
+    while told.position.z() < -0.8 {
+        told.fly(STEP_S);
+    }
+    told.tell(Event::Operator(OperatorCommand::Abort));
+    told.fly(9.0);
+    assert!((told.position.z() + 7.0).abs() < 0.2, "{:?}", told.position);
+    told.fly(8.0);
+    assert!((told.position.z() + 7.0).abs() < 0.2, "{:?}", told.position);
+    assert_eq!(told.decisions.last().unwrap().1.action, Action::None);
+}
+
+#[test]
+fn a_vehicle_that_may_stand_is_not_lifted_by_an_abort() {
+    for height_m in [0.0, 0.2, 0.45] {
+        let mut told = Told::started(Config::default(), 5.0);
+        told.pad = Some(Point::origin());
+        told.fly(2.0);
+        while told.position.z() < -height_m {
+            told.fly(STEP_S);
+        }
+        // It stands on the pad, though its autopilot does not say so.
+        told.velocity = Vector::zero();
+        told.run(1.0, true);
+        told.tell(Event::Operator(OperatorCommand::Abort));
+        told.fly(4.5);
+        assert!((told.position.z() + height_m).abs() < 0.1, "{height_m}: {:?}", told.position);
+    }
 }
 
 #[test]
