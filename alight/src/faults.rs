@@ -159,7 +159,9 @@ fn run_in_real_time(
             outcome.phase,
             outcome.why,
         ));
-        folder.keep_logs(flight.seed)?;
+        if let Err(problem) = folder.keep_logs(flight.seed) {
+            write_error(&format!("warning: {problem:#}"));
+        }
         findings.outcomes.push(outcome);
         steps.flown(findings.outcomes.len(), planned);
         // What there is, should the next one end this process.

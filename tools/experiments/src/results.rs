@@ -122,23 +122,19 @@ impl Folder {
         Ok(logs)
     }
 
-    /// Gives the logs of a flight that counts their place, instead of those of an earlier run.
+    /// Gives the logs of a flight that counts their place, instead of those of an earlier run. What is not of a process stays
+    /// where it is.
     ///
     /// # Errors
-    /// When those cannot be removed, or these not be moved.
+    /// When those cannot be removed, or these not be moved: they are left where they were written, and the flight counts.
     pub fn keep_logs(&mut self, seed: u64) -> anyhow::Result<()> {
         let (from, to) = (self.unfinished_logs(seed), self.path.join(format!("{LOGS}{seed}")));
         let (of_this_flight, others) =
             std::mem::take(&mut self.old).into_iter().partition(|old| old.starts_with(&to));
         self.old = others;
-        remove(of_this_flight)?;
-        // One by one: the folder stays where it has files of the user.
-        std::fs::create_dir_all(&to).with_context(|| format!("making {}", to.display()))?;
-        for name in names(&from)? {
-            std::fs::rename(from.join(&name), to.join(&name))
-                .with_context(|| format!("moving {name} into {}", to.display()))?;
-        }
-        std::fs::remove_dir(&from).with_context(|| format!("removing {}", from.display()))
+        remove(of_this_flight)
+            .and_then(|()| move_logs(&from, &to))
+            .with_context(|| format!("leaving logs of a flight in {}", from.display()))
     }
 
     fn unfinished_logs(&self, seed: u64) -> PathBuf {
@@ -157,9 +153,34 @@ fn written(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     add(folder.to_owned(), &is_result)?;
     add(folder.join(RECORDINGS), &is_of_a_row)?;
     for logs in names(folder)?.iter().filter(|name| is_of_logs(name)) {
-        add(folder.join(logs), &is_of_a_process)?;
+        let logs = folder.join(logs);
+        // No process makes a folder there.
+        add(logs.clone(), &|name| is_of_a_process(name) && !logs.join(name).is_dir())?;
     }
     Ok(old)
+}
+
+/// Moves the logs of a flight, one by one, since both folders may have files of the user: all of them, or none where one would
+/// overwrite such a file.
+fn move_logs(from: &Path, to: &Path) -> anyhow::Result<()> {
+    std::fs::create_dir_all(to).with_context(|| format!("making {}", to.display()))?;
+    let mut logs = names(from)?;
+    logs.retain(|name| is_of_a_process(name));
+    if let Some(taken) = logs.iter().map(|name| to.join(name)).find(|path| is_there(path)) {
+        bail!("{} is not of an experiment, and would be overwritten", taken.display());
+    }
+    for name in logs {
+        std::fs::rename(from.join(&name), to.join(&name))
+            .with_context(|| format!("moving {name} into {}", to.display()))?;
+    }
+    // One with files of the user stays.
+    let _ = std::fs::remove_dir(from);
+    Ok(())
+}
+
+/// Whether something has this name, be it a link to nothing.
+fn is_there(path: &Path) -> bool {
+    path.symlink_metadata().is_ok()
 }
 
 fn remove(old: Vec<PathBuf>) -> anyhow::Result<()> {
@@ -367,6 +388,57 @@ mod tests {
         let kept = folder.path().join("logs-1");
         assert_eq!(names(&kept).unwrap(), ["mine", "world.log"]);
         assert_eq!(std::fs::read_to_string(kept.join("world.log")).unwrap(), "new");
+    }
+
+    #[test]
+    fn what_the_user_has_in_the_folders_of_logs_is_neither_moved_nor_overwritten() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["logs-1-unfinished/notes", "logs-1/notes", "logs-2/world.log/notes"] {
+            write(folder.path(), name, "of the user");
+        }
+        let mut claimed = Folder::claim(folder.path(), false).unwrap();
+        for seed in [1, 2, 3] {
+            let logs = claimed.begin_logs(seed).unwrap();
+            write(&logs, "camera.log", "new");
+            write(&logs, "world.log", "new");
+        }
+        // It came after the folder was claimed.
+        write(folder.path(), "logs-3/world.log", "of the user");
+        claimed.keep_logs(1).unwrap();
+        for (seed, taken) in [(2, "logs-2/world.log"), (3, "logs-3/world.log")] {
+            let problem = format!("{:#}", claimed.keep_logs(seed).unwrap_err());
+            for part in [taken, &format!("in {}", claimed.unfinished_logs(seed).display())] {
+                assert!(problem.contains(part), "`{part}` is not in: {problem}");
+            }
+            assert_eq!(names(&claimed.unfinished_logs(seed)).unwrap(), ["camera.log", "world.log"]);
+        }
+        // Those flights count all the same.
+        claimed.put(FLIGHTS_AS_CSV, "new").unwrap();
+        let kept = [
+            ("logs-1-unfinished/notes", "of the user"),
+            ("logs-1/notes", "of the user"),
+            ("logs-1/world.log", "new"),
+            ("logs-2/world.log/notes", "of the user"),
+            ("logs-3/world.log", "of the user"),
+            (FLIGHTS_AS_CSV, "new"),
+        ];
+        for (name, text) in kept {
+            assert_eq!(std::fs::read_to_string(folder.path().join(name)).unwrap(), text, "{name}");
+        }
+    }
+
+    #[test]
+    fn a_folder_of_the_user_among_old_logs_stays_and_costs_no_new_result() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["logs-1/camera.log", "logs-2/camera.log/notes", "logs-2/world.log"] {
+            write(folder.path(), name, "old");
+        }
+        let mut claimed = Folder::claim(folder.path(), true).unwrap();
+        write(&claimed.begin_logs(1).unwrap(), "world.log", "new");
+        claimed.keep_logs(1).unwrap();
+        claimed.put(FLIGHTS_AS_CSV, "new").unwrap();
+        assert_eq!(names(&folder.path().join("logs-1")).unwrap(), ["world.log"]);
+        assert_eq!(names(&folder.path().join("logs-2")).unwrap(), ["camera.log"]);
     }
 
     #[test]
