@@ -30,6 +30,8 @@ const QUESTION_PERIOD_NS: i64 = 2_000_000_000;
 pub(crate) struct Listener {
     newest: Option<u16>,
     in_report: bool,
+    /// Whether all of that report came so far.
+    is_whole: bool,
     /// The modes in which it can be armed; none while unknown.
     can_arm: u32,
     checks: Vec<Failing>,
@@ -42,7 +44,7 @@ pub(crate) struct Listener {
 /// What came of the question for a report.
 #[derive(Copy, Clone, Debug, Default)]
 struct Question {
-    /// A report came, asked for or not, or the question was refused.
+    /// A whole report came, asked for or not, or the question was refused.
     is_over: bool,
     asked: u8,
     due_ns: Option<i64>,
@@ -86,18 +88,19 @@ impl Listener {
         }
         if self.newest.is_some_and(|newest| event.sequence != newest.wrapping_add(1)) {
             // The end of a report may be among what was lost.
-            self.in_report = false;
+            (self.in_report, self.is_whole) = (false, false);
         }
         self.newest = Some(event.sequence);
         match px4_events::read(event, self.in_report)? {
             Px4Event::ChecksBegin { can_arm } => {
-                self.question.is_over = true;
                 self.can_arm = can_arm;
                 self.begin_report();
+                self.is_whole = true;
                 None
             }
             Px4Event::ChecksEnd => {
-                self.in_report = false;
+                self.question.is_over |= self.is_whole;
+                (self.in_report, self.is_whole) = (false, false);
                 None
             }
             Px4Event::Told(Told { severity, text, is_known, check: None }) => {
@@ -129,9 +132,16 @@ impl Listener {
         Some(compose::run_prearm_checks())
     }
 
-    /// The question was acknowledged. A PX4 that refuses it does so each time; of one that accepted it the report may be lost.
+    /// The question was acknowledged. A PX4 that refuses it does so each time, unless it says that it does so for now; of one that
+    /// accepted it the report may be lost.
     pub(crate) fn acknowledged(&mut self, result: MavResult) {
-        self.question.is_over |= result != MavResult::MAV_RESULT_ACCEPTED;
+        let may_report = matches!(
+            result,
+            MavResult::MAV_RESULT_ACCEPTED
+                | MavResult::MAV_RESULT_TEMPORARILY_REJECTED
+                | MavResult::MAV_RESULT_IN_PROGRESS
+        );
+        self.question.is_over |= !may_report;
     }
 
     /// True between the two summaries of a report.
@@ -373,6 +383,59 @@ mod tests {
         px4.sequence += 1;
         let stranger = px4.send(1, 3, &[]).map(|heard| heard.about);
         assert_eq!(stranger, Some(About::Else));
+    }
+
+    /// How often it is asked from now on.
+    fn asked(listener: &mut Listener) -> usize {
+        (0..20).filter(|i| listener.question(i * QUESTION_PERIOD_NS, false).is_some()).count()
+    }
+
+    #[test]
+    fn only_a_whole_report_answers_the_question() {
+        let mut summary = [0; 17];
+        summary[9] = 1;
+        let modes = OUR_MODES.to_le_bytes();
+        let events: [(u32, u8, &[u8]); 4] = [
+            (BEGIN, 0x88, &summary),
+            (SAFETY_BUTTON, 3, &modes),
+            (NO_POSITION, 3, &modes),
+            (END, 0x88, &[]),
+        ];
+        for lost in 0..events.len() {
+            let mut px4 = Px4::default();
+            px4.send(TAKEN_OVER, 4, &[]);
+            for (at, (id, level, arguments)) in events.iter().enumerate() {
+                match at == lost {
+                    true => px4.sequence += 1,
+                    false => drop(px4.send(*id, *level, arguments)),
+                }
+            }
+            assert!(px4.listener.question(0, false).is_some(), "{lost} lost");
+            px4.report(1, &[(SAFETY_BUTTON, 3, OUR_MODES), (NO_POSITION, 3, OUR_MODES)]);
+            assert_eq!(asked(&mut px4.listener), 0, "{lost} lost");
+            assert_eq!(
+                px4.why(),
+                "Press safety button first; Navigation error: No valid position estimate"
+            );
+        }
+    }
+
+    #[test]
+    fn the_question_is_asked_again_unless_it_is_refused_for_good() {
+        let answers = [
+            (MavResult::MAV_RESULT_ACCEPTED, 2),
+            (MavResult::MAV_RESULT_TEMPORARILY_REJECTED, 2),
+            (MavResult::MAV_RESULT_IN_PROGRESS, 2),
+            (MavResult::MAV_RESULT_DENIED, 0),
+            (MavResult::MAV_RESULT_UNSUPPORTED, 0),
+            (MavResult::MAV_RESULT_FAILED, 0),
+        ];
+        for (answer, times) in answers {
+            let mut listener = Listener::default();
+            assert!(listener.question(0, false).is_some());
+            listener.acknowledged(answer);
+            assert_eq!(asked(&mut listener), times, "{answer:?}");
+        }
     }
 
     #[test]

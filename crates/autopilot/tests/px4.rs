@@ -364,6 +364,24 @@ fn who_comes_after_its_events_or_was_away_learns_why_it_does_not_arm() {
 }
 
 #[test]
+fn where_a_part_of_its_report_is_lost_it_is_asked_once_more() {
+    for lost in 0..4 {
+        let mut world = World::with(|px4| px4.armed = true);
+        world.px4.armed = false;
+        world.px4.checks = report(1).to_vec();
+        world.px4.checks.remove(lost);
+        world.run(2);
+        assert_eq!(world.px4.checks_requests, 1, "{lost}");
+        world.px4.checks = report(5).to_vec();
+        world.run(10);
+        assert_eq!(world.px4.checks_requests, 2, "{lost}");
+        world.px4.queue.push(status_of_failing_checks());
+        world.step();
+        assert_eq!(world.client.not_ready_because(), [format!("prearm: {NO_POSITION}")], "{lost}");
+    }
+}
+
+#[test]
 fn after_it_started_again_its_events_count_from_the_first_and_old_checks_are_forgotten() {
     let mut world = World::with(|px4| px4.checks = report(10).to_vec());
     world.px4.queue.push(status_of_failing_checks());
@@ -396,10 +414,13 @@ fn a_question_for_its_checks_that_nobody_answers_or_that_is_refused_changes_noth
         assert_eq!(texts(&mut world.client), [""; 0]);
         world.request(Command::Arm).unwrap();
     }
-    // Accepted, and its report was lost on the way.
-    let mut world = World::new();
-    world.run(30);
-    assert_eq!(world.px4.checks_requests, 3);
+    // Accepted, and its report was lost on the way; or to come later.
+    let later = [MavResult::MAV_RESULT_TEMPORARILY_REJECTED, MavResult::MAV_RESULT_IN_PROGRESS];
+    for answer in [MavResult::MAV_RESULT_ACCEPTED].into_iter().chain(later) {
+        let mut world = World::with(|px4| px4.answers_checks = Some(answer));
+        world.run(30);
+        assert_eq!(world.px4.checks_requests, 3, "{answer:?}");
+    }
 }
 
 #[test]
