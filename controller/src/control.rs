@@ -16,8 +16,8 @@ const MAX_UNUSED_NS: i64 = 1_500_000_000;
 const MAX_RELEASE_NS: i64 = 6_000_000_000;
 /// Time after which a heartbeat shows what an earlier request did, in nanoseconds.
 const REACTION_NS: i64 = 200_000_000;
-/// Time for which zeros go on without a step, in nanoseconds: steps are at most 20 ms apart.
-const ZEROS_NS: i64 = 60_000_000;
+/// Time for which zeros go on without a step, in nanoseconds: steps are 25 ms apart.
+pub const ZEROS_NS: i64 = 60_000_000;
 
 /// A change to OFFBOARD that was asked for.
 #[derive(Clone, Debug)]
@@ -103,6 +103,10 @@ impl TakingControl {
             }
             let why = "the vehicle follows setpoints, but its attitude and position are not known, or it does not fly";
             self.give_up(now_ns, autopilot, why.to_owned());
+            return ControlProgress::Waiting;
+        }
+        if !state.armed || !state.landed.is_flying() {
+            self.give_up(now_ns, autopilot, "the vehicle does not fly any more".to_owned());
             return ControlProgress::Waiting;
         }
         match autopilot.status(self.request) {

@@ -419,9 +419,7 @@ impl Flight {
             return Err("the vehicle is taking off; the landing begins by itself".to_owned());
         }
         if self.mission.is_taking_control() {
-            return Err(
-                "the vehicle is changing to OFFBOARD; the landing begins by itself".to_owned()
-            );
+            return Err(format!("a start is under way: {}", self.view().phase(now_ns).1));
         }
         if self.autopilot.state().and_then(wire::vehicle).is_none() {
             return Err("attitude and position of the vehicle are not known".to_owned());

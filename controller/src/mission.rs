@@ -3,7 +3,7 @@
 use autopilot::{Autopilot, FlightMode, LandedState, Takeoff, TakeoffError, TakeoffProgress};
 
 use crate::config::Start;
-use crate::control::{ControlProgress, TakingControl};
+use crate::control::{ControlProgress, TakingControl, ZEROS_NS};
 
 /// Time within which motors that run again mean that a landing had not ended, in nanoseconds: nobody prepares the next
 /// flight so soon, and the autopilot's heartbeat may have been wrong.
@@ -118,6 +118,7 @@ impl Mission {
     /// Asks a PX4 that holds its place to follow setpoints. The landing begins once it does.
     pub fn take_control(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
         let awaits_takeoff = self.is_awaiting_takeoff();
+        self.goes_on_until_ns = None;
         let control = TakingControl::begin(now_ns, autopilot);
         self.state = State::TakingControl { control, awaits_takeoff };
     }
@@ -234,6 +235,10 @@ impl Mission {
                 })) => {
                     if let Some(obstacle) = obstacle {
                         obstacle.clone_into(why);
+                        // A PX4 in OFFBOARD gets no other setpoints yet.
+                        if autopilot.state().is_some_and(|s| s.mode == FlightMode::OFFBOARD) {
+                            autopilot.send_zeros_until(now_ns.saturating_add(ZEROS_NS));
+                        }
                         return None;
                     }
                     Some(match end {

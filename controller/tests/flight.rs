@@ -654,6 +654,13 @@ fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_sta
         assert!(phase == Phase::Idle || status.why.contains("pilot"), "{status:?}");
     }
 
+    // The heartbeat before the request shows the pilot's mode.
+    let mut flight = px4_in(HOLD, "command");
+    flight.command(1000 * MS, &ControllerCommand::Start);
+    hover(&mut flight, 1000, 2980, HOLD);
+    let sent = hover(&mut flight, 2980, 6000, POSITION);
+    assert!(sent.modes.is_empty(), "{sent:?}");
+
     // It never changes.
     let mut flight = px4_asked_for_offboard("command");
     hover(&mut flight, 3100, 25_000, HOLD);

@@ -324,11 +324,11 @@ impl Autopilot {
             let error = CommandError::Replaced { command: old.command, by: command };
             self.finish(old.id, old.command, Err(error));
         }
-        let proven = !command.needs_mode_of_now();
-        let from_ns = if proven { now_ns } else { now_ns.saturating_add(PROOF_NS) };
+        let proof_ns = if command.needs_mode_of_now() { PROOF_NS } else { 0 };
+        let (mode, from_ns) = (self.state().map(|it| it.mode), now_ns.saturating_add(proof_ns));
         match self.refusal(command) {
             Some(error) => self.finish(id, command, Err(error)),
-            None => self.requests.push(Request::new(id, command, from_ns)),
+            None => self.requests.push(Request::new(id, command, mode, from_ns)),
         }
         id
     }

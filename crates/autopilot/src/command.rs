@@ -258,7 +258,8 @@ impl Command {
         matches!(self, Self::Takeoff { .. })
     }
 
-    /// Whether it is sent only just after a heartbeat that shows the mode: OFFBOARD takes the vehicle from whoever flies it.
+    /// Whether it is sent only just after a heartbeat that shows the mode in which it was requested: OFFBOARD takes the vehicle from
+    /// whoever flies it.
     pub(crate) fn needs_mode_of_now(&self) -> bool {
         *self == Self::SetMode(FlightMode::OFFBOARD)
     }
@@ -281,6 +282,8 @@ impl Command {
 pub(crate) struct Request {
     pub(crate) id: CommandId,
     pub(crate) command: Command,
+    /// The mode in which it was requested.
+    from: Option<FlightMode>,
     phase: Phase,
     attempts: u32,
     began_ns: i64,
@@ -336,10 +339,16 @@ pub(crate) const MODE_OF_NOW_NS: i64 = 200_000_000;
 const MAX_TEXTS: usize = 8;
 
 impl Request {
-    pub(crate) fn new(id: CommandId, command: Command, now_ns: i64) -> Self {
+    pub(crate) fn new(
+        id: CommandId,
+        command: Command,
+        from: Option<FlightMode>,
+        now_ns: i64,
+    ) -> Self {
         Self {
             id,
             command,
+            from,
             phase: Phase::Due(now_ns),
             attempts: 0,
             began_ns: now_ns,
@@ -408,10 +417,13 @@ impl Request {
         timeouts: &Timeouts,
     ) -> Step {
         let command = self.command;
-        let waits = command.needs_mode_of_now() && !is_of_now;
         let sent = self.attempts > 0;
         if command.is_shown_by(state) && (sent || !command.is_done_when_accepted()) {
             return Step::Finish(Ok(()));
+        }
+        let waits = command.needs_mode_of_now() && !is_of_now;
+        if command.needs_mode_of_now() && !self.is_wanted_in(state.mode) {
+            return Step::Finish(Err(CommandError::Withdrawn { command }));
         }
         match self.phase {
             Phase::Due(at) if now_ns >= at && !waits => self.send(now_ns, timeouts),
@@ -438,6 +450,12 @@ impl Request {
             }
             _ => Step::Wait,
         }
+    }
+
+    /// Whether the mode is the one in which it was requested. PX4 ends its own take-off in HOLD.
+    fn is_wanted_in(&self, mode: FlightMode) -> bool {
+        let rises = [FlightMode::AUTO_TAKEOFF, FlightMode::AUTO_HOLD];
+        self.from.is_none_or(|from| mode == from || rises.contains(&mode) && rises.contains(&from))
     }
 
     fn send(&mut self, now_ns: i64, timeouts: &Timeouts) -> Step {

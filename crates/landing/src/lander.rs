@@ -2,6 +2,7 @@
 
 mod aborted;
 
+use aborted::AbortClimb;
 use geometry::{Ned, Odometry, Point, Vector};
 
 use crate::axis_check::{AxisConsistencyCheck, AxisError, Verdict};
@@ -94,8 +95,8 @@ pub struct Lander {
     land_requested: Option<Timestamp>,
     /// Height over the local origin to which a retry climbs, in metres.
     retry_to_m: Option<f64>,
-    /// Since when an aborted landing hovers at its height.
-    hovers_since: Option<Timestamp>,
+    /// What an aborted landing does about its height.
+    abort_climb: AbortClimb,
     /// Smallest angle from the image's centre to its edge, in radians.
     half_view_rad: Option<f64>,
     /// The expanding square that is being flown.
@@ -142,7 +143,7 @@ impl Lander {
             state_machine: StateMachine::new(config.phases),
             land_requested: None,
             retry_to_m: None,
-            hovers_since: None,
+            abort_climb: AbortClimb::default(),
             half_view_rad: None,
             square: None,
             limits: AutopilotLimits::default(),
@@ -587,7 +588,7 @@ impl Lander {
             self.retry_to_m = None;
         }
         if self.state_machine.phase() != Phase::Aborted {
-            self.hovers_since = None;
+            self.abort_climb = AbortClimb::default();
         }
         if !guided && !handing_over && !retrying {
             self.guidance.reset();

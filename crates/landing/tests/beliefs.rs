@@ -339,6 +339,21 @@ fn a_vehicle_that_may_stand_is_not_lifted_by_an_abort() {
         told.fly(4.5);
         assert!((told.position.z() + height_m).abs() < 0.1, "{height_m}: {:?}", told.position);
     }
+    // One that sinks when it is aborted is lifted, though it is still for a moment when it turns.
+    let mut told = Told::started(Config::default(), 5.0);
+    told.pad = Some(Point::origin());
+    told.fly(2.0);
+    while told.position.z() < -0.52 {
+        told.fly(STEP_S);
+    }
+    told.velocity = Vector::new(0.0, 0.0, 0.3);
+    told.run(STEP_S, true);
+    told.tell(Event::Operator(OperatorCommand::Abort));
+    told.position = Point::new(0.0, 0.0, -0.47);
+    told.velocity = Vector::zero();
+    told.run(STEP_S, true);
+    told.fly(4.5);
+    assert!((told.position.z() + 2.5).abs() < 0.2, "{:?}", told.position);
 }
 
 #[test]

@@ -1,5 +1,7 @@
 //! What a lander does after an abort: it hovers, lands or climbs, and then leaves the vehicle to its autopilot.
 
+use geometry::Vector;
+
 use super::Lander;
 use crate::config::OnAbort;
 use crate::decision::{Action, Reason};
@@ -16,6 +18,25 @@ const MIN_FLYING_M: f64 = 0.5;
 
 /// Height that may be missing from the one at which an aborted landing hovers, in metres.
 const HOVER_TOLERANCE_M: f64 = 0.1;
+
+/// What an aborted landing does about its height.
+#[derive(Copy, Clone, Debug, Default, PartialEq)]
+pub(super) enum AbortClimb {
+    /// It has just been aborted.
+    #[default]
+    Undecided,
+    /// It climbs.
+    Climbs,
+    /// It hovers.
+    Hovers {
+        /// Since then.
+        since: Timestamp,
+        /// It may stand, and climbs once it moves.
+        may_climb: bool,
+    },
+    /// Nothing is sent any more.
+    Released,
+}
 
 impl Lander {
     pub(super) fn aborted(&mut self, now: Timestamp) -> Action {
@@ -50,34 +71,65 @@ impl Lander {
     }
 
     /// Hovers for `release_after_s`, at `abort_hover_m` or higher: where the autopilot's velocity errs, a vehicle that hovers low
-    /// drifts onto the ground.
+    /// drifts onto the ground. One that may stand is not lifted, until it moves.
     fn hover_aborted(&mut self, now: Timestamp) -> Action {
-        let climb_m_s = self.climb_after_abort(now).filter(|_| self.hovers_since.is_none());
-        if let Some(climb_m_s) = climb_m_s
-            && self.state_machine.elapsed_s(now) <= CLIMB_AWAY_S
-        {
-            return self.climb(climb_m_s);
+        let missing_m = self.missing_after_abort(now);
+        let is_late = self.state_machine.elapsed_s(now) > CLIMB_AWAY_S;
+        self.abort_climb = match self.abort_climb {
+            AbortClimb::Hovers { since, .. }
+                if now.seconds_since(since) > self.config.phases.release_after_s =>
+            {
+                AbortClimb::Released
+            }
+            AbortClimb::Undecided if self.may_stand_after_abort(now) => {
+                AbortClimb::Hovers { since: now, may_climb: true }
+            }
+            AbortClimb::Hovers { may_climb: true, .. }
+                if !self.may_stand_after_abort(now) && missing_m.is_some() =>
+            {
+                AbortClimb::Climbs
+            }
+            AbortClimb::Undecided | AbortClimb::Climbs if missing_m.is_some() && !is_late => {
+                AbortClimb::Climbs
+            }
+            AbortClimb::Undecided | AbortClimb::Climbs => {
+                AbortClimb::Hovers { since: now, may_climb: false }
+            }
+            other => other,
+        };
+        match self.abort_climb {
+            AbortClimb::Released => Action::None,
+            AbortClimb::Climbs => self.climb(self.climb_speed(missing_m.unwrap_or(0.0))),
+            AbortClimb::Undecided | AbortClimb::Hovers { .. } => Action::hover(),
         }
-        let since = *self.hovers_since.get_or_insert(now);
-        let is_over = now.seconds_since(since) > self.config.phases.release_after_s;
-        if is_over { Action::None } else { Action::hover() }
     }
 
-    /// The speed at which an aborted landing climbs to `abort_hover_m`; `None` once it is there, and where the vehicle may stand: one
-    /// that is still, and lower than the heights err or where LAND was refused, is not lifted again.
-    fn climb_after_abort(&self, now: Timestamp) -> Option<f64> {
-        let vehicle = self.history.newest()?;
-        let height_m = self.known_height_m(now)?;
-        let is_still = vehicle.velocity.norm() <= MAX_STANDING_M_S;
+    /// Whether the vehicle may stand: it is still over the pad, and so low as heights err, or at a height that is not known, or LAND was
+    /// refused.
+    fn may_stand_after_abort(&self, now: Timestamp) -> bool {
+        let pad = self.recent_target(now).map_or(Vector::zero(), |target| target.velocity);
+        let is_still = self
+            .history
+            .newest()
+            .is_some_and(|vehicle| (vehicle.velocity - pad).norm() <= MAX_STANDING_M_S);
+        let is_low = self.known_height_m(now).is_none_or(|height_m| height_m < MIN_FLYING_M);
         let is_refused = self.state_machine.reason() == Reason::LandRefused;
-        let may_stand = is_still && (height_m < MIN_FLYING_M || is_refused) || self.may_stand(now);
-        if may_stand || self.landed(now) == Landed::OnGround {
+        is_still && (is_low || is_refused) || self.may_stand(now)
+    }
+
+    /// The height that is missing from `abort_hover_m`, from the fence or from where the landing began, in metres; `None` if none is, and
+    /// on the ground.
+    fn missing_after_abort(&self, now: Timestamp) -> Option<f64> {
+        let vehicle = self.history.newest()?;
+        if self.landed(now) == Landed::OnGround {
             return None;
         }
-        let wanted_m = self.altitude_m(now, self.config.phases.abort_hover_m);
-        let to_m = libm::fmin(wanted_m, self.altitude_of(self.start));
+        let phases = &self.config.phases;
+        let fence_m = if phases.fence_height_m > 0.0 { phases.fence_height_m } else { f64::MAX };
+        let wanted_m = self.altitude_m(now, phases.abort_hover_m);
+        let to_m = libm::fmin(libm::fmin(wanted_m, self.altitude_of(self.start)), fence_m);
         let missing_m = to_m + vehicle.position.z();
-        (missing_m > HOVER_TOLERANCE_M).then(|| self.climb_speed(missing_m))
+        (missing_m > HOVER_TOLERANCE_M).then_some(missing_m)
     }
 
     /// Climbs to `abort_height_m` and stays there.
