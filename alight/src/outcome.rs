@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use messages::{ControllerStatus, Health, RecorderStatus, Truth};
+use messages::{ControllerStatus, Health, Phase, RecorderStatus, Truth};
 use serde::Serialize;
 
 use crate::children::Exit;
@@ -252,6 +252,9 @@ impl LandingSummary {
             }
             (Some(why), None) => format!("{why}; no controller was running"),
             (None, _) if landed => "landed".to_owned(),
+            (None, Some(status)) if status.phase == Phase::Landed => {
+                format!("{}, but the simulation saw no touchdown", phase_and_reason(status))
+            }
             (None, Some(status)) => phase_and_reason(status),
             (None, None) => "no controller was running".to_owned(),
         };
@@ -365,7 +368,7 @@ pub(crate) fn phase_and_reason(status: &ControllerStatus) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::{Phase, Touchdown};
+    use messages::Touchdown;
 
     fn status(phase: Phase) -> ControllerStatus {
         ControllerStatus {
