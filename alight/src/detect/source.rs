@@ -49,6 +49,14 @@ impl Source {
         Self { listed: listed.into_iter(), video: None, images: 0 }
     }
 
+    /// The files that are still to be read.
+    pub(crate) fn files(&self) -> impl Iterator<Item = &Path> {
+        self.listed
+            .as_slice()
+            .iter()
+            .filter_map(|listed| listed.as_ref().ok().map(PathBuf::as_path))
+    }
+
     /// The next image; frames of a video are decoded here as far as they depend on each other.
     pub(crate) fn next(&mut self) -> Option<Item> {
         if let Some((path, video)) = &mut self.video {
