@@ -68,8 +68,8 @@ struct LandingArgs {
     /// or range as well.
     #[arg(long, value_name = "MS", default_value = "80")]
     latency: Values,
-    /// Height at the start, in metres. A list or range as well.
-    #[arg(long, value_name = "M", default_value = "10")]
+    /// Height at the start, in metres, from 0.1 to 100. A list or range as well.
+    #[arg(long, value_name = "M", default_value = "10", value_parser = plan::heights)]
     height: Values,
     /// Horizontal distance from the pad at the start, in metres. A list or range as well.
     #[arg(long, value_name = "M", default_value = "2.12")]

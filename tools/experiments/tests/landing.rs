@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use experiments::landing::fault::Fault;
 use experiments::landing::flight::{fly, fly_recorded};
 use experiments::landing::outcome::{Ending, Outcome};
-use experiments::landing::plan::{Plan, Planned, Request, Values, Vision};
+use experiments::landing::plan::{HEIGHTS_M, Plan, Planned, Request, Values, Vision};
 use experiments::landing::{self, Watch, in_parallel};
 use experiments::results::Folder;
 
@@ -50,6 +50,17 @@ fn the_same_seed_gives_the_same_flight_to_the_bit() {
             assert_eq!(format!("{first:?}"), format!("{second:?}"));
             assert_eq!(outcome.ending, Ending::Landed, "{outcome:?}");
         }
+    }
+}
+
+#[test]
+fn a_landing_begins_at_every_height_that_is_accepted() {
+    for height_m in [*HEIGHTS_M.start(), *HEIGHTS_M.end()] {
+        let height = Values::List(vec![height_m]);
+        let planned = Plan { height, ..plan(Vision::Modelled, 1) }.flights().remove(0);
+        let mut samples = Vec::new();
+        fly(&planned, Some(&mut samples)).unwrap();
+        assert!(!samples.is_empty(), "{height_m} m");
     }
 }
 

@@ -1,6 +1,7 @@
 //! The flights: every combination of the listed values, with several seeds each.
 
 use std::borrow::Cow;
+use std::ops::RangeInclusive;
 use std::str::FromStr;
 
 use super::fault::{Change, Fault, START_ANGLE, drawn, drawn_angle};
@@ -76,6 +77,29 @@ impl FromStr for Values {
             Some((min, max)) => Ok(Self::Range(number(min)?, number(max)?)),
             None => Ok(Self::List(text.split(',').map(number).collect::<Result<_, _>>()?)),
         }
+    }
+}
+
+/// Heights at which a landing can begin: the vehicle flies, and the simulator places it there.
+pub const HEIGHTS_M: RangeInclusive<f64> = 0.1..=100.0;
+
+/// Heights at the start.
+///
+/// # Errors
+/// When they are none, or one is outside of [`HEIGHTS_M`].
+pub fn heights(text: &str) -> Result<Values, String> {
+    let values: Values = text.parse()?;
+    let all = match &values {
+        Values::List(values) => values.clone(),
+        Values::Range(min, max) => vec![*min, *max],
+    };
+    match all.iter().find(|height_m| !HEIGHTS_M.contains(height_m)) {
+        None => Ok(values),
+        Some(height_m) => Err(format!(
+            "no landing begins at {height_m} m: heights are from {} to {} m",
+            HEIGHTS_M.start(),
+            HEIGHTS_M.end()
+        )),
     }
 }
 
@@ -288,6 +312,15 @@ mod tests {
         for wrong in ["", "a", "1,", "0..", "-1"] {
             assert!(wrong.parse::<Values>().is_err(), "{wrong}");
         }
+    }
+
+    #[test]
+    fn heights_at_which_no_landing_begins_are_refused() {
+        assert_eq!(heights("0.1,10"), Ok(Values::List(vec![0.1, 10.0])));
+        for wrong in ["0", "10,0.05", "0..5", "5..101", "x"] {
+            assert!(heights(wrong).is_err(), "{wrong}");
+        }
+        assert!(heights("0").unwrap_err().contains("from 0.1 to 100 m"));
     }
 
     #[test]

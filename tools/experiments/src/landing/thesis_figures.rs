@@ -55,6 +55,15 @@ fn component(vector: [f64; 3], axis: usize) -> f64 {
 /// Height of the legend above the curves, relative to theirs.
 const LEGEND_RATIO: f64 = 0.32;
 
+/// What finite values span; of none from 0 to 1. Marks along an axis without an end are never all set.
+fn span(values: impl Iterator<Item = f64>) -> Range<f64> {
+    let widened = |so_far: Option<Range<f64>>, value: f64| {
+        let Range { start, end } = so_far.unwrap_or(value..value);
+        Some(start.min(value)..end.max(value))
+    };
+    values.filter(|value| value.is_finite()).fold(None, widened).unwrap_or(0.0..1.0)
+}
+
 fn with_legend(range: Range<f64>) -> Range<f64> {
     let height = range.end - range.start;
     range.start..range.end + 0.5 * LEGEND_RATIO * height
@@ -62,10 +71,9 @@ fn with_legend(range: Range<f64>) -> Range<f64> {
 
 /// Curves over time.
 fn curves(caption: &str, samples: &[Sample], curves: &[Curve<'_>]) -> anyhow::Result<String> {
-    let values = || curves.iter().flat_map(|curve| samples.iter().filter_map(curve.of));
-    let min = values().fold(-0.1, f64::min);
-    let max = values().fold(0.1, f64::max);
-    let last_s = samples.last().map_or(1.0, |sample| sample.time_s);
+    let values = curves.iter().flat_map(|curve| samples.iter().filter_map(curve.of));
+    let Range { start: min, end: max } = span(values.chain([-0.1, 0.1]));
+    let last_s = samples.last().map_or(1.0, |sample| sample.time_s.max(0.1));
     picture([900, 480], |area| {
         let margin = 0.08 * (max - min);
         let mut chart = ChartBuilder::on(area)
@@ -102,9 +110,8 @@ fn trajectory(title: &str, samples: &[Sample]) -> anyhow::Result<String> {
     let place = |s: &Sample| [s.position.y(), s.position.x(), -s.position.z()];
     let pad = |s: &Sample| [s.pad.y(), s.pad.x(), -s.pad.z()];
     let range = |axis: usize| {
-        let values = || samples.iter().flat_map(|s| [place(s), pad(s)]).map(|p| component(p, axis));
-        let (min, max) =
-            (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
+        let values = samples.iter().flat_map(|s| [place(s), pad(s)]).map(|p| component(p, axis));
+        let Range { start: min, end: max } = span(values);
         let margin = 0.1 * (max - min).max(0.5);
         min - margin..max + margin
     };
@@ -131,4 +138,17 @@ fn trajectory(title: &str, samples: &[Sample]) -> anyhow::Result<String> {
         }
         Ok(())
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_flight_that_never_began_is_drawn_as_well() {
+        let figures = all("seed 1", &[]).unwrap();
+        assert_eq!(figures.len(), FIGURES.len());
+        assert!(figures.iter().all(|(_, svg)| svg.contains("seed 1")));
+        assert_eq!(span([2.0, f64::NAN, -1.0, f64::INFINITY].into_iter()), -1.0..2.0);
+    }
 }
