@@ -20,6 +20,7 @@ use serde::Deserialize;
 
 use crate::drawing::{Drawing, Ink, Layer, Shape};
 use crate::marker::Marker;
+use crate::square_code::SquareCode;
 
 /// Markers in known positions around one landing point, the origin of the pad's frame.
 #[derive(Clone, Debug, PartialEq)]
@@ -98,6 +99,8 @@ const MAX_OFFSET_M: f64 = 10.0;
 const MAX_TOLERANCE_M: f64 = 0.05;
 /// Tolerance of markers printed on one sheet, in metres; used where a description names none.
 const PRINTED_TOLERANCE_M: f64 = 0.0005;
+/// Overlaps up to this are rounding, in metres.
+const ROUNDING_M: f64 = 1e-6;
 /// Largest number of markers on a pad.
 const MAX_MARKERS: usize = 32;
 
@@ -186,6 +189,51 @@ impl PlacedMarker {
         [self.position_m[0] + right, self.position_m[1] + up]
     }
 
+    /// How far from its centre its print reaches along each axis, and how far its quiet zone, in metres.
+    fn reaches_m(&self) -> Option<[f64; 2]> {
+        let drawing = Drawing::new(&self.marker, self.size_m)?;
+        let farthest = |m: f64, [x, y]: [f64; 2]| m.max(x.abs()).max(y.abs());
+        let printed_m = drawing.layers.iter().fold(0.0, |m: f64, layer| match layer.shape {
+            Shape::Disc { centre_m: [x, y], radius_m } => m.max(x.abs().max(y.abs()) + radius_m),
+            Shape::Rectangle { min_m, max_m } => farthest(farthest(m, min_m), max_m),
+        });
+        Some([printed_m, drawing.half_extent_m])
+    }
+
+    /// How far from its centre the square reaches that its code leaves free, in metres.
+    fn free_m(&self) -> f64 {
+        let cells = SquareCode::for_family(self.marker.family).map_or(0, SquareCode::free_cells);
+        let across = SquareCode::for_family(self.marker.family).map_or(1, |code| code.cells);
+        self.size_m * f64::from(cells) / (2.0 * f64::from(across))
+    }
+
+    /// Why it cannot be printed after another one: the print of one covers the other or its quiet zone, and it does not lie in
+    /// that one's free centre.
+    fn overlap(&self, other: &Self) -> Option<String> {
+        let [printed_m, quiet_m] = self.reaches_m()?;
+        let [other_printed_m, other_quiet_m] = other.reaches_m()?;
+        let [x, y] = [0, 1].map(|i| (self.position_m[i] - other.position_m[i]).abs());
+        let away_m = x.max(y);
+        let overlap_m = (printed_m + other_quiet_m).max(quiet_m + other_printed_m) - away_m;
+        let outside_m = away_m + quiet_m - other.free_m();
+        if overlap_m <= ROUNDING_M || outside_m <= ROUNDING_M {
+            return None;
+        }
+        let other_name = other.marker;
+        if away_m + other_quiet_m <= self.free_m() + ROUNDING_M {
+            return Some(format!(
+                "it would cover `{other_name}`, which is in its free centre; name that one after it"
+            ));
+        }
+        let inside = match other.free_m() > 0.0 {
+            true => format!(", and reaches out of its free centre by {outside_m:.4} m"),
+            false => String::new(),
+        };
+        Some(format!(
+            "it overlaps `{other_name}` by {overlap_m:.4} m, the quiet zone included{inside}; move one of them"
+        ))
+    }
+
     fn on_pad(&self, layer: &Layer) -> Layer {
         let shape = match layer.shape {
             Shape::Disc { centre_m, radius_m } => {
@@ -242,11 +290,12 @@ impl FromStr for Pad {
             within(&format!("y_m of marker {number}"), placed.y_m, -MAX_OFFSET_M..=MAX_OFFSET_M)?;
             let turns = f64::from(placed.quarter_turns);
             within(&format!("quarter_turns of marker {number}"), turns, 0.0..=3.0)?;
-            let placed = placed.checked(&markers).map_err(|problem| PadError::Marker {
-                number,
-                text: placed.marker.clone(),
-                problem,
-            })?;
+            let text = &placed.marker;
+            let refused = |problem| PadError::Marker { number, text: text.clone(), problem };
+            let placed = placed.checked(&markers).map_err(refused)?;
+            if let Some(problem) = markers.iter().find_map(|before| placed.overlap(before)) {
+                return Err(refused(problem));
+            }
             markers.push(placed);
         }
         Ok(Self { id: described.id, tolerance_m, markers })
@@ -305,8 +354,45 @@ mod tests {
         check("id = 1\ntolerance_m = 1\nmarkers = [{ marker = \"rings:0.1\" }]", "tolerance_m");
         check("markers = [{ marker = \"rings:0.1\" }]", "missing field `id`");
         check("id = 1\nsize = 3\nmarkers = []", "unknown field `size`");
+        let pair =
+            |one: &str, other: &str| format!("id = 1\nmarkers = [{{ {one} }}, {{ {other} }}]");
+        let large = "marker = \"apriltag-36h11:7:0.15\", y_m = 0.1";
+        let small = "marker = \"aruco-4x4-50:1:0.06\"";
+        // The tag's paper reaches down to 0.1 - 0.09375, the ArUco marker up to 0.03.
+        let text = "marker 2, `aruco-4x4-50:1:0.06`: it overlaps `apriltag-36h11:7:0.15` by 0.023";
+        check(&pair(large, small), text);
+        check(&pair(small, "marker = \"rings:0.05\""), "overlaps `aruco-4x4-50:1:0.06`");
+        let hollow = "marker = \"apriltag-custom48h12:0:0.099\"";
+        let inside = |size: &str| format!("marker = \"aruco-4x4-50:0:{size}\"");
+        check(&pair(hollow, &inside("0.026")), "out of its free centre by 0.0008 m");
+        let aside = format!("{}, x_m = 0.002", inside("0.024"));
+        check(&pair(hollow, &aside), "out of its free centre by 0.0015 m");
+        check(&pair(&inside("0.024"), hollow), "name that one after it");
         let missing = Pad::named("no/such.toml", |_| Err("there is no such file"));
         let missing = missing.unwrap_err().to_string();
         assert!(missing.contains("no/such.toml") && missing.contains("a4"), "{missing}");
+    }
+
+    #[test]
+    fn markers_may_share_their_quiet_zones_and_lie_in_a_free_centre() {
+        let hollow = "apriltag-custom48h12:0:0.099";
+        for (one, other, aside) in [
+            (hollow, "aruco-4x4-50:0:0.024", ""),
+            ("apriltag-36h11:7:0.15", "aruco-4x4-50:1:0.06", ", y_m = -0.12375"),
+            ("apriltag-36h11:7:0.15", "aruco-4x4-50:1:0.06", ", x_m = 0.13, y_m = 0.05"),
+            ("rings:0.1", "stag-hd21:5:0.05", ", x_m = 0.1"),
+        ] {
+            let markers = format!("{{ marker = \"{one}\" }}, {{ marker = \"{other}\"{aside} }}");
+            let pad = format!("id = 1\nmarkers = [{markers}]").parse::<Pad>();
+            assert!(pad.is_ok(), "{pad:?}");
+        }
+    }
+
+    #[test]
+    fn the_example_of_the_manual_is_valid() {
+        let text = include_str!("../../../docs/pads.md");
+        let example = text.split("```toml").nth(1).and_then(|rest| rest.split("```").next());
+        let pad = example.unwrap().parse::<Pad>();
+        assert!(pad.is_ok(), "{pad:?}");
     }
 }

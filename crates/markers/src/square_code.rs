@@ -58,6 +58,18 @@ impl SquareCode {
         codeword.is_some_and(|word| self.rotated(self.rotated(*word)) == *word)
     }
 
+    /// Cells across the square in its middle that has no bits, and is left free for a smaller marker; 0 if there is none.
+    pub fn free_cells(&self) -> u8 {
+        let cells = self.cells as i8;
+        // The border lies inside of the outline.
+        let is_free = |from: &i8| {
+            let inside = *from..cells - *from;
+            !self.bits.iter().any(|bit| bit.iter().all(|place| inside.contains(place)))
+        };
+        // Half of the cells leave nothing.
+        (1..=cells / 2).find(is_free).map_or(0, |from| (cells - 2 * from) as u8)
+    }
+
     /// Columns and rows that the marker has outside the square on each side: white paper around a black border, the
     /// black ring and the outer bits around a white one.
     pub fn margin(&self) -> u8 {
@@ -162,6 +174,13 @@ mod tests {
             ids.filter(|id| code.is_symmetrical(*id)).map(|id| (code.family, id))
         });
         assert_eq!(symmetrical.collect::<Vec<_>>(), [(Family::ArucoOriginal, 1023)]);
+    }
+
+    #[test]
+    fn one_family_leaves_its_middle_free() {
+        let free = codes().filter(|code| code.free_cells() > 0);
+        let free: Vec<_> = free.map(|code| (code.family, code.free_cells())).collect();
+        assert_eq!(free, [(Family::AprilTagCustom48h12, 2)]);
     }
 
     #[test]
