@@ -51,6 +51,16 @@ pub enum ConfigError {
         /// The system's reason.
         cause: std::io::Error,
     },
+    /// A file whose bytes are no UTF-8.
+    #[error("the configuration file {path:?} is not UTF-8 in line {line}{hint}: save it as UTF-8")]
+    NotUtf8 {
+        /// The file.
+        path: PathBuf,
+        /// The line with the first wrong byte, from 1.
+        line: usize,
+        /// What else it is, or nothing.
+        hint: &'static str,
+    },
     /// Text that is not TOML.
     #[error("{source_name} is not valid TOML: {cause}")]
     Syntax {
@@ -134,7 +144,7 @@ impl ConfigError {
                 Self::Syntax { source_name: source(source_name), cause }
             }
             Self::Form { text } => Self::Form { text: format!("{service}.{text}") },
-            other @ Self::Unreadable { .. } => other,
+            other @ (Self::Unreadable { .. } | Self::NotUtf8 { .. }) => other,
         }
     }
 }
@@ -234,9 +244,26 @@ fn parse(name: &str, text: &str) -> Result<Table, ConfigError> {
     })
 }
 
-fn file_layer(path: &Path) -> Result<Layer, ConfigError> {
-    let text = std::fs::read_to_string(path)
+/// The text of a configuration file.
+///
+/// # Errors
+/// When it cannot be read, or is not UTF-8.
+pub fn read_text(path: &Path) -> Result<String, ConfigError> {
+    let bytes = std::fs::read(path)
         .map_err(|cause| ConfigError::Unreadable { path: path.to_owned(), cause })?;
+    String::from_utf8(bytes).map_err(|wrong| {
+        let before = wrong.as_bytes().get(..wrong.utf8_error().valid_up_to()).unwrap_or_default();
+        let hint = match wrong.as_bytes() {
+            [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => ", but UTF-16",
+            _ => "",
+        };
+        let line = 1 + before.iter().filter(|byte| **byte == b'\n').count();
+        ConfigError::NotUtf8 { path: path.to_owned(), line, hint }
+    })
+}
+
+fn file_layer(path: &Path) -> Result<Layer, ConfigError> {
+    let text = read_text(path)?;
     let name = path.display().to_string();
     let table = parse(&name, &text)?;
     Ok(Layer { name, table })
@@ -460,6 +487,20 @@ mod tests {
             set: set.iter().map(|s| (*s).to_owned()).collect(),
         };
         layers.load::<Camera>().map(|c| c.settings).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn a_file_that_is_not_utf_8_is_told_with_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("settings.toml");
+        for (bytes, parts) in [
+            (&b"a = 1\n\n# H\xf6he\n"[..], ["line 3: save it as UTF-8", "settings.toml"]),
+            (b"\xff\xfea\0 \0=\0", ["line 1, but UTF-16", "save it as UTF-8"]),
+        ] {
+            std::fs::write(&path, bytes).unwrap();
+            let problem = read_text(&path).unwrap_err().to_string();
+            assert!(parts.iter().all(|part| problem.contains(part)), "{problem}");
+        }
     }
 
     #[test]
