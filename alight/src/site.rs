@@ -108,8 +108,7 @@ impl Site {
     /// # Errors
     /// Names the file and the problem.
     pub(crate) fn read(path: &Path) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|cause| ConfigError::Unreadable { path: path.to_owned(), cause })?;
+        let text = node::config::read_text(path)?;
         let mut site: Self = toml::from_str(&text).map_err(|cause| ConfigError::Syntax {
             source_name: path.display().to_string(),
             cause: cause.to_string().trim_end().to_owned(),
@@ -355,6 +354,16 @@ mod tests {
         let (_home, other) = example_with_keys(|text| text.replace("id=ground", "id=laptop"));
         let problem = format!("{:#}", other.jobs(Role::Ground).unwrap_err());
         assert!(problem.contains("--role detector --name laptop"), "{problem}");
+    }
+
+    #[test]
+    fn a_site_in_another_encoding_is_refused_with_its_line() {
+        let home = tempfile::tempdir().unwrap();
+        let path = home.path().join("site.toml");
+        std::fs::write(&path, b"vehicle = 'x'\n# H\xf6he\n").unwrap();
+        let told = Site::read(&path).unwrap_err().to_string();
+        assert!(told.contains("site.toml") && told.contains("line 2"), "{told}");
+        assert!(told.contains("save it as UTF-8"), "{told}");
     }
 
     #[test]
