@@ -1,5 +1,6 @@
 //! A site: one TOML file that lists the processes of every machine, and how the machines find each other.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
@@ -150,19 +151,14 @@ impl Site {
     /// # Errors
     /// When an entry or a setting is invalid, or an address or a key is missing.
     pub(crate) fn jobs(&self, role: Role) -> anyhow::Result<Vec<Job>> {
-        let entries = match role {
-            Role::Drone => &self.drone,
-            Role::Ground => &self.ground,
-            Role::Relay => &self.relay,
-            Role::Local => &self.local,
-        };
         let mut jobs: Vec<Job> = self.relay_job(role)?.into_iter().collect();
-        for (number, entry) in entries.iter().enumerate() {
+        for (number, entry) in self.entries(role).iter().enumerate() {
             let job = self
                 .job(role, entry)
                 .with_context(|| format!("[[{}]] number {}", role.name(), number + 1))?;
             jobs.push(job);
         }
+        self.check_detectors(role)?;
         ensure!(
             !jobs.is_empty(),
             "the site has no [[{}]], so there is nothing to run",
@@ -179,6 +175,39 @@ impl Site {
             job.network.source(&job.key).with_context(|| job.name.clone())?;
         }
         Ok(jobs)
+    }
+
+    fn entries(&self, role: Role) -> &[Entry] {
+        match role {
+            Role::Drone => &self.drone,
+            Role::Ground => &self.ground,
+            Role::Relay => &self.relay,
+            Role::Local => &self.local,
+        }
+    }
+
+    /// Refuses two detectors with one id, of which the second would not run: on this machine and on those that it reaches.
+    fn check_detectors(&self, role: Role) -> anyhow::Result<()> {
+        let connected = [Role::Drone, Role::Relay, Role::Ground];
+        let together = if role == Role::Local { &[Role::Local][..] } else { &connected };
+        let mut taken = BTreeMap::new();
+        for role in together {
+            for (number, entry) in self.entries(*role).iter().enumerate() {
+                // The files of another machine's services may be missing here.
+                let job = self.job(*role, entry).ok();
+                let Some(job) = job.filter(|job| job.service == Some(Service::Detector)) else {
+                    continue;
+                };
+                let place = format!("[[{}]] number {}", role.name(), number + 1);
+                if let Some(first) = taken.insert(job.key.clone(), place.clone()) {
+                    let id = job.key.split_once('.').map_or(job.key.as_str(), |(_, id)| id);
+                    anyhow::bail!(
+                        "{first} and {place} are detectors with one id, `{id}`; give one of them another: set = ['id=\"other\"']"
+                    );
+                }
+            }
+        }
+        Ok(())
     }
 
     fn relay_job(&self, role: Role) -> anyhow::Result<Option<Job>> {
@@ -280,7 +309,7 @@ mod tests {
         address = '10.42.0.1:8000'
         insecure = true
         drone = [{ run = 'detector' }, { run = 'controller', set = ['marker=\"rings\"'] }]
-        ground = [{ run = 'detector', set = ['id=\"ground\"'] }, { run = 'detector' }, { run = 'dashboard' }, { command = ['/usr/bin/python3', 'x.py'] }]";
+        ground = [{ run = 'detector', set = ['id=\"ground\"'] }, { run = 'detector', set = ['id=\"second\"'] }, { run = 'dashboard' }, { command = ['/usr/bin/python3', 'x.py'] }]";
 
     #[test]
     fn the_drone_has_a_relay_and_local_services() {
@@ -354,6 +383,22 @@ mod tests {
         let (_home, other) = example_with_keys(|text| text.replace("id=ground", "id=laptop"));
         let problem = format!("{:#}", other.jobs(Role::Ground).unwrap_err());
         assert!(problem.contains("--role detector --name laptop"), "{problem}");
+    }
+
+    #[test]
+    fn two_detectors_with_one_id_are_refused() {
+        let detector = "{ run = 'detector', set = ['id=\"one\"'] }";
+        let local = format!("local = [{detector}, {detector}]");
+        let told = problem(&local, Role::Local);
+        assert!(told.contains("[[local]] number 1 and [[local]] number 2"), "{told}");
+        assert!(told.contains("`one`"), "{told}");
+        let apart = format!(
+            "address = '10.0.0.1'\ninsecure = true\ndrone = [{detector}]\nground = [{{ run = 'dashboard' }}, {detector}]"
+        );
+        for role in [Role::Drone, Role::Ground] {
+            let told = problem(&apart, role);
+            assert!(told.contains("[[drone]] number 1 and [[ground]] number 2"), "{told}");
+        }
     }
 
     #[test]
