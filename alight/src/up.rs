@@ -2,11 +2,13 @@
 //! in order.
 
 use std::collections::VecDeque;
-use std::path::PathBuf;
+use std::ffi::OsStr;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use clap::Args;
 use node::Shutdown;
 use tokio::process::Command;
@@ -28,11 +30,13 @@ pub(crate) struct UpArgs {
     /// The site: which processes run on which machine (TOML, `docs/deploy.md`).
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Print the processes without starting them.
+    /// Print the processes without starting them; a program that is not found is an error.
     #[arg(long)]
     dry_run: bool,
 }
 
+/// The name of this program in a command.
+const OWN_PROGRAM: &str = "alight";
 /// Pause before a process is restarted; doubled with each further exit within [`PERIOD`].
 const MIN_PAUSE: Duration = Duration::from_millis(500);
 const MAX_PAUSE: Duration = Duration::from_secs(8);
@@ -50,10 +54,38 @@ pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
         for job in &jobs {
             say(&by_hand(job));
         }
+    }
+    let search = std::env::var_os("PATH").unwrap_or_default();
+    for job in &jobs {
+        check_program(job, &site.folder, &search)?;
+    }
+    if args.dry_run {
         return Ok(ExitCode::SUCCESS);
     }
     node::start_logging("warn");
     block_on(supervise(&site, args.role, jobs))?
+}
+
+/// Refuses a program that cannot be started: at its path from the site's folder, or in one of the folders of `search`.
+fn check_program(job: &Job, folder: &Path, search: &OsStr) -> anyhow::Result<()> {
+    let Some(program) = job.command.first().filter(|program| *program != OWN_PROGRAM) else {
+        return Ok(());
+    };
+    let is_program = |path: PathBuf| {
+        let found = std::fs::metadata(path);
+        found.is_ok_and(|it| it.is_file() && it.permissions().mode() & 0o111 != 0)
+    };
+    let (name, is_path) = (&job.name, program.contains('/'));
+    let is_found = match is_path {
+        true => is_program(folder.join(program)),
+        false => std::env::split_paths(search).any(|place| is_program(place.join(program))),
+    };
+    ensure!(
+        is_found,
+        "{name}: there is no program `{program}` {}; install it, or correct its `command`",
+        if is_path { format!("from {}", folder.display()) } else { "in the PATH".to_owned() }
+    );
+    Ok(())
 }
 
 /// Prints a line. A failure is ignored: the supervisor continues without a terminal.
@@ -291,7 +323,7 @@ fn start(
         command_line.extend(["--set".to_owned(), format!("start=\"{start}\"")]);
     }
     let (program, rest) = command_line.split_first().context("an empty command")?;
-    let own = program == "alight";
+    let own = program == OWN_PROGRAM;
     let file = if own {
         std::env::current_exe().context("finding this program's own file")?
     } else {
@@ -304,7 +336,9 @@ fn start(
     if own {
         command.arg("--stop-with-parent").arg(std::process::id().to_string());
     }
-    let pid = children.spawn(index, command, &job.name)?;
+    let pid = children
+        .spawn(index, command, &job.name)
+        .with_context(|| format!("the program `{program}`"))?;
     let mode = start_as.map_or_else(String::new, |start| format!(", start = \"{start}\""));
     say(&format!("{}: started as process {pid}{mode}", job.name));
     Ok(pid)
@@ -356,6 +390,30 @@ mod tests {
             process.on_exit(&failure(1), now);
             assert_eq!(process.state, State::Waiting(now + MIN_PAUSE));
             now += PERIOD + MIN_PAUSE;
+        }
+    }
+
+    #[test]
+    fn a_program_that_is_not_found_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("there");
+        std::fs::write(&file, "#!/bin/sh\n").unwrap();
+        let check = |program: &str| {
+            let job = Job { command: vec![program.to_owned()], ..supervised().job };
+            check_program(&job, folder.path(), folder.path().as_os_str())
+        };
+        // It may not be run.
+        check("there").unwrap_err();
+        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o755)).unwrap();
+        for program in ["alight", "there", "./there", file.to_str().unwrap()] {
+            check(program).unwrap();
+        }
+        for program in ["absent", "./absent", "/no/such"] {
+            let problem = check(program).unwrap_err().to_string();
+            assert!(
+                problem.contains(&format!("detector: there is no program `{program}`")),
+                "{problem}"
+            );
         }
     }
 
