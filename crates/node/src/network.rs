@@ -245,7 +245,7 @@ fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()>
         let path = keys.join(file);
         ensure!(
             path.is_file(),
-            "missing key file {path:?}; make it with `alight keys issue {} -o {}`",
+            "missing key file {path:?}; make it with `alight keys issue {} --authority DIR -o {}`, where DIR has the authority",
             issue_arguments(key_name),
             keys.display()
         );
@@ -284,6 +284,10 @@ fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()>
 fn issue_arguments(key_name: &str) -> String {
     match key_name.split_once('.') {
         Some((role, name)) => format!("--role {role} --name {name}"),
+        // Others connect to these.
+        None if matches!(key_name, "drone" | "relay") => {
+            format!("--role {key_name} --address HOST")
+        }
         None => format!("--role {key_name}"),
     }
 }
@@ -515,8 +519,12 @@ mod tests {
         let connect = Some("10.0.0.1".into());
         refused(
             Network { keys, connect, ..built_in("ground") },
-            "alight keys issue --role detector",
+            "alight keys issue --role detector --authority DIR -o no/keys`",
         );
+        for role in ["drone", "relay"] {
+            let told = issue_arguments(role);
+            assert_eq!(told, format!("--role {role} --address HOST"));
+        }
     }
 
     #[test]
