@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 use mcap::records::{MessageHeader, Record};
-use mcap::{Channel, McapError, Summary};
+use mcap::{Channel, Summary};
 use messages::{FrameHeader, PixelFormat, decode, topic};
 
 use crate::channel::{RAW_PREFIX, Received, split_raw};
 use crate::display::picture_channel;
 use crate::foxglove::{self, Image};
-use crate::records::{Records, contained, records_of};
+use crate::records::{Records, check_begin, contained, records_of};
 use crate::repair::DIFFERS;
 use crate::writer::{DROPPED_CHANNEL, METADATA, Problem, TIME_SET};
 
@@ -52,9 +52,7 @@ pub struct Reading {
 /// # Errors
 /// When it is no MCAP file at all.
 pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Problem> {
-    if !recording.starts_with(mcap::MAGIC) {
-        return Err(McapError::BadMagic.into());
-    }
+    check_begin(recording)?;
     let summary = contained(|| Summary::read(recording)).ok().flatten();
     let mut found = Found {
         keys: BTreeMap::new(),
@@ -242,6 +240,15 @@ mod tests {
             Entry::Picture { .. } | Entry::TimeSet(_) => panic!("{entry:?}"),
         });
         (times, others, reading.unwrap())
+    }
+
+    #[test]
+    fn what_is_no_recording_is_told_from_what_is_empty() {
+        for (file, part) in [(&b""[..], "it is empty"), (b"text", "does not begin as MCAP files")] {
+            let read = read(file, |_| ()).unwrap_err().to_string();
+            let repaired = crate::repair(file, std::io::sink()).unwrap_err().to_string();
+            assert!(read.contains(part) && repaired == read, "{read} {repaired}");
+        }
     }
 
     #[test]

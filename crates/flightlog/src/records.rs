@@ -74,6 +74,18 @@ impl<'a> Iterator for Records<'a> {
     }
 }
 
+/// Whether the file begins as MCAP files do.
+///
+/// # Errors
+/// When it does not.
+pub(crate) fn check_begin(recording: &[u8]) -> Result<(), Problem> {
+    match recording {
+        [] => Err(Problem::Empty),
+        _ if !recording.starts_with(mcap::MAGIC) => Err(Problem::Foreign),
+        _ => Ok(()),
+    }
+}
+
 /// The records of a chunk.
 ///
 /// # Errors

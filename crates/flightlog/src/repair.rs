@@ -8,7 +8,7 @@ use mcap::records::Record;
 use mcap::write::{NoSeek, WriteOptions};
 use mcap::{Attachment, Channel, McapError, Summary};
 
-use crate::records::{Records, contained, records_of};
+use crate::records::{Records, check_begin, contained, records_of};
 use crate::writer::Problem;
 
 /// The damage of a file of which nothing else is known to be damaged.
@@ -34,9 +34,7 @@ pub struct Repaired {
 /// # Errors
 /// When `recording` is no MCAP file at all, or the output does not take it.
 pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem> {
-    if !recording.starts_with(mcap::MAGIC) {
-        return Err(McapError::BadMagic.into());
-    }
+    check_begin(recording)?;
     let index = contained(|| Summary::read(recording)).ok().flatten();
     let options = WriteOptions::new().compression(None).disable_seeking(true);
     let mut copy = Copy {

@@ -30,6 +30,12 @@ pub enum Problem {
     /// The file did not take it, or is none.
     #[error("{0}")]
     Mcap(#[from] mcap::McapError),
+    /// Nothing is in it.
+    #[error("it is empty; was its recorder killed at once, or the disk full?")]
+    Empty,
+    /// It begins with other bytes than a recording.
+    #[error("it does not begin as MCAP files do")]
+    Foreign,
     /// Its reader panicked.
     #[error("its bytes make no sense to the reader")]
     Senseless,
