@@ -62,7 +62,7 @@ enum Command {
     Doctor(doctor::DoctorArgs),
     /// List the cameras of this machine, or take a picture.
     Cameras(crate::cameras::CamerasArgs),
-    /// Find markers in image files and videos.
+    /// Find markers in image files and videos: id, centre, largest extent in pixels (of a square its diagonal), confidence, pose.
     Detect(detect::DetectArgs),
     /// Calibrate a camera: print a board, and make a calibration file from images of it.
     Calibrate(Box<calibrate::CalibrateArgs>),

@@ -435,6 +435,7 @@ mod tests {
         let text = String::from_utf8(out).unwrap();
         assert!(text.contains("0.png  320 x 240 px"), "{text}");
         assert!(text.contains("\n  rings  centre (159."), "{text}");
+        assert!(text.contains(" px  largest extent 1"), "{text}");
         assert!(text.contains("4.png  error: "), "{text}");
         assert!(text.ends_with("images: 9, markers found: 7, not readable: 1\n"), "{text}");
     }

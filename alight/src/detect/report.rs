@@ -153,7 +153,7 @@ impl Detection {
         // Writing to a string cannot fail.
         let _ = write!(
             text,
-            "  {}{id}  centre ({x:.2}, {y:.2}) px  size {:.1} px  confidence {:.2}",
+            "  {}{id}  centre ({x:.2}, {y:.2}) px  largest extent {:.1} px  confidence {:.2}",
             self.family, self.size_px, self.confidence
         );
         if let Some(pose) = &self.pose {
