@@ -12,7 +12,7 @@ use media::{
     CalibrationDetails, CalibrationFormat, Rectifier, is_video, read_calibration, write_calibration,
 };
 
-use crate::detect::{Item, Source, file_name};
+use crate::detect::{Item, Source, stem};
 use crate::terminal::{print, write_error};
 
 /// The arguments of `alight rectify`.
@@ -82,7 +82,7 @@ pub(crate) fn run(args: &RectifyArgs) -> anyhow::Result<ExitCode> {
 
 /// The name of an image's file. A PNG keeps its name; others get that ending after their own, as `a.jpg` and `a.png` may both be there.
 fn output_name(image: &str) -> String {
-    file_name(image.strip_suffix(".png").unwrap_or(image))
+    format!("{}.png", stem(image.strip_suffix(".png").unwrap_or(image)))
 }
 
 /// The files that are written, none of which may be lost.

@@ -36,7 +36,8 @@ pub(crate) struct DetectArgs {
     /// Track: search first where the markers of the last images are predicted; one image after the other.
     #[arg(long, conflicts_with = "threads")]
     pub(super) track: bool,
-    /// Folder for annotated images: outlines, ids, confidence, and the axes of poses.
+    /// Folder for annotated images, IMAGE.drawn.png: outlines, ids, confidence, and the axes of poses. Earlier ones of that name
+    /// are replaced, other files never, and none is searched as an image of its folder.
     #[arg(long, value_name = "DIR")]
     pub(super) draw: Option<PathBuf>,
     /// Image files (PNG of 8 or 16 bits, JPEG), videos (Motion JPEG as AVI or stream, H.264 as MP4 or

@@ -20,10 +20,9 @@ use media::read_calibration;
 use crate::terminal::{Output, write_error};
 pub(crate) use args::DetectArgs;
 use picture::Gallery;
-pub(crate) use picture::file_name;
 use queue::process_all;
 use report::{Detection, Found, Line};
-pub(crate) use source::{Item, Source};
+pub(crate) use source::{Item, Source, stem};
 
 /// Prints the detections in each image, in the order given. Exit status 1 when an image could not be read.
 ///
@@ -120,12 +119,13 @@ impl Examiner {
     }
 
     fn examine(&self, item: Item, worker: &mut Worker) -> Line {
-        let (name, time_s, is_frame) = (item.name.clone(), item.time_s, item.is_frame);
+        let (name, stem) = (item.name.clone(), item.stem.clone());
+        let (time_s, is_frame) = (item.time_s, item.is_frame);
         let error = |error: String| Line::Error { image: name.clone(), error };
         // A panic in one image must not affect the others, which wait for its line.
         let examined = catch_unwind(AssertUnwindSafe(|| {
             let image = item.into_image(self.bayer)?;
-            let found = self.detect(&image, &name, time_s, worker)?;
+            let found = self.detect(&image, [&name, &stem], time_s, worker)?;
             Ok(Line::Image { image: name.clone(), time_s: is_frame.then_some(time_s), found })
         }));
         match examined {
@@ -143,7 +143,7 @@ impl Examiner {
     fn detect(
         &self,
         image: &GrayImage,
-        name: &str,
+        [name, stem]: [&str; 2],
         time_s: f64,
         worker: &mut Worker,
     ) -> Result<Found, String> {
@@ -166,7 +166,7 @@ impl Examiner {
         }
         if let Some(gallery) = &self.gallery {
             gallery
-                .add(name, image, found, camera.as_ref())
+                .add(stem, image, found, camera.as_ref())
                 .map_err(|problem| format!("{problem:#}"))?;
         }
         let pads = self.pads.iter().filter_map(|pad| {
@@ -377,7 +377,7 @@ mod tests {
         };
         let found = |examiner: &Examiner| {
             let mut worker = examiner.worker().unwrap();
-            examiner.detect(&image, "a.png", 0.0, &mut worker).unwrap().detections.len()
+            examiner.detect(&image, ["a.png"; 2], 0.0, &mut worker).unwrap().detections.len()
         };
         assert_eq!(found(&examiner("300")), 1);
         let wrong = examiner("30");
@@ -422,6 +422,7 @@ mod tests {
         let pictures: Vec<_> =
             std::fs::read_dir(&drawn).unwrap().map(|e| e.unwrap().path()).collect();
         assert_eq!(pictures.len(), 4);
+        assert!(pictures[0].to_string_lossy().ends_with(".drawn.png"));
         let picture = image::open(&pictures[0]).unwrap().to_rgb8();
         assert_eq!(picture.dimensions(), (960, 720));
         assert!(picture.pixels().filter(|p| p.0[1] > 200 && p.0[0] < 60).count() > 100);

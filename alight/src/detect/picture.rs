@@ -9,6 +9,8 @@ use fiducial::overlay::canvas::{Colour, RgbImageBuf};
 use geometry::{CameraModel, Pixel, Point, Transform};
 use imaging::{GrayImage, GrayView};
 
+use super::source::DRAWN_ENDING;
+
 const GREEN: Colour = [40, 230, 80];
 const RED: Colour = [255, 60, 60];
 const BLUE: Colour = [70, 140, 255];
@@ -37,30 +39,24 @@ impl Gallery {
         Ok(Self { folder: folder.to_owned() })
     }
 
-    /// Writes the annotated image.
+    /// Writes the annotated image; the ending of its name is that of earlier ones only, which it replaces.
     ///
     /// # Errors
     /// When it cannot be written.
     pub(super) fn add(
         &self,
-        name: &str,
+        stem: &str,
         image: &GrayImage,
         found: &[Observation],
         camera: Option<&CameraModel>,
     ) -> anyhow::Result<()> {
-        let path = self.folder.join(file_name(name));
+        let path = self.folder.join(format!("{stem}{DRAWN_ENDING}"));
         let Some(view) = image.view() else { return Ok(()) };
         let drawn = draw(view, found, camera);
         let (width, height) = (drawn.width as u32, drawn.height as u32);
         image::save_buffer(&path, &drawn.data, width, height, image::ColorType::Rgb8)
             .with_context(|| format!("writing the annotated image {path:?}"))
     }
-}
-
-/// A file name for an image: folders become parts of it, so that it is unique.
-pub(crate) fn file_name(name: &str) -> String {
-    let parts = name.split(['/', '\\']).filter(|part| !matches!(*part, "" | "." | ".."));
-    format!("{}.png", parts.collect::<Vec<_>>().join("_").replace(['#', ':'], "-"))
 }
 
 fn draw(view: GrayView<'_>, found: &[Observation], camera: Option<&CameraModel>) -> RgbImageBuf {
@@ -266,13 +262,6 @@ fn tip_of(
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn file_names_are_unique_across_folders() {
-        assert_eq!(file_name("../a/b.c/1.jpg"), "a_b.c_1.jpg.png");
-        assert_eq!(file_name("/d/flight.avi#12"), "d_flight.avi-12.png");
-        assert_ne!(file_name("a/1.png"), file_name("b/1.png"));
-    }
 
     #[test]
     fn small_images_are_enlarged_and_labelled_without_a_marker() {

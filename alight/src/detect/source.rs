@@ -1,5 +1,6 @@
 //! The images of files, folders and videos, in order.
 
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use imaging::{BayerPattern, GrayImage};
@@ -11,17 +12,26 @@ use media::{
 /// Assumed interval between image files, in seconds.
 const IMAGE_PERIOD_S: f64 = 0.1;
 
+/// The ending of annotated images, which are none of a folder's images.
+pub(crate) const DRAWN_ENDING: &str = ".drawn.png";
+
 /// Iterates over files, folders and videos.
 pub(crate) struct Source {
     listed: std::vec::IntoIter<Result<PathBuf, (PathBuf, String)>>,
     video: Option<(PathBuf, Video)>,
     images: u32,
+    /// How many names were given out, by the name that the file's path alone gives.
+    stems: HashMap<String, u32>,
+    /// The name of the video's frames.
+    video_stem: String,
 }
 
 /// An image, decoded or not yet.
 pub(crate) struct Item {
     /// Its name: a path, for a video frame with its number.
     pub(crate) name: String,
+    /// The beginning of the names of files about it, its own among those of the same source.
+    pub(crate) stem: String,
     /// Its time, in seconds after the first image.
     pub(crate) time_s: f64,
     /// Whether it is a frame of a video.
@@ -42,11 +52,27 @@ impl Source {
         let mut listed = Vec::new();
         for path in paths {
             match files_in(path, &[IMAGE_EXTENSIONS, VIDEO_EXTENSIONS]) {
-                Ok(files) => listed.extend(files.into_iter().map(Ok)),
+                Ok(files) => {
+                    let is_given = |file: &PathBuf| file == path || !is_drawn(file);
+                    listed.extend(files.into_iter().filter(is_given).map(Ok));
+                }
                 Err(problem) => listed.push(Err((path.clone(), problem.to_string()))),
             }
         }
-        Self { listed: listed.into_iter(), video: None, images: 0 }
+        let (stems, video_stem) = (HashMap::new(), String::new());
+        Self { listed: listed.into_iter(), video: None, images: 0, stems, video_stem }
+    }
+
+    /// The path as one name; where another file has it already, with a number.
+    fn stem(&mut self, path: &Path) -> String {
+        let plain = stem(&path.display().to_string());
+        let mut stem = plain.clone();
+        while let Some(before) = self.stems.get_mut(&stem) {
+            *before += 1;
+            stem = format!("{plain}~{before}");
+        }
+        self.stems.insert(stem.clone(), 1);
+        stem
     }
 
     /// The files that are still to be read.
@@ -64,7 +90,9 @@ impl Source {
                 Some(Ok(frame)) => {
                     let name = format!("{}#{}", path.display(), frame.index);
                     let content = Content::Frame(path.clone(), frame.image);
-                    return Some(Item { name, time_s: frame.time_s, is_frame: true, content });
+                    let stem = format!("{}-{}", self.video_stem, frame.index);
+                    let time_s = frame.time_s;
+                    return Some(Item { name, stem, time_s, is_frame: true, content });
                 }
                 Some(Err(problem)) => return Some(Item::unreadable(path, problem.to_string())),
                 None => self.video = None,
@@ -77,6 +105,7 @@ impl Source {
         if is_video(&path) {
             match Video::open(&path, DEFAULT_MAX_PIXELS) {
                 Ok(video) => {
+                    self.video_stem = self.stem(&path);
                     self.video = Some((path, video));
                     return self.next();
                 }
@@ -86,14 +115,26 @@ impl Source {
         let time_s = f64::from(self.images) * IMAGE_PERIOD_S;
         self.images = self.images.saturating_add(1);
         let name = path.display().to_string();
-        Some(Item { name, time_s, is_frame: false, content: Content::File(path) })
+        let stem = self.stem(&path);
+        Some(Item { name, stem, time_s, is_frame: false, content: Content::File(path) })
     }
+}
+
+fn is_drawn(file: &Path) -> bool {
+    file.to_string_lossy().ends_with(DRAWN_ENDING)
+}
+
+/// A path as one name, of which folders become parts.
+pub(crate) fn stem(path: &str) -> String {
+    let parts = path.split(['/', '\\']).filter(|part| !matches!(*part, "" | "." | ".."));
+    parts.collect::<Vec<_>>().join("_").replace(['#', ':'], "-")
 }
 
 impl Item {
     fn unreadable(path: &Path, problem: String) -> Self {
         let name = path.display().to_string();
-        Self { name, time_s: 0.0, is_frame: false, content: Content::Unreadable(problem) }
+        let content = Content::Unreadable(problem);
+        Self { stem: stem(&name), name, time_s: 0.0, is_frame: false, content }
     }
 
     /// The grey image, or the reason why there is none.
@@ -104,5 +145,40 @@ impl Item {
             Content::Unreadable(problem) => return Err(problem),
         };
         image.map_err(|problem| problem.to_string())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn stems(paths: &[PathBuf]) -> Vec<String> {
+        let mut source = Source::new(paths);
+        std::iter::from_fn(|| source.next()).map(|item| item.stem).collect()
+    }
+
+    #[test]
+    fn the_names_of_files_about_images_differ() {
+        assert_eq!(stem("../a/b.c/1.jpg"), "a_b.c_1.jpg");
+        assert_eq!(stem("/d/flight:2.avi"), "d_flight-2.avi");
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("a")).unwrap();
+        let paths = ["a/b.jpg", "a_b.jpg", "a/b.jpg", "c.jpg"].map(|name| folder.path().join(name));
+        paths.iter().for_each(|path| std::fs::write(path, "").unwrap());
+        let stems = stems(&paths);
+        let distinct: std::collections::BTreeSet<_> = stems.iter().collect();
+        assert_eq!(distinct.len(), 4, "{stems:?}");
+        assert!(stems[1].ends_with("a_b.jpg~2") && stems[2].ends_with("a_b.jpg~3"), "{stems:?}");
+    }
+
+    #[test]
+    fn annotated_images_of_a_folder_are_not_taken_for_its_images() {
+        let folder = tempfile::tempdir().unwrap();
+        let drawn = folder.path().join(format!("a.jpg{DRAWN_ENDING}"));
+        for path in [&folder.path().join("a.jpg"), &drawn] {
+            std::fs::write(path, "").unwrap();
+        }
+        assert_eq!(stems(&[folder.path().to_owned()]).len(), 1);
+        assert_eq!(stems(&[drawn]).len(), 1);
     }
 }
