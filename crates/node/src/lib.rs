@@ -19,6 +19,7 @@ pub mod denied;
 pub mod frames;
 pub mod health;
 pub mod identity;
+mod key_pair;
 mod memory;
 pub mod network;
 pub mod service;

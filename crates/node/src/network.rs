@@ -13,6 +13,7 @@ use serde_json::{Value, json};
 
 use crate::access::{HOLDERS, access_control};
 use crate::config::{NAME_RULE, is_name};
+use crate::key_pair;
 use crate::session::{LOCAL_CONFIG, LOCAL_PORT, ZenohSource};
 
 /// The relay on the drone.
@@ -250,7 +251,9 @@ fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()>
             keys.display()
         );
     }
-    check_private(&keys.join(key_file))?;
+    let key_file = keys.join(key_file);
+    check_private(&key_file)?;
+    key_pair::check(&keys.join(AUTHORITY), &keys.join(format!("{key_name}.pem")), &key_file)?;
     each_endpoint(config, &["connect", "listen"], |e| {
         if !(connects_locally && e.host == LOOPBACK) {
             e.protocol = "tls".to_owned();
@@ -579,12 +582,23 @@ mod tests {
         }
     }
 
+    /// A key with its certificate, which is its own authority.
+    fn write_keys(folder: &Path, name: &str) {
+        let key = rcgen::KeyPair::generate().unwrap();
+        let certificate = rcgen::CertificateParams::new(vec![name.to_owned()]).unwrap();
+        let certificate = certificate.self_signed(&key).unwrap().pem();
+        for file in [AUTHORITY.to_owned(), format!("{name}.pem")] {
+            std::fs::write(folder.join(file), &certificate).unwrap();
+        }
+        let path = folder.join(format!("{name}.key"));
+        std::fs::write(&path, key.serialize_pem()).unwrap();
+        std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o600)).unwrap();
+    }
+
     #[test]
     fn keys_that_others_can_read_are_refused() {
         let keys = tempfile::tempdir().unwrap();
-        for file in [AUTHORITY, "operator.pem", "operator.key"] {
-            std::fs::write(keys.path().join(file), "").unwrap();
-        }
+        write_keys(keys.path(), "operator");
         let network = Network {
             keys: Some(keys.path().to_owned()),
             connect: Some("10.0.0.1".into()),
@@ -606,11 +620,8 @@ mod tests {
     #[test]
     fn endpoints_for_each_mode_are_secured_as_a_list_is() {
         let keys = tempfile::tempdir().unwrap();
-        for file in [AUTHORITY, "relay.pem", "relay.key", HOLDERS] {
-            std::fs::write(keys.path().join(file), "").unwrap();
-            let path = keys.path().join(file);
-            std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o600)).unwrap();
-        }
+        write_keys(keys.path(), "relay");
+        std::fs::write(keys.path().join(HOLDERS), "").unwrap();
         for listen in ["['tcp/0.0.0.0:7448']", "{ peer: ['tcp/0.0.0.0:7448'] }"] {
             let text = format!(
                 "{{ mode: 'peer', namespace: 'hawk', connect: {{ endpoints: [] }}, listen: {{ endpoints: {listen} }} }}"
