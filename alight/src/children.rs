@@ -15,7 +15,7 @@ use tokio::sync::mpsc;
 use crate::services::Service;
 
 /// Time that a child gets to stop after SIGTERM.
-const STOP_TIMEOUT: Duration = Duration::from_secs(2);
+const STOP_TIMEOUT: Duration = Duration::from_secs(4);
 /// Maximum number of queued output lines; further ones are dropped, so that a service never waits for a
 /// terminal.
 const MAX_QUEUED_LINES: usize = 256;

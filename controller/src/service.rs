@@ -22,9 +22,9 @@ use crate::tape::TapedFlight;
 
 /// Period of the flight's ticks.
 const TICK: Duration = Duration::from_millis(25);
-/// Longest wait at shutdown for the autopilot to confirm that its parameter is put back, and for the heartbeat, one a second, after
-/// which a PX4 is asked to hold its place.
-const SHUTDOWN_TIMEOUT: Duration = Duration::from_millis(1200);
+/// Longest wait at shutdown for the autopilot to confirm that its parameter is put back, and for the heartbeats, one a second, after
+/// which a PX4 is asked to hold its place, and which shows that it does.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
 /// Period of the status while nothing changes, in nanoseconds.
 const STATUS_PERIOD_NS: i64 = 200_000_000;
 /// Period of the check whether the status has changed, in nanoseconds.

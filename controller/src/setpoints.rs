@@ -8,6 +8,8 @@ use geometry::{Ned, Vector};
 use landing::Action;
 use messages::Setpoint;
 
+use crate::control::ZEROS_NS;
+
 /// Sends setpoints at their rate, mode changes and disarming.
 #[derive(Debug)]
 pub struct Setpoints {
@@ -20,8 +22,12 @@ pub struct Setpoints {
     request: Option<CommandId>,
     /// When LAND was requested last.
     land_ns: Option<i64>,
+    /// When a PX4 was asked to hold its place: until it does, zero setpoints go on, as the request may be lost.
+    hold_ns: Option<i64>,
 }
 
+/// Time for which a PX4 that was asked to hold its place is waited for, in nanoseconds: the request is sent four times.
+const MAX_HOLD_NS: i64 = 6_000_000_000;
 /// Time after a request in which LAND may not show yet, in nanoseconds.
 const LAND_SHOWS_NS: i64 = 3_000_000_000;
 
@@ -35,6 +41,7 @@ impl Setpoints {
             sent_ns: i64::MIN,
             request: None,
             land_ns: None,
+            hold_ns: None,
         }
     }
 
@@ -61,7 +68,10 @@ impl Setpoints {
             Action::None if self.last.is_some() && self.needs_hold(now_ns, autopilot) => {
                 return self.hold_when_known(now_ns, autopilot);
             }
-            Action::None => self.last = None,
+            Action::None => {
+                self.last = None;
+                self.is_awaiting_hold(now_ns, autopilot);
+            }
             Action::Guided | Action::Disarm | Action::Land if !is_ours(autopilot) => {
                 self.last = None;
                 autopilot.withdraw();
@@ -103,10 +113,22 @@ impl Setpoints {
     pub fn end(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
         if self.last.is_none() || !self.needs_hold(now_ns, autopilot) {
             self.last = None;
-            return false;
+            return self.is_awaiting_hold(now_ns, autopilot);
         }
         self.hold_when_known(now_ns, autopilot);
-        self.last.is_some()
+        self.last.is_some() || self.is_awaiting_hold(now_ns, autopilot)
+    }
+
+    /// True while a PX4 that was asked to hold its place has not shown it: zero setpoints keep it where it is.
+    fn is_awaiting_hold(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
+        let is_recent = |asked_ns: &i64| {
+            now_ns.saturating_sub(*asked_ns) <= MAX_HOLD_NS && is_offboard(autopilot)
+        };
+        self.hold_ns = self.hold_ns.filter(is_recent);
+        if self.hold_ns.is_some() {
+            autopilot.send_zeros_until(now_ns.saturating_add(ZEROS_NS));
+        }
+        self.hold_ns.is_some()
     }
 
     /// Asks for HOLD once a heartbeat has just told that the mode is ours; until then it may be the pilot's already, and zero
@@ -118,6 +140,7 @@ impl Setpoints {
     ) -> Option<Result<(), SetpointError>> {
         if autopilot.shows_mode_of_now(now_ns) {
             self.last = None;
+            self.hold_ns = Some(now_ns);
             self.request(now_ns, Command::SetMode(FlightMode::AUTO_HOLD), autopilot);
             return None;
         }
@@ -172,6 +195,10 @@ impl Setpoints {
             autopilot.tick(now_ns);
         }
     }
+}
+
+fn is_offboard(autopilot: &Autopilot) -> bool {
+    autopilot.state().is_some_and(|state| state.armed && state.mode == FlightMode::OFFBOARD)
 }
 
 /// True while the autopilot's own mode is known and is ours: another one is the pilot's, and nothing is asked of it.

@@ -567,7 +567,11 @@ fn a_px4_is_asked_to_hold_its_place_when_setpoints_end() {
         let sent = hover(&mut flight, 1020, 5900, mode);
         assert!(sent.setpoints > 100 && sent.modes.is_empty(), "{sent:?}");
         let sent = hover(&mut flight, 5920, 7500, mode);
-        assert!(sent.setpoints < 30 && sent.modes.first() == asked, "{sent:?}");
+        assert_eq!(sent.modes.first(), asked, "{sent:?}");
+        // The request may be lost, and silence is a failure to a PX4.
+        assert_eq!(sent.setpoints > 25, asked.is_some(), "{sent:?}");
+        let sent = hover(&mut flight, 8000, 9900, if asked.is_some() { HOLD } else { mode });
+        assert!(sent.setpoints <= 2, "{sent:?}");
         // A controller that is asked to stop, and knows the mode of almost a second ago only.
         let mut flight = begun(mode);
         assert_eq!(flight.shutdown(1000 * MS), asked.is_some());
@@ -576,9 +580,11 @@ fn a_px4_is_asked_to_hold_its_place_when_setpoints_end() {
         assert!(sent.setpoints == 1 && sent.modes.is_empty(), "{sent:?}");
         pose(&mut flight, 1040 * MS);
         receive(&mut flight, 1050 * MS, &heartbeat(mode, true));
-        assert!(!flight.shutdown(1060 * MS));
+        assert_eq!(flight.shutdown(1060 * MS), asked.is_some(), "until it holds");
         sent.take(&mut flight);
         assert_eq!(sent.modes.first(), asked, "{sent:?}");
+        receive(&mut flight, 1500 * MS, &heartbeat(HOLD, true));
+        assert!(!flight.shutdown(1510 * MS));
         // The pilot has taken over meanwhile.
         let mut flight = begun(mode);
         flight.shutdown(1000 * MS);
