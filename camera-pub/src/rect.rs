@@ -87,12 +87,11 @@ impl Work {
     async fn run(mut self) {
         let mut ticks = tokio::time::interval(TICK);
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let mut checked = Instant::now();
         loop {
             tokio::select! {
-                _ = ticks.tick() => {
-                    let is_wanted = self.frames.has_subscribers().await;
-                    self.is_wanted.store(is_wanted, Ordering::Relaxed);
-                }
+                // The end of the service first: the runtime's clock ends after it, and must not be asked any more.
+                biased;
                 changed = self.offers.changed() => {
                     if changed.is_err() {
                         return;
@@ -101,8 +100,16 @@ impl Work {
                     if let Some(offer) = offer {
                         self.publish(&offer).await;
                     }
+                    // Frames may come faster than they are rectified.
+                    if checked.elapsed() < TICK {
+                        continue;
+                    }
                 }
+                _ = ticks.tick() => {}
             }
+            let is_wanted = self.frames.has_subscribers().await;
+            self.is_wanted.store(is_wanted, Ordering::Relaxed);
+            checked = Instant::now();
         }
     }
 
