@@ -99,7 +99,9 @@ fn make_certificate(
 ) -> anyhow::Result<ExitCode> {
     let certificate = match output {
         Some(path) => path.to_owned(),
-        None => usual_folder()?.join("dashboard.pem"),
+        None => usual_folder()
+            .context("no folder for the certificate; name a file with `--output FILE.pem`")?
+            .join("dashboard.pem"),
     };
     let key = certificate.with_extension("key");
     ensure!(key != certificate, "{certificate:?} has the ending of the key; name it `.pem`");

@@ -6,6 +6,7 @@
 
 use std::fs::{self, OpenOptions};
 use std::io::Write;
+use std::net::IpAddr;
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -332,7 +333,19 @@ pub(crate) fn make_for_tests(directory: &Path, detectors: &[&str]) -> anyhow::Re
     detectors.iter().try_for_each(|name| make(Role::Detector, Some(name)))
 }
 
+/// Whether it is an IP address or a host name.
+fn is_host(address: &str) -> bool {
+    let is_name_of = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    address.parse::<IpAddr>().is_ok() || !address.is_empty() && address.chars().all(is_name_of)
+}
+
 fn parameters(name: &str, addresses: &[String], days: u32) -> anyhow::Result<CertificateParams> {
+    for address in addresses {
+        ensure!(
+            is_host(address),
+            "invalid address `{address}`: expected an IP address or a host name, without a port"
+        );
+    }
     let mut params = CertificateParams::new(addresses.to_vec())
         .with_context(|| format!("invalid addresses {addresses:?}"))?;
     params.distinguished_name = rcgen::DistinguishedName::new();
@@ -477,6 +490,16 @@ mod tests {
         let names = format!("{names:?}");
         assert!(names.contains("kestrel.local"), "{names}");
         refused(make("10.0.0.2"), "never overwritten");
+    }
+
+    #[test]
+    fn what_nobody_can_connect_to_is_no_address_of_a_certificate() {
+        for address in ["10.0.0.1", "fe80::1", "kestrel.local", "drone_2"] {
+            assert!(parameters("drone", &[address.to_owned()], 30).is_ok(), "{address}");
+        }
+        for address in ["foo bar", "", "10.0.0.1:7448", "http://drone", "dr\u{f6}hne"] {
+            refused(parameters("drone", &[address.to_owned()], 30), "invalid address");
+        }
     }
 
     #[test]

@@ -1,4 +1,6 @@
-//! Whether the files of a key belong together. Zenoh only logs it below the level that is shown when they do not, and then listens nowhere.
+//! Whether the files of a key belong together.
+//!
+//! A process whose files do not would start, listen nowhere, and say nothing of it.
 
 use std::path::Path;
 
