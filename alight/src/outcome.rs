@@ -165,10 +165,13 @@ impl LandingSummary {
         }
         // One that fails goes on without a file; what it kept is in the last one.
         let before = self.recorder.replace(recorder).map(|before| before.file);
-        if let (Some(now), Some(before)) = (&mut self.recorder, before)
-            && now.file.is_empty()
-        {
-            now.file = before;
+        if let (Some(now), Some(before)) = (&mut self.recorder, before) {
+            if now.file.is_empty() {
+                now.file = before;
+            } else if !before.is_empty() && now.file != before {
+                // Another one has taken its place.
+                self.recorders_exit = None;
+            }
         }
     }
 
@@ -485,6 +488,8 @@ mod tests {
         assert_eq!(status(&landing), RECORDING_FAILED, "the landing is not in it");
         let table = landing.outcome().table();
         assert!(table.contains("its file is whole") && !table.contains("--repair"), "{table}");
+        landing.recorder(told("main", "flight-2.mcap", None));
+        assert_eq!(status(&landing), 0, "another recorder goes on");
     }
 
     #[test]
