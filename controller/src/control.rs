@@ -12,12 +12,10 @@ use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMo
 const MAX_CHANGE_NS: i64 = 10_000_000_000;
 /// Time in OFFBOARD within which the lander must have begun, in nanoseconds.
 const MAX_UNUSED_NS: i64 = 1_500_000_000;
-/// Time within which a start that is given up must show no OFFBOARD any more, in nanoseconds.
-const MAX_RELEASE_NS: i64 = 6_000_000_000;
+/// Time within which a PX4 that is to hold its place must show OFFBOARD no more, in nanoseconds: the request is sent four times.
+pub const MAX_RELEASE_NS: i64 = 6_000_000_000;
 /// Time after which a heartbeat shows what an earlier request did, in nanoseconds.
 const REACTION_NS: i64 = 200_000_000;
-/// Time for which zeros go on without a step, in nanoseconds: steps are 25 ms apart.
-pub const ZEROS_NS: i64 = 60_000_000;
 
 /// A change to OFFBOARD that was asked for.
 #[derive(Clone, Debug)]
@@ -78,7 +76,7 @@ impl TakingControl {
         let progress = self.advance(now_ns, autopilot);
         match progress {
             ControlProgress::Ended(_) => autopilot.withdraw(),
-            _ => autopilot.send_zeros_until(now_ns.saturating_add(ZEROS_NS)),
+            _ => autopilot.send_zeros(now_ns),
         }
         progress
     }
@@ -140,6 +138,13 @@ impl Release {
             self.request = Some(autopilot.request(now_ns, hold));
         }
         ControlProgress::Waiting
+    }
+}
+
+/// Keeps a PX4 where it is that is in OFFBOARD while nothing steers it: without setpoints it would leave the mode.
+pub fn hover_in_offboard(now_ns: i64, autopilot: &mut Autopilot) {
+    if autopilot.state().is_some_and(|state| state.mode == FlightMode::OFFBOARD) {
+        autopilot.send_zeros(now_ns);
     }
 }
 

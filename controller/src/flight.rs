@@ -587,7 +587,9 @@ impl Flight {
             // The mode may be newer than the state that the lander has.
             (Trigger::TakenOff, Phase::Idle) => self.mission.stand_down(true),
             (Trigger::InControl, phase) if phase.is_terminal() => {
-                self.mission = before.unwrap_or_else(|| self.mission.clone());
+                if let Some(before) = before {
+                    self.mission = before;
+                }
             }
             _ => {}
         }

@@ -1,7 +1,8 @@
 //! The other way to land: the autopilot's own precision landing, which is sent the landing target.
 //!
-//! No setpoint is sent, but zeros to a PX4 that hovers in OFFBOARD. Every frame that was used gives the autopilot a landing target; the pilot, a mission
-//! or our own start changes to LAND (PRECISION LAND on PX4), and the autopilot does the rest.
+//! No setpoint is sent, but zeros to a PX4 that hovers in OFFBOARD, as after a take-off. Every frame that was used
+//! gives the autopilot a landing target; the pilot, a mission or our own start changes to LAND (PRECISION LAND on
+//! PX4), and the autopilot does the rest.
 
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, Parameter};
 use geometry::Point;
@@ -9,7 +10,7 @@ use landing::{FrameObservation, TargetEstimate};
 use messages::Phase;
 
 use crate::config::{LandingTargetSettings, LandingTargetSource};
-use crate::control::ZEROS_NS;
+use crate::control::hover_in_offboard;
 use crate::wire;
 
 /// The parameters of ArduPilot that decide whether it uses landing targets.
@@ -128,11 +129,11 @@ impl LandingTargetMode {
                 self.state = State::Ended(format!("the pilot flies, in {}", state.mode));
             }
             State::Stabilising(since_ns) => {
-                self.stay_in_offboard(now_ns, state.mode, autopilot);
+                hover_in_offboard(now_ns, autopilot);
                 self.command_when_steady(now_ns, since_ns, autopilot);
             }
             State::Commanding(request) => {
-                self.stay_in_offboard(now_ns, state.mode, autopilot);
+                hover_in_offboard(now_ns, autopilot);
                 if let CommandStatus::Failed(problem) = autopilot.status(request) {
                     self.state = State::Ended(problem.to_string());
                 }
@@ -229,13 +230,6 @@ impl LandingTargetMode {
     /// True once a landing has ended.
     pub fn is_finished(&self) -> bool {
         matches!(self.state, State::Landed | State::Ended(_))
-    }
-
-    /// Lets a PX4 that began in OFFBOARD, as after a take-off, hover there until it lands: without setpoints it would leave it.
-    fn stay_in_offboard(&self, now_ns: i64, mode: FlightMode, autopilot: &mut Autopilot) {
-        if mode == FlightMode::OFFBOARD {
-            autopilot.send_zeros_until(now_ns.saturating_add(ZEROS_NS));
-        }
     }
 
     /// True in the modes in which the vehicle hovers until LAND is requested.

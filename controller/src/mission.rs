@@ -3,7 +3,7 @@
 use autopilot::{Autopilot, FlightMode, LandedState, Takeoff, TakeoffError, TakeoffProgress};
 
 use crate::config::Start;
-use crate::control::{ControlProgress, TakingControl, ZEROS_NS};
+use crate::control::{ControlProgress, TakingControl, hover_in_offboard};
 
 /// Time within which motors that run again mean that a landing had not ended, in nanoseconds: nobody prepares the next
 /// flight so soon, and the autopilot's heartbeat may have been wrong.
@@ -235,10 +235,7 @@ impl Mission {
                 })) => {
                     if let Some(obstacle) = obstacle {
                         obstacle.clone_into(why);
-                        // A PX4 in OFFBOARD gets no other setpoints yet.
-                        if autopilot.state().is_some_and(|s| s.mode == FlightMode::OFFBOARD) {
-                            autopilot.send_zeros_until(now_ns.saturating_add(ZEROS_NS));
-                        }
+                        hover_in_offboard(now_ns, autopilot);
                         return None;
                     }
                     Some(match end {

@@ -8,7 +8,7 @@ use geometry::{Ned, Vector};
 use landing::Action;
 use messages::Setpoint;
 
-use crate::control::ZEROS_NS;
+use crate::control::MAX_RELEASE_NS;
 
 /// Sends setpoints at their rate, mode changes and disarming.
 #[derive(Debug)]
@@ -26,8 +26,6 @@ pub struct Setpoints {
     hold_ns: Option<i64>,
 }
 
-/// Time for which a PX4 that was asked to hold its place is waited for, in nanoseconds: the request is sent four times.
-const MAX_HOLD_NS: i64 = 6_000_000_000;
 /// Time after a request in which LAND may not show yet, in nanoseconds.
 const LAND_SHOWS_NS: i64 = 3_000_000_000;
 
@@ -122,11 +120,11 @@ impl Setpoints {
     /// True while a PX4 that was asked to hold its place has not shown it: zero setpoints keep it where it is.
     fn is_awaiting_hold(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
         let is_recent = |asked_ns: &i64| {
-            now_ns.saturating_sub(*asked_ns) <= MAX_HOLD_NS && is_offboard(autopilot)
+            now_ns.saturating_sub(*asked_ns) <= MAX_RELEASE_NS && is_offboard(autopilot)
         };
         self.hold_ns = self.hold_ns.filter(is_recent);
         if self.hold_ns.is_some() {
-            autopilot.send_zeros_until(now_ns.saturating_add(ZEROS_NS));
+            autopilot.send_zeros(now_ns);
         }
         self.hold_ns.is_some()
     }

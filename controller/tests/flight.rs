@@ -408,12 +408,7 @@ fn precision_landing_gets_the_target_and_no_setpoint() {
 #[test]
 fn a_px4_that_holds_its_place_is_asked_to_land_by_itself() {
     const PRECISION_LAND: u32 = 0x0904_0000;
-    let mut flight = flight_with("command", &["mode=landing-target"]);
-    flight.camera(0, CameraInfo::sample());
-    flight.presence(0, "main", true);
-    receive(&mut flight, 0, &heartbeat(POSITION, true));
-    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
-    hover(&mut flight, 20, 1000, POSITION);
+    let mut flight = px4_in(POSITION, "command", &["mode=landing-target"]);
     let reply = flight.command(1000 * MS, &ControllerCommand::Start);
     assert!(!reply.accepted && reply.reason.contains("HOLD"), "{reply:?}");
     receive(&mut flight, 1010 * MS, &heartbeat(HOLD, true));
@@ -426,12 +421,7 @@ fn a_px4_that_holds_its_place_is_asked_to_land_by_itself() {
     assert_eq!(flight.status(5500 * MS).phase, Phase::Final);
 
     // Of one that began in OFFBOARD, HOLD is a pilot's choice.
-    let mut flight = flight_with("command", &["mode=landing-target"]);
-    flight.camera(0, CameraInfo::sample());
-    flight.presence(0, "main", true);
-    receive(&mut flight, 0, &heartbeat(OFFBOARD, true));
-    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
-    hover(&mut flight, 20, 1000, OFFBOARD);
+    let mut flight = px4_in(OFFBOARD, "command", &["mode=landing-target"]);
     assert!(flight.command(1000 * MS, &ControllerCommand::Start).accepted);
     let sent = hover(&mut flight, 2000, 6000, HOLD);
     assert!(sent.modes.is_empty(), "{sent:?}");
@@ -601,8 +591,8 @@ const HOLD: u32 = 0x0304_0000;
 const OFFBOARD: u32 = 0x0006_0000;
 
 /// A PX4 that flies in this mode, one second long.
-fn px4_in(mode: u32, start: &str) -> Flight {
-    let mut flight = flight(start);
+fn px4_in(mode: u32, start: &str, set: &[&str]) -> Flight {
+    let mut flight = flight_with(start, set);
     flight.camera(0, CameraInfo::sample());
     flight.presence(0, "main", true);
     receive(&mut flight, 0, &heartbeat(mode, true));
@@ -613,7 +603,7 @@ fn px4_in(mode: u32, start: &str) -> Flight {
 
 /// One that holds its place was asked for OFFBOARD at 3 s, and has not shown it.
 fn px4_asked_for_offboard(start: &str) -> Flight {
-    let mut flight = px4_in(HOLD, start);
+    let mut flight = px4_in(HOLD, start, &[]);
     let reply = flight.command(1000 * MS, &ControllerCommand::Start);
     assert!(reply.accepted && reply.reason.contains("OFFBOARD"), "{reply:?}");
     let sent = hover(&mut flight, 1000, 2980, HOLD);
@@ -661,7 +651,7 @@ fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_sta
     }
 
     // The heartbeat before the request shows the pilot's mode.
-    let mut flight = px4_in(HOLD, "command");
+    let mut flight = px4_in(HOLD, "command", &[]);
     flight.command(1000 * MS, &ControllerCommand::Start);
     hover(&mut flight, 1000, 2980, HOLD);
     let sent = hover(&mut flight, 2980, 6000, POSITION);
@@ -677,7 +667,7 @@ fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_sta
     assert!(flight.command(30_000 * MS, &ControllerCommand::Start).accepted, "once more");
 
     // A pilot is not disturbed.
-    let mut flight = px4_in(POSITION, "command");
+    let mut flight = px4_in(POSITION, "command", &[]);
     let reply = flight.command(1000 * MS, &ControllerCommand::Start);
     assert!(!reply.accepted && reply.reason.contains("HOLD"), "{reply:?}");
     let sent = hover(&mut flight, 1020, 3000, POSITION);
@@ -716,7 +706,7 @@ fn a_px4_that_may_have_changed_to_offboard_is_not_left_there_when_the_start_is_g
     }
 
     // The controller is ended, before it asked and after.
-    let mut flight = px4_in(HOLD, "command");
+    let mut flight = px4_in(HOLD, "command", &[]);
     flight.command(1000 * MS, &ControllerCommand::Start);
     hover(&mut flight, 1020, 1900, HOLD);
     assert!(flight.shutdown(1900 * MS));

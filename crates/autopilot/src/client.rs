@@ -16,7 +16,7 @@ use crate::boot::{BootClock, BootTime};
 use crate::clock::Clock;
 use crate::command::{
     Command, CommandError, CommandId, CommandStatus, MODE_OF_NOW_NS, Request, SetpointError, Step,
-    ns,
+    ZEROS_NS, ns,
 };
 use crate::compose;
 use crate::config::Config;
@@ -358,10 +358,10 @@ impl Autopilot {
         self.heartbeat_age_ns(now_ns).is_some_and(|age_ns| age_ns < MODE_OF_NOW_NS)
     }
 
-    /// Sends setpoints of zero velocity until then: before OFFBOARD, and until it shows whether a PX4 has changed to it. All other
-    /// modes ignore them.
-    pub fn send_zeros_until(&mut self, until_ns: i64) {
-        self.zeros_until_ns = until_ns;
+    /// Sends setpoints of zero velocity until the next call, a tick later: before OFFBOARD, and until it shows whether a PX4 has
+    /// changed to it. All other modes ignore them.
+    pub fn send_zeros(&mut self, now_ns: i64) {
+        self.zeros_until_ns = now_ns.saturating_add(ZEROS_NS);
     }
 
     /// Sends a velocity in m/s, with a yaw rate in rad/s (0 holds the heading): at least twice a second,

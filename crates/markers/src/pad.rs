@@ -202,9 +202,9 @@ impl PlacedMarker {
 
     /// How far from its centre the square reaches that its code leaves free, in metres.
     fn free_m(&self) -> f64 {
-        let cells = SquareCode::for_family(self.marker.family).map_or(0, SquareCode::free_cells);
-        let across = SquareCode::for_family(self.marker.family).map_or(1, |code| code.cells);
-        self.size_m * f64::from(cells) / (2.0 * f64::from(across))
+        SquareCode::for_family(self.marker.family).map_or(0.0, |code| {
+            self.size_m * f64::from(code.free_cells()) / (2.0 * f64::from(code.cells))
+        })
     }
 
     /// Why it cannot be printed after another one: the print of one covers the other or its quiet zone, and it does not lie in
