@@ -255,7 +255,8 @@ impl Watcher {
         if decision.rejected.is_none() {
             match event {
                 Event::Frame(frame) if frame.marker.is_some() => {
-                    self.newest_marker = Some(frame.stamp);
+                    // A late frame is used as well, and is not the newest.
+                    self.newest_marker = self.newest_marker.max(Some(frame.stamp));
                 }
                 Event::Vehicle(state) => self.hear(before, state.mode),
                 Event::Status(status) => self.hear(before, status.mode),
