@@ -343,11 +343,11 @@ impl Flight {
             self.log_setpoint(result);
         }
         let why = "the controller was ended";
-        let releases = self.mission.give_up_control(now_ns, &mut self.autopilot, why);
+        let leaves = self.mission.leave_offboard(now_ns, &mut self.autopilot, why);
         let waits = self.setpoints.end(now_ns, &mut self.autopilot);
         let is_pending = self.limits.restore(&mut self.autopilot);
         self.autopilot.tick(now_ns);
-        is_pending || releases || waits
+        is_pending || leaves || waits
     }
 
     /// The next packet for the autopilot.
@@ -420,6 +420,9 @@ impl Flight {
         }
         if self.mission.is_taking_control() {
             return Err(format!("a start is under way: {}", self.view().phase(now_ns).1));
+        }
+        if let Some(why) = self.mission.leaves_offboard_because() {
+            return Err(format!("the vehicle is just being taken back to HOLD: {why}"));
         }
         if self.autopilot.state().and_then(wire::vehicle).is_none() {
             return Err("attitude and position of the vehicle are not known".to_owned());
@@ -498,6 +501,11 @@ impl Flight {
             if command == OperatorCommand::Resume {
                 return Err("the vehicle is taking off; there is nothing to resume".to_owned());
             }
+            let why =
+                "aborted by the operator before the landing began; the vehicle holds its place";
+            if self.mission.leave_offboard(now_ns, &mut self.autopilot, why) {
+                return Ok(why.to_owned());
+            }
             let why = "aborted by the operator; the autopilot completes the take-off".to_owned();
             self.mission.fail(&mut self.autopilot, why.clone());
             return Ok(why);
@@ -507,7 +515,7 @@ impl Flight {
                 return Err("the landing has not begun; there is nothing to resume".to_owned());
             }
             let why = "ended by the operator before the vehicle followed setpoints";
-            self.mission.give_up_control(now_ns, &mut self.autopilot, why);
+            self.mission.leave_offboard(now_ns, &mut self.autopilot, why);
             return Ok(why.to_owned());
         }
         if !self.is_landing() {

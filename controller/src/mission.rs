@@ -1,6 +1,8 @@
 //! The mission: when a landing begins, and what comes before and after it.
 
-use autopilot::{Autopilot, FlightMode, LandedState, Takeoff, TakeoffError, TakeoffProgress};
+use autopilot::{
+    Autopilot, FlightMode, LandedState, OffboardExit, Takeoff, TakeoffError, TakeoffProgress,
+};
 
 use crate::config::Start;
 use crate::control::{ControlProgress, TakingControl, hover_in_offboard};
@@ -41,6 +43,15 @@ pub enum State {
         /// The change.
         control: TakingControl,
         /// The mission waited for the vehicle to fly, and does so again if the change fails.
+        awaits_takeoff: bool,
+    },
+    /// A PX4 that may be in OFFBOARD is taken back to HOLD.
+    LeavingOffboard {
+        /// The way out.
+        exit: OffboardExit,
+        /// Why nothing steers it.
+        why: String,
+        /// As before.
         awaits_takeoff: bool,
     },
     /// The lander decides.
@@ -123,13 +134,54 @@ impl Mission {
         self.state = State::TakingControl { control, awaits_takeoff };
     }
 
-    /// Gives up a change to OFFBOARD; true while one goes on, or may still have to be undone.
-    pub fn give_up_control(&mut self, now_ns: i64, autopilot: &mut Autopilot, why: &str) -> bool {
-        if let State::TakingControl { control, .. } = &mut self.state {
-            control.give_up(now_ns, autopilot, why.to_owned());
-            self.advance_control(now_ns, autopilot, false);
+    /// Why a PX4 that may be in OFFBOARD is taken back to HOLD; `None` when it is not.
+    pub fn leaves_offboard_because(&self) -> Option<&str> {
+        match &self.state {
+            State::LeavingOffboard { why, .. } => Some(why),
+            _ => None,
         }
-        self.is_taking_control()
+    }
+
+    /// Gives up a take-off or a change to OFFBOARD, for this reason, where a PX4 may be in OFFBOARD before a landing, or change to
+    /// it; true while the way out goes on.
+    pub fn leave_offboard(&mut self, now_ns: i64, autopilot: &mut Autopilot, why: &str) -> bool {
+        let may_be_in_it = autopilot.is_requesting_offboard()
+            || autopilot.state().is_some_and(|state| state.mode == FlightMode::OFFBOARD);
+        match &self.state {
+            State::TakingControl { .. } => {
+                let why = format!("the landing did not begin: {why}");
+                self.begin_exit(now_ns, autopilot, why);
+            }
+            State::TakingOff { .. } if may_be_in_it => {
+                self.begin_exit(now_ns, autopilot, why.to_owned());
+            }
+            _ => {}
+        }
+        self.advance_exit(now_ns, autopilot)
+    }
+
+    fn begin_exit(&mut self, now_ns: i64, autopilot: &mut Autopilot, why: String) {
+        tracing::warn!(why, "Back to HOLD, if the vehicle changes to OFFBOARD");
+        let awaits_takeoff =
+            matches!(self.state, State::TakingControl { awaits_takeoff: true, .. });
+        let exit = OffboardExit::begin(now_ns, autopilot);
+        self.state = State::LeavingOffboard { exit, why, awaits_takeoff };
+    }
+
+    /// Advances the way out of OFFBOARD; true while it goes on.
+    fn advance_exit(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
+        let State::LeavingOffboard { exit, why, awaits_takeoff } = &mut self.state else {
+            return false;
+        };
+        if exit.step(now_ns, autopilot) {
+            return true;
+        }
+        let (why, awaits_takeoff) = (std::mem::take(why), *awaits_takeoff);
+        self.fail(autopilot, why);
+        if awaits_takeoff {
+            self.stand_down(true);
+        }
+        false
     }
 
     /// True while a landing begins by itself once the vehicle flies.
@@ -257,6 +309,10 @@ impl Mission {
                 }
             },
             State::TakingControl { .. } => self.advance_control(now_ns, autopilot, is_fresh),
+            State::LeavingOffboard { .. } => {
+                self.advance_exit(now_ns, autopilot);
+                None
+            }
             State::Idle | State::Landing | State::SendingLandingTarget | State::Failed { .. } => {
                 None
             }
@@ -270,17 +326,12 @@ impl Mission {
         autopilot: &mut Autopilot,
         is_fresh: bool,
     ) -> Option<Trigger> {
-        let State::TakingControl { control, awaits_takeoff } = &mut self.state else { return None };
-        let awaits_takeoff = *awaits_takeoff;
+        let State::TakingControl { control, .. } = &mut self.state else { return None };
         match control.step(now_ns, autopilot) {
             ControlProgress::InControl => is_fresh.then_some(Trigger::InControl),
             ControlProgress::Waiting => None,
-            ControlProgress::Ended(why) => {
-                tracing::warn!(why, "The landing did not begin");
-                self.fail(autopilot, format!("the landing did not begin: {why}"));
-                if awaits_takeoff {
-                    self.stand_down(true);
-                }
+            ControlProgress::GivenUp(why) => {
+                self.leave_offboard(now_ns, autopilot, &why);
                 None
             }
         }

@@ -3,12 +3,10 @@
 use std::time::Duration;
 
 use autopilot::command::SetpointError;
-use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode};
+use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, OffboardExit};
 use geometry::{Ned, Vector};
 use landing::Action;
 use messages::Setpoint;
-
-use crate::control::MAX_RELEASE_NS;
 
 /// Sends setpoints at their rate, mode changes and disarming.
 #[derive(Debug)]
@@ -22,8 +20,8 @@ pub struct Setpoints {
     request: Option<CommandId>,
     /// When LAND was requested last.
     land_ns: Option<i64>,
-    /// When a PX4 was asked to hold its place: until it does, zero setpoints go on, as the request may be lost.
-    hold_ns: Option<i64>,
+    /// The way out of OFFBOARD.
+    exit: Option<OffboardExit>,
 }
 
 /// Time after a request in which LAND may not show yet, in nanoseconds.
@@ -39,7 +37,7 @@ impl Setpoints {
             sent_ns: i64::MIN,
             request: None,
             land_ns: None,
-            hold_ns: None,
+            exit: None,
         }
     }
 
@@ -62,14 +60,17 @@ impl Setpoints {
         is_urgent: bool,
         autopilot: &mut Autopilot,
     ) -> Option<Result<(), SetpointError>> {
+        if action == Action::None {
+            self.leave_offboard(now_ns, autopilot);
+            // With them a PX4 follows at once when the landing is called back.
+            if self.land_ns.is_some() && is_landing_px4(autopilot) {
+                autopilot.send_zeros(now_ns);
+            }
+            return None;
+        }
+        self.exit = None;
         match action {
-            Action::None if self.last.is_some() && self.needs_hold(now_ns, autopilot) => {
-                return self.hold_when_known(now_ns, autopilot);
-            }
-            Action::None => {
-                self.last = None;
-                self.is_awaiting_hold(now_ns, autopilot);
-            }
+            Action::None => {}
             Action::Guided | Action::Disarm | Action::Land if !is_ours(autopilot) => {
                 self.last = None;
                 autopilot.withdraw();
@@ -106,48 +107,29 @@ impl Setpoints {
         self.last.map(|_| self.send(now_ns, Vector::zero(), 0.0, autopilot))
     }
 
-    /// Ends the setpoints, after the last one has stopped the vehicle; true while it waits for the heartbeat after which a PX4 is
-    /// asked to hold its place.
+    /// Ends the setpoints, after the last one has stopped the vehicle; true while a PX4 may be in OFFBOARD.
     pub fn end(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
-        if self.last.is_none() || !self.needs_hold(now_ns, autopilot) {
-            self.last = None;
-            return self.is_awaiting_hold(now_ns, autopilot);
+        // A landing that is called back from LAND is asked for OFFBOARD.
+        if self.exit.is_none() && autopilot.is_requesting_offboard() {
+            self.exit = Some(OffboardExit::begin(now_ns, autopilot));
         }
-        self.hold_when_known(now_ns, autopilot);
-        self.last.is_some() || self.is_awaiting_hold(now_ns, autopilot)
+        self.leave_offboard(now_ns, autopilot)
     }
 
-    /// True while a PX4 that was asked to hold its place has not shown it: zero setpoints keep it where it is.
-    fn is_awaiting_hold(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
-        let is_recent = |asked_ns: &i64| {
-            now_ns.saturating_sub(*asked_ns) <= MAX_RELEASE_NS && is_offboard(autopilot)
-        };
-        self.hold_ns = self.hold_ns.filter(is_recent);
-        if self.hold_ns.is_some() {
-            autopilot.send_zeros(now_ns);
+    /// No setpoint follows: a PX4 that would take that for a failure is led out of OFFBOARD. True while that goes on.
+    fn leave_offboard(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
+        if self.last.is_some() && self.needs_hold(now_ns, autopilot) {
+            self.exit = Some(OffboardExit::begin(now_ns, autopilot));
         }
-        self.hold_ns.is_some()
+        self.last = None;
+        let goes_on = self.exit.as_mut().is_some_and(|exit| exit.step(now_ns, autopilot));
+        if !goes_on {
+            self.exit = None;
+        }
+        goes_on
     }
 
-    /// Asks for HOLD once a heartbeat has just told that the mode is ours; until then it may be the pilot's already, and zero
-    /// setpoints go on.
-    fn hold_when_known(
-        &mut self,
-        now_ns: i64,
-        autopilot: &mut Autopilot,
-    ) -> Option<Result<(), SetpointError>> {
-        if autopilot.shows_mode_of_now(now_ns) {
-            self.last = None;
-            self.hold_ns = Some(now_ns);
-            self.request(now_ns, Command::SetMode(FlightMode::AUTO_HOLD), autopilot);
-            return None;
-        }
-        let is_due = now_ns.saturating_sub(self.sent_ns) >= self.period_ns;
-        is_due.then(|| self.send(now_ns, Vector::zero(), 0.0, autopilot))
-    }
-
-    /// Whether silence would be a failure: a PX4 in OFFBOARD takes it for that of its companion, and without a remote control it
-    /// then descends and drifts with the wind (`COM_OBL_RC_ACT`). ArduPilot stops.
+    /// Whether silence would be a failure: to a PX4 in OFFBOARD it is one. ArduPilot stops.
     fn needs_hold(&self, now_ns: i64, autopilot: &Autopilot) -> bool {
         let lands =
             self.land_ns.is_some_and(|land_ns| now_ns.saturating_sub(land_ns) < LAND_SHOWS_NS);
@@ -195,8 +177,12 @@ impl Setpoints {
     }
 }
 
-fn is_offboard(autopilot: &Autopilot) -> bool {
-    autopilot.state().is_some_and(|state| state.armed && state.mode == FlightMode::OFFBOARD)
+/// True while a PX4 lands by itself, and flies.
+fn is_landing_px4(autopilot: &Autopilot) -> bool {
+    autopilot.firmware() == Some(Firmware::Px4)
+        && autopilot
+            .state()
+            .is_some_and(|state| state.armed && state.mode.is_landing() && state.landed.is_flying())
 }
 
 /// True while the autopilot's own mode is known and is ours: another one is the pilot's, and nothing is asked of it.

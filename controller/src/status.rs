@@ -138,11 +138,12 @@ impl View<'_> {
                 (Phase::Idle, "waiting for the vehicle to fly in GUIDED".to_owned())
             }
             (State::TakingOff { why, .. }, _) => (Phase::Takeoff, why.clone()),
-            (State::TakingControl { control, .. }, _) => {
+            (State::TakingControl { .. }, _) => {
                 let waits =
                     "changing to OFFBOARD; the landing begins once the vehicle follows setpoints";
-                (Phase::Idle, control.given_up().unwrap_or(waits).to_owned())
+                (Phase::Idle, waits.to_owned())
             }
+            (State::LeavingOffboard { why, .. }, _) => (Phase::Idle, why.clone()),
             (State::Failed { why }, _) => (Phase::Failed, why.clone()),
             (State::Landing, _) => (wire::phase(self.lander.phase()), self.reason()),
         }
@@ -181,7 +182,8 @@ impl View<'_> {
             State::Idle
             | State::AwaitingTakeoff
             | State::TakingOff { .. }
-            | State::TakingControl { .. } => false,
+            | State::TakingControl { .. }
+            | State::LeavingOffboard { .. } => false,
         }
     }
 

@@ -8,8 +8,8 @@ use std::sync::Arc;
 
 use autopilot::Parser;
 use autopilot::dialect::{
-    ATTITUDE_DATA, LANDING_TARGET_DATA, MavCmd, MavLandedState, MavMessage, PARAM_VALUE_DATA,
-    SYS_STATUS_DATA,
+    ATTITUDE_DATA, ESTIMATOR_STATUS_DATA, EstimatorStatusFlags, GLOBAL_POSITION_INT_DATA,
+    LANDING_TARGET_DATA, MavCmd, MavLandedState, MavMessage, PARAM_VALUE_DATA, SYS_STATUS_DATA,
 };
 use controller::Config;
 use controller::flight::Flight;
@@ -642,12 +642,24 @@ fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_sta
     // The pilot takes over before it changed; a controller that lands flight after flight waits for the next one.
     for (start, phase) in [("command", Phase::Failed), ("airborne", Phase::Idle)] {
         let mut flight = px4_asked_for_offboard(start);
-        receive(&mut flight, 3100 * MS, &heartbeat(POSITION, true));
-        let sent = hover(&mut flight, 3220, 6000, POSITION);
+        receive(&mut flight, 3300 * MS, &heartbeat(POSITION, true));
+        let sent = hover(&mut flight, 3420, 6000, POSITION);
         assert!(sent.setpoints <= 1 && sent.modes.is_empty(), "{sent:?}");
+        assert!(flight.command(6000 * MS, &ControllerCommand::Start).reason.contains("HOLD"));
         let status = flight.status(6000 * MS);
         assert_eq!(status.phase, phase, "{status:?}");
         assert!(phase == Phase::Idle || status.why.contains("pilot"), "{status:?}");
+    }
+
+    // A heartbeat as old as the request does not show that the pilot came after it: OFFBOARD may come yet.
+    for last in [POSITION, OFFBOARD] {
+        let mut flight = px4_asked_for_offboard("command");
+        receive(&mut flight, 3100 * MS, &heartbeat(POSITION, true));
+        let sent = hover(&mut flight, 3120, 3980, POSITION);
+        assert!(sent.setpoints > 10 && sent.modes.is_empty(), "{sent:?}");
+        let sent = hover(&mut flight, 4000, 4980, last);
+        assert_eq!(sent.modes.first(), (last == OFFBOARD).then_some(&4.0), "{sent:?}");
+        assert_eq!(sent.setpoints > 10, last == OFFBOARD, "{sent:?}");
     }
 
     // The heartbeat before the request shows the pilot's mode.
@@ -709,9 +721,7 @@ fn a_px4_that_may_have_changed_to_offboard_is_not_left_there_when_the_start_is_g
     let mut flight = px4_in(HOLD, "command", &[]);
     flight.command(1000 * MS, &ControllerCommand::Start);
     hover(&mut flight, 1020, 1900, HOLD);
-    assert!(flight.shutdown(1900 * MS));
-    receive(&mut flight, 2200 * MS, &heartbeat(HOLD, true));
-    assert!(!flight.shutdown(2210 * MS));
+    assert!(!flight.shutdown(1900 * MS), "nothing to take back");
     let mut sent = Sent::default();
     sent.take(&mut flight);
     assert!(sent.modes.is_empty(), "{sent:?}");
@@ -746,6 +756,97 @@ fn a_px4_whose_state_is_not_known_in_offboard_gets_zeros_and_is_taken_back() {
     assert_eq!(sent.modes.first(), Some(&4.0), "{sent:?}");
     let status = flight.status(9000 * MS);
     assert!(status.phase == Phase::Failed && status.why.contains("not known"), "{status:?}");
+}
+
+/// A PX4 that has taken off to 5 m, holds its place, and was asked for OFFBOARD at 5 s.
+fn px4_at_the_end_of_its_takeoff() -> Flight {
+    const TAKEOFF: u32 = 0x0204_0000;
+    let mut flight = flight_with("takeoff", &["takeoff_height_m=5"]);
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(HOLD, false));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+    let flags = EstimatorStatusFlags::from_bits_retain(831);
+    let estimator = ESTIMATOR_STATUS_DATA { flags, ..Default::default() };
+    receive(&mut flight, MS, &MavMessage::ESTIMATOR_STATUS(estimator));
+    let altitude = GLOBAL_POSITION_INT_DATA::default();
+    receive(&mut flight, MS, &MavMessage::GLOBAL_POSITION_INT(altitude));
+    let mut commands = Vec::new();
+    for ms in (20..1000).step_by(20) {
+        pose_at(&mut flight, ms * MS, 0.0);
+        flight.tick(ms * MS + 3);
+        commands.extend(sent(&mut flight).1);
+    }
+    assert!(commands.contains(&MavCmd::MAV_CMD_COMPONENT_ARM_DISARM), "{commands:?}");
+    receive(&mut flight, 1000 * MS, &heartbeat(HOLD, true));
+    flight.tick(1010 * MS);
+    receive(&mut flight, 1200 * MS, &heartbeat(TAKEOFF, true));
+    receive(&mut flight, 1200 * MS, &contact(MavLandedState::MAV_LANDED_STATE_TAKEOFF));
+    hover(&mut flight, 1220, 2980, TAKEOFF);
+    receive(&mut flight, 2990 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    let sent = hover(&mut flight, 3000, 4980, HOLD);
+    assert!(sent.setpoints > 10 && sent.modes.is_empty(), "{sent:?}");
+    let sent = hover(&mut flight, 5000, 5100, HOLD);
+    assert_eq!(sent.modes, [6.0], "{sent:?}");
+    assert_eq!(flight.status(5100 * MS).phase, Phase::Takeoff);
+    flight
+}
+
+#[test]
+fn a_px4_that_was_asked_for_offboard_after_its_takeoff_is_not_left_there() {
+    for (mode, asked) in [(OFFBOARD, Some(&4.0)), (HOLD, None)] {
+        // The operator aborts.
+        let mut flight = px4_at_the_end_of_its_takeoff();
+        assert!(flight.command(5100 * MS, &ControllerCommand::Abort).accepted);
+        let sent = hover(&mut flight, 5120, 5980, HOLD);
+        assert!(sent.setpoints > 10 && sent.modes.is_empty(), "it is not known yet: {sent:?}");
+        let sent = hover(&mut flight, 6000, 6900, mode);
+        assert_eq!(sent.modes.first(), asked, "{sent:?}");
+        assert_eq!(sent.setpoints > 10, mode == OFFBOARD, "{sent:?}");
+        let sent = hover(&mut flight, 7000, 8000, HOLD);
+        assert!(sent.setpoints <= 1 && sent.modes.is_empty(), "{sent:?}");
+        let status = flight.status(8000 * MS);
+        assert!(status.phase == Phase::Failed && status.why.contains("aborted"), "{status:?}");
+        // The controller is ended.
+        let mut flight = px4_at_the_end_of_its_takeoff();
+        assert!(flight.shutdown(5100 * MS));
+        receive(&mut flight, 5500 * MS, &heartbeat(mode, true));
+        for ms in (5520..5600).step_by(20) {
+            assert_eq!(flight.shutdown(ms * MS), mode == OFFBOARD);
+        }
+        let mut sent = Sent::default();
+        sent.take(&mut flight);
+        assert_eq!(sent.modes.first(), asked, "{sent:?}");
+        receive(&mut flight, 5700 * MS, &heartbeat(HOLD, true));
+        assert!(!flight.shutdown(5720 * MS));
+    }
+}
+
+#[test]
+fn a_px4_called_back_from_land_is_not_left_in_offboard_by_a_controller_that_ends() {
+    const LAND: u32 = 0x0604_0000;
+    let mut flight = flight("airborne");
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(OFFBOARD, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    hover(&mut flight, 20, 1000, OFFBOARD);
+    assert!(flight.command(1000 * MS, &ControllerCommand::LandHere).accepted);
+    hover(&mut flight, 1020, 1980, OFFBOARD);
+    let sent = hover(&mut flight, 2000, 3980, LAND);
+    assert!(sent.setpoints > 30, "for the way back: {sent:?}");
+    assert!(flight.command(3980 * MS, &ControllerCommand::Abort).accepted);
+    let sent = hover(&mut flight, 4000, 4100, LAND);
+    assert_eq!(sent.modes, [6.0], "just after the heartbeat of 4 s: {sent:?}");
+    assert!(flight.shutdown(4100 * MS), "it may be in OFFBOARD");
+    receive(&mut flight, 4400 * MS, &heartbeat(OFFBOARD, true));
+    assert!(flight.shutdown(4420 * MS));
+    assert!(flight.shutdown(4440 * MS));
+    let mut sent = Sent::default();
+    sent.take(&mut flight);
+    assert_eq!(sent.modes, [4.0], "{sent:?}");
+    receive(&mut flight, 4800 * MS, &heartbeat(HOLD, true));
+    assert!(!flight.shutdown(4810 * MS));
 }
 
 #[test]

@@ -2,9 +2,10 @@
 //!
 //! Feed it every packet ([`Autopilot::handle`]) and the time ([`Autopilot::tick`], 20 times a second or
 //! more); send what [`Autopilot::poll_outgoing`] returns and act on what [`Autopilot::poll_event`] returns.
-//! Only the heartbeat shows the state: an acknowledgement is a promise, and the pilot may have changed the mode
-//! since.
+//! Only the heartbeat, and PX4's CURRENT_MODE, show the mode: an acknowledgement is a promise, and the pilot may have changed
+//! the mode since.
 
+mod heartbeat;
 mod texts;
 
 use std::collections::VecDeque;
@@ -16,23 +17,21 @@ use crate::boot::{BootClock, BootTime};
 use crate::clock::Clock;
 use crate::command::{
     Command, CommandError, CommandId, CommandStatus, MODE_OF_NOW_NS, Request, SetpointError, Step,
-    ZEROS_NS, ns,
+    ns,
 };
 use crate::compose;
 use crate::config::Config;
 use crate::contact::Contact;
-use crate::dialect::{
-    COMMAND_ACK_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag, MavType,
-    TIMESYNC_DATA,
-};
+use crate::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, TIMESYNC_DATA};
 use crate::event::Event;
-use crate::mode::{Firmware, FlightMode};
+use crate::mode::Firmware;
 use crate::packet::{self, Packet, Sender};
 use crate::parameter::{Parameter, Parameters};
 use crate::px4_listener::Listener;
+use crate::setpoint_stream::SetpointStream;
 use crate::simulation::Simulation;
 use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
-use crate::stream::{self, Streams};
+use crate::stream::Streams;
 use crate::text::Joiner;
 
 /// The component id of every autopilot.
@@ -47,11 +46,6 @@ const HEARTBEAT_NS: i64 = 1_000_000_000;
 const UNSTEADY: Duration = Duration::from_secs(1);
 /// Maximum age of a position whose vertical speed says whether the vehicle stands, in nanoseconds.
 const MAX_SPEED_AGE_NS: i64 = 500_000_000;
-/// Time for which setpoints are sent before OFFBOARD is requested, in nanoseconds: PX4 enters it only after a
-/// second of setpoints at 2 Hz or more (<https://docs.px4.io/main/en/flight_modes/offboard.html>).
-const PROOF_NS: i64 = 1_300_000_000;
-/// Period of these setpoints, in nanoseconds.
-const PROOF_PERIOD_NS: i64 = 50_000_000;
 
 /// The conversation with one autopilot.
 #[derive(Clone, Debug)]
@@ -60,8 +54,8 @@ pub struct Autopilot {
     vehicle: Option<Vehicle>,
     clock: Clock,
     parameters: Parameters,
-    proof_due_ns: i64,
-    zeros_until_ns: i64,
+    setpoints: SetpointStream,
+    offboard_sent_ns: Option<i64>,
     streams: Streams,
     requests: Vec<Request>,
     outcomes: VecDeque<(CommandId, CommandStatus)>,
@@ -84,6 +78,8 @@ struct Vehicle {
     readiness: Readiness,
     simulation: Simulation,
     heartbeat_ns: i64,
+    /// When its mode was shown last.
+    mode_ns: i64,
     /// When its last packet was received.
     heard_ns: i64,
     boot: BootClock,
@@ -103,8 +99,8 @@ impl Autopilot {
             streams: Streams::new(&config.streams),
             clock: Clock::default(),
             parameters: Parameters::new(&config.parameters),
-            proof_due_ns: i64::MIN,
-            zeros_until_ns: i64::MIN,
+            setpoints: SetpointStream::default(),
+            offboard_sent_ns: None,
             config,
             vehicle: None,
             requests: Vec::new(),
@@ -156,6 +152,13 @@ impl Autopilot {
             MavMessage::PARAM_VALUE(value) => {
                 self.parameters.take(self.firmware().unwrap_or(Firmware::Unknown), value);
             }
+            // Whoever sends no heartbeat is not taken for one that flies.
+            MavMessage::CURRENT_MODE(message) if self.is_connected() => {
+                let is_known = self.firmware() == Some(Firmware::Px4);
+                if is_known && self.take_mode(now_ns, message.custom_mode) {
+                    self.report_status();
+                }
+            }
             _ => self.take_state(now_ns, message),
         }
         self.step_requests(now_ns);
@@ -185,8 +188,8 @@ impl Autopilot {
             }
             self.send_requests(now_ns);
             self.ask_for_checks(now_ns);
-            self.prove_setpoints(now_ns);
         }
+        self.prove_setpoints(now_ns);
         self.step_requests(now_ns);
     }
 
@@ -324,7 +327,8 @@ impl Autopilot {
             let error = CommandError::Replaced { command: old.command, by: command };
             self.finish(old.id, old.command, Err(error));
         }
-        let proof_ns = if command.needs_mode_of_now() { PROOF_NS } else { 0 };
+        let proof_ns =
+            if command.needs_mode_of_now() { self.setpoints.missing_ns(now_ns) } else { 0 };
         let (mode, from_ns) = (self.state().map(|it| it.mode), now_ns.saturating_add(proof_ns));
         match self.refusal(command) {
             Some(error) => self.finish(id, command, Err(error)),
@@ -348,20 +352,30 @@ impl Autopilot {
         outcome.map_or(CommandStatus::Unknown, |(_, status)| status.clone())
     }
 
-    /// Time since the last heartbeat, which tells mode and motors, in ns; `None` before the first.
-    pub fn heartbeat_age_ns(&self, now_ns: i64) -> Option<i64> {
-        self.vehicle.as_ref().map(|vehicle| now_ns.saturating_sub(vehicle.heartbeat_ns))
+    /// Time since the vehicle showed its mode last, in ns; `None` before the first heartbeat.
+    pub fn mode_age_ns(&self, now_ns: i64) -> Option<i64> {
+        self.vehicle.as_ref().map(|vehicle| now_ns.saturating_sub(vehicle.mode_ns))
     }
 
-    /// True just after a heartbeat: a pilot can hardly have changed the mode since.
+    /// True when it has just shown its mode: a pilot can hardly have changed it since.
     pub fn shows_mode_of_now(&self, now_ns: i64) -> bool {
-        self.heartbeat_age_ns(now_ns).is_some_and(|age_ns| age_ns < MODE_OF_NOW_NS)
+        self.mode_age_ns(now_ns).is_some_and(|age_ns| age_ns < MODE_OF_NOW_NS)
+    }
+
+    /// True while OFFBOARD is requested: the request may be carried out although it is withdrawn.
+    pub fn is_requesting_offboard(&self) -> bool {
+        self.requests.iter().any(|request| request.command.needs_mode_of_now())
+    }
+
+    /// When a request for OFFBOARD was sent last.
+    pub fn offboard_sent_ns(&self) -> Option<i64> {
+        self.offboard_sent_ns
     }
 
     /// Sends setpoints of zero velocity until the next call, a tick later: before OFFBOARD, and until it shows whether a PX4 has
     /// changed to it. All other modes ignore them.
     pub fn send_zeros(&mut self, now_ns: i64) {
-        self.zeros_until_ns = now_ns.saturating_add(ZEROS_NS);
+        self.setpoints.ask_for_zeros(now_ns);
     }
 
     /// Sends a velocity in m/s, with a yaw rate in rad/s (0 holds the heading): at least twice a second,
@@ -398,6 +412,7 @@ impl Autopilot {
         let time_ms = (now_ns / 1_000_000) as u32;
         let target = Sender { system: vehicle.system, component: AUTOPILOT };
         self.send(&compose::velocity(time_ms, velocity, yaw_rate, target));
+        self.setpoints.sent(now_ns);
         Ok(())
     }
 
@@ -459,12 +474,14 @@ impl Autopilot {
 
     /// While OFFBOARD is requested, and as long as asked for, PX4 gets setpoints of zero velocity.
     fn prove_setpoints(&mut self, now_ns: i64) {
-        let is_requested = self.requests.iter().any(|request| request.command.needs_mode_of_now());
-        if !(is_requested || now_ns < self.zeros_until_ns) || now_ns < self.proof_due_ns {
+        if !self.setpoints.is_zero_due(now_ns, self.is_requesting_offboard()) {
             return;
         }
-        self.proof_due_ns = now_ns.saturating_add(PROOF_PERIOD_NS);
-        let Some(system) = self.system() else { return };
+        // Also while only the heartbeat is missing, like every setpoint.
+        let limit_ns = now_ns.saturating_sub(ns(self.config.heartbeat_timeout));
+        let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.heard_ns >= limit_ns);
+        let Some(system) = vehicle.map(|vehicle| vehicle.system) else { return };
+        self.setpoints.sent(now_ns);
         let time_ms = (now_ns / 1_000_000) as u32;
         let target = Sender { system, component: AUTOPILOT };
         self.send(&compose::velocity(time_ms, Vector::zero(), 0.0, target));
@@ -492,97 +509,6 @@ impl Autopilot {
             self.events.pop_front();
         }
         self.events.push_back(event);
-    }
-
-    fn take_heartbeat(&mut self, now_ns: i64, system: u8, heartbeat: &HEARTBEAT_DATA) {
-        let flies = heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
-            && heartbeat.mavtype != MavType::MAV_TYPE_GCS;
-        if !flies || self.config.system_id.is_some_and(|pinned| pinned != system) {
-            return;
-        }
-        match &self.vehicle {
-            None => self.find(now_ns, system, heartbeat),
-            Some(vehicle) if vehicle.system != system => {
-                if !std::mem::replace(&mut self.other_vehicle, true) {
-                    self.push(Event::OtherVehicle { system });
-                }
-                return;
-            }
-            Some(_) => {}
-        }
-        self.follow_heartbeat(now_ns, heartbeat);
-        self.step_requests(now_ns);
-    }
-
-    fn find(&mut self, now_ns: i64, system: u8, heartbeat: &HEARTBEAT_DATA) {
-        let firmware = Firmware::of(heartbeat);
-        let mode = FlightMode::of(firmware, heartbeat.custom_mode);
-        self.vehicle = Some(Vehicle {
-            system,
-            firmware,
-            state: VehicleState {
-                stamp_ns: now_ns,
-                attitude: None,
-                position: None,
-                range: None,
-                mode,
-                armed: false,
-                landed: LandedState::Unknown,
-                ready: false,
-                battery: Battery::default(),
-                connected: true,
-            },
-            readiness: Readiness::default(),
-            simulation: Simulation::default(),
-            heartbeat_ns: now_ns,
-            heard_ns: now_ns,
-            boot: BootClock::default(),
-            contact: Contact::default(),
-            batteries: [Battery::default(); 2],
-            amsl_m: None,
-            joiner: Joiner::default(),
-            listener: Listener::default(),
-        });
-        self.streams = Streams::new(&stream::of_firmware(firmware, &self.config.streams));
-        self.push(Event::Found { system, firmware });
-        self.push(Event::ModeChanged { from: None, to: mode });
-    }
-
-    fn follow_heartbeat(&mut self, now_ns: i64, heartbeat: &HEARTBEAT_DATA) {
-        let Some(vehicle) = &mut self.vehicle else { return };
-        let state = &mut vehicle.state;
-        let mode = FlightMode::of(vehicle.firmware, heartbeat.custom_mode);
-        let armed = heartbeat.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
-        vehicle.heartbeat_ns = now_ns;
-        vehicle.simulation.take_mode(heartbeat.base_mode);
-        vehicle.heard_ns = now_ns;
-        state.stamp_ns = now_ns;
-        let before = state.mode;
-        let returned = !std::mem::replace(&mut state.connected, true);
-        let mode_changed = std::mem::replace(&mut state.mode, mode) != mode;
-        let armed_changed = std::mem::replace(&mut state.armed, armed) != armed;
-        let landed = if armed { state.landed } else { vehicle.contact.disarmed() };
-        let landed_before = std::mem::replace(&mut state.landed, landed);
-        if returned {
-            self.streams.restart();
-            self.push(Event::Returned);
-        }
-        if mode_changed {
-            self.push(Event::ModeChanged { from: Some(before), to: mode });
-        }
-        if armed_changed {
-            self.push(Event::ArmedChanged(armed));
-        }
-        self.report_contact(landed_before);
-    }
-
-    /// Reports mode, motors and contact with the ground, and the contact's change from `before`.
-    fn report_contact(&mut self, before: LandedState) {
-        let Some(state) = self.state().copied() else { return };
-        if before != state.landed {
-            self.push(Event::LandedChanged { from: before, to: state.landed });
-        }
-        self.push(Event::Status(state));
     }
 
     fn check_silence(&mut self, now_ns: i64) {
@@ -807,6 +733,9 @@ impl Autopilot {
                 Step::Wait => index += 1,
                 Step::Send(command, attempt) => {
                     index += 1;
+                    if command.needs_mode_of_now() {
+                        self.offboard_sent_ns = Some(now_ns);
+                    }
                     let message = command.message(attempt, self.ground_amsl_m());
                     self.send_to_vehicle(MavMessage::COMMAND_LONG(message));
                 }

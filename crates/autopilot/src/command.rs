@@ -335,8 +335,6 @@ impl Default for Timeouts {
 
 /// Maximum age of a heartbeat whose mode is the one of now, in nanoseconds.
 pub(crate) const MODE_OF_NOW_NS: i64 = 200_000_000;
-/// Time for which setpoints of zero velocity go on without being asked for again, in nanoseconds: ticks are 25 ms apart.
-pub(crate) const ZEROS_NS: i64 = 60_000_000;
 /// Maximum number of texts kept as an explanation.
 const MAX_TEXTS: usize = 8;
 

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::command::Timeouts;
-use crate::stream::Stream;
+use crate::stream::{Expected, Stream};
 
 /// Settings of the conversation with the autopilot.
 #[derive(Clone, Debug, PartialEq)]
@@ -47,15 +47,16 @@ impl Default for Config {
 
 /// The messages that landing needs, with attitude and position at this rate in Hz.
 pub fn default_streams(rate_hz: f64) -> Vec<Stream> {
-    let required = |message_id, rate_hz| Stream { message_id, rate_hz, required: true };
-    let welcome = |message_id, rate_hz| Stream { message_id, rate_hz, required: false };
+    let always = |message_id, rate_hz| Stream { message_id, rate_hz, expected: Expected::Always };
+    let if_present =
+        |message_id, rate_hz| Stream { message_id, rate_hz, expected: Expected::IfPresent };
     vec![
-        required(30, rate_hz), // ATTITUDE
-        required(32, rate_hz), // LOCAL_POSITION_NED
-        required(245, 5.0),    // EXTENDED_SYS_STATE
-        required(1, 2.0),      // SYS_STATUS
-        required(193, 2.0),    // EKF_STATUS_REPORT
-        welcome(132, 10.0),    // DISTANCE_SENSOR
-        welcome(147, 1.0),     // BATTERY_STATUS
+        always(30, rate_hz),   // ATTITUDE
+        always(32, rate_hz),   // LOCAL_POSITION_NED
+        always(245, 5.0),      // EXTENDED_SYS_STATE
+        always(1, 2.0),        // SYS_STATUS
+        always(193, 2.0),      // EKF_STATUS_REPORT
+        if_present(132, 10.0), // DISTANCE_SENSOR
+        if_present(147, 1.0),  // BATTERY_STATUS
     ]
 }

@@ -15,7 +15,7 @@
 //! [`state`] and [`parameter`] are what the vehicle reports, [`clock`] converts its time stamps, `boot` and
 //! `contact` say which of its reports are believed, `simulation` asks whether it is simulated, [`client`] is the
 //! conversation with it with the settings of [`config`], [`event`] its events, [`command`] is what can be requested
-//! and why it may fail, [`takeoff`] arms the vehicle and takes off, [`permission`] is what a ground station may send,
+//! and why it may fail, [`takeoff`] arms the vehicle and takes off, [`offboard_exit`] ends PX4's OFFBOARD, which needs the `setpoint_stream`, [`permission`] is what a ground station may send,
 //! [`compose`] makes the messages that a companion sends, and `unknown` its answer to commands that no one knows.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
@@ -33,12 +33,14 @@ mod gate;
 pub mod key_file;
 pub mod link;
 pub mod mode;
+pub mod offboard_exit;
 pub mod packet;
 pub mod parameter;
 pub mod peers;
 pub mod permission;
 mod px4_events;
 mod px4_listener;
+mod setpoint_stream;
 pub mod signing;
 mod simulation;
 pub mod state;
@@ -62,6 +64,7 @@ pub use event::Event;
 pub use key_file::{KeyFileError, SigningConfig};
 pub use link::{Link, LinkEvent, LinkSender};
 pub use mode::{Firmware, FlightMode};
+pub use offboard_exit::OffboardExit;
 pub use packet::{Packet, Parser, Sender};
 pub use parameter::Parameter;
 pub use peers::Peering;

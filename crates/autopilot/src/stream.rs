@@ -11,6 +11,9 @@ use crate::mode::Firmware;
 const EKF_STATUS_REPORT: u32 = 193;
 const ESTIMATOR_STATUS: u32 = 230;
 const GLOBAL_POSITION_INT: u32 = 33;
+/// PX4's heartbeat, once a second, may show a change of mode a second late. This one is sent with each change, and twice a second;
+/// versions before 1.15 do not have it. ArduPilot sends a heartbeat with each change.
+const CURRENT_MODE: u32 = 436;
 
 const SECOND_NS: i64 = 1_000_000_000;
 /// Minimum measured rate, relative to the requested rate.
@@ -36,8 +39,19 @@ pub struct Stream {
     pub message_id: u32,
     /// Requested rate, in Hz.
     pub rate_hz: f64,
-    /// Whether its absence is reported (a rangefinder may not exist).
-    pub required: bool,
+    /// What is expected of it.
+    pub expected: Expected,
+}
+
+/// What is expected of a requested message.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Expected {
+    /// It comes at its rate; its absence is reported.
+    Always,
+    /// It comes at its rate if at all: a rangefinder may not exist.
+    IfPresent,
+    /// It comes when its content changes, at most at its rate.
+    OnChange,
 }
 
 /// A report about a stream.
@@ -164,9 +178,10 @@ impl Watched {
     }
 
     fn judge(&mut self, now_ns: i64) -> Option<Notice> {
-        if self.ask_at_ns.is_some() {
+        if self.ask_at_ns.is_some() || self.stream.expected == Expected::OnChange {
             return None;
         }
+        let is_required = self.stream.expected == Expected::Always;
         let periods_ns = (5.0 / self.stream.rate_hz * SECOND_NS as f64) as i64;
         let elapsed_ns = now_ns.saturating_sub(self.since_ns);
         if elapsed_ns < COUNT_NS.max(periods_ns) {
@@ -179,7 +194,7 @@ impl Watched {
             let restored = std::mem::take(&mut self.missing);
             return restored.then_some(Notice::Restored { message: self.name, measured_hz });
         }
-        if !self.stream.required && measured_hz == 0.0 {
+        if !is_required && measured_hz == 0.0 {
             return None;
         }
         let pause_ns = COUNT_NS.saturating_mul(self.requests.into()).min(MAX_PAUSE_NS);
@@ -188,8 +203,7 @@ impl Watched {
         }
         let waits = !self.began
             && self.first_request_ns.is_some_and(|at| now_ns.saturating_sub(at) < BEGINNING_NS);
-        let is_report =
-            self.requests >= REPORT_AFTER && self.stream.required && !self.missing && !waits;
+        let is_report = self.requests >= REPORT_AFTER && is_required && !self.missing && !waits;
         self.missing |= is_report;
         let wanted_hz = self.stream.rate_hz;
         is_report.then_some(Notice::Missing { message: self.name, wanted_hz, measured_hz })
@@ -217,7 +231,9 @@ pub(crate) fn of_firmware(firmware: Firmware, streams: &[Stream]) -> Vec<Stream>
         for stream in streams.iter_mut().filter(|s| s.message_id == EKF_STATUS_REPORT) {
             stream.message_id = ESTIMATOR_STATUS;
         }
-        streams.push(Stream { message_id: GLOBAL_POSITION_INT, rate_hz: 2.0, required: true });
+        let more = |message_id, rate_hz, expected| Stream { message_id, rate_hz, expected };
+        streams.push(more(GLOBAL_POSITION_INT, 2.0, Expected::Always));
+        streams.push(more(CURRENT_MODE, 20.0, Expected::OnChange));
     }
     streams
 }
@@ -226,8 +242,8 @@ pub(crate) fn of_firmware(firmware: Firmware, streams: &[Stream]) -> Vec<Stream>
 mod tests {
     use super::*;
 
-    const ATTITUDE: Stream = Stream { message_id: 30, rate_hz: 50.0, required: true };
-    const RANGE: Stream = Stream { message_id: 132, rate_hz: 10.0, required: false };
+    const ATTITUDE: Stream = Stream { message_id: 30, rate_hz: 50.0, expected: Expected::Always };
+    const RANGE: Stream = Stream { message_id: 132, rate_hz: 10.0, expected: Expected::IfPresent };
 
     /// Runs for `seconds` in steps of 20 ms; an acknowledged message then comes in every `every`-th step.
     fn run(

@@ -9,10 +9,10 @@
 use std::collections::BTreeMap;
 
 use autopilot::dialect::{
-    ATTITUDE_DATA, COMMAND_ACK_DATA, COMMAND_LONG_DATA, ESTIMATOR_STATUS_DATA, EVENT_DATA,
-    EXTENDED_SYS_STATE_DATA, EstimatorStatusFlags, GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA,
-    LOCAL_POSITION_NED_DATA, MavAutopilot, MavCmd, MavLandedState, MavMessage, MavModeFlag,
-    MavResult, MavSysStatusSensor, MavType, STATUSTEXT_DATA, SYS_STATUS_DATA,
+    ATTITUDE_DATA, COMMAND_ACK_DATA, COMMAND_LONG_DATA, CURRENT_MODE_DATA, ESTIMATOR_STATUS_DATA,
+    EVENT_DATA, EXTENDED_SYS_STATE_DATA, EstimatorStatusFlags, GLOBAL_POSITION_INT_DATA,
+    HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot, MavCmd, MavLandedState, MavMessage,
+    MavModeFlag, MavResult, MavSysStatusSensor, MavType, STATUSTEXT_DATA, SYS_STATUS_DATA,
 };
 use autopilot::packet::{self, Sender};
 use autopilot::{
@@ -27,6 +27,7 @@ const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
 const GROUND_AMSL_M: f64 = 488.0;
 /// COM_OF_LOSS_T.
 const OFFBOARD_LOSS_NS: i64 = SECOND;
+const CURRENT_MODE: u32 = 436;
 
 struct Px4 {
     mode: FlightMode,
@@ -34,6 +35,11 @@ struct Px4 {
     height_m: f64,
     climbs_to_m: Option<f64>,
     intervals: BTreeMap<u32, i64>,
+    /// It knows CURRENT_MODE; the mode that was sent last, and when.
+    has_current_mode: bool,
+    reported_mode: Option<(FlightMode, i64)>,
+    /// Its heartbeats are lost on the way.
+    loses_heartbeats: bool,
     /// Since when setpoints have come at 2 Hz or more, and when the last one came.
     streaming: Option<(i64, i64)>,
     setpoints: Vec<[f32; 3]>,
@@ -98,6 +104,9 @@ impl Px4 {
         }
         match command.command {
             MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL => {
+                if command.param1 as u32 == CURRENT_MODE && !self.has_current_mode {
+                    return MavResult::MAV_RESULT_DENIED;
+                }
                 let interval = (f64::from(command.param2) * 1e3) as i64;
                 self.intervals.insert(command.param1 as u32, interval);
             }
@@ -142,11 +151,19 @@ impl Px4 {
             self.mode = FlightMode::AUTO_HOLD;
         }
         let mut sent = std::mem::take(&mut self.queue);
-        if now % SECOND == 0 {
+        if now % SECOND == 0 && !self.loses_heartbeats {
             sent.push(self.heartbeat());
         }
         for (&id, &interval) in &self.intervals {
-            if now % interval < STEP {
+            let is_due = now % interval < STEP;
+            if is_due && id == CURRENT_MODE {
+                // With each change, and twice a second.
+                let last = self.reported_mode.filter(|(mode, _)| *mode == self.mode);
+                if last.is_none_or(|(_, at)| now - at >= SECOND / 2) {
+                    self.reported_mode = Some((self.mode, now));
+                    sent.push(current_mode(self.mode));
+                }
+            } else if is_due {
                 sent.extend(self.report(id, now));
             }
         }
@@ -196,6 +213,11 @@ impl Px4 {
     }
 }
 
+fn current_mode(mode: FlightMode) -> MavMessage {
+    let custom_mode = mode.custom_mode();
+    MavMessage::CURRENT_MODE(CURRENT_MODE_DATA { custom_mode, ..Default::default() })
+}
+
 struct World {
     now: i64,
     client: Autopilot,
@@ -215,6 +237,9 @@ impl World {
             height_m: 0.0,
             climbs_to_m: None,
             intervals: BTreeMap::new(),
+            has_current_mode: false,
+            reported_mode: None,
+            loses_heartbeats: false,
             streaming: None,
             setpoints: Vec::new(),
             mode_requests: 0,
@@ -530,6 +555,98 @@ fn offboard_is_entered_with_a_stream_and_lost_without_one() {
     assert_eq!(world.px4.mode, FlightMode::AUTO_HOLD, "its failsafe");
     let refused = world.client.set_velocity(world.now, Vector::zero(), 0.0);
     assert!(refused.unwrap_err().to_string().contains("PX4 HOLD"));
+}
+
+/// Steps until the client shows a mode, in ms.
+fn shown_after_ms(world: &mut World, mode: FlightMode) -> i64 {
+    let began = world.now;
+    while world.client.state().unwrap().mode != mode {
+        assert!(world.now - began < 2 * SECOND);
+        world.step();
+    }
+    (world.now - began) / 1_000_000
+}
+
+#[test]
+fn a_change_of_mode_shows_at_once_where_it_sends_its_mode() {
+    const POSITION: FlightMode = FlightMode::Px4(3 << 16);
+    for has_current_mode in [true, false] {
+        let mut world = World::with(|px4| {
+            (px4.has_current_mode, px4.armed, px4.height_m) = (has_current_mode, true, 5.0);
+        });
+        world.run(5);
+        assert_eq!(world.px4.intervals.contains_key(&CURRENT_MODE), has_current_mode);
+        while world.now % SECOND != STEP {
+            world.step();
+        }
+        let events = std::iter::from_fn(|| world.client.poll_event());
+        assert!(!events.into_iter().any(|event| matches!(event, Event::StreamMissing { .. })));
+        world.px4.mode = POSITION;
+        let after_ms = shown_after_ms(&mut world, POSITION);
+        assert_eq!(after_ms <= 60, has_current_mode, "{after_ms} ms");
+        let events: Vec<Event> = std::iter::from_fn(|| world.client.poll_event()).collect();
+        let changes = events.iter().filter(|event| {
+            matches!(event, Event::ModeChanged { from: Some(FlightMode::AUTO_HOLD), to: POSITION })
+        });
+        assert_eq!(changes.count(), 1);
+        let told = events.iter().any(
+            |event| matches!(event, Event::Status(state) if state.mode == POSITION && state.armed),
+        );
+        assert!(told, "{events:?}");
+    }
+}
+
+#[test]
+fn called_back_from_land_it_is_in_offboard_sooner_where_it_sends_its_mode() {
+    let back_after_ms = |has_current_mode: bool| {
+        let mut world = World::with(|px4| {
+            (px4.has_current_mode, px4.armed, px4.height_m) = (has_current_mode, true, 5.0);
+        });
+        world.request(Command::SetMode(FlightMode::AUTO_LAND)).unwrap();
+        let landing = world.now;
+        while world.now - landing < 2 * SECOND || world.now % SECOND != 15 * STEP {
+            world.client.send_zeros(world.now);
+            world.step();
+        }
+        assert_eq!(world.px4.mode, FlightMode::AUTO_LAND);
+        world.client.request(world.now, Command::SetMode(FlightMode::OFFBOARD));
+        let began = world.now;
+        while world.px4.mode != FlightMode::OFFBOARD {
+            assert!(world.now - began < 5 * SECOND);
+            world.step();
+        }
+        (world.now - began) / 1_000_000
+    };
+    let (with, without) = (back_after_ms(true), back_after_ms(false));
+    assert!(with <= 520 && (680..750).contains(&without), "{with} and {without} ms");
+}
+
+#[test]
+fn a_mode_is_believed_of_a_connected_px4_only() {
+    let land = current_mode(FlightMode::AUTO_LAND);
+    let mut world = World::flying(5.0);
+    let other = packet::encode(Sender { system: 2, component: 1 }, 0, &land);
+    Parser::new().push(&other).iter().for_each(|packet| world.client.handle(world.now, packet));
+    assert_eq!(world.client.state().unwrap().mode, FlightMode::AUTO_HOLD);
+    world.px4.loses_heartbeats = true;
+    world.run(4);
+    assert!(!world.client.is_connected());
+    world.px4.queue.push(land);
+    world.step();
+    assert_eq!(world.client.state().unwrap().mode, FlightMode::AUTO_HOLD);
+}
+
+#[test]
+fn zeros_go_on_while_only_the_heartbeat_is_missing() {
+    let mut world = World::flying(5.0);
+    world.request(Command::SetMode(FlightMode::OFFBOARD)).unwrap();
+    world.px4.loses_heartbeats = true;
+    for _ in 0..6 * SECOND / STEP {
+        world.client.send_zeros(world.now);
+        world.step();
+    }
+    assert!(!world.client.is_connected());
+    assert_eq!(world.px4.mode, FlightMode::OFFBOARD);
 }
 
 #[test]

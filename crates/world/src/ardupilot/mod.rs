@@ -106,6 +106,7 @@ const GROUND_STATION: Sender = Sender { system: 255, component: 190 };
 const ALIGNED: f64 = 0.13;
 const ORIGIN_SET: f64 = 0.47;
 const HEARTBEAT_S: f64 = 1.0;
+const CURRENT_MODE: u32 = 436;
 const TIMESYNC_S: f64 = 10.0;
 
 /// The simulated autopilot.
@@ -295,7 +296,10 @@ impl SimulatedAutopilot {
             self.send(&MavMessage::TIMESYNC(request));
         }
         for id in self.schedule.due(self.now_s) {
-            self.send_message(id);
+            let mode = self.px4.shown(self.flight.mode(), self.flight.landed());
+            if id != CURRENT_MODE || self.px4.reports_mode(self.now_s, mode) {
+                self.send_message(id);
+            }
         }
     }
 

@@ -1,7 +1,8 @@
 //! The same vehicle under PX4's rules, taken from its documentation and not measured: modes by two numbers,
 //! OFFBOARD only with a stream of setpoints before and during
 //! (<https://docs.px4.io/main/en/flight_modes/offboard.html>), a takeoff to an altitude over the sea, a heartbeat that says so once a
-//! second, and events that tell which checks before arming fail: when that changes, and when it is asked.
+//! second, CURRENT_MODE with each change and twice a second if it is requested, and events that tell which checks before arming fail:
+//! when that changes, and when it is asked.
 
 use autopilot::FlightMode;
 use autopilot::dialect::{ESTIMATOR_STATUS_DATA, EVENT_DATA, EstimatorStatusFlags, MavMessage};
@@ -11,6 +12,8 @@ use super::flight::{Landed, Mode};
 /// Minimum time for which setpoints must have arrived at 2 Hz or more, in seconds.
 const STREAM_S: f64 = 1.0;
 const STREAM_GAP_S: f64 = 0.5;
+/// Period of CURRENT_MODE while the mode does not change, in seconds.
+const CURRENT_MODE_S: f64 = 0.5;
 /// The events that begin and end a report of all failing checks, and the check of a position.
 const CHECKS_BEGIN: u32 = 0x01a8_93e0;
 const CHECKS_END: u32 = 0x011d_3727;
@@ -32,6 +35,8 @@ pub(super) struct Px4 {
     pub(super) precision: bool,
     /// Number of its events so far.
     events: u16,
+    /// The mode that CURRENT_MODE reported last, and when.
+    reported: Option<(FlightMode, f64)>,
 }
 
 impl Px4 {
@@ -80,6 +85,16 @@ impl Px4 {
         self.offboard = mode == Mode::Guided;
         self.precision = (main, sub) == (4, 9);
         Some(mode)
+    }
+
+    /// True when CURRENT_MODE is to be sent.
+    pub(super) fn reports_mode(&mut self, now_s: f64, mode: FlightMode) -> bool {
+        let is_due =
+            self.reported.is_none_or(|(last, at_s)| last != mode || now_s - at_s >= CURRENT_MODE_S);
+        if is_due {
+            self.reported = Some((mode, now_s));
+        }
+        is_due
     }
 
     pub(super) fn on_takeoff(&mut self) {

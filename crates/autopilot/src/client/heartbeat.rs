@@ -1,0 +1,120 @@
+//! The heartbeat: which vehicle it is, its mode and its motors.
+
+use super::{Autopilot, Vehicle};
+use crate::boot::BootClock;
+use crate::contact::Contact;
+use crate::dialect::{HEARTBEAT_DATA, MavAutopilot, MavModeFlag, MavType};
+use crate::event::Event;
+use crate::mode::{Firmware, FlightMode};
+use crate::px4_listener::Listener;
+use crate::simulation::Simulation;
+use crate::state::{Battery, LandedState, Readiness, VehicleState};
+use crate::stream::{self, Streams};
+use crate::text::Joiner;
+
+impl Autopilot {
+    pub(super) fn take_heartbeat(&mut self, now_ns: i64, system: u8, heartbeat: &HEARTBEAT_DATA) {
+        let flies = heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
+            && heartbeat.mavtype != MavType::MAV_TYPE_GCS;
+        if !flies || self.config.system_id.is_some_and(|pinned| pinned != system) {
+            return;
+        }
+        match &self.vehicle {
+            None => self.find(now_ns, system, heartbeat),
+            Some(vehicle) if vehicle.system != system => {
+                if !std::mem::replace(&mut self.other_vehicle, true) {
+                    self.push(Event::OtherVehicle { system });
+                }
+                return;
+            }
+            Some(_) => {}
+        }
+        self.follow_heartbeat(now_ns, heartbeat);
+        self.step_requests(now_ns);
+    }
+
+    fn find(&mut self, now_ns: i64, system: u8, heartbeat: &HEARTBEAT_DATA) {
+        let firmware = Firmware::of(heartbeat);
+        let mode = FlightMode::of(firmware, heartbeat.custom_mode);
+        self.vehicle = Some(Vehicle {
+            system,
+            firmware,
+            state: VehicleState {
+                stamp_ns: now_ns,
+                attitude: None,
+                position: None,
+                range: None,
+                mode,
+                armed: false,
+                landed: LandedState::Unknown,
+                ready: false,
+                battery: Battery::default(),
+                connected: true,
+            },
+            readiness: Readiness::default(),
+            simulation: Simulation::default(),
+            heartbeat_ns: now_ns,
+            mode_ns: now_ns,
+            heard_ns: now_ns,
+            boot: BootClock::default(),
+            contact: Contact::default(),
+            batteries: [Battery::default(); 2],
+            amsl_m: None,
+            joiner: Joiner::default(),
+            listener: Listener::default(),
+        });
+        self.streams = Streams::new(&stream::of_firmware(firmware, &self.config.streams));
+        self.push(Event::Found { system, firmware });
+        self.push(Event::ModeChanged { from: None, to: mode });
+    }
+
+    fn follow_heartbeat(&mut self, now_ns: i64, heartbeat: &HEARTBEAT_DATA) {
+        let Some(vehicle) = &mut self.vehicle else { return };
+        let state = &mut vehicle.state;
+        let armed = heartbeat.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
+        vehicle.heartbeat_ns = now_ns;
+        vehicle.simulation.take_mode(heartbeat.base_mode);
+        vehicle.heard_ns = now_ns;
+        state.stamp_ns = now_ns;
+        let returned = !std::mem::replace(&mut state.connected, true);
+        let armed_changed = std::mem::replace(&mut state.armed, armed) != armed;
+        let landed = if armed { state.landed } else { vehicle.contact.disarmed() };
+        let landed_before = std::mem::replace(&mut state.landed, landed);
+        if returned {
+            self.streams.restart();
+            self.push(Event::Returned);
+        }
+        self.take_mode(now_ns, heartbeat.custom_mode);
+        if armed_changed {
+            self.push(Event::ArmedChanged(armed));
+        }
+        self.report_contact(landed_before);
+    }
+
+    /// Takes a mode that was just shown; true when it is another one than before.
+    pub(super) fn take_mode(&mut self, now_ns: i64, number: u32) -> bool {
+        let Some(vehicle) = &mut self.vehicle else { return false };
+        vehicle.mode_ns = now_ns;
+        let to = FlightMode::of(vehicle.firmware, number);
+        let from = std::mem::replace(&mut vehicle.state.mode, to);
+        if from != to {
+            self.push(Event::ModeChanged { from: Some(from), to });
+        }
+        from != to
+    }
+
+    /// Reports mode, motors and contact with the ground, and the contact's change from `before`.
+    pub(super) fn report_contact(&mut self, before: LandedState) {
+        let Some(state) = self.state() else { return };
+        if before != state.landed {
+            self.push(Event::LandedChanged { from: before, to: state.landed });
+        }
+        self.report_status();
+    }
+
+    pub(super) fn report_status(&mut self) {
+        if let Some(state) = self.state().copied() {
+            self.push(Event::Status(state));
+        }
+    }
+}

@@ -1,0 +1,52 @@
+//! The stream of setpoints that PX4's OFFBOARD needs, before it and while it lasts.
+
+/// Time for which setpoints are sent before OFFBOARD is requested, in nanoseconds: PX4 enters it only after a
+/// second of setpoints at 2 Hz or more (<https://docs.px4.io/main/en/flight_modes/offboard.html>).
+const PROOF_NS: i64 = 1_300_000_000;
+/// Maximum gap between two of them, in nanoseconds.
+const MAX_GAP_NS: i64 = 300_000_000;
+/// Period of the zeros, in nanoseconds.
+const PERIOD_NS: i64 = 50_000_000;
+/// Time for which zeros go on without being asked for again, in nanoseconds: ticks are 25 ms apart.
+const ZEROS_NS: i64 = 60_000_000;
+
+/// When setpoints were sent, and until when zeros are.
+#[derive(Copy, Clone, Debug, Default)]
+pub(crate) struct SetpointStream {
+    /// Since when they have been sent without a gap, and when the last one was.
+    lasts: Option<(i64, i64)>,
+    zeros_until_ns: Option<i64>,
+}
+
+impl SetpointStream {
+    /// A setpoint is sent now.
+    pub(crate) fn sent(&mut self, now_ns: i64) {
+        let since_ns = self.since_ns(now_ns).unwrap_or(now_ns);
+        self.lasts = Some((since_ns, now_ns));
+    }
+
+    /// Zeros are sent until the next call, a tick later.
+    pub(crate) fn ask_for_zeros(&mut self, now_ns: i64) {
+        self.zeros_until_ns = Some(now_ns.saturating_add(ZEROS_NS));
+    }
+
+    /// True when a zero is to be sent, where `is_wanted` says that OFFBOARD is requested.
+    pub(crate) fn is_zero_due(&self, now_ns: i64, is_wanted: bool) -> bool {
+        let is_asked_for = self.zeros_until_ns.is_some_and(|until_ns| now_ns < until_ns);
+        let is_due = self
+            .lasts
+            .is_none_or(|(_, last_ns)| now_ns.saturating_sub(last_ns) >= PERIOD_NS);
+        (is_wanted || is_asked_for) && is_due
+    }
+
+    /// For how long setpoints must still be sent before OFFBOARD is requested, in nanoseconds.
+    pub(crate) fn missing_ns(&self, now_ns: i64) -> i64 {
+        let lasted_ns = self.since_ns(now_ns).map_or(0, |since_ns| now_ns - since_ns);
+        (PROOF_NS - lasted_ns).max(0)
+    }
+
+    fn since_ns(&self, now_ns: i64) -> Option<i64> {
+        let lasts = self.lasts.filter(|(_, last_ns)| now_ns - last_ns <= MAX_GAP_NS);
+        lasts.map(|(since_ns, _)| since_ns)
+    }
+}
