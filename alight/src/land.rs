@@ -11,7 +11,7 @@ use anyhow::{Context, bail, ensure};
 use clap::Args;
 use markers::{Marker, Pad};
 use messages::topic;
-use node::{Layers, Network, Node, Shutdown};
+use node::{Layers, Network, Node, Shutdown, read_text};
 use tempfile::TempDir;
 use tokio::time::Instant;
 
@@ -176,7 +176,7 @@ impl ServiceSettings {
             controller.push(format!("marker=\"{}\"", marker.name()));
         }
         if let Some(name) = &args.pad {
-            let pad = Pad::named(name, |file| std::fs::read_to_string(file))?;
+            let pad = Pad::named(name, |file| read_text(file))?;
             // The services run in the same working directory.
             let name = toml::Value::from(name.as_str());
             simulator.push(format!("pad.markers={name}"));
@@ -531,6 +531,16 @@ mod tests {
         assert!(!is_simulated(&["--autopilot", "udpin:127.0.0.1:14551"]));
         let address = "controller.autopilot.address=\"udpin:127.0.0.1:14551\"";
         assert!(!is_simulated(&["--set", address]));
+    }
+
+    #[test]
+    fn a_pad_that_is_not_utf_8_is_told_with_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("pad.toml");
+        std::fs::write(&file, b"id = 1\nname = \"H\xf6he\"\n").unwrap();
+        let args = Tool::parse_from(["land", "--pad", file.to_str().unwrap()]);
+        let problem = ServiceSettings::new(&args.land).err().unwrap().to_string();
+        assert!(problem.contains("is not UTF-8 in line 2: save it as UTF-8"), "{problem}");
     }
 
     #[test]

@@ -128,3 +128,27 @@ where
     .with_context(|| format!("running {}", service.name()))?;
     Ok(ExitCode::SUCCESS)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pad_that_is_not_utf_8_is_told_as_settings_are() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("pad.toml");
+        std::fs::write(&file, b"id = 1\n# H\xf6he\n").unwrap();
+        let said = format!("the file {file:?} is not UTF-8 in line 2: save it as UTF-8");
+        for (service, set) in [
+            (Service::Detector, format!("pads=[{file:?}]")),
+            (Service::Simulator, format!("pad.markers={file:?}")),
+        ] {
+            let layers = Layers { file: None, set: vec![set] };
+            let problem = service.effective_config(&layers).unwrap_err().to_string();
+            assert!(problem.contains(&said), "{problem}");
+        }
+        let settings = Layers { file: Some(file), set: Vec::new() };
+        let problem = Service::Detector.effective_config(&settings).unwrap_err().to_string();
+        assert!(problem.contains(&said), "{problem}");
+    }
+}

@@ -109,7 +109,7 @@ impl Site {
     /// # Errors
     /// Names the file and the problem.
     pub(crate) fn read(path: &Path) -> Result<Self, ConfigError> {
-        let text = node::config::read_text(path)?;
+        let text = node::read_text(path)?;
         let mut site: Self = toml::from_str(&text).map_err(|cause| ConfigError::Syntax {
             source_name: path.display().to_string(),
             cause: cause.to_string().trim_end().to_owned(),

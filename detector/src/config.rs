@@ -3,7 +3,7 @@
 use fiducial::{Detector, ResponseSetting, TrackingSettings};
 use markers::{Marker, Pad};
 use messages::Place;
-use node::{Check, Settings};
+use node::{Check, Settings, read_text};
 use serde::{Deserialize, Serialize};
 
 /// The keys of `detector.toml`; meanings, units and ranges are told there.
@@ -143,7 +143,7 @@ impl Config {
     /// # Errors
     /// Says which pad is wrong and why, or which file cannot be read.
     pub fn parsed_pads(&self) -> Result<Vec<Pad>, String> {
-        let read = |name: &String| Pad::named(name, |file| std::fs::read_to_string(file));
+        let read = |name: &String| Pad::named(name, |file| read_text(file));
         let pads: Vec<Pad> =
             self.pads.iter().map(read).collect::<Result<_, _>>().map_err(|e| e.to_string())?;
         for (i, pad) in pads.iter().enumerate() {

@@ -16,6 +16,7 @@ use geometry::CameraModel;
 use imaging::{BayerPattern, GrayImage, GrayView};
 use markers::{Marker, Pad};
 use media::read_calibration;
+use node::read_text;
 
 use crate::terminal::{Output, write_error};
 pub(crate) use args::DetectArgs;
@@ -79,7 +80,7 @@ struct Worker {
 
 impl Examiner {
     fn new(args: &DetectArgs, lens: Lens) -> anyhow::Result<Self> {
-        let read = |name: &String| Pad::named(name, |file| std::fs::read_to_string(file));
+        let read = |name: &String| Pad::named(name, |file| read_text(file));
         let pads: Vec<Pad> = args.pads.iter().map(read).collect::<Result<_, _>>()?;
         let mut markers = args.markers.clone();
         for pad in &pads {

@@ -12,6 +12,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use clap::Args;
 use markers::{Marker, Pad};
+use node::read_text;
 
 use crate::ending::{Ending, format_of};
 use crate::terminal::print;
@@ -109,7 +110,7 @@ pub(crate) fn run(args: &MarkerArgs) -> anyhow::Result<ExitCode> {
         }
         (None, pad) => {
             let name = pad.as_deref().unwrap_or_default();
-            let pad = Pad::named(name, |file| std::fs::read_to_string(file))?;
+            let pad = Pad::named(name, |file| read_text(file))?;
             let count = pad.markers().len();
             (Sheet::with_pad(&pad, args.paper)?, format!("{}, {count} markers", pad.name()))
         }

@@ -46,8 +46,8 @@ pub struct PlacedMarker {
 /// Why a pad's description was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PadError {
-    /// Neither the name of a built-in pad nor a readable file.
-    #[error("pad `{name}`: {problem}; neither a readable file nor a built-in pad ({known})")]
+    /// Neither the name of a built-in pad nor a file of text.
+    #[error("pad `{name}`: {problem} (built in: {known})")]
     Unreadable {
         /// The name.
         name: String,

@@ -44,7 +44,7 @@ pub struct Layers {
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// A file that cannot be read.
-    #[error("reading the configuration file {path:?}: {cause}; check the path")]
+    #[error("reading the file {path:?}: {cause}; check the path")]
     Unreadable {
         /// The file.
         path: PathBuf,
@@ -52,7 +52,7 @@ pub enum ConfigError {
         cause: std::io::Error,
     },
     /// A file whose bytes are no UTF-8.
-    #[error("the configuration file {path:?} is not UTF-8 in line {line}{hint}: save it as UTF-8")]
+    #[error("the file {path:?} is not UTF-8 in line {line}{hint}: save it as UTF-8")]
     NotUtf8 {
         /// The file.
         path: PathBuf,
@@ -244,11 +244,12 @@ fn parse(name: &str, text: &str) -> Result<Table, ConfigError> {
     })
 }
 
-/// The text of a configuration file.
+/// The text of a file with settings, or with a description that they name.
 ///
 /// # Errors
 /// When it cannot be read, or is not UTF-8.
-pub fn read_text(path: &Path) -> Result<String, ConfigError> {
+pub fn read_text(path: impl AsRef<Path>) -> Result<String, ConfigError> {
+    let path = path.as_ref();
     let bytes = std::fs::read(path)
         .map_err(|cause| ConfigError::Unreadable { path: path.to_owned(), cause })?;
     String::from_utf8(bytes).map_err(|wrong| {

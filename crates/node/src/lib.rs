@@ -34,7 +34,7 @@ pub use block_on::block_on;
 pub use boxed::BoxFuture;
 pub use clock::{boot_ahead_ns, clock_name, host_name, now_ns};
 pub use config::{
-    Check, ConfigError, Effective, Layers, Settings, changed, from_toml, named, to_toml,
+    Check, ConfigError, Effective, Layers, Settings, changed, from_toml, named, read_text, to_toml,
 };
 pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
 pub use health::HealthCounters;

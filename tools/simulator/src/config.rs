@@ -4,7 +4,7 @@ use airlink::AirConfig;
 use autopilot::Address;
 use geometry::{CameraModel, Point, Transform, Vector};
 use markers::{Drawing, Marker, Pad};
-use node::{Check, Settings};
+use node::{Check, Settings, read_text};
 use rendering::{CameraSettings, PadInScene, Preset, Scene, Surface};
 use serde::Deserialize;
 use world::ardupilot::{AutopilotConfig, EstimateConfig, Firmware};
@@ -293,7 +293,7 @@ impl Config {
             let drawing = marker.size_m.and_then(|size_m| Drawing::new(&marker, size_m));
             return drawing.ok_or_else(|| format!("`{marker}` cannot be printed: it needs an id"));
         }
-        let pad = Pad::named(name, |file| std::fs::read_to_string(file));
+        let pad = Pad::named(name, |file| read_text(file));
         let pad = pad.map_err(|problem| problem.to_string())?;
         pad.drawing().ok_or_else(|| format!("pad `{name}` cannot be printed"))
     }
