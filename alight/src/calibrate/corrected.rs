@@ -1,6 +1,4 @@
-//! The corrected camera as tables of camera-pub's configuration.
-
-use std::fmt::Write as _;
+//! The corrected camera as keys of camera-pub's configuration, and what each of them was.
 
 use calibration::flight::QUANTITIES;
 use calibration::{FlightCalibration, Quantity};
@@ -8,71 +6,174 @@ use geometry::Distortion;
 
 use super::recorded::RecordedFlight;
 
-/// The tables that replace those of the same names; `None` when nothing was observable.
-pub(super) fn toml(flight: &RecordedFlight, result: &FlightCalibration) -> Option<String> {
+/// What a calibration changes of a camera's configuration.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Changes {
+    /// The keys, those of a table together.
+    pub(super) keys: Vec<Change>,
+    /// Why no key corrects the time offset, and what to do instead.
+    pub(super) advice: Option<String>,
+}
+
+/// A key that gets another value.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Change {
+    pub(super) table: &'static str,
+    pub(super) key: &'static str,
+    /// Its value as TOML.
+    pub(super) value: String,
+    pub(super) before: Before,
+}
+
+/// What a key was in the camera's configuration.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Before {
+    /// The recording has no configuration of the camera.
+    Unknown,
+    /// It had no such key.
+    Absent,
+    /// Its value as TOML.
+    Was(String),
+}
+
+/// What changes; nothing when nothing was observable.
+pub(super) fn changes(flight: &RecordedFlight, result: &FlightCalibration) -> Changes {
     let correction = |wanted: Quantity| {
         let index = QUANTITIES.iter().position(|quantity| *quantity == wanted)?;
-        Some(result.estimates[index].correction()).filter(|value| *value != 0.0)
+        Some(result.estimates.get(index)?.correction()).filter(|value| *value != 0.0)
     };
-    let mut text = format!(
-        "# Found by `alight calibrate flight`: these keys replace those in the configuration of the camera `{}`.\n",
-        // The name comes from a file, and ends no comment.
-        flight.camera.escape_debug()
-    );
-    let mut is_empty = true;
+    let mut changes = Changes::default();
+    let mut set = |table, key, value: String| {
+        let before = before(flight, table, key);
+        if before != Before::Was(value.clone()) {
+            changes.keys.push(Change { table, key, value, before });
+        }
+    };
+    let mut advice = None;
     if let Some(offset_s) = correction(Quantity::TimeOffset) {
-        is_empty = false;
-        text.push_str(&delay(flight, offset_s));
+        match delay_ms(flight, 1e3 * offset_s) {
+            Ok(delay_ms) => set("source", "delay_ms", format!("{delay_ms:.2}")),
+            Err(why) => advice = Some(why),
+        }
     }
     if correction(Quantity::FocalScale).or(correction(Quantity::K1)).is_some() {
-        is_empty = false;
-        text.push_str(&intrinsics(result));
+        let model = &result.camera.model;
+        let (lens, numbers): (&str, &[f64]) = match &model.distortion {
+            Distortion::None => ("pinhole", &[]),
+            Distortion::BrownConrady(k) => ("brown-conrady", k),
+            Distortion::KannalaBrandt(k) => ("kannala-brandt", k),
+        };
+        let numbers: Vec<String> = numbers.iter().map(|number| format!("{number:.9}")).collect();
+        set("calibration", "file", "\"\"".to_owned());
+        set("calibration", "focal_px", format!("[{:.4}, {:.4}]", model.fx, model.fy));
+        set("calibration", "principal_px", format!("[{:.4}, {:.4}]", model.cx, model.cy));
+        set("calibration", "lens", format!("\"{lens}\""));
+        set("calibration", "distortion", format!("[{}]", numbers.join(", ")));
     }
     let turns = [Quantity::MountRoll, Quantity::MountPitch, Quantity::MountYaw];
     if turns.into_iter().any(|quantity| correction(quantity).is_some()) {
-        is_empty = false;
-        let mount = result.camera.body_from_camera;
-        let [w, x, y, z] = mount.rotation().wxyz();
-        // Writing to a string cannot fail.
-        let _ = write!(
-            text,
-            "\n[mount]\norientation = \"quaternion\"\nrotation_wxyz = [{w:.9}, {x:.9}, {y:.9}, {z:.9}]\n"
-        );
+        let [w, x, y, z] = result.camera.body_from_camera.rotation().wxyz();
+        set("mount", "orientation", "\"quaternion\"".to_owned());
+        set("mount", "rotation_wxyz", format!("[{w:.9}, {x:.9}, {y:.9}, {z:.9}]"));
     }
-    (!is_empty).then_some(text)
+    Changes { advice, ..changes }
 }
 
-fn delay(flight: &RecordedFlight, offset_s: f64) -> String {
-    let offset_ms = 1e3 * offset_s;
-    let told = format!("frames are exposed {offset_ms:+.2} ms after their stamps");
+fn before(flight: &RecordedFlight, table: &str, key: &str) -> Before {
+    let Some(configuration) = &flight.configuration else { return Before::Unknown };
+    let value = configuration.get(table).and_then(|table| table.get(key));
+    value.map_or(Before::Absent, |value| Before::Was(value.to_string()))
+}
+
+/// The delay that makes stamps right.
+///
+/// # Errors
+/// Why no key does, and what to do.
+fn delay_ms(flight: &RecordedFlight, offset_ms: f64) -> Result<f64, String> {
+    let told = format!("frames are exposed {offset_ms:+.2} ms after their stamps, and");
     if flight.is_stamped_by_camera {
-        return format!(
-            "\n# {told}. The camera stamps them itself, so no key corrects that: check `source.stamp_at`, `source.readout_ms` and the\n\
-             # delay of the autopilot's telemetry.\n"
-        );
+        return Err(format!(
+            "{told} no key corrects that, as the camera stamps them itself: check `source.stamp_at`, `source.readout_ms` and the \
+             delay of the autopilot's telemetry"
+        ));
     }
-    match flight.delay_ms.map(|delay_ms| delay_ms - offset_ms) {
-        Some(delay_ms) if delay_ms >= 0.0 => {
-            format!("\n# {told}.\n[source]\ndelay_ms = {delay_ms:.2}\n")
+    let delay = before(flight, "source", "delay_ms");
+    let Before::Was(delay) = delay else {
+        return Err(format!(
+            "{told} what `source.delay_ms` was is not known, as the recording has no configuration of camera-pub `{}`: make it \
+             smaller by {offset_ms:.2}, or stamp them later if another program is the camera",
+            // The name comes from a file.
+            flight.camera.escape_debug()
+        ));
+    };
+    let delay_ms = delay.parse::<f64>().unwrap_or_default() - offset_ms;
+    if delay_ms >= 0.0 {
+        return Ok(delay_ms);
+    }
+    Err(format!(
+        "{told} `source.delay_ms` = {delay} cannot be made smaller by that: check the delay of the autopilot's telemetry"
+    ))
+}
+
+impl Changes {
+    /// The tables that replace those of the same names; `None` where no key changes.
+    pub(super) fn toml(&self, camera: &str) -> Option<String> {
+        let mut text = format!(
+            "# Found by `alight calibrate flight`: these keys replace those in the configuration of the camera `{}`.\n",
+            // The name comes from a file, and ends no comment.
+            camera.escape_debug()
+        );
+        if let Some(advice) = &self.advice {
+            text.push_str(&format!("# Not here: {advice}.\n"));
         }
-        _ => format!("\n# {told}: make `source.delay_ms` smaller by {offset_ms:.2}.\n"),
+        let mut table = "";
+        for change in &self.keys {
+            if change.table != table {
+                table = change.table;
+                text.push_str(&format!("\n[{table}]\n"));
+            }
+            text.push_str(&format!("{} = {}\n", change.key, change.value));
+        }
+        (!self.keys.is_empty()).then_some(text)
+    }
+
+    /// For people: what happens to each key, and what is left.
+    pub(super) fn lines(&self, camera: &str) -> Vec<String> {
+        let key = |change: &Change| {
+            let name = change.name();
+            match &change.before {
+                Before::Unknown => format!(
+                    "set: `{name}` = {} (what it was is not known: the recording has no configuration of camera-pub `{}`)",
+                    change.value,
+                    camera.escape_debug()
+                ),
+                Before::Absent => format!("added: `{name}` = {}", change.value),
+                Before::Was(before) => {
+                    format!("changed: `{name}` from {before} to {}", change.value)
+                }
+            }
+        };
+        let left = self.advice.iter().map(|advice| format!("left: {advice}"));
+        self.keys.iter().map(key).chain(left).collect()
+    }
+
+    /// The key that corrects a quantity; `None` where none does.
+    pub(super) fn key_of(&self, quantity: Quantity) -> Option<String> {
+        let key = match quantity {
+            Quantity::TimeOffset => "source.delay_ms",
+            Quantity::MountRoll | Quantity::MountPitch | Quantity::MountYaw => {
+                "mount.rotation_wxyz"
+            }
+            Quantity::FocalScale => "calibration.focal_px",
+            Quantity::K1 => "calibration.distortion",
+        };
+        self.keys.iter().map(Change::name).find(|name| name == key)
     }
 }
 
-fn intrinsics(result: &FlightCalibration) -> String {
-    let model = &result.camera.model;
-    let (lens, numbers): (&str, &[f64]) = match &model.distortion {
-        Distortion::None => ("pinhole", &[]),
-        Distortion::BrownConrady(k) => ("brown-conrady", k),
-        Distortion::KannalaBrandt(k) => ("kannala-brandt", k),
-    };
-    let numbers: Vec<String> = numbers.iter().map(|number| format!("{number:.9}")).collect();
-    format!(
-        "\n[calibration]\nfile = \"\"\nfocal_px = [{:.4}, {:.4}]\nprincipal_px = [{:.4}, {:.4}]\nlens = \"{lens}\"\ndistortion = [{}]\n",
-        model.fx,
-        model.fy,
-        model.cx,
-        model.cy,
-        numbers.join(", ")
-    )
+impl Change {
+    /// Its dotted name.
+    pub(super) fn name(&self) -> String {
+        format!("{}.{}", self.table, self.key)
+    }
 }

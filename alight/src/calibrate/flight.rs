@@ -8,7 +8,7 @@ use calibration::{FlightCalibration, FlightEstimate, Quantity, calibrate_flight}
 use clap::Args;
 use serde_json::{Value, json};
 
-use super::corrected;
+use super::corrected::{self, Before, Changes};
 use super::recorded::{self, RecordedFlight, Wanted};
 use crate::args::Format;
 use crate::ending::toml_file;
@@ -52,22 +52,23 @@ pub(super) fn run(args: &FlightArgs) -> anyhow::Result<ExitCode> {
     flight.damage.iter().for_each(|damage| write_error(damage));
     let result = calibrate_flight(&flight.configured, &flight.vehicle, &flight.markers)
         .with_context(|| format!("calibrating the camera `{}` from {file:?}", flight.camera))?;
+    let changes = corrected::changes(&flight, &result);
     match args.format {
-        Format::Text => print(text(&flight, &result).trim_end())?,
-        Format::Json => print(&json(&flight, &result).to_string())?,
+        Format::Text => print(text(&flight, &result, &changes).trim_end())?,
+        Format::Json => print(&json(&flight, &result, &changes).to_string())?,
     }
-    let changes = corrected::toml(&flight, &result);
-    match (&args.output, &changes) {
-        (Some(path), Some(changes)) => {
-            std::fs::write(path, changes)
+    write_error(&match (&args.output, changes.toml(&flight.camera)) {
+        (Some(path), Some(toml)) => {
+            std::fs::write(path, toml)
                 .with_context(|| format!("writing {path:?}; name another file with `--output`"))?;
-            write_error(&format!("{}: the keys that change", path.display()));
+            format!("{}: the {} keys that change", path.display(), changes.keys.len())
         }
-        (Some(path), None) => {
-            write_error(&format!("{}: not written, as no key changes", path.display()));
+        (Some(path), None) => format!("{}: not written, as no key changes", path.display()),
+        (None, Some(_)) => {
+            "nothing is written; `--output FILE.toml` writes the keys that change".to_owned()
         }
-        (None, _) => {}
-    }
+        (None, None) => "no key changes".to_owned(),
+    });
     let is_any = result.estimates.iter().any(FlightEstimate::is_observable);
     Ok(if is_any { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
@@ -86,16 +87,22 @@ fn name(quantity: Quantity) -> (&'static str, &'static str, f64) {
 }
 
 /// What is said of an estimate.
-fn verdict(estimate: &FlightEstimate) -> &'static str {
-    match (estimate.is_observable(), estimate.deviation.is_finite()) {
+fn verdict(estimate: &FlightEstimate, changes: &Changes) -> String {
+    let stays = match (estimate.is_observable(), estimate.deviation.is_finite()) {
         (true, _) if estimate.may_be_as_configured() => "stays: it may be as configured",
-        (true, _) => "corrected",
+        (true, _) => {
+            return match changes.key_of(estimate.quantity) {
+                Some(key) => format!("corrected by `{key}`"),
+                None => "stays, although it is off: see below".to_owned(),
+            };
+        }
         (false, true) => "not observable, stays: too uncertain",
         (false, false) => "not observable, stays: the vehicle did not move so that it shows",
-    }
+    };
+    stays.to_owned()
 }
 
-fn text(flight: &RecordedFlight, result: &FlightCalibration) -> String {
+fn text(flight: &RecordedFlight, result: &FlightCalibration, changes: &Changes) -> String {
     let excitation = &result.excitation;
     let mut lines = vec![
         format!(
@@ -123,9 +130,10 @@ fn text(flight: &RecordedFlight, result: &FlightCalibration) -> String {
             ],
             false => ["-".to_owned(), "-".to_owned()],
         };
-        let verdict = verdict(estimate);
+        let verdict = verdict(estimate, changes);
         lines.push(format!("{name:<14}{value:>12}{spread:>12}{limit:>12}  {unit:<4} {verdict}"));
     }
+    lines.extend(changes.lines(&flight.camera));
     let [before, after] = [&flight.configured, &result.camera].map(|camera| {
         let (roll, pitch, yaw) = camera.body_from_camera.rotation().euler();
         let [roll, pitch, yaw] = [roll, pitch, yaw].map(f64::to_degrees);
@@ -143,7 +151,7 @@ fn text(flight: &RecordedFlight, result: &FlightCalibration) -> String {
     lines.join("\n")
 }
 
-fn json(flight: &RecordedFlight, result: &FlightCalibration) -> Value {
+fn json(flight: &RecordedFlight, result: &FlightCalibration, changes: &Changes) -> Value {
     let key = |quantity| match quantity {
         Quantity::TimeOffset => "time_offset_s",
         Quantity::MountRoll => "mount_roll_rad",
@@ -161,8 +169,16 @@ fn json(flight: &RecordedFlight, result: &FlightCalibration) -> Value {
             "max_sigma": estimate.quantity.max_deviation(),
             "observable": estimate.is_observable(),
             "correction": estimate.correction(),
-            "verdict": verdict(estimate),
+            "key": changes.key_of(estimate.quantity).filter(|_| estimate.correction() != 0.0),
+            "verdict": verdict(estimate, changes),
         })
+    });
+    let keys = changes.keys.iter().map(|change| {
+        let before = match &change.before {
+            Before::Was(before) => Some(before),
+            Before::Unknown | Before::Absent => None,
+        };
+        json!({ "key": change.name(), "before": before, "after": change.value })
     });
     let camera = |camera: &calibration::ConfiguredCamera| {
         json!({
@@ -179,6 +195,8 @@ fn json(flight: &RecordedFlight, result: &FlightCalibration) -> Value {
         "used": result.markers,
         "estimates": estimates.collect::<Vec<_>>(),
         "covariance": covariance,
+        "changes": keys.collect::<Vec<_>>(),
+        "left": changes.advice,
         "before": camera(&flight.configured),
         "after": camera(&result.camera),
         "tilt_rad": result.excitation.tilt_rad,
@@ -305,8 +323,47 @@ mod tests {
             }
             assert!(landed.result.estimates[0].is_observable() && errors[0].abs() < 0.002);
             assert!(landed.result.estimates[2].is_observable());
-            assert!(text(&landed.flight, &landed.result).contains("corrected"));
+            let changes = corrected::changes(&landed.flight, &landed.result);
+            let text = text(&landed.flight, &landed.result, &changes);
+            assert!(text.contains("corrected by `mount.rotation_wxyz`"), "{text}");
         }
+    }
+
+    #[test]
+    fn what_is_told_to_be_corrected_is_a_key_that_changes() {
+        let Landed { mut flight, result, .. } = landed(&planned(6200, WRONG, &[])).unwrap();
+        let told = |flight: &RecordedFlight| {
+            let changes = corrected::changes(flight, &result);
+            let toml: toml::Table = changes.toml(&flight.camera).unwrap().parse().unwrap();
+            let text = text(flight, &result, &changes);
+            let named = text.split("corrected by `").skip(1).filter_map(|it| it.split('`').next());
+            for (table, key) in named.filter_map(|name| name.split_once('.')) {
+                assert!(toml[table].get(key).is_some(), "{table}.{key} is not in {toml}");
+            }
+            (text, toml)
+        };
+        let all = |text: &str, parts: &[&str]| {
+            for part in parts {
+                assert!(text.contains(part), "`{part}` is not in: {text}");
+            }
+        };
+        // The simulator has no configuration of camera-pub, and stamps frames itself.
+        let (text, toml) = told(&flight);
+        all(&text, &["stays, although it is off: see below", "left: frames are exposed +"]);
+        all(&text, &["no key corrects that", "set: `mount.rotation_wxyz` = ["]);
+        assert!(toml.get("source").is_none(), "{toml}");
+        flight.is_stamped_by_camera = false;
+        all(&told(&flight).0, &["left: ", "what `source.delay_ms` was is not known"]);
+        let configuration = "source.delay_ms = 50.0\nmount.orientation = \"down\"";
+        flight.configuration = Some(configuration.parse().unwrap());
+        let (text, toml) = told(&flight);
+        all(&text, &["corrected by `source.delay_ms`", "changed: `source.delay_ms` from 50.0 to "]);
+        all(&text, &["changed: `mount.orientation` from \"down\" to \"quaternion\""]);
+        all(&text, &["added: `mount.rotation_wxyz` = ["]);
+        let delay_ms = toml["source"]["delay_ms"].as_float().unwrap();
+        assert!((delay_ms - 10.0).abs() < 2.0 && !text.contains("left: "), "{text}");
+        flight.configuration = Some("source.delay_ms = 5.0".parse().unwrap());
+        all(&told(&flight).0, &["left: ", "`source.delay_ms` = 5.0 cannot be made smaller"]);
     }
 
     #[test]

@@ -21,8 +21,8 @@ pub(super) struct RecordedFlight {
     pub(super) marker: String,
     /// Whether frames tell their exposure: their stamps are the camera's own, and no delay is subtracted from them.
     pub(super) is_stamped_by_camera: bool,
-    /// `source.delay_ms` of camera-pub, where its configuration was recorded.
-    pub(super) delay_ms: Option<f64>,
+    /// The configuration of camera-pub, every key of it, where it was recorded.
+    pub(super) configuration: Option<toml::Table>,
     /// What of the recording is damaged.
     pub(super) damage: Vec<String>,
 }
@@ -84,7 +84,7 @@ pub(super) fn read(file: &Path, wanted: &Wanted<'_>) -> anyhow::Result<RecordedF
             let exact = found.iter().filter(|message| message.header.exposure_ns > 0).count();
             2 * exact > found.len()
         },
-        delay_ms: delay_ms(&flight, &camera),
+        configuration: configuration(&flight, &camera),
         damage: flight.damage,
         camera,
     })
@@ -203,22 +203,13 @@ fn vehicle(flight: &Flight, at_s: impl Fn(i64) -> f64) -> Vec<VehicleSample> {
     flight.vehicle.iter().filter_map(sample).collect()
 }
 
-/// The table of the camera's source, if camera-pub's configuration was recorded.
-fn source(flight: &Flight, camera: &str) -> Option<toml::Table> {
-    let text = flight.configurations.get(&format!("camera-pub/{camera}"))?;
-    let table: toml::Table = text.parse().ok()?;
-    table.get("source")?.as_table().cloned()
-}
-
-/// The delay that camera-pub subtracted from stamps.
-fn delay_ms(flight: &Flight, camera: &str) -> Option<f64> {
-    let source = source(flight, camera)?;
-    let delay = source.get("delay_ms")?;
-    delay.as_float().or_else(|| delay.as_integer().map(|ms| ms as f64))
+/// The configuration of camera-pub, if it was recorded.
+fn configuration(flight: &Flight, camera: &str) -> Option<toml::Table> {
+    flight.configurations.get(&format!("camera-pub/{camera}"))?.parse().ok()
 }
 
 /// Whether camera-pub read a device, whose driver stamps.
 fn is_device(flight: &Flight, camera: &str) -> bool {
-    let device = |source: toml::Table| Some(!source.get("device")?.as_str()?.is_empty());
-    source(flight, camera).and_then(device).unwrap_or(false)
+    let device = |all: toml::Table| Some(!all.get("source")?.get("device")?.as_str()?.is_empty());
+    configuration(flight, camera).and_then(device).unwrap_or(false)
 }
