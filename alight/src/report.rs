@@ -5,7 +5,9 @@ use std::process::ExitCode;
 
 use anyhow::{Context, ensure};
 use clap::{Args, ValueEnum};
-use report::{Flight, FlightReader, comparison, document, figures, page, replay_tapes, summary};
+use report::{
+    Figure, Flight, FlightReader, comparison, document, figures, page, replay_tapes, summary,
+};
 
 use crate::ending::{Ending, format_of};
 use crate::terminal::{print, write_error};
@@ -19,14 +21,18 @@ pub(crate) struct ReportArgs {
     /// Which landing of each recording, from 1 on, where it has several [default: the last].
     #[arg(long, value_name = "N")]
     landing: Option<usize>,
-    /// The page [default: the first recording's name with `.html` or `.pdf`, beside it]. Its name ends in .html, or in .pdf
-    /// for a PDF document.
+    /// The page [default: beside the first recording, with its name, `flight.html`; of two flights `one-and-other.html`, with
+    /// `--landing 2` `flight-landing-2.html`]. Its name ends in .html, or in .pdf for a PDF document.
     #[arg(short, long, value_name = "FILE")]
     output: Option<Page>,
     /// A folder for the charts as SVG files, with title and legend, for papers and slides; of two flights in
     /// the folders `1` and `2` in it.
     #[arg(long, value_name = "FOLDER")]
     figures: Option<PathBuf>,
+    /// Replace a page or figures that are there already, which may be another flight's; without it they are refused. The page of
+    /// one recording, with its name and beside it, is written anew in any case.
+    #[arg(long)]
+    replace: bool,
     /// What is printed: a line for a bug report, or the flight in numbers as one JSON object; or the line, and the page is a
     /// PDF document.
     #[arg(long, value_enum, default_value_t)]
@@ -69,6 +75,9 @@ const MAX_FLIGHTS: usize = 2;
 /// Writes the page, and prints the summary.
 pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     let is_pdf = args.is_pdf()?;
+    if let Some(page) = &args.output {
+        args.check_is_free(&page.path, "--output")?;
+    }
     let mut flights = flights(&args.files)?;
     for flight in &mut flights {
         let (name, number) = (flight.name.clone(), args.landing.unwrap_or(0));
@@ -87,20 +96,32 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
             args.files
         ),
     };
-    let extension = if is_pdf { "pdf" } else { "html" };
-    let beside = args.files.first().map(|file| file.with_extension(extension)).unwrap_or_default();
+    let beside = args.beside(&flights, if is_pdf { "pdf" } else { "html" });
     let output = args.output.as_ref().map_or(&beside, |page| &page.path);
     ensure!(
         !args.files.iter().any(|file| is_same_file(file, output)),
         "{output:?} is a recording; name another file for the page with `--output`"
     );
-    std::fs::write(output, written)
-        .with_context(|| format!("writing {output:?}; name another file with `--output`"))?;
+    if args.output.is_none() && flights.len() > 1 {
+        args.check_is_free(output, "--output")?;
+    }
+    // All is checked before the first file is written.
+    let mut drawn = Vec::new();
     if let Some(folder) = &args.figures {
         for (number, flight) in (1..).zip(&flights) {
             let of_several = folder.join(number.to_string());
-            write_figures(flight, if flights.len() > 1 { &of_several } else { folder })?;
+            let folder = if flights.len() > 1 { of_several } else { folder.clone() };
+            let figures = figures(flight)?;
+            for figure in &figures {
+                args.check_is_free(&folder.join(&figure.name), "--figures")?;
+            }
+            drawn.push((folder, figures));
         }
+    }
+    std::fs::write(output, written)
+        .with_context(|| format!("writing {output:?}; name another file with `--output`"))?;
+    for (folder, figures) in &drawn {
+        write_figures(figures, folder)?;
     }
     for flight in &flights {
         let summary = summary(flight);
@@ -114,6 +135,30 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
 }
 
 impl ReportArgs {
+    /// Refuses a file that is there already: it may be another flight's.
+    fn check_is_free(&self, file: &Path, option: &str) -> anyhow::Result<()> {
+        ensure!(
+            self.replace || !file.exists(),
+            "{file:?} is there already, and may be of another flight: name another with `{option}`, or replace it with `--replace`"
+        );
+        Ok(())
+    }
+
+    /// The page's place where none is named: beside the first recording, and no other flight's or landing's.
+    fn beside(&self, flights: &[Flight], extension: &str) -> PathBuf {
+        let Some(first) = self.files.first() else { return PathBuf::new() };
+        let stem =
+            |name: &Path| name.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let mut name = stem(first);
+        for other in flights.iter().skip(1) {
+            name.push_str(&format!("-and-{}", stem(Path::new(&other.name))));
+        }
+        if let Some(number) = self.landing {
+            name.push_str(&format!("-landing-{number}"));
+        }
+        first.with_file_name(format!("{name}.{extension}"))
+    }
+
     /// Whether the page is a PDF document.
     fn is_pdf(&self) -> anyhow::Result<bool> {
         let wants_pdf = self.format == Format::Pdf;
@@ -126,11 +171,10 @@ impl ReportArgs {
     }
 }
 
-fn write_figures(flight: &Flight, folder: &Path) -> anyhow::Result<()> {
+fn write_figures(figures: &[Figure], folder: &Path) -> anyhow::Result<()> {
     std::fs::create_dir_all(folder)
         .with_context(|| format!("making the folder {folder:?} of `--figures`"))?;
-    let figures = figures(flight)?;
-    for figure in &figures {
+    for figure in figures {
         let file = folder.join(&figure.name);
         std::fs::write(&file, &figure.svg).with_context(|| format!("writing {file:?}"))?;
     }
@@ -176,6 +220,8 @@ fn name(file: &Path) -> String {
 mod tests {
     use super::*;
     use clap::Parser;
+    use experiments::landing::flight::fly_recorded;
+    use experiments::landing::plan::Plan;
 
     #[derive(Parser)]
     struct Program {
@@ -248,5 +294,52 @@ mod tests {
         ];
         let names: Vec<String> = flights(&files).unwrap().into_iter().map(|it| it.name).collect();
         assert_eq!(names, ["one.mcap", "two.mcap", "in-lock-step.mcap"]);
+    }
+
+    /// A recorded landing of its own.
+    fn fly(file: &Path, seed: u64) {
+        let plan = Plan { flights: 1, seed, ..Plan::default() };
+        fly_recorded(&plan.flights()[0], std::fs::File::create(file).unwrap()).unwrap();
+    }
+
+    #[test]
+    fn the_page_of_another_flight_is_kept() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        let [one, other] = ["one.mcap", "other.mcap"].map(path);
+        fly(&one, 1);
+        fly(&other, 2);
+        let reported = |files: &[&Path], options: &[&str]| {
+            let files = files.iter().map(|file| file.as_os_str());
+            let options = options.iter().map(|option| (*option).as_ref());
+            let text = std::iter::once("report".as_ref()).chain(files).chain(options);
+            run(&Program::try_parse_from(text).unwrap().args).map_err(|problem| problem.to_string())
+        };
+        let text = |name: &str| std::fs::read_to_string(path(name)).unwrap();
+        // Each has its own, and its own is written anew.
+        reported(&[&one], &[]).unwrap();
+        reported(&[&other], &[]).unwrap();
+        reported(&[&one, &other], &[]).unwrap();
+        reported(&[&one], &["--landing", "1"]).unwrap();
+        for name in ["one.html", "other.html", "one-and-other.html", "one-landing-1.html"] {
+            assert!(text(name).contains("<html"), "{name}");
+        }
+        std::fs::write(path("one.html"), "old").unwrap();
+        reported(&[&one], &[]).unwrap();
+        assert!(text("one.html") != "old");
+        // A place that was named is of whoever was there first.
+        let [page, charts] = ["page.html", "charts"].map(|name| path(name).display().to_string());
+        let named = ["-o", &page, "--figures", &charts];
+        reported(&[&one], &named).unwrap();
+        let first = text("page.html");
+        let problem = reported(&[&other], &named).unwrap_err();
+        assert!(problem.contains("page.html") && problem.contains("`--replace`"), "{problem}");
+        let problem = reported(&[&other], &["-o", "new.html", "--figures", &charts]).unwrap_err();
+        assert!(problem.contains(".svg") && problem.contains("`--figures`"), "{problem}");
+        assert!(!Path::new("new.html").exists(), "written before the figures were refused");
+        assert!(reported(&[&one, &other], &[]).unwrap_err().contains("one-and-other.html"));
+        assert_eq!(text("page.html"), first);
+        reported(&[&other], &[&named[..], &["--replace"]].concat()).unwrap();
+        assert_ne!(text("page.html"), first);
     }
 }
