@@ -5,8 +5,11 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
+use controller::wire::marker_name;
+use markers::{Marker, Pad};
 use messages::{
-    Candidate, ControllerCommand, ControllerStatus, DetectorInfo, DetectorState, Place, topic,
+    Candidate, Configuration, ControllerCommand, ControllerStatus, DetectorInfo, DetectorState,
+    Place, topic,
 };
 use node::Node;
 use serde::Serialize;
@@ -18,6 +21,8 @@ use crate::terminal::{aligned, print};
 
 /// Duration of listening: every detector publishes its information once a second.
 const LISTENING: Duration = Duration::from_millis(1500);
+/// Further time for the controller's configuration, which is published every 3 s.
+const CONFIGURATION_PATIENCE: Duration = Duration::from_secs(2);
 
 /// The arguments of `alight detectors`.
 #[derive(Args)]
@@ -88,7 +93,8 @@ fn list(network: &NetworkArgs, format: Format) -> anyhow::Result<ExitCode> {
 async fn listen(node: &Node) -> anyhow::Result<Overview> {
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     let infos = node.subscriber(topic::DETECTOR_INFO, &[]).await?;
-    let (mut status, mut announced) = (None, BTreeMap::new());
+    let configurations = node.subscriber(topic::CONFIGURATION, &["controller"]).await?;
+    let (mut status, mut announced, mut marker) = (None, BTreeMap::new(), None);
     let receive = async {
         loop {
             tokio::select! {
@@ -98,14 +104,43 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
                     let name = topic::DETECTOR_INFO.first_name(&key).unwrap_or_default();
                     announced.insert(name.to_owned(), info);
                 }
+                Some(configuration) = configurations.next() => marker = marker_of(&configuration),
                 else => return,
             }
         }
     };
     // Ends by the timeout.
     let _ = tokio::time::timeout(LISTENING, receive).await;
+    if status.is_some() && marker.is_none() {
+        let next = tokio::time::timeout(CONFIGURATION_PATIENCE, configurations.next()).await;
+        marker = next.ok().flatten().as_ref().and_then(marker_of);
+    }
     let ready = node.alive("detector", "*").await?.into_iter().collect();
-    Ok(Overview::new(status, &announced, ready))
+    Ok(Overview::new(status, marker, &announced, ready))
+}
+
+/// The marker of a controller's landing.
+fn marker_of(controller: &Configuration) -> Option<String> {
+    let table: toml::Table = controller.toml.parse().ok()?;
+    table.get("marker")?.as_str().map(str::to_owned)
+}
+
+/// Whether a detector with these markers (`FAMILY:ID:SIZE_M`, `pad:ID`) surely never reports the one that is wanted, `FAMILY` or
+/// `FAMILY:ID`.
+fn looks_for_others(markers: &[String], wanted: &str) -> bool {
+    let Ok((family, id)) = marker_name(wanted) else { return false };
+    let is_other = |text: &String| match text.split_once(':') {
+        Some((Pad::FAMILY, number)) if family == Pad::FAMILY => {
+            id.is_some_and(|id| number != id.to_string())
+        }
+        // It may have the marker on it.
+        Some((Pad::FAMILY, _)) => false,
+        _ => text.parse::<Marker>().is_ok_and(|marker| {
+            let is_other_id = marker.id.zip(id).is_some_and(|(one, other)| one != other);
+            marker.family.name() != family || is_other_id
+        }),
+    };
+    !markers.is_empty() && markers.iter().all(is_other)
 }
 
 /// The detectors of a vehicle.
@@ -116,8 +151,10 @@ struct Overview {
     why: String,
     preference: String,
     changes: u64,
+    /// The marker of the landing; `None` when the controller did not tell it.
+    marker: Option<String>,
     detectors: Vec<Entry>,
-    /// What the controller refuses, and which detectors disagree.
+    /// What the controller refuses, which detectors disagree, and which look for another marker.
     warnings: Vec<String>,
 }
 
@@ -125,7 +162,8 @@ struct Overview {
 #[derive(Serialize)]
 struct Entry {
     id: String,
-    /// `active`, `shadow`, `stale`; `waiting` for one from which the controller has received nothing.
+    /// `active`, `shadow`, `stale`, `blind`, `outvoted`; `waiting` for one from which the controller has received nothing, and
+    /// `other-marker` for one that answers and never reports the marker of the landing.
     state: &'static str,
     place: Option<Place>,
     host: Option<String>,
@@ -142,6 +180,7 @@ struct Entry {
 impl Overview {
     fn new(
         status: Option<ControllerStatus>,
+        marker: Option<String>,
         announced: &BTreeMap<String, DetectorInfo>,
         ready: BTreeSet<String>,
     ) -> Self {
@@ -151,18 +190,34 @@ impl Overview {
             status.candidates.iter().map(|c| (c.detector.as_str(), c)).collect();
         let mut names: BTreeSet<&str> = candidates.keys().copied().collect();
         names.extend(ready.iter().map(String::as_str));
-        let entry =
-            |name: &str| Entry::new(name, candidates.get(name).copied(), announced.get(name));
+        let entry = |name: &str| {
+            let (candidate, info) = (candidates.get(name).copied(), announced.get(name));
+            Entry::new(name, candidate, info, marker.as_deref())
+        };
         let mut detectors: Vec<Entry> = names.into_iter().map(entry).collect();
         detectors.sort_by_key(|entry| entry.state != "active");
+        let mut warnings = status.warnings;
+        if let Some(marker) = &marker {
+            let others = detectors.iter().filter(|it| looks_for_others(&it.markers, marker));
+            warnings.extend(others.map(|it| {
+                format!(
+                    "detector `{}` looks for {}, and the landing is on {marker}; \
+                     `alight command --detector {} set 'markers=[\"FAMILY:ID:SIZE_M\"]'` changes that",
+                    it.id,
+                    it.markers.join(" "),
+                    it.id
+                )
+            }));
+        }
         Self {
             controller,
             active: status.active_detector.clone(),
             why: status.detector_why.clone(),
             preference: status.preference.clone(),
             changes: status.detector_changes,
+            marker,
             detectors,
-            warnings: status.warnings,
+            warnings,
         }
     }
 
@@ -222,13 +277,23 @@ impl Overview {
 }
 
 impl Entry {
-    fn new(name: &str, candidate: Option<&Candidate>, info: Option<&DetectorInfo>) -> Self {
+    fn new(
+        name: &str,
+        candidate: Option<&Candidate>,
+        info: Option<&DetectorInfo>,
+        wanted: Option<&str>,
+    ) -> Self {
+        let looks_for_others =
+            wanted.zip(info).is_some_and(|(wanted, info)| looks_for_others(&info.markers, wanted));
         Self {
             id: name.to_owned(),
             state: match candidate.map(|c| c.state) {
                 Some(DetectorState::Active) => "active",
-                Some(DetectorState::Shadow) => "shadow",
                 Some(DetectorState::Stale) => "stale",
+                Some(_) if looks_for_others => "other-marker",
+                Some(DetectorState::Shadow) => "shadow",
+                Some(DetectorState::Blind) => "blind",
+                Some(DetectorState::Outvoted) => "outvoted",
                 None => "waiting",
             },
             place: candidate.and_then(|c| c.place).or(info.map(|info| info.place)),
@@ -285,14 +350,86 @@ mod tests {
         };
         let announced = [("main".to_owned(), info)].into();
         let ready = ["main".to_owned(), "late".to_owned()].into();
-        let table = Overview::new(Some(status), &announced, ready).table();
+        let table = Overview::new(Some(status), None, &announced, ready).table();
         let lines: Vec<&str> = table.lines().collect();
         assert!(lines[1].starts_with("main") && lines[1].contains("rings:0.15341"), "{table}");
         assert!(lines[2].contains("shadow") && lines[2].contains("29 of 30, 0.012 m"), "{table}");
         assert!(lines[3].starts_with("late") && lines[3].contains("waiting"), "{table}");
         assert!(lines[4].contains("preferred: ground; 3 changes"), "{table}");
         assert!(lines[5].starts_with("Warning: detections of `late`"), "{table}");
-        let nobody = Overview::new(None, &announced, BTreeSet::new()).table();
+        let nobody = Overview::new(None, None, &announced, BTreeSet::new()).table();
         assert!(nobody.contains("No controller"), "{nobody}");
+    }
+
+    #[test]
+    fn one_that_looks_for_another_marker_is_not_called_stale() {
+        let states = [
+            ("main", DetectorState::Active, "rings:0.15341"),
+            ("blind", DetectorState::Blind, "rings:0.15341"),
+            ("late", DetectorState::Stale, "aruco-4x4-50:7:0.15"),
+            ("liar", DetectorState::Outvoted, "rings:0.15341"),
+            ("tag", DetectorState::Blind, "aruco-4x4-50:7:0.15"),
+        ];
+        let candidates = states.map(|(name, state, _)| Candidate {
+            detector: name.into(),
+            state,
+            ..Candidate::sample()
+        });
+        let status =
+            ControllerStatus { candidates: candidates.into(), ..ControllerStatus::default() };
+        let info = |markers: &str| DetectorInfo {
+            detector: String::new(),
+            host: "pi".into(),
+            place: Place::Onboard,
+            camera: "down".into(),
+            markers: vec![markers.into()],
+            version: "alight 0.1.0".into(),
+            pid: 7,
+        };
+        let announced = states.map(|(name, _, markers)| (name.to_owned(), info(markers))).into();
+        let marker = marker_of(&Configuration {
+            service: "controller".into(),
+            instance: "main".into(),
+            host: "pi".into(),
+            version: "0.1.0".into(),
+            toml: "marker = \"rings\"".into(),
+        });
+        let overview = Overview::new(Some(status), marker, &announced, BTreeSet::new());
+        let told: Vec<_> = overview.detectors.iter().map(|it| (it.id.as_str(), it.state)).collect();
+        let expected = [
+            ("main", "active"),
+            ("blind", "blind"),
+            ("late", "stale"),
+            ("liar", "outvoted"),
+            ("tag", "other-marker"),
+        ];
+        assert_eq!(told, expected);
+        let table = overview.table();
+        let said =
+            "Warning: detector `tag` looks for aruco-4x4-50:7:0.15, and the landing is on rings;";
+        assert!(table.contains(said), "{table}");
+        assert!(!table.contains("detector `main` looks"), "{table}");
+    }
+
+    #[test]
+    fn another_marker_is_one_that_the_landing_never_takes() {
+        for (markers, wanted, is_other) in [
+            (&["rings:0.15"][..], "rings", false),
+            (&["rings:0.15"], "aruco-4x4-50:7", true),
+            (&["aruco-4x4-50:7:0.1"], "aruco-4x4-50", false),
+            (&["aruco-4x4-50:7:0.1"], "aruco-4x4-50:8", true),
+            (&["aruco-4x4-50:*:0.1"], "aruco-4x4-50:8", false),
+            (&["aruco-4x4-50:7:0.1", "rings:0.2"], "rings", false),
+            (&["pad:1"], "pad:1", false),
+            (&["pad:1"], "pad:2", true),
+            (&["rings:0.15"], "pad:1", true),
+            // What is on a pad, or a detector of another program calls its markers, is not known.
+            (&["pad:1"], "rings", false),
+            (&["my marker"], "rings", false),
+            (&[], "rings", false),
+        ] {
+            let markers: Vec<String> = markers.iter().map(|it| (*it).to_owned()).collect();
+            assert_eq!(looks_for_others(&markers, wanted), is_other, "{markers:?} for {wanted}");
+        }
     }
 }

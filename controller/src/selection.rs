@@ -349,10 +349,12 @@ impl Selection {
     pub fn candidates(&self, now_ns: i64) -> Vec<Candidate> {
         let candidate = |known: &Known| Candidate {
             detector: known.name.clone(),
-            state: match self.trouble(now_ns, known) {
-                Some(_) => DetectorState::Stale,
-                None if self.active.as_ref() == Some(&known.name) => DetectorState::Active,
-                None => DetectorState::Shadow,
+            state: match (self.ailment(now_ns, known), &known.fault) {
+                (Some(_), _) => DetectorState::Stale,
+                (None, Some(Fault::Blind { .. })) => DetectorState::Blind,
+                (None, Some(Fault::Outvoted { .. })) => DetectorState::Outvoted,
+                (None, None) if self.active.as_ref() == Some(&known.name) => DetectorState::Active,
+                (None, None) => DetectorState::Shadow,
             },
             place: known.place,
             age_ms: now_ns.saturating_sub(known.stamp_ns) as f64 * 1e-6,

@@ -447,7 +447,7 @@ fn of_three_the_one_that_sees_the_marker_elsewhere_is_outvoted_even_if_it_is_pre
     let active = bench.selection.active().unwrap().to_owned();
     assert_ne!(active, "liar");
     assert!(bench.selection.why().contains("liar: 2 others see"), "{}", bench.selection.why());
-    assert_eq!((bench.selection.dispute(), bench.state("liar")), (None, DetectorState::Stale));
+    assert_eq!((bench.selection.dispute(), bench.state("liar")), (None, DetectorState::Outvoted));
 }
 
 #[test]
@@ -460,6 +460,8 @@ fn a_preferred_one_that_sees_nothing_is_passed_over_and_told() {
         bench.frame_seen(i * PERIOD, &answers);
     }
     assert_eq!((bench.selection.active(), bench.selection.dispute()), (Some("main"), None));
+    // It answers in time, and is not stale.
+    assert_eq!(bench.state("blind"), DetectorState::Blind);
     // Where nobody sees the marker, nobody is blind.
     for i in 120..240 {
         bench.frame_seen(i * PERIOD, &[("main", 30 * MS, None), ("blind", 20 * MS, None)]);

@@ -60,6 +60,8 @@ pub fn detector(state: DetectorState) -> &'static str {
         DetectorState::Active => "in use",
         DetectorState::Shadow => "standby",
         DetectorState::Stale => "silent or late",
+        DetectorState::Blind => "sees no marker",
+        DetectorState::Outvoted => "outvoted",
     }
 }
 

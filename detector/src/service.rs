@@ -14,6 +14,7 @@ use fiducial::overlay::debug;
 use fiducial::{ResponseEstimate, ResponseSetting, StageObserver};
 use geometry::CameraModel;
 use imaging::{Converter, GrayView};
+use markers::Pad;
 use messages::{
     CameraInfo, CameraResponse, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo,
     FrameAck, FrameHeader, PixelFormat, Refusals, topic,
@@ -68,8 +69,8 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let work = Work::new(&node, &config, shared).await?;
     let responses = node.publisher(topic::CAMERA_RESPONSE, &[&config.id]).await?;
     let infos_of_ours = node.publisher(topic::DETECTOR_INFO, &[&config.id]).await?;
-    infos_of_ours.publish(&info(&config)).await;
-    let mut live = Live { config, change };
+    let mut live = Live { info: info(&config).map_err(anyhow::Error::msg)?, config, change };
+    infos_of_ours.publish(&live.info).await;
     let (stopped, thread) = work.start()?;
     node.announce().await?;
     let follow_camera = async {
@@ -87,7 +88,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
         loop {
             tokio::select! {
                 _ = introduction.tick() => {
-                    infos_of_ours.publish(&info(&live.config)).await;
+                    infos_of_ours.publish(&live.info).await;
                     let now = lock(&response).clone();
                     if let Some(response) = now.as_ref().filter(|_| now != told) {
                         responses.publish(response).await;
@@ -152,16 +153,18 @@ fn accept(node: &Node, known: Option<&CameraInfo>, info: &CameraInfo, silence: D
 }
 
 /// What this detector says about itself.
-fn info(config: &Config) -> DetectorInfo {
-    DetectorInfo {
+fn info(config: &Config) -> Result<DetectorInfo, String> {
+    let mut markers = config.markers.clone();
+    markers.extend(config.parsed_pads()?.iter().map(Pad::name));
+    Ok(DetectorInfo {
         detector: config.id.clone(),
         host: node::host_name(),
         place: config.place,
         camera: config.camera.clone(),
-        markers: config.markers.clone(),
+        markers,
         version: concat!("alight ", env!("CARGO_PKG_VERSION")).to_owned(),
         pid: std::process::id(),
-    }
+    })
 }
 
 /// The response that a configuration gives a camera; `None` where it is to be estimated.
@@ -207,6 +210,7 @@ struct Change {
 /// The parameters, as they are changed.
 struct Live {
     config: Config,
+    info: DetectorInfo,
     change: Arc<Mutex<Option<Change>>>,
 }
 
@@ -233,6 +237,7 @@ impl Live {
     fn set(&mut self, key: &str, value: &str) -> Result<(), String> {
         let config = self.config.with(key, value)?;
         let search = Search::new(&config)?;
+        self.info = info(&config)?;
         *lock(&self.change) = Some(Change { config: config.clone(), search });
         self.config = config;
         Ok(())

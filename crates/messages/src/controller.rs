@@ -9,7 +9,7 @@ use crate::detector::Place;
 
 wire! {
     TargetEstimate = 6 v 2;
-    ControllerStatus = 7 v 5;
+    ControllerStatus = 7 v 6;
     ControllerCommand = 8 v 3;
     CommandReply = 9 v 1;
 }
@@ -89,6 +89,10 @@ pub enum DetectorState {
     Shadow,
     /// It is silent, late, slow or gone.
     Stale,
+    /// It answers in time, and sees no marker where another one sees it.
+    Blind,
+    /// It answers in time, and others see the marker elsewhere.
+    Outvoted,
 }
 
 /// The phase of a flight.

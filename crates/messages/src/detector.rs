@@ -148,7 +148,7 @@ pub struct DetectorInfo {
     pub place: Place,
     /// The camera whose frames it searches.
     pub camera: String,
-    /// The markers it looks for, as `FAMILY:ID:SIZE_M`.
+    /// The markers it looks for, as `FAMILY:ID:SIZE_M`, and its pads as `pad:ID`.
     pub markers: Vec<String>,
     /// Its program and version.
     pub version: String,
