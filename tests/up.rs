@@ -1,6 +1,7 @@
 //! Two roles on one machine, each under its supervisor: they meet, what dies comes back, and the end is orderly.
 
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpListener;
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -278,6 +279,60 @@ fn a_dry_run_says_what_would_be_run_and_a_mistake_is_named() -> anyhow::Result<(
     let output = alight(folder.path(), &["up", "drone", "--dry-run"])?;
     let text = String::from_utf8_lossy(&output.stderr);
     ensure!(output.status.code() == Some(2) && text.contains("detectr"), "{output:?}");
+    Ok(())
+}
+
+/// A web server, which answers once it was sent a line.
+fn web_server() -> anyhow::Result<u16> {
+    let listener = TcpListener::bind("127.0.0.1:0")?;
+    let port = listener.local_addr()?.port();
+    std::thread::Builder::new().name("web server".into()).spawn(move || {
+        for mut stream in listener.incoming().map_while(Result::ok) {
+            // Who connects may leave at any time.
+            let _ = BufReader::new(&stream).read_until(b'\n', &mut Vec::new());
+            let _ = stream.write_all(b"HTTP/1.0 400 Bad request\r\n\r\n");
+        }
+    })?;
+    Ok(port)
+}
+
+#[test]
+fn another_program_where_processes_connect_is_told_at_the_start() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let port = web_server()?.to_string();
+    let site = format!("meet = {port}\n[[local]]\nrun = 'detector'\n");
+    std::fs::write(folder.path().join("site.toml"), site)?;
+    let site = folder.path().join("site.toml").display().to_string();
+    let address = format!("127.0.0.1:{port}");
+    let ([], air, _) = ports::free()?;
+    let listen = format!("127.0.0.1:{air}");
+    for (arguments, remedy) in [
+        (&["up", "local", "--config", &site][..], "`meet` of the site"),
+        (&["detector", "--meet", &port], "`--meet PORT`"),
+        (&["relay", "--meet", &port, "--listen", &listen], "`--meet PORT`"),
+        (&["detectors", "--meet", &port], "`--meet PORT`"),
+        (&["detector", "--zenoh", "ground", "--connect", &address], "`--connect`"),
+    ] {
+        let begun = Instant::now();
+        let mut child = Command::new(ALIGHT).args(arguments).stderr(Stdio::piped()).spawn()?;
+        let status = loop {
+            match child.try_wait()? {
+                Some(status) => break status,
+                None if begun.elapsed() < PATIENCE => std::thread::sleep(Duration::from_millis(20)),
+                None => {
+                    child.kill()?;
+                    anyhow::bail!("{arguments:?} goes on");
+                }
+            }
+        };
+        let mut said = String::new();
+        child.stderr.take().context("standard error")?.read_to_string(&mut said)?;
+        println!("{:?} {arguments:?}: {said}", begun.elapsed());
+        ensure!(status.code() == Some(1), "{arguments:?}: {status}, {said}");
+        for part in [&address, "does not speak Zenoh", "HTTP/1.0 400", "ss -ltnp", remedy] {
+            ensure!(said.contains(part), "`{part}` is not in {said}");
+        }
+    }
     Ok(())
 }
 

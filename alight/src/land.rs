@@ -275,9 +275,9 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     ));
     if let Some(port) = rendezvous.unusual_port {
         progress.say(&format!(
-            "Port {} is in use, by another landing or a detector that was left running: other commands find this landing with \
-             `export ALIGHT_MEET={port}`",
-            node::session::LOCAL_PORT
+            "Port {usual} is in use, by another landing, a detector that was left running or another program (`ss -ltnp 'sport = :{usual}'` \
+             names it): other commands find this landing with `export ALIGHT_MEET={port}`",
+            usual = node::session::LOCAL_PORT
         ));
     }
     if let Some(address) = args.dashboard {

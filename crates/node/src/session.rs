@@ -12,6 +12,7 @@ use zenoh::sample::{Sample, SampleKind};
 
 use crate::boxed::BoxFuture;
 use crate::clock::{host_name, now_ns};
+use crate::foreign;
 use crate::health::HealthCounters;
 use crate::identity::Identity;
 use crate::memory::lack_of_shared_memory;
@@ -85,10 +86,13 @@ impl Node {
     /// Opens the session. The service is not announced before [`Node::announce`].
     ///
     /// # Errors
-    /// When the configuration cannot be read or the session cannot be opened.
+    /// When the configuration cannot be read, another program answers where it connects, or the session cannot be opened.
     pub fn open(identity: Identity, source: &ZenohSource) -> BoxFuture<'_, anyhow::Result<Self>> {
         Box::pin(async move {
             let mut config = zenoh_config(source)?;
+            foreign::refuse(&config)
+                .await
+                .with_context(|| format!("{identity} cannot join the network"))?;
             let has_shared_memory = share_memory(&mut config)?;
             let session = zenoh::open(config)
                 .await
