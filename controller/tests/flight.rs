@@ -570,7 +570,10 @@ fn a_px4_is_asked_to_hold_its_place_when_setpoints_end() {
         assert!(sent.setpoints == 1 && sent.modes.is_empty(), "{sent:?}");
         pose(&mut flight, 1040 * MS);
         receive(&mut flight, 1050 * MS, &heartbeat(mode, true));
-        assert_eq!(flight.shutdown(1060 * MS), asked.is_some(), "until it holds");
+        assert_eq!(flight.shutdown(1060 * MS), asked.is_some(), "another mode may follow at once");
+        sent.take(&mut flight);
+        assert!(sent.modes.is_empty(), "{sent:?}");
+        assert_eq!(flight.shutdown(1140 * MS), asked.is_some(), "until it holds");
         sent.take(&mut flight);
         assert_eq!(sent.modes.first(), asked, "{sent:?}");
         receive(&mut flight, 1500 * MS, &heartbeat(HOLD, true));
@@ -728,8 +731,8 @@ fn a_px4_that_may_have_changed_to_offboard_is_not_left_there_when_the_start_is_g
     let mut flight = px4_asked_for_offboard("command");
     assert!(flight.shutdown(3100 * MS));
     receive(&mut flight, 3500 * MS, &heartbeat(OFFBOARD, true));
-    assert!(flight.shutdown(3510 * MS));
-    assert!(flight.shutdown(3520 * MS));
+    assert!(flight.shutdown(3590 * MS));
+    assert!(flight.shutdown(3610 * MS));
     let mut sent = Sent::default();
     sent.take(&mut flight);
     assert_eq!(sent.modes, [4.0], "{sent:?}");
@@ -840,8 +843,8 @@ fn a_px4_called_back_from_land_is_not_left_in_offboard_by_a_controller_that_ends
     assert_eq!(sent.modes, [6.0], "just after the heartbeat of 4 s: {sent:?}");
     assert!(flight.shutdown(4100 * MS), "it may be in OFFBOARD");
     receive(&mut flight, 4400 * MS, &heartbeat(OFFBOARD, true));
-    assert!(flight.shutdown(4420 * MS));
-    assert!(flight.shutdown(4440 * MS));
+    assert!(flight.shutdown(4490 * MS));
+    assert!(flight.shutdown(4510 * MS));
     let mut sent = Sent::default();
     sent.take(&mut flight);
     assert_eq!(sent.modes, [4.0], "{sent:?}");

@@ -1,7 +1,10 @@
-//! The list of source files in ARCHITECTURE.md: each with the first sentence of its own documentation.
+//! The list of source files in ARCHITECTURE.md: each with the first sentence of its own documentation and what it defines.
 
 use std::collections::BTreeMap;
 use std::path::Path;
+
+/// Maximum number of names that are listed of a file.
+const MAX_NAMES: usize = 12;
 
 /// The list as it must stand in the document.
 ///
@@ -15,18 +18,42 @@ pub(crate) fn list<'a>(
         let Some((room, within)) = file.to_str().and_then(|name| name.split_once("/src/")) else {
             continue;
         };
-        let sentence = first_sentence(&read(file)?);
+        let text = read(file)?;
+        let sentence = first_sentence(&text);
         anyhow::ensure!(!sentence.is_empty(), "{} does not begin with `//!`", file.display());
         rooms
             .entry(room)
             .or_default()
-            .insert(sort_key(within), format!("- `{within}`: {sentence}"));
+            .insert(sort_key(within), format!("- `{within}`: {sentence}{}", names(&text)));
     }
     let sections = rooms.iter().map(|(room, files)| {
         let lines: Vec<&str> = files.values().map(String::as_str).collect();
         format!("### `{room}/src`\n\n{}\n", lines.join("\n"))
     });
     Ok(sections.collect::<Vec<_>>().join("\n"))
+}
+
+/// What a file defines, outside of its tests: types, then functions, in their order; the first of them.
+fn names(text: &str) -> String {
+    let before_tests = text.split("\nmod tests {").next().unwrap_or_default();
+    let defines = |keywords: &[&str]| -> Vec<String> {
+        let name_of = |line: &str| {
+            let line = line.strip_prefix("pub(crate) ").unwrap_or(line);
+            let line = line.strip_prefix("pub(super) ").unwrap_or(line);
+            let line = line.strip_prefix("pub ").unwrap_or(line);
+            let line =
+                line.strip_prefix("const fn ").map_or(line.to_owned(), |it| format!("fn {it}"));
+            let line = line.strip_prefix("async ").unwrap_or(&line);
+            let rest = keywords.iter().find_map(|keyword| line.strip_prefix(keyword))?;
+            let end = rest.find(|c: char| !c.is_alphanumeric() && c != '_')?;
+            Some(format!("`{}`", &rest[..end]))
+        };
+        before_tests.lines().filter_map(name_of).collect()
+    };
+    let mut names = defines(&["struct ", "enum ", "trait ", "union "]);
+    names.extend(defines(&["fn "]));
+    names.truncate(MAX_NAMES);
+    if names.is_empty() { String::new() } else { format!(" ({})", names.join(", ")) }
 }
 
 /// A module stands before those of its folder, and a library before its modules.

@@ -16,8 +16,8 @@ use geometry::{Body, Ned, Point, Vector};
 use crate::boot::{BootClock, BootTime};
 use crate::clock::Clock;
 use crate::command::{
-    Command, CommandError, CommandId, CommandStatus, MODE_OF_NOW_NS, Request, SetpointError, Step,
-    ns,
+    Command, CommandError, CommandId, CommandStatus, MODE_OF_NOW_NS, MODE_SETTLES_NS, Request,
+    SetpointError, Step, ns,
 };
 use crate::compose;
 use crate::config::Config;
@@ -80,6 +80,8 @@ struct Vehicle {
     heartbeat_ns: i64,
     /// When its mode was shown last.
     mode_ns: i64,
+    /// When its mode was shown first, of the times that are not older than [`MODE_OF_NOW_NS`].
+    mode_since_ns: i64,
     /// When its last packet was received.
     heard_ns: i64,
     boot: BootClock,
@@ -152,12 +154,8 @@ impl Autopilot {
             MavMessage::PARAM_VALUE(value) => {
                 self.parameters.take(self.firmware().unwrap_or(Firmware::Unknown), value);
             }
-            // Whoever sends no heartbeat is not taken for one that flies.
-            MavMessage::CURRENT_MODE(message) if self.is_connected() => {
-                let is_known = self.firmware() == Some(Firmware::Px4);
-                if is_known && self.take_mode(now_ns, message.custom_mode) {
-                    self.report_status();
-                }
+            MavMessage::CURRENT_MODE(message) if self.firmware() == Some(Firmware::Px4) => {
+                self.take_current_mode(now_ns, message.custom_mode);
             }
             _ => self.take_state(now_ns, message),
         }
@@ -357,9 +355,12 @@ impl Autopilot {
         self.vehicle.as_ref().map(|vehicle| now_ns.saturating_sub(vehicle.mode_ns))
     }
 
-    /// True when it has just shown its mode: a pilot can hardly have changed it since.
+    /// True when it has shown its mode, and no other one in a moment since: a pilot can hardly have changed it.
     pub fn shows_mode_of_now(&self, now_ns: i64) -> bool {
-        self.mode_age_ns(now_ns).is_some_and(|age_ns| age_ns < MODE_OF_NOW_NS)
+        self.vehicle.as_ref().is_some_and(|vehicle| {
+            let age_ns = now_ns.saturating_sub(vehicle.mode_since_ns);
+            (MODE_SETTLES_NS..MODE_OF_NOW_NS).contains(&age_ns)
+        })
     }
 
     /// True while OFFBOARD is requested: the request may be carried out although it is withdrawn.

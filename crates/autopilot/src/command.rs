@@ -333,8 +333,11 @@ impl Default for Timeouts {
     }
 }
 
-/// Maximum age of a heartbeat whose mode is the one of now, in nanoseconds.
+/// Maximum age of a message whose mode is the one of now, in nanoseconds.
 pub(crate) const MODE_OF_NOW_NS: i64 = 200_000_000;
+/// Minimum age of it, in nanoseconds: when PX4 has accepted another mode, it sends the former one once more, and up to 48 ms later the new
+/// one (measured with PX4 1.17 in its own simulation).
+pub(crate) const MODE_SETTLES_NS: i64 = 80_000_000;
 /// Maximum number of texts kept as an explanation.
 const MAX_TEXTS: usize = 8;
 

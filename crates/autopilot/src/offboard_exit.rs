@@ -59,8 +59,7 @@ impl OffboardExit {
     }
 
     fn request_hold(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
-        let is_offboard =
-            autopilot.state().is_some_and(|state| state.mode == FlightMode::OFFBOARD);
+        let is_offboard = autopilot.state().is_some_and(|state| state.mode == FlightMode::OFFBOARD);
         let is_requested =
             self.request.is_some_and(|id| autopilot.status(id) == CommandStatus::Pending);
         if is_offboard && !is_requested && autopilot.shows_mode_of_now(now_ns) {

@@ -33,9 +33,8 @@ impl SetpointStream {
     /// True when a zero is to be sent, where `is_wanted` says that OFFBOARD is requested.
     pub(crate) fn is_zero_due(&self, now_ns: i64, is_wanted: bool) -> bool {
         let is_asked_for = self.zeros_until_ns.is_some_and(|until_ns| now_ns < until_ns);
-        let is_due = self
-            .lasts
-            .is_none_or(|(_, last_ns)| now_ns.saturating_sub(last_ns) >= PERIOD_NS);
+        let is_due =
+            self.lasts.is_none_or(|(_, last_ns)| now_ns.saturating_sub(last_ns) >= PERIOD_NS);
         (is_wanted || is_asked_for) && is_due
     }
 

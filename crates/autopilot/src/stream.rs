@@ -11,8 +11,9 @@ use crate::mode::Firmware;
 const EKF_STATUS_REPORT: u32 = 193;
 const ESTIMATOR_STATUS: u32 = 230;
 const GLOBAL_POSITION_INT: u32 = 33;
-/// PX4's heartbeat, once a second, may show a change of mode a second late. This one is sent with each change, and twice a second;
-/// versions before 1.15 do not have it. ArduPilot sends a heartbeat with each change.
+/// PX4's heartbeat, once a second, may show a change of mode a second late. This one is sent with each change, and twice a second,
+/// however high a rate is requested (1.17 in its own simulation: 20 ms after the change, at most 48 ms, at 200 Hz); versions before 1.15
+/// do not have it. ArduPilot sends a heartbeat with each change.
 const CURRENT_MODE: u32 = 436;
 
 const SECOND_NS: i64 = 1_000_000_000;
@@ -233,7 +234,7 @@ pub(crate) fn of_firmware(firmware: Firmware, streams: &[Stream]) -> Vec<Stream>
         }
         let more = |message_id, rate_hz, expected| Stream { message_id, rate_hz, expected };
         streams.push(more(GLOBAL_POSITION_INT, 2.0, Expected::Always));
-        streams.push(more(CURRENT_MODE, 20.0, Expected::OnChange));
+        streams.push(more(CURRENT_MODE, 100.0, Expected::OnChange));
     }
     streams
 }

@@ -2,6 +2,7 @@
 
 use super::{Autopilot, Vehicle};
 use crate::boot::BootClock;
+use crate::command::MODE_OF_NOW_NS;
 use crate::contact::Contact;
 use crate::dialect::{HEARTBEAT_DATA, MavAutopilot, MavModeFlag, MavType};
 use crate::event::Event;
@@ -55,6 +56,7 @@ impl Autopilot {
             simulation: Simulation::default(),
             heartbeat_ns: now_ns,
             mode_ns: now_ns,
+            mode_since_ns: now_ns,
             heard_ns: now_ns,
             boot: BootClock::default(),
             contact: Contact::default(),
@@ -91,12 +93,28 @@ impl Autopilot {
         self.report_contact(landed_before);
     }
 
+    /// Takes the mode that PX4 sends beside the heartbeat. When the motors stop after a landing PX4 goes back to OFFBOARD, which the
+    /// heartbeat shows together with the motors, so on the ground, and for that change, the heartbeat alone counts. Nor does anything
+    /// count of one that sends no heartbeat.
+    pub(super) fn take_current_mode(&mut self, now_ns: i64, number: u32) {
+        let Some(state) = self.state().filter(|state| state.connected) else { return };
+        let to = FlightMode::of(Firmware::Px4, number);
+        let may_be_the_end =
+            state.mode.is_landing() && to.is_guided() && !self.is_requesting_offboard();
+        if state.landed.is_flying() && !may_be_the_end && self.take_mode(now_ns, number) {
+            self.report_status();
+        }
+    }
+
     /// Takes a mode that was just shown; true when it is another one than before.
-    pub(super) fn take_mode(&mut self, now_ns: i64, number: u32) -> bool {
+    fn take_mode(&mut self, now_ns: i64, number: u32) -> bool {
         let Some(vehicle) = &mut self.vehicle else { return false };
         vehicle.mode_ns = now_ns;
         let to = FlightMode::of(vehicle.firmware, number);
         let from = std::mem::replace(&mut vehicle.state.mode, to);
+        if from != to || now_ns.saturating_sub(vehicle.mode_since_ns) >= MODE_OF_NOW_NS {
+            vehicle.mode_since_ns = now_ns;
+        }
         if from != to {
             self.push(Event::ModeChanged { from: Some(from), to });
         }
@@ -112,7 +130,7 @@ impl Autopilot {
         self.report_status();
     }
 
-    pub(super) fn report_status(&mut self) {
+    fn report_status(&mut self) {
         if let Some(state) = self.state().copied() {
             self.push(Event::Status(state));
         }

@@ -9,6 +9,7 @@ use geometry::{Body, Ned, Rotation, Vector};
 
 use super::flight::{Mode, Setpoint};
 use super::parameters::{Parameter, ParameterValue, Parameters};
+use super::px4::{CURRENT_MODE, current_mode};
 use super::steering::HeadingCommand;
 use super::{SimulatedAutopilot, nanoseconds, packet};
 
@@ -116,8 +117,12 @@ impl SimulatedAutopilot {
                 let custom = (first as i64) & 1 == 1;
                 if self.is_px4() {
                     let [_, main, sub, ..] = values;
+                    let before = self.shown_mode();
                     let result = self.set_px4_mode(now_s, main as u8, sub as u8);
                     self.acknowledge(command as u16, result, from);
+                    if result == ACCEPTED && self.schedule.has(CURRENT_MODE) {
+                        self.send(&current_mode(before));
+                    }
                     return;
                 }
                 // A number that is none names no mode.

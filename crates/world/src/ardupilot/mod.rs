@@ -21,12 +21,12 @@ mod telemetry;
 
 use std::collections::VecDeque;
 
-use autopilot::Sender;
 use autopilot::dialect::{
     HEARTBEAT_DATA, MavAutopilot, MavMessage, MavModeFlag, MavSeverity, MavState, MavType,
     TIMESYNC_DATA,
 };
 use autopilot::packet::encode;
+use autopilot::{FlightMode, Sender};
 use geometry::{Ned, Vector};
 
 pub use direct::ReportedMotion;
@@ -40,7 +40,7 @@ use crate::vehicle::{Demand, VehicleTruth};
 use estimate::{Estimate, Estimator};
 use flight::{Flight, FlightEvent, Setpoint};
 use parameters::Parameters;
-use px4::Px4;
+use px4::{CURRENT_MODE, Px4};
 use telemetry::{Readiness, Schedule, Telemetry};
 
 /// The simulated autopilot's settings.
@@ -106,7 +106,6 @@ const GROUND_STATION: Sender = Sender { system: 255, component: 190 };
 const ALIGNED: f64 = 0.13;
 const ORIGIN_SET: f64 = 0.47;
 const HEARTBEAT_S: f64 = 1.0;
-const CURRENT_MODE: u32 = 436;
 const TIMESYNC_S: f64 = 10.0;
 
 /// The simulated autopilot.
@@ -212,7 +211,7 @@ impl SimulatedAutopilot {
             }
         }
         let timeout_s = self.parameters.get(Parameter::OffboardLoss);
-        if self.is_px4() && self.px4.has_lost_setpoints(now_s, timeout_s) {
+        if self.is_px4() && self.armed() && self.px4.has_lost_setpoints(now_s, timeout_s) {
             self.flight.set_mode(now_s, Mode::Loiter, &self.estimate);
         }
         let demand = self.flight.step(now_s, dt_s, &self.estimate, truth, &self.parameters);
@@ -224,6 +223,11 @@ impl SimulatedAutopilot {
     /// Packets for the link, in order; the first is the text of the boot.
     pub fn outgoing(&mut self) -> impl Iterator<Item = Vec<u8>> + '_ {
         self.outgoing.drain(..)
+    }
+
+    /// The mode that PX4 shows.
+    fn shown_mode(&self) -> FlightMode {
+        self.px4.shown(self.flight.mode(), self.flight.landed())
     }
 
     fn is_px4(&self) -> bool {
@@ -272,6 +276,9 @@ impl SimulatedAutopilot {
 
     fn report_events(&mut self) {
         for event in self.flight.take_events() {
+            if event == FlightEvent::Disarmed && self.is_px4() && self.px4.ends_landing() {
+                self.flight.set_mode(self.now_s, Mode::Guided, &self.estimate);
+            }
             let text = match event {
                 FlightEvent::Disarmed => "Disarming motors".to_owned(),
                 FlightEvent::Hit(speed) => format!("SIM Hit ground at {speed:.6} m/s"),
@@ -296,7 +303,7 @@ impl SimulatedAutopilot {
             self.send(&MavMessage::TIMESYNC(request));
         }
         for id in self.schedule.due(self.now_s) {
-            let mode = self.px4.shown(self.flight.mode(), self.flight.landed());
+            let mode = self.shown_mode();
             if id != CURRENT_MODE || self.px4.reports_mode(self.now_s, mode) {
                 self.send_message(id);
             }
@@ -316,7 +323,7 @@ impl SimulatedAutopilot {
             target_velocity: self.flight.target_velocity(),
             rangefinder: self.config.rangefinder,
             says_simulated: self.config.says_simulated,
-            px4: self.is_px4().then(|| self.px4.shown(self.flight.mode(), self.flight.landed())),
+            px4: self.is_px4().then(|| self.shown_mode()),
         }
     }
 

@@ -3,18 +3,19 @@
 use autopilot::FlightMode;
 use autopilot::dialect::{
     ATTITUDE_DATA, ATTITUDE_QUATERNION_DATA, AUTOPILOT_VERSION_DATA, BATTERY_STATUS_DATA,
-    CURRENT_MODE_DATA, DISTANCE_SENSOR_DATA, EKF_STATUS_REPORT_DATA, EXTENDED_SYS_STATE_DATA,
-    EkfStatusFlags, GLOBAL_POSITION_INT_DATA, GPS_GLOBAL_ORIGIN_DATA, GPS_RAW_INT_DATA, GpsFixType,
-    HEARTBEAT_DATA, HIL_STATE_QUATERNION_DATA, HOME_POSITION_DATA, LOCAL_POSITION_NED_DATA,
-    MavAutopilot, MavDistanceSensor, MavFrame, MavLandedState, MavMessage, MavModeFlag,
-    MavSensorOrientation, MavState, MavSysStatusSensor, MavType, MavVtolState,
-    POSITION_TARGET_LOCAL_NED_DATA, PositionTargetTypemask, RANGEFINDER_DATA, SIM_STATE_DATA,
-    SIMSTATE_DATA, SYS_STATUS_DATA, SYSTEM_TIME_DATA, VFR_HUD_DATA,
+    DISTANCE_SENSOR_DATA, EKF_STATUS_REPORT_DATA, EXTENDED_SYS_STATE_DATA, EkfStatusFlags,
+    GLOBAL_POSITION_INT_DATA, GPS_GLOBAL_ORIGIN_DATA, GPS_RAW_INT_DATA, GpsFixType, HEARTBEAT_DATA,
+    HIL_STATE_QUATERNION_DATA, HOME_POSITION_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot,
+    MavDistanceSensor, MavFrame, MavLandedState, MavMessage, MavModeFlag, MavSensorOrientation,
+    MavState, MavSysStatusSensor, MavType, MavVtolState, POSITION_TARGET_LOCAL_NED_DATA,
+    PositionTargetTypemask, RANGEFINDER_DATA, SIM_STATE_DATA, SIMSTATE_DATA, SYS_STATUS_DATA,
+    SYSTEM_TIME_DATA, VFR_HUD_DATA,
 };
 use geometry::{Body, Ned, Vector};
 
 use super::estimate::Estimate;
 use super::flight::{Landed, Mode};
+use super::px4::CURRENT_MODE;
 use crate::vehicle::{GRAVITY_M_S2, VehicleTruth};
 
 /// Message numbers that can be requested, by the stream of REQUEST_DATA_STREAM they belong to (0: none).
@@ -39,7 +40,7 @@ const MESSAGES: [(u32, u8); 21] = [
     (230, 0),
     (242, 0),
     (245, 0),
-    (436, 0),
+    (CURRENT_MODE, 0),
 ];
 
 /// When each message is due.
@@ -74,6 +75,11 @@ impl Schedule {
             });
         }
         true
+    }
+
+    /// True when message `id` is sent.
+    pub(super) fn has(&self, id: u32) -> bool {
+        self.entries.iter().any(|entry| entry.id == id)
     }
 
     /// Sets all messages of a stream (all streams when 0) to one rate.
@@ -225,10 +231,7 @@ impl Telemetry<'_> {
             }
             242 if self.readiness >= Readiness::OriginSet => self.home_position(),
             245 => self.extended_sys_state(),
-            436 => MavMessage::CURRENT_MODE(CURRENT_MODE_DATA {
-                custom_mode: self.px4?.custom_mode(),
-                ..CURRENT_MODE_DATA::default()
-            }),
+            CURRENT_MODE => super::px4::current_mode(self.px4?),
             _ => return None,
         };
         Some(message)
