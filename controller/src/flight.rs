@@ -9,7 +9,8 @@ use std::time::Duration;
 use autopilot::dialect::{MavMessage, MavType};
 use autopilot::{Autopilot, Event, FlightMode, LandedState, Packet};
 use landing::{
-    Decision, Event as LanderEvent, FrameObservation, Lander, OperatorCommand, Phase, Timestamp,
+    Action, Decision, Event as LanderEvent, FrameObservation, Lander, OperatorCommand, Phase,
+    Timestamp,
 };
 use messages::{
     CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorInfo,
@@ -26,6 +27,7 @@ use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
 use crate::limits::{Limits, Note};
 use crate::mission::{Mission, Trigger, is_flying_guided};
+use crate::offboard_watch::OffboardWatch;
 use crate::pad_note::{PadNote, PadNotes};
 use crate::setpoints::Setpoints;
 use crate::status::{Used, View};
@@ -51,6 +53,7 @@ pub struct Flight {
     frames: Frames,
     used: Used,
     setpoints: Setpoints,
+    offboard: OffboardWatch,
     /// The autopilot's own precision landing, where that steers.
     landing_target: Option<LandingTargetMode>,
     limits: Limits,
@@ -96,6 +99,7 @@ impl Flight {
                 settings.setpoint_rate_hz,
                 Duration::from_secs_f64(config.phases.stale_vehicle_s),
             ),
+            offboard: OffboardWatch::default(),
             landing_target: is_autopilots.then(|| {
                 LandingTargetMode::new(config.landing_target, config.phases.search_timeout_s)
             }),
@@ -160,6 +164,20 @@ impl Flight {
             self.decide(now_ns, LanderEvent::LinkDelay(delay_s));
         }
         self.decide(now_ns, LanderEvent::Tick);
+        self.watch_offboard(now_ns);
+    }
+
+    /// Leads a PX4 out of OFFBOARD that is left there while no landing steers it.
+    fn watch_offboard(&mut self, now_ns: i64) {
+        let steers = self.decision.is_some_and(|decision| {
+            !decision.phase.is_terminal()
+                || matches!(decision.action, Action::Velocity { .. } | Action::Guided)
+        });
+        if self.mission.is_landing() && steers && !self.is_ending {
+            self.offboard.stand_down();
+        } else if !self.is_ending {
+            self.offboard.step(now_ns, &mut self.autopilot);
+        }
     }
 
     /// Reads the autopilot's limits, and has its setpoint timeout shortened while our setpoints land it.
@@ -336,7 +354,7 @@ impl Flight {
     }
 
     /// Stops the vehicle where it is: without a last setpoint it would stop only after its setpoint timeout, which
-    /// is put back. True while the autopilot has not confirmed that, or a PX4 is not yet asked to hold its place.
+    /// is put back. True while the autopilot has not confirmed that, or a PX4 may be in OFFBOARD.
     pub fn shutdown(&mut self, now_ns: i64) -> bool {
         if !std::mem::replace(&mut self.is_ending, true) {
             let result = self.setpoints.stop(now_ns, &mut self.autopilot);
@@ -345,6 +363,11 @@ impl Flight {
         let why = "the controller was ended";
         let leaves = self.mission.leave_offboard(now_ns, &mut self.autopilot, why);
         let waits = self.setpoints.end(now_ns, &mut self.autopilot);
+        let waits = if leaves || waits || self.mission.is_landing() {
+            waits
+        } else {
+            self.offboard.end(now_ns, &mut self.autopilot)
+        };
         let is_pending = self.limits.restore(&mut self.autopilot);
         self.autopilot.tick(now_ns);
         is_pending || leaves || waits
@@ -501,8 +524,7 @@ impl Flight {
             if command == OperatorCommand::Resume {
                 return Err("the vehicle is taking off; there is nothing to resume".to_owned());
             }
-            let why =
-                "aborted by the operator before the landing began; the vehicle holds its place";
+            let why = "aborted by the operator before the landing began; the vehicle is to hold its place";
             if self.mission.leave_offboard(now_ns, &mut self.autopilot, why) {
                 return Ok(why.to_owned());
             }
@@ -665,8 +687,7 @@ impl Flight {
             return;
         }
         let is_urgent = matches!(event, LanderEvent::Frame(_) | LanderEvent::DetectorsAlive(_));
-        let result =
-            self.setpoints.carry_out(now_ns, decision.action, is_urgent, &mut self.autopilot);
+        let result = self.setpoints.carry_out(now_ns, &decision, is_urgent, &mut self.autopilot);
         self.log_setpoint(result);
     }
 

@@ -7,7 +7,7 @@
 //! Modules in reading order: [`config`] has the settings; [`service`] joins network and link to the
 //! [`flight`] with its [`tape`], an event loop over [`frames`] (detections in, the lander's next frame out, with [`selection`]
 //! of the detector by health and [`agreement`], the [`cameras`], and the [`refusals`] that last), [`mount`] (what is said of a camera that is not as configured), [`mission`]
-//! (when a landing begins), [`setpoints`] (the lander's actions to the autopilot), [`landing_target`] (the
+//! (when a landing begins), [`setpoints`] (the lander's actions to the autopilot), [`control`] (how a PX4 comes to follow setpoints) and [`offboard_watch`] (that it is not left so), [`landing_target`] (the
 //! other way to land, by the autopilot's own precision landing), [`limits`] (the autopilot's parameters for
 //! setpoints), [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is logged and
 //! counted, [`pad_note`] where the pad is, for the controller that is started next, [`note_file`] what must survive a crash, [`wire`] converts messages into the lander's types and
@@ -28,6 +28,7 @@ pub mod limits;
 pub mod mission;
 pub mod mount;
 pub mod note_file;
+pub mod offboard_watch;
 pub mod pad_note;
 pub mod refusals;
 pub mod selection;

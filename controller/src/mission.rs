@@ -176,7 +176,9 @@ impl Mission {
         if exit.step(now_ns, autopilot) {
             return true;
         }
-        let (why, awaits_takeoff) = (std::mem::take(why), *awaits_takeoff);
+        // In OFFBOARD still, the landing that was given up would begin by itself.
+        let is_out = autopilot.state().is_none_or(|state| !state.mode.is_guided());
+        let (why, awaits_takeoff) = (std::mem::take(why), *awaits_takeoff && is_out);
         self.fail(autopilot, why);
         if awaits_takeoff {
             self.stand_down(true);

@@ -5,7 +5,7 @@ use std::time::Duration;
 use autopilot::command::SetpointError;
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, OffboardExit};
 use geometry::{Ned, Vector};
-use landing::Action;
+use landing::{Action, Decision, Phase};
 use messages::Setpoint;
 
 /// Sends setpoints at their rate, mode changes and disarming.
@@ -51,19 +51,20 @@ impl Setpoints {
         self.sent_ns
     }
 
-    /// Carries out an action; the result is that of a setpoint, if one was due. One that `is_urgent` is sent
+    /// Carries out a decision; the result is that of a setpoint, if one was due. One that `is_urgent` is sent
     /// before its time.
     pub fn carry_out(
         &mut self,
         now_ns: i64,
-        action: Action,
+        decision: &Decision,
         is_urgent: bool,
         autopilot: &mut Autopilot,
     ) -> Option<Result<(), SetpointError>> {
+        let action = decision.action;
         if action == Action::None {
             self.leave_offboard(now_ns, autopilot);
             // With them a PX4 follows at once when the landing is called back.
-            if self.land_ns.is_some() && is_landing_px4(autopilot) {
+            if decision.phase == Phase::Final && is_landing_px4(autopilot) {
                 autopilot.send_zeros(now_ns);
             }
             return None;

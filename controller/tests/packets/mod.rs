@@ -1,13 +1,19 @@
-//! An autopilot's packets for tests.
+//! A flight for tests, its autopilot's packets, and what it sends.
 
 #![allow(dead_code, reason = "each test uses a part of it")]
 
+use std::sync::Arc;
+
 use autopilot::dialect::{
-    ATTITUDE_DATA, EXTENDED_SYS_STATE_DATA, HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot,
-    MavLandedState, MavMessage, MavModeFlag, MavType,
+    ATTITUDE_DATA, EXTENDED_SYS_STATE_DATA, HEARTBEAT_DATA, LANDING_TARGET_DATA,
+    LOCAL_POSITION_NED_DATA, MavAutopilot, MavCmd, MavLandedState, MavMessage, MavModeFlag,
+    MavType,
 };
 use autopilot::{Parser, Sender};
+use controller::Config;
 use controller::flight::Flight;
+use messages::{Detections, FrameHeader};
+use node::{Layers, clock_name};
 
 pub(crate) const MS: i64 = 1_000_000;
 
@@ -53,4 +59,107 @@ pub(crate) fn position(now_ns: i64, height_m: f32) -> MavMessage {
     let time_boot_ms = (now_ns / MS) as u32;
     let position = LOCAL_POSITION_NED_DATA { time_boot_ms, z: -height_m, ..Default::default() };
     MavMessage::LOCAL_POSITION_NED(position)
+}
+
+pub(crate) fn flight(start: &str) -> Flight {
+    flight_with(start, &[])
+}
+
+pub(crate) fn flight_with(start: &str, set: &[&str]) -> Flight {
+    let mut all = vec![format!("start={start}"), "takeoff_real_vehicle=true".to_owned()];
+    all.extend(set.iter().map(|s| (*s).to_owned()));
+    let layers = Layers { file: None, set: all };
+    Flight::new(layers.load::<Config>().unwrap().settings, Arc::default()).unwrap()
+}
+
+/// Attitude and position 5 m over the origin.
+pub(crate) fn pose(flight: &mut Flight, now_ns: i64) {
+    pose_at(flight, now_ns, 5.0);
+}
+
+pub(crate) fn pose_at(flight: &mut Flight, now_ns: i64, height_m: f32) {
+    receive(flight, now_ns, &attitude(now_ns));
+    receive(flight, now_ns + 1, &position(now_ns, height_m));
+}
+
+/// Setpoints, and commands other than for messages, since the last call.
+pub(crate) fn sent(flight: &mut Flight) -> (usize, Vec<MavCmd>) {
+    let (mut setpoints, mut commands) = (0, Vec::new());
+    while let Some(packet) = flight.poll_outgoing() {
+        for packet in Parser::new().push(&packet) {
+            match packet.message {
+                Some(MavMessage::SET_POSITION_TARGET_LOCAL_NED(_)) => setpoints += 1,
+                Some(MavMessage::COMMAND_LONG(c))
+                    if c.command != MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL =>
+                {
+                    commands.push(c.command);
+                }
+                _ => {}
+            }
+        }
+    }
+    (setpoints, commands)
+}
+
+pub(crate) fn in_flight(start: &str) -> Flight {
+    let mut flight = flight(start);
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    flight
+}
+
+pub(crate) fn header(stamp_ns: i64) -> FrameHeader {
+    FrameHeader { stamp_ns, clock: clock_name().into(), ..FrameHeader::sample() }
+}
+
+/// A frame in which the marker lies 5 m below a camera at the body's origin.
+pub(crate) fn seen(stamp_ns: i64) -> Detections {
+    Detections { header: header(stamp_ns), ..Detections::sample() }
+}
+
+/// Hovers in view of the marker in a mode of the autopilot.
+pub(crate) fn hover(flight: &mut Flight, from_ms: i64, to_ms: i64, mode: u32) -> Sent {
+    let mut sent = Sent::default();
+    for ms in (from_ms..to_ms).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(flight, ms * MS, &heartbeat(mode, true));
+        }
+        pose(flight, ms * MS);
+        if ms % 60 == 0 {
+            flight.detections(ms * MS + 2, "main", &seen(ms * MS - 40 * MS));
+        }
+        flight.tick(ms * MS + 3);
+        sent.take(flight);
+    }
+    sent
+}
+
+#[derive(Debug, Default)]
+pub(crate) struct Sent {
+    pub(crate) setpoints: usize,
+    pub(crate) targets: Vec<LANDING_TARGET_DATA>,
+    pub(crate) modes: Vec<f32>,
+    pub(crate) requested: Vec<String>,
+}
+
+impl Sent {
+    pub(crate) fn take(&mut self, flight: &mut Flight) {
+        while let Some(packet) = flight.poll_outgoing() {
+            for packet in Parser::new().push(&packet) {
+                match packet.message {
+                    Some(MavMessage::SET_POSITION_TARGET_LOCAL_NED(_)) => self.setpoints += 1,
+                    Some(MavMessage::LANDING_TARGET(target)) => self.targets.push(target),
+                    Some(MavMessage::COMMAND_LONG(c))
+                        if c.command == MavCmd::MAV_CMD_DO_SET_MODE =>
+                    {
+                        self.modes.push(c.param2);
+                    }
+                    Some(MavMessage::PARAM_REQUEST_READ(r)) => {
+                        self.requested.push(r.param_id.to_str().unwrap_or_default().to_owned());
+                    }
+                    _ => {}
+                }
+            }
+        }
+    }
 }

@@ -24,7 +24,7 @@ use crate::config::Config;
 use crate::contact::Contact;
 use crate::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, TIMESYNC_DATA};
 use crate::event::Event;
-use crate::mode::Firmware;
+use crate::mode::{Firmware, FlightMode};
 use crate::packet::{self, Packet, Sender};
 use crate::parameter::{Parameter, Parameters};
 use crate::px4_listener::Listener;
@@ -82,6 +82,8 @@ struct Vehicle {
     mode_ns: i64,
     /// When its mode was shown first, of the times that are not older than [`MODE_OF_NOW_NS`].
     mode_since_ns: i64,
+    /// The mode before the last change that CURRENT_MODE showed, and when it did.
+    mode_before: Option<(FlightMode, i64)>,
     /// When its last packet was received.
     heard_ns: i64,
     boot: BootClock,
@@ -325,8 +327,7 @@ impl Autopilot {
             let error = CommandError::Replaced { command: old.command, by: command };
             self.finish(old.id, old.command, Err(error));
         }
-        let proof_ns =
-            if command.needs_mode_of_now() { self.setpoints.missing_ns(now_ns) } else { 0 };
+        let proof_ns = if command.is_offboard() { self.setpoints.missing_ns(now_ns) } else { 0 };
         let (mode, from_ns) = (self.state().map(|it| it.mode), now_ns.saturating_add(proof_ns));
         match self.refusal(command) {
             Some(error) => self.finish(id, command, Err(error)),
@@ -365,7 +366,12 @@ impl Autopilot {
 
     /// True while OFFBOARD is requested: the request may be carried out although it is withdrawn.
     pub fn is_requesting_offboard(&self) -> bool {
-        self.requests.iter().any(|request| request.command.needs_mode_of_now())
+        self.requests.iter().any(|request| request.command.is_offboard())
+    }
+
+    /// When a setpoint was sent last, a zero or another.
+    pub fn setpoint_sent_ns(&self) -> Option<i64> {
+        self.setpoints.last_ns()
     }
 
     /// When a request for OFFBOARD was sent last.
@@ -690,6 +696,8 @@ impl Autopilot {
         vehicle.state.ready = false;
         let before = std::mem::replace(&mut vehicle.state.landed, LandedState::Unknown);
         vehicle.amsl_m = None;
+        self.setpoints = SetpointStream::default();
+        self.offboard_sent_ns = None;
         self.clock.restart();
         self.parameters.restart();
         self.streams.restart();
@@ -734,7 +742,7 @@ impl Autopilot {
                 Step::Wait => index += 1,
                 Step::Send(command, attempt) => {
                     index += 1;
-                    if command.needs_mode_of_now() {
+                    if command.is_offboard() {
                         self.offboard_sent_ns = Some(now_ns);
                     }
                     let message = command.message(attempt, self.ground_amsl_m());

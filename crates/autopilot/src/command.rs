@@ -10,7 +10,7 @@ use crate::state::{LandedState, VehicleState};
 /// A command to the autopilot.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub enum Command {
-    /// Change the flight mode; done when the heartbeat shows it.
+    /// Change the flight mode; done when the vehicle shows it.
     SetMode(FlightMode),
     /// Arm the motors; done when the heartbeat shows it.
     Arm,
@@ -92,7 +92,7 @@ pub enum CommandError {
     },
     /// The autopilot accepted, and nothing changed.
     #[error(
-        "{command}: accepted, but the heartbeat still shows {seen} after {} s; another station may command the vehicle",
+        "{command}: accepted, but the vehicle still shows {seen} after {} s; another station may command it",
         waited.as_secs_f32()
     )]
     NotConfirmed {
@@ -258,9 +258,8 @@ impl Command {
         matches!(self, Self::Takeoff { .. })
     }
 
-    /// Whether it is sent only just after a heartbeat that shows the mode in which it was requested: OFFBOARD takes the vehicle from
-    /// whoever flies it.
-    pub(crate) fn needs_mode_of_now(&self) -> bool {
+    /// Whether PX4 needs a stream of setpoints for it.
+    pub(crate) fn is_offboard(&self) -> bool {
         *self == Self::SetMode(FlightMode::OFFBOARD)
     }
 
@@ -411,7 +410,7 @@ impl Request {
         };
     }
 
-    /// The next step, where `is_of_now` says that the state's mode has just been shown by a heartbeat.
+    /// The next step, where `is_of_now` says that the state's mode has just been shown.
     pub(crate) fn step(
         &mut self,
         now_ns: i64,
@@ -424,8 +423,8 @@ impl Request {
         if command.is_shown_by(state) && (sent || !command.is_done_when_accepted()) {
             return Step::Finish(Ok(()));
         }
-        let waits = command.needs_mode_of_now() && !is_of_now;
-        if command.needs_mode_of_now() && !self.is_wanted_in(state.mode) {
+        let waits = self.needs_mode_of_now() && !is_of_now;
+        if self.needs_mode_of_now() && !self.is_wanted_in(state.mode) {
             return Step::Finish(Err(CommandError::Withdrawn { command }));
         }
         match self.phase {
@@ -453,6 +452,13 @@ impl Request {
             }
             _ => Step::Wait,
         }
+    }
+
+    /// Whether it is sent only just after a message that shows the mode in which it was requested: OFFBOARD, and HOLD out of it, take the
+    /// vehicle from whoever has changed the mode since.
+    fn needs_mode_of_now(&self) -> bool {
+        let is_hold = self.command == Command::SetMode(FlightMode::AUTO_HOLD);
+        self.command.is_offboard() || is_hold && self.from == Some(FlightMode::OFFBOARD)
     }
 
     /// Whether the mode is the one in which it was requested. PX4 ends its own take-off in HOLD.

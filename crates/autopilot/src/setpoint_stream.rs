@@ -33,19 +33,24 @@ impl SetpointStream {
     /// True when a zero is to be sent, where `is_wanted` says that OFFBOARD is requested.
     pub(crate) fn is_zero_due(&self, now_ns: i64, is_wanted: bool) -> bool {
         let is_asked_for = self.zeros_until_ns.is_some_and(|until_ns| now_ns < until_ns);
-        let is_due =
-            self.lasts.is_none_or(|(_, last_ns)| now_ns.saturating_sub(last_ns) >= PERIOD_NS);
+        let is_recent = |last_ns: i64| (0..PERIOD_NS).contains(&now_ns.saturating_sub(last_ns));
+        let is_due = self.lasts.is_none_or(|(_, last_ns)| !is_recent(last_ns));
         (is_wanted || is_asked_for) && is_due
     }
 
     /// For how long setpoints must still be sent before OFFBOARD is requested, in nanoseconds.
     pub(crate) fn missing_ns(&self, now_ns: i64) -> i64 {
-        let lasted_ns = self.since_ns(now_ns).map_or(0, |since_ns| now_ns - since_ns);
-        (PROOF_NS - lasted_ns).max(0)
+        let lasted_ns = self.since_ns(now_ns).map_or(0, |since_ns| now_ns.saturating_sub(since_ns));
+        PROOF_NS.saturating_sub(lasted_ns).max(0)
+    }
+
+    /// When the last one was sent.
+    pub(crate) fn last_ns(&self) -> Option<i64> {
+        self.lasts.map(|(_, last_ns)| last_ns)
     }
 
     fn since_ns(&self, now_ns: i64) -> Option<i64> {
-        let lasts = self.lasts.filter(|(_, last_ns)| now_ns - last_ns <= MAX_GAP_NS);
-        lasts.map(|(since_ns, _)| since_ns)
+        let is_gap = |last_ns: i64| !(0..=MAX_GAP_NS).contains(&now_ns.saturating_sub(last_ns));
+        self.lasts.filter(|(_, last_ns)| !is_gap(*last_ns)).map(|(since_ns, _)| since_ns)
     }
 }

@@ -19,6 +19,9 @@ const CURRENT_MODE: u32 = 436;
 const SECOND_NS: i64 = 1_000_000_000;
 /// Minimum measured rate, relative to the requested rate.
 const MIN_RATE_RATIO: f64 = 0.7;
+/// Minimum rate of a message that comes when its content changes, in Hz: PX4 sends its mode twice a second when that was requested, and
+/// every two seconds otherwise.
+const MIN_CHANGE_HZ: f64 = 0.9;
 /// Timeout of an acknowledgement, in nanoseconds.
 const ACK_NS: i64 = SECOND_NS;
 /// Pause after a refused request, in nanoseconds.
@@ -51,7 +54,7 @@ pub enum Expected {
     Always,
     /// It comes at its rate if at all: a rangefinder may not exist.
     IfPresent,
-    /// It comes when its content changes, at most at its rate.
+    /// It comes when its content changes, at most at its rate, and else once a second or more often.
     OnChange,
 }
 
@@ -179,18 +182,22 @@ impl Watched {
     }
 
     fn judge(&mut self, now_ns: i64) -> Option<Notice> {
-        if self.ask_at_ns.is_some() || self.stream.expected == Expected::OnChange {
+        if self.ask_at_ns.is_some() {
             return None;
         }
+        let rate_hz = match self.stream.expected {
+            Expected::OnChange => MIN_CHANGE_HZ,
+            _ => MIN_RATE_RATIO * self.stream.rate_hz,
+        };
         let is_required = self.stream.expected == Expected::Always;
-        let periods_ns = (5.0 / self.stream.rate_hz * SECOND_NS as f64) as i64;
+        let periods_ns = (5.0 / libm::fmin(rate_hz, self.stream.rate_hz) * SECOND_NS as f64) as i64;
         let elapsed_ns = now_ns.saturating_sub(self.since_ns);
         if elapsed_ns < COUNT_NS.max(periods_ns) {
             return None;
         }
         let measured_hz = f64::from(self.count) / (elapsed_ns as f64 / SECOND_NS as f64);
         self.count_anew(now_ns);
-        if measured_hz >= MIN_RATE_RATIO * self.stream.rate_hz {
+        if measured_hz >= rate_hz {
             self.requests = 1;
             let restored = std::mem::take(&mut self.missing);
             return restored.then_some(Notice::Restored { message: self.name, measured_hz });

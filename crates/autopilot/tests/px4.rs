@@ -687,6 +687,24 @@ fn a_mode_is_believed_of_a_connected_px4_only() {
     world.px4.queue.push(land);
     world.step();
     assert_eq!(world.client.state().unwrap().mode, FlightMode::AUTO_HOLD);
+    // ArduPilot sends a heartbeat with each change.
+    let mut client = Autopilot::new(Config::default());
+    let heartbeat = MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+        custom_mode: FlightMode::Guided.custom_mode(),
+        mavtype: MavType::MAV_TYPE_QUADROTOR,
+        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
+        ..Default::default()
+    });
+    let in_air = MavMessage::EXTENDED_SYS_STATE(EXTENDED_SYS_STATE_DATA {
+        landed_state: MavLandedState::MAV_LANDED_STATE_IN_AIR,
+        ..Default::default()
+    });
+    for message in [heartbeat, in_air, current_mode(FlightMode::Land)] {
+        let packet = packet::encode(AUTOPILOT, 0, &message);
+        Parser::new().push(&packet).iter().for_each(|packet| client.handle(world.now, packet));
+    }
+    assert_eq!(client.state().unwrap().mode, FlightMode::Guided);
 }
 
 #[test]

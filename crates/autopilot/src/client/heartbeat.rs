@@ -13,6 +13,9 @@ use crate::state::{Battery, LandedState, Readiness, VehicleState};
 use crate::stream::{self, Streams};
 use crate::text::Joiner;
 
+/// Time for which a heartbeat may come behind CURRENT_MODE, in nanoseconds, besides the link's delay.
+const OVERTAKEN_NS: i64 = 300_000_000;
+
 impl Autopilot {
     pub(super) fn take_heartbeat(&mut self, now_ns: i64, system: u8, heartbeat: &HEARTBEAT_DATA) {
         let flies = heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
@@ -57,6 +60,7 @@ impl Autopilot {
             heartbeat_ns: now_ns,
             mode_ns: now_ns,
             mode_since_ns: now_ns,
+            mode_before: None,
             heard_ns: now_ns,
             boot: BootClock::default(),
             contact: Contact::default(),
@@ -86,7 +90,9 @@ impl Autopilot {
             self.streams.restart();
             self.push(Event::Returned);
         }
-        self.take_mode(now_ns, heartbeat.custom_mode);
+        if !self.is_overtaken(now_ns, heartbeat.custom_mode) {
+            self.take_mode(now_ns, heartbeat.custom_mode);
+        }
         if armed_changed {
             self.push(Event::ArmedChanged(armed));
         }
@@ -101,9 +107,24 @@ impl Autopilot {
         let to = FlightMode::of(Firmware::Px4, number);
         let may_be_the_end =
             state.mode.is_landing() && to.is_guided() && !self.is_requesting_offboard();
+        let before = state.mode;
         if state.landed.is_flying() && !may_be_the_end && self.take_mode(now_ns, number) {
+            if let Some(vehicle) = &mut self.vehicle {
+                vehicle.mode_before = Some((before, now_ns));
+            }
             self.report_status();
         }
+    }
+
+    /// Whether a heartbeat shows the mode before a change that CURRENT_MODE, sent later, has just shown: a link may reorder packets.
+    fn is_overtaken(&self, now_ns: i64, number: u32) -> bool {
+        let delay_ns = self.link_delay(now_ns).map_or(0, |delay| delay.as_nanos() as i64);
+        let before = self.vehicle.as_ref().and_then(|vehicle| vehicle.mode_before);
+        before.is_some_and(|(mode, changed_ns)| {
+            let is_recent =
+                now_ns.saturating_sub(changed_ns) <= OVERTAKEN_NS.saturating_add(delay_ns);
+            is_recent && mode == FlightMode::of(Firmware::Px4, number)
+        })
     }
 
     /// Takes a mode that was just shown; true when it is another one than before.

@@ -1,0 +1,71 @@
+//! No PX4 is left in OFFBOARD without setpoints by us.
+//!
+//! Every part that steers leads the vehicle out of OFFBOARD itself when it ends. This is for what no part expects: a request that
+//! was withdrawn and is carried out late, a takeover that was none, another station that chooses OFFBOARD while zeros are sent.
+
+use autopilot::{Autopilot, Firmware, FlightMode, OffboardExit};
+
+/// Time without a setpoint after which nobody steers, in nanoseconds: PX4 waits for half a second or more (`COM_OF_LOSS_T`).
+const UNSTEERED_NS: i64 = 150_000_000;
+/// Time after our last setpoint or request for OFFBOARD up to which OFFBOARD is ours, in nanoseconds: later it is another
+/// program's.
+const OURS_NS: i64 = 10_000_000_000;
+
+/// Watches for OFFBOARD in which nobody steers.
+#[derive(Clone, Debug, Default)]
+pub struct OffboardWatch {
+    exit: Option<OffboardExit>,
+    /// The vehicle did not leave OFFBOARD: it is not tried again before it was in another mode.
+    is_in_vain: bool,
+}
+
+impl OffboardWatch {
+    /// Advances it, after whoever steers was asked; to be called with each tick. True while it leads the vehicle out.
+    pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
+        let is_offboard = is_flying_offboard(autopilot);
+        self.is_in_vain &= is_offboard;
+        let is_left = is_offboard && !is_steered(now_ns, autopilot) && is_ours(now_ns, autopilot);
+        if self.exit.is_none() && is_left && !self.is_in_vain {
+            tracing::warn!(
+                "PX4 is in OFFBOARD and nothing steers it: it is asked to hold its place"
+            );
+            self.exit = Some(OffboardExit::begin(now_ns, autopilot));
+        }
+        let goes_on = self.exit.as_mut().is_some_and(|exit| exit.step(now_ns, autopilot));
+        if !goes_on && self.exit.take().is_some() {
+            self.is_in_vain = is_flying_offboard(autopilot);
+        }
+        goes_on
+    }
+
+    /// Somebody steers: nothing is left.
+    pub fn stand_down(&mut self) {
+        self.exit = None;
+    }
+
+    /// Whoever steers ends now: a vehicle in OFFBOARD is led out at once. True while that goes on.
+    pub fn end(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
+        if self.exit.is_none() && is_flying_offboard(autopilot) && is_ours(now_ns, autopilot) {
+            self.exit = Some(OffboardExit::begin(now_ns, autopilot));
+        }
+        self.step(now_ns, autopilot)
+    }
+}
+
+fn is_flying_offboard(autopilot: &Autopilot) -> bool {
+    autopilot.firmware() == Some(Firmware::Px4)
+        && autopilot.state().is_some_and(|state| {
+            state.armed && state.mode == FlightMode::OFFBOARD && state.landed.is_flying()
+        })
+}
+
+/// Whether a setpoint was sent of late, a zero or another.
+fn is_steered(now_ns: i64, autopilot: &Autopilot) -> bool {
+    let sent_ns = autopilot.setpoint_sent_ns();
+    sent_ns.is_some_and(|sent_ns| now_ns.saturating_sub(sent_ns) <= UNSTEERED_NS)
+}
+
+fn is_ours(now_ns: i64, autopilot: &Autopilot) -> bool {
+    let sent_ns = autopilot.setpoint_sent_ns().max(autopilot.offboard_sent_ns());
+    sent_ns.is_some_and(|sent_ns| now_ns.saturating_sub(sent_ns) <= OURS_NS)
+}

@@ -1,0 +1,536 @@
+//! A flight with a PX4: how it comes into OFFBOARD, and that it is not left there.
+
+#![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
+
+mod packets;
+
+use autopilot::dialect::{
+    CURRENT_MODE_DATA, ESTIMATOR_STATUS_DATA, EstimatorStatusFlags, GLOBAL_POSITION_INT_DATA,
+    MavCmd, MavLandedState, MavMessage,
+};
+use controller::flight::Flight;
+use messages::{CameraInfo, ControllerCommand, Phase};
+use packets::{
+    MS, Sent, contact, flight, flight_with, heartbeat, hover, pose, pose_at, receive, sent,
+};
+
+#[test]
+fn a_px4_that_holds_its_place_is_asked_to_land_by_itself() {
+    const PRECISION_LAND: u32 = 0x0904_0000;
+    let mut flight = px4_in(POSITION, "command", &["mode=landing-target"]);
+    let reply = flight.command(1000 * MS, &ControllerCommand::Start);
+    assert!(!reply.accepted && reply.reason.contains("HOLD"), "{reply:?}");
+    receive(&mut flight, 1010 * MS, &heartbeat(HOLD, true));
+    assert!(flight.command(1015 * MS, &ControllerCommand::Start).accepted);
+    let sent = hover(&mut flight, 1020, 4900, HOLD);
+    assert_eq!((sent.setpoints, sent.modes.first()), (0, Some(&4.0)), "{sent:?}");
+    assert!(sent.targets.len() > 30, "{sent:?}");
+    receive(&mut flight, 4900 * MS, &heartbeat(PRECISION_LAND, true));
+    hover(&mut flight, 4920, 5500, PRECISION_LAND);
+    assert_eq!(flight.status(5500 * MS).phase, Phase::Final);
+
+    // Of one that began in OFFBOARD, HOLD is a pilot's choice.
+    let mut flight = px4_in(OFFBOARD, "command", &["mode=landing-target"]);
+    assert!(flight.command(1000 * MS, &ControllerCommand::Start).accepted);
+    let sent = hover(&mut flight, 2000, 6000, HOLD);
+    assert!(sent.modes.is_empty(), "{sent:?}");
+    assert_eq!(flight.status(6000 * MS).phase, Phase::Aborted);
+}
+
+#[test]
+fn a_px4_is_asked_to_hold_its_place_when_setpoints_end() {
+    const GUIDED: u32 = 4;
+    let begun = |mode| {
+        let mut flight = flight("airborne");
+        receive(&mut flight, 0, &heartbeat(mode, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        assert!(hover(&mut flight, 20, 1000, mode).setpoints > 20);
+        flight
+    };
+    // 4 is AUTO; without an answer the command is sent again.
+    for (mode, asked) in [(GUIDED, None), (OFFBOARD, Some(&4.0))] {
+        let mut flight = begun(mode);
+        assert!(flight.command(1000 * MS, &ControllerCommand::Abort).accepted);
+        let sent = hover(&mut flight, 1020, 5900, mode);
+        assert!(sent.setpoints > 100 && sent.modes.is_empty(), "{sent:?}");
+        let sent = hover(&mut flight, 5920, 7500, mode);
+        assert_eq!(sent.modes.first(), asked, "{sent:?}");
+        // The request may be lost, and silence is a failure to a PX4.
+        assert_eq!(sent.setpoints > 25, asked.is_some(), "{sent:?}");
+        let sent = hover(&mut flight, 8000, 9900, if asked.is_some() { HOLD } else { mode });
+        assert!(sent.setpoints <= 2, "{sent:?}");
+        // A controller that is asked to stop, and knows the mode of almost a second ago only.
+        let mut flight = begun(mode);
+        assert_eq!(flight.shutdown(1000 * MS), asked.is_some());
+        let mut sent = Sent::default();
+        sent.take(&mut flight);
+        assert!(sent.setpoints == 1 && sent.modes.is_empty(), "{sent:?}");
+        pose(&mut flight, 1040 * MS);
+        receive(&mut flight, 1050 * MS, &heartbeat(mode, true));
+        assert_eq!(flight.shutdown(1060 * MS), asked.is_some(), "another mode may follow at once");
+        sent.take(&mut flight);
+        assert!(sent.modes.is_empty(), "{sent:?}");
+        assert_eq!(flight.shutdown(1140 * MS), asked.is_some(), "until it holds");
+        sent.take(&mut flight);
+        assert_eq!(sent.modes.first(), asked, "{sent:?}");
+        receive(&mut flight, 1500 * MS, &heartbeat(HOLD, true));
+        assert!(!flight.shutdown(1510 * MS));
+        // The pilot has taken over meanwhile.
+        let mut flight = begun(mode);
+        flight.shutdown(1000 * MS);
+        receive(&mut flight, 1050 * MS, &heartbeat(mode + (1 << 16), true));
+        assert!(!flight.shutdown(1060 * MS));
+        let mut sent = Sent::default();
+        sent.take(&mut flight);
+        assert!(sent.modes.is_empty(), "{sent:?}");
+    }
+}
+
+const POSITION: u32 = 0x0003_0000;
+const HOLD: u32 = 0x0304_0000;
+const OFFBOARD: u32 = 0x0006_0000;
+
+/// A PX4 that flies in this mode, one second long.
+fn px4_in(mode: u32, start: &str, set: &[&str]) -> Flight {
+    let mut flight = flight_with(start, set);
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(mode, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    assert_eq!(hover(&mut flight, 20, 1000, mode).setpoints, 0);
+    flight
+}
+
+/// One that holds its place was asked for OFFBOARD at 3 s, and has not shown it.
+fn px4_asked_for_offboard(start: &str) -> Flight {
+    let mut flight = px4_in(HOLD, start, &[]);
+    let reply = flight.command(1000 * MS, &ControllerCommand::Start);
+    assert!(reply.accepted && reply.reason.contains("OFFBOARD"), "{reply:?}");
+    let sent = hover(&mut flight, 1000, 2980, HOLD);
+    assert!(sent.setpoints > 15, "{sent:?}");
+    assert!(sent.modes.is_empty(), "2 s is too early, and then the mode is not known: {sent:?}");
+    let sent = hover(&mut flight, 2980, 3100, HOLD);
+    assert_eq!(sent.modes, [6.0], "{sent:?}");
+    assert_eq!(flight.status(3100 * MS).phase, Phase::Idle);
+    flight
+}
+
+#[test]
+fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_started() {
+    let mut flight = px4_asked_for_offboard("command");
+    assert!(!flight.command(3100 * MS, &ControllerCommand::Start).accepted, "it is under way");
+    receive(&mut flight, 3100 * MS, &heartbeat(OFFBOARD, true));
+    let sent = hover(&mut flight, 3120, 3700, OFFBOARD);
+    let status = flight.status(3700 * MS);
+    assert!(sent.setpoints > 10, "{sent:?}");
+    assert!(matches!(status.phase, Phase::Approach | Phase::Descend), "{status:?}");
+
+    // The markers are of no use any more when it has changed.
+    let mut flight = px4_asked_for_offboard("command");
+    receive(&mut flight, 3100 * MS, &heartbeat(OFFBOARD, true));
+    for ms in (3120..5000).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(&mut flight, ms * MS, &heartbeat(OFFBOARD, true));
+        }
+        pose(&mut flight, ms * MS);
+        flight.tick(ms * MS + 3);
+    }
+    let mut sent = Sent::default();
+    sent.take(&mut flight);
+    assert!(sent.setpoints > 30, "{sent:?} {:?}", flight.status(5000 * MS));
+
+    // The pilot takes over before it changed; a controller that lands flight after flight waits for the next one.
+    for (start, phase) in [("command", Phase::Failed), ("airborne", Phase::Idle)] {
+        let mut flight = px4_asked_for_offboard(start);
+        receive(&mut flight, 3300 * MS, &heartbeat(POSITION, true));
+        let sent = hover(&mut flight, 3420, 6000, POSITION);
+        assert!(sent.setpoints <= 1 && sent.modes.is_empty(), "{sent:?}");
+        assert!(flight.command(6000 * MS, &ControllerCommand::Start).reason.contains("HOLD"));
+        let status = flight.status(6000 * MS);
+        assert_eq!(status.phase, phase, "{status:?}");
+        assert!(phase == Phase::Idle || status.why.contains("pilot"), "{status:?}");
+    }
+
+    // A heartbeat as old as the request does not show that the pilot came after it: OFFBOARD may come yet.
+    for last in [POSITION, OFFBOARD] {
+        let mut flight = px4_asked_for_offboard("command");
+        receive(&mut flight, 3100 * MS, &heartbeat(POSITION, true));
+        let sent = hover(&mut flight, 3120, 3980, POSITION);
+        assert!(sent.setpoints > 10 && sent.modes.is_empty(), "{sent:?}");
+        let sent = hover(&mut flight, 4000, 4980, last);
+        assert_eq!(sent.modes.first(), (last == OFFBOARD).then_some(&4.0), "{sent:?}");
+        assert_eq!(sent.setpoints > 10, last == OFFBOARD, "{sent:?}");
+    }
+
+    // The heartbeat before the request shows the pilot's mode.
+    let mut flight = px4_in(HOLD, "command", &[]);
+    flight.command(1000 * MS, &ControllerCommand::Start);
+    hover(&mut flight, 1000, 2980, HOLD);
+    let sent = hover(&mut flight, 2980, 6000, POSITION);
+    assert!(sent.modes.is_empty(), "{sent:?}");
+
+    // It never changes.
+    let mut flight = px4_asked_for_offboard("command");
+    hover(&mut flight, 3100, 25_000, HOLD);
+    let status = flight.status(25_000 * MS);
+    assert!(status.phase == Phase::Failed && status.why.contains("did not begin"), "{status:?}");
+    let sent = hover(&mut flight, 25_000, 30_000, HOLD);
+    assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
+    assert!(flight.command(30_000 * MS, &ControllerCommand::Start).accepted, "once more");
+
+    // A pilot is not disturbed.
+    let mut flight = px4_in(POSITION, "command", &[]);
+    let reply = flight.command(1000 * MS, &ControllerCommand::Start);
+    assert!(!reply.accepted && reply.reason.contains("HOLD"), "{reply:?}");
+    let sent = hover(&mut flight, 1020, 3000, POSITION);
+    assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
+}
+
+#[test]
+fn a_px4_that_may_have_changed_to_offboard_is_not_left_there_when_the_start_is_given_up() {
+    let given_up = |command: &ControllerCommand| {
+        let mut flight = px4_asked_for_offboard("command");
+        assert!(!flight.command(3100 * MS, &ControllerCommand::Resume).accepted);
+        assert!(flight.command(3100 * MS, command).accepted);
+        let sent = hover(&mut flight, 3120, 3980, HOLD);
+        assert!(sent.setpoints > 10 && sent.modes.is_empty(), "it is not known yet: {sent:?}");
+        flight
+    };
+    for command in [ControllerCommand::Abort, ControllerCommand::Hold] {
+        // It has not changed.
+        let mut flight = given_up(&command);
+        let sent = hover(&mut flight, 3980, 6000, HOLD);
+        assert!(sent.setpoints <= 2 && sent.modes.is_empty(), "{sent:?}");
+        assert_eq!(flight.status(6000 * MS).phase, Phase::Failed);
+        // It has changed, and the first request for HOLD is lost.
+        let mut flight = given_up(&command);
+        let sent = hover(&mut flight, 3980, 5900, OFFBOARD);
+        assert!(sent.setpoints > 30 && sent.modes.len() >= 2, "{sent:?}");
+        assert!(sent.modes.iter().all(|mode| *mode == 4.0), "{sent:?}");
+        let sent = hover(&mut flight, 6000, 8000, HOLD);
+        assert!(sent.setpoints <= 2 && sent.modes.is_empty(), "{sent:?}");
+        assert_eq!(flight.status(8000 * MS).phase, Phase::Failed);
+        // The pilot has taken over.
+        let mut flight = given_up(&command);
+        let sent = hover(&mut flight, 4000, 8000, POSITION);
+        assert!(sent.setpoints <= 1 && sent.modes.is_empty(), "{sent:?}");
+        assert_eq!(flight.status(8000 * MS).phase, Phase::Failed);
+    }
+
+    // The controller is ended, before it asked and after.
+    let mut flight = px4_in(HOLD, "command", &[]);
+    flight.command(1000 * MS, &ControllerCommand::Start);
+    hover(&mut flight, 1020, 1900, HOLD);
+    assert!(!flight.shutdown(1900 * MS), "nothing to take back");
+    let mut sent = Sent::default();
+    sent.take(&mut flight);
+    assert!(sent.modes.is_empty(), "{sent:?}");
+    let mut flight = px4_asked_for_offboard("command");
+    assert!(flight.shutdown(3100 * MS));
+    receive(&mut flight, 3500 * MS, &heartbeat(OFFBOARD, true));
+    assert!(flight.shutdown(3590 * MS));
+    assert!(flight.shutdown(3610 * MS));
+    let mut sent = Sent::default();
+    sent.take(&mut flight);
+    assert_eq!(sent.modes, [4.0], "{sent:?}");
+    receive(&mut flight, 4000 * MS, &heartbeat(HOLD, true));
+    assert!(!flight.shutdown(4010 * MS));
+}
+
+#[test]
+fn a_px4_whose_state_is_not_known_in_offboard_gets_zeros_and_is_taken_back() {
+    let mut flight = px4_asked_for_offboard("command");
+    let mut sent = Sent::default();
+    for ms in (3120..9000).step_by(20) {
+        if ms % 1000 == 700 {
+            let is_asked = sent.modes.contains(&4.0);
+            let mode = if is_asked { HOLD } else { OFFBOARD };
+            receive(&mut flight, ms * MS, &heartbeat(mode, true));
+        }
+        flight.tick(ms * MS + 3);
+        sent.take(&mut flight);
+        if ms == 5200 {
+            assert!(sent.setpoints > 30 && sent.modes.is_empty(), "{sent:?}");
+        }
+    }
+    assert_eq!(sent.modes.first(), Some(&4.0), "{sent:?}");
+    let status = flight.status(9000 * MS);
+    assert!(status.phase == Phase::Failed && status.why.contains("not known"), "{status:?}");
+}
+
+/// A PX4 that has taken off to 5 m, holds its place, and was asked for OFFBOARD at 5 s.
+fn px4_at_the_end_of_its_takeoff() -> Flight {
+    const TAKEOFF: u32 = 0x0204_0000;
+    let mut flight = flight_with("takeoff", &["takeoff_height_m=5"]);
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(HOLD, false));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+    let flags = EstimatorStatusFlags::from_bits_retain(831);
+    let estimator = ESTIMATOR_STATUS_DATA { flags, ..Default::default() };
+    receive(&mut flight, MS, &MavMessage::ESTIMATOR_STATUS(estimator));
+    let altitude = GLOBAL_POSITION_INT_DATA::default();
+    receive(&mut flight, MS, &MavMessage::GLOBAL_POSITION_INT(altitude));
+    let mut commands = Vec::new();
+    for ms in (20..1000).step_by(20) {
+        pose_at(&mut flight, ms * MS, 0.0);
+        flight.tick(ms * MS + 3);
+        commands.extend(sent(&mut flight).1);
+    }
+    assert!(commands.contains(&MavCmd::MAV_CMD_COMPONENT_ARM_DISARM), "{commands:?}");
+    receive(&mut flight, 1000 * MS, &heartbeat(HOLD, true));
+    flight.tick(1010 * MS);
+    receive(&mut flight, 1200 * MS, &heartbeat(TAKEOFF, true));
+    receive(&mut flight, 1200 * MS, &contact(MavLandedState::MAV_LANDED_STATE_TAKEOFF));
+    hover(&mut flight, 1220, 2980, TAKEOFF);
+    receive(&mut flight, 2990 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    let sent = hover(&mut flight, 3000, 4980, HOLD);
+    assert!(sent.setpoints > 10 && sent.modes.is_empty(), "{sent:?}");
+    let sent = hover(&mut flight, 5000, 5100, HOLD);
+    assert_eq!(sent.modes, [6.0], "{sent:?}");
+    assert_eq!(flight.status(5100 * MS).phase, Phase::Takeoff);
+    flight
+}
+
+#[test]
+fn a_px4_that_was_asked_for_offboard_after_its_takeoff_is_not_left_there() {
+    for (mode, asked) in [(OFFBOARD, Some(&4.0)), (HOLD, None)] {
+        // The operator aborts.
+        let mut flight = px4_at_the_end_of_its_takeoff();
+        assert!(flight.command(5100 * MS, &ControllerCommand::Abort).accepted);
+        let sent = hover(&mut flight, 5120, 5980, HOLD);
+        assert!(sent.setpoints > 10 && sent.modes.is_empty(), "it is not known yet: {sent:?}");
+        let sent = hover(&mut flight, 6000, 6900, mode);
+        assert_eq!(sent.modes.first(), asked, "{sent:?}");
+        assert_eq!(sent.setpoints > 10, mode == OFFBOARD, "{sent:?}");
+        let sent = hover(&mut flight, 7000, 8000, HOLD);
+        assert!(sent.setpoints <= 1 && sent.modes.is_empty(), "{sent:?}");
+        let status = flight.status(8000 * MS);
+        assert!(status.phase == Phase::Failed && status.why.contains("aborted"), "{status:?}");
+        // The controller is ended.
+        let mut flight = px4_at_the_end_of_its_takeoff();
+        assert!(flight.shutdown(5100 * MS));
+        receive(&mut flight, 5500 * MS, &heartbeat(mode, true));
+        for ms in (5520..5600).step_by(20) {
+            assert_eq!(flight.shutdown(ms * MS), mode == OFFBOARD);
+        }
+        let mut sent = Sent::default();
+        sent.take(&mut flight);
+        assert_eq!(sent.modes.first(), asked, "{sent:?}");
+        receive(&mut flight, 5700 * MS, &heartbeat(HOLD, true));
+        assert!(!flight.shutdown(5720 * MS));
+    }
+}
+
+#[test]
+fn a_px4_called_back_from_land_is_not_left_in_offboard_by_a_controller_that_ends() {
+    let mut flight = px4_in_land(3980);
+    assert!(flight.command(3980 * MS, &ControllerCommand::Abort).accepted);
+    let sent = hover(&mut flight, 4000, 4100, LAND);
+    assert_eq!(sent.modes, [6.0], "just after the heartbeat of 4 s: {sent:?}");
+    assert!(flight.shutdown(4100 * MS), "it may be in OFFBOARD");
+    receive(&mut flight, 4400 * MS, &heartbeat(OFFBOARD, true));
+    assert!(flight.shutdown(4490 * MS));
+    assert!(flight.shutdown(4510 * MS));
+    let mut sent = Sent::default();
+    sent.take(&mut flight);
+    assert_eq!(sent.modes, [4.0], "{sent:?}");
+    receive(&mut flight, 4800 * MS, &heartbeat(HOLD, true));
+    assert!(!flight.shutdown(4810 * MS));
+}
+
+#[test]
+fn a_px4_is_asked_to_hold_its_place_only_while_its_position_is_no_older_than_configured() {
+    for (set, is_asked) in
+        [("phases.stale_vehicle_s=0.5", false), ("phases.stale_vehicle_s=0.9", true)]
+    {
+        let mut flight = flight_with("airborne", &[set]);
+        receive(&mut flight, 0, &heartbeat(OFFBOARD, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        assert!(hover(&mut flight, 20, 1000, OFFBOARD).setpoints > 20);
+        // It is told to stop 0.7 s after the last position.
+        assert_eq!(flight.shutdown(1680 * MS), is_asked, "{set}");
+    }
+}
+
+const LAND: u32 = 0x0604_0000;
+
+fn current_mode(custom_mode: u32) -> MavMessage {
+    MavMessage::CURRENT_MODE(CURRENT_MODE_DATA { custom_mode, ..Default::default() })
+}
+
+/// A PX4 that has landed by itself since 2 s, as we asked it to.
+fn px4_in_land(to_ms: i64) -> Flight {
+    let mut flight = flight("airborne");
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(OFFBOARD, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    hover(&mut flight, 20, 1000, OFFBOARD);
+    assert!(flight.command(1000 * MS, &ControllerCommand::LandHere).accepted);
+    hover(&mut flight, 1020, 1980, OFFBOARD);
+    let sent = hover(&mut flight, 2000, to_ms, LAND);
+    assert!(sent.setpoints > 30, "for the way back: {sent:?}");
+    flight
+}
+
+#[test]
+fn a_px4_that_leaves_land_as_its_motors_stop_has_landed() {
+    for after in [OFFBOARD, HOLD] {
+        let mut flight = px4_in_land(5980);
+        let mut sent = Sent::default();
+        for ms in (6000..11_000).step_by(20) {
+            if ms % 200 == 0 {
+                let ground = contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND);
+                receive(&mut flight, ms * MS, &ground);
+            }
+            if ms % 1000 == 0 {
+                let is_over = ms > 8300;
+                let mode = if is_over { after } else { LAND };
+                receive(&mut flight, ms * MS, &heartbeat(mode, !is_over));
+            }
+            // Disarmed at 8.3 s.
+            if ms == 8320 {
+                receive(&mut flight, ms * MS, &current_mode(after));
+            }
+            pose_at(&mut flight, ms * MS, 0.0);
+            flight.tick(ms * MS + 3);
+            if ms == 8300 {
+                sent.take(&mut flight);
+                sent = Sent::default();
+            }
+        }
+        sent.take(&mut flight);
+        let status = flight.status(11_000 * MS);
+        assert!(status.phase == Phase::Landed && status.finished, "{status:?}");
+        assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
+    }
+}
+
+#[test]
+fn a_heartbeat_that_current_mode_overtook_is_no_pilots_switch() {
+    let mut flight = px4_asked_for_offboard("command");
+    receive(&mut flight, 3110 * MS, &current_mode(OFFBOARD));
+    hover(&mut flight, 3120, 3200, OFFBOARD);
+    receive(&mut flight, 3210 * MS, &heartbeat(HOLD, true));
+    let sent = hover(&mut flight, 3220, 3600, OFFBOARD);
+    assert!(sent.setpoints > 5, "{sent:?}");
+    let phase = flight.status(3600 * MS).phase;
+    assert!(matches!(phase, Phase::Approach | Phase::Descend), "{phase:?}");
+    // Later it is one.
+    receive(&mut flight, 3900 * MS, &heartbeat(HOLD, true));
+    assert_eq!(flight.status(3900 * MS).phase, Phase::PilotInCommand);
+
+    let mut flight = px4_in_land(3980);
+    assert!(flight.command(3980 * MS, &ControllerCommand::Abort).accepted);
+    assert_eq!(hover(&mut flight, 4000, 4100, LAND).modes, [6.0]);
+    receive(&mut flight, 4110 * MS, &current_mode(OFFBOARD));
+    hover(&mut flight, 4120, 4300, OFFBOARD);
+    receive(&mut flight, 4310 * MS, &heartbeat(LAND, true));
+    let sent = hover(&mut flight, 4320, 5900, OFFBOARD);
+    assert!(sent.setpoints > 40 && sent.modes.is_empty(), "it hovers: {sent:?}");
+}
+
+#[test]
+fn a_px4_that_comes_into_offboard_after_all_is_asked_to_hold_its_place() {
+    // A landing is called back, nothing is heard of it for 5 s, and then the last request is carried out.
+    let mut flight = px4_in_land(3980);
+    assert!(flight.command(3980 * MS, &ControllerCommand::Abort).accepted);
+    hover(&mut flight, 4000, 10_980, LAND);
+    let sent = hover(&mut flight, 11_000, 12_900, OFFBOARD);
+    assert!(sent.modes.contains(&4.0) && sent.setpoints > 20, "{sent:?}");
+    let sent = hover(&mut flight, 13_000, 14_900, HOLD);
+    assert!(sent.modes.is_empty() && sent.setpoints <= 1, "{sent:?}");
+
+    // A take-off fails because the heartbeat is lost, and OFFBOARD was on its way.
+    let mut flight = px4_at_the_end_of_its_takeoff();
+    for ms in (5120..9000).step_by(20) {
+        pose(&mut flight, ms * MS);
+        flight.tick(ms * MS + 3);
+    }
+    assert_eq!(flight.status(9000 * MS).phase, Phase::Failed);
+    let sent = hover(&mut flight, 9000, 10_900, OFFBOARD);
+    assert!(sent.modes.contains(&4.0) && sent.setpoints > 20, "{sent:?}");
+
+    // OFFBOARD is chosen by a switch while it lands, which PX4 allows as zeros are sent.
+    let mut flight = px4_in_land(5980);
+    let sent = hover(&mut flight, 6000, 7900, OFFBOARD);
+    assert!(sent.modes.contains(&4.0) && sent.setpoints > 20, "{sent:?}");
+
+    // Another program's OFFBOARD is none of ours.
+    let mut flight = px4_in(OFFBOARD, "command", &[]);
+    let sent = hover(&mut flight, 1020, 5000, OFFBOARD);
+    assert!(sent.modes.is_empty() && sent.setpoints == 0, "{sent:?}");
+}
+
+#[test]
+fn a_precision_landing_that_ends_before_it_began_leaves_no_px4_in_offboard() {
+    for ends in [Some(ControllerCommand::Abort), None] {
+        let mut flight = px4_in(OFFBOARD, "command", &["mode=landing-target"]);
+        assert!(flight.command(1000 * MS, &ControllerCommand::Start).accepted);
+        let sent = hover(&mut flight, 1020, 1980, OFFBOARD);
+        assert!(sent.setpoints > 10 && sent.modes.is_empty(), "{sent:?}");
+        let sent = match ends {
+            Some(command) => {
+                assert!(flight.command(1990 * MS, &command).accepted);
+                hover(&mut flight, 2000, 3900, OFFBOARD)
+            }
+            None => {
+                let mut sent = Sent::default();
+                for ms in (2000..3900).step_by(20) {
+                    if ms % 1000 == 0 {
+                        receive(&mut flight, ms * MS, &heartbeat(OFFBOARD, true));
+                    }
+                    assert!(flight.shutdown(ms * MS + 3));
+                    sent.take(&mut flight);
+                }
+                receive(&mut flight, 4000 * MS, &heartbeat(HOLD, true));
+                assert!(!flight.shutdown(4020 * MS));
+                sent
+            }
+        };
+        assert!(sent.modes.contains(&4.0) && sent.setpoints > 20, "{sent:?}");
+    }
+}
+
+#[test]
+fn hold_is_not_asked_for_again_once_the_pilot_may_have_another_mode() {
+    let mut flight = px4_asked_for_offboard("command");
+    assert!(flight.command(3100 * MS, &ControllerCommand::Abort).accepted);
+    hover(&mut flight, 3120, 3980, HOLD);
+    receive(&mut flight, 4000 * MS, &heartbeat(OFFBOARD, true));
+    let mut asked_ms = Vec::new();
+    for ms in (4020..8000).step_by(20) {
+        // The pilot switched at 4.3 s, and the heartbeat of 5 s comes late.
+        if ms % 1000 == 180 {
+            receive(&mut flight, ms * MS, &heartbeat(POSITION, true));
+        }
+        pose(&mut flight, ms * MS);
+        flight.tick(ms * MS + 3);
+        let mut sent = Sent::default();
+        sent.take(&mut flight);
+        asked_ms.extend(sent.modes.iter().map(|_| ms));
+    }
+    assert!(asked_ms.len() == 1 && asked_ms[0] < 4300, "{asked_ms:?}");
+}
+
+#[test]
+fn a_pilot_who_lands_gets_no_zeros() {
+    let mut flight = px4_in_land(3980);
+    hover(&mut flight, 4000, 6000, POSITION);
+    assert_eq!(flight.status(6000 * MS).phase, Phase::PilotInCommand);
+    let sent = hover(&mut flight, 6000, 9000, LAND);
+    assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
+}
+
+#[test]
+fn a_start_that_was_aborted_does_not_begin_a_landing_where_px4_refuses_hold() {
+    let mut flight = px4_asked_for_offboard("airborne");
+    assert!(flight.command(3100 * MS, &ControllerCommand::Abort).accepted);
+    hover(&mut flight, 3120, 3980, HOLD);
+    for ms in (4000..20_000).step_by(1000) {
+        hover(&mut flight, ms, ms + 1000, OFFBOARD);
+        let status = flight.status((ms + 1000) * MS);
+        assert!(matches!(status.phase, Phase::Idle | Phase::Failed), "{status:?}");
+    }
+}
