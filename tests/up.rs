@@ -1,9 +1,12 @@
 //! Two roles on one machine, each under its supervisor: they meet, what dies comes back, and the end is orderly.
 
 use std::io::{BufRead, BufReader, Read, Write};
-use std::net::TcpListener;
+use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, ensure};
@@ -14,7 +17,7 @@ use testing::{ports, with_second_try};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
-use crate::flight::{alone, small_camera};
+use crate::flight::{alone, output_of, small_camera};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
@@ -282,57 +285,144 @@ fn a_dry_run_says_what_would_be_run_and_a_mistake_is_named() -> anyhow::Result<(
     Ok(())
 }
 
-/// A web server, which answers once it was sent a line.
-fn web_server() -> anyhow::Result<u16> {
-    let listener = TcpListener::bind("127.0.0.1:0")?;
-    let port = listener.local_addr()?.port();
-    std::thread::Builder::new().name("web server".into()).spawn(move || {
-        for mut stream in listener.incoming().map_while(Result::ok) {
-            // Who connects may leave at any time.
-            let _ = BufReader::new(&stream).read_until(b'\n', &mut Vec::new());
-            let _ = stream.write_all(b"HTTP/1.0 400 Bad request\r\n\r\n");
-        }
-    })?;
-    Ok(port)
+/// A web server, which answers once it was sent something, for as long as this lives.
+struct WebServer {
+    port: u16,
+    ends: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl WebServer {
+    fn start() -> anyhow::Result<Self> {
+        let listener = TcpListener::bind("127.0.0.1:0")?;
+        let port = listener.local_addr()?.port();
+        let ends = Arc::new(AtomicBool::new(false));
+        let asked = Arc::clone(&ends);
+        let thread = std::thread::Builder::new().name("web server".into()).spawn(move || {
+            for mut stream in listener.incoming().map_while(Result::ok) {
+                if asked.load(Ordering::Relaxed) {
+                    return;
+                }
+                // Who connects may leave at any time, or say nothing.
+                let _ = stream.set_read_timeout(Some(Duration::from_millis(300)));
+                let _ = stream.read(&mut [0; 256]);
+                let _ = stream.write_all(b"HTTP/1.0 400 Bad request\r\n\r\n");
+            }
+        })?;
+        Ok(Self { port, ends, thread: Some(thread) })
+    }
+}
+
+impl Drop for WebServer {
+    fn drop(&mut self) {
+        self.ends.store(true, Ordering::Relaxed);
+        // It looks at the next connection.
+        drop(TcpStream::connect(("127.0.0.1", self.port)));
+        drop(self.thread.take().map(JoinHandle::join));
+    }
 }
 
 #[test]
-fn another_program_where_processes_connect_is_told_at_the_start() -> anyhow::Result<()> {
-    let folder = tempfile::tempdir()?;
-    let port = web_server()?.to_string();
-    let site = format!("meet = {port}\n[[local]]\nrun = 'detector'\n");
-    std::fs::write(folder.path().join("site.toml"), site)?;
-    let site = folder.path().join("site.toml").display().to_string();
+fn another_program_where_tools_connect_is_told_at_the_start() -> anyhow::Result<()> {
+    let server = WebServer::start()?;
+    let port = server.port.to_string();
     let address = format!("127.0.0.1:{port}");
-    let ([], air, _) = ports::free()?;
-    let listen = format!("127.0.0.1:{air}");
+    let folder = tempfile::tempdir()?;
+    let file = folder.path().join("zenoh.json5").display().to_string();
+    std::fs::write(&file, node::session::local_config(server.port))?;
     for (arguments, remedy) in [
-        (&["up", "local", "--config", &site][..], "`meet` of the site"),
-        (&["detector", "--meet", &port], "`--meet PORT`"),
-        (&["relay", "--meet", &port, "--listen", &listen], "`--meet PORT`"),
-        (&["detectors", "--meet", &port], "`--meet PORT`"),
-        (&["detector", "--zenoh", "ground", "--connect", &address], "`--connect`"),
+        (&["detectors", "--meet", &port][..], "`--meet PORT`"),
+        (&["command", "start", "--meet", &port], "`--meet PORT`"),
+        (&["land", "--zenoh", &file], "the endpoints of the file"),
     ] {
         let begun = Instant::now();
-        let mut child = Command::new(ALIGHT).args(arguments).stderr(Stdio::piped()).spawn()?;
-        let status = loop {
-            match child.try_wait()? {
-                Some(status) => break status,
-                None if begun.elapsed() < PATIENCE => std::thread::sleep(Duration::from_millis(20)),
-                None => {
-                    child.kill()?;
-                    anyhow::bail!("{arguments:?} goes on");
-                }
-            }
-        };
-        let mut said = String::new();
-        child.stderr.take().context("standard error")?.read_to_string(&mut said)?;
+        let output = output_of(Command::new(ALIGHT).args(arguments))?;
+        let said = String::from_utf8_lossy(&output.stderr);
         println!("{:?} {arguments:?}: {said}", begun.elapsed());
-        ensure!(status.code() == Some(1), "{arguments:?}: {status}, {said}");
+        ensure!(output.status.code() == Some(1), "{arguments:?}: {output:?}");
         for part in [&address, "does not speak Zenoh", "HTTP/1.0 400", "ss -ltnp", remedy] {
             ensure!(said.contains(part), "`{part}` is not in {said}");
         }
     }
+    Ok(())
+}
+
+/// A process that is killed at the end.
+struct Service(Child);
+
+impl Drop for Service {
+    fn drop(&mut self) {
+        // A supervisor ends its processes.
+        let _ = kill_process(Pid::from_child(&self.0), Signal::TERM);
+        let _ = self.0.wait();
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn services_outlast_another_program_where_they_connect() -> anyhow::Result<()> {
+    let _alone = alone().await?;
+    services_outlast_it().await
+}
+
+async fn services_outlast_it() -> anyhow::Result<()> {
+    let server = WebServer::start()?;
+    let port = server.port;
+    let folder = tempfile::tempdir()?;
+    let site = folder.path().join("site.toml").display().to_string();
+    std::fs::write(
+        &site,
+        format!("meet = {port}\n[[local]]\nrun = 'detector'\nset = ['id=supervised']\n"),
+    )?;
+    let meet = port.to_string();
+    let ([], air, _) = ports::free()?;
+    let listen = format!("127.0.0.1:{air}");
+    let all = [
+        &["up", "local", "--config", &site][..],
+        &["detector", "--meet", &meet, "--set", "id=alone"],
+        &["relay", "--meet", &meet, "--listen", &listen, "--insecure"],
+    ];
+    let mut services = Vec::new();
+    for arguments in all {
+        let child = Command::new(ALIGHT).args(arguments).stderr(Stdio::piped()).spawn()?;
+        let mut service = Service(child);
+        let mut lines = BufReader::new(service.0.stderr.take().context("standard error")?).lines();
+        let (sender, mut said) = mpsc::unbounded_channel();
+        std::thread::Builder::new().name("said".into()).spawn(move || {
+            while let Some(Ok(line)) = lines.next() {
+                println!("{line}");
+                drop(sender.send(line));
+            }
+        })?;
+        let tells = async {
+            while let Some(line) = said.recv().await {
+                if line.contains("ERROR") && line.contains("answers `HTTP/1.0 400") {
+                    return Ok(());
+                }
+            }
+            anyhow::bail!("{arguments:?} ended")
+        };
+        timeout(PATIENCE, tells).await??;
+        services.push(service);
+    }
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    for (service, arguments) in services.iter_mut().zip(all) {
+        ensure!(service.0.try_wait()?.is_none(), "{arguments:?} ended");
+    }
+    // The program goes, and they meet.
+    drop(server);
+    let network = Network { meet: Some(port), ..Network::default() };
+    let identity = Identity { service: "alight", instance: "test".into() };
+    let node = Node::open(identity, &network.source("operator")?).await?;
+    let meet = async {
+        loop {
+            let peers = node.list_peers().await?;
+            let is_there = |name: &str| peers.iter().any(|(_, instance)| instance == name);
+            if is_there("alone") && is_there("supervised") {
+                return anyhow::Ok(());
+            }
+        }
+    };
+    timeout(PATIENCE, meet).await.context("they never meet")??;
     Ok(())
 }
 

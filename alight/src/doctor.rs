@@ -155,7 +155,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     let before = findings.findings.len();
     match network.source(OPERATOR) {
         Ok(zenoh) => block_on(async {
-            match timeout(OPEN_TIMEOUT, Node::open(tool_identity("doctor"), &zenoh)).await {
+            match timeout(OPEN_TIMEOUT, Node::open_tool(tool_identity("doctor"), &zenoh)).await {
                 Ok(Ok(node)) => {
                     let watched = Watched {
                         duration: Duration::from_secs(args.seconds),

@@ -266,7 +266,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     // Its own file is checked as those of the services are: nothing listens beyond this machine by accident.
     let network = Network { config: Some(rendezvous.file.clone()), ..Network::default() };
     let zenoh = network.source(OPERATOR)?;
-    let node = Node::open(tool_identity("land"), &zenoh).await?;
+    let node = Node::open_tool(tool_identity("land"), &zenoh).await?;
     let mut progress = Progress::new(args.format);
     progress.say(&format!(
         "Zenoh: {}. To add a second detector: alight detector --zenoh {} --set id=spare",

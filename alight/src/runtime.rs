@@ -31,7 +31,7 @@ pub(crate) fn with_node<T>(
     node::start_logging("warn");
     let zenoh = network.source(OPERATOR)?;
     block_on(async {
-        let node = Node::open(tool_identity(tool), &zenoh).await?;
+        let node = Node::open_tool(tool_identity(tool), &zenoh).await?;
         let result = work(&node).await;
         node.close().await;
         result

@@ -1,6 +1,8 @@
 //! Whether a program that is none of ours answers where a session connects. Zenoh tries such an address again for ever, without a word.
+//! A tool, which ends soon, is refused. A service goes on: it meets the others once the right program is there.
 
 use std::io;
+use std::net::SocketAddr;
 use std::time::Duration;
 
 use anyhow::bail;
@@ -12,10 +14,10 @@ use tokio::time::{Instant, timeout, timeout_at};
 
 use crate::boxed::BoxFuture;
 
-/// Maximum time for which the start of a session waits for answers: a process on this machine gives one within milliseconds.
+/// Maximum time for which the start of a tool waits for answers: a process on this machine gives one within milliseconds.
 const AT_START: Duration = Duration::from_millis(300);
-/// Time after which an address at which somebody accepts connections, and says nothing, is told.
-const PATIENCE: Duration = Duration::from_secs(3);
+/// Time after which an address at which somebody accepts connections, and says nothing, is told: less than a tool listens.
+const PATIENCE: Duration = Duration::from_secs(2);
 /// Pause before an address is tried again at which a connection was closed without an answer, as a process does that ends.
 const PAUSE: Duration = Duration::from_millis(200);
 /// Bytes of an answer that are read.
@@ -31,12 +33,16 @@ const MAX_INIT_ACK: u16 = 4096;
 /// The answer that refuses: CLOSE, which is shorter than what TLS says to who does not speak it.
 const CLOSE: u8 = 0x03;
 const MAX_CLOSE: u16 = 16;
+/// The answer of a relay with keys to who does not speak TLS: the beginning of an alert.
+const TLS_ALERT: [u8; 2] = [0x15, 0x03];
 
 /// What answers at an address.
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Answer {
     /// Nobody, or a process that speaks Zenoh.
     Fine,
+    /// Somebody who speaks TLS, as a relay with keys does.
+    Encrypted,
     /// Another program, with the beginning of what it says.
     Foreign(String),
     /// Somebody accepts connections and says nothing: another program, or one of ours that stands still.
@@ -47,53 +53,82 @@ enum Answer {
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Contact {
     /// `127.0.0.1:7447`.
-    address: String,
+    address: SocketAddr,
     /// Whether the processes of this machine meet there; else it is the other side of a link.
     is_rendezvous: bool,
 }
 
-/// Refuses a session that would connect to another program. What is found out later is logged.
+/// All places where a session connects.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+struct Contacts {
+    /// Those that are asked. Names are not: the system looks them up for long, and holds up the end of the process meanwhile. Nor are
+    /// encrypted ones: who greets them without a certificate is counted there as an intruder.
+    asked: Vec<Contact>,
+    /// Whether there are others.
+    has_others: bool,
+}
+
+/// Refuses the session of a tool that would meet nobody: wherever it connects is another program. What is found out later, or is
+/// wrong with some of several places, is logged.
 ///
 /// # Errors
 /// Names the port, what answers there, and what to do.
 pub(crate) fn refuse(config: &zenoh::Config) -> BoxFuture<'static, anyhow::Result<()>> {
-    let contacts = contacts(&config.get_json("connect/endpoints").unwrap_or_default());
+    let Contacts { asked, has_others } = Contacts::of(config);
     Box::pin(async move {
         let start = Instant::now() + AT_START;
+        let count = asked.len();
         // All are asked before the first answer is awaited.
-        let answers: Vec<_> = contacts.into_iter().map(ask).collect();
+        let answers: Vec<_> = asked.into_iter().map(ask).collect();
+        let mut problems = Vec::new();
         for mut answer in answers {
             if let Ok(Ok(Some(problem))) = timeout_at(start, &mut answer).await {
-                bail!(problem);
+                problems.push(problem);
             }
         }
-        Ok(())
+        match problems.first() {
+            Some(first) if problems.len() == count && !has_others => bail!("{first}"),
+            _ => {
+                log(&problems);
+                Ok(())
+            }
+        }
     })
 }
 
-/// The addresses of a configuration's endpoints for connections without encryption: a list, or one for each mode. Who greets
-/// an encrypted one without a certificate is counted there as an intruder.
-fn contacts(endpoints: &str) -> Vec<Contact> {
-    let endpoints: Value = serde_json::from_str(endpoints).unwrap_or_default();
-    let of_modes = endpoints.as_object().into_iter().flat_map(|modes| modes.values());
-    let texts = of_modes.chain([&endpoints]).filter_map(Value::as_array).flatten();
-    texts.filter_map(Value::as_str).filter_map(Contact::of).collect()
+/// Logs what is wrong where a service connects, beside its start.
+pub(crate) fn watch(config: &zenoh::Config) {
+    let answers: Vec<_> = Contacts::of(config).asked.into_iter().map(ask).collect();
+    tokio::spawn(async move {
+        let mut problems = Vec::new();
+        for answer in answers {
+            problems.extend(answer.await.ok().flatten());
+        }
+        log(&problems);
+    });
+}
+
+/// Logs the first problem alone: the ports of a relay have all the same one.
+fn log(problems: &[String]) {
+    if let Some(first) = problems.first() {
+        tracing::error!("Zenoh cannot connect: {first}");
+    }
 }
 
 /// Asks in a task of its own. The receiver hears the problem; when nobody waits any more it is logged.
 fn ask(contact: Contact) -> oneshot::Receiver<Option<String>> {
     let (sender, receiver) = oneshot::channel();
     tokio::spawn(async move {
-        let problem = contact.problem(&answer(&contact.address).await);
+        let problem = contact.problem(&answer(contact.address).await);
         if let Err(Some(problem)) = sender.send(problem) {
-            tracing::warn!("{problem}");
+            log(&[problem]);
         }
     });
     receiver
 }
 
 /// Greets until there is an answer, or patience ends.
-async fn answer(address: &str) -> Answer {
+async fn answer(address: SocketAddr) -> Answer {
     let end = Instant::now() + PATIENCE;
     loop {
         match timeout_at(end, greet(address)).await {
@@ -108,11 +143,23 @@ async fn answer(address: &str) -> Answer {
 ///
 /// # Errors
 /// When the connection is closed without an answer.
-async fn greet(address: &str) -> io::Result<Answer> {
+async fn greet(address: SocketAddr) -> io::Result<Answer> {
     // An address out of reach takes longer than the patience, and is nobody either.
     let Ok(Ok(mut stream)) = timeout(PATIENCE - PAUSE, TcpStream::connect(address)).await else {
         return Ok(Answer::Fine);
     };
+    answer_on(&mut stream).await
+}
+
+/// The answer to a greeting on a connection.
+///
+/// # Errors
+/// When it is closed without an answer.
+async fn answer_on(stream: &mut TcpStream) -> io::Result<Answer> {
+    // A port of those that the system gives away can be its own: then nobody listens there.
+    if stream.local_addr()? == stream.peer_addr()? {
+        return Ok(Answer::Fine);
+    }
     stream.write_all(&GREETING).await?;
     let mut answer = [0; ANSWER_BYTES];
     let mut len = 0;
@@ -132,7 +179,11 @@ async fn greet(address: &str) -> io::Result<Answer> {
         },
         _ => false,
     };
-    Ok(if is_zenoh { Answer::Fine } else { Answer::Foreign(beginning(said)) })
+    Ok(match is_zenoh {
+        true => Answer::Fine,
+        false if said.starts_with(&TLS_ALERT) => Answer::Encrypted,
+        false => Answer::Foreign(beginning(said)),
+    })
 }
 
 /// The beginning of an answer for people.
@@ -145,41 +196,73 @@ fn beginning(said: &[u8]) -> String {
     }
 }
 
+impl Contacts {
+    fn of(config: &zenoh::Config) -> Self {
+        let part = |key| config.get_json(key).unwrap_or_default();
+        Self::parse(&part("mode"), &part("connect/endpoints"))
+    }
+
+    /// Of a mode and endpoints as JSON: a list, or one for each mode.
+    fn parse(mode: &str, endpoints: &str) -> Self {
+        let mode: Value = serde_json::from_str(mode).unwrap_or_default();
+        let endpoints: Value = serde_json::from_str(endpoints).unwrap_or_default();
+        let of_mode = endpoints.get(mode.as_str().unwrap_or("peer")).unwrap_or(&endpoints);
+        let mut contacts = Self::default();
+        for endpoint in of_mode.as_array().into_iter().flatten().filter_map(Value::as_str) {
+            match Contact::of(endpoint) {
+                // Several connections may lead to one place.
+                Some(contact) if contacts.asked.contains(&contact) => {}
+                Some(contact) => contacts.asked.push(contact),
+                None => contacts.has_others = true,
+            }
+        }
+        contacts
+    }
+}
+
 impl Contact {
     /// `tcp/127.0.0.1:7447`, or `tcp/10.42.0.1:7448?prio=1-4#dscp=0xb8`: each connection of the air link has settings.
     fn of(endpoint: &str) -> Option<Self> {
         let text = endpoint.strip_prefix("tcp/")?;
-        let address = text.split(['?', '#']).next()?.to_owned();
-        let is_local = ["127.", "localhost:", "[::1]:"].iter().any(|it| text.starts_with(it));
-        Some(Self { is_rendezvous: is_local && address == text, address })
+        let plain = text.split(['?', '#']).next()?;
+        let address: SocketAddr = plain.parse().ok()?;
+        Some(Self { is_rendezvous: address.ip().is_loopback() && plain == text, address })
     }
 
     /// What is wrong with an answer, and what to do.
     fn problem(&self, answer: &Answer) -> Option<String> {
         let Self { address, is_rendezvous } = self;
-        let port = address.rsplit(':').next().unwrap_or_default();
+        let port = address.port();
         let place = match is_rendezvous {
             true => format!("port {port} of this machine, where its processes meet ({address})"),
             false => format!("{address}, where this process is to connect"),
         };
+        let elsewhere = "have all processes of this machine meet at another port: by the endpoints of the file where `--zenoh` names \
+                         one, else by `--meet PORT`, `meet` of the site, or ALIGHT_MEET";
+        let correct = "correct the address: `--connect`, `address` or `relay_address` of the site, or ALIGHT_CONNECT";
         let remedy = match is_rendezvous {
-            true => format!(
-                "`ss -ltnp 'sport = :{port}'` names it; end it, or have all processes of this machine meet at another port: \
-                 `--meet PORT`, `meet` of the site, or ALIGHT_MEET"
-            ),
-            false => format!(
-                "`ss -ltnp 'sport = :{port}'` on that machine names it; end it, or correct the address: `--connect`, `address` or \
-                 `relay_address` of the site, or ALIGHT_CONNECT"
-            ),
+            true => format!("`ss -ltnp 'sport = :{port}'` names it; end it, or {elsewhere}"),
+            false => {
+                format!(
+                    "`ss -ltnp 'sport = :{port}'` on that machine names it; end it, or {correct}"
+                )
+            }
         };
         match answer {
             Answer::Fine => None,
+            Answer::Encrypted if *is_rendezvous => Some(format!(
+                "who listens at {place} speaks TLS, as a relay with keys does, and the processes of a machine meet without: {elsewhere}"
+            )),
+            Answer::Encrypted => Some(format!(
+                "who listens at {place}, wants keys, and this process has none: give it those of the vehicle with `--keys DIRECTORY`, \
+                 `keys` of the site, or ALIGHT_KEYS; where it is no relay of yours, {correct}"
+            )),
             Answer::Foreign(said) => Some(format!(
                 "another program listens at {place}: it does not speak Zenoh, but answers {said}. {remedy}"
             )),
             Answer::Silence => Some(format!(
-                "Somebody listens at {place}, and has not answered for {} s, so this process meets no other: it is another \
-                 program, or one of Alight that stands still. {remedy}",
+                "somebody listens at {place}, and has not answered for {} s: another program, or one of Alight that stands still; \
+                 this process meets nobody there. {remedy}",
                 PATIENCE.as_secs()
             )),
         }
@@ -193,9 +276,9 @@ mod tests {
 
     /// Says this to everybody who connects, once they have said something, and closes the connection; or keeps it and says
     /// nothing.
-    async fn listener(says: Option<&'static [u8]>) -> String {
+    async fn listener(says: Option<&'static [u8]>) -> SocketAddr {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let address = listener.local_addr().unwrap().to_string();
+        let address = listener.local_addr().unwrap();
         tokio::spawn(async move {
             let mut kept = Vec::new();
             while let Ok((mut stream, _)) = listener.accept().await {
@@ -215,17 +298,18 @@ mod tests {
     #[tokio::test]
     async fn an_answer_tells_zenoh_from_other_programs() {
         let foreign = |said: &str| Answer::Foreign(said.to_owned());
-        let answers: [(&'static [u8], Answer); 7] = [
+        let answers: [(&'static [u8], Answer); 8] = [
             (b"\x09\x00\x21\x09\x31abcd\x00\x00", Answer::Fine),
             (b"\x02\x00\xe1", Answer::Fine),
             (b"\x02\x00\x03\x01", Answer::Fine),
             (b"HTTP/1.0 400 Bad Request\r\n\r\n", foreign("`HTTP/1.0 400 Bad Request`")),
             (b"Mail for you\r\n", foreign("`Mail for you`")),
             (b"SSH-2.0-OpenSSH_9.2\r\n", foreign("`SSH-2.0-OpenSSH_9.2`")),
-            (b"\x15\x03\x03\x00\x02\x02\x16", foreign("7 bytes that are no text")),
+            (b"\x15\x03\x03\x00\x02\x02\x16", Answer::Encrypted),
+            (b"\x00\x03\x03\x00\x02\x02\x16", foreign("7 bytes that are no text")),
         ];
         for (says, expected) in answers {
-            assert_eq!(answer(&listener(Some(says)).await).await, expected, "{says:?}");
+            assert_eq!(answer(listener(Some(says)).await).await, expected, "{says:?}");
         }
     }
 
@@ -235,30 +319,67 @@ mod tests {
         let config = crate::session::local_config(port);
         let config = zenoh::Config::from_json5(&config).unwrap();
         let _session = zenoh::open(config).await.unwrap();
-        let address = format!("127.0.0.1:{port}");
-        TcpStream::connect(&address).await.expect("it listens");
-        assert_eq!(greet(&address).await.unwrap(), Answer::Fine);
+        let address = SocketAddr::from(([127, 0, 0, 1], port));
+        TcpStream::connect(address).await.expect("it listens");
+        assert_eq!(greet(address).await.unwrap(), Answer::Fine);
     }
 
     #[tokio::test]
     async fn who_closes_or_says_nothing_is_silent_and_nobody_is_fine() {
         let begun = Instant::now();
         let [closes, keeps] = [listener(Some(b"")).await, listener(None).await];
-        let (closes, keeps) = tokio::join!(answer(&closes), answer(&keeps));
+        let (closes, keeps) = tokio::join!(answer(closes), answer(keeps));
         assert_eq!([closes, keeps], [Answer::Silence, Answer::Silence]);
         assert!(begun.elapsed() < PATIENCE + Duration::from_secs(2), "{:?}", begun.elapsed());
         let nobody = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
-        assert_eq!(answer(&nobody.to_string()).await, Answer::Fine);
+        assert_eq!(answer(nobody).await, Answer::Fine);
+    }
+
+    #[tokio::test]
+    async fn who_connects_to_itself_has_met_nobody() {
+        // With its own port as the one that it wants, the system connects a socket to itself.
+        let socket = tokio::net::TcpSocket::new_v4().unwrap();
+        socket.bind(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
+        let address = socket.local_addr().unwrap();
+        let mut stream = socket.connect(address).await.unwrap();
+        assert_eq!(answer_on(&mut stream).await.unwrap(), Answer::Fine);
     }
 
     #[test]
-    fn only_connections_without_encryption_are_asked() {
-        let found = |text| contacts(text).into_iter().map(|it| it.address).collect::<Vec<_>>();
-        let list =
-            r#"["tcp/10.0.0.1:7448?prio=1-4#dscp=0xb8", "tls/10.0.0.1:7449", "tcp/[::1]:7#a=b"]"#;
-        assert_eq!(found(list), ["10.0.0.1:7448", "[::1]:7"]);
-        assert_eq!(found(r#"{"peer": ["tcp/a:1"], "client": ["tcp/b:2"]}"#), ["b:2", "a:1"]);
-        assert!(found("").is_empty() && found("null").is_empty());
+    fn only_addresses_without_encryption_are_asked_of_the_sessions_mode() {
+        let found = |mode, text| {
+            let Contacts { asked, has_others } = Contacts::parse(mode, text);
+            (asked.iter().map(|it| it.address.to_string()).collect::<Vec<_>>(), has_others)
+        };
+        let list = r#"["tcp/10.0.0.1:7448?prio=1-4#dscp=0xb8", "tcp/[::1]:7#a=b"]"#;
+        let both = ["10.0.0.1:7448", "[::1]:7"].map(str::to_owned).to_vec();
+        assert_eq!(found("\"peer\"", list), (both, false));
+        for other in [r#"["tls/10.0.0.1:7449"]"#, r#"["tcp/drone.local:7448"]"#] {
+            assert_eq!(found("null", other), (vec![], true), "{other}");
+        }
+        let modes = r#"{"peer": ["tcp/1.1.1.1:1", "tcp/1.1.1.1:1"], "client": ["tcp/2.2.2.2:2"]}"#;
+        assert_eq!(found("\"client\"", modes).0, ["2.2.2.2:2"]);
+        assert_eq!(found("null", modes).0, ["1.1.1.1:1"]);
+        assert_eq!(found("\"router\"", modes), (vec![], false));
+        assert_eq!((found("", ""), found("", "null")), ((vec![], false), (vec![], false)));
+    }
+
+    #[tokio::test]
+    async fn a_tool_is_refused_only_where_all_that_it_connects_to_is_foreign() {
+        let foreign = listener(Some(b"HTTP/1.0 400 Bad Request\r\n\r\n")).await;
+        let nobody = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
+        for (endpoints, is_refused) in [
+            (vec![format!("tcp/{foreign}")], true),
+            (vec![format!("tcp/{foreign}"), format!("tcp/{foreign}?prio=5-6")], true),
+            (vec![format!("tcp/{foreign}"), format!("tcp/{nobody}")], false),
+            (vec![format!("tcp/{foreign}"), "tcp/drone.local:7448".to_owned()], false),
+            (vec![], false),
+        ] {
+            let mut config = zenoh::Config::default();
+            let text = serde_json::to_string(&endpoints).unwrap();
+            config.insert_json5("connect/endpoints", &text).unwrap();
+            assert_eq!(refuse(&config).await.is_err(), is_refused, "{text}");
+        }
     }
 
     #[test]
@@ -271,10 +392,15 @@ mod tests {
         // A tunnel has its end here as well.
         for endpoint in ["tcp/10.0.0.1:7448", "tcp/127.0.0.1:7448?prio=5-6"] {
             let there = told(endpoint, Answer::Silence).unwrap();
-            for part in ["0.0.1:7448, where", "3 s", "on that machine", "--connect"] {
+            for part in ["0.0.1:7448, where", "2 s", "on that machine", "--connect"] {
                 assert!(there.contains(part), "`{part}` is not in: {there}");
             }
+            let keys = told(endpoint, Answer::Encrypted).unwrap();
+            assert!(keys.contains("wants keys") && keys.contains("`--keys DIRECTORY`"), "{keys}");
+            assert!(!keys.contains("end it"), "a relay is to be ended: {keys}");
         }
+        let speaks_tls = told("tcp/127.0.0.1:7447", Answer::Encrypted).unwrap();
+        assert!(speaks_tls.contains("TLS") && !speaks_tls.contains("end it"), "{speaks_tls}");
         assert_eq!(told("tcp/127.0.0.1:7447", Answer::Fine), None);
     }
 }

@@ -5,7 +5,7 @@
 //!
 //! Modules in reading order: [`config`] merges a user's settings into the defaults; [`service`] runs a
 //! service from start to shutdown; [`network`] configures the network, with the rights of others from
-//! [`access`], and [`session`] joins it under an [`identity`], unless `foreign` programs answer there, with shared memory where `memory`
+//! [`access`], and [`session`] joins it under an [`identity`], a tool's unless `foreign` programs answer there, with shared memory where `memory`
 //! says that it can; [`topics`] has typed messages, [`frames`] pixels,
 //! and [`tap`] everything as it came; [`health`] counts, with [`stats`]; [`denied`] counts what access control
 //! denies; [`clock`] is the host's clock, [`standstill`] says that a process was frozen, and [`state`] where a service keeps

@@ -83,29 +83,49 @@ pub struct Presence {
 }
 
 impl Node {
-    /// Opens the session. The service is not announced before [`Node::announce`].
+    /// Opens the session of a service, which goes on where another program answers: it meets the others once the right one is there.
+    /// The service is not announced before [`Node::announce`].
     ///
     /// # Errors
-    /// When the configuration cannot be read, another program answers where it connects, or the session cannot be opened.
+    /// When the configuration cannot be read, or the session cannot be opened.
     pub fn open(identity: Identity, source: &ZenohSource) -> BoxFuture<'_, anyhow::Result<Self>> {
         Box::pin(async move {
-            let mut config = zenoh_config(source)?;
+            let config = zenoh_config(source)?;
+            foreign::watch(&config);
+            Self::open_with(identity, config).await
+        })
+    }
+
+    /// Opens the session of a tool, which ends soon: it is refused where another program answers.
+    ///
+    /// # Errors
+    /// When the configuration cannot be read, another program answers wherever it connects, or the session cannot be opened.
+    pub fn open_tool(
+        identity: Identity,
+        source: &ZenohSource,
+    ) -> BoxFuture<'_, anyhow::Result<Self>> {
+        Box::pin(async move {
+            let config = zenoh_config(source)?;
             foreign::refuse(&config)
                 .await
                 .with_context(|| format!("{identity} cannot join the network"))?;
-            let has_shared_memory = share_memory(&mut config)?;
-            let session = zenoh::open(config)
-                .await
-                .map_err(|cause| anyhow!("opening the Zenoh session of {identity}: {cause}"))?;
-            Ok(Self {
-                session,
-                has_shared_memory,
-                identity: Arc::new(identity),
-                health: Arc::default(),
-                token: Arc::default(),
-                claim: Arc::default(),
-                started_ns: now_ns(),
-            })
+            Self::open_with(identity, config).await
+        })
+    }
+
+    async fn open_with(identity: Identity, mut config: zenoh::Config) -> anyhow::Result<Self> {
+        let has_shared_memory = share_memory(&mut config)?;
+        let session = zenoh::open(config)
+            .await
+            .map_err(|cause| anyhow!("opening the Zenoh session of {identity}: {cause}"))?;
+        Ok(Self {
+            session,
+            has_shared_memory,
+            identity: Arc::new(identity),
+            health: Arc::default(),
+            token: Arc::default(),
+            claim: Arc::default(),
+            started_ns: now_ns(),
         })
     }
 
