@@ -82,7 +82,9 @@ impl Picture {
         }
         let heard = |name: &str| {
             let known = status.candidates.iter().find(|candidate| candidate.detector == name);
-            known.is_some_and(|it| it.alive && it.state != DetectorState::Stale)
+            known.is_some_and(|it| {
+                it.alive && matches!(it.state, DetectorState::Active | DetectorState::Shadow)
+            })
         };
         let steers = status.started_ns.is_some() && status.setpoint.is_some();
         let both = heard("onboard") && heard("ground");
