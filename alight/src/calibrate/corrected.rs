@@ -3,6 +3,7 @@
 use calibration::flight::QUANTITIES;
 use calibration::{FlightCalibration, Quantity};
 use geometry::Distortion;
+use toml::Value;
 
 use super::recorded::RecordedFlight;
 
@@ -36,6 +37,36 @@ pub(super) enum Before {
     Was(String),
 }
 
+impl Before {
+    /// Whether it was this value, which may have been written with other digits.
+    fn is(&self, value: &str) -> bool {
+        match self {
+            Self::Was(before) => {
+                parsed(before).zip(parsed(value)).is_some_and(|(one, other)| is_same(&one, &other))
+            }
+            Self::Unknown | Self::Absent => false,
+        }
+    }
+}
+
+/// A value as TOML.
+fn parsed(value: &str) -> Option<Value> {
+    format!("value = {value}").parse::<toml::Table>().ok()?.remove("value")
+}
+
+fn is_same(one: &Value, other: &Value) -> bool {
+    let number = |value: &Value| value.as_float().or(value.as_integer().map(|it| it as f64));
+    match (one, other) {
+        (Value::Array(one), Value::Array(other)) => {
+            one.len() == other.len() && one.iter().zip(other).all(|(a, b)| is_same(a, b))
+        }
+        _ => match (number(one), number(other)) {
+            (Some(one), Some(other)) => one == other,
+            _ => one == other,
+        },
+    }
+}
+
 /// What changes; nothing when nothing was observable.
 pub(super) fn changes(flight: &RecordedFlight, result: &FlightCalibration) -> Changes {
     let correction = |wanted: Quantity| {
@@ -45,7 +76,7 @@ pub(super) fn changes(flight: &RecordedFlight, result: &FlightCalibration) -> Ch
     let mut changes = Changes::default();
     let mut set = |table, key, value: String| {
         let before = before(flight, table, key);
-        if before != Before::Was(value.clone()) {
+        if !before.is(&value) {
             changes.keys.push(Change { table, key, value, before });
         }
     };
@@ -116,13 +147,19 @@ fn delay_ms(flight: &RecordedFlight, offset_ms: f64) -> Result<f64, String> {
 }
 
 impl Changes {
-    /// The tables that replace those of the same names; `None` where no key changes.
-    pub(super) fn toml(&self, camera: &str) -> Option<String> {
-        let mut text = format!(
-            "# Found by `alight calibrate flight`: these keys replace those in the configuration of the camera `{}`.\n",
-            // The name comes from a file, and ends no comment.
-            camera.escape_debug()
-        );
+    /// The tables that replace those of the same names; a comment alone where no key changes.
+    pub(super) fn toml(&self, camera: &str) -> String {
+        let mut text = match self.keys.is_empty() {
+            true => format!(
+                "# `alight calibrate flight`: no key of the camera `{}` changes.\n",
+                camera.escape_debug()
+            ),
+            false => format!(
+                "# Found by `alight calibrate flight`: these keys replace those in the configuration of the camera `{}`.\n",
+                // The name comes from a file, and ends no comment.
+                camera.escape_debug()
+            ),
+        };
         if let Some(advice) = &self.advice {
             text.push_str(&format!("# Not here: {advice}.\n"));
         }
@@ -134,7 +171,7 @@ impl Changes {
             }
             text.push_str(&format!("{} = {}\n", change.key, change.value));
         }
-        (!self.keys.is_empty()).then_some(text)
+        text
     }
 
     /// For people: what happens to each key, and what is left.
@@ -175,5 +212,19 @@ impl Change {
     /// Its dotted name.
     pub(super) fn name(&self) -> String {
         format!("{}.{}", self.table, self.key)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_value_with_other_digits_is_no_change() {
+        let was = |before: &str, value: &str| Before::Was(before.to_owned()).is(value);
+        assert!(was("[647.5, 485.5]", "[647.5000, 485.5000]") && was("640", "640.00"));
+        assert!(was("[]", "[]") && was("'down'", "\"down\""));
+        assert!(!was("[647.5, 485.5]", "[647.5001, 485.5000]") && !was("[1.0]", "[1.0, 0.0]"));
+        assert!(!was("\"\"", "0") && !Before::Absent.is("0") && !Before::Unknown.is("0"));
     }
 }

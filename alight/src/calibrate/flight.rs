@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use calibration::{FlightCalibration, FlightEstimate, Quantity, calibrate_flight};
 use clap::Args;
 use serde_json::{Value, json};
@@ -32,6 +32,9 @@ pub(crate) struct FlightArgs {
     /// Write what changes, as tables of camera-pub's configuration (TOML).
     #[arg(short, long, value_name = "FILE.toml", value_parser = toml_file)]
     output: Option<PathBuf>,
+    /// Replace the file of `--output` where it is there already, as of another flight; without it that file is refused.
+    #[arg(long)]
+    replace: bool,
     /// Format of what is printed: a table, or one JSON object.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
@@ -42,7 +45,13 @@ pub(crate) struct FlightArgs {
 /// # Errors
 /// When the recording cannot be read, has no detections, telemetry or calibration, or contradicts itself.
 pub(super) fn run(args: &FlightArgs) -> anyhow::Result<ExitCode> {
-    let FlightArgs { file, camera, detector, marker, .. } = args;
+    let FlightArgs { file, camera, detector, marker, output, replace, .. } = args;
+    if let Some(path) = output {
+        ensure!(
+            *replace || !path.exists(),
+            "{path:?} is there already, and may be of another flight: name another with `--output`, or replace it with `--replace`"
+        );
+    }
     let wanted = Wanted {
         camera: camera.as_deref(),
         detector: detector.as_deref(),
@@ -57,17 +66,21 @@ pub(super) fn run(args: &FlightArgs) -> anyhow::Result<ExitCode> {
         Format::Text => print(text(&flight, &result, &changes).trim_end())?,
         Format::Json => print(&json(&flight, &result, &changes).to_string())?,
     }
-    write_error(&match (&args.output, changes.toml(&flight.camera)) {
-        (Some(path), Some(toml)) => {
-            std::fs::write(path, toml)
+    let count = changes.keys.len();
+    write_error(&match output {
+        Some(path) => {
+            // Also where no key changes: a file that is replaced says nothing of another flight.
+            std::fs::write(path, changes.toml(&flight.camera))
                 .with_context(|| format!("writing {path:?}; name another file with `--output`"))?;
-            format!("{}: the {} keys that change", path.display(), changes.keys.len())
+            match count {
+                0 => format!("{}: no key changes", path.display()),
+                _ => format!("{}: the {count} keys that change", path.display()),
+            }
         }
-        (Some(path), None) => format!("{}: not written, as no key changes", path.display()),
-        (None, Some(_)) => {
+        None if count > 0 => {
             "nothing is written; `--output FILE.toml` writes the keys that change".to_owned()
         }
-        (None, None) => "no key changes".to_owned(),
+        None => "no key changes".to_owned(),
     });
     let is_any = result.estimates.iter().any(FlightEstimate::is_observable);
     Ok(if is_any { ExitCode::SUCCESS } else { ExitCode::FAILURE })
@@ -195,6 +208,7 @@ fn json(flight: &RecordedFlight, result: &FlightCalibration, changes: &Changes) 
         "used": result.markers,
         "estimates": estimates.collect::<Vec<_>>(),
         "covariance": covariance,
+        "is_changed": !changes.keys.is_empty(),
         "changes": keys.collect::<Vec<_>>(),
         "left": changes.advice,
         "before": camera(&flight.configured),
@@ -334,7 +348,7 @@ mod tests {
         let Landed { mut flight, result, .. } = landed(&planned(6200, WRONG, &[])).unwrap();
         let told = |flight: &RecordedFlight| {
             let changes = corrected::changes(flight, &result);
-            let toml: toml::Table = changes.toml(&flight.camera).unwrap().parse().unwrap();
+            let toml: toml::Table = changes.toml(&flight.camera).parse().unwrap();
             let text = text(flight, &result, &changes);
             let named = text.split("corrected by `").skip(1).filter_map(|it| it.split('`').next());
             for (table, key) in named.filter_map(|name| name.split_once('.')) {
@@ -364,6 +378,32 @@ mod tests {
         assert!((delay_ms - 10.0).abs() < 2.0 && !text.contains("left: "), "{text}");
         flight.configuration = Some("source.delay_ms = 5.0".parse().unwrap());
         all(&told(&flight).0, &["left: ", "`source.delay_ms` = 5.0 cannot be made smaller"]);
+    }
+
+    #[test]
+    fn a_file_of_another_flight_is_refused_and_says_nothing_more_once_it_is_replaced() {
+        let folder = tempfile::tempdir().unwrap();
+        let [file, output] = ["flight.mcap", "changes.toml"].map(|name| folder.path().join(name));
+        std::fs::write(&output, "[source]\ndelay_ms = 7.0\n").unwrap();
+        let mut args = FlightArgs {
+            file: file.clone(),
+            camera: None,
+            detector: None,
+            marker: None,
+            output: Some(output.clone()),
+            replace: false,
+            format: Format::Json,
+        };
+        // Before the recording, which is not there, is read.
+        let problem = run(&args).unwrap_err().to_string();
+        assert!(problem.contains("changes.toml") && problem.contains("`--replace`"), "{problem}");
+        fly_recorded(&planned(6200, Wrong::default(), &[]), std::fs::File::create(&file).unwrap())
+            .unwrap();
+        args.replace = true;
+        run(&args).unwrap();
+        let text = std::fs::read_to_string(&output).unwrap();
+        let table: toml::Table = text.parse().unwrap();
+        assert!(table.get("source").is_none() && text.starts_with("# "), "{text}");
     }
 
     #[test]
