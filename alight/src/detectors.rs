@@ -116,7 +116,12 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
         marker = next.ok().flatten().as_ref().and_then(marker_of);
     }
     let ready = node.alive("detector", "*").await?.into_iter().collect();
-    Ok(Overview::new(status, marker, &announced, ready))
+    let controller = match (status, &marker) {
+        (Some(status), _) => Controller::Read(Box::new(status)),
+        (None, None) if node.alive("controller", "*").await?.is_empty() => Controller::Absent,
+        (None, _) => Controller::Unread,
+    };
+    Ok(Overview::new(controller, marker, &announced, ready))
 }
 
 /// The marker of a controller's landing.
@@ -143,10 +148,21 @@ fn looks_for_others(markers: &[String], wanted: &str) -> bool {
     !markers.is_empty() && markers.iter().all(is_other)
 }
 
+/// What is known of the controller.
+enum Controller {
+    Absent,
+    /// One is running, and no status of it could be read.
+    Unread,
+    Read(Box<ControllerStatus>),
+}
+
 /// The detectors of a vehicle.
 #[derive(Serialize)]
 struct Overview {
+    /// Whether one is running.
     controller: bool,
+    /// Whether its status could be read: without it nothing is known of which detector is in use.
+    status_read: bool,
     active: Option<String>,
     why: String,
     preference: String,
@@ -179,13 +195,16 @@ struct Entry {
 
 impl Overview {
     fn new(
-        status: Option<ControllerStatus>,
+        controller: Controller,
         marker: Option<String>,
         announced: &BTreeMap<String, DetectorInfo>,
         ready: BTreeSet<String>,
     ) -> Self {
-        let controller = status.is_some();
-        let status = status.unwrap_or_default();
+        let (controller, status_read, status) = match controller {
+            Controller::Absent => (false, false, ControllerStatus::default()),
+            Controller::Unread => (true, false, ControllerStatus::default()),
+            Controller::Read(status) => (true, true, *status),
+        };
         let candidates: BTreeMap<&str, &Candidate> =
             status.candidates.iter().map(|c| (c.detector.as_str(), c)).collect();
         let mut names: BTreeSet<&str> = candidates.keys().copied().collect();
@@ -211,6 +230,7 @@ impl Overview {
         }
         Self {
             controller,
+            status_read,
             active: status.active_detector.clone(),
             why: status.detector_why.clone(),
             preference: status.preference.clone(),
@@ -257,6 +277,11 @@ impl Overview {
         let mut text = aligned(&rows);
         let summary = match (self.controller, &self.active) {
             (false, _) => "No controller is running, so none is in use.".to_owned(),
+            (true, _) if !self.status_read => {
+                "A controller is running, and no status of it can be read: is it of another version, or does it stand still? \
+                 Which detector is in use is not known."
+                    .to_owned()
+            }
             (true, None) => format!("None is in use: {}.", self.why),
             (true, Some(active)) => {
                 let preference = match self.preference.as_str() {
@@ -350,15 +375,23 @@ mod tests {
         };
         let announced = [("main".to_owned(), info)].into();
         let ready = ["main".to_owned(), "late".to_owned()].into();
-        let table = Overview::new(Some(status), None, &announced, ready).table();
+        let table =
+            Overview::new(Controller::Read(Box::new(status)), None, &announced, ready).table();
         let lines: Vec<&str> = table.lines().collect();
         assert!(lines[1].starts_with("main") && lines[1].contains("rings:0.15341"), "{table}");
         assert!(lines[2].contains("shadow") && lines[2].contains("29 of 30, 0.012 m"), "{table}");
         assert!(lines[3].starts_with("late") && lines[3].contains("waiting"), "{table}");
         assert!(lines[4].contains("preferred: ground; 3 changes"), "{table}");
         assert!(lines[5].starts_with("Warning: detections of `late`"), "{table}");
-        let nobody = Overview::new(None, None, &announced, BTreeSet::new()).table();
+        let nobody = Overview::new(Controller::Absent, None, &announced, BTreeSet::new()).table();
         assert!(nobody.contains("No controller"), "{nobody}");
+        // As its configuration is read, whose version is the same.
+        let marker = Some("rings".to_owned());
+        let unread = Overview::new(Controller::Unread, marker, &announced, BTreeSet::new());
+        assert!(unread.controller && !unread.status_read);
+        let unread = unread.table();
+        assert!(unread.contains("A controller is running") && !unread.contains("No controller"));
+        assert!(unread.contains("is it of another version"), "{unread}");
     }
 
     #[test]
@@ -394,7 +427,8 @@ mod tests {
             version: "0.1.0".into(),
             toml: "marker = \"rings\"".into(),
         });
-        let overview = Overview::new(Some(status), marker, &announced, BTreeSet::new());
+        let overview =
+            Overview::new(Controller::Read(Box::new(status)), marker, &announced, BTreeSet::new());
         let told: Vec<_> = overview.detectors.iter().map(|it| (it.id.as_str(), it.state)).collect();
         let expected = [
             ("main", "active"),
