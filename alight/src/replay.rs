@@ -73,15 +73,20 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     if args.live {
         return live::run(recordings, &args.without, &args.network);
     }
-    for damage in reader.damage() {
-        write_error(damage);
-    }
-    let mut is_whole = reader.damage().is_empty();
+    let damage = reader.damage().to_vec();
+    damage.iter().for_each(|damage| write_error(damage));
+    let mut is_whole = damage.is_empty();
     let tapes = reader.tapes();
     if args.from == Some(From::Frames) {
         from_frames(&recordings, &tapes, args)?;
         return Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE });
     }
+    ensure!(
+        !tapes.is_empty() || damage.is_empty(),
+        "no tape of a controller can be read in {:?}: {}",
+        args.files,
+        damage.join("; ")
+    );
     ensure!(
         !tapes.is_empty(),
         "there is no tape of a controller in {:?}; `alight land --record` and `alight record` keep it",
@@ -223,4 +228,47 @@ fn told(change: &Change) -> String {
         change.rms_velocity_m_s,
         change.max_target_m
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+    use messages::{Message as _, Tape, TapeEvent, TapeOutput, TapeWriter, encode, topic};
+
+    #[derive(Parser)]
+    struct Program {
+        #[command(flatten)]
+        args: ReplayArgs,
+    }
+
+    #[test]
+    fn a_tape_of_another_version_is_no_missing_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("flight.mcap");
+        let refused = |payload: Option<&[u8]>| {
+            let mut recording = Vec::new();
+            let about = flightlog::About::default();
+            let mut writer = flightlog::Writer::new(&mut recording, &about).unwrap();
+            if let Some(payload) = payload {
+                let key = topic::TAPE.key(&[]);
+                let message =
+                    flightlog::Received { key: &key, payload, attachment: b"", received_ns: 9 };
+                writer.receive(message).unwrap();
+            }
+            writer.finish().unwrap();
+            std::fs::write(&file, recording).unwrap();
+            let text = ["replay".as_ref(), file.as_os_str(), "--verify".as_ref()];
+            run(&Program::try_parse_from(text).unwrap().args).unwrap_err().to_string()
+        };
+        let mut tape = TapeWriter::new(3);
+        tape.write(4, &TapeEvent::Tick, &TapeOutput::default());
+        let mut payload = encode(&tape.take().unwrap());
+        // After the mark of our messages and their type.
+        payload[2] = Tape::VERSION - 1;
+        let problem = refused(Some(&payload));
+        let said = format!("({}; this program reads {})", Tape::VERSION - 1, Tape::VERSION);
+        assert!(problem.contains(&said) && !problem.contains("there is no tape"), "{problem}");
+        assert!(refused(None).contains("there is no tape"));
+    }
 }

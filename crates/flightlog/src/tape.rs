@@ -44,7 +44,7 @@ impl TapeReader {
     pub fn take(&mut self, payload: &[u8]) {
         match decode::<Tape>(payload) {
             Ok(tape) => self.push(tape),
-            Err(problem) => self.note(format!("a part of a tape cannot be read: {problem}")),
+            Err(problem) => self.note(format!("a part of a tape {}", problem.in_recording())),
         }
     }
 

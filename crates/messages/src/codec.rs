@@ -96,6 +96,16 @@ impl DecodeError {
             Self::Trailing { .. } => "trailing bytes",
         }
     }
+
+    /// Why a message of a recording cannot be read, after the word "it": there, no program is to be run in another version.
+    pub fn in_recording(&self) -> String {
+        match self {
+            Self::Version { found, wanted, .. } => {
+                format!("is of another version ({found}; this program reads {wanted})")
+            }
+            other => format!("cannot be read: {other}"),
+        }
+    }
 }
 
 /// The bytes of a message.

@@ -133,7 +133,7 @@ impl Writer {
     fn head(&mut self, letter: &str, summary: &Summary) {
         self.line(&format!("{letter}{}", summary.name), TITLE);
         let rgb = match (summary.landed, summary.phase.as_deref()) {
-            (true, _) => GREEN,
+            (Some(true), _) => GREEN,
             (_, None) => QUIET,
             _ => RED,
         };

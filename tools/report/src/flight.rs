@@ -40,7 +40,7 @@ pub struct Frame {
 pub struct Unreadable {
     /// How many.
     pub count: u64,
-    /// Why the first could not.
+    /// Why the first could not: "is of another version ...".
     pub why: String,
 }
 
@@ -358,7 +358,7 @@ impl Flight {
                 let unreadable = self
                     .unreadable
                     .entry(key.to_owned())
-                    .or_insert_with(|| Unreadable { count: 0, why: problem.to_string() });
+                    .or_insert_with(|| Unreadable { count: 0, why: problem.in_recording() });
                 unreadable.count += 1;
                 None
             }

@@ -154,7 +154,7 @@ pub fn recording(flight: &Flight) -> Vec<String> {
     }
     for (key, unreadable) in &flight.unreadable {
         lines.push(format!(
-            "{} messages of {key} cannot be read: {}",
+            "{} messages of {key} are left out: the first {}",
             unreadable.count, unreadable.why
         ));
     }

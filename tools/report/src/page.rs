@@ -70,7 +70,7 @@ fn head(views: &[&View<'_>]) -> String {
             _ => "B: ",
         };
         let mood = match (summary.landed, summary.phase.as_deref()) {
-            (true, _) => "good",
+            (Some(true), _) => "good",
             (_, None) => "quiet",
             _ => "bad",
         };
@@ -139,7 +139,8 @@ pub(crate) fn in_numbers(
     summary: &Summary,
 ) -> impl Iterator<Item = (&'static str, Result<String, &'static str>)> {
     // What an aborted landing did not come to is not missing in its recording.
-    let none = if summary.landed || summary.phase.is_none() { "not recorded" } else { "-" };
+    let none =
+        if summary.landed == Some(true) || summary.phase.is_none() { "not recorded" } else { "-" };
     FIGURES.iter().map(move |Figure { name, of, digits, unit }| {
         let value = of(summary).map(|value| format!("{value:.digits$} {unit}"));
         (*name, value.ok_or(none))

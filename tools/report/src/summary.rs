@@ -1,6 +1,6 @@
 //! A flight in numbers, and in one line.
 
-use messages::{LandedState, Phase};
+use messages::{LandedState, Phase, topic};
 use node::stats::quantile;
 use serde::Serialize;
 
@@ -22,8 +22,10 @@ pub struct Summary {
     pub phase: Option<String>,
     /// Its reason.
     pub why: Option<String>,
-    /// Whether it landed and its motors stopped.
-    pub landed: bool,
+    /// Whether it landed and its motors stopped; `None` without a status of a controller.
+    pub landed: Option<bool>,
+    /// Why no status of a controller could be read, where there are some.
+    pub unreadable_status: Option<String>,
     /// From the start of the landing to disarmed motors, in seconds.
     pub time_to_disarm_s: Option<f64>,
     /// From the start of the landing to the first contact, in seconds.
@@ -110,7 +112,12 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
         guidance: last.map(|status| status.guidance.clone()),
         phase: last.map(|status| status.phase.name().to_owned()),
         why: last.map(|status| status.why.clone()),
-        landed: last.is_some_and(|status| status.phase == Phase::Landed),
+        landed: last.map(|status| status.phase == Phase::Landed),
+        unreadable_status: flight
+            .unreadable
+            .get(&topic::STATUS.key(&[]))
+            .filter(|_| last.is_none())
+            .map(|it| it.why.clone()),
         time_to_disarm_s: disarmed_ns.and_then(since_start_s),
         time_to_touchdown_s: touchdown
             .map(|it| it.stamp_ns)
@@ -176,10 +183,13 @@ impl Summary {
     /// How it ended, in a few words.
     pub fn outcome(&self) -> String {
         match (&self.phase, &self.why) {
-            _ if self.landed => "landed".to_owned(),
+            _ if self.landed == Some(true) => "landed".to_owned(),
             (Some(phase), Some(why)) if why.starts_with(phase) => why.clone(),
             (Some(phase), Some(why)) => format!("{phase}: {why}"),
-            _ => "no status of a controller was recorded".to_owned(),
+            _ => match &self.unreadable_status {
+                Some(why) => format!("the status of the controller {why}"),
+                None => "no status of a controller was recorded".to_owned(),
+            },
         }
     }
 
