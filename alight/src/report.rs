@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use anyhow::{Context, ensure};
 use clap::{Args, ValueEnum};
 use report::{
-    Figure, Flight, FlightReader, comparison, document, figures, page, replay_tapes, summary,
+    Figure, Flight, FlightReader, comparison, document, figures, marks, page, replay_tapes, summary,
 };
 
 use crate::ending::{Ending, format_of};
@@ -30,7 +30,7 @@ pub(crate) struct ReportArgs {
     #[arg(long, value_name = "FOLDER")]
     figures: Option<PathBuf>,
     /// Replace a page or figures that are there already, which may be another flight's; without it they are refused. The page of
-    /// one recording, with its name and beside it, is written anew in any case.
+    /// the same flights is written anew in any case, as is that of one recording with its name and beside it.
     #[arg(long)]
     replace: bool,
     /// What is printed: a line for a bug report, or the flight in numbers as one JSON object; or the line, and the page is a
@@ -72,12 +72,9 @@ impl std::str::FromStr for Page {
 /// Maximum number of flights on a page.
 const MAX_FLIGHTS: usize = 2;
 
-/// Writes the page, and prints the summary.
+/// Prints the summary, and writes the page.
 pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     let is_pdf = args.is_pdf()?;
-    if let Some(page) = &args.output {
-        args.check_is_free(&page.path, "--output")?;
-    }
     let mut flights = flights(&args.files)?;
     for flight in &mut flights {
         let (name, number) = (flight.name.clone(), args.landing.unwrap_or(0));
@@ -85,26 +82,37 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
             anyhow::anyhow!("`--landing {number}`: {name} has {of} landings, counted from 1")
         })?;
     }
-    let written = match flights.as_slice() {
-        [one] if is_pdf => document(one, None)?,
-        [one, other] if is_pdf => document(one, Some(other))?,
-        [one] => page(one)?.into_bytes(),
-        [one, other] => comparison(one, other)?.into_bytes(),
-        all => anyhow::bail!(
-            "{} flights in {:?}, a page has one, or {MAX_FLIGHTS} to compare",
-            all.len(),
-            args.files
-        ),
-    };
+    ensure!(
+        flights.len() <= MAX_FLIGHTS,
+        "{} flights in {:?}, a page has one, or {MAX_FLIGHTS} to compare",
+        flights.len(),
+        args.files
+    );
+    // Also where there is a reason against the page.
+    for flight in &flights {
+        let summary = summary(flight);
+        match args.format {
+            Format::Text | Format::Pdf => print(&summary.line())?,
+            Format::Json => print(&serde_json::to_string(&summary)?)?,
+        }
+    }
     let beside = args.beside(&flights, if is_pdf { "pdf" } else { "html" });
     let output = args.output.as_ref().map_or(&beside, |page| &page.path);
     ensure!(
         !args.files.iter().any(|file| is_same_file(file, output)),
         "{output:?} is a recording; name another file for the page with `--output`"
     );
-    if args.output.is_none() && flights.len() > 1 {
+    let is_own = args.output.is_none() && flights.len() == 1;
+    if !is_own && !has_marks(output, &marks(&flights.iter().collect::<Vec<_>>())) {
         args.check_is_free(output, "--output")?;
     }
+    let written = match flights.as_slice() {
+        [one] if is_pdf => document(one, None)?,
+        [one, other] if is_pdf => document(one, Some(other))?,
+        [one] => page(one)?.into_bytes(),
+        [one, other] => comparison(one, other)?.into_bytes(),
+        _ => anyhow::bail!("no flight in {:?}", args.files),
+    };
     // All is checked before the first file is written.
     let mut drawn = Vec::new();
     if let Some(folder) = &args.figures {
@@ -118,17 +126,10 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
             drawn.push((folder, figures));
         }
     }
-    std::fs::write(output, written)
+    write_whole(output, &written)
         .with_context(|| format!("writing {output:?}; name another file with `--output`"))?;
     for (folder, figures) in &drawn {
         write_figures(figures, folder)?;
-    }
-    for flight in &flights {
-        let summary = summary(flight);
-        match args.format {
-            Format::Text | Format::Pdf => print(&summary.line())?,
-            Format::Json => print(&serde_json::to_string(&summary)?)?,
-        }
     }
     write_error(&format!("the page: {}", output.display()));
     Ok(ExitCode::SUCCESS)
@@ -169,6 +170,34 @@ impl ReportArgs {
         );
         Ok(*is_pdf)
     }
+}
+
+/// Whether a file is a page of just these flights.
+fn has_marks(page: &Path, marks: &str) -> bool {
+    let parts = [format!("\"{marks}\""), format!("({marks})")];
+    std::fs::read(page).is_ok_and(|page| {
+        // Of HTML, and of a PDF document.
+        parts.iter().any(|part| page.windows(part.len()).any(|at| at == part.as_bytes()))
+    })
+}
+
+/// Writes a file under another name first, so that what was there stays until all of the new one is.
+fn write_whole(file: &Path, contents: &[u8]) -> std::io::Result<()> {
+    // A device or a pipe is written as it is.
+    if file.exists() && !file.is_file() {
+        return std::fs::write(file, contents);
+    }
+    // What a link leads to is written, not the link.
+    let file = file.canonicalize().unwrap_or_else(|_| file.to_owned());
+    let mut name = file.file_name().unwrap_or_default().to_owned();
+    name.push(format!(".{}.new", std::process::id()));
+    let new = file.with_file_name(name);
+    let written = std::fs::write(&new, contents).and_then(|()| std::fs::rename(&new, &file));
+    if written.is_err() {
+        // It may not be there.
+        let _ = std::fs::remove_file(&new);
+    }
+    written
 }
 
 fn write_figures(figures: &[Figure], folder: &Path) -> anyhow::Result<()> {
@@ -337,9 +366,36 @@ mod tests {
         let problem = reported(&[&other], &["-o", "new.html", "--figures", &charts]).unwrap_err();
         assert!(problem.contains(".svg") && problem.contains("`--figures`"), "{problem}");
         assert!(!Path::new("new.html").exists(), "written before the figures were refused");
-        assert!(reported(&[&one, &other], &[]).unwrap_err().contains("one-and-other.html"));
         assert_eq!(text("page.html"), first);
         reported(&[&other], &[&named[..], &["--replace"]].concat()).unwrap();
         assert_ne!(text("page.html"), first);
+    }
+
+    #[test]
+    fn the_page_of_the_same_flight_is_written_anew() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        let [one, other] = ["one.mcap", "other.mcap"].map(path);
+        fly(&one, 1);
+        fly(&other, 2);
+        let reported = |files: &[&Path], page: &Path| {
+            let files = files.iter().map(|file| file.as_os_str());
+            let options = ["-o".as_ref(), page.as_os_str()];
+            let text = std::iter::once("report".as_ref()).chain(files).chain(options);
+            run(&Program::try_parse_from(text).unwrap().args).is_ok()
+        };
+        for page in ["page.html", "page.pdf"].map(path) {
+            assert!(reported(&[&one], &page) && reported(&[&one], &page), "{page:?}");
+            let first = std::fs::read(&page).unwrap();
+            for others in [&[&*other][..], &[&one, &other], &[&other, &one]] {
+                assert!(!reported(others, &page), "{others:?} replaced {page:?}");
+            }
+            assert_eq!(std::fs::read(&page).unwrap(), first);
+            std::fs::remove_file(&page).unwrap();
+            assert!(reported(&[&one, &other], &page) && reported(&[&one, &other], &page));
+            assert!(!reported(&[&one], &page) && !reported(&[&other, &one], &page));
+        }
+        // Nothing is left beside the pages.
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 4);
     }
 }

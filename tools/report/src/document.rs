@@ -4,7 +4,7 @@
 use crate::chart::{Chart, Ink, WIDTH};
 use crate::flight::Flight;
 use crate::html::{Block, Cell};
-use crate::page::{compared, differing, in_numbers};
+use crate::page::{compared, differing, in_numbers, marks};
 use crate::pdf::{Font, PAGE, Pages, Type};
 use crate::plots::share_axes;
 use crate::sections::{self, Section};
@@ -56,7 +56,7 @@ pub fn document(flight: &Flight, other: Option<&Flight>) -> anyhow::Result<Vec<u
         for section in sections::of(&view) {
             writer.section(&section)?;
         }
-        return Ok(writer.finish(&title));
+        return Ok(writer.finish(&title, &marks(&[flight])));
     };
     writer.head("A: ", &view.summary);
     writer.head("B: ", &second.summary);
@@ -70,7 +70,7 @@ pub fn document(flight: &Flight, other: Option<&Flight>) -> anyhow::Result<Vec<u
     for (mut left, mut right) in sections::of(&view).into_iter().zip(sections::of(second)) {
         writer.pair(&mut left, &mut right)?;
     }
-    Ok(writer.finish(&title))
+    Ok(writer.finish(&title, &marks(&[flight, other])))
 }
 
 /// Writes down the pages.
@@ -86,9 +86,9 @@ impl Writer {
         Self { pages: Pages::default(), name: name.to_owned(), top: MARGIN }
     }
 
-    fn finish(mut self, title: &str) -> Vec<u8> {
+    fn finish(mut self, title: &str, keywords: &str) -> Vec<u8> {
         self.number();
-        self.pages.finish(title)
+        self.pages.finish(title, keywords)
     }
 
     /// The page's number, at its foot.

@@ -228,6 +228,18 @@ fn configuration_of(tape: &RecordedTape) -> Option<String> {
 }
 
 impl Flight {
+    /// A mark by which its page is known as its own: made of its recording's name, run and begin, and of its landing.
+    pub fn mark(&self) -> String {
+        let run = self.facts.get("run").map_or("", String::as_str);
+        let landing = self.landing.as_ref().map_or(0, |it| it.number);
+        let text = format!("{}\0{run}\0{}\0{landing}", self.name, self.zero_ns);
+        // FNV-1a: the same in every version of the program.
+        let hash = text.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
+            (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
+        });
+        format!("alight-flight-{hash:016x}")
+    }
+
     /// A time of the recorder's clock by the vehicle's, in nanoseconds.
     pub fn vehicle_ns(&self, received_ns: i64) -> i64 {
         received_ns.saturating_sub(self.shift_ns)

@@ -36,7 +36,7 @@ pub mod view;
 pub use document::document;
 pub use figures::{Figure, figures};
 pub use flight::{Flight, FlightReader, Replayed};
-pub use page::{comparison, page};
+pub use page::{comparison, marks, page};
 pub use summary::Summary;
 pub use tape::replay_tapes;
 

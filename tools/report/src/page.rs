@@ -25,7 +25,7 @@ pub fn page(flight: &Flight) -> anyhow::Result<String> {
     for section in &sections {
         body.push_str(&one(section)?);
     }
-    Ok(html(&view.summary.name, &body, "one"))
+    Ok(html(&view.summary.name, &body, "one", &marks(&[flight])))
 }
 
 /// The page of two flights side by side, with what they differ in.
@@ -44,15 +44,21 @@ pub fn comparison(first: &Flight, second: &Flight) -> anyhow::Result<String> {
         body.push_str(&pair(left, right)?);
     }
     let title = format!("{} and {}", one.summary.name, other.summary.name);
-    Ok(html(&title, &body, "two"))
+    Ok(html(&title, &body, "two", &marks(&[first, second])))
 }
 
-fn html(title: &str, body: &str, class: &str) -> String {
+/// The marks of a page's flights, as they are in it.
+pub fn marks(flights: &[&Flight]) -> String {
+    flights.iter().map(|flight| flight.mark()).collect::<Vec<_>>().join(" ")
+}
+
+fn html(title: &str, body: &str, class: &str, marks: &str) -> String {
     format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
          <meta name=\"color-scheme\" content=\"light dark\">\
          <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">\
+         <meta name=\"alight-flights\" content=\"{marks}\">\
          <title>{}: flight report</title><style>{STYLE}</style></head>\n\
          <body class=\"{class}\"><main>{body}</main></body></html>\n",
         escaped(title)

@@ -159,8 +159,8 @@ impl Pages {
         drawn.map_err(|problem| anyhow!("{}: {problem}", chart.title))
     }
 
-    /// The file.
-    pub fn finish(mut self, title: &str) -> Vec<u8> {
+    /// The file, with keywords in ASCII.
+    pub fn finish(mut self, title: &str, keywords: &str) -> Vec<u8> {
         self.turn();
         let mut next = 0;
         let mut reference = || {
@@ -174,7 +174,10 @@ impl Pages {
             self.done.into_iter().map(|content| (reference(), reference(), content)).collect();
         let mut pdf = Pdf::new();
         pdf.catalog(catalog).pages(tree);
-        pdf.document_info(info).title(TextStr(title)).creator(TextStr("alight report"));
+        pdf.document_info(info)
+            .title(TextStr(title))
+            .keywords(TextStr(keywords))
+            .creator(TextStr("alight report"));
         let count = i32::try_from(pages.len()).unwrap_or(i32::MAX);
         pdf.pages(tree).kids(pages.iter().map(|(page, _, _)| *page)).count(count);
         for (font, reference) in fonts {
