@@ -221,19 +221,66 @@ pub fn from_toml<T: Settings>(
 
 /// The configuration that results from layers over a table.
 fn effective<T: Settings>(mut table: Table, layers: &[Layer]) -> Result<Effective<T>, ConfigError> {
+    let before = table.clone();
     for layer in layers {
         lay_over(&mut table, &layer.table, &layer.name, &mut String::new())?;
     }
-    let settings = T::from_table(table.clone()).map_err(|cause| {
-        let message = cause.message().to_owned();
-        let source_name = layers.last().map_or("the defaults".to_owned(), |l| l.name.clone());
-        ConfigError::Syntax { source_name, cause: message }
-    })?;
+    let settings =
+        T::from_table(table.clone()).map_err(|cause| refusal::<T>(before, layers, &cause))?;
     let mut check = Check { table: &table, layers, problem: None };
     settings.check(&mut check);
     match check.problem {
         Some(problem) => Err(problem),
         None => Ok(Effective { settings, table }),
+    }
+}
+
+/// Which value of which layer the settings cannot be read with, after [`lay_over`] found all keys and types right: such as a
+/// word that an enumeration lacks. The reader of a table does not say where it stood, so that each value is tried alone.
+fn refusal<T: Settings>(mut table: Table, layers: &[Layer], cause: &TableError) -> ConfigError {
+    for layer in layers {
+        let mut values = Vec::new();
+        single_values(&layer.table, &mut Vec::new(), &mut values);
+        for (path, value) in values {
+            let key = path.join(".");
+            let mut single = Table::new();
+            if let Some((last, parents)) = path.split_last() {
+                single.insert((*last).to_owned(), value.clone());
+                for parent in parents.iter().rev() {
+                    let inner = std::mem::take(&mut single);
+                    single.insert((*parent).to_owned(), Value::Table(inner));
+                }
+            }
+            if let Err(problem) = lay_over(&mut table, &single, &layer.name, &mut String::new()) {
+                return problem;
+            }
+            if let Err(cause) = T::from_table(table.clone()) {
+                return ConfigError::Refused {
+                    source_name: layer.name.clone(),
+                    key,
+                    value: value.to_string(),
+                    limit: cause.message().to_owned(),
+                };
+            }
+        }
+    }
+    let source_name = layers.last().map_or("the defaults", |layer| &layer.name).to_owned();
+    ConfigError::Syntax { source_name, cause: cause.message().to_owned() }
+}
+
+/// The values below a table that are no tables, with their paths.
+fn single_values<'a>(
+    table: &'a Table,
+    path: &mut Vec<&'a str>,
+    values: &mut Vec<(Vec<&'a str>, &'a Value)>,
+) {
+    for (name, value) in table {
+        path.push(name);
+        match value {
+            Value::Table(inner) => single_values(inner, path, values),
+            value => values.push((path.clone(), value)),
+        }
+        path.pop();
     }
 }
 
@@ -461,11 +508,19 @@ mod tests {
     #[serde(deny_unknown_fields)]
     struct Lens {
         focal_px: f64,
+        kind: Kind,
+    }
+
+    #[derive(Debug, Deserialize, PartialEq, Serialize)]
+    #[serde(rename_all = "kebab-case")]
+    enum Kind {
+        Pinhole,
+        Fisheye,
     }
 
     impl Settings for Camera {
         const DEFAULTS: &'static str =
-            "name = \"down\"\nrate_hz = 15.0\n[lens]\nfocal_px = 1818.0\n";
+            "name = \"down\"\nrate_hz = 15.0\n[lens]\nfocal_px = 1818.0\nkind = \"pinhole\"\n";
 
         fn from_table(table: Table) -> Result<Self, TableError> {
             table.try_into()
@@ -508,7 +563,7 @@ mod tests {
     fn settings_override_the_file_and_the_file_the_defaults() {
         let camera =
             load(Some("rate_hz = 20\n[lens]\nfocal_px = 900.0"), &["rate_hz=30", "name=left"]);
-        let lens = Lens { focal_px: 900.0 };
+        let lens = Lens { focal_px: 900.0, kind: Kind::Pinhole };
         assert_eq!(camera, Ok(Camera { name: "left".into(), rate_hz: 30.0, lens }));
     }
 
@@ -548,6 +603,22 @@ mod tests {
         check(None, &["rate_hz=fast"], &["--set rate_hz=fast", "where a number is needed"]);
         check(Some("rate_hz = = 1"), &[], &["is not valid TOML", ".toml"]);
         check(None, &["name=a/b"], &["letters, digits"]);
+    }
+
+    #[test]
+    fn a_word_that_is_no_variant_is_told_with_its_own_source_and_the_allowed_words() {
+        let words = ["`lens.kind` = \"wide\" is invalid", "`pinhole`", "`fisheye`"];
+        for (file, set, source) in [
+            (None, &["lens.kind=wide", "rate_hz=30"][..], "--set lens.kind=wide: "),
+            (None, &["rate_hz=30", "lens.kind=wide"][..], "--set lens.kind=wide: "),
+            (Some("[lens]\nfocal_px = 2.0\nkind = \"wide\""), &["rate_hz=30"][..], ".toml: "),
+        ] {
+            let problem = load(file, set).unwrap_err();
+            assert!(problem.contains(source) && !problem.contains("TOML"), "{problem}");
+            assert!(words.iter().all(|word| problem.contains(word)), "{problem}");
+        }
+        // A later layer mends an earlier one.
+        assert!(load(Some("lens.kind = \"wide\""), &["lens.kind=fisheye"]).is_ok());
     }
 
     #[test]
