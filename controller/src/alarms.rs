@@ -81,6 +81,27 @@ impl Alarms {
     }
 }
 
+/// Why no flight begins with this battery: it is at its critical limit or below, so that the vehicle would land at once. An alarm
+/// waits, as the voltage drops in a climb; before it motors take nothing.
+pub fn too_empty(settings: &AlarmSettings, battery: &Battery) -> Option<String> {
+    let AlarmSettings { battery_critical, battery_critical_v, .. } = *settings;
+    let volts = battery.voltage_v.filter(|volts| *volts > 0.0);
+    if let Some(volts) =
+        volts.filter(|volts| battery_critical_v > 0.0 && *volts <= battery_critical_v)
+    {
+        return Some(format!(
+            "no takeoff: the battery has {volts:.1} V, and is critical at {battery_critical_v} V and below (`alarms.battery_critical_v`); charge it, or correct the limit"
+        ));
+    }
+    let charge =
+        battery.remaining.filter(|it| battery_critical > 0.0 && *it <= battery_critical)?;
+    Some(format!(
+        "no takeoff: the battery has {:.0} % of its charge, and is critical at {:.0} % and below (`alarms.battery_critical`); charge it, or correct the limit",
+        100.0 * charge,
+        100.0 * battery_critical
+    ))
+}
+
 /// Keeps since when a condition has held.
 fn since(since_ns: &mut Option<i64>, holds: bool, now_ns: i64) {
     *since_ns = if holds { since_ns.or(Some(now_ns)) } else { None };
@@ -151,6 +172,22 @@ mod tests {
             assert_eq!(alarms.tick(lost_s * SECOND, None), Some(Alarm::AutopilotLost));
             assert_eq!(alarms.tick((lost_s + 1) * SECOND, None), None, "once");
         }
+    }
+
+    #[test]
+    fn a_battery_at_its_critical_limit_is_too_empty_to_begin_with() {
+        let settings = alarms().settings;
+        let why = |battery| too_empty(&settings, &battery);
+        assert_eq!(why(battery(0.11, 10.6)), None);
+        let told = why(battery(0.5, 10.5)).unwrap();
+        assert!(told.contains("10.5 V") && told.contains("battery_critical_v"), "{told}");
+        let told = why(battery(0.1, 12.0)).unwrap();
+        assert!(told.contains("10 %") && told.contains("`alarms.battery_critical`"), "{told}");
+        // An autopilot without a sensor says 0 V; and a limit of 0 is none.
+        assert_eq!(why(battery(0.5, 0.0)), None);
+        let off = AlarmSettings { battery_critical: 0.0, battery_critical_v: 0.0, ..settings };
+        assert_eq!(too_empty(&off, &battery(0.0, 1.0)), None);
+        assert_eq!(why(Battery::default()), None);
     }
 
     #[test]

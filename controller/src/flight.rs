@@ -18,7 +18,7 @@ use messages::{
 };
 use node::HealthCounters;
 
-use crate::alarms::Alarms;
+use crate::alarms::{self, Alarms};
 use crate::cameras::Reception;
 use crate::config::{Config, Mode, Start};
 use crate::control::{is_holding_px4, pilots_px4_mode};
@@ -585,6 +585,7 @@ impl Flight {
             // Somebody else began it; it is followed like our own.
             self.mission.begin(now_ns, true);
         }
+        self.refuse_empty_takeoff();
         // The lander refuses a start without a fresh state, and the mission would not try again.
         let state = self.autopilot.state().and_then(wire::vehicle);
         let is_fresh = state.is_some_and(|state| {
@@ -622,6 +623,16 @@ impl Flight {
                 }
             }
             _ => {}
+        }
+    }
+
+    /// Refuses a take-off before the motors are armed, where the alarm would end it right after.
+    fn refuse_empty_takeoff(&mut self) {
+        let standing = self.autopilot.state().filter(|state| !state.armed);
+        let Some(state) = standing.filter(|_| self.mission.is_taking_off()) else { return };
+        if let Some(why) = alarms::too_empty(&self.config.alarms, &state.battery) {
+            tracing::error!("{why}");
+            self.mission.fail(&mut self.autopilot, why);
         }
     }
 

@@ -1,7 +1,7 @@
 //! What the controller publishes about a flight.
 
 use autopilot::{Autopilot, LandedState};
-use landing::{Action, Decision, Lander};
+use landing::{Action, Decision, Lander, Reason};
 use messages::{ControllerStatus, Phase, Setpoint, TargetEstimate};
 
 use crate::config::{Config, GuidanceName, Mode, Start};
@@ -161,6 +161,12 @@ impl View<'_> {
             return "no detector is alive, nothing descends".to_owned();
         }
         let why = self.decision.map_or_else(String::new, |decision| decision.why.to_string());
+        if let Some(reason) = self.cause() {
+            return match self.lander.phase() {
+                landing::Phase::Landed => format!("{why}: {reason}"),
+                _ => format!("{reason}: {why}"),
+            };
+        }
         match self.autopilot.state() {
             // It may as well be the autopilot's failsafe: when PX4 misses setpoints it leaves OFFBOARD.
             Some(state) if self.lander.phase() == landing::Phase::PilotInCommand => {
@@ -168,6 +174,18 @@ impl View<'_> {
             }
             _ => why,
         }
+    }
+
+    /// What the vehicle lands for where that is no marker, once the decision's own reason no longer tells it.
+    fn cause(&self) -> Option<String> {
+        let reason = self.lander.cause()?;
+        let is_told = self.decision.is_none_or(|decision| decision.why == reason);
+        (!is_told).then(|| match reason {
+            Reason::OperatorLand => "the operator's command to land here".to_owned(),
+            // The full text says what a hold waits for.
+            Reason::AutopilotLost => "autopilot link lost".to_owned(),
+            reason => reason.to_string(),
+        })
     }
 
     /// True once nothing more happens without a command.

@@ -480,6 +480,59 @@ fn a_low_battery_leads_to_what_is_configured() {
 }
 
 #[test]
+fn a_landing_for_an_alarm_or_a_command_tells_why_until_after_it() {
+    let told = |set: &[&str], begin: &dyn Fn(&mut Flight)| {
+        let mut flight = flight_with("airborne", set);
+        receive(&mut flight, 0, &heartbeat(4, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        hover(&mut flight, 1000, 2000, 4);
+        begin(&mut flight);
+        let asked = hover(&mut flight, 2000, 2500, 4);
+        assert!(asked.modes.contains(&9.0), "{:?}", asked.modes);
+        hover(&mut flight, 3000, 4000, 9);
+        let landing = flight.status(4000 * MS);
+        receive(&mut flight, 4001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+        receive(&mut flight, 4002 * MS, &heartbeat(9, false));
+        pose(&mut flight, 4020 * MS);
+        flight.tick(4030 * MS);
+        let landed = flight.status(4030 * MS);
+        assert_eq!((landing.phase, landed.phase), (Phase::Final, Phase::Landed));
+        (landing.why, landed.why)
+    };
+    let empty = |flight: &mut Flight| {
+        let battery = SYS_STATUS_DATA { voltage_battery: 12_600, ..Default::default() };
+        receive(flight, 2000 * MS, &MavMessage::SYS_STATUS(battery));
+    };
+    let (landing, landed) = told(&["alarms.battery_critical_v=13", "alarms.battery_s=0.1"], &empty);
+    assert_eq!(landing, "the battery is nearly empty: the autopilot is landing");
+    assert_eq!(landed, "landed and disarmed: the battery is nearly empty");
+    let command = |flight: &mut Flight| {
+        assert!(flight.command(2000 * MS, &ControllerCommand::LandHere).accepted);
+    };
+    let (landing, landed) = told(&[], &command);
+    assert_eq!(landing, "the operator's command to land here: the autopilot is landing");
+    assert_eq!(landed, "landed and disarmed: the operator's command to land here");
+}
+
+#[test]
+fn a_takeoff_with_a_battery_at_its_critical_limit_is_refused_before_the_motors_are_armed() {
+    for (volts, is_refused) in [(13.0, true), (13.1, false)] {
+        let mut flight = flight_with("takeoff", &["alarms.battery_critical_v=13"]);
+        receive(&mut flight, 0, &heartbeat(4, false));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+        let voltage_battery = (volts * 1e3) as u16;
+        let battery =
+            SYS_STATUS_DATA { voltage_battery, battery_remaining: -1, ..Default::default() };
+        receive(&mut flight, 2 * MS, &MavMessage::SYS_STATUS(battery));
+        flight.tick(3 * MS);
+        let status = flight.status(3 * MS);
+        assert_eq!(status.phase == Phase::Failed && status.finished, is_refused, "{status:?}");
+        let names = ["13.0 V", "critical at 13 V", "alarms.battery_critical_v"];
+        assert_eq!(names.iter().all(|name| status.why.contains(name)), is_refused, "{status:?}");
+    }
+}
+
+#[test]
 fn after_a_pilots_landing_the_next_flight_is_landed() {
     let mut flight = flight("airborne");
     receive(&mut flight, 0, &heartbeat(9, true));

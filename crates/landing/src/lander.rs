@@ -244,6 +244,11 @@ impl Lander {
         self.state_machine.phase()
     }
 
+    /// The alarm or the operator's command for which the vehicle lands, or has landed, away from the marker.
+    pub fn cause(&self) -> Option<Reason> {
+        self.state_machine.cause()
+    }
+
     /// By how much the camera's mount and focal length are certainly off.
     pub fn mount_findings(&self) -> MountFindings {
         self.mount_check.findings()

@@ -154,6 +154,8 @@ pub struct StateMachine {
     retries: u32,
     /// When the motors were first seen to be off.
     disarmed: Option<Timestamp>,
+    /// The alarm or command that the vehicle lands for, until the next phase after that landing.
+    cause: Option<Reason>,
 }
 
 /// The configured reaction to an alarm, and the reason; `None` for any other event.
@@ -183,6 +185,7 @@ impl StateMachine {
             expects_land: false,
             retries: 0,
             disarmed: None,
+            cause: None,
         }
     }
 
@@ -194,6 +197,12 @@ impl StateMachine {
     /// The reason for it.
     pub fn reason(&self) -> Reason {
         self.reason
+    }
+
+    /// The alarm or the operator's command for which it lands, or has landed, away from the marker. The reason tells that only
+    /// until the autopilot is in LAND.
+    pub fn cause(&self) -> Option<Reason> {
+        self.cause
     }
 
     /// Seconds since the phase was entered.
@@ -319,6 +328,18 @@ impl StateMachine {
     fn enter(&mut self, phase: Phase, reason: Reason, now: Timestamp) {
         self.is_recalling =
             phase == Phase::Aborted && self.landing && reason == Reason::OperatorAbort;
+        self.cause = match (phase, reason) {
+            (
+                Phase::Final,
+                Reason::OperatorLand
+                | Reason::BatteryLow
+                | Reason::BatteryCritical
+                | Reason::OperatorLost
+                | Reason::AutopilotLost,
+            ) => Some(reason),
+            (Phase::Landed, _) => self.cause,
+            _ => None,
+        };
         self.phase = phase;
         self.reason = reason;
         self.entered = now;

@@ -165,6 +165,31 @@ fn an_abort_ends_land_only_while_the_vehicle_is_high() {
 }
 
 #[test]
+fn what_a_landing_is_for_is_kept_until_after_it() {
+    let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
+    let down = flown(20.0, |v| (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround));
+    let alarm = Inputs { alarm: Some((AlarmAction::Land, Reason::BatteryCritical)), ..at(1.0) };
+    let ready = seen(2.0, Progress::Ready(Reason::LowAndAligned));
+    for (inputs, cause) in [
+        (vec![alarm], Some(Reason::BatteryCritical)),
+        (vec![commanded(1.0, OperatorCommand::LandHere)], Some(Reason::OperatorLand)),
+        (vec![seen(1.0, Progress::Unchanged), ready], None),
+    ] {
+        let mut machine = StateMachine::new(PhaseConfig::default());
+        for input in [start()].iter().chain(&inputs).chain(&[land(2.2)]) {
+            machine.advance(input);
+        }
+        let lands = (Phase::Final, Reason::AutopilotLands, cause);
+        assert_eq!((machine.phase(), machine.reason(), machine.cause()), lands);
+        machine.advance(&down);
+        assert_eq!((machine.phase(), machine.cause()), (Phase::Landed, cause));
+        // The next landing has its own.
+        machine.advance(&commanded(90.0, OperatorCommand::Start));
+        assert_eq!((machine.phase(), machine.cause()), (Phase::Search, None));
+    }
+}
+
+#[test]
 fn landing_here_needs_no_marker_and_leaves_a_vehicle_that_may_not_in_the_air() {
     let here = |seconds| commanded(seconds, OperatorCommand::LandHere);
     let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
