@@ -319,7 +319,7 @@ impl Flight {
 
     /// A detector came or went.
     pub fn presence(&mut self, now_ns: i64, detector: &str, alive: bool) {
-        self.frames.selection.presence(now_ns, detector, alive);
+        self.frames.presence(now_ns, detector, alive);
         self.use_newest(now_ns);
     }
 
@@ -329,6 +329,7 @@ impl Flight {
             self.journal.reject("another-detectors-name");
             return;
         }
+        self.frames.heard(now_ns, &info.camera);
         self.frames.selection.set_place(now_ns, publisher, info.place);
         self.use_newest(now_ns);
     }

@@ -249,12 +249,17 @@ impl Selection {
 
     /// Lets time pass.
     pub fn tick(&mut self, now_ns: i64) {
+        let is_there = self.known_active().is_some_and(|active| active.alive);
         self.known.retain(|known| {
             let timeout_ns = if known.alive { SILENT_TIMEOUT_NS } else { GONE_TIMEOUT_NS };
             now_ns.saturating_sub(known.received_ns) < timeout_ns
         });
         self.compare_all(now_ns);
         self.choose(now_ns);
+        if is_there && self.active.is_none() {
+            let silence_s = SILENT_TIMEOUT_NS / 1_000_000_000;
+            self.why = format!("the last one has not searched a frame for {silence_s} s");
+        }
     }
 
     /// The frame to be used now, by its detector and stamp: the active detector's newest, if it is newer than

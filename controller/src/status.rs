@@ -145,7 +145,7 @@ impl View<'_> {
             }
             (State::LeavingOffboard { why, .. }, _) => (Phase::Idle, why.clone()),
             (State::Failed { why }, _) => (Phase::Failed, why.clone()),
-            (State::Landing, _) => (wire::phase(self.lander.phase()), self.reason()),
+            (State::Landing, _) => (wire::phase(self.lander.phase()), self.reason(now_ns)),
         }
     }
 
@@ -156,11 +156,20 @@ impl View<'_> {
     }
 
     /// The reason for the lander's phase.
-    fn reason(&self) -> String {
-        if self.is_landing() && self.frames.selection.is_blind() {
-            return "no detector is alive, nothing descends".to_owned();
-        }
-        let why = self.decision.map_or_else(String::new, |decision| decision.why.to_string());
+    fn reason(&self, now_ns: i64) -> String {
+        let no_frame = self.frames.no_frame(now_ns).filter(|_| self.is_landing());
+        let is_blind = self.is_landing() && self.frames.selection.is_blind();
+        let reason = self.decision.map(|decision| decision.why);
+        let why = match (reason, no_frame) {
+            // A detector that has searched nothing for long is forgotten by the selection, and is there all the same.
+            (Some(Reason::NoDetector), Some(no_frame)) => format!("nothing descends: {no_frame}"),
+            (_, Some(no_frame)) if is_blind => format!("nothing descends: {no_frame}"),
+            _ if is_blind => return Reason::NoDetector.to_string(),
+            (Some(reason), Some(no_frame)) if looks_for_marker(reason) => {
+                format!("{reason}: {no_frame}")
+            }
+            (reason, _) => reason.map_or_else(String::new, |reason| reason.to_string()),
+        };
         if let Some(reason) = self.cause() {
             return match self.lander.phase() {
                 landing::Phase::Landed => format!("{why}: {reason}"),
@@ -232,4 +241,16 @@ impl View<'_> {
     fn detection_age_ms(&self, now_ns: i64) -> Option<f64> {
         self.used.stamp_ns.map(|stamp| now_ns.saturating_sub(stamp) as f64 * 1e-6)
     }
+}
+
+/// True for the reasons that say that the marker is not seen.
+fn looks_for_marker(reason: Reason) -> bool {
+    matches!(
+        reason,
+        Reason::Searching
+            | Reason::TargetAging
+            | Reason::TargetLost
+            | Reason::TargetNotFound
+            | Reason::Retrying
+    )
 }

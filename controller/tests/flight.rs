@@ -9,7 +9,10 @@ use autopilot::dialect::{
 };
 use controller::flight::Flight;
 use controller::pad_note::PadNote;
-use messages::{CameraInfo, ControllerCommand, Detection, Detections, FrameHeader, Phase};
+use messages::{
+    CameraInfo, ControllerCommand, ControllerStatus, Detection, Detections, DetectorInfo,
+    FrameHeader, Phase, Place,
+};
 use node::clock_name;
 use packets::{
     MS, Sent, attitude, contact, flight, flight_with, header, heartbeat, hover, in_flight, pose,
@@ -512,6 +515,48 @@ fn a_landing_for_an_alarm_or_a_command_tells_why_until_after_it() {
     let (landing, landed) = told(&[], &command);
     assert_eq!(landing, "the operator's command to land here: the autopilot is landing");
     assert_eq!(landed, "landed and disarmed: the operator's command to land here");
+}
+
+#[test]
+fn a_camera_that_sends_nothing_is_told_of_and_its_detectors_are_not_said_to_have_gone() {
+    let mut flight = in_flight("airborne");
+    hover(&mut flight, 1000, 3000, 4);
+    let info = DetectorInfo {
+        detector: "main".into(),
+        host: "drone".into(),
+        place: Place::Onboard,
+        camera: "down".into(),
+        markers: Vec::new(),
+        version: "test".into(),
+        pid: 1,
+    };
+    let told = |status: &ControllerStatus| status.warnings.iter().any(|it| it.contains("no frame"));
+    // The frames end; the detector goes on telling about itself. After a minute the selection forgets it.
+    for ms in (3000..80_000).step_by(20) {
+        let now_ns = ms * MS;
+        if ms % 1000 == 0 {
+            receive(&mut flight, now_ns, &heartbeat(4, true));
+            flight.on_detector_info(now_ns, "main", &info);
+        }
+        pose(&mut flight, now_ns);
+        flight.tick(now_ns + 3);
+        let status = flight.status(now_ns + 3);
+        let gone = ["gone", "no detector is alive"];
+        assert!(!gone.iter().any(|it| status.why.contains(it)), "{status:?}");
+        assert!(!status.detector_why.contains("gone"), "{status:?}");
+        assert_eq!(told(&status), ms >= 4940, "after {ms} ms: {status:?}");
+        if ms == 16_000 {
+            let text = "no frame from camera `down` for 13 s: check the camera";
+            assert_eq!(status.warnings, [text]);
+            assert!(status.why.ends_with(text), "{}", status.why);
+        }
+    }
+    // One that has gone is told as before.
+    flight.presence(80_000 * MS, "main", false);
+    flight.tick(80_001 * MS);
+    let status = flight.status(80_001 * MS);
+    assert!(!told(&status), "{status:?}");
+    assert_eq!(status.why, "no detector is alive, nothing descends");
 }
 
 #[test]
