@@ -12,7 +12,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
-use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, topic};
+use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, Phase, topic};
 use node::access::{HOLDERS, Holder, Holders};
 use node::network::{AIR_PORT, AUTHORITY, Address, check_private};
 use node::{INSECURE, Network, Node, clock_name, stats};
@@ -396,9 +396,46 @@ struct Seen {
     healths: Vec<Health>,
     cameras: Vec<CameraInfo>,
     status: Option<ControllerStatus>,
+    /// Detectors that told about themselves or what they found: some tell no health.
+    detectors: BTreeSet<String>,
+    /// The time at the end of the watch, in nanoseconds.
+    ended_ns: i64,
     /// As JPEG.
     frames: Vec<ReceivedFrame>,
     raw_frames: Vec<ReceivedFrame>,
+}
+
+impl Seen {
+    /// Whether a camera or a detector was heard by what it is there for.
+    fn hears(&self, service: &str, instance: &str) -> bool {
+        match service {
+            "detector" => self.detectors.contains(instance),
+            "camera-pub" => {
+                let mut frames = self.frames.iter().chain(&self.raw_frames);
+                self.cameras.iter().any(|info| info.camera == instance)
+                    || frames.any(|frame| frame.header.camera == instance)
+            }
+            _ => false,
+        }
+    }
+
+    /// True while a landing is under way.
+    fn lands(&self) -> bool {
+        self.status.as_ref().is_some_and(|status| match status.phase {
+            Phase::Search
+            | Phase::Approach
+            | Phase::Descend
+            | Phase::Retry
+            | Phase::Hold
+            | Phase::Final => !status.finished,
+            _ => false,
+        })
+    }
+}
+
+/// Whether a site has a camera run on this machine.
+fn has_camera(expected: &[Job]) -> bool {
+    expected.iter().any(|job| job.service == Some(Service::CameraPub))
 }
 
 struct ReceivedFrame {
@@ -416,7 +453,7 @@ async fn check_network(findings: &mut Findings, node: Node, watched: Watched, ex
             check_presence(findings, &seen, expected, watched);
             check_replies(findings, &node, &seen).await;
             check_healths(findings, &seen);
-            cameras::check(findings, &seen, watched.duration.as_secs());
+            cameras::check(findings, &seen, watched, has_camera(expected));
             check_landing(findings, &seen);
         }
         Err(problem) => findings.wrong("network", format!("{problem:#}"), "start it again"),
@@ -426,10 +463,12 @@ async fn check_network(findings: &mut Findings, node: Node, watched: Watched, ex
 
 async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result<()> {
     seen.peers = node.list_peers().await?;
-    let (healths, cameras, statuses) = tokio::try_join!(
+    let (healths, cameras, statuses, infos, detections) = tokio::try_join!(
         node.subscriber(topic::HEALTH, &[]),
         node.subscriber(topic::CAMERA_INFO, &[]),
         node.subscriber(topic::STATUS, &[]),
+        node.subscriber(topic::DETECTOR_INFO, &[]),
+        node.subscriber(topic::DETECTIONS, &[]),
     )?;
     // JPEG frames fit every link; our cameras make them while there is a subscriber, others may not.
     let frames = node.frame_subscriber(topic::JPEG, &[]).await?;
@@ -452,12 +491,15 @@ async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result
                     keep(&mut seen.cameras, camera, |a, b| a.camera == b.camera);
                 }
                 Some(status) = statuses.next() => seen.status = Some(status),
+                Some(info) = infos.next() => drop(seen.detectors.insert(info.detector)),
+                Some(found) = detections.next() => drop(seen.detectors.insert(found.detector)),
                 Some(frame) = frames.next() => seen.frames.push(focus.received(frame)),
                 Some(frame) = next_raw() => seen.raw_frames.push(focus.received(frame)),
             }
         }
     };
     let _: Result<(), _> = timeout(watched.duration, watching).await;
+    seen.ended_ns = node::now_ns();
     // Peers that joined meanwhile.
     seen.peers.extend(node.list_peers().await?);
     seen.peers.sort();
@@ -526,34 +568,44 @@ async fn check_replies(findings: &mut Findings, node: &Node, seen: &Seen) {
     let mut replies = queries.join_all().await;
     replies.sort_by(|a, b| (&a.0, &a.1).cmp(&(&b.0, &b.1)));
     for (service, instance, times_ms) in replies {
-        let health = seen
-            .healths
-            .iter()
-            .find(|health| (&health.service, &health.instance) == (&service, &instance));
-        let who = match health {
-            Some(health) => {
-                format!("{service} `{instance}` on {} (alight {})", health.host, health.version)
-            }
-            None => format!("{service} `{instance}`"),
-        };
-        let lost = ROUND_TRIPS as usize - times_ms.len().min(ROUND_TRIPS as usize);
-        let Some(median_ms) = stats::quantile(&times_ms, 0.5) else {
-            findings.wrong(
-                "services",
-                format!("{who} does not answer"),
-                "it has another version, or it or the link hangs; see its log",
-            );
-            continue;
-        };
-        let took = format!("{who} answers in {median_ms:.1} ms");
-        match lost {
-            0 => findings.good("services", took),
-            _ => findings.doubtful(
-                "link",
-                format!("{took}; {lost} of {ROUND_TRIPS} queries were lost"),
-                "reduce the distance, or use a channel with less traffic",
-            ),
+        check_reply(findings, seen, (&service, &instance), &times_ms);
+    }
+}
+
+fn check_reply(
+    findings: &mut Findings,
+    seen: &Seen,
+    (service, instance): (&str, &str),
+    times_ms: &[f64],
+) {
+    let is_its = |health: &&Health| health.service == service && health.instance == instance;
+    let health = seen.healths.iter().find(is_its);
+    let who = match health {
+        Some(health) => {
+            format!("{service} `{instance}` on {} (alight {})", health.host, health.version)
         }
+        None => format!("{service} `{instance}`"),
+    };
+    let lost = ROUND_TRIPS as usize - times_ms.len().min(ROUND_TRIPS as usize);
+    let Some(median_ms) = stats::quantile(times_ms, 0.5) else {
+        // Cameras and detectors of others need not tell it (docs/wire-format.md).
+        if health.is_none() && seen.hears(service, instance) {
+            return findings.good("services", format!("{who} is heard (tells no health)"));
+        }
+        return findings.wrong(
+            "services",
+            format!("{who} does not answer"),
+            "it has another version, or it or the link hangs; see its log",
+        );
+    };
+    let took = format!("{who} answers in {median_ms:.1} ms");
+    match lost {
+        0 => findings.good("services", took),
+        _ => findings.doubtful(
+            "link",
+            format!("{took}; {lost} of {ROUND_TRIPS} queries were lost"),
+            "reduce the distance, or use a channel with less traffic",
+        ),
     }
 }
 
@@ -615,5 +667,37 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
             "the controller uses none".to_owned(),
             "check that one runs and gets frames",
         ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_camera_or_detector_that_tells_no_health_is_well_while_it_is_heard() {
+        let model = geometry::CameraModel::pinhole(640, 480, 1800.0);
+        let info = CameraInfo::new("down", &model, &geometry::Transform::identity());
+        let seen = Seen {
+            cameras: vec![info],
+            detectors: BTreeSet::from(["mine".to_owned()]),
+            ..Seen::default()
+        };
+        let told = |service, instance| {
+            let mut findings = Findings::default();
+            check_reply(&mut findings, &seen, (service, instance), &[]);
+            findings.text()
+        };
+        for (service, instance) in [("camera-pub", "down"), ("detector", "mine")] {
+            let text = told(service, instance);
+            let well = format!("{service} `{instance}` is heard (tells no health)");
+            assert!(text.contains(&well) && text.ends_with("Nothing is wrong."), "{text}");
+        }
+        for (service, instance) in
+            [("camera-pub", "up"), ("detector", "no"), ("controller", "mine")]
+        {
+            let text = told(service, instance);
+            assert!(text.contains("does not answer") && text.contains("1 wrong"), "{text}");
+        }
     }
 }

@@ -5,7 +5,7 @@ use std::fmt::Write;
 use messages::{CameraInfo, Health, PixelFormat};
 use node::{clock_name, stats};
 
-use super::{Findings, ReceivedFrame, Seen};
+use super::{Findings, ReceivedFrame, Seen, Watched};
 
 /// Maximum age of a frame on arrival, in milliseconds; a larger one is a wrong clock, or a link that is of no use.
 const MAX_AGE_MS: f64 = 1000.0;
@@ -19,8 +19,13 @@ const MAX_EDGE_WIDTH_PX: f64 = 4.0;
 /// Part of the frames that a camera may drop.
 const MAX_DROPPED: f64 = 0.02;
 
-/// Checks the cameras that were seen: calibration, frames, stamps, exposure, and what was dropped.
-pub(super) fn check(findings: &mut Findings, seen: &Seen, seconds: u64) {
+/// Silence after which a camera whose frames are needed is dead, in seconds.
+const MAX_SILENCE_S: f64 = 2.0;
+
+/// Checks the cameras that were seen: calibration, frames, stamps, exposure, and what was dropped. A site may have `has_camera`
+/// run on this machine.
+pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_camera: bool) {
+    let seconds = watched.duration.as_secs();
     for info in &seen.cameras {
         let camera = &info.camera;
         let Some([fx, fy]) = info.focal_px else {
@@ -85,13 +90,49 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, seconds: u64) {
             );
         }
     }
-    if all.is_empty() && !seen.peers.is_empty() {
+    let is_needed = has_camera || seen.lands();
+    let are_silent = is_needed && tell_silent(findings, seen, watched);
+    if all.is_empty() && !seen.peers.is_empty() && !are_silent {
         findings.doubtful(
             "camera",
             format!("no frame arrived within {seconds} s"),
             "check that a camera-pub runs, and the bandwidth of the link",
         );
     }
+}
+
+/// Tells of cameras whose frames have ended, or of none at all, where frames are needed; false when there is nothing to tell.
+fn tell_silent(findings: &mut Findings, seen: &Seen, watched: Watched) -> bool {
+    let watched_s = watched.duration.as_secs_f64();
+    let frames = || seen.frames.iter().chain(&seen.raw_frames);
+    let mut names: Vec<&str> = frames().map(|frame| frame.header.camera.as_str()).collect();
+    // Over an air link only JPEG frames come, which only our cameras make.
+    let is_ours = |name: &str| {
+        seen.healths.iter().any(|it| it.service == "camera-pub" && it.instance == name)
+    };
+    let infos = seen.cameras.iter().map(|info| info.camera.as_str());
+    names.extend(infos.filter(|name| watched.has_raw_frames || is_ours(name)));
+    names.sort_unstable();
+    names.dedup();
+    let mut silent: Vec<(String, f64)> = Vec::new();
+    if names.is_empty() && seen.cameras.is_empty() {
+        silent.push(("any camera".to_owned(), watched_s));
+    }
+    for name in names {
+        let of_camera = frames().filter(|frame| frame.header.camera == name);
+        let newest_ns = of_camera.map(|frame| frame.received_ns).max();
+        let since_s = |at_ns: i64| seen.ended_ns.saturating_sub(at_ns) as f64 * 1e-9;
+        silent.push((format!("camera `{name}`"), newest_ns.map_or(watched_s, since_s)));
+    }
+    silent.retain(|(_, silence_s)| *silence_s > MAX_SILENCE_S);
+    for (name, silence_s) in &silent {
+        findings.wrong(
+            "camera",
+            format!("no frame from {name} for {silence_s:.0} s, where a landing needs them"),
+            "on the drone: check the camera and its cable, see the output of its camera-pub (or of your own camera), and start it again",
+        );
+    }
+    !silent.is_empty()
 }
 
 fn implausible(info: &CameraInfo, focal_px: [f64; 2]) -> Option<String> {
@@ -267,7 +308,9 @@ fn ages_ms(frames: &[&ReceivedFrame]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::{Count, FrameHeader, Rate};
+    use std::time::Duration;
+
+    use messages::{ControllerStatus, Count, FrameHeader, Phase, Rate};
 
     fn frame(age_ms: i64, exposure_ns: u32) -> ReceivedFrame {
         let header = FrameHeader {
@@ -291,7 +334,9 @@ mod tests {
         let mount = geometry::Transform::identity();
         let mut findings = Findings::default();
         let cameras = vec![CameraInfo::new("down", &model, &mount)];
-        check(&mut findings, &Seen { cameras, healths, raw_frames: frames, ..Seen::default() }, 1);
+        let watched = Watched { duration: Duration::from_secs(1), has_raw_frames: true };
+        let seen = Seen { cameras, healths, raw_frames: frames, ..Seen::default() };
+        check(&mut findings, &seen, watched, false);
         findings.text()
     }
 
@@ -360,5 +405,38 @@ mod tests {
             other.contains("calibrated at 1280 x 480 pixels, but its frames have 640 x 480"),
             "{other}"
         );
+    }
+
+    #[test]
+    fn a_camera_whose_frames_ended_is_wrong_where_they_are_needed() {
+        let model = geometry::CameraModel::pinhole(640, 480, 1800.0);
+        let info = CameraInfo::new("down", &model, &geometry::Transform::identity());
+        let status = |phase| ControllerStatus { phase, ..ControllerStatus::default() };
+        let told = |phase, is_of_site, frames: Vec<ReceivedFrame>, cameras, ended_s: i64| {
+            let mut findings = Findings::default();
+            let watched = Watched { duration: Duration::from_secs(3), has_raw_frames: true };
+            let seen = Seen {
+                peers: vec![("controller".into(), "main".into())],
+                status: Some(status(phase)),
+                ended_ns: 1_000_000_000_000 + ended_s * 1_000_000_000,
+                raw_frames: frames,
+                cameras,
+                ..Seen::default()
+            };
+            check(&mut findings, &seen, watched, is_of_site);
+            findings.text()
+        };
+        let dead = "WRONG  camera        no frame from camera `down` for 3 s";
+        let silent = told(Phase::Search, false, Vec::new(), vec![info.clone()], 3);
+        assert!(silent.contains(dead) && silent.contains("on the drone"), "{silent}");
+        let ended = told(Phase::Search, false, vec![frame(30, 1)], vec![info.clone()], 3);
+        assert!(ended.contains(dead), "{ended}");
+        let here = told(Phase::Idle, true, Vec::new(), Vec::new(), 3);
+        assert!(here.contains("no frame from any camera for 3 s"), "{here}");
+        // It sends frames, or nobody needs them.
+        let well = told(Phase::Search, false, vec![frame(30, 1)], vec![info.clone()], 1);
+        assert!(well.ends_with("Nothing is wrong."), "{well}");
+        let idle = told(Phase::Idle, false, Vec::new(), vec![info], 3);
+        assert!(idle.contains("0 wrong, 1 doubtful"), "{idle}");
     }
 }
