@@ -99,6 +99,9 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                     let Some(request) = request else { return };
                     let is_last = request.message == DetectorCommand::Stop;
                     let reply = live.command(&request.message);
+                    if reply.accepted && !is_last {
+                        node.configuration_changed(node::to_toml(&live.config));
+                    }
                     request.answer(&reply).await;
                     if is_last {
                         tokio::time::sleep(FAREWELL).await;

@@ -7,8 +7,8 @@ use detector::Config;
 use imaging::GrayImage;
 use markers::{Drawing, Ink};
 use messages::{
-    BayerPattern, CameraInfo, CommandReply, Detections, DetectorCommand, FrameHeader, PixelFormat,
-    topic,
+    BayerPattern, CameraInfo, CommandReply, Configuration, Detections, DetectorCommand,
+    FrameHeader, PixelFormat, topic,
 };
 use node::{
     FramePublisher, Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, clock_name, now_ns,
@@ -195,6 +195,42 @@ async fn check_response(operator: &Node) -> anyhow::Result<()> {
     };
     let told = timeout(PATIENCE, configured).await.context("waiting for the response")??;
     ensure!((told.curve, told.sharpening) == (1.1, 0.5) && told.camera == "down", "{told:?}");
+    Ok(())
+}
+
+/// What a detector publishes as its configuration is what it was changed to last, also for those that come late.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_changed_parameter_is_in_the_published_configuration() -> anyhow::Result<()> {
+    let ([port], _, _) = ports::free()?;
+    let node = open("detector", "main", port).await?;
+    let operator = open("alight", "test", port).await?;
+    let layers = Layers { file: None, set: vec![format!("markers={ALL}")] };
+    let config = layers.load::<Config>()?;
+    let (telling, toml) = (node.clone(), config.table.to_string());
+    let telling = tokio::spawn(async move { telling.publish_configuration(toml).await });
+    let service = tokio::spawn(detector::run(node, config.settings, Shutdown::on_signals()?));
+    let told = operator.subscriber(topic::CONFIGURATION, &["detector", "main"]).await?;
+    let next_with = async |told: &Subscriber<Configuration>, value: &str| {
+        let wait = async {
+            while let Some(Configuration { toml, .. }) = told.next().await {
+                // The others stay.
+                ensure!(toml.contains("aruco-4x4-50:3:0.1"), "{toml}");
+                if toml.lines().any(|line| line == format!("min_confidence = {value}")) {
+                    return Ok(());
+                }
+            }
+            anyhow::bail!("the session is closed")
+        };
+        timeout(PATIENCE, wait).await.with_context(|| format!("waiting for {value}"))?
+    };
+    next_with(&told, "0.0").await?;
+    ensure!(!set(&operator, "min_confidence", "1.5").await?.accepted);
+    accept(&operator, "min_confidence", "0.75").await?;
+    next_with(&told, "0.75").await?;
+    let late = operator.subscriber(topic::CONFIGURATION, &["detector", "main"]).await?;
+    next_with(&late, "0.75").await?;
+    telling.abort();
+    service.abort();
     Ok(())
 }
 

@@ -9,7 +9,7 @@ wire! {
     Configuration = 17 v 1;
 }
 
-/// The configuration that a service started with.
+/// The configuration that a service uses.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Configuration {
     /// The service.

@@ -222,7 +222,7 @@ pub const HEALTH: Topic<Health> = Topic::new(
     ],
     BRIDGE,
 );
-/// The configuration that a service started with.
+/// The configuration that a service uses.
 pub const CONFIGURATION: Topic<Configuration> = Topic::new(
     "config/{service}/{instance}",
     Delivery::LastValue,

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail};
 use messages::{Configuration, topic};
+use tokio::sync::watch;
 use zenoh::handlers::RingChannelHandler;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::sample::{Sample, SampleKind};
@@ -69,6 +70,8 @@ pub struct Node {
     token: Arc<Mutex<Option<LivelinessToken>>>,
     /// Held from before the check for other instances until the service is announced.
     claim: Arc<Mutex<Option<LivelinessToken>>>,
+    /// The configuration that the service has changed to, as TOML; `None` while it is that of its start.
+    changed: Arc<watch::Sender<Option<String>>>,
     started_ns: i64,
 }
 
@@ -125,6 +128,7 @@ impl Node {
             health: Arc::default(),
             token: Arc::default(),
             claim: Arc::default(),
+            changed: Arc::new(watch::Sender::new(None)),
             started_ns: now_ns(),
         })
     }
@@ -315,8 +319,13 @@ impl Node {
         })
     }
 
-    /// Publishes the service's configuration once it is announced, and every few seconds for those that come late, until
-    /// it fails. One that is refused its name publishes none.
+    /// The service has changed its configuration to this TOML: [`Node::publish_configuration`] publishes it at once.
+    pub fn configuration_changed(&self, toml: String) {
+        self.changed.send_replace(Some(toml));
+    }
+
+    /// Publishes the service's configuration once it is announced, when it changes, and every few seconds for those that
+    /// come late, until it fails. One that is refused its name publishes none.
     ///
     /// # Errors
     /// When the session is closed.
@@ -327,7 +336,7 @@ impl Node {
             }
             let names = [self.identity.service, self.identity.instance.as_str()];
             let publisher = self.publisher(topic::CONFIGURATION, &names).await?;
-            let configuration = Configuration {
+            let mut configuration = Configuration {
                 service: self.identity.service.to_owned(),
                 instance: self.identity.instance.clone(),
                 host: host_name(),
@@ -335,8 +344,16 @@ impl Node {
                 toml,
             };
             let mut due = tokio::time::interval(CONFIGURATION_PERIOD);
+            let mut changed = self.changed.subscribe();
             loop {
-                due.tick().await;
+                tokio::select! {
+                    _ = due.tick() => {}
+                    // The sender lives as long as this node.
+                    _ = changed.changed() => {}
+                }
+                if let Some(toml) = changed.borrow_and_update().clone() {
+                    configuration.toml = toml;
+                }
                 publisher.publish(&configuration).await;
             }
         })

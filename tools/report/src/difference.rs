@@ -41,6 +41,20 @@ pub fn parameters_of_one(one: &Flight, other: &Flight) -> Vec<String> {
     names(one).symmetric_difference(&names(other)).cloned().collect()
 }
 
+/// The settings in which two configurations of a service differ, both as TOML.
+pub fn of_service(one: &str, other: &str) -> Vec<Difference> {
+    let settings = |text: &str| {
+        let mut settings = BTreeMap::new();
+        if let Ok(table) = text.parse::<toml::Table>() {
+            flatten("", &Value::Table(table), &mut |path, value| {
+                settings.insert(path, value);
+            });
+        }
+        settings
+    };
+    differences(&settings(one), &settings(other))
+}
+
 fn differences(
     one: &BTreeMap<String, String>,
     other: &BTreeMap<String, String>,
@@ -62,7 +76,9 @@ fn settings(flight: &Flight) -> BTreeMap<String, String> {
     let mut settings = BTreeMap::new();
     for (service, text) in &flight.configurations {
         match text.parse::<toml::Table>() {
-            Ok(table) => flatten(service, "", &Value::Table(table), &mut settings),
+            Ok(table) => flatten("", &Value::Table(table), &mut |path, value| {
+                settings.insert(format!("{service}: {path}"), value);
+            }),
             Err(problem) => {
                 settings.insert(format!("{service}: "), format!("cannot be read: {problem}"));
             }
@@ -71,17 +87,15 @@ fn settings(flight: &Flight) -> BTreeMap<String, String> {
     settings
 }
 
-fn flatten(service: &str, path: &str, value: &Value, into: &mut BTreeMap<String, String>) {
+fn flatten(path: &str, value: &Value, take: &mut impl FnMut(String, String)) {
     match value {
         Value::Table(table) => {
             for (key, value) in table {
                 let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
-                flatten(service, &path, value, into);
+                flatten(&path, value, take);
             }
         }
-        value => {
-            into.insert(format!("{service}: {path}"), value.to_string());
-        }
+        value => take(path.to_owned(), value.to_string()),
     }
 }
 

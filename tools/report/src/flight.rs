@@ -10,6 +10,7 @@ use messages::{
     Wind, decode, topic,
 };
 
+use crate::difference::{self, Difference};
 use crate::packets::Packets;
 
 /// Longest gap over which a position is interpolated, in nanoseconds.
@@ -51,6 +52,17 @@ pub struct Process {
     pub first: Health,
     /// The last.
     pub last: Health,
+}
+
+/// A service's change of a setting.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Change {
+    /// Service and instance.
+    pub service: String,
+    /// When the recorder got it, in nanoseconds of the recorder's clock.
+    pub received_ns: i64,
+    /// The key, and its value before and after.
+    pub setting: Difference,
 }
 
 /// What a replay of its tape found.
@@ -110,8 +122,10 @@ pub struct Flight {
     pub frames: BTreeMap<String, Vec<Frame>>,
     /// Processes by service, instance and process id.
     pub processes: BTreeMap<String, Process>,
-    /// Configurations as TOML, by service and instance.
+    /// The last configurations as TOML, by service and instance.
     pub configurations: BTreeMap<String, String>,
+    /// How services changed theirs, in order.
+    pub changes: Vec<Change>,
     /// Detectors by name.
     pub detectors: BTreeMap<String, DetectorInfo>,
     /// Cameras by name.
@@ -341,7 +355,14 @@ impl Flight {
             ["config", ..] => {
                 if let Some(configuration) = self.decoded(topic::CONFIGURATION, key, payload) {
                     let Configuration { service, instance, toml, .. } = configuration;
-                    self.configurations.insert(format!("{service}/{instance}"), toml);
+                    let service = format!("{service}/{instance}");
+                    if let Some(before) = self.configurations.get(&service) {
+                        let of_service =
+                            |setting| Change { service: service.clone(), received_ns, setting };
+                        let settings = difference::of_service(before, &toml);
+                        self.changes.extend(settings.into_iter().map(of_service));
+                    }
+                    self.configurations.insert(service, toml);
                 }
             }
             ["recorder", _, "status"] => {

@@ -4,7 +4,8 @@ use std::collections::BTreeSet;
 
 use messages::TapeEvent;
 
-use crate::flight::Flight;
+use crate::difference::Difference;
+use crate::flight::{Change, Flight};
 use crate::phases;
 
 /// Maximum number of lines; further ones are counted.
@@ -29,6 +30,7 @@ pub fn of(flight: &Flight) -> (Vec<Line>, usize) {
     lines.extend(commands(flight));
     lines.extend(autopilot(flight));
     lines.extend(processes(flight));
+    lines.extend(changes(flight));
     lines.sort_by(|one, other| one.time_s.total_cmp(&other.time_s));
     let left_out = lines.len().saturating_sub(MAX_LINES);
     lines.truncate(MAX_LINES);
@@ -158,4 +160,19 @@ fn processes(flight: &Flight) -> Vec<Line> {
         }
     }
     lines
+}
+
+/// Settings that services changed.
+fn changes(flight: &Flight) -> Vec<Line> {
+    let value = |value: &Option<String>| value.clone().unwrap_or_else(|| "nothing".to_owned());
+    let line = |change: &Change| {
+        let Difference { name, one, other } = &change.setting;
+        Line {
+            time_s: flight.at_s(flight.vehicle_ns(change.received_ns)),
+            who: change.service.clone(),
+            is_warning: false,
+            text: format!("setting `{name}` changed from {} to {}", value(one), value(other)),
+        }
+    };
+    flight.changes.iter().map(line).collect()
 }

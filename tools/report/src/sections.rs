@@ -1,6 +1,6 @@
 //! The sections of the page: what each says of a flight, and what was not recorded.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::chart::Chart;
 use crate::frames::Fate;
@@ -407,6 +407,13 @@ fn configuration(view: &View<'_>) -> Section {
     let mut section = section("configuration", "Configuration and parameters", "");
     if flight.configurations.is_empty() {
         section.before.push(missing("the configuration of the services"));
+    }
+    let changed: BTreeSet<&str> = flight.changes.iter().map(|it| it.service.as_str()).collect();
+    for service in changed {
+        let what = format!(
+            "The configuration of {service} was changed (the log says when); this is the last."
+        );
+        section.before.push(paragraph(&what));
     }
     for (service, toml) in &flight.configurations {
         section.after.push(details(service, Block::Lines(toml.clone())));

@@ -9,7 +9,7 @@ use experiments::landing::flight::fly_recorded;
 use experiments::landing::outcome::Outcome;
 use experiments::landing::plan::{Plan, Planned, Values, Vision};
 use flightlog::{About, Entry, Received, TapeReader, Writer};
-use messages::{ControllerStatus, Health, Message as _, Tape, encode};
+use messages::{Configuration, ControllerStatus, Health, Message as _, Tape, encode};
 use report::frames::Fate;
 use report::{Flight, FlightReader, comparison, document, page, replay_tapes, summary};
 
@@ -534,4 +534,34 @@ fn what_a_text_of_the_autopilot_says_stays_text() {
     flight.statuses.iter_mut().for_each(|status| status.why = "<script>alert(1)</script>".into());
     let html = page(&flight).unwrap();
     assert!(!html.contains("<script>") && !html.contains("<b>name"), "escaped");
+}
+
+#[test]
+fn a_setting_that_a_service_changed_is_told_with_its_time() {
+    let about = About { program: "test".to_owned(), facts: BTreeMap::new(), utc_offset_ns: 0 };
+    let mut recording = Vec::new();
+    let mut writer = Writer::new(&mut recording, &about).unwrap();
+    let tell = |writer: &mut Writer<&mut Vec<u8>>, is_thorough: bool, received_ns: i64| {
+        let configuration = Configuration {
+            service: "detector".to_owned(),
+            instance: "main".to_owned(),
+            host: "drone".to_owned(),
+            version: "0.1.0".to_owned(),
+            toml: format!("thorough = {is_thorough}\n[tracking]\nenabled = true\n"),
+        };
+        let (key, payload) = ("config/detector/main", encode(&configuration));
+        writer.receive(Received { key, payload: &payload, attachment: b"", received_ns }).unwrap();
+    };
+    for (is_thorough, at_s) in [(false, 3), (false, 6), (true, 8), (true, 9)] {
+        tell(&mut writer, is_thorough, at_s * 1_000_000_000);
+    }
+    writer.finish().unwrap();
+    let flight = read(&recording);
+    let change = flight.changes.first().unwrap();
+    assert_eq!((flight.changes.len(), change.received_ns), (1, 8_000_000_000));
+    let (lines, _) = report::journal::of(&flight);
+    let told = lines.iter().find(|line| line.who == "detector/main").unwrap();
+    assert_eq!(told.text, "setting `thorough` changed from false to true");
+    assert!((told.time_s - flight.at_s(8_000_000_000)).abs() < 1e-9, "{told:?}");
+    assert!(page(&flight).unwrap().contains("setting `thorough` changed from false to true"));
 }
