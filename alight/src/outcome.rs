@@ -364,8 +364,11 @@ impl Outcome {
 
 /// A phase and its reason, which may begin with the phase's name.
 pub(crate) fn phase_and_reason(status: &ControllerStatus) -> String {
-    let phase = format!("{}: ", status.phase);
-    if status.why.starts_with(&phase) { status.why.clone() } else { phase + &status.why }
+    let phase = status.phase.to_string();
+    let after = status.why.strip_prefix(&phase);
+    // As in "aborted: held too long" and "aborted by the operator".
+    let says_it = after.is_some_and(|after| after.starts_with(": ") || after.starts_with(" by "));
+    if says_it { status.why.clone() } else { format!("{phase}: {}", status.why) }
 }
 
 #[cfg(test)]
@@ -501,6 +504,16 @@ mod tests {
         for file in ["flight.mcap", "a/flights.mcap", "a/flight-x.mcap", "a/flight-2", "a/b.mcap"] {
             assert!(!ours.may_write(Path::new(file)), "{file}");
         }
+    }
+
+    #[test]
+    fn no_reason_doubles_the_word_of_its_phase() {
+        let told = |why: &str| {
+            phase_and_reason(&ControllerStatus { why: why.into(), ..status(Phase::Aborted) })
+        };
+        assert_eq!(told("aborted by the operator"), "aborted by the operator");
+        assert_eq!(told("aborted: held too long"), "aborted: held too long");
+        assert_eq!(told("the battery is low"), "aborted: the battery is low");
     }
 
     #[test]

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use autopilot::Event;
 use autopilot::command::SetpointError;
+use autopilot::dialect::MavSeverity;
 use landing::{Alarm, Decision, Phase};
 use node::HealthCounters;
 
@@ -117,7 +118,7 @@ impl Journal {
 
     /// Logs an alarm.
     pub fn alarm(&self, alarm: Alarm) {
-        tracing::warn!(?alarm, "Alarm");
+        tracing::warn!(%alarm, "Alarm");
         self.health.count("alarms");
     }
 
@@ -145,14 +146,26 @@ impl Journal {
             Event::SameAddress { .. } => tracing::warn!(
                 "Another companion uses our system and component id; change `autopilot.component_id` on one of them"
             ),
-            Event::Lost { silence } => tracing::error!(?silence, "Autopilot heartbeat lost"),
+            Event::Lost { silence } => {
+                let silence = format_args!("{:.1} s", silence.as_secs_f64());
+                tracing::error!(%silence, "Autopilot heartbeat lost");
+            }
             Event::Returned => tracing::info!("Autopilot heartbeat regained"),
             Event::Restarted => tracing::error!("Autopilot restarted"),
             Event::ArmedChanged(armed) => tracing::info!(armed, "Motors"),
-            Event::ModeChanged { from, to } => tracing::info!(?from, %to, "Flight mode"),
+            // The first one is no change.
+            Event::ModeChanged { from: None, to } => tracing::info!(mode = %to, "Flight mode"),
+            Event::ModeChanged { from: Some(from), to } => {
+                tracing::info!(%from, %to, "Flight mode");
+            }
             Event::LandedChanged { from, to } => tracing::info!(%from, %to, "Landed state"),
-            Event::ReadyChanged { ready, reasons } => tracing::info!(ready, ?reasons, "Readiness"),
-            Event::Text { severity, text } => tracing::info!(?severity, text, "Autopilot"),
+            Event::ReadyChanged { ready: true, .. } => tracing::info!("Ready to arm"),
+            Event::ReadyChanged { ready: false, reasons } => {
+                tracing::info!(reasons = reasons.join("; "), "Not ready to arm");
+            }
+            Event::Text { severity, text } => {
+                tracing::info!(severity = severity_name(*severity), text, "Autopilot");
+            }
             Event::Command { command, result: Ok(()), .. } => tracing::info!(%command, "Done"),
             Event::Command { result: Err(problem), .. } => {
                 self.health.failed("commands");
@@ -175,6 +188,84 @@ impl Journal {
             | Event::Attitude(_)
             | Event::Position(_)
             | Event::Range(_) => {}
+        }
+    }
+}
+
+/// A severity as people call it.
+fn severity_name(severity: MavSeverity) -> &'static str {
+    match severity {
+        MavSeverity::MAV_SEVERITY_EMERGENCY => "emergency",
+        MavSeverity::MAV_SEVERITY_ALERT => "alert",
+        MavSeverity::MAV_SEVERITY_CRITICAL => "critical",
+        MavSeverity::MAV_SEVERITY_ERROR => "error",
+        MavSeverity::MAV_SEVERITY_WARNING => "warning",
+        MavSeverity::MAV_SEVERITY_NOTICE => "notice",
+        MavSeverity::MAV_SEVERITY_INFO => "information",
+        MavSeverity::MAV_SEVERITY_DEBUG => "debug",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+    use std::sync::{Mutex, PoisonError};
+
+    use autopilot::FlightMode;
+
+    use super::*;
+
+    /// A log in memory.
+    #[derive(Clone, Default)]
+    struct Log(Arc<Mutex<Vec<u8>>>);
+
+    impl Write for Log {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            self.0.lock().unwrap_or_else(PoisonError::into_inner).write(bytes)
+        }
+
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn the_log_says_it_as_people_write_it() {
+        let log = Log::default();
+        let writer = log.clone();
+        let subscriber = tracing_subscriber::fmt()
+            .with_ansi(false)
+            .without_time()
+            .with_writer(move || writer.clone())
+            .finish();
+        tracing::subscriber::with_default(subscriber, || {
+            let journal = Journal::new(Arc::default());
+            journal.alarm(Alarm::AutopilotLost);
+            journal.autopilot(&Event::ModeChanged { from: None, to: FlightMode::Guided });
+            journal.autopilot(&Event::ModeChanged {
+                from: Some(FlightMode::Guided),
+                to: FlightMode::Land,
+            });
+            let reasons = vec!["no position".to_owned(), "no compass".to_owned()];
+            journal.autopilot(&Event::ReadyChanged { ready: false, reasons });
+            let severity = MavSeverity::MAV_SEVERITY_WARNING;
+            journal.autopilot(&Event::Text { severity, text: "Low".to_owned() });
+            journal.autopilot(&Event::Lost { silence: Duration::from_millis(3003) });
+        });
+        let told = log.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let told = std::str::from_utf8(&told).unwrap();
+        for wanted in [
+            "Alarm alarm=the link to the autopilot is lost",
+            "Flight mode mode=GUIDED",
+            "Flight mode from=GUIDED to=LAND",
+            "no position; no compass",
+            "warning",
+            "silence=3.0 s",
+        ] {
+            assert!(told.contains(wanted), "`{wanted}` is not in {told}");
+        }
+        for debug in ["Some(", "MAV_", "AutopilotLost", "["] {
+            assert!(!told.contains(debug), "`{debug}` is in {told}");
         }
     }
 }

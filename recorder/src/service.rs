@@ -354,17 +354,18 @@ impl Recorder {
         if let Some(problem) = disk.problem {
             bail!("{problem}");
         }
+        let shown = disk.path.map_or_else(String::new, |path| path.display().to_string());
         if disk.bytes > 0 && self.retry.take().is_some() {
-            tracing::warn!(file = ?disk.path, "Recording again");
+            tracing::warn!(file = %shown, "Recording again");
         }
         let stall_s = disk.stalled.as_secs();
         let stalls = disk.stalled >= STALLED;
         let problem = stalls.then(|| format!("the disk has taken nothing for {stall_s} s"));
         let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
         if stalls && status.problem.is_none() && self.health.failed("the disk takes nothing") {
-            tracing::error!(file = ?disk.path, "The disk takes nothing; waiting for it");
+            tracing::error!(file = %shown, "The disk takes nothing; waiting for it");
         }
-        status.file = disk.path.map_or_else(String::new, |path| path.display().to_string());
+        status.file = shown;
         status.bytes = disk.bytes;
         status.waiting_bytes = (disk.waiting_bytes + before_bytes) as u64;
         status.kept = self.kept;
@@ -422,7 +423,7 @@ impl Recorder {
                 disk.has_ended,
                 "the disk did not take the end of {name:?} within {END_PATIENCE:?}; `alight record --repair` ends it"
             );
-            tracing::info!(file = ?name, bytes = disk.bytes, messages = self.kept, "Recorded");
+            tracing::info!(file = %name.display(), bytes = disk.bytes, messages = self.kept, "Recorded");
         }
         ensure!(!is_missing, "nothing could be recorded at the end; see the log above");
         Ok(())

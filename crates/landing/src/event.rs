@@ -1,5 +1,7 @@
 //! The events that the lander reacts to.
 
+use std::fmt;
+
 use geometry::{Body, Camera, Marker, Ned, Pixel, Point, Rotation, Transform, Vector};
 use libm::fmax;
 use nalgebra::Matrix3;
@@ -62,6 +64,17 @@ pub enum Alarm {
     OperatorLost,
     /// The link to the autopilot is lost.
     AutopilotLost,
+}
+
+impl fmt::Display for Alarm {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::BatteryLow => "the battery is low",
+            Self::BatteryCritical => "the battery is nearly empty",
+            Self::OperatorLost => "the link to the operator is lost",
+            Self::AutopilotLost => "the link to the autopilot is lost",
+        })
+    }
 }
 
 /// How the autopilot follows velocity setpoints. The defaults are those of ArduPilot Copter 4.5.
