@@ -11,6 +11,7 @@ use anyhow::{Context, bail, ensure};
 use clap::Args;
 use markers::{Marker, Pad};
 use messages::topic;
+use node::network::variable;
 use node::{Layers, Network, Node, Shutdown, read_text};
 use tempfile::TempDir;
 use tokio::time::Instant;
@@ -60,6 +61,9 @@ pub(crate) struct LandArgs {
     /// Zenoh configuration (JSON5) [default: the built-in `local.json5`].
     #[arg(long, value_name = "FILE")]
     zenoh: Option<PathBuf>,
+    /// Port at which the processes of this landing meet, if it is free; otherwise another one is chosen, and told [default: 7447].
+    #[arg(long, value_name = "PORT", env = variable::MEET, value_parser = clap::value_parser!(u16).range(1..))]
+    meet: Option<u16>,
     /// Give up after this many seconds, from 1 to 86400.
     #[arg(long, default_value_t = 300.0, value_name = "SECONDS", value_parser = timeout_s)]
     timeout_s: f64,
@@ -262,9 +266,11 @@ fn ground_station(autopilot: Option<&str>) -> Vec<String> {
 
 async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<LandingSummary> {
     let shutdown = Shutdown::on_signals()?;
-    let rendezvous = Rendezvous::new(args.zenoh.as_deref())?;
+    let rendezvous = Rendezvous::new(args.zenoh.as_deref(), args.meet)?;
     // Its own file is checked as those of the services are: nothing listens beyond this machine by accident.
-    let network = Network { config: Some(rendezvous.file.clone()), ..Network::default() };
+    // Of a user's file the services read ALIGHT_MEET as well.
+    let meet = args.zenoh.as_ref().and(args.meet);
+    let network = Network { config: Some(rendezvous.file.clone()), meet, ..Network::default() };
     let zenoh = network.source(OPERATOR)?;
     let node = Node::open_tool(tool_identity("land"), &zenoh).await?;
     let mut progress = Progress::new(args.format);
@@ -275,9 +281,9 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     ));
     if let Some(port) = rendezvous.unusual_port {
         progress.say(&format!(
-            "Port {usual} is in use, by another landing, a detector that was left running or another program (`ss -ltnp 'sport = :{usual}'` \
+            "Port {wanted} is in use, by another landing, a detector that was left running or another program (`ss -ltnp 'sport = :{wanted}'` \
              names it): other commands find this landing with `export ALIGHT_MEET={port}`",
-            usual = node::session::LOCAL_PORT
+            wanted = args.meet.unwrap_or(node::session::LOCAL_PORT)
         ));
     }
     if let Some(address) = args.dashboard {
@@ -450,7 +456,7 @@ fn consequence(service: Service) -> &'static str {
 struct Rendezvous {
     file: PathBuf,
     description: String,
-    /// The port, if it is not the usual one of a machine.
+    /// The port, if it is not the one at which other commands look for it.
     unusual_port: Option<u16>,
     /// Is deleted at the end, with what is in it.
     directory: TempDir,
@@ -459,8 +465,8 @@ struct Rendezvous {
 }
 
 impl Rendezvous {
-    /// The user's file, or the built-in configuration at its usual port or at a free one.
-    fn new(user_file: Option<&Path>) -> anyhow::Result<Self> {
+    /// The user's file, or the built-in configuration at the port that is wanted, the usual one if none is, or at a free one.
+    fn new(user_file: Option<&Path>, wanted: Option<u16>) -> anyhow::Result<Self> {
         let directory = tempfile::Builder::new()
             .prefix("alight-")
             .tempdir()
@@ -470,16 +476,16 @@ impl Rendezvous {
             let description = file.display().to_string();
             return Ok(Self { file, description, unusual_port: None, directory, _claim: None });
         }
-        let usual = node::session::LOCAL_PORT;
-        let (port, lock) = match claim(usual) {
-            Ok(lock) => (usual, lock),
+        let wanted = wanted.unwrap_or(node::session::LOCAL_PORT);
+        let (port, lock) = match claim(wanted) {
+            Ok(lock) => (wanted, lock),
             Err(_) => free_port()?,
         };
         let file = directory.path().join("zenoh.json5");
         std::fs::write(&file, node::session::local_config(port))
             .with_context(|| format!("writing {file:?}"))?;
         let description = format!("local, rendezvous at port {port}");
-        let unusual_port = (port != usual).then_some(port);
+        let unusual_port = (port != wanted).then_some(port);
         Ok(Self { file, description, unusual_port, directory, _claim: Some(lock) })
     }
 }
@@ -545,10 +551,35 @@ mod tests {
 
     #[test]
     fn landings_that_begin_at_once_meet_at_different_ports() -> anyhow::Result<()> {
-        let [first, second] = [Rendezvous::new(None)?, Rendezvous::new(None)?];
+        let [first, second] = [Rendezvous::new(None, None)?, Rendezvous::new(None, None)?];
         let [told, other] = [&first, &second].map(|it| std::fs::read_to_string(&it.file));
         assert_ne!(told?, other?, "{} and {}", first.description, second.description);
         Ok(())
+    }
+
+    #[test]
+    fn a_landing_meets_at_the_port_that_is_asked_for_and_tells_of_another_one() -> anyhow::Result<()>
+    {
+        let (port, lock) = free_port()?;
+        drop(lock);
+        let args = Tool::parse_from(["land", "--meet", &port.to_string()]).land;
+        let asked = Rendezvous::new(None, args.meet)?;
+        let config = std::fs::read_to_string(&asked.file)?;
+        assert!(config.contains(&format!("127.0.0.1:{port}")), "{config}");
+        assert_eq!(asked.unusual_port, None);
+        // The first one keeps it.
+        let other = Rendezvous::new(None, args.meet)?;
+        assert!(other.unusual_port.is_some_and(|it| it != port), "{}", other.description);
+        assert!(Tool::try_parse_from(["land", "--meet", "0"]).is_err());
+        Ok(())
+    }
+
+    #[test]
+    fn the_environment_says_where_a_landing_meets() {
+        use clap::CommandFactory as _;
+        let tool = Tool::command();
+        let meet = tool.get_arguments().find(|argument| argument.get_id() == "meet").unwrap();
+        assert_eq!(meet.get_env(), Some(std::ffi::OsStr::new("ALIGHT_MEET")));
     }
 
     #[test]
