@@ -16,8 +16,9 @@ const FONT: u32 = 28;
 const MIN_STEP: f64 = 2.0;
 /// Width of a chart in pixels as shown.
 pub const WIDTH: u32 = 560;
-/// Space for the names left of an axis, and below one, in pixels of the drawing.
-const LEFT: u32 = 92;
+/// Space for the names left of an axis, and below one, in pixels of the drawing: left for the longest number, as in -0.015, with the unit
+/// beside it.
+const LEFT: u32 = 144;
 const LEFT_OF_ROWS: u32 = 250;
 const BELOW: u32 = 78;
 const MARGIN: u32 = 16;
@@ -110,6 +111,8 @@ pub enum Shape {
     Steps,
     /// Dots.
     Dots,
+    /// Large dots, behind others that they would hide or be hidden by.
+    LargeDots,
     /// The inside of a closed line.
     Area,
     /// Crosses.
@@ -328,7 +331,8 @@ impl Chart {
         for layer in self.layers.iter().filter(|it| !it.name.is_empty() && !it.points.is_empty()) {
             let form = match layer.shape {
                 Shape::Area => "area",
-                Shape::Dots | Shape::Crosses => "dot",
+                Shape::Dots | Shape::LargeDots => "dot",
+                Shape::Crosses => "cross",
                 Shape::Line | Shape::Wide | Shape::Thin | Shape::Steps => "line",
             };
             // Writing to a string cannot fail.
@@ -383,10 +387,11 @@ fn draw_layer<Backend: DrawingBackend<ErrorType: 'static>>(
                 chart.draw_series([Polygon::new(outline, ink.mix(0.2).filled())])?;
             }
         }
-        Shape::Dots => {
+        Shape::Dots | Shape::LargeDots => {
             let style = ink.mix(0.7).filled();
             let dots = apart(finite().copied(), pixels);
-            chart.draw_series(dots.into_iter().map(|dot| Circle::new(dot, 5, style)))?;
+            let radius = if layer.shape == Shape::LargeDots { 9 } else { 5 };
+            chart.draw_series(dots.into_iter().map(|dot| Circle::new(dot, radius, style)))?;
         }
         Shape::Crosses => {
             let style = ink.stroke_width(4);
@@ -492,5 +497,39 @@ mod tests {
         assert!(x.end - x.start > y.end - y.start, "{x:?} {y:?}");
         let svg = chart.svg().unwrap();
         assert!(svg.contains("a &lt; b") && svg.contains("<polyline"), "{svg}");
+    }
+
+    #[test]
+    fn the_unit_is_left_of_the_longest_numbers() {
+        let chart = Chart {
+            title: "error".to_owned(),
+            axes: Axes {
+                x_name: "s".to_owned(),
+                y_name: "m".to_owned(),
+                x: 0.0..1.0,
+                y: -0.019..0.019,
+                is_equal: false,
+            },
+            bands: Vec::new(),
+            layers: vec![layer("line", Ink::Blue, Shape::Line, [at(0.0, 0.0), at(1.0, 0.01)])],
+            rows: Vec::new(),
+            height: 270,
+            note: String::new(),
+        };
+        let svg = chart.svg().unwrap();
+        // Each text with the number after `x="` of its element.
+        let texts: Vec<(f64, &str)> = svg
+            .split("<text ")
+            .skip(1)
+            .map(|text| {
+                let x = text.split("x=\"").nth(1).unwrap().split('"').next().unwrap();
+                let said = text.split('>').nth(1).unwrap().split('<').next().unwrap().trim();
+                (x.parse().unwrap(), said)
+            })
+            .collect();
+        let unit = texts.iter().find(|(_, said)| *said == "m").unwrap().0;
+        let (end, longest) = texts.iter().find(|(_, said)| *said == "-0.015").unwrap();
+        let begin = end - 0.6 * f64::from(FONT) * longest.len() as f64;
+        assert!(unit + f64::from(FONT) < begin, "the unit at {unit}, the number from {begin}");
     }
 }

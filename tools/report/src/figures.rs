@@ -114,8 +114,15 @@ fn sample(layer: &Layer, left: f64, middle: u32) -> String {
                 "<rect x=\"{left:.0}\" y=\"{top}\" width=\"{SAMPLE}\" height=\"18\" fill=\"{colour}\" fill-opacity=\"0.3\"/>"
             )
         }
-        Shape::Dots | Shape::Crosses => {
+        Shape::Dots | Shape::LargeDots => {
             format!("<circle cx=\"{centre:.0}\" cy=\"{middle}\" r=\"6\" fill=\"{colour}\"/>")
+        }
+        Shape::Crosses => {
+            let (west, east) = (centre - 7.0, centre + 7.0);
+            let (north, south) = (middle - 7, middle + 7);
+            format!(
+                "<path d=\"M{west:.0} {north}L{east:.0} {south}M{west:.0} {south}L{east:.0} {north}\" stroke=\"{colour}\" stroke-width=\"3\"/>"
+            )
         }
         Shape::Line | Shape::Wide | Shape::Thin | Shape::Steps => format!(
             "<line x1=\"{left:.0}\" x2=\"{right:.0}\" y1=\"{middle}\" y2=\"{middle}\" stroke=\"{colour}\" stroke-width=\"5\"/>"

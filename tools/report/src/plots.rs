@@ -15,6 +15,8 @@ const HEIGHT: u32 = 270;
 const MAX_SECOND: f64 = 1e6;
 /// Number of ellipses of uncertainty in the view from above.
 const CIRCLES: usize = 14;
+/// Largest radius of one that is drawn, relative to what the picture spans without them.
+const MAX_CIRCLE: f64 = 0.5;
 /// Names of the axes of local NED.
 const NED: [&str; 3] = ["north", "east", "down"];
 /// The standard deviations that are drawn.
@@ -54,7 +56,13 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
     let mut above = Vec::new();
     let reach = span(places().flat_map(|it| [it.east_m, it.north_m]), -0.3..0.3);
     let step = estimated.len().div_ceil(CIRCLES).max(1);
-    let circles = estimated.iter().step_by(step).flat_map(|it| circle(it, &reach));
+    // A circle is whole or not there: those of moderate size make the picture larger, the others would make the rest small.
+    let max_radius_m = MAX_CIRCLE * (reach.end - reach.start);
+    let (drawn, left_out): (Vec<&Place>, Vec<&Place>) =
+        estimated.iter().step_by(step).partition(|it| SIGMAS * it.deviation_m <= max_radius_m);
+    let circles: Vec<At> = drawn.into_iter().flat_map(circle).collect();
+    let around = circles.iter().flat_map(|it| [it.x, it.y]).filter(|it| it.is_finite());
+    let reach = span(around, reach);
     above.push(layer("circles: 2 standard deviations", Ink::Blue, Shape::Thin, circles));
     let from_above = |places: &[Place]| unbridged(places, |it| it.time_s, away);
     above.push(layer("truth", Ink::Orange, Shape::Wide, from_above(&truth)));
@@ -100,7 +108,11 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
         layers: above,
         rows: Vec::new(),
         height: 430,
-        note: String::new(),
+        note: match left_out.len() {
+            0 => String::new(),
+            1 => "a larger circle is left out".to_owned(),
+            count => format!("{count} larger circles are left out"),
+        },
     };
     let from_the_side = Chart {
         title: "From the side, along the way from the start to the pad".to_owned(),
@@ -112,21 +124,20 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
             is_equal: false,
         },
         layers,
+        note: String::new(),
         ..from_above.clone()
     };
     vec![from_above, from_the_side]
 }
 
-/// The circle of a place's uncertainty, as far as it is within reach.
-fn circle(place: &Place, reach: &std::ops::Range<f64>) -> Vec<At> {
+/// The circle of a place's uncertainty, and a gap after it.
+fn circle(place: &Place) -> Vec<At> {
     let radius_m = SIGMAS * place.deviation_m;
     let around = (0..=24).map(|part| {
         let (sin, cos) = (TAU * f64::from(part) / 24.0).sin_cos();
         at(place.east_m + radius_m * sin, place.north_m + radius_m * cos)
     });
-    let is_within = |point: &At| reach.contains(&point.x) && reach.contains(&point.y);
-    let within = around.map(|point| if is_within(&point) { point } else { at(f64::NAN, f64::NAN) });
-    within.chain([at(f64::NAN, f64::NAN)]).collect()
+    around.chain([at(f64::NAN, f64::NAN)]).collect()
 }
 
 /// Height, distance from the pad, and the error of the estimate.
@@ -251,7 +262,7 @@ pub fn latency(view: &View<'_>) -> Vec<Chart> {
     let setpoints = in_use().filter_map(|it| point(it.exposed_ns, it.setpoint_ns?));
     let detected = in_use().filter_map(|it| point(it.exposed_ns, it.handled_ns));
     let layers = vec![
-        layer("exposure to setpoint", Ink::Orange, Shape::Dots, setpoints),
+        layer("exposure to setpoint", Ink::Orange, Shape::LargeDots, setpoints),
         layer("exposure to detections at the controller", Ink::Blue, Shape::Dots, detected),
     ];
     let mut chart = over_time(view, "Age of what is used", "ms", layers);
@@ -274,24 +285,28 @@ pub fn latency(view: &View<'_>) -> Vec<Chart> {
     vec![chart]
 }
 
-/// True and estimated wind.
+/// True and estimated wind, as one speaks of it: by where it comes from.
 pub fn wind(view: &View<'_>) -> Vec<Chart> {
     let flight = view.flight;
-    let axis = |axis: usize| {
+    let axis = |axis: usize, from: &str, against: &str| {
         let truth = view.curve(&flight.wind, |it| {
-            Some(at(flight.at_s(it.stamp_ns), component(it.velocity_ned_m_s, axis)))
+            Some(at(flight.at_s(it.stamp_ns), -component(it.velocity_ned_m_s, axis)))
         });
         let estimate = view.curve(&flight.targets, |it| {
-            Some(at(flight.at_s(it.stamp_ns), *it.wind_ned_m_s?.get(axis)?))
+            Some(at(flight.at_s(it.stamp_ns), -*it.wind_ned_m_s?.get(axis)?))
         });
         let layers = vec![
             layer("truth", Ink::Orange, Shape::Line, truth),
             layer("estimate from the tilt", Ink::Blue, Shape::Line, estimate),
         ];
-        let name = NED.get(axis).copied().unwrap_or_default();
-        over_time(view, &format!("Air moving to the {name}"), "m/s", layers)
+        over_time(
+            view,
+            &format!("Wind from the {from} (negative: from the {against})"),
+            "m/s",
+            layers,
+        )
     };
-    vec![axis(0), axis(1)]
+    vec![axis(0, "north", "south"), axis(1, "east", "west")]
 }
 
 /// Battery and link.

@@ -10,7 +10,10 @@ use experiments::landing::outcome::Outcome;
 use experiments::landing::plan::{Plan, Planned, Values, Vision};
 use flightlog::{About, Entry, Received, TapeReader, Writer};
 use messages::{Configuration, ControllerStatus, Health, Message as _, Tape, encode};
+use report::chart::Shape;
 use report::frames::Fate;
+use report::plots;
+use report::view::View;
 use report::{Flight, FlightReader, comparison, document, page, replay_tapes, summary};
 
 /// The sections that a page has.
@@ -140,6 +143,51 @@ fn a_page_has_every_section_and_needs_nothing_else() {
     assert!(html.contains("Not recorded: the health of the processes"), "health");
     assert!(html.contains("descending over the marker"), "reasons");
     assert!(html.len() < 2_000_000, "{} bytes", html.len());
+}
+
+#[test]
+fn the_wind_is_told_by_where_it_comes_from() {
+    let mut flight = read(&landing().recording);
+    for wind in &mut flight.wind {
+        wind.velocity_ned_m_s = [-4.0, 2.0, 0.0];
+    }
+    let charts = plots::wind(&View::new(&flight));
+    assert_eq!(charts[0].title, "Wind from the north (negative: from the south)");
+    for (chart, from_m_s) in charts.iter().zip([4.0, -2.0]) {
+        let truth: Vec<f64> = chart.layers[0].points.iter().map(|it| it.y).collect();
+        let drawn: Vec<f64> = truth.into_iter().filter(|speed| speed.is_finite()).collect();
+        assert!(!drawn.is_empty() && drawn.iter().all(|speed| *speed == from_m_s), "{drawn:?}");
+    }
+}
+
+#[test]
+fn circles_of_the_deviation_are_whole_and_the_large_ones_are_left_out_aloud() {
+    let flight = read(&landing().recording);
+    let mut view = View::new(&flight);
+    let end_s = view.estimated.last().unwrap().time_s;
+    for place in &mut view.estimated {
+        place.deviation_m = if place.time_s < 0.5 * end_s { 50.0 } else { 0.2 };
+    }
+    let charts = plots::landing(&view);
+    let (axes, circles) = (&charts[0].axes, &charts[0].layers[0].points);
+    assert!(circles.iter().any(|it| it.x.is_finite()), "no circle");
+    for run in circles.split(|it| !it.x.is_finite()).filter(|run| !run.is_empty()) {
+        assert_eq!(run.len(), 25, "a circle has a part only");
+        assert!(run.iter().all(|it| axes.x.contains(&it.x) && axes.y.contains(&it.y)), "{axes:?}");
+    }
+    assert!(charts[0].note.contains("left out"), "{}", charts[0].note);
+    assert_eq!(charts[1].note, "");
+}
+
+#[test]
+fn a_legend_shows_crosses_as_crosses_and_no_dots_hide_others() {
+    let flight = read(&landing().recording);
+    let html = page(&flight).unwrap();
+    assert!(html.contains("<i class=\"cross text\"></i>pad"));
+    let chart = plots::latency(&View::new(&flight)).swap_remove(0);
+    let shapes: Vec<Shape> = chart.layers.iter().map(|layer| layer.shape).take(2).collect();
+    // The hindmost first.
+    assert_eq!(shapes, [Shape::LargeDots, Shape::Dots]);
 }
 
 #[test]
