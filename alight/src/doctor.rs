@@ -568,14 +568,15 @@ async fn check_replies(findings: &mut Findings, node: &Node, seen: &Seen) {
     let mut replies = queries.join_all().await;
     replies.sort_by(|a, b| (&a.0, &a.1).cmp(&(&b.0, &b.1)));
     for (service, instance, times_ms) in replies {
-        check_reply(findings, seen, (&service, &instance), &times_ms);
+        check_reply(findings, seen, &service, &instance, &times_ms);
     }
 }
 
 fn check_reply(
     findings: &mut Findings,
     seen: &Seen,
-    (service, instance): (&str, &str),
+    service: &str,
+    instance: &str,
     times_ms: &[f64],
 ) {
     let is_its = |health: &&Health| health.service == service && health.instance == instance;
@@ -685,7 +686,7 @@ mod tests {
         };
         let told = |service, instance| {
             let mut findings = Findings::default();
-            check_reply(&mut findings, &seen, (service, instance), &[]);
+            check_reply(&mut findings, &seen, service, instance, &[]);
             findings.text()
         };
         for (service, instance) in [("camera-pub", "down"), ("detector", "mine")] {

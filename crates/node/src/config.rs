@@ -239,9 +239,7 @@ fn effective<T: Settings>(mut table: Table, layers: &[Layer]) -> Result<Effectiv
 /// word that an enumeration lacks. The reader of a table does not say where it stood, so that each value is tried alone.
 fn refusal<T: Settings>(mut table: Table, layers: &[Layer], cause: &TableError) -> ConfigError {
     for layer in layers {
-        let mut values = Vec::new();
-        single_values(&layer.table, &mut Vec::new(), &mut values);
-        for (path, value) in values {
+        for (path, value) in single_values(&layer.table) {
             let key = path.join(".");
             let mut single = Table::new();
             if let Some((last, parents)) = path.split_last() {
@@ -269,19 +267,19 @@ fn refusal<T: Settings>(mut table: Table, layers: &[Layer], cause: &TableError) 
 }
 
 /// The values below a table that are no tables, with their paths.
-fn single_values<'a>(
-    table: &'a Table,
-    path: &mut Vec<&'a str>,
-    values: &mut Vec<(Vec<&'a str>, &'a Value)>,
-) {
+fn single_values(table: &Table) -> Vec<(Vec<&str>, &Value)> {
+    let mut values = Vec::new();
     for (name, value) in table {
-        path.push(name);
-        match value {
-            Value::Table(inner) => single_values(inner, path, values),
-            value => values.push((path.clone(), value)),
+        let Value::Table(inner) = value else {
+            values.push((vec![name.as_str()], value));
+            continue;
+        };
+        for (mut path, value) in single_values(inner) {
+            path.insert(0, name);
+            values.push((path, value));
         }
-        path.pop();
     }
+    values
 }
 
 fn parse(name: &str, text: &str) -> Result<Table, ConfigError> {

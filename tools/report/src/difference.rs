@@ -5,17 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use toml::Value;
 
 use crate::flight::Flight;
-
-/// A value that two flights do not share.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Difference {
-    /// Its name: service and key, or parameter.
-    pub name: String,
-    /// In the first flight; `None` when it has no such key.
-    pub one: Option<String>,
-    /// In the second.
-    pub other: Option<String>,
-}
+use crate::settings::{Difference, differences, flatten};
 
 /// The settings in which the services of two flights differ.
 pub fn configurations(one: &Flight, other: &Flight) -> Vec<Difference> {
@@ -41,36 +31,6 @@ pub fn parameters_of_one(one: &Flight, other: &Flight) -> Vec<String> {
     names(one).symmetric_difference(&names(other)).cloned().collect()
 }
 
-/// The settings in which two configurations of a service differ, both as TOML.
-pub fn of_service(one: &str, other: &str) -> Vec<Difference> {
-    let settings = |text: &str| {
-        let mut settings = BTreeMap::new();
-        if let Ok(table) = text.parse::<toml::Table>() {
-            flatten("", &Value::Table(table), &mut |path, value| {
-                settings.insert(path, value);
-            });
-        }
-        settings
-    };
-    differences(&settings(one), &settings(other))
-}
-
-fn differences(
-    one: &BTreeMap<String, String>,
-    other: &BTreeMap<String, String>,
-) -> Vec<Difference> {
-    let names: BTreeSet<&String> = one.keys().chain(other.keys()).collect();
-    names
-        .into_iter()
-        .filter(|name| one.get(*name) != other.get(*name))
-        .map(|name| Difference {
-            name: name.clone(),
-            one: one.get(name).cloned(),
-            other: other.get(name).cloned(),
-        })
-        .collect()
-}
-
 /// All settings of a flight by `service/instance: key`.
 fn settings(flight: &Flight) -> BTreeMap<String, String> {
     let mut settings = BTreeMap::new();
@@ -85,18 +45,6 @@ fn settings(flight: &Flight) -> BTreeMap<String, String> {
         }
     }
     settings
-}
-
-fn flatten(path: &str, value: &Value, take: &mut impl FnMut(String, String)) {
-    match value {
-        Value::Table(table) => {
-            for (key, value) in table {
-                let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
-                flatten(&path, value, take);
-            }
-        }
-        value => take(path.to_owned(), value.to_string()),
-    }
 }
 
 #[cfg(test)]

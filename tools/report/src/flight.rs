@@ -10,8 +10,8 @@ use messages::{
     Wind, decode, topic,
 };
 
-use crate::difference::{self, Difference};
 use crate::packets::Packets;
+use crate::settings::{self, Difference};
 
 /// Longest gap over which a position is interpolated, in nanoseconds.
 const MAX_GAP_NS: i64 = 500_000_000;
@@ -359,7 +359,7 @@ impl Flight {
                     if let Some(before) = self.configurations.get(&service) {
                         let of_service =
                             |setting| Change { service: service.clone(), received_ns, setting };
-                        let settings = difference::of_service(before, &toml);
+                        let settings = settings::of_service(before, &toml);
                         self.changes.extend(settings.into_iter().map(of_service));
                     }
                     self.configurations.insert(service, toml);

@@ -4,9 +4,9 @@ use std::collections::BTreeSet;
 
 use messages::TapeEvent;
 
-use crate::difference::Difference;
 use crate::flight::{Change, Flight};
 use crate::phases;
+use crate::settings::Difference;
 
 /// Maximum number of lines; further ones are counted.
 const MAX_LINES: usize = 2000;

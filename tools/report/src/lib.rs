@@ -7,7 +7,7 @@
 //! one landing of it; [`frames`] tells
 //! what became of each frame, [`latency`] how long it took, [`track`] where the vehicle was, [`phases`] and [`journal`]
 //! what happened and why, [`losses`] what is missing, [`tape`] whether the tape
-//! gives the same again, and [`mod@summary`] all of it in numbers. [`difference`] compares
+//! gives the same again, and [`mod@summary`] all of it in numbers. [`difference`], over [`settings`], compares
 //! configurations. [`view`] joins these for the page: [`plots`] are its charts, drawn by [`chart`], [`sections`] its
 //! parts, in pieces of [`html`], and [`mod@page`] the whole, [`mod@document`] the same on the pages of a [`pdf`] file. [`mod@figures`] are the charts as files of their own.
 
@@ -28,6 +28,7 @@ pub mod pdf;
 pub mod phases;
 pub mod plots;
 pub mod sections;
+pub mod settings;
 pub mod summary;
 pub mod tape;
 pub mod track;

@@ -3,11 +3,12 @@
 use std::fmt::Write as _;
 
 use crate::chart::Chart;
-use crate::difference::{Difference, configurations, parameters, parameters_of_one};
+use crate::difference::{configurations, parameters, parameters_of_one};
 use crate::flight::Flight;
 use crate::html::{Block, Cell, all_as_html, escaped, missing, number, paragraph, table, text};
 use crate::plots::share_axes;
 use crate::sections::{self, Section};
+use crate::settings::Difference;
 use crate::summary::Summary;
 use crate::view::View;
 

@@ -423,7 +423,7 @@ fn a_landing_that_follows_an_aborted_one_is_shown_whole() {
     (earlier.stamp_ns, earlier.error_m) = (started_ns - 5_000_000_000, 7.0);
     before.touchdown = Some(earlier);
     flight.truth.insert(0, before);
-    let view = report::view::View::new(&flight);
+    let view = View::new(&flight);
     let lasted_s = view.summary.time_to_disarm_s.unwrap();
     assert!(view.time.end > lasted_s, "{:?} of {lasted_s} s", view.time);
     assert!(view.summary.touchdown_error_m.unwrap() < 1.0, "that of the landing before");
