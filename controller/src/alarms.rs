@@ -90,13 +90,13 @@ pub fn too_empty(settings: &AlarmSettings, battery: &Battery) -> Option<String> 
         volts.filter(|volts| battery_critical_v > 0.0 && *volts <= battery_critical_v)
     {
         return Some(format!(
-            "no takeoff: the battery has {volts:.1} V, and is critical at {battery_critical_v} V and below (`alarms.battery_critical_v`); charge it, or correct the limit"
+            "no takeoff: the battery has {volts:.1} V, and is critical at {battery_critical_v} V and below (`alarms.battery_critical_v`); charge it, or correct the limit, and start the controller again"
         ));
     }
     let charge =
         battery.remaining.filter(|it| battery_critical > 0.0 && *it <= battery_critical)?;
     Some(format!(
-        "no takeoff: the battery has {:.0} % of its charge, and is critical at {:.0} % and below (`alarms.battery_critical`); charge it, or correct the limit",
+        "no takeoff: the battery has {:.0} % of its charge, and is critical at {:.0} % and below (`alarms.battery_critical`); charge it, or correct the limit, and start the controller again",
         100.0 * charge,
         100.0 * battery_critical
     ))

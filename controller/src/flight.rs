@@ -9,8 +9,8 @@ use std::time::Duration;
 use autopilot::dialect::{MavMessage, MavType};
 use autopilot::{Autopilot, Event, FlightMode, LandedState, Packet};
 use landing::{
-    Action, Decision, Event as LanderEvent, FrameObservation, Lander, OperatorCommand, Phase,
-    Timestamp,
+    Action, AlarmAction, Decision, Event as LanderEvent, FrameObservation, Lander, OperatorCommand,
+    Phase, Timestamp,
 };
 use messages::{
     CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorInfo,
@@ -65,6 +65,8 @@ pub struct Flight {
     is_ending: bool,
     /// Two detectors see the marker at two places.
     is_disputed: bool,
+    /// Since when a take-off waits for a battery that is not empty.
+    empty_since_ns: Option<i64>,
 }
 
 impl Flight {
@@ -110,6 +112,7 @@ impl Flight {
             journal: Journal::new(health),
             is_ending: false,
             is_disputed: false,
+            empty_since_ns: None,
             config,
         })
     }
@@ -167,17 +170,26 @@ impl Flight {
         self.watch_offboard(now_ns);
     }
 
-    /// Leads a PX4 out of OFFBOARD that is left there while no landing steers it.
+    /// Leads a PX4 out of OFFBOARD that is left there while nothing steers it.
     fn watch_offboard(&mut self, now_ns: i64) {
-        let steers = self.decision.is_some_and(|decision| {
-            !decision.phase.is_terminal()
-                || matches!(decision.action, Action::Velocity { .. } | Action::Guided)
-        });
-        if self.mission.is_landing() && steers && !self.is_ending {
+        if self.is_steering() {
             self.offboard.stand_down();
         } else if !self.is_ending {
             self.offboard.step(now_ns, &mut self.autopilot);
         }
+    }
+
+    /// Whether a part of this flight steers the vehicle, or is to.
+    fn is_steering(&self) -> bool {
+        if self.mission.is_landing() {
+            return self.decision.is_some_and(|decision| {
+                !decision.phase.is_terminal() || decision.action != Action::None
+            });
+        }
+        self.mission.is_taking_off()
+            || self.mission.is_taking_control()
+            || self.mission.leaves_offboard_because().is_some()
+            || self.landing_target.as_ref().is_some_and(LandingTargetMode::is_active)
     }
 
     /// Reads the autopilot's limits, and has its setpoint timeout shortened while our setpoints land it.
@@ -364,11 +376,9 @@ impl Flight {
         let why = "the controller was ended";
         let leaves = self.mission.leave_offboard(now_ns, &mut self.autopilot, why);
         let waits = self.setpoints.end(now_ns, &mut self.autopilot);
-        let waits = if leaves || waits || self.mission.is_landing() {
-            waits
-        } else {
-            self.offboard.end(now_ns, &mut self.autopilot)
-        };
+        // A landing that is not over has been ended by its setpoints.
+        let is_over = !self.mission.is_landing() || self.lander.phase().is_terminal();
+        let waits = waits || !leaves && is_over && self.offboard.end(now_ns, &mut self.autopilot);
         let is_pending = self.limits.restore(&mut self.autopilot);
         self.autopilot.tick(now_ns);
         is_pending || leaves || waits
@@ -447,6 +457,9 @@ impl Flight {
         }
         if let Some(why) = self.mission.leaves_offboard_because() {
             return Err(format!("the vehicle is just being taken back to HOLD: {why}"));
+        }
+        if self.offboard.is_leading_out() {
+            return Err("the vehicle is just being taken back to HOLD".to_owned());
         }
         if self.autopilot.state().and_then(wire::vehicle).is_none() {
             return Err("attitude and position of the vehicle are not known".to_owned());
@@ -586,7 +599,9 @@ impl Flight {
             // Somebody else began it; it is followed like our own.
             self.mission.begin(now_ns, true);
         }
-        self.refuse_empty_takeoff();
+        if self.offboard.is_leading_out() || self.waits_for_battery(now_ns) {
+            return;
+        }
         // The lander refuses a start without a fresh state, and the mission would not try again.
         let state = self.autopilot.state().and_then(wire::vehicle);
         let is_fresh = state.is_some_and(|state| {
@@ -627,14 +642,25 @@ impl Flight {
         }
     }
 
-    /// Refuses a take-off before the motors are armed, where the alarm would end it right after.
-    fn refuse_empty_takeoff(&mut self) {
-        let standing = self.autopilot.state().filter(|state| !state.armed);
-        let Some(state) = standing.filter(|_| self.mission.is_taking_off()) else { return };
-        if let Some(why) = alarms::too_empty(&self.config.alarms, &state.battery) {
+    /// A take-off does not begin with a battery for which the vehicle would land at once, and is refused where that lasts. True while it
+    /// waits for another reading.
+    fn waits_for_battery(&mut self, now_ns: i64) -> bool {
+        let phases = &self.config.phases;
+        let would_end =
+            matches!(phases.on_battery_critical, AlarmAction::Land | AlarmAction::Abort);
+        let standing = self.autopilot.state().filter(|state| !state.armed && would_end);
+        let standing = standing.filter(|_| self.mission.is_taking_off());
+        let why = standing.and_then(|it| alarms::too_empty(&self.config.alarms, &it.battery));
+        let Some(why) = why else {
+            self.empty_since_ns = None;
+            return false;
+        };
+        let since_ns = *self.empty_since_ns.get_or_insert(now_ns);
+        if now_ns.saturating_sub(since_ns) as f64 * 1e-9 >= self.config.alarms.battery_s {
             tracing::error!("{why}");
             self.mission.fail(&mut self.autopilot, why);
         }
+        true
     }
 
     fn handle_autopilot_events(&mut self, now_ns: i64) {

@@ -129,7 +129,7 @@ impl Frames {
         let is_there = now_ns.saturating_sub(*heard_ns) <= UNHEARD_NS;
         (is_there && silence_ns > limit_ns).then(|| {
             let silence_s = silence_ns / 1_000_000_000;
-            format!("no frame from camera `{camera}` for {silence_s} s: check the camera")
+            format!("no frame from camera `{camera}` for {silence_s} s: check the camera, and whether its detector hangs")
         })
     }
 

@@ -15,17 +15,17 @@ const OURS_NS: i64 = 10_000_000_000;
 #[derive(Clone, Debug, Default)]
 pub struct OffboardWatch {
     exit: Option<OffboardExit>,
-    /// The vehicle did not leave OFFBOARD: it is not tried again before it was in another mode.
-    is_in_vain: bool,
+    /// It was led out, or in vain, since something steered it: OFFBOARD is another program's from then on.
+    is_done: bool,
 }
 
 impl OffboardWatch {
     /// Advances it, after whoever steers was asked; to be called with each tick. True while it leads the vehicle out.
     pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
-        let is_offboard = is_flying_offboard(autopilot);
-        self.is_in_vain &= is_offboard;
-        let is_left = is_offboard && !is_steered(now_ns, autopilot) && is_ours(now_ns, autopilot);
-        if self.exit.is_none() && is_left && !self.is_in_vain {
+        let is_left = is_flying_offboard(autopilot)
+            && !is_steered(now_ns, autopilot)
+            && is_ours(now_ns, autopilot);
+        if self.exit.is_none() && is_left && !self.is_done {
             tracing::warn!(
                 "PX4 is in OFFBOARD and nothing steers it: it is asked to hold its place"
             );
@@ -33,19 +33,25 @@ impl OffboardWatch {
         }
         let goes_on = self.exit.as_mut().is_some_and(|exit| exit.step(now_ns, autopilot));
         if !goes_on && self.exit.take().is_some() {
-            self.is_in_vain = is_flying_offboard(autopilot);
+            self.is_done = true;
         }
         goes_on
     }
 
-    /// Somebody steers: nothing is left.
+    /// Something steers: nothing is left.
     pub fn stand_down(&mut self) {
-        self.exit = None;
+        *self = Self::default();
+    }
+
+    /// True while it leads the vehicle out.
+    pub fn is_leading_out(&self) -> bool {
+        self.exit.is_some()
     }
 
     /// Whoever steers ends now: a vehicle in OFFBOARD is led out at once. True while that goes on.
     pub fn end(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
-        if self.exit.is_none() && is_flying_offboard(autopilot) && is_ours(now_ns, autopilot) {
+        let is_left = is_flying_offboard(autopilot) && is_ours(now_ns, autopilot);
+        if self.exit.is_none() && is_left && !self.is_done {
             self.exit = Some(OffboardExit::begin(now_ns, autopilot));
         }
         self.step(now_ns, autopilot)

@@ -457,6 +457,11 @@ fn a_px4_that_comes_into_offboard_after_all_is_asked_to_hold_its_place() {
     let sent = hover(&mut flight, 6000, 7900, OFFBOARD);
     assert!(sent.modes.contains(&4.0) && sent.setpoints > 20, "{sent:?}");
 
+    // Once: who chooses it again has another program for it.
+    hover(&mut flight, 8000, 8900, HOLD);
+    let sent = hover(&mut flight, 9000, 12_000, OFFBOARD);
+    assert!(sent.modes.is_empty() && sent.setpoints <= 1, "{sent:?}");
+
     // Another program's OFFBOARD is none of ours.
     let mut flight = px4_in(OFFBOARD, "command", &[]);
     let sent = hover(&mut flight, 1020, 5000, OFFBOARD);
@@ -533,4 +538,33 @@ fn a_start_that_was_aborted_does_not_begin_a_landing_where_px4_refuses_hold() {
         let status = flight.status((ms + 1000) * MS);
         assert!(matches!(status.phase, Phase::Idle | Phase::Failed), "{status:?}");
     }
+}
+
+#[test]
+fn a_pause_in_which_no_zero_is_sent_ends_no_precision_landing() {
+    let mut flight = px4_in(OFFBOARD, "command", &["mode=landing-target"]);
+    assert!(flight.command(1000 * MS, &ControllerCommand::Start).accepted);
+    hover(&mut flight, 1020, 1980, OFFBOARD);
+    // Nothing runs for 0.4 s.
+    let sent = hover(&mut flight, 2380, 2980, OFFBOARD);
+    assert!(sent.setpoints > 5, "{sent:?}");
+    let status = flight.status(2980 * MS);
+    assert!(status.phase == Phase::Final && status.why.contains("LAND"), "{status:?}");
+}
+
+#[test]
+fn a_px4_that_is_just_being_led_out_of_offboard_is_led_out_when_the_controller_ends() {
+    // OFFBOARD is chosen by a switch while it lands.
+    let mut flight = px4_in_land(5980);
+    assert_eq!(hover(&mut flight, 6000, 6300, OFFBOARD).modes, [4.0]);
+    let reply = flight.command(6290 * MS, &ControllerCommand::Start);
+    assert!(!reply.accepted, "{reply:?}");
+    let mut sent = Sent::default();
+    for ms in (6300..6900).step_by(20) {
+        assert!(flight.shutdown(ms * MS));
+        sent.take(&mut flight);
+    }
+    assert!(sent.setpoints > 5, "until it shows HOLD: {sent:?}");
+    receive(&mut flight, 7000 * MS, &heartbeat(HOLD, true));
+    assert!(!flight.shutdown(7020 * MS));
 }

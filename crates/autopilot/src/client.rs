@@ -696,8 +696,6 @@ impl Autopilot {
         vehicle.state.ready = false;
         let before = std::mem::replace(&mut vehicle.state.landed, LandedState::Unknown);
         vehicle.amsl_m = None;
-        self.setpoints = SetpointStream::default();
-        self.offboard_sent_ns = None;
         self.clock.restart();
         self.parameters.restart();
         self.streams.restart();

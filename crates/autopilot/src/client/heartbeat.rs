@@ -13,7 +13,7 @@ use crate::state::{Battery, LandedState, Readiness, VehicleState};
 use crate::stream::{self, Streams};
 use crate::text::Joiner;
 
-/// Time for which a heartbeat may come behind CURRENT_MODE, in nanoseconds, besides the link's delay.
+/// Time for which a heartbeat may come behind CURRENT_MODE, in nanoseconds, besides the link's delay up to as long.
 const OVERTAKEN_NS: i64 = 300_000_000;
 
 impl Autopilot {
@@ -119,6 +119,7 @@ impl Autopilot {
     /// Whether a heartbeat shows the mode before a change that CURRENT_MODE, sent later, has just shown: a link may reorder packets.
     fn is_overtaken(&self, now_ns: i64, number: u32) -> bool {
         let delay_ns = self.link_delay(now_ns).map_or(0, |delay| delay.as_nanos() as i64);
+        let delay_ns = delay_ns.min(OVERTAKEN_NS);
         let before = self.vehicle.as_ref().and_then(|vehicle| vehicle.mode_before);
         before.is_some_and(|(mode, changed_ns)| {
             let is_recent =
