@@ -69,11 +69,13 @@ pub(crate) struct Children<K> {
 }
 
 impl Children<Service> {
-    /// Starts a service as a process of this program; `state` is where it keeps its notes, if not at the usual place.
+    /// Starts a service as a process of this program; `meet` is the port that replaces that of the file `zenoh`, and `state` where it
+    /// keeps its notes, if not at the usual place.
     pub(crate) fn start(
         &mut self,
         service: Service,
         zenoh: &Path,
+        meet: Option<u16>,
         settings: &[String],
         state: Option<&Path>,
     ) -> anyhow::Result<Started> {
@@ -81,6 +83,11 @@ impl Children<Service> {
         let mut command = Command::new(program);
         command.arg(service.name()).arg("--zenoh").arg(zenoh);
         command.arg("--stop-with-parent").arg(std::process::id().to_string());
+        // That of this process may be another one than what it joined itself.
+        match meet {
+            Some(port) => command.env(node::network::variable::MEET, port.to_string()),
+            None => command.env_remove(node::network::variable::MEET),
+        };
         if let Some(state) = state {
             command.env(node::STATE_VARIABLE, state);
         }

@@ -268,7 +268,6 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     let shutdown = Shutdown::on_signals()?;
     let rendezvous = Rendezvous::new(args.zenoh.as_deref(), args.meet)?;
     // Its own file is checked as those of the services are: nothing listens beyond this machine by accident.
-    // Of a user's file the services read ALIGHT_MEET as well.
     let meet = args.zenoh.as_ref().and(args.meet);
     let network = Network { config: Some(rendezvous.file.clone()), meet, ..Network::default() };
     let zenoh = network.source(OPERATOR)?;
@@ -298,7 +297,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     let mut resume = String::new();
     for (service, settings) in &settings.by_service {
         let notes = notes_in.filter(|_| *service == Service::Controller);
-        let started = children.start(*service, &rendezvous.file, settings, notes)?;
+        let started = children.start(*service, &rendezvous.file, meet, settings, notes)?;
         progress.debug(&started.to_string());
         if *service == Service::Controller {
             resume = started.by_hand;
