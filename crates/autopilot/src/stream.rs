@@ -185,19 +185,19 @@ impl Watched {
         if self.ask_at_ns.is_some() {
             return None;
         }
-        let rate_hz = match self.stream.expected {
-            Expected::OnChange => MIN_CHANGE_HZ,
-            _ => MIN_RATE_RATIO * self.stream.rate_hz,
+        let (usual_hz, min_hz) = match self.stream.expected {
+            Expected::OnChange => (MIN_CHANGE_HZ, MIN_CHANGE_HZ),
+            _ => (self.stream.rate_hz, MIN_RATE_RATIO * self.stream.rate_hz),
         };
         let is_required = self.stream.expected == Expected::Always;
-        let periods_ns = (5.0 / libm::fmin(rate_hz, self.stream.rate_hz) * SECOND_NS as f64) as i64;
+        let periods_ns = (5.0 / usual_hz * SECOND_NS as f64) as i64;
         let elapsed_ns = now_ns.saturating_sub(self.since_ns);
         if elapsed_ns < COUNT_NS.max(periods_ns) {
             return None;
         }
         let measured_hz = f64::from(self.count) / (elapsed_ns as f64 / SECOND_NS as f64);
         self.count_anew(now_ns);
-        if measured_hz >= rate_hz {
+        if measured_hz >= min_hz {
             self.requests = 1;
             let restored = std::mem::take(&mut self.missing);
             return restored.then_some(Notice::Restored { message: self.name, measured_hz });
