@@ -331,6 +331,14 @@ mod tests {
         fly_recorded(&plan.flights()[0], std::fs::File::create(file).unwrap()).unwrap();
     }
 
+    /// Runs `alight report`, or says why not.
+    fn reported(files: &[&Path], options: &[&str]) -> Result<ExitCode, String> {
+        let files = files.iter().map(|file| file.as_os_str());
+        let options = options.iter().map(|option| (*option).as_ref());
+        let text = std::iter::once("report".as_ref()).chain(files).chain(options);
+        run(&Program::try_parse_from(text).unwrap().args).map_err(|problem| problem.to_string())
+    }
+
     #[test]
     fn the_page_of_another_flight_is_kept() {
         let folder = tempfile::tempdir().unwrap();
@@ -338,12 +346,6 @@ mod tests {
         let [one, other] = ["one.mcap", "other.mcap"].map(path);
         fly(&one, 1);
         fly(&other, 2);
-        let reported = |files: &[&Path], options: &[&str]| {
-            let files = files.iter().map(|file| file.as_os_str());
-            let options = options.iter().map(|option| (*option).as_ref());
-            let text = std::iter::once("report".as_ref()).chain(files).chain(options);
-            run(&Program::try_parse_from(text).unwrap().args).map_err(|problem| problem.to_string())
-        };
         let text = |name: &str| std::fs::read_to_string(path(name)).unwrap();
         // Each has its own, and its own is written anew.
         reported(&[&one], &[]).unwrap();
@@ -378,12 +380,8 @@ mod tests {
         let [one, other] = ["one.mcap", "other.mcap"].map(path);
         fly(&one, 1);
         fly(&other, 2);
-        let reported = |files: &[&Path], page: &Path| {
-            let files = files.iter().map(|file| file.as_os_str());
-            let options = ["-o".as_ref(), page.as_os_str()];
-            let text = std::iter::once("report".as_ref()).chain(files).chain(options);
-            run(&Program::try_parse_from(text).unwrap().args).is_ok()
-        };
+        let reported =
+            |files: &[&Path], page: &Path| reported(files, &["-o", page.to_str().unwrap()]).is_ok();
         for page in ["page.html", "page.pdf"].map(path) {
             assert!(reported(&[&one], &page) && reported(&[&one], &page), "{page:?}");
             let first = std::fs::read(&page).unwrap();

@@ -75,7 +75,7 @@ impl TakingControl {
 
 /// Keeps a PX4 where it is that is in OFFBOARD while nothing steers it: without setpoints it would leave the mode.
 pub fn hover_in_offboard(now_ns: i64, autopilot: &mut Autopilot) {
-    if autopilot.state().is_some_and(|state| state.mode == FlightMode::OFFBOARD) {
+    if autopilot.is_in_offboard() {
         autopilot.send_zeros(now_ns);
     }
 }

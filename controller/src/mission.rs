@@ -145,8 +145,7 @@ impl Mission {
     /// Gives up a take-off or a change to OFFBOARD, for this reason, where a PX4 may be in OFFBOARD before a landing, or change to
     /// it; true while the way out goes on.
     pub fn leave_offboard(&mut self, now_ns: i64, autopilot: &mut Autopilot, why: &str) -> bool {
-        let may_be_in_it = autopilot.is_requesting_offboard()
-            || autopilot.state().is_some_and(|state| state.mode == FlightMode::OFFBOARD);
+        let may_be_in_it = autopilot.is_requesting_offboard() || autopilot.is_in_offboard();
         match &self.state {
             State::TakingControl { .. } => {
                 let why = format!("the landing did not begin: {why}");

@@ -3,7 +3,7 @@
 //! Every part that steers leads the vehicle out of OFFBOARD itself when it ends. This is for what no part expects: a request that
 //! was withdrawn and is carried out late, a takeover that was none, another station that chooses OFFBOARD while zeros are sent.
 
-use autopilot::{Autopilot, Firmware, FlightMode, OffboardExit};
+use autopilot::{Autopilot, OffboardExit};
 
 /// Time without a setpoint after which nobody steers, in nanoseconds: PX4 waits for half a second or more (`COM_OF_LOSS_T`).
 const UNSTEERED_NS: i64 = 150_000_000;
@@ -22,20 +22,12 @@ pub struct OffboardWatch {
 impl OffboardWatch {
     /// Advances it, after whoever steers was asked; to be called with each tick. True while it leads the vehicle out.
     pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
-        let is_left = is_flying_offboard(autopilot)
-            && !is_steered(now_ns, autopilot)
-            && is_ours(now_ns, autopilot);
-        if self.exit.is_none() && is_left && !self.is_done {
-            tracing::warn!(
-                "PX4 is in OFFBOARD and nothing steers it: it is asked to hold its place"
-            );
-            self.exit = Some(OffboardExit::begin(now_ns, autopilot));
-        }
-        let goes_on = self.exit.as_mut().is_some_and(|exit| exit.step(now_ns, autopilot));
-        if !goes_on && self.exit.take().is_some() {
-            self.is_done = true;
-        }
-        goes_on
+        self.lead_out(now_ns, autopilot, !is_steered(now_ns, autopilot))
+    }
+
+    /// The same when whoever steers ends: a vehicle in OFFBOARD is led out at once.
+    pub fn end(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
+        self.lead_out(now_ns, autopilot, true)
     }
 
     /// Something steers: nothing is left.
@@ -48,21 +40,25 @@ impl OffboardWatch {
         self.exit.is_some()
     }
 
-    /// Whoever steers ends now: a vehicle in OFFBOARD is led out at once. True while that goes on.
-    pub fn end(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
-        let is_left = is_flying_offboard(autopilot) && is_ours(now_ns, autopilot);
+    fn lead_out(&mut self, now_ns: i64, autopilot: &mut Autopilot, is_left: bool) -> bool {
+        let is_left = is_left && is_flying_offboard(autopilot) && is_ours(now_ns, autopilot);
         if self.exit.is_none() && is_left && !self.is_done {
+            tracing::warn!(
+                "PX4 is in OFFBOARD and nothing steers it: it is asked to hold its place"
+            );
             self.exit = Some(OffboardExit::begin(now_ns, autopilot));
         }
-        self.step(now_ns, autopilot)
+        let goes_on = self.exit.as_mut().is_some_and(|exit| exit.step(now_ns, autopilot));
+        if !goes_on && self.exit.take().is_some() {
+            self.is_done = true;
+        }
+        goes_on
     }
 }
 
 fn is_flying_offboard(autopilot: &Autopilot) -> bool {
-    autopilot.firmware() == Some(Firmware::Px4)
-        && autopilot.state().is_some_and(|state| {
-            state.armed && state.mode == FlightMode::OFFBOARD && state.landed.is_flying()
-        })
+    let flies = autopilot.state().is_some_and(|state| state.armed && state.landed.is_flying());
+    flies && autopilot.is_in_offboard()
 }
 
 /// Whether a setpoint was sent of late, a zero or another.

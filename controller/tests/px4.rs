@@ -186,6 +186,18 @@ fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_sta
     assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
 }
 
+/// A controller that is ended sees OFFBOARD, and asks for HOLD until that shows.
+fn ends_in_hold(flight: &mut Flight, from_ms: i64) {
+    receive(flight, from_ms * MS, &heartbeat(OFFBOARD, true));
+    assert!(flight.shutdown((from_ms + 90) * MS));
+    assert!(flight.shutdown((from_ms + 110) * MS));
+    let mut sent = Sent::default();
+    sent.take(flight);
+    assert_eq!(sent.modes, [4.0], "{sent:?}");
+    receive(flight, (from_ms + 400) * MS, &heartbeat(HOLD, true));
+    assert!(!flight.shutdown((from_ms + 410) * MS));
+}
+
 #[test]
 fn a_px4_that_may_have_changed_to_offboard_is_not_left_there_when_the_start_is_given_up() {
     let given_up = |command: &ControllerCommand| {
@@ -227,14 +239,7 @@ fn a_px4_that_may_have_changed_to_offboard_is_not_left_there_when_the_start_is_g
     assert!(sent.modes.is_empty(), "{sent:?}");
     let mut flight = px4_asked_for_offboard("command");
     assert!(flight.shutdown(3100 * MS));
-    receive(&mut flight, 3500 * MS, &heartbeat(OFFBOARD, true));
-    assert!(flight.shutdown(3590 * MS));
-    assert!(flight.shutdown(3610 * MS));
-    let mut sent = Sent::default();
-    sent.take(&mut flight);
-    assert_eq!(sent.modes, [4.0], "{sent:?}");
-    receive(&mut flight, 4000 * MS, &heartbeat(HOLD, true));
-    assert!(!flight.shutdown(4010 * MS));
+    ends_in_hold(&mut flight, 3500);
 }
 
 #[test]
@@ -329,14 +334,7 @@ fn a_px4_called_back_from_land_is_not_left_in_offboard_by_a_controller_that_ends
     let sent = hover(&mut flight, 4000, 4100, LAND);
     assert_eq!(sent.modes, [6.0], "just after the heartbeat of 4 s: {sent:?}");
     assert!(flight.shutdown(4100 * MS), "it may be in OFFBOARD");
-    receive(&mut flight, 4400 * MS, &heartbeat(OFFBOARD, true));
-    assert!(flight.shutdown(4490 * MS));
-    assert!(flight.shutdown(4510 * MS));
-    let mut sent = Sent::default();
-    sent.take(&mut flight);
-    assert_eq!(sent.modes, [4.0], "{sent:?}");
-    receive(&mut flight, 4800 * MS, &heartbeat(HOLD, true));
-    assert!(!flight.shutdown(4810 * MS));
+    ends_in_hold(&mut flight, 4400);
 }
 
 #[test]

@@ -364,6 +364,11 @@ impl Autopilot {
         })
     }
 
+    /// True while the vehicle shows OFFBOARD.
+    pub fn is_in_offboard(&self) -> bool {
+        self.state().is_some_and(|state| state.mode == FlightMode::OFFBOARD)
+    }
+
     /// True while OFFBOARD is requested: the request may be carried out although it is withdrawn.
     pub fn is_requesting_offboard(&self) -> bool {
         self.requests.iter().any(|request| request.command.is_offboard())

@@ -43,11 +43,11 @@ impl OffboardExit {
     }
 
     fn goes_on(&self, now_ns: i64, autopilot: &Autopilot) -> bool {
-        let Some(state) = autopilot.state().filter(|state| state.armed) else { return false };
-        if now_ns.saturating_sub(self.since_ns) > MAX_EXIT_NS {
+        let is_armed = autopilot.state().is_some_and(|state| state.armed);
+        if !is_armed || now_ns.saturating_sub(self.since_ns) > MAX_EXIT_NS {
             return false;
         }
-        if state.mode == FlightMode::OFFBOARD {
+        if autopilot.is_in_offboard() {
             return true;
         }
         // What was shown earlier says nothing of a request that was sent.
@@ -59,10 +59,9 @@ impl OffboardExit {
     }
 
     fn request_hold(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
-        let is_offboard = autopilot.state().is_some_and(|state| state.mode == FlightMode::OFFBOARD);
         let is_requested =
             self.request.is_some_and(|id| autopilot.status(id) == CommandStatus::Pending);
-        if is_offboard && !is_requested && autopilot.shows_mode_of_now(now_ns) {
+        if autopilot.is_in_offboard() && !is_requested && autopilot.shows_mode_of_now(now_ns) {
             let hold = Command::SetMode(FlightMode::AUTO_HOLD);
             self.request = Some(autopilot.request(now_ns, hold));
         }
