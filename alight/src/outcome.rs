@@ -250,15 +250,13 @@ impl LandingSummary {
             |ns: i64| self.started_ns.map(|start| ns.saturating_sub(start) as f64 / 1e9);
         let landed = self.disarmed_ns.is_some() && touchdown.is_some();
         let outcome = match (&self.interrupted, status) {
-            (Some(why), Some(status)) => {
-                format!("{why}; it was in {}", phase_and_reason(status))
-            }
+            (Some(why), Some(status)) => format!("{why}; it was in {}", status.sentence()),
             (Some(why), None) => format!("{why}; no controller was running"),
             (None, _) if landed => "landed".to_owned(),
             (None, Some(status)) if status.phase == Phase::Landed => {
-                format!("{}, but the simulation saw no touchdown", phase_and_reason(status))
+                format!("{}, but the simulation saw no touchdown", status.sentence())
             }
-            (None, Some(status)) => phase_and_reason(status),
+            (None, Some(status)) => status.sentence(),
             (None, None) => "no controller was running".to_owned(),
         };
         Outcome {
@@ -360,15 +358,6 @@ impl Outcome {
         text.truncate(text.trim_end().len());
         text
     }
-}
-
-/// A phase and its reason, which may begin with the phase's name.
-pub(crate) fn phase_and_reason(status: &ControllerStatus) -> String {
-    let phase = status.phase.to_string();
-    let after = status.why.strip_prefix(&phase);
-    // As in "aborted: held too long" and "aborted by the operator".
-    let says_it = after.is_some_and(|after| after.starts_with(": ") || after.starts_with(" by "));
-    if says_it { status.why.clone() } else { format!("{phase}: {}", status.why) }
 }
 
 #[cfg(test)]
@@ -504,16 +493,6 @@ mod tests {
         for file in ["flight.mcap", "a/flights.mcap", "a/flight-x.mcap", "a/flight-2", "a/b.mcap"] {
             assert!(!ours.may_write(Path::new(file)), "{file}");
         }
-    }
-
-    #[test]
-    fn no_reason_doubles_the_word_of_its_phase() {
-        let told = |why: &str| {
-            phase_and_reason(&ControllerStatus { why: why.into(), ..status(Phase::Aborted) })
-        };
-        assert_eq!(told("aborted by the operator"), "aborted by the operator");
-        assert_eq!(told("aborted: held too long"), "aborted: held too long");
-        assert_eq!(told("the battery is low"), "aborted: the battery is low");
     }
 
     #[test]

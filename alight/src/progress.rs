@@ -8,7 +8,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use messages::{ControllerStatus, Phase};
 
 use crate::args::Format;
-use crate::outcome::{LandingSummary, phase_and_reason};
+use crate::outcome::LandingSummary;
 use crate::terminal::write_error;
 
 /// The display of a landing.
@@ -65,7 +65,7 @@ impl Progress {
             && matches!(status.phase, Phase::Idle | Phase::Takeoff)
             && self.why != why;
         if self.phase.replace(status.phase) != Some(status.phase) || is_other_reason {
-            self.say(&phase_and_reason(status));
+            self.say(&status.sentence());
             self.why = why;
         }
         if status.active_detector != self.active_detector {

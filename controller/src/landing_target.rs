@@ -217,7 +217,7 @@ impl LandingTargetMode {
             ),
             State::Commanding(_) => (Phase::Final, "requesting LAND".to_owned()),
             State::Landing => (Phase::Final, format!("the autopilot lands; {target}")),
-            State::Landed => (Phase::Landed, "landed and disarmed".to_owned()),
+            State::Landed => (Phase::Landed, landing::Reason::TouchedDown.to_string()),
             State::Recalling(_, why) | State::Ended(why) => (Phase::Aborted, why.clone()),
         }
     }

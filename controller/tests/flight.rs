@@ -508,13 +508,13 @@ fn a_landing_for_an_alarm_or_a_command_tells_why_until_after_it() {
     };
     let (landing, landed) = told(&["alarms.battery_critical_v=13", "alarms.battery_s=0.1"], &empty);
     assert_eq!(landing, "the battery is nearly empty: the autopilot is landing");
-    assert_eq!(landed, "landed and disarmed: the battery is nearly empty");
+    assert_eq!(landed, "on the ground, disarmed: the battery is nearly empty");
     let command = |flight: &mut Flight| {
         assert!(flight.command(2000 * MS, &ControllerCommand::LandHere).accepted);
     };
     let (landing, landed) = told(&[], &command);
     assert_eq!(landing, "the operator's command to land here: the autopilot is landing");
-    assert_eq!(landed, "landed and disarmed: the operator's command to land here");
+    assert_eq!(landed, "on the ground, disarmed: the operator's command to land here");
 }
 
 #[test]

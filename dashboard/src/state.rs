@@ -146,7 +146,7 @@ impl State {
                 Phase::Hold | Phase::Retry | Phase::PilotInCommand => Level::Warn,
                 _ => Level::Info,
             };
-            self.log.add(now_ns, level, &format!("{}: {}", status.phase, status.why));
+            self.log.add(now_ns, level, &status.sentence());
         }
         if before.and_then(|it| it.active_detector.as_ref()) != status.active_detector.as_ref() {
             let name = status.active_detector.as_deref().unwrap_or("none");
@@ -525,6 +525,13 @@ mod tests {
         // The controller's clock is ours: the message was old when it came.
         state.take(SECOND, health("controller", 1, "ours", 0.0, 1.0));
         assert_eq!(state.now(2 * SECOND)["status"]["age_ms"], 2000.0);
+    }
+
+    #[test]
+    fn the_log_says_the_word_of_a_phase_once() {
+        let mut state = State::new("ours");
+        state.take(SECOND, status(Phase::Aborted, "aborted by the operator"));
+        assert!(texts(&state).contains(&"aborted by the operator"), "{:?}", texts(&state));
     }
 
     #[test]

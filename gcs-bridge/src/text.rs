@@ -46,10 +46,7 @@ impl StatusTextSender {
     /// holds.
     pub(crate) fn status(&mut self, now_ns: i64, status: &ControllerStatus) -> Vec<MavMessage> {
         let mut packets = Vec::new();
-        let text = match status.why.is_empty() {
-            true => format!("Alight: {}", status.phase),
-            false => format!("Alight: {}: {}", status.phase, status.why),
-        };
+        let text = format!("Alight: {}", status.sentence());
         // A change of digits alone, as of a height, is not sent.
         let change = matter(&text);
         if self.last.as_ref() != Some(&change)
@@ -209,6 +206,9 @@ mod tests {
         assert!(sender.status(0, &status(Phase::Search, "waiting 2 s", None)).is_empty());
         let sent = join(&sender.status(0, &status(Phase::Aborted, "", None)));
         assert_eq!(sent, [(MavSeverity::MAV_SEVERITY_CRITICAL, "Alight: aborted".to_owned())]);
+        let sent =
+            join(&sender.status(0, &status(Phase::Aborted, "aborted by the operator", None)));
+        assert_eq!(sent[0].1, "Alight: aborted by the operator");
         sender.reset();
         assert_eq!(join(&sender.status(0, &search)).len(), 1);
     }

@@ -191,7 +191,7 @@ named! {
         /// The autopilot is in its LAND mode.
         AutopilotLands = "autopilot-lands", "the autopilot is landing";
         /// On the ground, disarmed.
-        TouchedDown = "touched-down", "landed and disarmed";
+        TouchedDown = "touched-down", "on the ground, disarmed";
         /// The operator commanded a hold.
         OperatorHold = "operator-hold", "held by the operator";
         /// The marker was lost.

@@ -199,6 +199,22 @@ pub struct ControllerStatus {
     pub warnings: Vec<String>,
 }
 
+impl ControllerStatus {
+    /// The phase and its reason in words. A reason that begins with the phase's name stands alone, as "aborted: held too long" and
+    /// "aborted by the operator" do.
+    pub fn sentence(&self) -> String {
+        let phase = self.phase.name();
+        let after = self.why.strip_prefix(phase);
+        let says_it =
+            after.is_some_and(|after| after.starts_with(": ") || after.starts_with(" by "));
+        match self.why.as_str() {
+            "" => phase.to_owned(),
+            why if says_it => why.to_owned(),
+            why => format!("{phase}: {why}"),
+        }
+    }
+}
+
 /// What a text of a status is about: all but its numbers, which change with each second. Digits within backquotes stay, as
 /// they are part of a name.
 pub fn matter(text: &str) -> String {
@@ -242,6 +258,17 @@ pub struct CommandReply {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn no_reason_doubles_the_word_of_its_phase() {
+        let told = |phase, why: &str| {
+            ControllerStatus { phase, why: why.into(), ..ControllerStatus::default() }.sentence()
+        };
+        assert_eq!(told(Phase::Aborted, "aborted by the operator"), "aborted by the operator");
+        assert_eq!(told(Phase::Aborted, "aborted: held too long"), "aborted: held too long");
+        assert_eq!(told(Phase::Aborted, "the battery is low"), "aborted: the battery is low");
+        assert_eq!(told(Phase::Aborted, ""), "aborted");
+    }
 
     #[test]
     fn a_text_is_about_names_and_not_about_numbers() {

@@ -50,7 +50,7 @@ fn controller(flight: &Flight) -> Vec<Line> {
             last.phase == status.phase && phases::is_same(&last.why, &status.why)
         };
         if !last.is_some_and(is_same) {
-            say(false, format!("{}: {}", status.phase.name(), status.why));
+            say(false, status.sentence());
         }
         if last.is_none_or(|last| last.autopilot != status.autopilot) {
             say(false, format!("link to the autopilot: {}", status.autopilot));
