@@ -301,6 +301,35 @@ async fn the_operators_choice_is_followed(landing: &Landing) -> anyhow::Result<(
     Ok(())
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn what_came_down_after_an_abort_is_not_said_to_have_landed() -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
+    for on_abort in ["hover", "land"] {
+        with_second_try(async || comes_down_after_an_abort(on_abort).await).await?;
+    }
+    Ok(())
+}
+
+async fn comes_down_after_an_abort(on_abort: &str) -> anyhow::Result<()> {
+    let on = format!("controller.phases.on_abort={on_abort}");
+    let landing = Landing::start(&["--seed", "6", "--set", &on]).await?;
+    landing.descends_below(9.0).await?;
+    command(&landing, ControllerCommand::Abort).await?;
+    let told = match on_abort {
+        "hover" => {
+            command(&landing, ControllerCommand::LandHere).await?;
+            "the operator's command to land here; it touched down "
+        }
+        _ => "aborted by the operator; it touched down ",
+    };
+    let (result, status) = landing.ends().await?;
+    ensure!(status == Some(1), "{status:?}: {result}");
+    ensure!(result["landed"] == false && result["down"] == true, "{result}");
+    let outcome = result["outcome"].as_str().context("outcome")?;
+    ensure!(outcome.starts_with(told) && outcome.contains("from the pad's centre"), "{outcome}");
+    Ok(())
+}
+
 async fn command(landing: &Landing, command: ControllerCommand) -> anyhow::Result<()> {
     let reply = landing.node.command(topic::COMMAND, &[], &command).await?;
     ensure!(reply.accepted, "{reply:?}");

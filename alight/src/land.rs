@@ -88,8 +88,9 @@ fn timeout_s(text: &str) -> Result<f64, String> {
     }
 }
 
-const EXIT_STATUS: &str = "Exit status of a landing: 0 when it landed, 1 when it did not, 2 for a wrong command line or setting, and 3 when it landed \
-                           but the recording of `--record` failed (its problem is in the result).";
+const EXIT_STATUS: &str = "Exit status of a landing: 0 when it landed on the pad (led there by the marker, and at most 0.3 m from its centre), 1 when it did not, \
+                           also when it came down otherwise (after an abort, by `land-here`, for an alarm, by the pilot: the result says how far from the pad), \
+                           2 for a wrong command line or setting, and 3 when it landed but the recording of `--record` failed (its problem is in the result).";
 
 /// The loopback interface.
 pub(crate) const LOOPBACK: &str = "127.0.0.1";
@@ -420,6 +421,11 @@ async fn watch(
                 return Ok(landing);
             }
             () = tokio::time::sleep_until(end) => {
+                // Where an abort lands it, or the pilot does, the result tells where it comes down.
+                if over.is_some() && landing.comes_down() && Instant::now() < deadline {
+                    over = Some(Instant::now() + AFTER_LANDING);
+                    continue;
+                }
                 if over.is_none() {
                     let is_alone = node.alive("controller", "*").await.is_ok_and(|it| it.is_empty());
                     landing.timed_out(controllers_exit.as_deref().filter(|_| is_alone));

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use messages::{ControllerStatus, Health, Phase, RecorderStatus, Truth};
+use experiments::landing::outcome::FAR_M;
+use messages::{ControllerStatus, Health, Phase, RecorderStatus, Touchdown, Truth};
 use serde::Serialize;
 
 use crate::children::Exit;
@@ -36,7 +37,10 @@ pub(crate) struct LandingSummary {
 /// The result of a landing.
 #[derive(Serialize)]
 pub(crate) struct Outcome {
+    /// On the pad, by the landing.
     pub(crate) landed: bool,
+    /// On the ground, wherever and however it came down.
+    down: bool,
     outcome: String,
     time_to_disarm_s: Option<f64>,
     time_to_touchdown_s: Option<f64>,
@@ -50,6 +54,9 @@ pub(crate) struct Outcome {
     guidance: String,
     processes: Vec<Process>,
     recording: Option<Recording>,
+    /// Whether the landing led it down, too far from the pad's centre.
+    #[serde(skip)]
+    is_beside: bool,
     /// Whether it was to be recorded: others may have recorded it as well.
     #[serde(skip)]
     is_to_be_recorded: bool,
@@ -122,6 +129,12 @@ impl OurRecorder {
 
 /// The problem of a recorder until it reports.
 const UNHEARD: &str = "the recorder has not reported";
+
+/// A vehicle that sinks faster comes down, in m/s.
+const MIN_SINK_M_S: f64 = 0.1;
+
+/// Longest time after a touchdown in which an autopilot may stop the motors, in nanoseconds: ArduPilot takes 7 s.
+const MAX_DISARMING_NS: i64 = 12_000_000_000;
 
 /// Exit status of a landing whose recording failed.
 const RECORDING_FAILED: u8 = 3;
@@ -248,19 +261,26 @@ impl LandingSummary {
         let touchdown = self.last_truth.as_ref().and_then(|t| t.touchdown);
         let since_start =
             |ns: i64| self.started_ns.map(|start| ns.saturating_sub(start) as f64 / 1e9);
-        let landed = self.disarmed_ns.is_some() && touchdown.is_some();
+        let down =
+            self.last_truth.as_ref().is_some_and(|truth| truth.on_ground) && touchdown.is_some();
+        let elsewhere = touchdown.and_then(|touchdown| self.elsewhere(&touchdown));
+        let landed = self.disarmed_ns.is_some() && touchdown.is_some() && elsewhere.is_none();
         let outcome = match (&self.interrupted, status) {
             (Some(why), Some(status)) => format!("{why}; it was in {}", status.sentence()),
             (Some(why), None) => format!("{why}; no controller was running"),
             (None, _) if landed => "landed".to_owned(),
-            (None, Some(status)) if status.phase == Phase::Landed => {
-                format!("{}, but the simulation saw no touchdown", status.sentence())
-            }
-            (None, Some(status)) => status.sentence(),
+            (None, Some(status)) => match elsewhere.filter(|_| down) {
+                Some(elsewhere) => elsewhere,
+                None if status.phase == Phase::Landed => {
+                    format!("{}, but the simulation saw no touchdown", status.sentence())
+                }
+                None => status.sentence(),
+            },
             (None, None) => "no controller was running".to_owned(),
         };
         Outcome {
             landed,
+            down,
             outcome,
             time_to_disarm_s: self.disarmed_ns.and_then(since_start),
             time_to_touchdown_s: touchdown.and_then(|t| since_start(t.stamp_ns)),
@@ -282,8 +302,43 @@ impl LandingSummary {
                 never_came: recorder.never_came(),
                 problem: self.recording_problem(recorder),
             }),
+            is_beside: down
+                && status.is_some_and(|it| it.phase == Phase::Landed && it.landed_for().is_none())
+                && touchdown.is_some_and(|it| it.error_m > FAR_M),
             is_to_be_recorded: self.recorded_by.is_some(),
         }
+    }
+
+    /// How it came down, and how far from the pad, if the landing did not lead it onto the pad.
+    fn elsewhere(&self, touchdown: &Touchdown) -> Option<String> {
+        let status = self.last_status.as_ref()?;
+        let error_m = touchdown.error_m;
+        let limit = format!("more than the {FAR_M} m within which a landing counts");
+        let (why, beyond) = match (status.phase, status.landed_for()) {
+            (Phase::Landed, None) if error_m <= FAR_M => return None,
+            (Phase::Landed, None) => (status.why.clone(), format!(", {limit}")),
+            (Phase::Landed, Some(cause)) => (cause.to_owned(), String::new()),
+            _ => (status.sentence(), String::new()),
+        };
+        let motors = match self.disarmed_ns {
+            None => ", and its motors may still run",
+            Some(_) if why.contains("disarmed") => "",
+            Some(_) => ", and its motors are off",
+        };
+        Some(format!("{why}; it touched down {error_m:.3} m from the pad's centre{beyond}{motors}"))
+    }
+
+    /// Whether it comes down although the landing has ended, as after an abort that lands it, or has just done so with its motors on.
+    pub(crate) fn comes_down(&self) -> bool {
+        let is_landed = self.last_status.as_ref().is_some_and(|it| it.phase == Phase::Landed);
+        self.last_truth.as_ref().filter(|_| !is_landed).is_some_and(|truth| {
+            let [_, _, sink_m_s] = truth.velocity_ned_m_s;
+            let standing_ns = truth.touchdown.map(|it| truth.stamp_ns.saturating_sub(it.stamp_ns));
+            match standing_ns.filter(|_| truth.on_ground) {
+                Some(standing_ns) => self.disarmed_ns.is_none() && standing_ns < MAX_DISARMING_NS,
+                None => !truth.on_ground && sink_m_s > MIN_SINK_M_S,
+            }
+        })
     }
 
     fn processes(&self) -> Vec<Process> {
@@ -298,7 +353,7 @@ impl LandingSummary {
 }
 
 impl Outcome {
-    /// The exit status of `alight land`: 0, 1 without a landing, and another where only the recording failed.
+    /// The exit status of `alight land`: 0, 1 without a landing on the pad, and another where only the recording failed.
     pub(crate) fn exit_status(&self) -> u8 {
         let problem = self.recording.as_ref().and_then(|recording| recording.problem.as_ref());
         match self.landed {
@@ -313,6 +368,8 @@ impl Outcome {
         let mut text = String::new();
         let verdict = match self.landed {
             true => "Landed.".to_owned(),
+            false if self.is_beside => format!("Down beside the pad: {}.", self.outcome),
+            false if self.down => format!("Down, but not led to the pad: {}.", self.outcome),
             false => format!("Not landed: {}.", self.outcome),
         };
         // Writing to a string cannot fail.
@@ -363,7 +420,6 @@ impl Outcome {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::Touchdown;
 
     fn status(phase: Phase) -> ControllerStatus {
         ControllerStatus {
@@ -428,10 +484,89 @@ mod tests {
         assert!(outcome.table().contains("0.020 m        0.068 m"), "{}", outcome.table());
     }
 
+    /// The result of a landing that ended like this, and the distance from the pad at the touchdown.
+    fn ended(phase: Phase, why: &str, error_m: f64) -> Outcome {
+        let mut landing = LandingSummary::default();
+        landing.status(ControllerStatus {
+            why: why.into(),
+            started_ns: Some(0),
+            disarmed_ns: Some(9),
+            ..status(phase)
+        });
+        let touchdown =
+            Touchdown { stamp_ns: 5, error_m, vertical_speed_m_s: 0.5, lateral_speed_m_s: 0.0 };
+        landing.truth(truth(Some(touchdown)));
+        landing.outcome()
+    }
+
+    #[test]
+    fn what_came_down_otherwise_has_not_landed_on_the_pad() {
+        let landed = ended(Phase::Landed, "on the ground, disarmed", 0.02);
+        assert_eq!((landed.landed, landed.down, landed.exit_status()), (true, true, 0));
+        for (phase, why, error_m, told) in [
+            (
+                Phase::Landed,
+                "on the ground, disarmed: the operator's command to land here",
+                0.44,
+                "the operator's command to land here; it touched down 0.440 m from the pad's centre, and its motors are off",
+            ),
+            (
+                Phase::Landed,
+                "on the ground, disarmed",
+                0.44,
+                "on the ground, disarmed; it touched down 0.440 m from the pad's centre, more than the 0.3 m within which a landing counts",
+            ),
+            (
+                Phase::Aborted,
+                "aborted: disarmed before the touchdown",
+                0.02,
+                "aborted: disarmed before the touchdown; it touched down 0.020 m from the pad's centre",
+            ),
+            (
+                Phase::PilotInCommand,
+                "the pilot flies",
+                0.02,
+                "pilot-in-command: the pilot flies; it touched down 0.020 m from the pad's centre, and its motors are off",
+            ),
+        ] {
+            let outcome = ended(phase, why, error_m);
+            assert_eq!(outcome.outcome, told);
+            assert_eq!((outcome.landed, outcome.down, outcome.exit_status()), (false, true, 1));
+            let how =
+                if told.contains("counts") { "beside the pad" } else { "but not led to the pad" };
+            let verdict = outcome.table().lines().next().unwrap_or_default().to_owned();
+            assert!(verdict.starts_with("Down"), "{verdict}");
+            assert!(verdict.ends_with(&format!("{how}: {told}.")), "{verdict}");
+        }
+    }
+
+    #[test]
+    fn a_vehicle_that_an_abort_lands_is_watched_until_its_motors_stop() {
+        let mut landing = LandingSummary::default();
+        landing.status(status(Phase::Aborted));
+        let sinks = |sink_m_s| Truth { velocity_ned_m_s: [0.0, 0.0, sink_m_s], ..truth(None) };
+        let mut seen = |truth| {
+            landing.truth(truth);
+            landing.comes_down()
+        };
+        assert!(seen(sinks(0.5)) && !seen(sinks(0.0)), "it hovers");
+        let touchdown = Touchdown {
+            stamp_ns: 0,
+            error_m: 0.02,
+            vertical_speed_m_s: 0.5,
+            lateral_speed_m_s: 0.0,
+        };
+        let stands = |stamp_ns| Truth { stamp_ns, ..truth(Some(touchdown)) };
+        assert!(seen(stands(7_000_000_000)) && !seen(stands(13_000_000_000)));
+        landing.status(ControllerStatus { disarmed_ns: Some(1), ..status(Phase::Aborted) });
+        landing.truth(stands(7_000_000_000));
+        assert!(!landing.comes_down());
+    }
+
     #[test]
     fn a_landing_whose_recording_failed_has_an_exit_status_of_its_own() {
         let landed = |mut landing: LandingSummary| {
-            landing.disarmed_ns = Some(2);
+            landing.status(ControllerStatus { disarmed_ns: Some(2), ..status(Phase::Landed) });
             let touchdown = Touchdown {
                 stamp_ns: 1,
                 error_m: 0.02,

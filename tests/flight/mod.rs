@@ -223,20 +223,25 @@ impl Landing {
     }
 
     /// Waits for the result, and checks that it landed on the pad.
-    pub(crate) async fn lands(mut self) -> anyhow::Result<serde_json::Value> {
+    pub(crate) async fn lands(self) -> anyhow::Result<serde_json::Value> {
+        let (result, status) = self.ends().await?;
+        ensure!(result["landed"] == true, "{result}");
+        ensure!(status == Some(0), "exit status");
+        let error_m = result["touchdown_error_m"].as_f64().context("touchdown_error_m")?;
+        ensure!(error_m < MAX_ERROR_M, "landed {error_m} m from the pad");
+        Ok(result)
+    }
+
+    /// Waits for the result and the exit status.
+    pub(crate) async fn ends(mut self) -> anyhow::Result<(serde_json::Value, Option<i32>)> {
         let mut stdout = self.land.stdout.take().context("standard output")?;
         let read = tokio::task::spawn_blocking(move || {
             let mut text = String::new();
             std::io::Read::read_to_string(&mut stdout, &mut text).map(|_| text)
         });
         let text = timeout(PATIENCE, read).await.context("waiting for the result")???;
-        let result: serde_json::Value =
-            serde_json::from_str(text.lines().last().context("no result")?)?;
-        ensure!(result["landed"] == true, "{result}");
-        ensure!(self.land.wait()?.success(), "exit status");
-        let error_m = result["touchdown_error_m"].as_f64().context("touchdown_error_m")?;
-        ensure!(error_m < MAX_ERROR_M, "landed {error_m} m from the pad");
-        Ok(result)
+        let result = serde_json::from_str(text.lines().last().context("no result")?)?;
+        Ok((result, self.land.wait()?.code()))
     }
 }
 

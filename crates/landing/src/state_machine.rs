@@ -303,6 +303,7 @@ impl StateMachine {
             Mode::Guided => self.begin(Phase::Final, Reason::OperatorLand, inputs.now),
             Mode::Land => {
                 self.begin(Phase::Final, Reason::AutopilotLands, inputs.now);
+                self.cause = Some(Reason::OperatorLand);
                 self.follow_land(vehicle);
             }
             Mode::Other => self.reason = Reason::NotGuided,

@@ -213,6 +213,12 @@ impl ControllerStatus {
             why => format!("{phase}: {why}"),
         }
     }
+
+    /// The alarm or the command for which it has landed where it was; `None` where the landing led it to the marker.
+    pub fn landed_for(&self) -> Option<&str> {
+        let (_, cause) = self.why.split_once(": ").filter(|_| self.phase == Phase::Landed)?;
+        Some(cause)
+    }
 }
 
 /// What a text of a status is about: all but its numbers, which change with each second. Digits within backquotes stay, as

@@ -77,7 +77,7 @@ fn head(views: &[&View<'_>]) -> String {
             _ => "B: ",
         };
         let mood = match (summary.landed, summary.phase.as_deref()) {
-            (Some(true), _) => "good",
+            (Some(true), _) if summary.was_led_to_the_marker() => "good",
             (_, None) => "quiet",
             _ => "bad",
         };

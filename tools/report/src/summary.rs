@@ -180,10 +180,23 @@ fn battery_min(flight: &Flight) -> Option<f64> {
 }
 
 impl Summary {
+    /// The alarm or the command for which it landed where it was.
+    fn landed_for(&self) -> Option<&str> {
+        self.why.as_deref()?.split_once(": ").map(|(_, cause)| cause)
+    }
+
+    /// Whether it landed, and was led to the marker.
+    pub fn was_led_to_the_marker(&self) -> bool {
+        self.landed == Some(true) && self.landed_for().is_none()
+    }
+
     /// How it ended, in a few words.
     pub fn outcome(&self) -> String {
         match (&self.phase, &self.why) {
-            _ if self.landed == Some(true) => "landed".to_owned(),
+            _ if self.landed == Some(true) => match self.landed_for() {
+                Some(cause) => format!("landed, but not led to the marker: {cause}"),
+                None => "landed".to_owned(),
+            },
             (Some(phase), Some(why)) if why.starts_with(phase) => why.clone(),
             (Some(phase), Some(why)) => format!("{phase}: {why}"),
             _ => match &self.unreadable_status {

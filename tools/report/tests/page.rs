@@ -585,6 +585,19 @@ fn what_a_text_of_the_autopilot_says_stays_text() {
 }
 
 #[test]
+fn what_landed_by_a_command_was_not_led_to_the_marker() {
+    let mut flight = read(&landing().recording);
+    assert!(summary(&flight).was_led_to_the_marker());
+    let why = "on the ground, disarmed: the operator's command to land here";
+    why.clone_into(&mut flight.statuses.last_mut().unwrap().why);
+    let told = summary(&flight);
+    assert!(!told.was_led_to_the_marker());
+    let outcome = "landed, but not led to the marker: the operator's command to land here";
+    assert_eq!(told.outcome(), outcome);
+    assert!(page(&flight).unwrap().contains("class=\"outcome bad\""));
+}
+
+#[test]
 fn a_setting_that_a_service_changed_is_told_with_its_time() {
     let about = About { program: "test".to_owned(), facts: BTreeMap::new(), utc_offset_ns: 0 };
     let mut recording = Vec::new();

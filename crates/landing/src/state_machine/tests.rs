@@ -190,6 +190,18 @@ fn what_a_landing_is_for_is_kept_until_after_it() {
 }
 
 #[test]
+fn landing_here_is_kept_as_what_it_is_for_also_of_a_vehicle_that_lands_already() {
+    let mut machine = StateMachine::new(PhaseConfig::default());
+    let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
+    let here = Inputs { operator: Some(OperatorCommand::LandHere), ..land(3.0) };
+    for input in [start(), commanded(1.0, OperatorCommand::Abort), land(2.0), here] {
+        machine.advance(&input);
+    }
+    let lands = (Phase::Final, Reason::AutopilotLands, Some(Reason::OperatorLand));
+    assert_eq!((machine.phase(), machine.reason(), machine.cause()), lands);
+}
+
+#[test]
 fn landing_here_needs_no_marker_and_leaves_a_vehicle_that_may_not_in_the_air() {
     let here = |seconds| commanded(seconds, OperatorCommand::LandHere);
     let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
