@@ -17,9 +17,12 @@ use crate::{
 /// Exit status for an invalid command line or configuration.
 const WRONG_USE: u8 = 2;
 
+/// The version with the commit, of the build script.
+pub(crate) const VERSION: &str = env!("ALIGHT_VERSION");
+
 /// Lands a UAV on a printed marker. Without a subcommand: `alight land`.
 #[derive(Parser)]
-#[command(version, args_conflicts_with_subcommands = true)]
+#[command(version = VERSION, args_conflicts_with_subcommands = true)]
 struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
@@ -150,4 +153,28 @@ fn print_config(args: ConfigArgs) -> anyhow::Result<ExitCode> {
         print(&format!("# {}\n{table}", service.name()))?;
     }
     Ok(ExitCode::SUCCESS)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    #[test]
+    fn the_version_tells_the_commit_of_the_repository_in_which_it_is_built() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+        let arguments = ["show", "--no-patch", "--format=%h, %cs", "--abbrev=9", "HEAD"];
+        let git = std::process::Command::new("git").arg("-C").arg(&root).args(arguments).output();
+        let commit = git.ok().filter(|it| root.join(".git").exists() && it.status.success());
+        let release = env!("CARGO_PKG_VERSION");
+        let Some(commit) = commit else {
+            assert_eq!(VERSION, release);
+            return;
+        };
+        let commit = String::from_utf8(commit.stdout).unwrap();
+        let told = format!("{release} ({}", commit.trim());
+        let rest = VERSION.strip_prefix(told.as_str());
+        assert!(matches!(rest, Some(")" | ", changed)")), "{VERSION}, and not {told})");
+    }
 }

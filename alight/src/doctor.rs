@@ -15,6 +15,7 @@ use clap::Args;
 use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, Phase, topic};
 use node::access::{HOLDERS, Holder, Holders};
 use node::network::{AIR_PORT, AUTHORITY, Address, check_private};
+use node::version::release;
 use node::{INSECURE, Network, Node, clock_name, stats};
 use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
@@ -200,7 +201,7 @@ fn check_machine(findings: &mut Findings) {
         "machine",
         format!(
             "alight {} on {} ({} {}, {cores} cores), clock {}",
-            env!("CARGO_PKG_VERSION"),
+            node::version(),
             system.nodename().to_string_lossy(),
             system.sysname().to_string_lossy(),
             system.machine().to_string_lossy(),
@@ -613,17 +614,7 @@ fn check_reply(
 fn check_healths(findings: &mut Findings, seen: &Seen) {
     for health in &seen.healths {
         let who = format!("{} `{}`", health.service, health.instance);
-        if health.version != env!("CARGO_PKG_VERSION") {
-            findings.wrong(
-                "versions",
-                format!(
-                    "{who} is alight {}, this is {}",
-                    health.version,
-                    env!("CARGO_PKG_VERSION")
-                ),
-                "install the same version on all machines",
-            );
-        }
+        check_version(findings, &who, &health.version, node::version());
         if health.errors.iter().any(|error| error.reason == INSECURE) {
             findings.doubtful("security", format!("{who}: {INSECURE}"), MAKE_KEYS);
         }
@@ -636,6 +627,20 @@ fn check_healths(findings: &mut Findings, seen: &Seen) {
                 "its log has the first one of each reason",
             );
         }
+    }
+}
+
+/// Compares the version of another process with that of this program.
+fn check_version(findings: &mut Findings, who: &str, theirs: &str, ours: &str) {
+    let told = format!("{who} is alight {theirs}, this is {ours}");
+    match release(theirs) == release(ours) {
+        true if theirs == ours => {}
+        true => findings.doubtful(
+            "versions",
+            told,
+            "install the same build on all machines, or know that they fit each other",
+        ),
+        false => findings.wrong("versions", told, "install the same version on all machines"),
     }
 }
 
@@ -674,6 +679,24 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn another_build_of_the_same_version_is_doubtful() {
+        let told = |theirs: &str| {
+            let mut findings = Findings::default();
+            check_version(
+                &mut findings,
+                "detector `main`",
+                theirs,
+                "0.1.0 (1a2b3c4d5, 2026-11-27)",
+            );
+            (findings.count(Verdict::Doubtful), findings.count(Verdict::Wrong))
+        };
+        assert_eq!(told("0.1.0 (1a2b3c4d5, 2026-11-27)"), (0, 0));
+        assert_eq!(told("0.1.0 (1a2b3c4d5, 2026-11-27, changed)"), (1, 0));
+        assert_eq!(told("0.1.0"), (1, 0));
+        assert_eq!(told("0.2.0 (1a2b3c4d5, 2026-11-27)"), (0, 1));
+    }
 
     #[test]
     fn a_camera_or_detector_that_tells_no_health_is_well_while_it_is_heard() {

@@ -48,6 +48,7 @@ use std::process::ExitCode;
 
 /// Runs the command line of this process.
 pub fn main() -> ExitCode {
+    node::set_version(cli::VERSION);
     node::relaunch_with_zenoh_threads();
     cli::run()
 }

@@ -43,7 +43,7 @@ pub struct TapedFlight {
 
 /// The program with its version, as the tape names it.
 pub fn program() -> String {
-    format!("alight {}", env!("CARGO_PKG_VERSION"))
+    format!("alight {}", node::version())
 }
 
 /// For what this program was built, as the tape names it.

@@ -165,7 +165,7 @@ fn info(config: &Config) -> Result<DetectorInfo, String> {
         place: config.place,
         camera: config.camera.clone(),
         markers,
-        version: concat!("alight ", env!("CARGO_PKG_VERSION")).to_owned(),
+        version: format!("alight {}", node::version()),
         pid: std::process::id(),
     })
 }

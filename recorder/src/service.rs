@@ -137,7 +137,7 @@ fn about(node: &Node) -> About {
         ("run".to_owned(), format!("{}-{}", std::process::id(), now_ns())),
     ];
     About {
-        program: format!("alight {}", env!("CARGO_PKG_VERSION")),
+        program: format!("alight {}", node::version()),
         facts: facts.into(),
         utc_offset_ns: utc_offset_ns(),
     }

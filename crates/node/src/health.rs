@@ -9,6 +9,7 @@ use messages::{Count, Health, Latency, Rate};
 use crate::clock::{clock_name, host_name, now_ns};
 use crate::identity::Identity;
 use crate::stats;
+use crate::version::version;
 
 /// Number of recent latencies over which percentiles are taken.
 const LATENCIES_KEPT: usize = 512;
@@ -112,8 +113,7 @@ impl HealthCounters {
             service: identity.service.to_owned(),
             instance: identity.instance.clone(),
             host: host_name(),
-            // All packages of the workspace have one version.
-            version: env!("CARGO_PKG_VERSION").to_owned(),
+            version: version().to_owned(),
             clock: clock_name().to_owned(),
             stamp_ns: now,
             pid: std::process::id(),

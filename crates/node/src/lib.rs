@@ -8,8 +8,8 @@
 //! [`access`], and [`session`] joins it under an [`identity`], a tool's unless `foreign` programs answer there, with shared memory where `memory`
 //! says that it can; [`topics`] has typed messages, [`frames`] pixels,
 //! and [`tap`] everything as it came; [`health`] counts, with [`stats`]; [`denied`] counts what access control
-//! denies; [`clock`] is the host's clock, [`standstill`] says that a process was frozen, and [`state`] where a service keeps
-//! what survives a reboot.
+//! denies; [`clock`] is the host's clock, [`standstill`] says that a process was frozen, [`state`] where a service keeps
+//! what survives a reboot, and [`version`](mod@version) which program it is.
 
 pub mod access;
 mod block_on;
@@ -31,6 +31,7 @@ pub mod state;
 pub mod stats;
 pub mod tap;
 pub mod topics;
+pub mod version;
 
 pub use block_on::block_on;
 pub use boxed::BoxFuture;
@@ -48,3 +49,4 @@ pub use standstill::Standstill;
 pub use state::{STATE_VARIABLE, state_directory};
 pub use tap::{Tap, Tapped};
 pub use topics::{Commands, Publisher, Request, Subscriber};
+pub use version::{set_version, version};

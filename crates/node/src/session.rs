@@ -17,6 +17,7 @@ use crate::foreign;
 use crate::health::HealthCounters;
 use crate::identity::Identity;
 use crate::memory::lack_of_shared_memory;
+use crate::version::version;
 
 /// The configuration for one machine, the default.
 pub const LOCAL_CONFIG: &str = include_str!("../../../zenoh-config/local.json5");
@@ -340,7 +341,7 @@ impl Node {
                 service: self.identity.service.to_owned(),
                 instance: self.identity.instance.clone(),
                 host: host_name(),
-                version: env!("CARGO_PKG_VERSION").to_owned(),
+                version: version().to_owned(),
                 toml,
             };
             let mut due = tokio::time::interval(CONFIGURATION_PERIOD);

@@ -60,7 +60,7 @@ impl<'a> Recording<'a> {
                 service: (*service).to_owned(),
                 instance: "main".to_owned(),
                 host: node::host_name(),
-                version: env!("CARGO_PKG_VERSION").to_owned(),
+                version: node::version().to_owned(),
                 toml: toml.clone(),
             };
             self.write(now_ns, topic::CONFIGURATION, &[service, "main"], &configuration)?;
