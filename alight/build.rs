@@ -56,7 +56,10 @@ fn commit(root: &Path) -> Option<String> {
 
 /// What git says; `None` where there is none, or it refuses.
 fn git(root: &Path, arguments: &[&str]) -> Option<String> {
-    let output = Command::new("git").arg("-C").arg(root).args(arguments).output().ok()?;
+    let mut command = Command::new("git");
+    // A user may have git check signatures, and tell of it.
+    command.args(["-c", "log.showSignature=false", "-C"]).arg(root);
+    let output = command.args(arguments).output().ok()?;
     let text = String::from_utf8(output.stdout).ok().filter(|_| output.status.success())?;
     Some(text.trim().to_owned())
 }

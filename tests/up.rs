@@ -278,6 +278,13 @@ fn a_dry_run_says_what_would_be_run_and_a_mistake_is_named() -> anyhow::Result<(
     ensure!(commands == ["relay", "simulator", "detector", "controller"], "{text}");
     let output = alight(folder.path(), &["up", "relay", "--dry-run"])?;
     ensure!(output.status.success(), "{output:?}");
+    let set = "\"source.command=['no-such-camera']\", \"source.size_px=[64, 48]\"";
+    let camera = format!("[[local]]\nrun = 'camera-pub'\nset = [{set}]\n");
+    std::fs::write(folder.path().join("site.toml"), camera)?;
+    let output = alight(folder.path(), &["up", "local", "--dry-run"])?;
+    let text = String::from_utf8_lossy(&output.stderr);
+    let named = "camera-pub: there is no program `no-such-camera` in the PATH";
+    ensure!(output.status.code() == Some(1) && text.contains(named), "{output:?}");
     std::fs::write(folder.path().join("site.toml"), "[[drone]]\nrun = 'detectr'\n")?;
     let output = alight(folder.path(), &["up", "drone", "--dry-run"])?;
     let text = String::from_utf8_lossy(&output.stderr);

@@ -24,6 +24,7 @@ use tokio::time::timeout;
 use self::focus::Focus;
 use crate::args::{Format, NetworkArgs, OPERATOR};
 use crate::keys;
+use crate::programs::{missing, missing_of_service};
 use crate::runtime::{block_on, tool_identity};
 use crate::services::Service;
 use crate::site::{Job, Role, Site};
@@ -141,7 +142,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
         network = site.network(role);
         match site.jobs(role) {
             Ok(jobs) => {
-                check_site(&mut findings, role, &jobs);
+                check_site(&mut findings, role, &site.folder, &jobs);
                 expected = jobs;
             }
             Err(problem) => findings.wrong(
@@ -231,10 +232,11 @@ fn check_machine(findings: &mut Findings) {
     }
 }
 
-fn check_site(findings: &mut Findings, role: Role, jobs: &[Job]) {
+fn check_site(findings: &mut Findings, role: Role, folder: &Path, jobs: &[Job]) {
     let names: Vec<_> = jobs.iter().map(|job| job.name.as_str()).collect();
     findings.good("site", format!("{} runs {}", role.name(), names.join(", ")));
     let (mut certificates, mut holders) = (BTreeSet::new(), BTreeSet::new());
+    let search = std::env::var_os("PATH").unwrap_or_default();
     for job in jobs {
         if job.network.is_open().unwrap_or(false) {
             findings.doubtful("security", format!("{}: {INSECURE}", job.name), MAKE_KEYS);
@@ -248,8 +250,12 @@ fn check_site(findings: &mut Findings, role: Role, jobs: &[Job]) {
                 check_holders(findings, keys, vehicle);
             }
         }
+        let missing = missing(job, folder, &search);
+        if let Some(problem) = missing.or_else(|| missing_of_service(job, folder, &search)) {
+            findings.wrong("programs", problem, "`alight up ... --dry-run` reports the same");
+        }
         if let Some(service) = job.service {
-            check_devices(findings, job, service);
+            check_devices(findings, job, service, folder);
         }
     }
 }
@@ -285,7 +291,7 @@ fn problem_of_key(job: &Job, service: Service) -> Option<String> {
 }
 
 /// Checks the files and devices that a service needs.
-fn check_devices(findings: &mut Findings, job: &Job, service: Service) {
+fn check_devices(findings: &mut Findings, job: &Job, service: Service, folder: &Path) {
     let Ok(config) = service.effective_config(&job.layers) else { return };
     if service == Service::Controller
         && let Some(address) = config["autopilot"]["address"].as_str()
@@ -309,7 +315,7 @@ fn check_devices(findings: &mut Findings, job: &Job, service: Service) {
     if service == Service::CameraPub {
         let paths = config["source"]["paths"].as_array().into_iter().flatten();
         for path in paths.filter_map(toml::Value::as_str) {
-            if let Err(cause) = std::fs::metadata(path) {
+            if let Err(cause) = std::fs::metadata(folder.join(path)) {
                 findings.wrong("camera", format!("{path}: {cause}"), "correct `source.paths`");
             }
         }

@@ -2,13 +2,11 @@
 //! in order.
 
 use std::collections::VecDeque;
-use std::ffi::OsStr;
-use std::os::unix::fs::PermissionsExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail};
 use clap::Args;
 use node::Shutdown;
 use tokio::process::Command;
@@ -16,6 +14,7 @@ use tokio::time::Instant;
 
 use crate::children::{ChildEvent, Children, Exit};
 use crate::peers::{LandingMarkerFile, Peers, Slot};
+use crate::programs::{OWN_PROGRAM, missing, missing_of_service};
 use crate::runtime::block_on;
 use crate::services::Service;
 use crate::site::{Job, Role, Site};
@@ -30,13 +29,11 @@ pub(crate) struct UpArgs {
     /// The site: which processes run on which machine (TOML, `docs/deploy.md`).
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Print the processes without starting them; a program that is not found is an error.
+    /// Print the processes without starting them; a program that is not found is an error, also one that reads a camera.
     #[arg(long)]
     dry_run: bool,
 }
 
-/// The name of this program in a command.
-const OWN_PROGRAM: &str = "alight";
 /// Pause before a process is restarted; doubled with each further exit within [`PERIOD`].
 const MIN_PAUSE: Duration = Duration::from_millis(500);
 const MAX_PAUSE: Duration = Duration::from_secs(8);
@@ -57,35 +54,18 @@ pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
     }
     let search = std::env::var_os("PATH").unwrap_or_default();
     for job in &jobs {
-        check_program(job, &site.folder, &search)?;
+        let missing = missing(job, &site.folder, &search);
+        // In the air the others go on without a camera; its publisher tells what it lacks, and is started again.
+        let of_service = || missing_of_service(job, &site.folder, &search).filter(|_| args.dry_run);
+        if let Some(problem) = missing.or_else(of_service) {
+            bail!(problem);
+        }
     }
     if args.dry_run {
         return Ok(ExitCode::SUCCESS);
     }
     node::start_logging("warn");
     block_on(supervise(&site, args.role, jobs))?
-}
-
-/// Refuses a program that cannot be started: at its path from the site's folder, or in one of the folders of `search`.
-fn check_program(job: &Job, folder: &Path, search: &OsStr) -> anyhow::Result<()> {
-    let Some(program) = job.command.first().filter(|program| *program != OWN_PROGRAM) else {
-        return Ok(());
-    };
-    let is_program = |path: PathBuf| {
-        let found = std::fs::metadata(path);
-        found.is_ok_and(|it| it.is_file() && it.permissions().mode() & 0o111 != 0)
-    };
-    let (name, is_path) = (&job.name, program.contains('/'));
-    let is_found = match is_path {
-        true => is_program(folder.join(program)),
-        false => std::env::split_paths(search).any(|place| is_program(place.join(program))),
-    };
-    ensure!(
-        is_found,
-        "{name}: there is no program `{program}` {}; install it, or correct its `command`",
-        if is_path { format!("from {}", folder.display()) } else { "in the PATH".to_owned() }
-    );
-    Ok(())
 }
 
 /// Prints a line. A failure is ignored: the supervisor continues without a terminal.
@@ -390,30 +370,6 @@ mod tests {
             process.on_exit(&failure(1), now);
             assert_eq!(process.state, State::Waiting(now + MIN_PAUSE));
             now += PERIOD + MIN_PAUSE;
-        }
-    }
-
-    #[test]
-    fn a_program_that_is_not_found_is_named() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("there");
-        std::fs::write(&file, "#!/bin/sh\n").unwrap();
-        let check = |program: &str| {
-            let job = Job { command: vec![program.to_owned()], ..supervised().job };
-            check_program(&job, folder.path(), folder.path().as_os_str())
-        };
-        // It may not be run.
-        check("there").unwrap_err();
-        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o755)).unwrap();
-        for program in ["alight", "there", "./there", file.to_str().unwrap()] {
-            check(program).unwrap();
-        }
-        for program in ["absent", "./absent", "/no/such"] {
-            let problem = check(program).unwrap_err().to_string();
-            assert!(
-                problem.contains(&format!("detector: there is no program `{program}`")),
-                "{problem}"
-            );
         }
     }
 

@@ -1,0 +1,108 @@
+//! The programs that the processes of a site need beside `alight`, and whether this machine has them.
+
+use std::ffi::OsStr;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use crate::services::Service;
+use crate::site::Job;
+
+/// The name of this program in a command.
+pub(crate) const OWN_PROGRAM: &str = "alight";
+
+/// Why the program of a process cannot be started, with what to do, or `None`: it is looked for at its path from the site's folder,
+/// or in one of the folders of `search`.
+pub(crate) fn missing(job: &Job, folder: &Path, search: &OsStr) -> Option<String> {
+    let program = job.command.first().filter(|program| *program != OWN_PROGRAM)?;
+    absent(program, folder, search)
+        .map(|absent| format!("{}: {absent}; install it, or correct its `command`", job.name))
+}
+
+/// The same of a program that a service starts: the one that reads a camera.
+pub(crate) fn missing_of_service(job: &Job, folder: &Path, search: &OsStr) -> Option<String> {
+    let service = job.service.filter(|service| *service == Service::CameraPub)?;
+    let config = service.effective_config(&job.layers).ok()?;
+    let command = config.get("source")?.get("command")?.as_array()?;
+    let program = command.first()?.as_str()?;
+    absent(program, folder, search).map(|absent| {
+        format!("{}: {absent}; install it, or correct its `source.command`", job.name)
+    })
+}
+
+fn absent(program: &str, folder: &Path, search: &OsStr) -> Option<String> {
+    let is_program = |path: PathBuf| {
+        let found = std::fs::metadata(path);
+        found.is_ok_and(|it| it.is_file() && it.permissions().mode() & 0o111 != 0)
+    };
+    let (is_found, place) = match program.contains('/') {
+        true => (is_program(folder.join(program)), format!("from {}", folder.display())),
+        false => {
+            let mut places = std::env::split_paths(search);
+            (places.any(|place| is_program(place.join(program))), "in the PATH".to_owned())
+        }
+    };
+    (!is_found).then(|| format!("there is no program `{program}` {place}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn job(service: Service, command: &[&str], set: &[&str]) -> Job {
+        Job {
+            name: service.name().to_owned(),
+            service: Some(service),
+            command: command.iter().map(|&it| it.to_owned()).collect(),
+            network: node::Network::default(),
+            key: service.name().to_owned(),
+            layers: node::Layers { file: None, set: set.iter().map(|&it| it.to_owned()).collect() },
+        }
+    }
+
+    /// A folder with the file `there`, which may be run.
+    fn folder() -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("there");
+        std::fs::write(&file, "#!/bin/sh\n").unwrap();
+        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o755)).unwrap();
+        folder
+    }
+
+    #[test]
+    fn a_program_that_is_not_found_is_named() {
+        let folder = folder();
+        let told = |program: &str| {
+            let job = job(Service::Detector, &[program], &[]);
+            missing(&job, folder.path(), folder.path().as_os_str())
+        };
+        let file = folder.path().join("there");
+        for program in ["alight", "there", "./there", file.to_str().unwrap()] {
+            assert_eq!(told(program), None, "{program}");
+        }
+        for program in ["absent", "./absent", "/no/such"] {
+            let told = told(program).unwrap();
+            let named = format!("detector: there is no program `{program}`");
+            assert!(told.contains(&named), "{told}");
+        }
+        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o644)).unwrap();
+        assert!(told("there").is_some(), "it may not be run");
+    }
+
+    #[test]
+    fn the_program_of_a_camera_is_looked_for_as_well() {
+        let folder = folder();
+        let told = |command: &str| {
+            let command = format!("source.command={command}");
+            let set = ["source.size_px=[64, 48]", "calibration.file=c.yaml", command.as_str()];
+            let job = job(Service::CameraPub, &["alight", "camera-pub"], &set);
+            missing_of_service(&job, folder.path(), folder.path().as_os_str())
+        };
+        assert_eq!(told("['there', 'x']"), None);
+        assert_eq!(told("['./there']"), None);
+        let problem = told("['rpicam-none', 'x']").unwrap();
+        assert_eq!(
+            problem,
+            "camera-pub: there is no program `rpicam-none` in the PATH; install it, or correct its `source.command`"
+        );
+    }
+}
