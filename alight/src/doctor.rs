@@ -4,6 +4,7 @@
 
 mod cameras;
 mod focus;
+mod keys;
 
 use std::collections::BTreeSet;
 use std::fmt::Write;
@@ -13,8 +14,7 @@ use std::time::Duration;
 
 use clap::Args;
 use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, Phase, topic};
-use node::access::{HOLDERS, Holder, Holders};
-use node::network::{AIR_PORT, AUTHORITY, Address, check_private};
+use node::network::{AIR_PORT, Address};
 use node::version::release;
 use node::{INSECURE, Network, Node, clock_name, stats};
 use rustix::process::{Resource, getrlimit};
@@ -22,8 +22,8 @@ use serde::Serialize;
 use tokio::time::timeout;
 
 use self::focus::Focus;
+use self::keys::Checked;
 use crate::args::{Format, NetworkArgs, OPERATOR};
-use crate::keys;
 use crate::programs::{missing, missing_of_service};
 use crate::runtime::{block_on, tool_identity};
 use crate::services::Service;
@@ -52,8 +52,6 @@ pub(crate) struct DoctorArgs {
 /// Minimum memlock limit of a reader of frames, in bytes: a camera of 1296 x 972 pixels takes 5 MB, and a
 /// reader keeps the memory of every camera process it has seen.
 const MIN_MEMLOCK: u64 = 64 << 20;
-/// Certificates that expire within this time are reported, in seconds.
-const EXPIRES_SOON_S: i64 = 30 * 86_400;
 /// Number of round trips to each process.
 const ROUND_TRIPS: u32 = 10;
 const REPLY_TIMEOUT: Duration = Duration::from_millis(300);
@@ -137,12 +135,16 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     check_machine(&mut findings);
     let mut network = args.network.network();
     let mut expected = Vec::new();
+    let mut checked = Checked::default();
+    // On the drone what is asked stays on the machine, and needs no key.
+    let mut needs_key = true;
     if let (Some(role), Some(file)) = (args.role, &args.config) {
         let site = Site::read(file)?;
         network = site.network(role);
+        needs_key = matches!(role, Role::Ground | Role::Relay);
         match site.jobs(role) {
             Ok(jobs) => {
-                check_site(&mut findings, role, &site.folder, &jobs);
+                check_site(&mut findings, &mut checked, role, &site.folder, &jobs);
                 expected = jobs;
             }
             Err(problem) => findings.wrong(
@@ -151,9 +153,12 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
                 "fix the file; `alight up ... --dry-run` reports the same",
             ),
         }
-    } else if let Some(keys) = &network.keys {
-        check_certificate(&mut findings, keys, OPERATOR);
     }
+    let before = findings.count(Verdict::Wrong);
+    if let Some(keys) = network.keys.as_ref().filter(|_| needs_key) {
+        checked.operator(&mut findings, keys, network.vehicle.as_deref());
+    }
+    let is_key_wrong = findings.count(Verdict::Wrong) > before;
     let before = findings.findings.len();
     match network.source(OPERATOR) {
         Ok(zenoh) => block_on(async {
@@ -174,6 +179,11 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
                 ),
             }
         })?,
+        Err(_) if is_key_wrong => findings.doubtful(
+            "network",
+            "not looked at, as the operator's key cannot be used".to_owned(),
+            "mend the key, then run this again",
+        ),
         Err(problem) => findings.wrong(
             "network",
             format!("{problem:#}"),
@@ -232,24 +242,21 @@ fn check_machine(findings: &mut Findings) {
     }
 }
 
-fn check_site(findings: &mut Findings, role: Role, folder: &Path, jobs: &[Job]) {
+fn check_site(
+    findings: &mut Findings,
+    checked: &mut Checked,
+    role: Role,
+    folder: &Path,
+    jobs: &[Job],
+) {
     let names: Vec<_> = jobs.iter().map(|job| job.name.as_str()).collect();
     findings.good("site", format!("{} runs {}", role.name(), names.join(", ")));
-    let (mut certificates, mut holders) = (BTreeSet::new(), BTreeSet::new());
     let search = std::env::var_os("PATH").unwrap_or_default();
     for job in jobs {
         if job.network.is_open().unwrap_or(false) {
             findings.doubtful("security", format!("{}: {INSECURE}", job.name), MAKE_KEYS);
         }
-        if let Some(keys) = job.network.keys.as_deref().filter(|_| job.needs_key())
-            && certificates.insert((keys, &job.key))
-        {
-            check_certificate(findings, keys, &job.key);
-            let vehicle = job.network.vehicle.as_deref().unwrap_or("drone");
-            if holders.insert((keys, vehicle)) {
-                check_holders(findings, keys, vehicle);
-            }
-        }
+        checked.process(findings, job);
         let missing = missing(job, folder, &search);
         if let Some(problem) = missing.or_else(|| missing_of_service(job, folder, &search)) {
             findings.wrong("programs", problem, "`alight up ... --dry-run` reports the same");
@@ -257,22 +264,6 @@ fn check_site(findings: &mut Findings, role: Role, folder: &Path, jobs: &[Job]) 
         if let Some(service) = job.service {
             check_devices(findings, job, service, folder);
         }
-    }
-}
-
-/// Checks that a list of holders among the keys names the drone: processes beside an older one refuse its relay.
-fn check_holders(findings: &mut Findings, keys: &Path, vehicle: &str) {
-    let path = keys.join(HOLDERS);
-    let Ok(text) = std::fs::read_to_string(&path) else { return };
-    let copy = "copy it from the authority's folder again, and start what reads it anew";
-    match text.parse::<Holders>() {
-        Err(problem) => findings.wrong("keys", format!("{}: {problem:#}", path.display()), copy),
-        Ok(holders) if !holders.has("drone", vehicle) => findings.wrong(
-            "keys",
-            format!("{} does not name `drone@{vehicle}`, which is refused", path.display()),
-            copy,
-        ),
-        Ok(_) => {}
     }
 }
 
@@ -320,42 +311,6 @@ fn check_devices(findings: &mut Findings, job: &Job, service: Service, folder: &
             }
         }
     }
-}
-
-fn check_certificate(findings: &mut Findings, keys: &Path, role: &str) {
-    for (name, file) in [(role, format!("{role}.pem")), ("authority", AUTHORITY.to_owned())] {
-        let path = keys.join(file);
-        let again = "make a new one with `alight keys`, in a new directory";
-        match keys::certificate(&path) {
-            Err(problem) => findings.wrong("keys", format!("{problem:#}"), again),
-            Ok(read) if name == role && key_name_of(&read) != role => findings.wrong(
-                "keys",
-                format!("{path:?} is for `{}`", read.common_name),
-                "keep the file names of `alight keys issue`",
-            ),
-            Ok(read) if read.expires_in_s < 0 => {
-                findings.wrong("keys", format!("{path:?} has expired"), again);
-            }
-            Ok(read) if read.expires_in_s < EXPIRES_SOON_S => findings.doubtful(
-                "keys",
-                format!("{path:?} expires in {} days", read.expires_in_s / 86_400),
-                again,
-            ),
-            Ok(read) => findings
-                .good("keys", format!("{path:?} is valid for {} days", read.expires_in_s / 86_400)),
-        }
-    }
-    let key = keys.join(format!("{role}.key"));
-    if key.is_file()
-        && let Err(problem) = check_private(&key)
-    {
-        findings.wrong("keys", format!("{problem:#}"), "run the command, then this again");
-    }
-}
-
-/// The file name for which a certificate was made.
-fn key_name_of(certificate: &keys::Certificate) -> String {
-    certificate.common_name.parse().map_or_else(|_| String::new(), |h: Holder| h.key_name())
 }
 
 /// Checks whether the ports of the other side accept connections.

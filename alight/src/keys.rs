@@ -178,6 +178,21 @@ pub(crate) fn certificate(path: &Path) -> anyhow::Result<Certificate> {
     Ok(Certificate { common_name, expires_in_s })
 }
 
+/// Whether an authority has signed a certificate.
+///
+/// # Errors
+/// When a file is not a certificate.
+pub(crate) fn is_signed_by(certificate: &Path, authority: &Path) -> anyhow::Result<bool> {
+    let [signed, signer] = [certificate, authority].map(|path| {
+        let text = fs::read(path).with_context(|| format!("reading the certificate {path:?}"))?;
+        let pem = x509_parser::pem::parse_x509_pem(&text).map(|(_, pem)| pem);
+        pem.map_err(|cause| anyhow!("{path:?} is not a certificate: {cause}"))
+    });
+    let (signed, signer) = (signed?, signer?);
+    let (signed, signer) = (signed.parse_x509()?, signer.parse_x509()?);
+    Ok(signed.verify_signature(Some(signer.public_key())).is_ok())
+}
+
 fn init(output: &Path, days: u32) -> anyhow::Result<Vec<PathBuf>> {
     let files = [output.join(AUTHORITY_KEY), output.join(AUTHORITY)];
     refuse_existing(&files)?;

@@ -131,6 +131,11 @@ impl Holders {
         Ok(())
     }
 
+    /// True when it is among them, and not revoked.
+    pub fn admits(&self, holder: &Holder) -> bool {
+        self.admitted.contains(holder)
+    }
+
     /// True when a vehicle's key in this role is among them.
     pub fn has(&self, role: &str, vehicle: &str) -> bool {
         self.of(role, vehicle).next().is_some()

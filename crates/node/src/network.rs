@@ -253,7 +253,7 @@ fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()>
     }
     let key_file = keys.join(key_file);
     check_private(&key_file)?;
-    key_pair::check(&keys.join(AUTHORITY), &keys.join(format!("{key_name}.pem")), &key_file)?;
+    check_pair(keys, key_name)?;
     each_endpoint(config, &["connect", "listen"], |e| {
         if !(connects_locally && e.host == LOOPBACK) {
             e.protocol = "tls".to_owned();
@@ -284,7 +284,7 @@ fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()>
 }
 
 /// The arguments with which `alight keys issue` makes a key.
-fn issue_arguments(key_name: &str) -> String {
+pub fn issue_arguments(key_name: &str) -> String {
     match key_name.split_once('.') {
         Some((role, name)) => format!("--role {role} --name {name}"),
         // Others connect to these.
@@ -309,6 +309,15 @@ pub fn check_private(path: &Path) -> anyhow::Result<()> {
         path.display()
     );
     Ok(())
+}
+
+/// Checks that the key of this name in a directory belongs to its certificate.
+///
+/// # Errors
+/// Names the file that is none, or the key of another certificate.
+pub fn check_pair(keys: &Path, key_name: &str) -> anyhow::Result<()> {
+    let [certificate, key] = ["pem", "key"].map(|end| keys.join(format!("{key_name}.{end}")));
+    key_pair::check(&keys.join(AUTHORITY), &certificate, &key)
 }
 
 /// An endpoint at which everybody in reach may connect to this configuration; `None` if only this machine or

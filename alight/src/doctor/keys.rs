@@ -1,0 +1,334 @@
+//! The keys of this machine: those of its processes, and on the ground that of its operator.
+
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+use node::access::{HOLDERS, Holder, Holders};
+use node::network::{AUTHORITY, check_pair, check_private, issue_arguments};
+
+use super::Findings;
+use crate::args::OPERATOR;
+use crate::keys::{Certificate, certificate, is_signed_by};
+use crate::site::Job;
+
+/// Certificates that expire within this time are reported, in seconds.
+const EXPIRES_SOON_S: i64 = 30 * DAY_S;
+const DAY_S: i64 = 86_400;
+const COPY_HOLDERS: &str =
+    "copy it from the authority's folder again, and start what reads it anew";
+const COPY_BOTH: &str = "copy certificate and key from one `alight keys issue`";
+
+/// What was checked already, so that it is told once.
+#[derive(Default)]
+pub(super) struct Checked {
+    keys: BTreeSet<(PathBuf, String)>,
+    authorities: BTreeSet<PathBuf>,
+    vehicles: BTreeSet<(PathBuf, String)>,
+}
+
+impl Checked {
+    /// Checks the key of a process of the site, if it needs one.
+    pub(super) fn process(&mut self, findings: &mut Findings, job: &Job) {
+        if let Some(keys) = job.network.keys.as_deref().filter(|_| job.needs_key()) {
+            self.key(findings, keys, &job.key, job.network.vehicle.as_deref());
+        }
+    }
+
+    /// Checks the key of the operator, with which `alight command` and `alight doctor` join the network.
+    pub(super) fn operator(&mut self, findings: &mut Findings, keys: &Path, vehicle: Option<&str>) {
+        self.key(findings, keys, OPERATOR, vehicle);
+    }
+
+    /// Checks the files of a key by their name.
+    fn key(&mut self, findings: &mut Findings, keys: &Path, name: &str, vehicle: Option<&str>) {
+        let vehicle = vehicle.unwrap_or("drone");
+        if !self.keys.insert((keys.to_owned(), name.to_owned())) {
+            return;
+        }
+        if self.authorities.insert(keys.to_owned()) {
+            check_authority(findings, &keys.join(AUTHORITY));
+        }
+        let is_there = ["pem", "key"].map(|end| keys.join(format!("{name}.{end}")).exists());
+        if is_there == [false; 2] {
+            let place = keys.display();
+            let told = format!("there is no key `{name}` in {place}{}", without(name));
+            findings.wrong("keys", told, &issue(name, vehicle));
+        } else {
+            check_certificate(findings, keys, name, vehicle);
+            check_key(findings, keys, name, vehicle);
+        }
+        if self.vehicles.insert((keys.to_owned(), vehicle.to_owned())) {
+            check_holders(findings, keys, vehicle);
+        }
+    }
+}
+
+/// How to make a key and its certificate.
+fn issue(name: &str, vehicle: &str) -> String {
+    let arguments = issue_arguments(name);
+    format!(
+        "make it where the authority is, into a new directory (`alight keys issue {arguments} --vehicle {vehicle} --authority DIR -o NEW`), \
+         and copy it here"
+    )
+}
+
+/// What cannot be done without a key.
+fn without(name: &str) -> &'static str {
+    match name {
+        OPERATOR => ": without it this machine can neither command nor see what runs on the drone",
+        _ => "",
+    }
+}
+
+fn check_authority(findings: &mut Findings, path: &Path) {
+    let again = "copy it again from where `alight keys init` made it";
+    match certificate(path) {
+        Err(problem) => findings.wrong("keys", format!("the authority: {problem:#}"), again),
+        Ok(read) => tell_validity(findings, &read, "the authority", path, "make a new authority"),
+    }
+}
+
+/// Tells how long a certificate is valid.
+fn tell_validity(
+    findings: &mut Findings,
+    read: &Certificate,
+    whose: &str,
+    path: &Path,
+    again: &str,
+) {
+    let days = read.expires_in_s.unsigned_abs() / DAY_S.unsigned_abs();
+    let path = path.display();
+    match read.expires_in_s {
+        ..0 => findings.wrong(
+            "keys",
+            format!(
+                "{whose} has expired {days} days ago, or the clock of this machine is wrong: {path}"
+            ),
+            again,
+        ),
+        0..EXPIRES_SOON_S => {
+            findings.doubtful("keys", format!("{whose} expires in {days} days: {path}"), again);
+        }
+        _ => findings.good("keys", format!("{whose} is valid for {days} days: {path}")),
+    }
+}
+
+/// Checks a certificate: whose it is, for which vehicle, and whether the authority has signed it and the list of holders names it.
+fn check_certificate(findings: &mut Findings, keys: &Path, name: &str, vehicle: &str) {
+    let path = keys.join(format!("{name}.pem"));
+    let told = path.display();
+    let again = issue(name, vehicle);
+    let read = match certificate(&path) {
+        Ok(read) => read,
+        Err(problem) => {
+            findings.wrong("keys", format!("the key `{name}`: {problem:#}"), &again);
+            return;
+        }
+    };
+    let holder = match read.common_name.parse::<Holder>() {
+        Ok(holder) if holder.key_name() == name => holder,
+        _ => {
+            let whose = format!("{told} is of `{}`, not of a `{name}`", read.common_name);
+            findings.wrong("keys", whose, "keep the file names of `alight keys issue`");
+            return;
+        }
+    };
+    if holder.vehicle() != vehicle {
+        findings.wrong(
+            "keys",
+            format!(
+                "{told} is of `{holder}`, and the vehicle here is `{vehicle}`, which refuses it"
+            ),
+            &format!("correct `vehicle` in the site, or {again}"),
+        );
+        return;
+    }
+    match is_signed_by(&path, &keys.join(AUTHORITY)) {
+        Ok(true) => {
+            let whose = format!("the key of `{holder}`, signed by the authority here,");
+            tell_validity(findings, &read, &whose, &path, &again);
+        }
+        Ok(false) => findings.wrong(
+            "keys",
+            format!("{told} is not signed by the authority whose certificate lies beside it, so nobody takes it"),
+            "copy all files from one directory of `alight keys issue`, of one authority",
+        ),
+        // It was told above that the authority's certificate cannot be read.
+        Err(_) => {}
+    }
+    let listed = std::fs::read_to_string(keys.join(HOLDERS)).ok();
+    if let Some(holders) = listed.and_then(|text| text.parse::<Holders>().ok())
+        && !holders.admits(&holder)
+    {
+        let list = keys.join(HOLDERS);
+        findings.wrong(
+            "keys",
+            format!("{} does not name `{holder}`, or names it as revoked: it is refused", list.display()),
+            "copy the list from the authority's folder again; a revoked key stays out, and another `--name` is let in",
+        );
+    }
+}
+
+/// Checks a private key: whether it is there, for this user alone, and belongs to its certificate.
+fn check_key(findings: &mut Findings, keys: &Path, name: &str, vehicle: &str) {
+    let path = keys.join(format!("{name}.key"));
+    let told = path.display();
+    match File::open(&path) {
+        Err(cause) if cause.kind() == ErrorKind::NotFound => {
+            let without = match name {
+                OPERATOR => {
+                    ": without it this machine can neither command nor see what runs on the drone"
+                }
+                _ => "",
+            };
+            findings.wrong("keys", format!("there is no {told}{without}"), &issue(name, vehicle));
+            return;
+        }
+        Err(cause) => {
+            let own = "it belongs to the user that runs this: `chown` it, or run this as that user";
+            findings.wrong("keys", format!("{told} cannot be read: {cause}"), own);
+            return;
+        }
+        Ok(_) => {}
+    }
+    if let Err(problem) = check_private(&path) {
+        findings.wrong("keys", format!("{problem:#}"), "run the command, then this again");
+    }
+    let has_certificates = [AUTHORITY.to_owned(), format!("{name}.pem")]
+        .iter()
+        .all(|file| certificate(&keys.join(file)).is_ok());
+    if has_certificates && let Err(problem) = check_pair(keys, name) {
+        findings.wrong("keys", format!("{problem:#}"), COPY_BOTH);
+    }
+}
+
+/// Checks that a list of holders among the keys names the drone: processes beside an older one refuse its relay.
+fn check_holders(findings: &mut Findings, keys: &Path, vehicle: &str) {
+    let path = keys.join(HOLDERS);
+    let Ok(text) = std::fs::read_to_string(&path) else { return };
+    match text.parse::<Holders>() {
+        Err(problem) => {
+            findings.wrong("keys", format!("{}: {problem:#}", path.display()), COPY_HOLDERS);
+        }
+        Ok(holders) if !holders.has("drone", vehicle) => findings.wrong(
+            "keys",
+            format!("{} does not name `drone@{vehicle}`, which is refused", path.display()),
+            COPY_HOLDERS,
+        ),
+        Ok(_) => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+    use crate::keys::make_for_tests;
+
+    /// What is told of the operator's key in a folder.
+    fn told(keys: &Path) -> String {
+        let mut findings = Findings::default();
+        Checked::default().operator(&mut findings, keys, None);
+        findings.text()
+    }
+
+    #[test]
+    fn the_operators_key_is_told_with_its_holder_and_what_is_wrong_with_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let [here, other] = ["here", "other"].map(|name| folder.path().join(name));
+        for keys in [&here, &other] {
+            make_for_tests(keys, &[]).unwrap();
+        }
+        let good = told(&here);
+        assert!(good.ends_with("Nothing is wrong."), "{good}");
+        let whose = "the key of `operator@drone`, signed by the authority here, ";
+        assert!(good.contains(whose), "{good}");
+        let file = |name: &str| here.join(name);
+        let copy = |from: &Path, name: &str| {
+            std::fs::copy(from, file(name)).unwrap();
+        };
+        let changes: [(&str, &dyn Fn(), &str); 8] = [
+            (
+                "another authority",
+                &|| copy(&other.join(AUTHORITY), AUTHORITY),
+                "is not signed by the authority",
+            ),
+            ("another key", &|| copy(&file("observer.key"), "operator.key"), "does not belong to"),
+            (
+                "another certificate",
+                &|| copy(&file("observer.pem"), "operator.pem"),
+                "is of `observer@drone`, not of a `operator`",
+            ),
+            (
+                "open to others",
+                &|| {
+                    let open = std::fs::Permissions::from_mode(0o644);
+                    std::fs::set_permissions(file("operator.key"), open).unwrap();
+                },
+                "chmod 600",
+            ),
+            (
+                "no key",
+                &|| std::fs::remove_file(file("operator.key")).unwrap(),
+                "can neither command nor see",
+            ),
+            (
+                "no certificate",
+                &|| std::fs::remove_file(file("operator.pem")).unwrap(),
+                "alight keys issue --role operator --vehicle drone",
+            ),
+            (
+                "neither",
+                &|| {
+                    for end in ["key", "pem"] {
+                        std::fs::remove_file(file(&format!("operator.{end}"))).unwrap();
+                    }
+                },
+                "there is no key `operator` in",
+            ),
+            (
+                "revoked",
+                &|| {
+                    let list = std::fs::read_to_string(file(HOLDERS)).unwrap();
+                    let list = list.replace("operator@", "revoked operator@");
+                    std::fs::write(file(HOLDERS), list).unwrap();
+                },
+                "does not name `operator@drone`, or names it as revoked",
+            ),
+        ];
+        for (name, change, part) in changes {
+            change();
+            let text = told(&here);
+            assert!(text.contains(part) && text.contains("WRONG"), "{name}: {text}");
+            std::fs::remove_dir_all(&here).unwrap();
+            make_for_tests(&here, &[]).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_key_of_another_vehicle_is_refused_there() {
+        let folder = tempfile::tempdir().unwrap();
+        make_for_tests(folder.path(), &[]).unwrap();
+        let mut findings = Findings::default();
+        Checked::default().operator(&mut findings, folder.path(), Some("kestrel"));
+        let text = findings.text();
+        let part = "is of `operator@drone`, and the vehicle here is `kestrel`, which refuses it";
+        assert!(text.contains(part), "{text}");
+    }
+
+    #[test]
+    fn a_certificate_that_ends_soon_or_has_ended_is_told() {
+        let told = |expires_in_s| {
+            let mut findings = Findings::default();
+            let read = Certificate { common_name: String::new(), expires_in_s };
+            tell_validity(&mut findings, &read, "the key", Path::new("x.pem"), "again");
+            findings.text()
+        };
+        assert!(told(400 * DAY_S).contains("ok     keys          the key is valid for 400 days"));
+        assert!(told(3 * DAY_S).contains("?      keys          the key expires in 3 days"));
+        assert!(told(-3 * DAY_S).contains("WRONG  keys          the key has expired 3 days ago"));
+    }
+}
