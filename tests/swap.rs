@@ -151,10 +151,24 @@ fn a_swap_that_fails_keeps_the_old_one_and_says_why(landing: &Landing) -> anyhow
     let blind = format!(
         "'{ALIGHT}' detector --set id=blind --set 'markers=[\"apriltag-36h11:5:0.2\"]' --zenoh '{zenoh}'"
     );
+    let wrong_size = format!(
+        "'{ALIGHT}' detector --set id=large --set 'markers=[\"rings:0.199433\"]' --zenoh '{zenoh}'"
+    );
     for (to, parts) in [
         (
             blind.as_str(),
             &["main stays in use", "agrees in only 0 of", "does not see the marker"][..],
+        ),
+        (
+            wrong_size.as_str(),
+            &[
+                "main stays in use",
+                "agrees in only 0 of",
+                "m from where `main` does",
+                "m farther, in the camera's view",
+                "`detectors.tolerance_m` of the controller, 0.1",
+                "as where the marker's size or the focal length is given 30 % larger",
+            ],
         ),
         ("false", &["main stays in use", "the new detector exited"]),
         ("no-such-program --x", &["no-such-program"]),

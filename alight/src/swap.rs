@@ -4,6 +4,8 @@
 //! the active one, becomes the active one, and only then the old one is stopped. On any failure before that,
 //! the old one stays in use and the new one is stopped.
 
+mod comparison;
+
 use std::collections::BTreeSet;
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -13,7 +15,8 @@ use std::time::Duration;
 use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use messages::{
-    Candidate, ControllerCommand, ControllerStatus, DetectorCommand, DetectorState, topic,
+    Candidate, Configuration, ControllerCommand, ControllerStatus, Detections, DetectorCommand,
+    DetectorState, topic,
 };
 use node::{Layers, Node, Presence, Shutdown, Subscriber};
 use rustix::process::{Pid, Signal, kill_process_group};
@@ -22,6 +25,7 @@ use tempfile::TempDir;
 use tokio::process::{Child, Command};
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
+use self::comparison::Comparison;
 use crate::args::{Format, NetworkArgs};
 use crate::runtime::with_node;
 use crate::terminal::{print, write_error};
@@ -36,6 +40,8 @@ const PROBATION: Duration = Duration::from_millis(600);
 const STOP_TIMEOUT: Duration = Duration::from_secs(3);
 /// Minimum ratio of agreeing frames to compared frames for the new detector.
 const MIN_AGREEMENT: f64 = 0.9;
+/// Timeout for the controller's configuration, which it publishes every three seconds.
+const CONFIGURATION_TIMEOUT: Duration = Duration::from_millis(3500);
 /// Number of lines of the log that are shown when a detector fails.
 const LOG_LINES_SHOWN: usize = 8;
 
@@ -109,6 +115,8 @@ pub(crate) fn run(args: &SwapArgs) -> anyhow::Result<ExitCode> {
 
 async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Result<Report> {
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
+    let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
+    let configurations = node.subscriber(topic::CONFIGURATION, &["controller", "*"]).await?;
     let presence = node.presence("detector").await?;
     let first = timeout(CONTROLLER_TIMEOUT, statuses.next()).await.ok().flatten();
     let first = first.context("no controller answered; `swap` needs a running controller")?;
@@ -127,6 +135,9 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
         node,
         shutdown,
         statuses,
+        detections,
+        configurations,
+        comparison: Comparison::default(),
         presence,
         existing,
         child,
@@ -248,6 +259,9 @@ struct Swap<'a> {
     node: &'a Node,
     shutdown: &'a Shutdown,
     statuses: Subscriber<ControllerStatus>,
+    detections: Subscriber<Detections>,
+    configurations: Subscriber<Configuration>,
+    comparison: Comparison,
     presence: Presence,
     existing: BTreeSet<String>,
     child: Child,
@@ -298,17 +312,27 @@ impl Swap<'_> {
 
     /// The next event; an error when the new detector exits, on a shutdown request, and at the deadline.
     async fn next_event(&mut self, deadline: Instant, waiting_for: &str) -> anyhow::Result<Event> {
-        tokio::select! {
-            Some(status) = self.statuses.next() => Ok(Event::Status(Box::new(status))),
-            Some((name, alive)) = self.presence.next() => {
-                Ok(if alive { Event::Joined(name) } else { Event::Left(name) })
-            }
-            status = self.child.wait() => {
-                let status = status.map_or_else(|cause| cause.to_string(), |s| s.to_string());
-                bail!("the new detector exited ({status}) while waiting until {waiting_for}")
-            }
-            () = self.shutdown.requested() => bail!("interrupted"),
-            () = sleep_until(deadline) => bail!("timeout while waiting until {waiting_for}"),
+        loop {
+            return tokio::select! {
+                Some(status) = self.statuses.next() => Ok(Event::Status(Box::new(status))),
+                Some((name, alive)) = self.presence.next() => {
+                    Ok(if alive { Event::Joined(name) } else { Event::Left(name) })
+                }
+                Some(found) = self.detections.next() => {
+                    self.comparison.found(&found);
+                    continue;
+                }
+                Some(configuration) = self.configurations.next() => {
+                    self.comparison.configured(&configuration);
+                    continue;
+                }
+                status = self.child.wait() => {
+                    let status = status.map_or_else(|cause| cause.to_string(), |s| s.to_string());
+                    bail!("the new detector exited ({status}) while waiting until {waiting_for}")
+                }
+                () = self.shutdown.requested() => bail!("interrupted"),
+                () = sleep_until(deadline) => bail!("timeout while waiting until {waiting_for}"),
+            };
         }
     }
 
@@ -328,12 +352,17 @@ impl Swap<'_> {
 
     async fn until_agreed(&mut self, new: &str, report: &mut Report) -> anyhow::Result<()> {
         let deadline = Instant::now() + Duration::from_secs(self.args.agree_s);
+        self.comparison.of(report.from.as_deref(), new);
         loop {
             let waiting_for = match (report.compared, report.agreed) {
                 (0, _) => "it can be compared: the active detector sees no marker, or the new one searches \
                            other frames"
                     .to_owned(),
-                (compared, agreed) => format!("it agrees, so far in {agreed} of {compared} frames"),
+                (compared, agreed) => {
+                    let differs = self.comparison.text().filter(|_| agreed < compared);
+                    let differs = differs.map_or_else(String::new, |text| format!("; {text}"));
+                    format!("it agrees, so far in {agreed} of {compared} frames{differs}")
+                }
             };
             match self.next_event(deadline, &waiting_for).await? {
                 Event::Left(name) if name == new => bail!("the new detector left the network"),
@@ -345,11 +374,42 @@ impl Swap<'_> {
                     let Some(shadow) = find(&status, new) else { continue };
                     (report.compared, report.agreed) = (shadow.compared, shadow.agreed);
                     report.disagreement_m = shadow.disagreement_m;
-                    if let Some(verdict) = verdict(shadow, self.args.frames) {
-                        return verdict;
+                    self.comparison.of(status.active_detector.as_deref(), new);
+                    match verdict(shadow, self.args.frames) {
+                        Some(Verdict::Agrees) => return Ok(()),
+                        Some(Verdict::Differs(why)) => {
+                            self.learn_limit().await;
+                            bail!("{why}{}", self.difference(shadow));
+                        }
+                        None => {}
                     }
                 }
                 Event::Joined(_) | Event::Left(_) => {}
+            }
+        }
+    }
+
+    /// Waits for the controller's configuration, which it publishes every few seconds: the limit is in it.
+    async fn learn_limit(&mut self) {
+        let waiting = async {
+            while !self.comparison.is_configured() {
+                match self.configurations.next().await {
+                    Some(configuration) => self.comparison.configured(&configuration),
+                    None => return,
+                }
+            }
+        };
+        // Without it the keys of the limit are named, and not their values.
+        let _ = timeout(CONFIGURATION_TIMEOUT, waiting).await;
+    }
+
+    /// In what it differs.
+    fn difference(&self, shadow: &Candidate) -> String {
+        match (shadow.disagreement_m, self.comparison.text()) {
+            (None, _) => "; it does not see the marker".to_owned(),
+            (Some(_), Some(text)) => format!("; {text}"),
+            (Some(apart_m), None) => {
+                format!("; its last position of the marker is {apart_m:.2} m off")
             }
         }
     }
@@ -442,23 +502,26 @@ fn find<'a>(status: &'a ControllerStatus, name: &str) -> Option<&'a Candidate> {
     status.candidates.iter().find(|candidate| candidate.detector == name)
 }
 
+/// Whether a detector agrees.
+#[derive(Debug, PartialEq)]
+enum Verdict {
+    Agrees,
+    /// In how many frames it does.
+    Differs(String),
+}
+
 /// Whether a detector agrees, once enough frames are compared; `None` while that is undecided.
-fn verdict(shadow: &Candidate, frames: u32) -> Option<anyhow::Result<()>> {
+fn verdict(shadow: &Candidate, frames: u32) -> Option<Verdict> {
     let (agreed, compared) = (shadow.agreed, shadow.compared);
     if compared < frames {
         return None;
     }
     let ratio = f64::from(agreed) / f64::from(compared);
     if ratio >= MIN_AGREEMENT && shadow.state == DetectorState::Shadow {
-        return Some(Ok(()));
+        return Some(Verdict::Agrees);
     }
-    (ratio < 0.5).then(|| {
-        let apart = shadow.disagreement_m.map_or_else(
-            || "it does not see the marker".to_owned(),
-            |apart_m| format!("its last position of the marker is {apart_m:.2} m off"),
-        );
-        Err(anyhow!("it agrees in only {agreed} of {compared} frames; {apart}"))
-    })
+    (ratio < 0.5)
+        .then(|| Verdict::Differs(format!("it agrees in only {agreed} of {compared} frames")))
 }
 
 fn last_lines(log: &Path) -> Option<String> {
@@ -485,10 +548,10 @@ mod tests {
     #[test]
     fn agreement_needs_enough_frames() {
         assert!(verdict(&shadow(14, 14), 15).is_none());
-        assert!(verdict(&shadow(15, 14), 15).unwrap().is_ok());
+        assert_eq!(verdict(&shadow(15, 14), 15), Some(Verdict::Agrees));
         assert!(verdict(&shadow(15, 10), 15).is_none(), "undecided");
-        let refused = verdict(&shadow(15, 3), 15).unwrap().unwrap_err().to_string();
-        assert!(refused.contains("3 of 15") && refused.contains("0.40 m"), "{refused}");
+        let refused = Verdict::Differs("it agrees in only 3 of 15 frames".into());
+        assert_eq!(verdict(&shadow(15, 3), 15), Some(refused));
         let stale = Candidate { state: DetectorState::Stale, ..shadow(15, 15) };
         assert!(verdict(&stale, 15).is_none());
     }
