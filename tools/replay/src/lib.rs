@@ -5,9 +5,10 @@
 //!
 //! Modules in reading order: [`mod@run`] gives a tape to a flight, [`difference`] names what two results differ in,
 //! [`mod@verify`] finds the first difference, and [`mod@change`] sums up what another configuration would have done; [`frames`]
-//! searches the recorded pictures again, compares what is found with what was found then, by [`truth`] where there is one, and
-//! [`mod@restamp`] gives messages the time at which they are published again.
+//! searches the recorded pictures again, compares what is found with what was found then, by [`truth`] where there is one,
+//! [`brightness`] tells how bright they are, and [`mod@restamp`] gives messages the time at which they are published again.
 
+pub mod brightness;
 pub mod change;
 pub mod difference;
 pub mod frames;
@@ -16,6 +17,7 @@ pub mod run;
 pub mod truth;
 pub mod verify;
 
+pub use brightness::{Brightness, Meter};
 pub use change::{Change, change};
 pub use frames::{Again, Searched, search};
 pub use restamp::Restamp;

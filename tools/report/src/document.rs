@@ -155,7 +155,7 @@ impl Writer {
             }
             self.skip(25.0);
         }
-        for problem in &summary.problems {
+        for problem in summary.problems.iter().chain(&summary.light) {
             self.line(problem, Type { rgb: RED, ..BOLD });
         }
         self.line("For a bug report:", SMALL);

@@ -10,11 +10,16 @@ use messages::{
     Wind, decode, topic,
 };
 
+use replay::{Brightness, Meter};
+
 use crate::packets::Packets;
 use crate::settings::{self, Difference};
 
 /// Longest gap over which a position is interpolated, in nanoseconds.
 const MAX_GAP_NS: i64 = 500_000_000;
+
+/// Time between pictures that are measured, in nanoseconds.
+const LIGHT_PERIOD_NS: u64 = 1_000_000_000;
 
 /// Detections as they came.
 #[derive(Clone, Debug)]
@@ -34,6 +39,17 @@ pub struct Frame {
     pub sequence: u64,
     /// Mid-exposure, in nanoseconds of its clock.
     pub stamp_ns: i64,
+}
+
+/// How bright a picture is.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Light {
+    /// Mid-exposure, in nanoseconds of the camera's clock.
+    pub stamp_ns: i64,
+    /// How long it was exposed, in milliseconds; `None` where that is not known.
+    pub exposure_ms: Option<f64>,
+    /// Its brightness.
+    pub brightness: Brightness,
 }
 
 /// Messages that could not be read.
@@ -120,6 +136,8 @@ pub struct Flight {
     pub found: Vec<Found>,
     /// Frames by camera.
     pub frames: BTreeMap<String, Vec<Frame>>,
+    /// How bright one picture of each second is, by camera.
+    pub light: BTreeMap<String, Vec<Light>>,
     /// Processes by service, instance and process id.
     pub processes: BTreeMap<String, Process>,
     /// The last configurations as TOML, by service and instance.
@@ -151,10 +169,11 @@ pub struct Flight {
 }
 
 /// Reads the recording of a flight, which may be several files.
-#[derive(Clone, Debug, Default)]
+#[derive(Default)]
 pub struct FlightReader {
     flight: Flight,
     tapes: TapeReader,
+    meter: Meter,
     /// Messages that a recorder lost since its start, by its run and their key.
     lost_by_run: BTreeMap<String, BTreeMap<String, u64>>,
 }
@@ -171,7 +190,7 @@ impl FlightReader {
     /// # Errors
     /// When it is no MCAP file at all.
     pub fn add(&mut self, recording: &[u8]) -> Result<(), flightlog::Problem> {
-        let Self { flight, tapes, lost_by_run } = self;
+        let Self { flight, tapes, meter, lost_by_run } = self;
         let tape_key = topic::TAPE.key(&[]);
         let mut lost = BTreeMap::new();
         let mut run = String::new();
@@ -186,7 +205,7 @@ impl FlightReader {
                 Entry::Message(message) if message.key == tape_key => tapes.take(message.payload),
                 Entry::Message(message) => flight.take(message),
                 Entry::TimeSet(ahead_ns) => set_s.push(ahead_ns as f64 * 1e-9),
-                Entry::Picture { .. } => {}
+                Entry::Picture { header, bytes, .. } => flight.see(meter, &header, bytes),
             })?;
         flight.time_set_s.extend(set_s);
         // Counted since the recorder's start: of its files the last has those before it.
@@ -213,7 +232,7 @@ impl FlightReader {
 
     /// The flight.
     pub fn finish(self) -> Flight {
-        let Self { mut flight, tapes, lost_by_run } = self;
+        let Self { mut flight, tapes, lost_by_run, .. } = self;
         for (key, count) in lost_by_run.into_values().flatten() {
             *flight.lost.entry(key).or_default() += count;
         }
@@ -298,6 +317,20 @@ impl Flight {
         let (_, text) = all.find(|(name, _)| name.starts_with("controller"))?;
         let table: toml::Table = text.parse().ok()?;
         Some(table.get("marker")?.as_str()?.to_owned())
+    }
+
+    /// Measures a picture, unless one was measured a moment before: to decode each would take minutes.
+    fn see(&mut self, meter: &mut Meter, header: &FrameHeader, bytes: &[u8]) {
+        let FrameHeader { ref camera, stamp_ns, exposure_ns, .. } = *header;
+        let before = self.light.get(camera).and_then(|all| all.last());
+        if before.is_some_and(|it| stamp_ns.abs_diff(it.stamp_ns) < LIGHT_PERIOD_NS) {
+            return;
+        }
+        if let Some(brightness) = meter.measure(header, bytes) {
+            let exposure_ms = (exposure_ns > 0).then(|| f64::from(exposure_ns) * 1e-6);
+            let all = self.light.entry(camera.clone()).or_default();
+            all.push(Light { stamp_ns, exposure_ms, brightness });
+        }
     }
 
     fn take(&mut self, message: Received<'_>) {

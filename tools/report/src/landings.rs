@@ -64,6 +64,9 @@ impl Flight {
         for frames in self.frames.values_mut() {
             frames.retain(|it| time_ns.contains(&it.stamp_ns));
         }
+        for pictures in self.light.values_mut() {
+            pictures.retain(|it| time_ns.contains(&it.stamp_ns));
+        }
         self.changes.retain(|it| is_received(it.received_ns));
         self.packets.received_ns.retain(|it| is_received(*it));
         self.packets.power.retain(|it| is_received(it.received_ns));

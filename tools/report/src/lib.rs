@@ -5,7 +5,7 @@
 //!
 //! Modules in reading order: [`flight`] has what a recording holds, with the autopilot's [`packets`], and [`landings`] keeps
 //! one landing of it; [`frames`] tells
-//! what became of each frame, [`latency`] how long it took, [`track`] where the vehicle was, [`phases`] and [`journal`]
+//! what became of each frame, [`latency`] how long it took, [`light`] how bright the pictures were, [`track`] where the vehicle was, [`phases`] and [`journal`]
 //! what happened and why, [`losses`] what is missing, [`tape`] whether the tape
 //! gives the same again, and [`mod@summary`] all of it in numbers. [`difference`], over [`settings`], compares
 //! configurations. [`view`] joins these for the page: [`plots`] are its charts, drawn by [`chart`], [`sections`] its
@@ -21,6 +21,7 @@ pub mod html;
 pub mod journal;
 pub mod landings;
 pub mod latency;
+pub mod light;
 pub mod losses;
 pub mod packets;
 pub mod page;

@@ -89,7 +89,7 @@ fn head(views: &[&View<'_>]) -> String {
             escaped(&summary.outcome())
         );
         html.push_str(&cards(summary));
-        for problem in &summary.problems {
+        for problem in summary.problems.iter().chain(&summary.light) {
             let _ = write!(html, "<p class=\"warning\">{}</p>", escaped(problem));
         }
         let _ = write!(

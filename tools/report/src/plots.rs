@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 
 use crate::chart::{At, Axes, Chart, Ink, Layer, Shape, at, layer, span};
+use crate::flight::Light;
 use crate::frames::Fate;
 use crate::latency::between_ms;
 use crate::track::Place;
@@ -248,7 +249,29 @@ pub fn detections(view: &View<'_>) -> Vec<Chart> {
         vec![layer("about 3 for a consistent filter; cut at 30", Ink::Blue, Shape::Dots, nis)],
     );
     consistency.height = HEIGHT;
-    vec![chart, consistency]
+    vec![chart, consistency, light(view)]
+}
+
+/// How bright the pictures were: of the camera with the most of them.
+fn light(view: &View<'_>) -> Chart {
+    let pictures = view.flight.light.values().max_by_key(|it| it.len());
+    let pictures = pictures.map_or(&[][..], Vec::as_slice);
+    let curve = |of: fn(&Light) -> f64| {
+        view.curve(pictures, |it| Some(at(view.flight.at_s(it.stamp_ns), 100.0 * of(it))))
+    };
+    let brightest = curve(|it| it.brightness.brightest);
+    let mean = curve(|it| it.brightness.mean);
+    let mut chart = over_time(
+        view,
+        "Brightness of the pictures",
+        "% of white",
+        vec![
+            layer("brightest hundredth of the pixels", Ink::Orange, Shape::Line, brightest),
+            layer("mean", Ink::Blue, Shape::Line, mean),
+        ],
+    );
+    chart.axes.y = 0.0..100.0;
+    chart
 }
 
 /// How long frames took.

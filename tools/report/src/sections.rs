@@ -6,7 +6,7 @@ use crate::chart::Chart;
 use crate::frames::Fate;
 use crate::html::{Block, Cell, count, details, missing, number, paragraph, table, text};
 use crate::view::View;
-use crate::{journal, losses, plots};
+use crate::{journal, light, losses, plots};
 
 /// A part of the page, for one flight.
 #[derive(Clone, Debug)]
@@ -169,6 +169,26 @@ fn detections(view: &View<'_>) -> Section {
         })
         .collect();
     section.after.push(table(&["", "meaning", "detector", "frames", "of all"], rows));
+    let light = view.flight.light.iter();
+    let rows: Vec<Vec<Cell>> = light
+        .filter_map(|(camera, pictures)| {
+            let usual = light::usual(pictures)?;
+            Some(vec![
+                text(camera),
+                count(pictures.len() as u64),
+                number(Some(100.0 * usual.mean), 1, "%"),
+                number(Some(100.0 * usual.brightest), 1, "%"),
+                number(usual.exposure_ms, 1, "ms"),
+            ])
+        })
+        .collect();
+    if rows.is_empty() {
+        section.before.push(missing("pictures, so nothing is known of the light"));
+    } else {
+        let head =
+            ["camera", "pictures measured", "mean brightness", "brightest hundredth", "exposure"];
+        section.after.push(table(&head, rows));
+    }
     section
 }
 

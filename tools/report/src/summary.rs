@@ -7,7 +7,7 @@ use serde::Serialize;
 use crate::flight::{Flight, Landing};
 use crate::frames::{Fate, Frames};
 use crate::latency::{Stage, TO_SETPOINT, budget};
-use crate::{losses, phases, track};
+use crate::{light, losses, phases, track};
 
 /// A flight in numbers. What was not recorded is `None`.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -74,6 +74,8 @@ pub struct Summary {
     pub tape: Option<String>,
     /// What the recording lacks, as sentences.
     pub problems: Vec<String>,
+    /// What is wrong with the light, as sentences, where most frames had no marker.
+    pub light: Vec<String>,
     /// The latency budget.
     pub latency: Vec<Stage>,
     /// The phases with their reasons.
@@ -152,6 +154,10 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
         tape_verified: flight.replayed.as_ref().map(|it| it.is_verified),
         tape: flight.replayed.as_ref().map(|it| it.text.clone()),
         problems: losses::recording(flight),
+        light: match frames.count(&Fate::NoMarker) * 2 > frames.all.len() {
+            true => light::warnings(flight),
+            false => Vec::new(),
+        },
         latency,
         phases,
     }
@@ -228,6 +234,7 @@ impl Summary {
             self.retries.map(|retries| format!("{retries} retries")),
             Some(format!("recorder lost {} messages", self.messages_lost)),
             self.tape.clone(),
+            (!self.light.is_empty()).then(|| self.light.join("; ")),
             (!self.problems.is_empty()).then(|| format!("recording: {}", self.problems.join("; "))),
         ];
         let parts: Vec<String> = parts.into_iter().flatten().collect();

@@ -8,8 +8,10 @@ use std::sync::OnceLock;
 use experiments::landing::flight::fly_recorded;
 use experiments::landing::outcome::Outcome;
 use experiments::landing::plan::{Plan, Planned, Values, Vision};
-use flightlog::{About, Entry, Received, TapeReader, Writer};
-use messages::{Configuration, ControllerStatus, Health, Message as _, Tape, encode};
+use flightlog::{About, Entry, Picture, Received, TapeReader, Writer};
+use messages::{
+    Configuration, ControllerStatus, Detections, FrameHeader, Health, Message as _, Tape, encode,
+};
 use report::chart::Shape;
 use report::frames::Fate;
 use report::plots;
@@ -625,4 +627,50 @@ fn a_setting_that_a_service_changed_is_told_with_its_time() {
     assert_eq!(told.text, "setting `thorough` changed from false to true");
     assert!((told.time_s - flight.at_s(8_000_000_000)).abs() < 1e-9, "{told:?}");
     assert!(page(&flight).unwrap().contains("setting `thorough` changed from false to true"));
+}
+
+#[test]
+fn pictures_in_which_it_was_too_dark_for_a_marker_are_told() {
+    let told = |level: u8| {
+        let about = About { program: "test".to_owned(), facts: BTreeMap::new(), utc_offset_ns: 0 };
+        let mut recording = Vec::new();
+        let mut writer = Writer::new(&mut recording, &about).unwrap();
+        for sequence in 0..30 {
+            let received_ns = 100_000_000 * sequence as i64;
+            let header = FrameHeader {
+                sequence,
+                stamp_ns: received_ns,
+                width: 64,
+                height: 48,
+                exposure_ns: 20_000_000,
+                ..FrameHeader::sample()
+            };
+            let (pixels, attachment) = (vec![level; 64 * 48], encode(&header));
+            let key = "camera/down/frame";
+            let frame = Received { key, payload: &pixels, attachment: &attachment, received_ns };
+            writer.frame(frame, &header, &Picture::Pixels).unwrap();
+            let found = Detections {
+                detector: "main".to_owned(),
+                header,
+                detections: Vec::new(),
+                stages: Vec::new(),
+            };
+            let (key, payload) = ("detector/main/detections", encode(&found));
+            let found = Received { key, payload: &payload, attachment: b"", received_ns };
+            writer.receive(found).unwrap();
+        }
+        writer.finish().unwrap();
+        let flight = read(&recording);
+        assert_eq!(flight.light["down"].len(), 3, "one of each second");
+        (summary(&flight), page(&flight).unwrap())
+    };
+    let (dark, html) = told(5);
+    let sentence = "the pictures of camera `down` are too dark for a marker: in the median their mean is 2.0 % of white";
+    assert!(dark.light[0].starts_with(sentence), "{:?}", dark.light);
+    assert!(dark.line().contains(sentence), "{}", dark.line());
+    assert!(html.matches(sentence).count() >= 2 && html.contains("Brightness of the pictures"));
+    assert!(html.contains("20.0 ms"));
+    let (grey, html) = told(120);
+    assert_eq!(grey.light, Vec::<String>::new());
+    assert!(html.contains("Brightness of the pictures") && html.contains("47.1 %"));
 }

@@ -1,0 +1,82 @@
+//! How bright a flight's pictures were, and whether that explains that no marker was seen.
+
+use node::stats::quantile;
+
+use crate::flight::{Flight, Light};
+
+/// Pictures whose brightest hundredth does not reach this share of white are dark: of a marker's white not enough is left over its black.
+const DARK: f64 = 0.2;
+/// Pictures whose mean is above this share of white show little else than white.
+const BRIGHT: f64 = 0.9;
+
+/// The pictures of a camera, in medians.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Usual {
+    /// Mean of a picture's pixels, from 0, black, to 1, white.
+    pub mean: f64,
+    /// What the brightest hundredth of them reaches.
+    pub brightest: f64,
+    /// How long they were exposed, in milliseconds.
+    pub exposure_ms: Option<f64>,
+}
+
+/// The pictures of a camera, in medians; `None` without any.
+pub fn usual(pictures: &[Light]) -> Option<Usual> {
+    let median = |of: &dyn Fn(&Light) -> Option<f64>| {
+        let values: Vec<f64> = pictures.iter().filter_map(of).collect();
+        quantile(&values, 0.5)
+    };
+    Some(Usual {
+        mean: median(&|it| Some(it.brightness.mean))?,
+        brightest: median(&|it| Some(it.brightness.brightest))?,
+        exposure_ms: median(&|it| it.exposure_ms),
+    })
+}
+
+/// What is wrong with the light, as sentences with what to do.
+pub fn warnings(flight: &Flight) -> Vec<String> {
+    let told = flight.light.iter().filter_map(|(camera, pictures)| {
+        let Usual { mean, brightest, exposure_ms } = usual(pictures)?;
+        let exposed = exposure_ms.map_or_else(String::new, |ms| format!(", exposed for {ms:.1} ms"));
+        let of_white = format!(
+            "in the median their mean is {:.1} % of white, and the brightest hundredth of the pixels reaches {:.1} %{exposed}",
+            100.0 * mean,
+            100.0 * brightest
+        );
+        let (how, remedy) = if brightest < DARK {
+            ("too dark", "light the pad, or give the camera a longer exposure or more gain")
+        } else if mean > BRIGHT {
+            ("too bright", "give the camera a shorter exposure or less gain")
+        } else {
+            return None;
+        };
+        Some(format!("the pictures of camera `{camera}` are {how} for a marker: {of_white}; {remedy} (docs/camera.md)"))
+    });
+    told.collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use replay::Brightness;
+
+    #[test]
+    fn dark_and_bright_pictures_are_told_with_their_numbers() {
+        let told = |mean: f64, brightest: f64, exposure_ms| {
+            let brightness = Brightness { mean, brightest };
+            let picture = Light { stamp_ns: 0, exposure_ms, brightness };
+            let mut flight = Flight::default();
+            flight.light.insert("down".to_owned(), vec![picture]);
+            warnings(&flight)
+        };
+        assert_eq!(told(0.4, 0.9, None), Vec::<String>::new());
+        assert_eq!(
+            told(0.012, 0.05, Some(20.0)),
+            [
+                "the pictures of camera `down` are too dark for a marker: in the median their mean is 1.2 % of white, and the brightest hundredth of the pixels reaches 5.0 %, exposed for 20.0 ms; light the pad, or give the camera a longer exposure or more gain (docs/camera.md)"
+            ]
+        );
+        assert!(told(0.97, 1.0, None)[0].contains("too bright"));
+        assert_eq!(warnings(&Flight::default()), Vec::<String>::new());
+    }
+}
