@@ -333,7 +333,9 @@ impl Chart {
                 Shape::Area => "area",
                 Shape::Dots | Shape::LargeDots => "dot",
                 Shape::Crosses => "cross",
-                Shape::Line | Shape::Wide | Shape::Thin | Shape::Steps => "line",
+                Shape::Line | Shape::Steps => "line",
+                Shape::Wide => "wide",
+                Shape::Thin => "thin",
             };
             // Writing to a string cannot fail.
             let _ = write!(

@@ -1,11 +1,11 @@
 //! The report as a PDF document, for who needs one: the page's sections on A4, with what a page shows once it is opened left
 //! out where it is long.
 
-use crate::chart::{Chart, Ink, WIDTH};
+use crate::chart::{Chart, Ink, Shape, WIDTH};
 use crate::flight::Flight;
 use crate::html::{Block, Cell};
 use crate::page::{compared, differing, in_numbers, marks};
-use crate::pdf::{Font, PAGE, Pages, Type};
+use crate::pdf::{Font, PAGE, Pages, SAMPLE, Type};
 use crate::plots::share_axes;
 use crate::sections::{self, Section};
 use crate::summary::Summary;
@@ -20,6 +20,10 @@ const FOOT: f64 = PAGE[1] - MARGIN;
 /// Space between two charts, and between columns of a table.
 const GAP: f64 = 12.0;
 const CELL_GAP: f64 = 8.0;
+/// Width of one of two charts beside each other.
+const CHART: f64 = (COLUMN - GAP) / 2.0;
+/// Width of a legend's sample with the space before its name.
+const SAMPLE_WITH_GAP: f64 = SAMPLE + 3.5;
 /// Distance of lines, in sizes of their letters.
 const LEADING: f64 = 1.32;
 /// Longest text that is shown as it is, in lines.
@@ -121,8 +125,12 @@ impl Writer {
     }
 
     fn heading(&mut self, text: &str) {
-        // Not alone at the foot of a page.
-        self.needs(110.0);
+        self.heading_before(text, 70.0);
+    }
+
+    /// A heading with so much of what follows on its page: not alone at the foot of one.
+    fn heading_before(&mut self, text: &str, height: f64) {
+        self.needs(40.0 + height);
         self.skip(8.0);
         self.pages.fill([MARGIN, self.top], [COLUMN, 0.6], LINE);
         self.skip(7.0);
@@ -164,9 +172,9 @@ impl Writer {
     }
 
     fn section(&mut self, section: &Section) -> anyhow::Result<()> {
-        self.begin(section);
-        self.blocks(&section.before);
         let charts: Vec<&Chart> = section.charts.iter().filter(|it| !it.is_empty()).collect();
+        self.begin(section, [charts.first().copied(), charts.get(1).copied()]);
+        self.blocks(&section.before);
         for pair in charts.chunks(2) {
             self.charts([pair.first().copied(), pair.get(1).copied()], ["", ""])?;
         }
@@ -176,7 +184,8 @@ impl Writer {
 
     /// A section of two flights, chart by chart with the same axes.
     fn pair(&mut self, left: &mut Section, right: &mut Section) -> anyhow::Result<()> {
-        self.begin(left);
+        let first = [&left.charts, &right.charts].map(|charts| charts.first());
+        self.begin(left, first.map(|chart| chart.filter(|it| !it.is_empty())));
         for index in 0..left.charts.len().max(right.charts.len()) {
             if let (Some(one), Some(other)) =
                 (left.charts.get_mut(index), right.charts.get_mut(index))
@@ -197,8 +206,10 @@ impl Writer {
         Ok(())
     }
 
-    fn begin(&mut self, section: &Section) {
-        self.heading(section.title);
+    /// The title of a section, on the page of its first charts.
+    fn begin(&mut self, section: &Section, first: [Option<&Chart>; 2]) {
+        let before = 24.0 * section.before.len() as f64;
+        self.heading_before(section.title, (before + height_of(first)).max(70.0));
         if !section.lead.is_empty() {
             self.line(section.lead, SMALL);
         }
@@ -206,12 +217,8 @@ impl Writer {
 
     /// Up to two charts beside each other.
     fn charts(&mut self, charts: [Option<&Chart>; 2], letters: [&str; 2]) -> anyhow::Result<()> {
-        let width = (COLUMN - GAP) / 2.0;
-        let shape = |chart: &Chart| width * f64::from(chart.height) / f64::from(WIDTH);
-        let heights = charts.map(|chart| {
-            chart.map_or(0.0, |it| 14.0 + shape(it) + 10.0 * legend(it, width).len() as f64)
-        });
-        let height = heights.into_iter().fold(0.0, f64::max);
+        let width = CHART;
+        let height = height_of(charts);
         if height == 0.0 {
             return Ok(());
         }
@@ -222,13 +229,13 @@ impl Writer {
             let title = format!("{letter}{}", chart.title);
             self.pages.text([left, self.top + 9.0], BOLD, &title);
             self.pages.chart(chart, [left, self.top + 13.0], width)?;
-            let mut foot = self.top + 13.0 + shape(chart) + 8.0;
+            let mut foot = self.top + 13.0 + shape(chart, width) + 8.0;
             for line in legend(chart, width) {
                 let mut at = left;
-                for Key { name, ink } in line {
-                    if let Some(ink) = ink {
-                        self.pages.fill([at, foot - 4.0], [9.0, 2.5], ink.channels());
-                        at += 12.0;
+                for Key { name, drawn } in line {
+                    if let Some((shape, ink)) = drawn {
+                        self.pages.sample(shape, ink, [at, foot]);
+                        at += SAMPLE_WITH_GAP;
                     }
                     self.pages.text([at, foot], SMALL, name);
                     at += SMALL.font.width(SMALL.size, name) + GAP;
@@ -396,21 +403,35 @@ fn wrapped(text: &str, of: Type, width: f64) -> Vec<String> {
     lines
 }
 
-/// A name in a legend; a note has no colour.
+/// Height of a chart so wide, without title and legend.
+fn shape(chart: &Chart, width: f64) -> f64 {
+    width * f64::from(chart.height) / f64::from(WIDTH)
+}
+
+/// Height of charts beside each other, with title and legend; 0 of none.
+fn height_of(charts: [Option<&Chart>; 2]) -> f64 {
+    let width = CHART;
+    let heights = charts.map(|chart| {
+        chart.map_or(0.0, |it| 14.0 + shape(it, width) + 10.0 * legend(it, width).len() as f64)
+    });
+    heights.into_iter().fold(0.0, f64::max)
+}
+
+/// A name in a legend, and how it is drawn; a note is not.
 struct Key<'a> {
     name: &'a str,
-    ink: Option<Ink>,
+    drawn: Option<(Shape, Ink)>,
 }
 
 /// The names of a chart's layers, and its note, in lines.
 fn legend(chart: &Chart, width: f64) -> Vec<Vec<Key<'_>>> {
     let named = chart.layers.iter().filter(|it| !it.name.is_empty() && !it.points.is_empty());
-    let keys = named.map(|it| Key { name: &it.name, ink: Some(it.ink) });
-    let note = (!chart.note.is_empty()).then_some(Key { name: &chart.note, ink: None });
+    let keys = named.map(|it| Key { name: &it.name, drawn: Some((it.shape, it.ink)) });
+    let note = (!chart.note.is_empty()).then_some(Key { name: &chart.note, drawn: None });
     let mut lines: Vec<Vec<Key<'_>>> = Vec::new();
     let mut used = f64::INFINITY;
     for key in keys.chain(note) {
-        let needed = 12.0 + SMALL.font.width(SMALL.size, key.name) + GAP;
+        let needed = SAMPLE_WITH_GAP + SMALL.font.width(SMALL.size, key.name) + GAP;
         if used + needed - GAP > width {
             lines.push(Vec::new());
             used = 0.0;

@@ -124,9 +124,16 @@ fn sample(layer: &Layer, left: f64, middle: u32) -> String {
                 "<path d=\"M{west:.0} {north}L{east:.0} {south}M{west:.0} {south}L{east:.0} {north}\" stroke=\"{colour}\" stroke-width=\"3\"/>"
             )
         }
-        Shape::Line | Shape::Wide | Shape::Thin | Shape::Steps => format!(
-            "<line x1=\"{left:.0}\" x2=\"{right:.0}\" y1=\"{middle}\" y2=\"{middle}\" stroke=\"{colour}\" stroke-width=\"5\"/>"
-        ),
+        Shape::Line | Shape::Wide | Shape::Thin | Shape::Steps => {
+            let width = match layer.shape {
+                Shape::Thin => 2,
+                Shape::Wide => 8,
+                _ => 5,
+            };
+            format!(
+                "<line x1=\"{left:.0}\" x2=\"{right:.0}\" y1=\"{middle}\" y2=\"{middle}\" stroke=\"{colour}\" stroke-width=\"{width}\"/>"
+            )
+        }
     }
 }
 

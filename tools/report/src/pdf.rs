@@ -5,16 +5,18 @@ use std::convert::Infallible;
 use anyhow::anyhow;
 use pdf_writer::types::{LineCapStyle, LineJoinStyle};
 use pdf_writer::{Content, Finish, Name, Pdf, Rect, Ref, Str, TextStr};
-use plotters::prelude::{DrawingBackend, IntoDrawingArea};
+use plotters::prelude::{Color, DrawingBackend, IntoDrawingArea, RGBColor, ShapeStyle};
 use plotters_backend::text_anchor::{HPos, VPos};
 use plotters_backend::{
     BackendColor, BackendCoord, BackendStyle, BackendTextStyle, DrawingErrorKind, FontTransform,
 };
 
-use crate::chart::{Chart, SIZE_FACTOR, WIDTH};
+use crate::chart::{Chart, Ink, SIZE_FACTOR, Shape, WIDTH};
 
 /// Size of a page, in units of 1/72 inch.
 pub const PAGE: [f64; 2] = [595.28, 841.89];
+/// Width of what a legend shows of a layer.
+pub const SAMPLE: f64 = 11.0;
 /// Steps of opacity.
 const ALPHAS: u8 = 20;
 /// Distance of the control points of a quarter circle's Bezier curve along the tangent, in radii.
@@ -157,6 +159,43 @@ impl Pages {
         };
         self.content.restore_state();
         drawn.map_err(|problem| anyhow!("{}: {problem}", chart.title))
+    }
+
+    /// Draws how a layer is drawn, for a legend whose text's foot is at this place: [`SAMPLE`] wide.
+    pub fn sample(&mut self, shape: Shape, ink: Ink, [left, foot]: [f64; 2]) {
+        let [red, green, blue] = ink.channels();
+        let colour = RGBColor(red, green, blue);
+        self.content.save_state();
+        // A tenth of a unit is one of the drawing, which counts downwards.
+        let place = [0.1, 0.0, 0.0, -0.1, left, PAGE[1] - foot];
+        self.content.transform(place.map(|it| it as f32));
+        let right = (10.0 * SAMPLE) as i32;
+        let (centre, middle) = (right / 2, -24);
+        let mut drawing = Drawing { content: &mut self.content, size: [right.unsigned_abs(), 60] };
+        let drawn = match shape {
+            Shape::Area => drawing.draw_rect((0, -54), (right, 4), &colour.mix(0.3), true),
+            Shape::Dots => drawing.draw_circle((centre, middle), 16, &colour, true),
+            Shape::LargeDots => drawing.draw_circle((centre, middle), 26, &colour, true),
+            Shape::Crosses => {
+                let style = ShapeStyle::from(colour).stroke_width(9);
+                let corner = |x: i32, y: i32| (centre + 22 * x, middle + 22 * y);
+                drawing
+                    .draw_line(corner(-1, -1), corner(1, 1), &style)
+                    .and_then(|()| drawing.draw_line(corner(-1, 1), corner(1, -1), &style))
+            }
+            Shape::Line | Shape::Wide | Shape::Thin | Shape::Steps => {
+                let width = match shape {
+                    Shape::Thin => 8,
+                    Shape::Wide => 30,
+                    _ => 17,
+                };
+                let style = ShapeStyle::from(colour).stroke_width(width);
+                drawing.draw_line((0, middle), (right, middle), &style)
+            }
+        };
+        // Nothing can fail in memory.
+        let _ = drawn;
+        self.content.restore_state();
     }
 
     /// The file, with keywords in ASCII.
@@ -415,5 +454,27 @@ impl DrawingBackend for Drawing<'_> {
         self.content.set_text_matrix(matrix.map(|it| it as f32));
         self.content.show(Str(&encoded(text))).end_text();
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_legend_tells_areas_dots_crosses_and_lines_apart() {
+        let drawn = |shape: Shape| {
+            let mut pages = Pages::default();
+            pages.sample(shape, Ink::Blue, [100.0, 100.0]);
+            String::from_utf8_lossy(&pages.content.finish().into_vec()).into_owned()
+        };
+        let shapes =
+            [Shape::Area, Shape::Dots, Shape::Crosses, Shape::Line, Shape::Wide, Shape::Thin];
+        let samples: std::collections::BTreeSet<String> = shapes.into_iter().map(drawn).collect();
+        assert_eq!(samples.len(), shapes.len(), "{samples:?}");
+        // As pale as in the chart, and only there.
+        let area = drawn(Shape::Area);
+        assert!(area.contains("/A6 gs") && area.trim_end().ends_with('Q'), "{area}");
+        assert_eq!(drawn(Shape::Steps), drawn(Shape::Line));
     }
 }
