@@ -105,6 +105,51 @@ fn draw_curve(
     Ok(())
 }
 
+/// Size of a view of the trajectory in pixels.
+const VIEW: [u32; 2] = [550, 560];
+
+/// A view of the trajectory, without its axes.
+fn view<'a, 'b>(
+    area: &'a DrawingArea<SVGBackend<'b>, plotters::coord::Shift>,
+    caption: &str,
+) -> ChartBuilder<'a, 'b, SVGBackend<'b>> {
+    let mut builder = ChartBuilder::on(area);
+    builder
+        .caption(caption, ("sans-serif", 15))
+        .margin(12)
+        .x_label_area_size(40)
+        .y_label_area_size(50);
+    builder
+}
+
+/// Pixels between the axes of a view, which only a drawn one tells.
+fn plot_size() -> anyhow::Result<[f64; 2]> {
+    let mut size = [1.0; 2];
+    picture(VIEW, |area| {
+        let chart = view(area, "from above").build_cartesian_2d(0.0..1.0, 0.0..1.0)?;
+        let (width, height) = chart.plotting_area().dim_in_pixel();
+        size = [width, height].map(f64::from);
+        Ok(())
+    })?;
+    Ok(size)
+}
+
+/// Ranges of two axes around these, with one scale for both on so many pixels: a landing looks as it was.
+fn to_scale(ranges: [Range<f64>; 2], size: [f64; 2]) -> [Range<f64>; 2] {
+    let length = |range: &Range<f64>| range.end - range.start;
+    let mut metres_a_pixel = 0.0;
+    for (range, pixels) in ranges.iter().zip(size) {
+        metres_a_pixel = f64::max(metres_a_pixel, length(range) / pixels);
+    }
+    let [x, y] = ranges;
+    let [width, height] = size.map(|pixels| metres_a_pixel * pixels);
+    let around = |range: Range<f64>, length: f64| {
+        let centre = (range.start + range.end) / 2.0;
+        centre - length / 2.0..centre + length / 2.0
+    };
+    [around(x, width), around(y, height)]
+}
+
 /// The trajectory seen from above and from the south.
 fn trajectory(title: &str, samples: &[Sample]) -> anyhow::Result<String> {
     let place = |s: &Sample| [s.position.y(), s.position.x(), -s.position.z()];
@@ -115,19 +160,16 @@ fn trajectory(title: &str, samples: &[Sample]) -> anyhow::Result<String> {
         let margin = 0.1 * (max - min).max(0.5);
         min - margin..max + margin
     };
-    picture([1100, 560], |area| {
-        let (left, right) = area.split_horizontally(550);
+    let size = plot_size()?;
+    picture([2 * VIEW[0], VIEW[1]], |area| {
+        let (left, right) = area.split_horizontally(VIEW[0]);
         let views = [
             (left, [0, 1], format!("{title}: from above"), "north, m"),
             (right, [0, 2], "from the south".to_owned(), "height, m"),
         ];
         for (half, [across, up], caption, axis) in views {
-            let mut chart = ChartBuilder::on(&half)
-                .caption(caption, ("sans-serif", 15))
-                .margin(12)
-                .x_label_area_size(40)
-                .y_label_area_size(50)
-                .build_cartesian_2d(range(across), with_legend(range(up)))?;
+            let [x, y] = to_scale([range(across), with_legend(range(up))], size);
+            let mut chart = view(&half, &caption).build_cartesian_2d(x, y)?;
             chart.configure_mesh().x_desc("east, m").y_desc(axis).draw()?;
             let flat = |p: [f64; 3]| (component(p, across), component(p, up));
             draw_curve(&mut chart, 0, "vehicle", samples.iter().map(|s| flat(place(s))))?;
@@ -143,6 +185,20 @@ fn trajectory(title: &str, samples: &[Sample]) -> anyhow::Result<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn both_axes_of_a_view_have_one_scale() {
+        let size = plot_size().unwrap();
+        for ranges in [[-1.0..1.0, 0.0..12.0], [-30.0..10.0, 0.0..1.0]] {
+            let [x, y] = to_scale(ranges.clone(), size);
+            let [across, up] = [&x, &y].map(|range| range.end - range.start);
+            assert!((across / size[0] - up / size[1]).abs() < 1e-12, "{x:?} {y:?}");
+            for (shown, range) in [x, y].iter().zip(&ranges) {
+                let is_whole = shown.start <= range.start + 1e-9 && range.end <= shown.end + 1e-9;
+                assert!(is_whole, "{shown:?} of {range:?}");
+            }
+        }
+    }
 
     #[test]
     fn a_flight_that_never_began_is_drawn_as_well() {
