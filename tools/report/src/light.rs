@@ -6,6 +6,8 @@ use crate::flight::{Flight, Light};
 
 /// Pictures whose brightest hundredth does not reach this share of white are dark: of a marker's white not enough is left over its black.
 const DARK: f64 = 0.2;
+/// Noise above this share of white leaves nothing of small markers.
+const NOISY: f64 = 0.03;
 /// Pictures whose mean is above this share of white show little else than white.
 const BRIGHT: f64 = 0.9;
 
@@ -16,6 +18,8 @@ pub struct Usual {
     pub mean: f64,
     /// What the brightest hundredth of them reaches.
     pub brightest: f64,
+    /// Standard deviation of the noise from pixel to pixel.
+    pub noise: f64,
     /// How long they were exposed, in milliseconds.
     pub exposure_ms: Option<f64>,
 }
@@ -29,6 +33,7 @@ pub fn usual(pictures: &[Light]) -> Option<Usual> {
     Some(Usual {
         mean: median(&|it| Some(it.brightness.mean))?,
         brightest: median(&|it| Some(it.brightness.brightest))?,
+        noise: median(&|it| Some(it.brightness.noise))?,
         exposure_ms: median(&|it| it.exposure_ms),
     })
 }
@@ -36,17 +41,20 @@ pub fn usual(pictures: &[Light]) -> Option<Usual> {
 /// What is wrong with the light, as sentences with what to do.
 pub fn warnings(flight: &Flight) -> Vec<String> {
     let told = flight.light.iter().filter_map(|(camera, pictures)| {
-        let Usual { mean, brightest, exposure_ms } = usual(pictures)?;
+        let Usual { mean, brightest, noise, exposure_ms } = usual(pictures)?;
         let exposed = exposure_ms.map_or_else(String::new, |ms| format!(", exposed for {ms:.1} ms"));
         let of_white = format!(
-            "in the median their mean is {:.1} % of white, and the brightest hundredth of the pixels reaches {:.1} %{exposed}",
+            "in the median their mean is {:.1} % of white, the brightest hundredth of the pixels reaches {:.1} %, and the noise is {:.1} %{exposed}",
             100.0 * mean,
-            100.0 * brightest
+            100.0 * brightest,
+            100.0 * noise
         );
         let (how, remedy) = if brightest < DARK {
             ("too dark", "light the pad, or give the camera a longer exposure or more gain")
         } else if mean > BRIGHT {
             ("too bright", "give the camera a shorter exposure or less gain")
+        } else if noise > NOISY {
+            ("too noisy, as in too little light with a large gain,", "light the pad, or give the camera a longer exposure and less gain")
         } else {
             return None;
         };
@@ -61,22 +69,23 @@ mod tests {
     use replay::Brightness;
 
     #[test]
-    fn dark_and_bright_pictures_are_told_with_their_numbers() {
-        let told = |mean: f64, brightest: f64, exposure_ms| {
-            let brightness = Brightness { mean, brightest };
+    fn dark_bright_and_noisy_pictures_are_told_with_their_numbers() {
+        let told = |mean: f64, brightest: f64, noise: f64, exposure_ms| {
+            let brightness = Brightness { mean, brightest, noise };
             let picture = Light { stamp_ns: 0, exposure_ms, brightness };
             let mut flight = Flight::default();
             flight.light.insert("down".to_owned(), vec![picture]);
             warnings(&flight)
         };
-        assert_eq!(told(0.4, 0.9, None), Vec::<String>::new());
+        assert_eq!(told(0.4, 0.9, 0.01, None), Vec::<String>::new());
         assert_eq!(
-            told(0.012, 0.05, Some(20.0)),
+            told(0.012, 0.05, 0.01, Some(20.0)),
             [
-                "the pictures of camera `down` are too dark for a marker: in the median their mean is 1.2 % of white, and the brightest hundredth of the pixels reaches 5.0 %, exposed for 20.0 ms; light the pad, or give the camera a longer exposure or more gain (docs/camera.md)"
+                "the pictures of camera `down` are too dark for a marker: in the median their mean is 1.2 % of white, the brightest hundredth of the pixels reaches 5.0 %, and the noise is 1.0 %, exposed for 20.0 ms; light the pad, or give the camera a longer exposure or more gain (docs/camera.md)"
             ]
         );
-        assert!(told(0.97, 1.0, None)[0].contains("too bright"));
+        assert!(told(0.97, 1.0, 0.0, None)[0].contains("too bright"));
+        assert!(told(0.3, 0.5, 0.06, None)[0].contains("too noisy, as in too little light"));
         assert_eq!(warnings(&Flight::default()), Vec::<String>::new());
     }
 }

@@ -261,13 +261,15 @@ fn light(view: &View<'_>) -> Chart {
     };
     let brightest = curve(|it| it.brightness.brightest);
     let mean = curve(|it| it.brightness.mean);
+    let noise = curve(|it| it.brightness.noise);
     let mut chart = over_time(
         view,
-        "Brightness of the pictures",
+        "Brightness and noise of the pictures",
         "% of white",
         vec![
             layer("brightest hundredth of the pixels", Ink::Orange, Shape::Line, brightest),
             layer("mean", Ink::Blue, Shape::Line, mean),
+            layer("noise", Ink::Red, Shape::Line, noise),
         ],
     );
     chart.axes.y = 0.0..100.0;

@@ -178,6 +178,7 @@ fn detections(view: &View<'_>) -> Section {
                 count(pictures.len() as u64),
                 number(Some(100.0 * usual.mean), 1, "%"),
                 number(Some(100.0 * usual.brightest), 1, "%"),
+                number(Some(100.0 * usual.noise), 1, "%"),
                 number(usual.exposure_ms, 1, "ms"),
             ])
         })
@@ -185,8 +186,14 @@ fn detections(view: &View<'_>) -> Section {
     if rows.is_empty() {
         section.before.push(missing("pictures, so nothing is known of the light"));
     } else {
-        let head =
-            ["camera", "pictures measured", "mean brightness", "brightest hundredth", "exposure"];
+        let head = [
+            "camera",
+            "pictures measured",
+            "mean brightness",
+            "brightest hundredth",
+            "noise",
+            "exposure",
+        ];
         section.after.push(table(&head, rows));
     }
     section

@@ -668,9 +668,12 @@ fn pictures_in_which_it_was_too_dark_for_a_marker_are_told() {
     let sentence = "the pictures of camera `down` are too dark for a marker: in the median their mean is 2.0 % of white";
     assert!(dark.light[0].starts_with(sentence), "{:?}", dark.light);
     assert!(dark.line().contains(sentence), "{}", dark.line());
-    assert!(html.matches(sentence).count() >= 2 && html.contains("Brightness of the pictures"));
+    assert!(
+        html.matches(sentence).count() >= 2
+            && html.contains("Brightness and noise of the pictures")
+    );
     assert!(html.contains("20.0 ms"));
     let (grey, html) = told(120);
     assert_eq!(grey.light, Vec::<String>::new());
-    assert!(html.contains("Brightness of the pictures") && html.contains("47.1 %"));
+    assert!(html.contains("Brightness and noise of the pictures") && html.contains("47.1 %"));
 }
