@@ -17,7 +17,7 @@ use testing::{ports, with_second_try};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
-use crate::flight::{alone, output_of, small_camera};
+use crate::flight::{alone, beside_another, output_of, small_camera};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
@@ -367,7 +367,7 @@ impl Drop for Service {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn services_outlast_another_program_where_they_connect() -> anyhow::Result<()> {
-    let _alone = alone().await?;
+    let _flight = beside_another().await?;
     services_outlast_it().await
 }
 

@@ -118,7 +118,9 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
     let ready = node.alive("detector", "*").await?.into_iter().collect();
     let controller = match (status, &marker) {
         (Some(status), _) => Controller::Read(Box::new(status)),
-        (None, None) if node.alive("controller", "*").await?.is_empty() => Controller::Absent,
+        (None, None) if node.alive("controller", "*").await?.is_empty() => {
+            Controller::Absent(node.explain_silence("controller").await)
+        }
         (None, _) => Controller::Unread,
     };
     Ok(Overview::new(controller, marker, &announced, ready))
@@ -150,7 +152,8 @@ fn looks_for_others(markers: &[String], wanted: &str) -> bool {
 
 /// What is known of the controller.
 enum Controller {
-    Absent,
+    /// None answers, and why.
+    Absent(String),
     /// One is running, and no status of it could be read.
     Unread,
     Read(Box<ControllerStatus>),
@@ -201,7 +204,9 @@ impl Overview {
         ready: BTreeSet<String>,
     ) -> Self {
         let (controller, status_read, status) = match controller {
-            Controller::Absent => (false, false, ControllerStatus::default()),
+            Controller::Absent(detector_why) => {
+                (false, false, ControllerStatus { detector_why, ..ControllerStatus::default() })
+            }
             Controller::Unread => (true, false, ControllerStatus::default()),
             Controller::Read(status) => (true, true, *status),
         };
@@ -276,7 +281,7 @@ impl Overview {
         }
         let mut text = aligned(&rows);
         let summary = match (self.controller, &self.active) {
-            (false, _) => "No controller is running, so none is in use.".to_owned(),
+            (false, _) => format!("No controller answers, so none is in use: {}.", self.why),
             (true, _) if !self.status_read => {
                 "A controller is running, and no status of it can be read: is it of another version, or does it stand still? \
                  Which detector is in use is not known."
@@ -383,8 +388,10 @@ mod tests {
         assert!(lines[3].starts_with("late") && lines[3].contains("waiting"), "{table}");
         assert!(lines[4].contains("preferred: ground; 3 changes"), "{table}");
         assert!(lines[5].starts_with("Warning: detections of `late`"), "{table}");
-        let nobody = Overview::new(Controller::Absent, None, &announced, BTreeSet::new()).table();
-        assert!(nobody.contains("No controller"), "{nobody}");
+        let absent = Controller::Absent("nobody listens at 10.0.0.1:7448".to_owned());
+        let nobody = Overview::new(absent, None, &announced, BTreeSet::new()).table();
+        assert!(nobody.contains("No controller answers"), "{nobody}");
+        assert!(nobody.contains("nobody listens at 10.0.0.1:7448."), "{nobody}");
         // As its configuration is read, whose version is the same.
         let marker = Some("rings".to_owned());
         let unread = Overview::new(Controller::Unread, marker, &announced, BTreeSet::new());

@@ -4,8 +4,9 @@
 //! (`crates/node/src/access.rs`); `zenoh-config/secured.json5` has the rights of each role. The list of holders
 //! beside the authority's key says who may connect; who is revoked there stays out.
 
+use std::collections::BTreeMap;
 use std::fs::{self, OpenOptions};
-use std::io::Write;
+use std::io::{self, Write};
 use std::net::IpAddr;
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
@@ -20,9 +21,11 @@ use rcgen::{
     BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
     KeyUsagePurpose,
 };
+use serde::Serialize;
 use sha2::{Digest, Sha256};
 
-use crate::terminal::print;
+use crate::args::Format;
+use crate::terminal::{aligned, print};
 
 /// The authority's private key, which is not copied to other machines.
 const AUTHORITY_KEY: &str = "authority.key";
@@ -78,6 +81,16 @@ enum Action {
         /// Days until it expires.
         #[arg(long, value_name = "DAYS", default_value_t = 365, value_parser = clap::value_parser!(u32).range(1..=36_500))]
         days: u32,
+    },
+    /// List who may connect, by the list of holders in a directory (the authority's, or its copy on any machine), and the keys
+    /// that are there.
+    List {
+        /// The directory.
+        #[arg(value_name = "DIRECTORY")]
+        directory: PathBuf,
+        /// Format of the list: a table, or one JSON object.
+        #[arg(long, value_enum, default_value_t)]
+        format: Format,
     },
     /// Make a passphrase for signed MAVLink packets: the file for `signing_key`, whose text goes into the autopilot or the
     /// ground station as well (docs/deploy.md).
@@ -145,7 +158,55 @@ pub(crate) struct Certificate {
     pub(crate) expires_in_s: i64,
 }
 
-/// Makes an authority or a key.
+/// Who may connect, by name.
+#[derive(Debug, Serialize)]
+struct HolderList {
+    holders: Vec<Listed>,
+}
+
+/// A holder in the list.
+#[derive(Debug, Serialize)]
+struct Listed {
+    /// `operator.anna@drone`.
+    holder: String,
+    standing: Standing,
+    /// The file of the holder's certificate in this directory.
+    file: Option<String>,
+    /// Days until the certificate expires; negative when it has.
+    expires_in_days: Option<i64>,
+}
+
+/// What the list of holders says of one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+enum Standing {
+    Admitted,
+    Revoked,
+    /// A certificate is here, and the list does not name its holder.
+    Unlisted,
+}
+
+impl HolderList {
+    fn table(&self) -> String {
+        let mut rows = vec![["HOLDER", "MAY CONNECT", "KEY HERE"].map(str::to_owned)];
+        for listed in &self.holders {
+            let standing = match listed.standing {
+                Standing::Admitted => "yes",
+                Standing::Revoked => "no, revoked",
+                Standing::Unlisted => "no, not in holders.txt",
+            };
+            let key = match (&listed.file, listed.expires_in_days) {
+                (Some(file), Some(..0)) => format!("{file}, expired"),
+                (Some(file), Some(days)) => format!("{file}, expires in {days} days"),
+                _ => "-".to_owned(),
+            };
+            rows.push([listed.holder.clone(), standing.to_owned(), key]);
+        }
+        aligned(&rows).trim_end().to_owned()
+    }
+}
+
+/// Makes an authority or a key, or lists those that there are.
 pub(crate) fn run(args: &KeysArgs) -> anyhow::Result<ExitCode> {
     let written = match &args.action {
         Action::Init { output, days } => init(output, *days)?,
@@ -154,6 +215,14 @@ pub(crate) fn run(args: &KeysArgs) -> anyhow::Result<ExitCode> {
             let holder = Holder::new(&role.name(), name.as_deref().or(default), vehicle)?;
             let authority = authority.as_deref().unwrap_or(output);
             issue(*role, &holder, output, authority, address, *days)?
+        }
+        Action::List { directory, format } => {
+            let list = list(directory)?;
+            print(&match format {
+                Format::Text => list.table(),
+                Format::Json => serde_json::to_string(&list)?,
+            })?;
+            return Ok(ExitCode::SUCCESS);
         }
         Action::Signing { output } => vec![passphrase(output)?],
         Action::Revoke { holder, authority } => vec![revoke(holder, authority)?],
@@ -313,12 +382,53 @@ fn revoke(holder: &Holder, authority: &Path) -> anyhow::Result<PathBuf> {
     write_holders(authority, &holders)
 }
 
+/// The holders that the list in a directory names, and those whose certificates are there.
+fn list(directory: &Path) -> anyhow::Result<HolderList> {
+    let path = directory.join(HOLDERS);
+    let text = fs::read_to_string(&path).with_context(|| {
+        format!("reading {path:?}, the list of holders, which `alight keys issue` writes")
+    })?;
+    let holders: Holders = text.parse().with_context(|| format!("{path:?}"))?;
+    let mut by_name: BTreeMap<String, Listed> = BTreeMap::new();
+    for (listed, standing) in holders
+        .admitted()
+        .map(|holder| (holder, Standing::Admitted))
+        .chain(holders.revoked().map(|holder| (holder, Standing::Revoked)))
+    {
+        let holder = listed.to_string();
+        let listed = Listed { holder: holder.clone(), standing, file: None, expires_in_days: None };
+        by_name.insert(holder, listed);
+    }
+    let files = fs::read_dir(directory).with_context(|| format!("reading {directory:?}"))?;
+    let mut paths: Vec<PathBuf> = files.map(|file| Ok(file?.path())).collect::<io::Result<_>>()?;
+    paths.retain(|path| {
+        path.extension().is_some_and(|it| it == "pem") && !path.ends_with(AUTHORITY)
+    });
+    paths.sort();
+    for path in paths {
+        // Certificates of pages and others may be there as well.
+        let Ok(Certificate { common_name, expires_in_s }) = certificate(&path) else { continue };
+        if common_name.parse::<Holder>().is_err() {
+            continue;
+        }
+        let listed = by_name.entry(common_name.clone()).or_insert_with(|| Listed {
+            holder: common_name,
+            standing: Standing::Unlisted,
+            file: None,
+            expires_in_days: None,
+        });
+        listed.file = path.file_name().map(|name| name.to_string_lossy().into_owned());
+        listed.expires_in_days = Some(expires_in_s.div_euclid(DAY.as_secs().cast_signed()));
+    }
+    Ok(HolderList { holders: by_name.into_values().collect() })
+}
+
 /// The holders of an authority's keys; none before the first.
 fn read_holders(authority: &Path) -> anyhow::Result<Holders> {
     let path = authority.join(HOLDERS);
     match fs::read_to_string(&path) {
         Ok(text) => text.parse().with_context(|| format!("{path:?}")),
-        Err(cause) if cause.kind() == std::io::ErrorKind::NotFound => Ok(Holders::default()),
+        Err(cause) if cause.kind() == io::ErrorKind::NotFound => Ok(Holders::default()),
         Err(cause) => Err(cause).with_context(|| format!("reading {path:?}")),
     }
 }
@@ -524,13 +634,26 @@ mod tests {
         init(here, 30).unwrap();
         issue_for(Role::Operator, Some("bob"), &laptop, here).unwrap();
         let bob: Holder = "operator.bob@drone".parse().unwrap();
-        let list = fs::read_to_string(revoke(&bob, here).unwrap()).unwrap();
-        assert!(list.contains("\nrevoked operator.bob@drone\n"), "{list}");
+        let written = fs::read_to_string(revoke(&bob, here).unwrap()).unwrap();
+        assert!(written.contains("\nrevoked operator.bob@drone\n"), "{written}");
         let again = home.path().join("again");
         refused(issue_for(Role::Operator, Some("bob"), &again, here), "was revoked");
         refused(revoke(&"operator.eve@drone".parse().unwrap(), here), "no key was issued");
+        issue_for(Role::Observer, None, here, here).unwrap();
+        let of_laptop = list(&laptop).unwrap().table();
+        // The laptop's list is of the time before.
+        let lines: Vec<_> = of_laptop.lines().collect();
+        assert!(lines[1].starts_with("operator.bob@drone  yes          operator.pem, expires in "));
+        let of_home = list(here).unwrap().table();
+        let lines: Vec<_> = of_home.lines().collect();
+        assert!(lines[1].starts_with("observer@drone      yes          observer.pem, expires in "));
+        assert_eq!(lines[2], "operator.bob@drone  no, revoked  -");
         issue_for(Role::Operator, Some("bobby"), &again, here).unwrap();
         let copied = fs::read_to_string(again.join(HOLDERS)).unwrap();
         assert!(copied.contains("\nrevoked operator.bob@drone\n"), "{copied}");
+        fs::write(here.join(HOLDERS), "").unwrap();
+        let unlisted = list(here).unwrap().table();
+        assert!(unlisted.contains("observer@drone  no, not in holders.txt"), "{unlisted}");
+        refused(list(&here.join("none")), "alight keys issue");
     }
 }

@@ -119,7 +119,10 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
     let configurations = node.subscriber(topic::CONFIGURATION, &["controller", "*"]).await?;
     let presence = node.presence("detector").await?;
     let first = timeout(CONTROLLER_TIMEOUT, statuses.next()).await.ok().flatten();
-    let first = first.context("no controller answered; `swap` needs a running controller")?;
+    let Some(first) = first else {
+        let why = node.explain_silence("controller").await;
+        bail!("no controller answered, and `swap` needs one: {why}");
+    };
     let mut existing: BTreeSet<String> = node.alive("detector", "*").await?.into_iter().collect();
     existing.extend(first.candidates.iter().map(|candidate| candidate.detector.clone()));
     let new_detector = NewDetector::new(args, &existing)?;

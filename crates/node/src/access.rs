@@ -136,6 +136,16 @@ impl Holders {
         self.admitted.contains(holder)
     }
 
+    /// Those who may connect, sorted.
+    pub fn admitted(&self) -> impl Iterator<Item = &Holder> {
+        self.admitted.iter()
+    }
+
+    /// Those who are shut out, sorted.
+    pub fn revoked(&self) -> impl Iterator<Item = &Holder> {
+        self.revoked.iter()
+    }
+
     /// True when a vehicle's key in this role is among them.
     pub fn has(&self, role: &str, vehicle: &str) -> bool {
         self.of(role, vehicle).next().is_some()

@@ -6,13 +6,13 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use anyhow::bail;
-use serde_json::Value;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::oneshot;
 use tokio::time::{Instant, timeout, timeout_at};
 
 use crate::boxed::BoxFuture;
+use crate::endpoint;
 
 /// Maximum time for which the start of a tool waits for answers: a process on this machine gives one within milliseconds.
 const AT_START: Duration = Duration::from_millis(300);
@@ -204,12 +204,9 @@ impl Contacts {
 
     /// Of a mode and endpoints as JSON: a list, or one for each mode.
     fn parse(mode: &str, endpoints: &str) -> Self {
-        let mode: Value = serde_json::from_str(mode).unwrap_or_default();
-        let endpoints: Value = serde_json::from_str(endpoints).unwrap_or_default();
-        let of_mode = endpoints.get(mode.as_str().unwrap_or("peer")).unwrap_or(&endpoints);
         let mut contacts = Self::default();
-        for endpoint in of_mode.as_array().into_iter().flatten().filter_map(Value::as_str) {
-            match Contact::of(endpoint) {
+        for endpoint in endpoint::connected(mode, endpoints) {
+            match Contact::of(&endpoint) {
                 // Several connections may lead to one place.
                 Some(contact) if contacts.asked.contains(&contact) => {}
                 Some(contact) => contacts.asked.push(contact),

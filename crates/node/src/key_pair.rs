@@ -9,6 +9,7 @@ use rustls::RootCertStore;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::sign::CertifiedKey;
+use x509_parser::prelude::{FromDer, X509Certificate};
 
 /// Checks the certificate of an authority, a certificate and its private key.
 ///
@@ -20,9 +21,7 @@ pub(crate) fn check(authority: &Path, certificate: &Path, key: &Path) -> anyhow:
         .add(root)
         .with_context(|| format!("{authority:?} is no certificate of an authority"))?;
     let own = certificate_of(certificate)?;
-    let private = PrivateKeyDer::from_pem_file(key).with_context(|| {
-        format!("{key:?} is no private key; copy it again from where it was made")
-    })?;
+    let private = private_of(key)?;
     let provider = rustls::crypto::ring::default_provider();
     CertifiedKey::from_der(vec![own], private, &provider).with_context(|| {
         format!(
@@ -32,8 +31,25 @@ pub(crate) fn check(authority: &Path, certificate: &Path, key: &Path) -> anyhow:
     Ok(())
 }
 
+/// The common name of a certificate: its holder.
+pub(crate) fn common_name(path: &Path) -> anyhow::Result<String> {
+    let der = certificate_of(path)?;
+    let (_, certificate) =
+        X509Certificate::from_der(&der).with_context(|| format!("{path:?} is no certificate"))?;
+    let name = certificate.subject().iter_common_name().next();
+    let name = name.with_context(|| format!("{path:?} has no common name"))?;
+    Ok(name.as_str().with_context(|| format!("the common name of {path:?}"))?.to_owned())
+}
+
+/// The private key of a file.
+pub(crate) fn private_of(path: &Path) -> anyhow::Result<PrivateKeyDer<'static>> {
+    PrivateKeyDer::from_pem_file(path).with_context(|| {
+        format!("{path:?} is no private key; copy it again from where it was made")
+    })
+}
+
 /// The first certificate of a file.
-fn certificate_of(path: &Path) -> anyhow::Result<CertificateDer<'static>> {
+pub(crate) fn certificate_of(path: &Path) -> anyhow::Result<CertificateDer<'static>> {
     CertificateDer::from_pem_file(path).with_context(|| {
         format!("{path:?} is no certificate; copy it again from where it was made")
     })

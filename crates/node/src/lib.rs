@@ -4,9 +4,9 @@
 //! This is the only crate that uses Zenoh. It knows nothing of images, markers or autopilots.
 //!
 //! Modules in reading order: [`config`] merges a user's settings into the defaults; [`service`] runs a
-//! service from start to shutdown; [`network`] configures the network, with the rights of others from
-//! [`access`], and [`session`] joins it under an [`identity`], a tool's unless `foreign` programs answer there, with shared memory where `memory`
-//! says that it can; [`topics`] has typed messages, [`frames`] pixels,
+//! service from start to shutdown; [`network`] configures the network, its `endpoint`s and, from [`access`], the rights of others,
+//! and [`session`] joins it under an [`identity`], a tool's unless `foreign` programs answer there (`reach` says why nobody does), with shared memory where `memory`
+//! says that it can; [`topics`] has typed messages and commands, with their `sender`, [`frames`] pixels,
 //! and [`tap`] everything as it came; [`health`] counts, with [`stats`]; [`denied`] counts what access control
 //! denies; [`clock`] is the host's clock, [`standstill`] says that a process was frozen, [`state`] where a service keeps
 //! what survives a reboot, and [`version`](mod@version) which program it is.
@@ -17,6 +17,7 @@ mod boxed;
 pub mod clock;
 pub mod config;
 pub mod denied;
+mod endpoint;
 mod foreign;
 pub mod frames;
 pub mod health;
@@ -24,6 +25,8 @@ pub mod identity;
 mod key_pair;
 mod memory;
 pub mod network;
+mod reach;
+mod sender;
 pub mod service;
 pub mod session;
 pub mod standstill;

@@ -4,7 +4,6 @@
 //! differ from site to site and are filled in here, so that no site needs files of its own.
 
 use std::ffi::OsString;
-use std::net::IpAddr;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
@@ -13,6 +12,7 @@ use serde_json::{Value, json};
 
 use crate::access::{HOLDERS, access_control};
 use crate::config::{NAME_RULE, is_name};
+use crate::endpoint::Endpoint;
 use crate::key_pair;
 use crate::session::{LOCAL_CONFIG, LOCAL_PORT, ZenohSource};
 
@@ -391,37 +391,7 @@ impl Address {
     }
 }
 
-/// An endpoint: `tcp/127.0.0.1:7447?prio=1-4#iface=wlan0`.
-struct Endpoint {
-    protocol: String,
-    host: String,
-    port: u16,
-    rest: String,
-}
-
 impl Endpoint {
-    fn parse(text: &str) -> Option<Self> {
-        let (protocol, rest) = text.split_once('/')?;
-        let end = rest.find(['?', '#']).unwrap_or(rest.len());
-        let (host, port) = rest.get(..end)?.rsplit_once(':')?;
-        Some(Self {
-            protocol: protocol.to_owned(),
-            host: host.to_owned(),
-            port: port.parse().ok()?,
-            rest: rest.get(end..)?.to_owned(),
-        })
-    }
-
-    fn text(&self) -> String {
-        format!("{}/{}:{}{}", self.protocol, self.host, self.port, self.rest)
-    }
-
-    /// Whether only processes of this machine can connect there.
-    fn is_local(&self) -> bool {
-        let host = self.host.trim_matches(['[', ']']);
-        host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
-    }
-
     /// Replaces a host; the ports keep their offsets from the first one.
     fn redirect(&mut self, replaced: &str, address: &Address) {
         if self.host == replaced {

@@ -17,6 +17,8 @@ use crate::foreign;
 use crate::health::HealthCounters;
 use crate::identity::Identity;
 use crate::memory::lack_of_shared_memory;
+use crate::reach::Reach;
+use crate::sender;
 use crate::version::version;
 
 /// The configuration for one machine, the default.
@@ -73,6 +75,9 @@ pub struct Node {
     claim: Arc<Mutex<Option<LivelinessToken>>>,
     /// The configuration that the service has changed to, as TOML; `None` while it is that of its start.
     changed: Arc<watch::Sender<Option<String>>>,
+    reach: Arc<Reach>,
+    /// Who this process is to those that it commands.
+    pub(crate) sender: Arc<str>,
     started_ns: i64,
 }
 
@@ -119,6 +124,8 @@ impl Node {
 
     async fn open_with(identity: Identity, mut config: zenoh::Config) -> anyhow::Result<Self> {
         let has_shared_memory = share_memory(&mut config)?;
+        let reach = Arc::new(Reach::of(&config));
+        let sender = sender::name(&identity, reach.certificate()).into();
         let session = zenoh::open(config)
             .await
             .map_err(|cause| anyhow!("opening the Zenoh session of {identity}: {cause}"))?;
@@ -130,6 +137,8 @@ impl Node {
             token: Arc::default(),
             claim: Arc::default(),
             changed: Arc::new(watch::Sender::new(None)),
+            reach,
+            sender,
             started_ns: now_ns(),
         })
     }
@@ -229,6 +238,26 @@ impl Node {
             peers.sort();
             peers.dedup();
             Ok(peers)
+        })
+    }
+
+    /// Why no instance of a service answers, and what to do: for a tool that gives up.
+    pub fn explain_silence<'a>(&'a self, service: &'a str) -> BoxFuture<'a, String> {
+        Box::pin(async move {
+            let ready = self.list_peers().await.unwrap_or_default();
+            if ready.is_empty() {
+                return self.reach.explain().await;
+            }
+            if ready.iter().any(|(name, _)| name == service) {
+                let role = match self.reach.certificate() {
+                    Some(_) => ", or the role of this key may not command (`operator` may)",
+                    None => "",
+                };
+                return format!("a {service} is there: it stands still, or is too busy{role}");
+            }
+            let names: Vec<_> = ready.iter().map(|(name, id)| format!("{name} `{id}`")).collect();
+            let vehicle = self.reach.vehicle();
+            format!("of the vehicle `{vehicle}` there is only {}", names.join(", "))
         })
     }
 

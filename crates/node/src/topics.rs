@@ -22,12 +22,15 @@ use zenoh::session::SessionGetBuilder;
 use crate::boxed::BoxFuture;
 use crate::clock::now_ns;
 use crate::health::HealthCounters;
+use crate::sender;
 use crate::session::Node;
 
 /// Timeout of the reply to a query.
 pub(crate) const REPLY_TIMEOUT: Duration = Duration::from_secs(2);
 /// Pause before a command without a recipient is sent again.
 const RETRY_PAUSE: Duration = Duration::from_millis(100);
+/// Letters of a command in the log.
+const MAX_LOGGED: usize = 200;
 /// The attachment of a query that asks for the recipient's time.
 const ASKS_TIME: &[u8] = b"time?";
 
@@ -71,6 +74,8 @@ pub struct Request<M> {
     pub message: M,
     /// When it was sent, in nanoseconds of this recipient's clock; `None` from a requester that has not asked for it.
     pub sent_ns: Option<i64>,
+    /// Who says to have sent it, for a log.
+    pub sender: String,
     query: Query,
 }
 
@@ -286,16 +291,25 @@ impl Node {
                 }
             }
             let sent = match told {
-                Some(Reply::Time(time_ns)) => time_ns.to_le_bytes().to_vec(),
+                Some(Reply::Time(time_ns)) => {
+                    [&time_ns.to_le_bytes(), self.sender.as_bytes()].concat()
+                }
                 // A recipient that tells no time.
                 Some(Reply::Command(_)) => Vec::new(),
-                None => return Err(unanswered(&key)),
+                None => return Err(self.unanswered(&key).await),
             };
             match self.query(&key, &command, &sent, REPLY_TIMEOUT).await? {
                 Some(Reply::Command(reply)) => Ok(reply),
-                Some(Reply::Time(_)) | None => Err(unanswered(&key)),
+                Some(Reply::Time(_)) | None => Err(self.unanswered(&key).await),
             }
         })
+    }
+
+    async fn unanswered(&self, key: &str) -> anyhow::Error {
+        let who = key.rsplit_once('/').map_or(key, |(who, _command)| who);
+        let service = who.split('/').next().unwrap_or(who);
+        let why = self.explain_silence(service).await;
+        anyhow!("no {who} answered within {} s: {why}", REPLY_TIMEOUT.as_secs())
     }
 
     async fn query(
@@ -322,18 +336,19 @@ impl Node {
     }
 }
 
-fn unanswered(key: &str) -> anyhow::Error {
-    let who = key.rsplit_once('/').map_or(key, |(who, _command)| who);
-    anyhow!("no {who} answered within {REPLY_TIMEOUT:?}; is one running for this vehicle?")
-}
-
 fn nanoseconds(ns: i64) -> Duration {
     Duration::from_nanos(u64::try_from(ns).unwrap_or(0))
 }
 
 /// The time in an attachment, in nanoseconds.
 fn time(attachment: &ZBytes) -> Option<i64> {
-    Some(i64::from_le_bytes(attachment.to_bytes().as_ref().try_into().ok()?))
+    Some(i64::from_le_bytes(*attachment.to_bytes().first_chunk()?))
+}
+
+/// The name of a command's sender, which follows the time.
+fn sender(attachment: &ZBytes) -> String {
+    let bytes = attachment.to_bytes();
+    sender::shown(bytes.get(size_of::<i64>()..).unwrap_or_default())
 }
 
 /// A query with the quality of service of commands; its replies get the same.
@@ -363,13 +378,14 @@ impl<M: Message> Commands<M> {
                 continue;
             }
             let sent_ns = attachment.and_then(time);
+            let sender = attachment.map_or_else(|| sender::shown(&[]), sender);
             let payload = query.payload().map(|p| p.to_bytes().into_owned()).unwrap_or_default();
             let reason = match decode(&payload) {
                 Ok(message) => match refusal(sent_ns, now_ns()) {
-                    None => return Some(Request { message, sent_ns, query }),
+                    None => return Some(Request { message, sent_ns, sender, query }),
                     Some(reason) => {
                         let key = query.key_expr().as_str();
-                        tracing::warn!(key, reason, "Command refused");
+                        tracing::warn!(key, reason, sender, "Command refused");
                         self.health.failed("commands: too late");
                         reason
                     }
@@ -418,9 +434,16 @@ fn tell_time(query: Query) -> BoxFuture<'static, ()> {
     })
 }
 
-impl<M> Request<M> {
-    /// Answers the command.
+impl<M: Message> Request<M> {
+    /// Answers the command, and logs whose it was.
     pub async fn answer(self, reply: &messages::CommandReply) {
+        let command = serde_json::to_string(&self.message).unwrap_or_default();
+        let command: String = command.chars().take(MAX_LOGGED).collect();
+        let (sender, reason) = (&self.sender, &reply.reason);
+        match reply.accepted {
+            true => tracing::info!(%command, %sender, reason, "Command accepted"),
+            false => tracing::warn!(%command, %sender, reason, "Command refused"),
+        }
         answer(self.query, encode(reply)).await;
     }
 }

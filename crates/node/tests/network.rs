@@ -256,6 +256,8 @@ async fn a_command_is_answered_and_without_a_controller_the_error_says_so() -> a
     let commands = controller.commands(topic::COMMAND, &[]).await?;
     let answering = tokio::spawn(async move {
         while let Some(request) = commands.next().await {
+            let own = format!(", alight main on {}", node::host_name());
+            assert!(request.sender.ends_with(&own), "{}", request.sender);
             let reason = format!("{:?}", request.message);
             request.answer(&CommandReply { accepted: true, reason }).await;
         }
@@ -285,7 +287,7 @@ async fn a_command_that_waited_until_its_sender_gave_up_is_refused() -> anyhow::
     let foreign = Foreign::open(port).await?;
     let answering = tokio::spawn(async move {
         while let Some(request) = commands.next().await {
-            let reason = format!("{:?}", request.sent_ns.is_some());
+            let reason = format!("{} {}", request.sent_ns.is_some(), request.sender);
             request.answer(&CommandReply { accepted: true, reason }).await;
         }
     });
@@ -306,9 +308,13 @@ async fn a_command_that_waited_until_its_sender_gave_up_is_refused() -> anyhow::
         assert_eq!(reply.accepted, accepted, "{reply:?}");
         assert!(accepted || reply.reason.contains("give it again"), "{reply:?}");
     }
+    let named = [&now_ns().to_le_bytes()[..], b"anna\x1b[2J\n"].concat();
+    let named = foreign.ask("drone/controller/command", &start, &named).await?.0;
+    assert_eq!(decode::<CommandReply>(&named)?.reason, "true anna[2J");
     let undated: CommandReply =
         decode(&foreign.ask("drone/controller/command", &start, &[]).await?.0)?;
-    assert_eq!(undated, CommandReply { accepted: true, reason: "false".into() });
+    let reason = "false a sender without a name".to_owned();
+    assert_eq!(undated, CommandReply { accepted: true, reason });
     let errors = controller.health().report(controller.identity(), now_ns()).errors;
     let late = errors.iter().find(|count| count.reason == "commands: too late");
     assert_eq!(late.map(|count| count.count), Some(3), "{errors:?}");

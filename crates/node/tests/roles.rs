@@ -1,9 +1,12 @@
 //! Two hosts: the processes on the drone, its relay, and the ground.
 
-use std::path::PathBuf;
+mod common;
+
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, ensure};
+use common::Authority;
 use messages::{CommandReply, ControllerCommand, Wind, topic};
 use node::{Identity, Network, Node};
 use testing::ports;
@@ -122,4 +125,101 @@ async fn a_base_station_relays_between_drone_and_ground() -> anyhow::Result<()> 
     let detector = base.open("ground", "detector", "ground").await?;
     is_received(&camera, &detector).await?;
     is_received(&detector, &camera).await
+}
+
+/// What an operator is told who commands with this network.
+async fn told(network: &Network) -> anyhow::Result<String> {
+    let identity = Identity { service: "alight", instance: "command".into() };
+    let operator = Node::open_tool(identity, &network.source("operator")?).await?;
+    let unanswered = operator.command(topic::COMMAND, &[], &ControllerCommand::Hold).await;
+    operator.close().await;
+    Ok(unanswered.err().context("it is answered")?.to_string())
+}
+
+fn contains(told: &str, parts: &[&str]) -> anyhow::Result<()> {
+    for part in parts {
+        ensure!(told.contains(part), "`{part}` is not in: {told}");
+    }
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn without_an_answer_the_operator_is_told_why() -> anyhow::Result<()> {
+    let site = Site::new()?;
+    let ground = site.network("ground");
+    let at = |network: &Network, host: &str| Network {
+        connect: Some(site.air.replace("127.0.0.1", host)),
+        ..network.clone()
+    };
+    let nowhere = at(&ground, "nowhere.invalid");
+    let here = Network { meet: Some(site.meet), ..Network::default() };
+    let (nobody, unknown, alone) = tokio::join!(told(&ground), told(&nowhere), told(&here));
+    contains(&nobody?, &["no controller", "nobody listens at 127.0.0.1", "--connect"])?;
+    contains(&unknown?, &["address of `nowhere.invalid` is not known"])?;
+    contains(&alone?, &["no process of the vehicle `drone`", "--meet"])?;
+
+    let relay = site.open("drone", "relay", "drone").await?;
+    relay.announce().await?;
+    let other = Network { vehicle: Some("kestrel".into()), ..ground.clone() };
+    let (known, other) = tokio::join!(told(&ground), told(&other));
+    contains(&known?, &["there is only relay `drone`"])?;
+    contains(&other?, &["no process of the vehicle `kestrel`", "--vehicle"])
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn whom_a_relay_shuts_out_is_told_why() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let keys_of = |name: &str| -> anyhow::Result<PathBuf> {
+        let path = folder.path().join(name);
+        std::fs::create_dir(&path)?;
+        Ok(path)
+    };
+    let (authority, others) = (Authority::new()?, Authority::new()?);
+    let drone = keys_of("drone")?;
+    authority.issue(&drone, "drone@drone")?;
+    for line in ["drone@drone", "operator.anna@drone", "revoked operator.bob@drone"] {
+        common::list(&drone, line)?;
+    }
+    let issue = |authority: &Authority, name: &str, holder: &str| -> anyhow::Result<PathBuf> {
+        let keys = keys_of(name)?;
+        authority.issue(&keys, holder)?;
+        Ok(keys)
+    };
+    let keys_of_anna = issue(&authority, "anna", "operator.anna@drone")?;
+    let keys_of_bob = issue(&authority, "bob", "operator.bob@drone")?;
+    let keys_of_eve = issue(&others, "eve", "operator.eve@drone")?;
+    let mallory = issue(&authority, "mallory", "observer.mallory@drone")?;
+    for extension in ["pem", "key"] {
+        let copied = |role: &str| mallory.join(format!("{role}.{extension}"));
+        std::fs::rename(copied("observer"), copied("operator"))?;
+    }
+    common::list(&drone, "observer.mallory@drone")?;
+
+    let site = Site::new()?;
+    let with = |network: Network, keys: &Path| Network { keys: Some(keys.to_owned()), ..network };
+    let relays = Network { connect: None, ..with(site.network("drone"), &drone) };
+    let identity = Identity { service: "relay", instance: "drone".into() };
+    let relay = Node::open(identity, &relays.source("drone")?).await?;
+    relay.announce().await?;
+    let controller = site.open("local", "controller", "main").await?;
+    let ground = |keys: &Path| with(site.network("ground"), keys);
+    let elsewhere = Some(site.air.replace("127.0.0.1", "localhost"));
+    let to_anna = ground(&keys_of_anna);
+    let (to_bob, to_eve) = (ground(&keys_of_bob), ground(&keys_of_eve));
+    let named = Network { connect: elsewhere, ..to_anna.clone() };
+    let (anna, bob, eve, named) =
+        tokio::join!(told(&to_anna), told(&to_bob), told(&to_eve), told(&named));
+    contains(&anna?, &["there is only relay `drone`"])?;
+    contains(&bob?, &["bob/operator.pem, and shows it nothing", "revoked"])?;
+    contains(&eve?, &["of another authority"])?;
+    contains(&named?, &["not valid for the address `localhost`", "--address"])?;
+    controller.announce().await?;
+    contains(&told(&ground(&mallory)).await?, &["a controller is there", "role of this key"])?;
+    relay.close().await;
+
+    // A relay that has no keys yet.
+    let open = Site::new()?;
+    let _relay = open.open("drone", "relay", "drone").await?;
+    let plain = with(open.network("ground"), &keys_of_anna);
+    contains(&told(&plain).await?, &["has not answered with a certificate", "without keys"])
 }

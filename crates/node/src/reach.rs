@@ -1,0 +1,279 @@
+//! Why nobody answers a tool: Zenoh tries an address again for ever without a word, and a relay says nothing to whom it shuts out.
+
+use std::io::{self, Read};
+use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context;
+use rustls::pki_types::ServerName;
+use rustls::{CertificateError, ClientConfig, ClientConnection, RootCertStore, Stream};
+use tokio::time::timeout;
+
+use crate::endpoint::{self, Endpoint};
+use crate::key_pair;
+
+/// Maximum time for a connection, and for each step of the exchange of certificates.
+const PATIENCE: Duration = Duration::from_secs(1);
+/// Maximum time for an address altogether: the system may look a name up for longer.
+const MAX_TIME: Duration = Duration::from_secs(4);
+/// Who refuses a certificate says so at once; a relay that accepts it waits for the first message.
+const REFUSAL: Duration = Duration::from_millis(300);
+/// Addresses that are tried; a session has one, or the few of its site.
+const MAX_PLACES: usize = 4;
+/// What to do about an address.
+const CORRECT: &str =
+    "correct the address: `--connect`, `address` or `relay_address` of the site, or ALIGHT_CONNECT";
+
+/// Where a session connects, with what.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Reach {
+    /// The vehicle's name.
+    vehicle: String,
+    /// The first port of each host beyond this machine's rendezvous.
+    places: Vec<Place>,
+    /// The rendezvous port of this machine.
+    meet: Option<u16>,
+    keys: Option<Keys>,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Place {
+    host: String,
+    port: u16,
+    is_encrypted: bool,
+}
+
+/// The files of a key.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Keys {
+    authority: PathBuf,
+    certificate: PathBuf,
+    private: PathBuf,
+}
+
+/// What a connection to a place showed.
+#[derive(Debug)]
+enum Finding {
+    /// The name is not known.
+    Unknown(io::Error),
+    /// Nobody listens, or nothing comes back.
+    Unreachable(io::Error),
+    /// The exchange of certificates failed.
+    Refused(io::Error),
+    /// The files of the own key cannot be used.
+    Keys(anyhow::Error),
+    Accepted,
+}
+
+impl Reach {
+    pub(crate) fn of(config: &zenoh::Config) -> Self {
+        let part = |key: &str| config.get_json(key).unwrap_or_default();
+        let text = |key: &str| serde_json::from_str::<Option<String>>(&part(key)).ok().flatten();
+        let mut reach = Self { vehicle: text("namespace").unwrap_or_default(), ..Self::default() };
+        for endpoint in endpoint::connected(&part("mode"), &part("connect/endpoints")) {
+            let Some(Endpoint { protocol, host, port, rest }) = Endpoint::parse(&endpoint) else {
+                continue;
+            };
+            let is_encrypted = protocol == "tls";
+            let place = Place { host, port, is_encrypted };
+            if place.is_loopback() && rest.is_empty() && !is_encrypted {
+                reach.meet = Some(port);
+            } else if ["tcp", "tls"].contains(&protocol.as_str())
+                && reach.places.len() < MAX_PLACES
+                && reach.places.iter().all(|known| known.host != place.host)
+            {
+                reach.places.push(place);
+            }
+        }
+        let file = |key: &str| text(&format!("transport/link/tls/{key}")).map(PathBuf::from);
+        let authority = file("root_ca_certificate");
+        let own = (file("connect_certificate"), file("connect_private_key"));
+        if let (Some(authority), (Some(certificate), Some(private))) = (authority, own) {
+            reach.keys = Some(Keys { authority, certificate, private });
+        }
+        reach
+    }
+
+    /// The vehicle's name.
+    pub(crate) fn vehicle(&self) -> &str {
+        &self.vehicle
+    }
+
+    /// The certificate of this process.
+    pub(crate) fn certificate(&self) -> Option<&Path> {
+        self.keys.as_ref().map(|keys| keys.certificate.as_path())
+    }
+
+    /// Why no process of the vehicle is to be seen, and what to do.
+    pub(crate) async fn explain(&self) -> String {
+        let mut reasons = Vec::new();
+        for place in &self.places {
+            let (place, keys) = (place.clone(), self.keys.clone());
+            let described = place.clone();
+            let finding = tokio::task::spawn_blocking(move || place.finding(keys.as_ref()));
+            let finding = match timeout(MAX_TIME, finding).await {
+                Ok(Ok(finding)) => finding,
+                // The system still looks the name up.
+                Ok(Err(_)) | Err(_) => Finding::Unknown(io::ErrorKind::TimedOut.into()),
+            };
+            reasons.push(self.reason(&described, &finding));
+        }
+        if let Some(port) = self.meet {
+            reasons.push(format!(
+                "no process of the vehicle `{}` meets at port {port} of this machine: `alight up` and `alight land` say at which \
+                 port theirs do (`--meet`, ALIGHT_MEET)",
+                self.vehicle
+            ));
+        }
+        match reasons.is_empty() {
+            true => format!("is one running for the vehicle `{}`?", self.vehicle),
+            false => reasons.join("; "),
+        }
+    }
+
+    fn reason(&self, place: &Place, finding: &Finding) -> String {
+        let Place { host, port, .. } = place;
+        let at = format!("{host}:{port}");
+        let own = self.keys.as_ref().map(|keys| keys.certificate.display().to_string());
+        let own = own.unwrap_or_default();
+        match finding {
+            Finding::Unknown(cause) => {
+                format!("the address of `{host}` is not known here ({cause}); {CORRECT}")
+            }
+            Finding::Unreachable(cause) if cause.kind() == io::ErrorKind::ConnectionRefused => {
+                format!(
+                    "nobody listens at {at}: start the relay there (`alight up drone`), or {CORRECT}"
+                )
+            }
+            Finding::Unreachable(cause) => format!(
+                "{at} is out of reach ({cause}): is it switched on, and is this machine in its network? Else {CORRECT}"
+            ),
+            Finding::Keys(cause) => format!("{cause:#}"),
+            Finding::Refused(cause) => match rustls_error(cause) {
+                Some(rustls::Error::AlertReceived(alert)) => format!(
+                    "the relay at {at} refuses the certificate {own} ({alert:?}): it has expired, or is of another authority; \
+                     `alight keys issue` makes another"
+                ),
+                Some(rustls::Error::InvalidCertificate(problem)) => {
+                    let problem = certificate_problem(problem, host);
+                    format!("the relay at {at} has a certificate {problem}")
+                }
+                _ => format!(
+                    "who listens at {at} has not answered with a certificate ({cause}): another program, or a relay without keys \
+                     (`--keys`); else {CORRECT}"
+                ),
+            },
+            Finding::Accepted if place.is_encrypted => format!(
+                "the relay at {at} accepts the certificate {own}, and shows it nothing: its holder was revoked, is of another vehicle than \
+                 `{}`, or is not in the relay's holders.txt, which `alight keys issue` and `revoke` write beside the authority's key, and \
+                 which is to be copied to each relay",
+                self.vehicle
+            ),
+            Finding::Accepted => format!(
+                "{at} answers, and no process of the vehicle `{}` is there: is that its name (`--vehicle`, ALIGHT_VEHICLE)?",
+                self.vehicle
+            ),
+        }
+    }
+}
+
+impl Place {
+    fn is_loopback(&self) -> bool {
+        self.host.parse().is_ok_and(|address: std::net::IpAddr| address.is_loopback())
+    }
+
+    /// Connects, and exchanges certificates where that is asked for.
+    fn finding(&self, keys: Option<&Keys>) -> Finding {
+        let host = self.host.trim_matches(['[', ']']);
+        let addresses: Vec<SocketAddr> = match (host, self.port).to_socket_addrs() {
+            Ok(addresses) => addresses.take(MAX_PLACES).collect(),
+            Err(cause) => return Finding::Unknown(cause),
+        };
+        let mut last = io::ErrorKind::AddrNotAvailable.into();
+        for address in addresses {
+            match TcpStream::connect_timeout(&address, PATIENCE) {
+                Ok(stream) if self.is_encrypted => {
+                    return keys.map_or(Finding::Accepted, |keys| greet(stream, host, keys));
+                }
+                Ok(_) => return Finding::Accepted,
+                Err(cause) => last = cause,
+            }
+        }
+        Finding::Unreachable(last)
+    }
+}
+
+/// Exchanges certificates on a connection.
+fn greet(mut stream: TcpStream, host: &str, keys: &Keys) -> Finding {
+    let mut connection = match connection(host, keys) {
+        Ok(connection) => connection,
+        Err(cause) => return Finding::Keys(cause),
+    };
+    let shaken = (|| {
+        stream.set_read_timeout(Some(PATIENCE))?;
+        stream.set_write_timeout(Some(PATIENCE))?;
+        while connection.is_handshaking() {
+            connection.complete_io(&mut stream)?;
+        }
+        stream.set_read_timeout(Some(REFUSAL))?;
+        Stream::new(&mut connection, &mut stream).read(&mut [0; 1])
+    })();
+    match shaken {
+        Ok(0) => Finding::Refused(io::ErrorKind::UnexpectedEof.into()),
+        Ok(_) => Finding::Accepted,
+        Err(cause) if !connection.is_handshaking() && is_timeout(&cause) => Finding::Accepted,
+        Err(cause) => Finding::Refused(cause),
+    }
+}
+
+fn connection(host: &str, keys: &Keys) -> anyhow::Result<ClientConnection> {
+    let Keys { authority, certificate, private } = keys;
+    let mut roots = RootCertStore::empty();
+    roots
+        .add(key_pair::certificate_of(authority)?)
+        .with_context(|| format!("{authority:?} is no certificate of an authority"))?;
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let own = (vec![key_pair::certificate_of(certificate)?], key_pair::private_of(private)?);
+    let config = ClientConfig::builder_with_provider(provider)
+        .with_safe_default_protocol_versions()?
+        .with_root_certificates(roots)
+        .with_client_auth_cert(own.0, own.1)
+        .with_context(|| mismatch(private, certificate))?;
+    let name = ServerName::try_from(host.to_owned())
+        .with_context(|| format!("`{host}` is no name that a certificate can have"))?;
+    Ok(ClientConnection::new(Arc::new(config), name)?)
+}
+
+fn mismatch(private: &Path, certificate: &Path) -> String {
+    format!("{private:?} does not belong to {certificate:?}")
+}
+
+fn is_timeout(cause: &io::Error) -> bool {
+    matches!(cause.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut)
+}
+
+fn rustls_error(cause: &io::Error) -> Option<&rustls::Error> {
+    cause.get_ref()?.downcast_ref()
+}
+
+/// What is wrong with the certificate of a relay, and what to do.
+fn certificate_problem(problem: &CertificateError, host: &str) -> String {
+    match problem {
+        CertificateError::NotValidForName | CertificateError::NotValidForNameContext { .. } => {
+            format!(
+                "that is not valid for the address `{host}`: connect to an address that it names, or make its key with \
+                 `alight keys issue --address {host}`"
+            )
+        }
+        CertificateError::Expired | CertificateError::ExpiredContext { .. } => {
+            "that has expired (if this machine's clock is right): `alight keys issue` makes another".to_owned()
+        }
+        // Authorities may have the same name.
+        CertificateError::UnknownIssuer | CertificateError::BadSignature => {
+            "of another authority than that of this key: it is another vehicle's, or one of both has old keys".to_owned()
+        }
+        other => format!("that is not valid: {other}"),
+    }
+}
