@@ -209,7 +209,7 @@ settings! {
         regain_climb_m_s: f64 = 0.3, 0.1..=2.0;
         /// Maximum number of retries: climbs after which the landing starts again, for a lost marker or a
         /// vehicle that does not settle.
-        retries: u32 = 5, 0.0..=20.0;
+        retries: u32 = 10, 0.0..=20.0;
         /// Height gain of a retry, in m, never above the height where the landing started.
         retry_climb_m: f64 = 2.0, 0.0..=20.0;
         /// Speed of that climb, in m/s.

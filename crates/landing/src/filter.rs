@@ -15,8 +15,8 @@
 //! normalised innovation squared (NIS) stays larger than the covariance allows, and shrinks again afterwards.
 //! An autopilot whose velocity errs by decimetres a second for seconds also reports a wrong tilt, and its
 //! position wanders; one with a good estimate keeps the configured noise. A detection beyond the gate is an outlier, which
-//! the caller does not fuse, unless it is so near that the autopilot's position may have wandered there: then the
-//! estimate was too sure of itself, and is widened ([`State::predict_to`]).
+//! the caller does not fuse, unless it is so near that the autopilot's position and tilt may have wandered there: then
+//! the estimate was too sure of itself, and is widened ([`State::predict_to`]).
 
 use geometry::{Odometry, Point, cubed, squared};
 use libm::{exp, fmax, fmin, hypot, log};
@@ -52,6 +52,11 @@ const MAX_NOISE_SCALE: f64 = 30.0;
 const WANDER_M: f64 = 0.02;
 const WANDER_M_S: f64 = 0.5;
 const MAX_WANDER_S: f64 = 0.3;
+/// How far its roll and pitch may have wandered, in radians: at once, and per second. By 0.01 rad they err where the velocity errs by
+/// 0.3 m/s for seconds, as that of PX4 does in its own simulation. A pad that does not move seems displaced by as much for each metre
+/// of range.
+const WANDER_RAD: f64 = 0.004;
+const WANDER_RAD_S: f64 = 0.01;
 
 /// Share of the configured time offset by which it walks, per square root of a second.
 const OFFSET_CHANGE: f64 = 0.02;
@@ -165,7 +170,7 @@ impl State {
     }
 
     /// Advances the state by `dt_s` to a detection, and returns how it fits. A detection beyond the gate that
-    /// is as near as the autopilot's position may have wandered since the last one is none of another place: the covariance of
+    /// is as near as the autopilot's position and tilt may have wandered since the last one is none of another place: the covariance of
     /// position and velocity is widened by the factor by which it is beyond (a fading factor: Xia, Rao, Ying, Shen: Adaptive Fading
     /// Kalman Filter with an Application, Automatica 30, 1994).
     pub(crate) fn predict_to(
@@ -178,7 +183,10 @@ impl State {
         let nis = self.nis(measurement);
         // What is not a number, and what a covariance that is none makes negative, is no inlier.
         let is_inlier = |nis: f64| (0.0..=config.gate).contains(&nis);
-        let wander_m = WANDER_M + WANDER_M_S * fmin(dt_s, MAX_WANDER_S);
+        let wander_s = fmin(dt_s, MAX_WANDER_S);
+        let lever_m = if config.pad_speed_m_s > 0.0 { 0.0 } else { measurement.range_m };
+        let wander_m =
+            WANDER_M + WANDER_M_S * wander_s + lever_m * (WANDER_RAD + WANDER_RAD_S * wander_s);
         let is_near = self.innovation(measurement).norm() <= wander_m;
         if !(nis > config.gate && nis.is_finite() && is_near) {
             return Fit { nis, is_inlier: is_inlier(nis) };

@@ -23,6 +23,8 @@ pub(crate) struct Measurement {
     pub(crate) stamp: Timestamp,
     /// The pad in the odometry frame, in metres.
     pub(crate) position: Vector3<f64>,
+    /// Distance of the vehicle, in metres.
+    pub(crate) range_m: f64,
     /// Covariance of that position, in m^2.
     pub(crate) noise: Matrix3<f64>,
     /// Derivative of that position by a tilt about each of the body's axes, in metres per radian.
@@ -104,6 +106,7 @@ impl MarkerPose {
         Ok(Measurement {
             stamp: frame.stamp,
             position: motion.odometry.coords.coords + r,
+            range_m: r.norm(),
             noise,
             tilt,
             slip: -motion.velocity.coords - turning.cross(&r),

@@ -530,6 +530,7 @@ mod tests {
             let seen = Measurement {
                 stamp: frame.stamp,
                 position: nalgebra::Vector3::new(wild, 1.0, if i % 3 == 0 { wild } else { 0.0 }),
+                range_m: 8.0,
                 noise: nalgebra::Matrix3::identity(),
                 tilt: nalgebra::Matrix3::zeros(),
                 slip: nalgebra::Vector3::zeros(),
