@@ -130,10 +130,11 @@ struct EdgePixel {
 #[derive(Copy, Clone, Debug)]
 struct Crossing {
     along: f64,
-    /// The logarithm on the dark side, and by how much it rises to the bright one.
+    /// The logarithm on the dark side and on the bright one, and by how much it rises.
     dark: f64,
+    bright: f64,
     step: f64,
-    /// Where it is half of the way up, from the line; infinite where it does not rise.
+    /// Where it is half of the way up, from the line; infinite where it does not rise, or not by a likely step.
     at_px: f64,
 }
 
@@ -169,6 +170,7 @@ impl ShadowFinder {
             return None;
         }
         self.find_pixels(means);
+        self.vote(size);
         let mut best: Option<ShadowEdge> = None;
         for _ in 0..MAX_LINES {
             let Some(line) = self.longest_line(size) else { break };
@@ -182,7 +184,18 @@ impl ShadowFinder {
                 best = Some(edge);
             }
             // The pixels of this line do not count in the next one.
-            self.pixels.retain(|pixel| !pixel.is_on(&line));
+            let Self { pixels, votes, .. } = self;
+            pixels.retain(|pixel| {
+                let stays = !pixel.is_on(&line);
+                if !stays {
+                    pixel.for_each_bin(size, |bin| {
+                        if let Some(votes) = votes.get_mut(bin) {
+                            *votes = votes.saturating_sub(1);
+                        }
+                    });
+                }
+                stays
+            });
         }
         best
     }
@@ -191,7 +204,8 @@ impl ShadowFinder {
     fn find_pixels(&mut self, means: GrayView<'_>) {
         static LOGARITHMS: LazyLock<[f32; 256]> =
             LazyLock::new(|| std::array::from_fn(|grey| (grey as f64 + STRAY_LIGHT).ln() as f32));
-        let log = |grey: u8| LOGARITHMS[usize::from(grey)];
+        let logarithms: &[f32; 256] = &LOGARITHMS;
+        let log = |grey: u8| logarithms[usize::from(grey)];
         let square = |[x, y]: [f32; 2]| x * x + y * y;
         let mut min_square = MIN_RISE * MIN_RISE;
         self.pixels.clear();
@@ -211,36 +225,27 @@ impl ShadowFinder {
         }
     }
 
-    /// The straight line with the most pixels that rise across it, in pixels of the image; `None` where none is long enough.
-    fn longest_line(&mut self, size: [usize; 2]) -> Option<Bend> {
-        static UNITS: LazyLock<[[f32; 2]; DIRECTIONS]> = LazyLock::new(|| {
-            std::array::from_fn(|index| {
-                let (sin, cos) = (index as f64 * TAU / DIRECTIONS as f64).sin_cos();
-                [cos as f32, sin as f32]
-            })
-        });
-        let distances = distances(size);
-        let middle = size.map(|edge| edge as f32 / 2.0);
+    /// Counts the pixels on each line.
+    fn vote(&mut self, size: [usize; 2]) {
         self.votes.clear();
-        self.votes.resize(DIRECTIONS * distances, 0);
-        for EdgePixel { place, rise } in &self.pixels {
-            let turn = rise[1].atan2(rise[0]) / std::f32::consts::TAU;
-            let nearest = (turn * DIRECTIONS as f32).round() as isize;
-            for direction in nearest - 1..=nearest + 1 {
-                let direction = direction.rem_euclid(DIRECTIONS as isize) as usize;
-                let [nx, ny] = UNITS[direction];
-                let distance = (place[0] - middle[0]) * nx + (place[1] - middle[1]) * ny;
-                let bin = (distance / PX_PER_DISTANCE + distances as f32 / 2.0) as usize;
-                if let Some(votes) = self.votes.get_mut(direction * distances + bin) {
+        self.votes.resize(DIRECTIONS * distances(size), 0);
+        for pixel in &self.pixels {
+            pixel.for_each_bin(size, |bin| {
+                if let Some(votes) = self.votes.get_mut(bin) {
                     *votes = votes.saturating_add(1);
                 }
-            }
+            });
         }
+    }
+
+    /// The straight line with the most pixels that rise across it, in pixels of the image; `None` where none is long enough.
+    fn longest_line(&self, size: [usize; 2]) -> Option<Bend> {
+        let (distances, middle) = (distances(size), middle(size));
         let (index, votes) = self.votes.iter().enumerate().max_by_key(|(_, votes)| **votes)?;
         if *votes < MIN_VOTES {
             return None;
         }
-        let across = UNITS[index / distances];
+        let across = units()[index / distances];
         let bin = (index % distances) as f32 + 0.5;
         let distance = (bin - distances as f32 / 2.0) * PX_PER_DISTANCE;
         let through: [f64; 2] = std::array::from_fn(|axis| {
@@ -265,13 +270,11 @@ impl ShadowFinder {
     /// of other things ends in the image.
     fn measured(&mut self, view: GrayView<'_>, mut line: Bend) -> Option<ShadowEdge> {
         const STEPS: usize = 2;
-        self.look_across(view, &line);
-        let mut step = self.likely_step()?;
+        let mut step = self.step_across(view, &line)?;
         for _ in 0..STEPS {
             let likely = self.crossings.iter().filter(|it| it.is_likely(step));
             line = line.fitted(likely.map(|it| [it.along, it.at_px]))?;
-            self.look_across(view, &line);
-            step = self.likely_step()?;
+            step = self.step_across(view, &line)?;
         }
         let all = self.crossings.len();
         self.crossings.retain(|it| it.is_likely(step));
@@ -298,6 +301,16 @@ impl ShadowFinder {
         Some(edge)
     }
 
+    /// The likely step across the line, and where the image makes it.
+    fn step_across(&mut self, view: GrayView<'_>, line: &Bend) -> Option<f64> {
+        self.look_across(view, line);
+        let step = self.likely_step()?;
+        for it in self.crossings.iter_mut().filter(|it| it.has_step(step)) {
+            it.at_px = it.place(view, line)?;
+        }
+        Some(step)
+    }
+
     /// Lists what the image shows across the line, at places along it.
     fn look_across(&mut self, view: GrayView<'_>, line: &Bend) {
         self.crossings.clear();
@@ -321,6 +334,21 @@ impl ShadowFinder {
 }
 
 impl EdgePixel {
+    /// Calls with the index of each line that the pixel is on: in the nearest direction and those next to it.
+    fn for_each_bin(&self, size: [usize; 2], mut is_on: impl FnMut(usize)) {
+        let Self { place, rise } = self;
+        let (distances, middle) = (distances(size), middle(size));
+        let turn = rise[1].atan2(rise[0]) / std::f32::consts::TAU;
+        let nearest = (turn * DIRECTIONS as f32).round() as isize;
+        for direction in nearest - 1..=nearest + 1 {
+            let direction = direction.rem_euclid(DIRECTIONS as isize) as usize;
+            let [nx, ny] = units()[direction];
+            let distance = (place[0] - middle[0]) * nx + (place[1] - middle[1]) * ny;
+            let bin = (distance / PX_PER_DISTANCE + distances as f32 / 2.0) as usize;
+            is_on(direction * distances + bin);
+        }
+    }
+
     fn in_image(&self) -> [f64; 2] {
         self.place.map(|place| to_level_0(f64::from(place), LEVEL))
     }
@@ -336,9 +364,30 @@ impl EdgePixel {
 }
 
 impl Crossing {
-    fn is_likely(&self, step: f64) -> bool {
+    fn has_step(&self, step: f64) -> bool {
         (self.step - step).abs() < MAX_STEP_OFF.min(MAX_STEP_SHARE * step)
-            && self.at_px.abs() < MAX_PLACE_OFF_PX
+    }
+
+    fn is_likely(&self, step: f64) -> bool {
+        self.has_step(step) && self.at_px.abs() < MAX_PLACE_OFF_PX
+    }
+
+    /// Where the logarithm is half of the way up, from the line; `None` beyond the image.
+    fn place(&self, view: GrayView<'_>, line: &Bend) -> Option<f64> {
+        let half = (self.dark + self.bright) / 2.0;
+        let mut nearest = f64::INFINITY;
+        let mut before = None;
+        for from_line in -HALF_PX..=HALF_PX {
+            let after = logarithm(view, line.pixel(self.along, f64::from(from_line)))? - half;
+            if let Some(before) = before.replace(after).filter(|before| *before < 0.0)
+                && after >= 0.0
+            {
+                let at = f64::from(from_line - 1) - before / (after - before);
+                // Of two as near the first.
+                nearest = if at.abs() < nearest.abs() { at } else { nearest };
+            }
+        }
+        Some(nearest)
     }
 }
 
@@ -380,6 +429,21 @@ impl ShadowEdge {
     }
 }
 
+/// The directions as unit vectors.
+fn units() -> &'static [[f32; 2]; DIRECTIONS] {
+    static UNITS: LazyLock<[[f32; 2]; DIRECTIONS]> = LazyLock::new(|| {
+        std::array::from_fn(|index| {
+            let (sin, cos) = (index as f64 * TAU / DIRECTIONS as f64).sin_cos();
+            [cos as f32, sin as f32]
+        })
+    });
+    &UNITS
+}
+
+fn middle(size: [usize; 2]) -> [f32; 2] {
+    size.map(|edge| edge as f32 / 2.0)
+}
+
 /// Number of distances from the middle of an image of this size that lines may have.
 fn distances([width, height]: [usize; 2]) -> usize {
     (width as f32).hypot(height as f32) as usize / PX_PER_DISTANCE as usize + 2
@@ -395,29 +459,21 @@ fn logarithm(view: GrayView<'_>, [x, y]: [f64; 2]) -> Option<f64> {
     Some((bilinear(view, x, y)? + ROUNDING).ln())
 }
 
-/// What the image shows across a line at a place along it; `None` beyond the image.
+/// What the image shows across a line at a place along it, but for where it rises; `None` beyond the image.
 fn crossing(view: GrayView<'_>, line: &Bend, along: f64) -> Option<Crossing> {
-    const COUNT: usize = (2 * HALF_PX + 1) as usize;
-    let mut logs = [0.0; COUNT];
-    for (log, from_line) in logs.iter_mut().zip(-HALF_PX..) {
-        *log = logarithm(view, line.pixel(along, f64::from(from_line)))?;
+    // All between the ends is in the image as well.
+    for end in [-HALF_PX, HALF_PX] {
+        let [x, y] = line.pixel(along, f64::from(end));
+        bilinear(view, x, y)?;
     }
-    let index = |from_line: i32| (from_line + HALF_PX) as usize;
-    let mean = |places: Range<usize>| {
+    let mean = |places: Range<i32>| {
         let count = places.len() as f64;
-        logs.get(places).map(|logs| logs.iter().sum::<f64>() / count)
+        let logs = places.map(|from_line| logarithm(view, line.pixel(along, f64::from(from_line))));
+        logs.sum::<Option<f64>>().map(|sum| sum / count)
     };
-    let dark = mean(index(-PLAIN_TO_PX)..index(1 - PLAIN_FROM_PX))?;
-    let bright = mean(index(PLAIN_FROM_PX)..index(PLAIN_TO_PX + 1))?;
-    let step = bright - dark;
-    let half = (dark + bright) / 2.0;
-    let rises = logs.windows(2).zip(-HALF_PX..).filter_map(|(pair, from_line)| {
-        let [before, after] = [pair.first()? - half, pair.last()? - half];
-        let share = -before / (after - before);
-        (before < 0.0 && after >= 0.0).then_some(f64::from(from_line) + share)
-    });
-    let at_px = rises.min_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(f64::INFINITY);
-    Some(Crossing { along, dark, step, at_px })
+    let dark = mean(-PLAIN_TO_PX..1 - PLAIN_FROM_PX)?;
+    let bright = mean(PLAIN_FROM_PX..PLAIN_TO_PX + 1)?;
+    Some(Crossing { along, dark, bright, step: bright - dark, at_px: f64::INFINITY })
 }
 
 /// The mean of the middle half of the values; `None` of too few.
