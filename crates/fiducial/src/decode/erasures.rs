@@ -10,8 +10,8 @@ use markers::SquareCode;
 use crate::candidates::quad::Quad;
 use crate::decode::false_positive;
 use crate::decode::illumination::{
-    Agreement, Colour, Illumination, MAX_CELLS, ReferenceCells, SATURATED, intact_fraction,
-    is_border, log,
+    Agreement, BorderRatios, Colour, Illumination, MAX_CELLS, ReferenceCells, SATURATED,
+    intact_fraction, log,
 };
 use crate::optics::homography::Homography;
 
@@ -105,9 +105,9 @@ pub(crate) fn have_same_cells(a: &SquareCode, b: &SquareCode) -> bool {
 /// cells.
 pub(crate) fn has_border(view: GrayView<'_>, quad: &Quad, code: &SquareCode) -> bool {
     let Some(source) = Source::new(view, quad, code) else { return false };
-    let mut log_ratios = [0.0_f32; 4 * MAX_ACROSS];
-    let mut seen = 0;
-    for index in 0..4 * usize::from(code.cells).min(MAX_ACROSS) {
+    let places = 4 * usize::from(code.cells).min(MAX_ACROSS);
+    let mut ratios = BorderRatios::<{ 4 * MAX_ACROSS }>::new(places);
+    for index in 0..places {
         let along = (index / 4) as f64 + 0.5;
         let value = |depth: f64| {
             let place = match index % 4 {
@@ -118,12 +118,13 @@ pub(crate) fn has_border(view: GrayView<'_>, quad: &Quad, code: &SquareCode) -> 
             };
             source.grey(place).map(log)
         };
-        if let (Some(border), Some(quiet_zone)) = (value(0.5), value(-0.35)) {
-            log_ratios[seen] = quiet_zone - border;
-            seen += 1;
+        if let (Some(border), Some(quiet_zone)) = (value(0.5), value(-0.35))
+            && !ratios.add(quiet_zone - border)
+        {
+            return false;
         }
     }
-    seen >= 2 * usize::from(code.cells) && is_border(&mut log_ratios[..seen])
+    ratios.is_border(2 * usize::from(code.cells))
 }
 
 /// What a cell of a marker is.

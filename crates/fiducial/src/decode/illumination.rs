@@ -44,14 +44,44 @@ impl Colour {
     }
 }
 
-/// Whether the logarithms of white over black along a border are nearly the same for most of it: a shadow
-/// keeps the ratio. It sorts them.
-pub(crate) fn is_border(log_ratios: &mut [f32]) -> bool {
-    let count = log_ratios.len();
-    log_ratios.sort_unstable_by(f32::total_cmp);
-    let quantile = |numerator: usize| log_ratios.get(numerator * count / 5).copied();
-    let (Some(low), Some(high)) = (quantile(2), quantile(4)) else { return false };
-    low > MIN_LOG_RATIO && high < MAX_LOG_RATIO_VARIATION * low
+/// The logarithms of white over black at up to `N` places along a border.
+pub(crate) struct BorderRatios<const N: usize> {
+    log_ratios: [f32; N],
+    seen: usize,
+    /// How many are too low for a border, and how many may be, if all places are seen.
+    low: usize,
+    max_low: usize,
+}
+
+impl<const N: usize> BorderRatios<N> {
+    /// Of a border that is looked at in so many places.
+    pub(crate) fn new(places: usize) -> Self {
+        Self { log_ratios: [0.0; N], seen: 0, low: 0, max_low: quantile(2, places) }
+    }
+
+    /// Adds a place; false when it is no border, whatever the others show.
+    pub(crate) fn add(&mut self, log_ratio: f32) -> bool {
+        if let Some(slot) = self.log_ratios.get_mut(self.seen) {
+            *slot = log_ratio;
+            self.seen += 1;
+            self.low += usize::from(log_ratio <= MIN_LOG_RATIO);
+        }
+        self.low <= self.max_low
+    }
+
+    /// Whether they are nearly the same for most of the border, since a shadow keeps the ratio, and so many are seen.
+    pub(crate) fn is_border(&mut self, min_seen: usize) -> bool {
+        let log_ratios = &mut self.log_ratios[..self.seen];
+        log_ratios.sort_unstable_by(f32::total_cmp);
+        let at = |numerator: usize| log_ratios.get(quantile(numerator, log_ratios.len())).copied();
+        let (Some(low), Some(high)) = (at(2), at(4)) else { return false };
+        self.seen >= min_seen && low > MIN_LOG_RATIO && high < MAX_LOG_RATIO_VARIATION * low
+    }
+}
+
+/// The index of a quantile, in fifths, of so many sorted values.
+fn quantile(fifths: usize, count: usize) -> usize {
+    fifths * count / 5
 }
 
 /// The fraction of the seen cells that look as they should, the mean of black and white ones; `None` when it,

@@ -13,7 +13,7 @@ use markers::stag_code::{self, DOT_RADIUS, DOTS};
 use crate::decode::erasures::ErasedWord;
 use crate::decode::false_positive::words_within;
 use crate::decode::illumination::{
-    Agreement, Colour, Illumination, ReferenceCells, intact_fraction, is_border,
+    Agreement, BorderRatios, Colour, Illumination, ReferenceCells, intact_fraction,
 };
 use crate::optics::homography::Homography;
 
@@ -149,10 +149,17 @@ pub(crate) fn sample(
         }
     };
     let mut values = [f32::NAN; PLACES];
-    for (value_of, (place, _)) in values.iter_mut().zip(&places.known).take(8 * PER_SIDE) {
-        *value_of = value(place);
+    // The pairs of border and quiet zone, where both are in the image.
+    let mut ratios = BorderRatios::<{ 4 * PER_SIDE }>::new(4 * PER_SIDE);
+    let pairs = values.as_chunks_mut::<2>().0.iter_mut().zip(places.known.as_chunks::<2>().0);
+    for (pair, known) in pairs.take(4 * PER_SIDE) {
+        *pair = [0, 1].map(|i| value(&known[i].0));
+        let ratio = ((pair[1] + STRAY_LIGHT) / (pair[0] + STRAY_LIGHT)).ln();
+        if ratio.is_finite() && !ratios.add(ratio) {
+            return None;
+        }
     }
-    if !has_border(&values) {
+    if !ratios.is_border(2 * PER_SIDE) {
         return None;
     }
     let mut known = ReferenceCells::default();
@@ -185,20 +192,6 @@ pub(crate) fn sample(
         r_squared,
         is_washed_out,
     })
-}
-
-/// As [`is_border`], of the pairs of border and quiet zone that are in the image.
-fn has_border(values: &[f32; PLACES]) -> bool {
-    let mut log_ratios = [0.0_f32; 4 * PER_SIDE];
-    let mut seen = 0;
-    for pair in values[..8 * PER_SIDE].chunks_exact(2) {
-        let ratio = ((pair[1] + STRAY_LIGHT) / (pair[0] + STRAY_LIGHT)).ln();
-        if ratio.is_finite() {
-            log_ratios[seen] = ratio;
-            seen += 1;
-        }
-    }
-    seen >= 2 * PER_SIDE && is_border(&mut log_ratios[..seen])
 }
 
 fn colour(light: &Illumination, place: &Place, value: f32) -> Colour {
