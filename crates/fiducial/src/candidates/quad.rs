@@ -76,9 +76,10 @@ impl Quad {
         let indices = Self::corner_points(points)?;
         let [width, height] = [0, 1].map(|i| f32::from(outline.bounds[i + 2] - outline.bounds[i]));
         let size = width.max(height);
+        let max_rms = MAX_RMS_PX + MAX_RMS_RATIO * size;
         let mut sides = [Side::default(); 4];
         for (i, side) in sides.iter_mut().enumerate() {
-            *side = Side::new(points, indices[i], indices[(i + 1) % 4])?;
+            *side = Side::new(points, indices[i], indices[(i + 1) % 4], max_rms)?;
         }
         let mut lines = [Line::default(); 4];
         for (i, line) in lines.iter_mut().enumerate() {
@@ -86,7 +87,7 @@ impl Quad {
             let parallel = outline.level == 0 && size <= PARALLEL_PX;
             let opposite = parallel.then_some(&sides[(i + 2) % 4]);
             *line = sides[i].line(opposite)?;
-            if line.rms > MAX_RMS_PX + MAX_RMS_RATIO * size {
+            if line.rms > max_rms {
                 return None;
             }
         }
@@ -241,8 +242,9 @@ struct Side {
 }
 
 impl Side {
-    /// The points from one index to another, without the ends and without outliers.
-    fn new(points: &[[f32; 2]], from: usize, to: usize) -> Option<Self> {
+    /// The points from one index to another, without the ends and without outliers; `None` where they are farther from their line
+    /// than this.
+    fn new(points: &[[f32; 2]], from: usize, to: usize, max_rms: f32) -> Option<Self> {
         let ([ax, ay], [bx, by]) = (points[from], points[to]);
         let length = (bx - ax).hypot(by - ay);
         let end = (END_PX + END_RATIO * length).min(0.3 * length) * length;
@@ -254,6 +256,9 @@ impl Side {
         };
         let all = Self::sums(inner(), points[from]);
         let line = all.line(None)?;
+        if line.rms > max_rms {
+            return None;
+        }
         let max_distance = (2.0 * line.rms).max(0.25);
         let near =
             Self::sums(inner().filter(|point| line.distance(*point) <= max_distance), points[from]);

@@ -459,6 +459,11 @@ impl Side {
 
     /// The gap to the start of a side that continues this one's line.
     fn gap_to(&self, other: &Self) -> Option<f32> {
+        // Few others have its direction.
+        let is_along = dot(self.direction, other.direction) > 0.98;
+        if !is_along {
+            return None;
+        }
         let to_start = minus(other.start, self.end);
         let along = dot(to_start, self.direction);
         let to_end = minus(other.end, self.end);
@@ -468,7 +473,6 @@ impl Side {
         };
         let in_line = along > -2.0
             && far > along
-            && dot(self.direction, other.direction) > 0.98
             && along < 1.5 * (self.length + other.length)
             && offset(to_start, along)
             && offset(to_end, far);
