@@ -100,8 +100,17 @@ fn match_rays(
     let mut by_edge = [[0_u32; 2]; 6];
     let axes = ellipse.axes();
     for (i, ray) in (0..RAYS).zip(rays()) {
-        if i == FIRST && agree < 0.35 * seen {
+        // Even if all that is left agreed, there may be too little of it.
+        let left = |rays: u32| f64::from(rays.saturating_sub(i)) * bands.saturating_sub(1) as f64;
+        if i <= FIRST && agree + left(FIRST) < 0.35 * (seen + left(FIRST)) {
             return None;
+        }
+        if i >= FIRST && (agree + left(RAYS)) / (seen + left(RAYS)) < MIN_SCORE {
+            let edges = by_edge.iter().take(bands.saturating_sub(1));
+            let may_be_clear = edges.filter(|[seen, agree]| agree + 2 >= *seen).count() >= 2;
+            if !may_be_clear {
+                return None;
+            }
         }
         let on = axes.at(*ray);
         let mut before = None;
