@@ -18,7 +18,12 @@ pub fn bilinear(view: GrayView<'_>, x: f64, y: f64) -> Option<f64> {
     if (right == 0 && fx > 0.0) || (below == 0 && fy > 0.0) {
         return None;
     }
-    let [a, b, c, d] = view.square(left, top, [right.min(1), below.min(1)])?.map(f64::from);
+    // Nearly all places are well inside, where the four pixels need two checks.
+    let pixels = match (right, below) {
+        (1.., 1..) => view.four(left, top),
+        _ => view.square(left, top, [right.min(1), below.min(1)]),
+    };
+    let [a, b, c, d] = pixels?.map(f64::from);
     let (above, below) = (a + (b - a) * fx, c + (d - c) * fx);
     Some(above + (below - above) * fy)
 }

@@ -143,6 +143,15 @@ impl<'a> GrayView<'a> {
         Some([*pixels.first()?, *pixels.get(right)?, *pixels.get(down)?, *pixels.last()?])
     }
 
+    /// As [`GrayView::square`], with the pixels right beside and below.
+    #[inline]
+    pub(crate) fn four(&self, x: usize, y: usize) -> Option<[u8; 4]> {
+        let first = y * self.stride + x;
+        let [a, b] = *self.data.get(first..)?.first_chunk()?;
+        let [c, d] = *self.data.get(first + self.stride..)?.first_chunk()?;
+        Some([a, b, c, d])
+    }
+
     /// The pixel at column `x` of row `y`.
     ///
     /// # Panics
