@@ -1,6 +1,6 @@
 //! Adaptive binarisation: which pixels are dark and which are bright, one bit each.
 
-use crate::kernels::{TILE, above, below, tile_extremes};
+use crate::kernels::{TILE, above, below, tile_extremes, with_vectors};
 use crate::view::GrayView;
 
 /// One bit for each pixel of an image, 64 in a word, surrounded by zeros.
@@ -138,28 +138,27 @@ impl Binarizer {
         reserve(&mut self.row, width.next_multiple_of(TILE));
     }
 
-    /// Writes which pixels are dark, and optionally which are bright.
+    /// Writes which pixels of the image that was measured last are dark and which are bright, or one of both.
     pub fn apply(
         &mut self,
         view: GrayView<'_>,
         contrast: Contrast,
-        dark: &mut BitImage,
+        mut dark: Option<&mut BitImage>,
         mut bright: Option<&mut BitImage>,
     ) {
-        self.measure(view);
-        self.widen();
-        self.decide(contrast, view.height().div_ceil(TILE));
+        with_vectors(|| self.decide(contrast, view.height().div_ceil(TILE)));
         let (width, height) = (view.width(), view.height());
-        dark.resize(width, height);
-        if let Some(bright) = bright.as_deref_mut() {
-            bright.resize(width, height);
+        for bits in [dark.as_deref_mut(), bright.as_deref_mut()].into_iter().flatten() {
+            bits.resize(width, height);
         }
         self.row.resize(self.columns * TILE, 0);
         for (index, tiles) in self.thresholds.chunks(self.columns).enumerate() {
             let rows = index * TILE..((index + 1) * TILE).min(height);
-            expand(tiles, &mut self.row, |threshold| threshold);
-            for y in rows.clone() {
-                below(view.row(y), &self.row[..width], dark.row_mut(y));
+            if let Some(dark) = dark.as_deref_mut() {
+                expand(tiles, &mut self.row, |threshold| threshold);
+                for y in rows.clone() {
+                    below(view.row(y), &self.row[..width], dark.row_mut(y));
+                }
             }
             if let Some(bright) = bright.as_deref_mut() {
                 // Nothing is above 255: 0 wraps to it where the contrast is too small.
@@ -189,8 +188,8 @@ impl Binarizer {
         values.get(at).copied().filter(|_| inside).unwrap_or_default()
     }
 
-    /// Darkest and brightest pixel of each tile.
-    fn measure(&mut self, view: GrayView<'_>) {
+    /// Measures an image: the darkest and the brightest pixel of each tile, alone and with the tiles to its left and right.
+    pub fn measure(&mut self, view: GrayView<'_>) {
         self.columns = view.width().div_ceil(TILE);
         let count = self.columns * view.height().div_ceil(TILE);
         for buffer in [&mut self.low, &mut self.high, &mut self.wide_low, &mut self.wide_high] {
@@ -204,9 +203,11 @@ impl Binarizer {
             let rows = [0, 1, 2, 3].map(|i| view.row((index * TILE + i).min(view.height() - 1)));
             tile_extremes(&rows, low, high);
         }
+        with_vectors(|| self.widen());
     }
 
     /// Extremes of each tile and the ones to its left and right.
+    #[inline(always)]
     fn widen(&mut self) {
         let n = self.columns;
         let rows = self.low.chunks(n).zip(self.wide_low.chunks_mut(n));
@@ -215,6 +216,7 @@ impl Binarizer {
         rows.for_each(|(from, to)| spread(from, to, u8::max));
     }
 
+    #[inline(always)]
     fn decide(&mut self, contrast: Contrast, rows: usize) {
         let n = self.columns;
         for y in 0..rows {
@@ -248,7 +250,7 @@ impl Binarizer {
 
 impl Contrast {
     /// The threshold, or 0 where the contrast is too small.
-    #[inline]
+    #[inline(always)]
     fn gate(&self, low: u8, high: u8, threshold: u8) -> u8 {
         let difference = high.saturating_sub(low);
         let share =
@@ -258,7 +260,8 @@ impl Contrast {
 }
 
 /// Each value with its two neighbours.
-fn spread(from: &[u8], to: &mut [u8], wider: impl Fn(u8, u8) -> u8) {
+#[inline(always)]
+pub(crate) fn spread(from: &[u8], to: &mut [u8], wider: impl Fn(u8, u8) -> u8) {
     to.copy_from_slice(from);
     let n = from.len();
     for (to, left) in to[1.min(n)..].iter_mut().zip(from) {
@@ -270,14 +273,14 @@ fn spread(from: &[u8], to: &mut [u8], wider: impl Fn(u8, u8) -> u8) {
 }
 
 /// Above `low` unless both are the same.
-#[inline]
+#[inline(always)]
 fn between(low: u8, high: u8, share: u8) -> u8 {
     let up = u16::from(high.saturating_sub(low)) * u16::from(share);
     low + ((up + 255) >> 8) as u8
 }
 
 /// Above `low` unless both are the same. An offset for stray light keeps the darkest pixels from dominating.
-#[inline]
+#[inline(always)]
 fn mean_by_ratio(low: u8, high: u8) -> u8 {
     const STRAY_LIGHT: f32 = 4.0;
     let mean =
@@ -302,7 +305,9 @@ mod tests {
     fn apply(data: &[u8], width: usize, contrast: Contrast) -> (BitImage, BitImage) {
         let view = GrayView::packed(data, width, data.len() / width).unwrap();
         let (mut dark, mut bright) = (BitImage::default(), BitImage::default());
-        Binarizer::default().apply(view, contrast, &mut dark, Some(&mut bright));
+        let mut binarizer = Binarizer::default();
+        binarizer.measure(view);
+        binarizer.apply(view, contrast, Some(&mut dark), Some(&mut bright));
         (dark, bright)
     }
 
@@ -343,7 +348,8 @@ mod tests {
             let view = GrayView::packed(&data, width, data.len() / width).unwrap();
             let (mut dark, mut bright) = (BitImage::default(), BitImage::default());
             let mut binarizer = Binarizer::default();
-            binarizer.apply(view, contrast, &mut dark, Some(&mut bright));
+            binarizer.measure(view);
+            binarizer.apply(view, contrast, Some(&mut dark), Some(&mut bright));
             for y in 0..view.height() {
                 for x in 0..width {
                     let near = |x: usize, edge: usize| {

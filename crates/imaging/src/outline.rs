@@ -94,6 +94,8 @@ pub struct Outlines {
     /// Whether `sharp` belongs to this image.
     is_sharp: bool,
     binarizer: Binarizer,
+    /// The level and its rows that were measured for the binarizer last.
+    measured: Option<(usize, Option<Range<usize>>)>,
     dark: BitImage,
     bright: BitImage,
     path: Vec<u8>,
@@ -134,6 +136,7 @@ impl Outlines {
         self.tops.make_room(width);
         self.sharp.resize(width, height);
         self.is_sharp = false;
+        self.measured = None;
     }
 
     /// Adds the outlines on these levels; `view` is the image given to [`Outlines::begin`].
@@ -241,6 +244,7 @@ impl Outlines {
             return;
         };
         let wanted = |from: Option<usize>| from.is_some_and(|from| from <= level);
+        let dark = wanted(settings.dark_from).then_some(&mut self.dark);
         let bright = wanted(settings.bright_from).then_some(&mut self.bright);
         // At full resolution regions are a few pixels wide, with blurred lines hardly wider than a pixel.
         let sharp = if level == 0 {
@@ -257,9 +261,17 @@ impl Outlines {
                 None => Some(view),
             }
         }
-        let rows = rows.as_ref();
-        let Some((view, sharp)) = part(whole, rows).zip(part(sharp, rows)) else { return };
-        self.binarizer.apply(sharp, contrast(settings, level), &mut self.dark, bright);
+        let Some((view, sharp)) = part(whole, rows.as_ref()).zip(part(sharp, rows.as_ref())) else {
+            return;
+        };
+        let top = rows.as_ref().map_or(0, |rows| rows.start);
+        // Small paper is searched with two thresholds, one right after the other.
+        let measured = Some((level, rows));
+        if self.measured != measured {
+            self.binarizer.measure(sharp);
+            self.measured = measured;
+        }
+        self.binarizer.apply(sharp, contrast(settings, level), dark, bright);
         let limits = Limits::new(settings, level, view);
         for (from, bits, dark) in
             [(settings.dark_from, &self.dark, true), (settings.bright_from, &self.bright, false)]
@@ -273,7 +285,7 @@ impl Outlines {
                     dark,
                     level: level as u8,
                     places,
-                    top: rows.map_or(0, |rows| rows.start),
+                    top,
                     path: &mut self.path,
                     tops: &mut self.tops,
                     points: &mut self.points,
