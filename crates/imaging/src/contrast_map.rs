@@ -1,6 +1,8 @@
 //! Where an image has contrast between places as wide as markers' parts: a texture of dots and blades averages out there, paper
 //! and ink do not.
 
+use crate::binary::spread;
+use crate::kernels::with_vectors;
 use crate::pyramid::Pyramid;
 use crate::view::GrayView;
 
@@ -40,20 +42,24 @@ impl ContrastMap {
             list.clear();
             list.resize(columns * rows, 0);
         }
+        with_vectors(|| self.compare(means));
+    }
+
+    #[inline(always)]
+    fn compare(&mut self, means: GrayView<'_>) {
+        let (n, rows) = (means.width(), means.height());
         for y in 0..rows {
-            let (row, at) = (means.row(y), y * columns);
-            for x in 0..columns {
-                let near = &row[x.saturating_sub(1)..(x + 2).min(columns)];
-                let fold = |from: u8, of: fn(u8, u8) -> u8| near.iter().copied().fold(from, of);
-                (self.low[at + x], self.high[at + x]) = (fold(255, u8::min), fold(0, u8::max));
-            }
+            spread(means.row(y), &mut self.low[y * n..][..n], u8::min);
+            spread(means.row(y), &mut self.high[y * n..][..n], u8::max);
         }
         for y in 0..rows {
-            let near = [y.saturating_sub(1), y, (y + 1).min(rows - 1)].map(|y| y * columns);
-            for x in 0..columns {
-                let low = near.map(|row| self.low[row + x]).into_iter().fold(255, u8::min);
-                let high = near.map(|row| self.high[row + x]).into_iter().fold(0, u8::max);
-                self.percent[y * columns + x] = percent_brighter(low, high);
+            let near = [y.saturating_sub(1), y, (y + 1).min(rows - 1)];
+            let [a, b, c] = near.map(|y| &self.low[y * n..][..n]);
+            let [d, e, f] = near.map(|y| &self.high[y * n..][..n]);
+            let out = &mut self.percent[y * n..][..n];
+            for x in 0..n {
+                let (low, high) = (a[x].min(b[x]).min(c[x]), d[x].max(e[x]).max(f[x]));
+                out[x] = percent_brighter(low, high);
             }
         }
     }
@@ -83,10 +89,11 @@ impl ContrastMap {
     }
 }
 
-/// By how many percent a grey value is above another one, up to 255.
+/// By how many percent a grey value is above another one, up to 255. A quotient of such small numbers is not rounded up to a whole one.
+#[inline(always)]
 fn percent_brighter(low: u8, high: u8) -> u8 {
-    let difference = 100 * u32::from(high.saturating_sub(low));
-    (difference / u32::from(low.saturating_add(STRAY_LIGHT))).min(255) as u8
+    let difference = f32::from(high.saturating_sub(low));
+    (100.0 * difference / f32::from(low.saturating_add(STRAY_LIGHT))).min(255.0) as u8
 }
 
 /// Places of an image.
@@ -101,14 +108,35 @@ impl Places<'_> {
     /// The whole image.
     pub const EVERYWHERE: Self = Self { columns: 0, percent: &[], min_percent: 0 };
 
-    /// Whether a pixel of a level of the pyramid is among them. Coarse levels, of few pixels, are.
-    #[inline]
-    pub(crate) fn include(&self, x: usize, y: usize, level: usize) -> bool {
-        let Some(shift) = LEVEL.checked_sub(level).filter(|shift| *shift > 0) else { return true };
-        // The last columns of an image may not fill eight, nor the last rows, which are included.
-        let x = (x >> shift).min(self.columns.saturating_sub(1));
-        let at = (y >> shift) * self.columns + x;
-        self.percent.get(at).is_none_or(|percent| *percent >= self.min_percent)
+    /// How many rows of a level of the pyramid have the same places. Coarse levels, of few pixels, are among them as a whole.
+    pub(crate) fn rows_alike(&self, level: usize) -> usize {
+        if level < LEVEL { 1 << (LEVEL - level) } else { usize::MAX }
+    }
+
+    /// Marks the pixels of a row of a level of the pyramid that are among them, 64 in a word; false, and no words, when there is none.
+    pub(crate) fn mark(&self, y: usize, level: usize, words: &mut [u64]) -> bool {
+        let shift = LEVEL.saturating_sub(level);
+        let first = (y >> shift) * self.columns;
+        // The last rows of an image may not fill eight, and are included.
+        let row = self.percent.get(first..first + self.columns).filter(|_| shift > 0);
+        let Some((row, last)) = row.and_then(|row| Some((row, row.last()?))) else {
+            words.fill(u64::MAX);
+            return true;
+        };
+        let (pixels, places) = (1 << shift, 64 >> shift);
+        let is_place = |percent: &u8| *percent >= self.min_percent;
+        let marked = |percent: &u8, bits: u64| if is_place(percent) { bits } else { 0 };
+        if !row.iter().any(is_place) {
+            return false;
+        }
+        for (index, word) in words.iter_mut().enumerate() {
+            let here = row.get(index * places..).unwrap_or_default();
+            // The last columns may not fill eight, either, and belong to those before.
+            *word = here.iter().take(places).rev().fold(marked(last, u64::MAX), |word, percent| {
+                word << pixels | marked(percent, (1 << pixels) - 1)
+            });
+        }
+        true
     }
 }
 
@@ -123,6 +151,19 @@ mod tests {
         pyramid.build(view, 9, 24);
         map.measure(view, &pyramid);
         map
+    }
+
+    fn include(places: Places<'_>, x: usize, y: usize, level: usize) -> bool {
+        let mut words = [0; 12];
+        places.mark(y, level, &mut words) && words[x / 64] >> (x % 64) & 1 == 1
+    }
+
+    #[test]
+    fn percent_are_whole_parts_of_quotients() {
+        for (low, high) in (0..=255_u8).flat_map(|low| (low..=255).map(move |high| (low, high))) {
+            let exact = 100 * u32::from(high - low) / u32::from(low.saturating_add(STRAY_LIGHT));
+            assert_eq!(u32::from(percent_brighter(low, high)), exact.min(255));
+        }
     }
 
     /// Noise of this height, and paper with a black square on it at (303..327, 203..227).
@@ -155,11 +196,11 @@ mod tests {
         assert!(map.reaches(200), "{:?}", map.percent.iter().max());
         let places = map.places(40);
         for level in [0, 1, 2] {
-            let on = |x: usize, y: usize| places.include(x >> level, y >> level, level);
+            let on = |x: usize, y: usize| include(places, x >> level, y >> level, level);
             assert!(on(300, 200) && on(315, 198) && on(331, 215), "{level}");
             assert!(!on(20, 20) && !on(200, 215) && !on(644, 479), "{level}");
         }
-        assert!(places.include(0, 0, 3) && Places::EVERYWHERE.include(9, 9, 0));
+        assert!(include(places, 0, 0, 3) && include(Places::EVERYWHERE, 9, 9, 0));
         let shown = map.percent.iter().filter(|percent| **percent >= 40).count();
         assert!(shown < map.percent.len() / 50, "{shown}");
     }
@@ -180,7 +221,7 @@ mod tests {
     #[test]
     fn an_image_too_small_to_say_has_contrast_everywhere() {
         let map = map(&GrayImage::filled(100, 80, 9));
-        assert!(map.reaches(255) && map.places(255).include(50, 50, 0));
+        assert!(map.reaches(255) && include(map.places(255), 50, 50, 0));
         assert!(!self::map(&GrayImage::filled(300, 300, 9)).reaches(1));
     }
 }

@@ -30,6 +30,8 @@ pub(super) struct Tops {
     ends: Vec<u64>,
     /// The pixels of the other runs, from one that touches to the end of the run.
     flooded: Vec<u64>,
+    /// The places where outlines may begin at all.
+    places: Vec<u64>,
 }
 
 /// The settings applied to one level.
@@ -123,9 +125,8 @@ struct Trace {
     length: usize,
 }
 
-/// A walk along pixel edges.
+/// A walk along pixel edges, in pixels from where it starts.
 struct Walk {
-    start: [i32; 2],
     x: i32,
     y: i32,
     /// The pixel to the lower right of the current point.
@@ -135,58 +136,58 @@ struct Walk {
     left: i32,
     right: i32,
     bottom: i32,
-    /// Sum of the columns of vertical edges, downwards minus upwards.
-    area: i64,
-    /// Steps down and to the left; a convex outline has as many as its width plus its height.
-    back: i32,
 }
 
 impl Walk {
-    /// After the upper edge of pixel (x, y); `place` belongs to the next pixel.
+    /// After the upper edge of a pixel; `place` belongs to the next pixel.
     #[inline]
-    fn new(x: usize, y: usize, place: usize, row: usize) -> Self {
-        let (x, y) = (x as i32 + 1, y as i32);
-        let (start, left, right, bottom) = ([x, y], x - 1, x, y);
-        Self { start, x, y, place, row, direction: RIGHT, left, right, bottom, area: 0, back: 0 }
+    fn new(place: usize, row: usize) -> Self {
+        Self { x: 0, y: 0, place, row, direction: RIGHT, left: -1, right: 0, bottom: 0 }
     }
 
-    /// The outline, if it is closed here.
-    fn closed(&self, length: usize) -> Option<Trace> {
-        let bounds = [self.left, self.start[1], self.right, self.bottom];
-        let closed = self.direction == RIGHT && [self.x, self.y] == self.start;
-        closed.then_some(Trace { bounds, area: self.area, length })
+    /// The outline, if these steps from a point close it.
+    fn closed(&self, [x, y]: [i32; 2], path: &[u8]) -> Option<Trace> {
+        let bounds = [x + self.left, y, x + self.right, y + self.bottom];
+        let closed = self.direction == RIGHT && [self.x, self.y] == [0, 0];
+        closed.then(|| {
+            // The columns of vertical edges, downwards minus upwards.
+            let (mut column, mut area) = (0, 0);
+            for step in path {
+                let [right, down] = EDGES[usize::from(*step & 3)].along;
+                column += right;
+                area += i64::from(column * down);
+            }
+            Trace { bounds, area, length: path.len() }
+        })
     }
 
-    /// One step; false when the walk ends.
+    /// One step; false when the walk ends. With `steps`, their number with this one, as a ragged outline ends it.
     #[inline]
     fn right(&mut self, limits: &Limits) -> bool {
         self.direction = RIGHT;
         self.place += 1;
         self.x += 1;
         self.right = self.right.max(self.x);
-        let is_top = self.y == self.start[1] && self.x >= self.start[0];
+        let is_top = self.y == 0 && self.x >= 0;
         !is_top && self.right - self.left <= limits.max_size
     }
 
     #[inline]
-    fn down(&mut self, limits: &Limits) -> bool {
+    fn down(&mut self, steps: usize, limits: &Limits) -> bool {
         self.direction = DOWN;
         self.place += self.row;
         self.y += 1;
-        self.area += i64::from(self.x);
-        self.back += 1;
         self.bottom = self.bottom.max(self.y);
-        self.bottom - self.start[1] <= limits.max_size && !self.is_ragged(limits)
+        self.bottom <= limits.max_size && !self.is_ragged(steps, limits)
     }
 
     #[inline]
-    fn left(&mut self, limits: &Limits) -> bool {
+    fn left(&mut self, steps: usize, limits: &Limits) -> bool {
         self.direction = LEFT;
         self.place -= 1;
         self.x -= 1;
-        self.back += 1;
         self.left = self.left.min(self.x);
-        self.right - self.left <= limits.max_size && !self.is_ragged(limits)
+        self.right - self.left <= limits.max_size && !self.is_ragged(steps, limits)
     }
 
     #[inline]
@@ -194,16 +195,17 @@ impl Walk {
         self.direction = UP;
         self.place -= self.row;
         self.y -= 1;
-        self.area -= i64::from(self.x);
-        self.y >= self.start[1]
+        self.y >= 0
     }
 
-    /// Whether the steps down and to the left exceed those of a nearly convex outline with these bounds.
+    /// Whether the steps down and to the left exceed those of a nearly convex outline with these bounds, which has as many as its
+    /// width plus its height.
     #[inline]
-    fn is_ragged(&self, limits: &Limits) -> bool {
+    fn is_ragged(&self, steps: usize, limits: &Limits) -> bool {
         const SLACK: i32 = 2;
-        let convex = self.right - self.left + self.bottom - self.start[1];
-        self.back - convex > SLACK + ((convex * limits.detour_256ths) >> 8)
+        let convex = self.right - self.left + self.bottom;
+        let back = (steps as i32 - self.x + self.y) / 2;
+        back - convex > SLACK + ((convex * limits.detour_256ths) >> 8)
     }
 }
 
@@ -213,7 +215,17 @@ impl Search<'_> {
         let points_end = self.points.len() + limits.max_points;
         self.path.resize(limits.max_path, 0);
         let bits = self.bits;
+        let level = usize::from(self.level);
+        let mut has_places = true;
         for y in 0..bits.height() {
+            let row = y + self.top;
+            if y == 0 || row.is_multiple_of(self.places.rows_alike(level)) {
+                self.tops.places.resize(bits.row(y).len(), 0);
+                has_places = self.places.mark(row, level, &mut self.tops.places);
+            }
+            if !has_places {
+                continue;
+            }
             let mut tops = std::mem::take(self.tops);
             tops.mark(bits.row(y), bits.row_above(y));
             let continues = self.scan_row(y, &tops, limits, &mut steps_left);
@@ -226,13 +238,12 @@ impl Search<'_> {
 
     /// Follows the outlines that begin in a row; false when there are no steps left.
     fn scan_row(&mut self, y: usize, tops: &Tops, limits: &Limits, steps_left: &mut usize) -> bool {
-        for (index, word) in tops.ends.iter().skip(1).enumerate() {
-            let mut word = *word;
+        for (index, (ends, places)) in tops.ends.iter().skip(1).zip(&tops.places).enumerate() {
+            let mut word = ends & places;
             while word != 0 {
                 let x = index * 64 + word.trailing_zeros() as usize;
                 word &= word - 1;
-                if !self.places.include(x, y + self.top, usize::from(self.level))
-                    || limits.steep && !self.is_steep(x, y, limits.min_step_256ths)
+                if limits.steep && !self.is_steep(x, y, limits.min_step_256ths)
                     || self.is_futile(x, y, tops, limits)
                 {
                     continue;
@@ -257,28 +268,31 @@ impl Search<'_> {
     /// rises above the top elsewhere, begins further right as well, or is smaller than wanted.
     fn is_futile(&self, x: usize, y: usize, tops: &Tops, limits: &Limits) -> bool {
         const ROWS: usize = 4;
-        let (words, place) = (self.bits.bits(), self.bits.place(x, y));
-        let mut rows = [0; ROWS];
-        for (down, row) in rows.iter_mut().enumerate() {
-            *row = window(words, place + down * self.bits.row_bits());
-        }
+        let place = self.bits.place(x, y);
+        let row = |down: usize| window(self.bits.bits(), place + down * self.bits.row_bits());
         let flooded = window(&tops.flooded, 64 + x);
+        let (mut rows, mut parts) = ([row(0); ROWS], [0; ROWS]);
         // The top's own run, from its end to the left.
         let end = 1_u64 << HALF_WORD;
-        let own = flood(rows[0], end);
-        let mut parts = [0; ROWS];
+        let beyond = (!rows[0] & (end - 1)).checked_ilog2().map_or(0, |gap| gap + 1);
+        let own = 2 * end - (1 << beyond);
+        let is_of_other = |top: u64| top & !own & (!(end - 1) | flooded) != 0;
         parts[0] = own;
-        // Down and back up.
-        for (row, from) in
-            (1..ROWS).map(|row| (row, row - 1)).chain((1..ROWS).rev().map(|row| (row - 1, row)))
-        {
-            let touched = beside(parts[from]) & rows[row];
+        for down in 1..ROWS {
+            rows[down] = row(down);
+            parts[down] = flood(rows[down], beside(parts[down - 1]) & rows[down]);
+            // Most of a texture is joined right below. The end of a run tells whether it is flooded.
+            if down == 1 && is_of_other(upwards(rows[0], beside(parts[1]) & rows[0])) {
+                return true;
+            }
+        }
+        for row in (0..ROWS - 1).rev() {
+            let touched = beside(parts[row + 1]) & rows[row];
             if touched & !parts[row] != 0 {
                 parts[row] = flood(rows[row], touched | parts[row]);
             }
         }
-        let others = parts[0] & !own;
-        if others & !(end - 1) != 0 || others & flooded != 0 {
+        if is_of_other(parts[0]) {
             return true;
         }
         if parts[ROWS - 1] != 0 {
@@ -327,28 +341,29 @@ impl Search<'_> {
         let (bits, row) = (self.bits.bits(), self.bits.row_bits());
         // Whether the pixel is part of the region; false outside the image.
         let part = |place: usize| bits.get(place >> 6).is_some_and(|w| w >> (place & 63) & 1 == 1);
-        let mut walk = Walk::new(x, y, self.bits.place(x + 1, y), row);
-        for (length, step) in self.path.iter_mut().enumerate() {
+        let mut walk = Walk::new(self.bits.place(x + 1, y), row);
+        for (steps, step) in (1..).zip(self.path.iter_mut()) {
             // Regions are connected across corners: turn left if the pixel ahead to the left is set, go
             // straight on if the one ahead to the right is, else turn right.
             let place = walk.place;
             let continues = match walk.direction {
                 RIGHT if part(place - row) => walk.up(),
                 RIGHT if part(place) => walk.right(limits),
-                RIGHT => walk.down(limits),
+                RIGHT => walk.down(steps, limits),
                 DOWN if part(place) => walk.right(limits),
-                DOWN if part(place - 1) => walk.down(limits),
-                DOWN => walk.left(limits),
-                LEFT if part(place - 1) => walk.down(limits),
-                LEFT if part(place - row - 1) => walk.left(limits),
+                DOWN if part(place - 1) => walk.down(steps, limits),
+                DOWN => walk.left(steps, limits),
+                LEFT if part(place - 1) => walk.down(steps, limits),
+                LEFT if part(place - row - 1) => walk.left(steps, limits),
                 LEFT => walk.up(),
-                _ if part(place - row - 1) => walk.left(limits),
+                _ if part(place - row - 1) => walk.left(steps, limits),
                 _ if part(place - row) => walk.up(),
                 _ => walk.right(limits),
             };
             *step = walk.direction;
             if !continues {
-                return (walk.closed(length + 1), length + 1);
+                let start = [x as i32 + 1, y as i32];
+                return (walk.closed(start, self.path.get(..steps).unwrap_or_default()), steps);
             }
         }
         (None, self.path.len())
@@ -424,16 +439,13 @@ impl Search<'_> {
 /// in pixels outwards from the second.
 fn crossing(greys: [u8; 4], dark: bool) -> f32 {
     let flip = if dark { 0 } else { u8::MAX };
-    let [inner, a, b, outer] = greys.map(|grey| f32::from(grey ^ flip));
-    let middle = (inner.min(a) + outer.max(b)) / 2.0;
-    let between = |low: f32, high: f32| (middle - low) / (high - low);
-    let share = if b < middle {
-        1.0 + between(b, outer)
-    } else if a > middle {
-        between(inner, a) - 1.0
-    } else {
-        between(a, b)
-    };
+    let greys = greys.map(|grey| i32::from(grey ^ flip));
+    let [inner, a, b, outer] = greys;
+    // Twice the middle, a whole number; and the pixel that it is crossed after.
+    let middle = inner.min(a) + outer.max(b);
+    let index = if 2 * b < middle { 2 } else { usize::from(2 * a <= middle) };
+    let (low, high) = (greys[index], greys[index + 1]);
+    let share = index as f32 - 1.0 + (middle - 2 * low) as f32 / (2 * (high - low)) as f32;
     // Equal values have no crossing.
     if share.is_finite() { share.clamp(-1.0, 2.0) } else { 0.5 }
 }
@@ -471,16 +483,27 @@ fn beside(bits: u64) -> u64 {
 /// The runs of ones that contain `seeds`.
 #[inline]
 fn flood(bits: u64, seeds: u64) -> u64 {
+    let mut runs = upwards(bits, seeds);
+    // To the start of its run each spreads by one bit, then by two, four and so on.
+    let mut whole = bits;
+    for shift in [1, 2, 4, 8, 16, 32] {
+        runs |= runs >> shift & whole;
+        whole &= whole >> shift;
+    }
+    runs
+}
+
+/// The runs of ones from each of `seeds` to their ends.
+#[inline]
+fn upwards(bits: u64, seeds: u64) -> u64 {
     // Adding the seeds carries a one from each to the end of its run and changes the bits in between.
-    let upwards = |bits: u64, seeds: u64| (bits ^ bits.wrapping_add(seeds)) & bits | seeds;
-    let up = upwards(bits, seeds);
-    up | upwards(bits.reverse_bits(), seeds.reverse_bits()).reverse_bits()
+    (bits ^ bits.wrapping_add(seeds)) & bits | seeds
 }
 
 impl Tops {
     /// Reserves what rows of this length need.
     pub(super) fn make_room(&mut self, width: usize) {
-        for words in [&mut self.ends, &mut self.flooded] {
+        for words in [&mut self.ends, &mut self.flooded, &mut self.places] {
             words.reserve((width / 64 + 4).saturating_sub(words.len()));
         }
     }
