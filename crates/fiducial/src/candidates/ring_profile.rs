@@ -105,10 +105,17 @@ fn match_rays(
         if i <= FIRST && agree + left(FIRST) < 0.35 * (seen + left(FIRST)) {
             return None;
         }
-        if i >= FIRST && (agree + left(RAYS)) / (seen + left(RAYS)) < MIN_SCORE {
-            let edges = by_edge.iter().take(bands.saturating_sub(1));
-            let may_be_clear = edges.filter(|[seen, agree]| agree + 2 >= *seen).count() >= 2;
-            if !may_be_clear {
+        if i >= FIRST {
+            let best = (agree + left(RAYS)) / (seen + left(RAYS));
+            let edges = || by_edge.iter().take(bands.saturating_sub(1));
+            let may_match = match white_on_black {
+                true => best > MIN_WHITE_ON_BLACK_SCORE,
+                false => {
+                    let may_be_clear = |[seen, agree]: &&[u32; 2]| agree + 2 >= *seen;
+                    best >= MIN_SCORE || edges().filter(may_be_clear).count() >= 2
+                }
+            };
+            if !may_match {
                 return None;
             }
         }
