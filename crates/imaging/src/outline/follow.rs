@@ -534,3 +534,26 @@ impl Tops {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn a_flood_fills_the_runs_with_seeds(bits in any::<u64>(), more in any::<u64>(), seeds in any::<u64>()) {
+            // Long runs, too.
+            for bits in [bits, bits | more, u64::MAX] {
+                let seeds = bits & seeds & seeds.rotate_left(7);
+                let (mut runs, mut ends) = (seeds, seeds);
+                for _ in 0..64 {
+                    runs |= beside(runs) & bits;
+                    ends |= ends << 1 & bits;
+                }
+                prop_assert_eq!(flood(bits, seeds), runs);
+                prop_assert_eq!(upwards(bits, seeds), ends);
+            }
+        }
+    }
+}
