@@ -134,6 +134,9 @@ impl Segments {
             let across = &mut self.across[y * width..][..width - 1];
             let down = &mut self.down[y * width..][..width - 1];
             gradients(above, below, across, down);
+            // There are none behind the last column; an image before may have left some there.
+            self.across[y * width + width - 1] = 0;
+            self.down[y * width + width - 1] = 0;
         }
     }
 
@@ -476,6 +479,23 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn an_edge_at_the_border_is_found_whatever_the_image_before() {
+        let mut image = GrayImage::filled(64, 48, 50);
+        for y in 0..48 {
+            image.row_mut(y)[63] = 200;
+        }
+        let mut stripes = GrayImage::filled(50, 64, 0);
+        for y in 0..64 {
+            stripes.row_mut(y).iter_mut().skip(1).step_by(2).for_each(|pixel| *pixel = 255);
+        }
+        let mut segments = Segments::default();
+        let first = segments.find(image.view().unwrap(), LIMITS).to_vec();
+        assert_eq!(first.len(), 1, "{first:?}");
+        segments.find(stripes.view().unwrap(), LIMITS);
+        assert_eq!(segments.find(image.view().unwrap(), LIMITS), first);
     }
 
     #[test]
