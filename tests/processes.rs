@@ -376,9 +376,9 @@ async fn a_second_one_is_refused() -> anyhow::Result<()> {
 async fn two_landings_that_begin_at_once_both_land() -> anyhow::Result<()> {
     let _flights = time_for(2).await?;
     with_second_try(async || {
-        let landings = ["11", "12"].map(|seed| {
-            tokio::spawn(async move { Landing::start(&["--seed", seed]).await?.lands().await })
-        });
+        let options = [&["--seed", "11"][..], &["--seed", "12", "--vehicle", "kestrel"]];
+        let landings =
+            options.map(|it| tokio::spawn(async move { Landing::start(it).await?.lands().await }));
         for landing in landings {
             landing.await??;
         }

@@ -1,6 +1,7 @@
 //! Child processes: starts them, forwards their output, reports their exit, stops them.
 
 use std::borrow::Cow;
+use std::ffi::OsString;
 use std::fmt;
 use std::path::Path;
 use std::process::Stdio;
@@ -68,26 +69,51 @@ pub(crate) struct Children<K> {
     events: mpsc::Receiver<ChildEvent<K>>,
 }
 
+/// How the processes of one landing meet.
+pub(crate) struct Meeting<'a> {
+    /// Their Zenoh configuration.
+    pub(crate) zenoh: &'a Path,
+    /// The port that replaces that of the file.
+    pub(crate) port: Option<u16>,
+    /// The name that replaces the vehicle's in the file.
+    pub(crate) vehicle: Option<&'a str>,
+}
+
+impl Meeting<'_> {
+    /// The options of a service.
+    fn options(&self) -> Vec<OsString> {
+        let mut options = vec!["--zenoh".into(), self.zenoh.into()];
+        if let Some(port) = self.port {
+            options.extend(["--meet".into(), port.to_string().into()]);
+        }
+        if let Some(vehicle) = self.vehicle {
+            options.extend(["--vehicle".into(), vehicle.into()]);
+        }
+        options
+    }
+
+    /// The options of a service, for a shell.
+    pub(crate) fn for_shell(&self) -> String {
+        let options = self.options();
+        options.iter().map(|it| word(&it.to_string_lossy())).collect::<Vec<_>>().join(" ")
+    }
+}
+
 impl Children<Service> {
-    /// Starts a service as a process of this program; `meet` is the port that replaces that of the file `zenoh`, and `state` where it
-    /// keeps its notes, if not at the usual place.
+    /// Starts a service as a process of this program; `state` is where it keeps its notes, if not at the usual place.
     pub(crate) fn start(
         &mut self,
         service: Service,
-        zenoh: &Path,
-        meet: Option<u16>,
+        meeting: &Meeting<'_>,
         settings: &[String],
         state: Option<&Path>,
     ) -> anyhow::Result<Started> {
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
-        command.arg(service.name()).arg("--zenoh").arg(zenoh);
+        command.arg(service.name()).args(meeting.options());
         command.arg("--stop-with-parent").arg(std::process::id().to_string());
         // That of this process may be another one than what it joined itself.
-        match meet {
-            Some(port) => command.env(node::network::variable::MEET, port.to_string()),
-            None => command.env_remove(node::network::variable::MEET),
-        };
+        command.env_remove(node::network::variable::MEET);
         if let Some(state) = state {
             command.env(node::STATE_VARIABLE, state);
         }
@@ -98,17 +124,22 @@ impl Children<Service> {
             command.env("ALIGHT_LOG", "warn");
         }
         let number = self.spawn(service, command, service.name())?;
-        Ok(Started { service, number, by_hand: by_hand(service, zenoh, settings, state) })
+        Ok(Started { service, number, by_hand: by_hand(service, meeting, settings, state) })
     }
 }
 
 /// The command that starts a service again.
-fn by_hand(service: Service, zenoh: &Path, settings: &[String], state: Option<&Path>) -> String {
+fn by_hand(
+    service: Service,
+    meeting: &Meeting<'_>,
+    settings: &[String],
+    state: Option<&Path>,
+) -> String {
     let mut command = String::new();
     if let Some(state) = state {
         command = format!("{}={} ", node::STATE_VARIABLE, for_shell(state));
     }
-    command.push_str(&format!("alight {} --zenoh {}", service.name(), for_shell(zenoh)));
+    command.push_str(&format!("alight {} {}", service.name(), meeting.for_shell()));
     let is_start =
         |setting: &str| setting.split('=').next().is_some_and(|key| key.trim() == "start");
     let mut set = |setting: &str| command.push_str(&format!(" --set {}", word(setting)));
@@ -254,14 +285,21 @@ mod tests {
     fn the_command_by_hand_has_each_setting_as_it_was_given() {
         let zenoh = Path::new("my flights/zenoh.json5");
         let settings = ["id=\"it's $HOME\"", "start=\"airborne\"", "file=/a b"].map(str::to_owned);
-        let words = |service| shlex::split(&by_hand(service, zenoh, &settings, None)).unwrap();
+        let meeting = Meeting { zenoh, port: None, vehicle: None };
+        let words = |service| shlex::split(&by_hand(service, &meeting, &settings, None)).unwrap();
         let start = ["alight", "detector", "--zenoh", "my flights/zenoh.json5"];
         let set = settings.each_ref().map(|setting| ["--set", setting]);
         assert_eq!(words(Service::Detector), [&start[..], &set.concat()].concat());
         // A controller resumes, however it was started.
         let words = words(Service::Controller);
         assert_eq!(words[4..], ["--set", &settings[0], "--set", &settings[2], "--set", RESUME]);
-        let with_notes = by_hand(Service::Detector, zenoh, &[], Some(Path::new("a b")));
+        let with_notes = by_hand(Service::Detector, &meeting, &[], Some(Path::new("a b")));
+        let elsewhere = Meeting { port: Some(28_111), vehicle: Some("kestrel"), ..meeting };
+        let options = "--zenoh 'my flights/zenoh.json5' --meet 28111 --vehicle kestrel";
+        assert_eq!(
+            by_hand(Service::Detector, &elsewhere, &[], None),
+            format!("alight detector {options}")
+        );
         assert!(with_notes.starts_with(&format!("{}='a b' alight ", node::STATE_VARIABLE)));
     }
 }

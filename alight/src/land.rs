@@ -17,7 +17,7 @@ use tempfile::TempDir;
 use tokio::time::Instant;
 
 use crate::args::{Format, OPERATOR, address};
-use crate::children::{ChildEvent, Children, for_shell};
+use crate::children::{ChildEvent, Children, Meeting};
 use crate::ending::recording;
 use crate::outcome::{LandingSummary, OurRecorder};
 use crate::progress::Progress;
@@ -64,6 +64,9 @@ pub(crate) struct LandArgs {
     /// Port at which the processes of this landing meet, if it is free; otherwise another one is chosen, and told [default: 7447].
     #[arg(long, value_name = "PORT", env = variable::MEET, value_parser = clap::value_parser!(u16).range(1..))]
     meet: Option<u16>,
+    /// The vehicle's name, the first part of all keys [default: drone, or that of `--zenoh`].
+    #[arg(long, value_name = "NAME", env = variable::VEHICLE)]
+    vehicle: Option<String>,
     /// Give up after this many seconds, from 1 to 86400.
     #[arg(long, default_value_t = 300.0, value_name = "SECONDS", value_parser = timeout_s)]
     timeout_s: f64,
@@ -270,14 +273,21 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     let rendezvous = Rendezvous::new(args.zenoh.as_deref(), args.meet)?;
     // Its own file is checked as those of the services are: nothing listens beyond this machine by accident.
     let meet = args.zenoh.as_ref().and(args.meet);
-    let network = Network { config: Some(rendezvous.file.clone()), meet, ..Network::default() };
+    let vehicle = args.vehicle.as_deref();
+    let meeting = Meeting { zenoh: &rendezvous.file, port: meet, vehicle };
+    let network = Network {
+        config: Some(rendezvous.file.clone()),
+        meet,
+        vehicle: args.vehicle.clone(),
+        ..Network::default()
+    };
     let zenoh = network.source(OPERATOR)?;
     let node = Node::open_tool(tool_identity("land"), &zenoh).await?;
     let mut progress = Progress::new(args.format);
     progress.say(&format!(
-        "Zenoh: {}. To add a second detector: alight detector --zenoh {} --set id=spare",
+        "Zenoh: {}. To add a second detector: alight detector {} --set id=spare",
         rendezvous.description,
-        for_shell(&rendezvous.file)
+        meeting.for_shell()
     ));
     if let Some(port) = rendezvous.unusual_port {
         progress.say(&format!(
@@ -298,7 +308,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     let mut resume = String::new();
     for (service, settings) in &settings.by_service {
         let notes = notes_in.filter(|_| *service == Service::Controller);
-        let started = children.start(*service, &rendezvous.file, meet, settings, notes)?;
+        let started = children.start(*service, &meeting, settings, notes)?;
         progress.debug(&started.to_string());
         if *service == Service::Controller {
             resume = started.by_hand;

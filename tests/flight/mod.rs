@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail, ensure};
 use messages::{ControllerStatus, Phase, Truth, topic};
-use node::{Identity, Node, Subscriber, ZenohSource, now_ns};
+use node::{Identity, Network, Node, Subscriber, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::sync::{Semaphore, SemaphorePermit, mpsc};
 use tokio::time::timeout;
@@ -136,7 +136,10 @@ impl Landing {
         })?;
         let zenoh = zenoh.context("the Zenoh configuration")?;
         let identity = Identity { service: "alight", instance: "test".into() };
-        let node = Node::open(identity, &ZenohSource::File(zenoh.clone())).await?;
+        let vehicle = args.iter().skip_while(|it| **it != "--vehicle").nth(1);
+        let vehicle = vehicle.map(|name| (*name).to_owned());
+        let network = Network { config: Some(zenoh.clone()), vehicle, ..Network::default() };
+        let node = Node::open(identity, &network.source("operator")?).await?;
         let statuses = node.subscriber(topic::STATUS, &[]).await?;
         let truths = node.subscriber(topic::TRUTH, &[]).await?;
         let by_hand = Vec::new();
