@@ -119,7 +119,7 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
     let controller = match (status, &marker) {
         (Some(status), _) => Controller::Read(Box::new(status)),
         (None, None) if node.alive("controller", "*").await?.is_empty() => {
-            Controller::Absent(node.explain_silence("controller").await)
+            Controller::Absent(node.explain_silence("controller", None).await)
         }
         (None, _) => Controller::Unread,
     };
@@ -281,7 +281,7 @@ impl Overview {
         }
         let mut text = aligned(&rows);
         let summary = match (self.controller, &self.active) {
-            (false, _) => format!("No controller answers, so none is in use: {}.", self.why),
+            (false, _) => format!("No controller answers, so none is in use: {}", self.why),
             (true, _) if !self.status_read => {
                 "A controller is running, and no status of it can be read: is it of another version, or does it stand still? \
                  Which detector is in use is not known."
@@ -391,7 +391,7 @@ mod tests {
         let absent = Controller::Absent("nobody listens at 10.0.0.1:7448".to_owned());
         let nobody = Overview::new(absent, None, &announced, BTreeSet::new()).table();
         assert!(nobody.contains("No controller answers"), "{nobody}");
-        assert!(nobody.contains("nobody listens at 10.0.0.1:7448."), "{nobody}");
+        assert!(nobody.contains("nobody listens at 10.0.0.1:7448"), "{nobody}");
         // As its configuration is read, whose version is the same.
         let marker = Some("rings".to_owned());
         let unread = Overview::new(Controller::Unread, marker, &announced, BTreeSet::new());

@@ -155,8 +155,8 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
         }
     }
     let before = findings.count(Verdict::Wrong);
-    if let Some(keys) = network.keys.as_ref().filter(|_| needs_key) {
-        checked.operator(&mut findings, keys, network.vehicle.as_deref());
+    if needs_key {
+        checked.operator(&mut findings, &network);
     }
     let is_key_wrong = findings.count(Verdict::Wrong) > before;
     let before = findings.findings.len();

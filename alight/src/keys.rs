@@ -447,10 +447,10 @@ fn write_holders(directory: &Path, holders: &Holders) -> anyhow::Result<PathBuf>
 /// The keys of all roles in one directory, with those of these detectors.
 #[cfg(test)]
 pub(crate) fn make_for_tests(directory: &Path, detectors: &[&str]) -> anyhow::Result<()> {
-    init(directory, 30)?;
+    init(directory, 60)?;
     let make = |role: Role, name: Option<&str>| {
         let holder = Holder::new(&role.name(), name, "drone")?;
-        issue(role, &holder, directory, directory, &["127.0.0.1".into()], 30).map(drop)
+        issue(role, &holder, directory, directory, &["127.0.0.1".into()], 60).map(drop)
     };
     for role in Role::value_variants().iter().filter(|role| **role != Role::Detector) {
         make(*role, None)?;

@@ -296,6 +296,12 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
             wanted = args.meet.unwrap_or(node::session::LOCAL_PORT)
         ));
     }
+    if let Some(vehicle) = vehicle {
+        progress.say(&format!(
+            "Other commands find this vehicle with `export {}={vehicle}`",
+            variable::VEHICLE
+        ));
+    }
     if let Some(address) = args.dashboard {
         let layers = Layers { file: None, set: settings.of(Service::Dashboard).to_vec() };
         let is_encrypted = layers.load::<dashboard::Config>()?.settings.certificate().is_some();

@@ -19,6 +19,8 @@ const THESIS_ERROR_M: f64 = 0.0682;
 pub(crate) struct LandingSummary {
     pub(crate) last_status: Option<ControllerStatus>,
     pub(crate) last_truth: Option<Truth>,
+    /// When it last came down, by the truth.
+    sank_ns: Option<i64>,
     /// First and last health by service and process.
     healths: BTreeMap<(String, u32), (Health, Health)>,
     /// The first start: a restarted controller reports its own.
@@ -133,6 +135,9 @@ const UNHEARD: &str = "the recorder has not reported";
 /// A vehicle that sinks faster comes down, in m/s.
 const MIN_SINK_M_S: f64 = 0.1;
 
+/// Longest pause of a vehicle that comes down, in nanoseconds.
+const MAX_PAUSE_NS: i64 = 3_000_000_000;
+
 /// Longest time after a touchdown in which an autopilot may stop the motors, in nanoseconds: ArduPilot takes 7 s.
 const MAX_DISARMING_NS: i64 = 12_000_000_000;
 
@@ -162,6 +167,9 @@ impl LandingSummary {
     }
 
     pub(crate) fn truth(&mut self, truth: Truth) {
+        if !truth.on_ground && truth.velocity_ned_m_s[2] > MIN_SINK_M_S {
+            self.sank_ns = Some(truth.stamp_ns);
+        }
         self.last_truth = Some(truth);
     }
 
@@ -332,11 +340,11 @@ impl LandingSummary {
     pub(crate) fn comes_down(&self) -> bool {
         let is_landed = self.last_status.as_ref().is_some_and(|it| it.phase == Phase::Landed);
         self.last_truth.as_ref().filter(|_| !is_landed).is_some_and(|truth| {
-            let [_, _, sink_m_s] = truth.velocity_ned_m_s;
             let standing_ns = truth.touchdown.map(|it| truth.stamp_ns.saturating_sub(it.stamp_ns));
             match standing_ns.filter(|_| truth.on_ground) {
                 Some(standing_ns) => self.disarmed_ns.is_none() && standing_ns < MAX_DISARMING_NS,
-                None => !truth.on_ground && sink_m_s > MIN_SINK_M_S,
+                // A pilot pauses, and LAND brakes first.
+                None => self.sank_ns.is_some_and(|it| truth.stamp_ns - it < MAX_PAUSE_NS),
             }
         })
     }
@@ -544,12 +552,18 @@ mod tests {
     fn a_vehicle_that_an_abort_lands_is_watched_until_its_motors_stop() {
         let mut landing = LandingSummary::default();
         landing.status(status(Phase::Aborted));
-        let sinks = |sink_m_s| Truth { velocity_ned_m_s: [0.0, 0.0, sink_m_s], ..truth(None) };
+        let sinks = |sink_m_s, stamp_ns| Truth {
+            velocity_ned_m_s: [0.0, 0.0, sink_m_s],
+            stamp_ns,
+            ..truth(None)
+        };
         let mut seen = |truth| {
             landing.truth(truth);
             landing.comes_down()
         };
-        assert!(seen(sinks(0.5)) && !seen(sinks(0.0)), "it hovers");
+        assert!(!seen(sinks(0.0, 0)), "it hovers");
+        assert!(seen(sinks(0.5, 0)) && seen(sinks(0.0, 2_000_000_000)), "it pauses");
+        assert!(!seen(sinks(0.0, 4_000_000_000)), "it hovers again");
         let touchdown = Touchdown {
             stamp_ns: 0,
             error_m: 0.02,

@@ -120,7 +120,7 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
     let presence = node.presence("detector").await?;
     let first = timeout(CONTROLLER_TIMEOUT, statuses.next()).await.ok().flatten();
     let Some(first) = first else {
-        let why = node.explain_silence("controller").await;
+        let why = node.explain_silence("controller", None).await;
         bail!("no controller answered, and `swap` needs one: {why}");
     };
     let mut existing: BTreeSet<String> = node.alive("detector", "*").await?.into_iter().collect();

@@ -5,6 +5,7 @@ use std::fs::File;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
+use node::Network;
 use node::access::{HOLDERS, Holder, Holders};
 use node::network::{AUTHORITY, check_pair, check_private, issue_arguments};
 
@@ -31,19 +32,30 @@ pub(super) struct Checked {
 impl Checked {
     /// Checks the key of a process of the site, if it needs one.
     pub(super) fn process(&mut self, findings: &mut Findings, job: &Job) {
-        if let Some(keys) = job.network.keys.as_deref().filter(|_| job.needs_key()) {
-            self.key(findings, keys, &job.key, job.network.vehicle.as_deref());
+        if job.needs_key() {
+            self.key(findings, &job.network, &job.key);
         }
     }
 
     /// Checks the key of the operator, with which `alight command` and `alight doctor` join the network.
-    pub(super) fn operator(&mut self, findings: &mut Findings, keys: &Path, vehicle: Option<&str>) {
-        self.key(findings, keys, OPERATOR, vehicle);
+    pub(super) fn operator(&mut self, findings: &mut Findings, network: &Network) {
+        self.key(findings, network, OPERATOR);
     }
 
-    /// Checks the files of a key by their name.
-    fn key(&mut self, findings: &mut Findings, keys: &Path, name: &str, vehicle: Option<&str>) {
-        let vehicle = vehicle.unwrap_or("drone");
+    /// Checks the files of a network's key by their name.
+    fn key(&mut self, findings: &mut Findings, network: &Network, name: &str) {
+        let Some(keys) = network.keys.as_deref() else { return };
+        // A name that is wrong is told where the network is joined.
+        let vehicle = network.vehicle_name().unwrap_or_default();
+        let vehicle = vehicle.as_str();
+        if let Err(cause) = std::fs::read_dir(keys)
+            && cause.kind() == ErrorKind::PermissionDenied
+        {
+            if self.authorities.insert(keys.to_owned()) {
+                not_checked(findings, keys);
+            }
+            return;
+        }
         if !self.keys.insert((keys.to_owned(), name.to_owned())) {
             return;
         }
@@ -72,6 +84,15 @@ fn issue(name: &str, vehicle: &str) -> String {
         "make it where the authority is, into a new directory (`alight keys issue {arguments} --vehicle {vehicle} --authority DIR -o NEW`), \
          and copy it here"
     )
+}
+
+/// Tells that files are another user's.
+fn not_checked(findings: &mut Findings, path: &Path) {
+    findings.doubtful(
+        "keys",
+        format!("{} was not checked: this user may not read it", path.display()),
+        "run this as the user that runs the services: `sudo -u USER alight doctor ...`",
+    );
 }
 
 /// What cannot be done without a key.
@@ -177,18 +198,16 @@ fn check_key(findings: &mut Findings, keys: &Path, name: &str, vehicle: &str) {
     let told = path.display();
     match File::open(&path) {
         Err(cause) if cause.kind() == ErrorKind::NotFound => {
-            let without = match name {
-                OPERATOR => {
-                    ": without it this machine can neither command nor see what runs on the drone"
-                }
-                _ => "",
-            };
-            findings.wrong("keys", format!("there is no {told}{without}"), &issue(name, vehicle));
+            let told = format!("there is no {told}{}", without(name));
+            findings.wrong("keys", told, &issue(name, vehicle));
+            return;
+        }
+        Err(cause) if cause.kind() == ErrorKind::PermissionDenied => {
+            not_checked(findings, &path);
             return;
         }
         Err(cause) => {
-            let own = "it belongs to the user that runs this: `chown` it, or run this as that user";
-            findings.wrong("keys", format!("{told} cannot be read: {cause}"), own);
+            findings.wrong("keys", format!("{told} cannot be read: {cause}"), COPY_BOTH);
             return;
         }
         Ok(_) => {}
@@ -228,10 +247,15 @@ mod tests {
     use super::*;
     use crate::keys::make_for_tests;
 
+    fn network(keys: &Path, vehicle: Option<&str>) -> Network {
+        let vehicle = vehicle.map(str::to_owned);
+        Network { keys: Some(keys.to_owned()), vehicle, ..Network::default() }
+    }
+
     /// What is told of the operator's key in a folder.
     fn told(keys: &Path) -> String {
         let mut findings = Findings::default();
-        Checked::default().operator(&mut findings, keys, None);
+        Checked::default().operator(&mut findings, &network(keys, None));
         findings.text()
     }
 
@@ -313,10 +337,19 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         make_for_tests(folder.path(), &[]).unwrap();
         let mut findings = Findings::default();
-        Checked::default().operator(&mut findings, folder.path(), Some("kestrel"));
+        Checked::default().operator(&mut findings, &network(folder.path(), Some("kestrel")));
         let text = findings.text();
         let part = "is of `operator@drone`, and the vehicle here is `kestrel`, which refuses it";
         assert!(text.contains(part), "{text}");
+        // A file of the user's own names it as well.
+        let file = folder.path().join("zenoh.json5");
+        let own =
+            node::session::LOCAL_CONFIG.replace("namespace: \"drone\"", "namespace: \"kestrel\"");
+        std::fs::write(&file, own).unwrap();
+        let mut findings = Findings::default();
+        let own = Network { config: Some(file), ..network(folder.path(), None) };
+        Checked::default().operator(&mut findings, &own);
+        assert!(findings.text().contains(part), "{}", findings.text());
     }
 
     #[test]

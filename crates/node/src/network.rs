@@ -159,6 +159,20 @@ impl Network {
         Ok(config)
     }
 
+    /// The vehicle's name, by its setting or by the configuration.
+    ///
+    /// # Errors
+    /// As [`Network::source`], or when the configuration has none.
+    pub fn vehicle_name(&self) -> anyhow::Result<String> {
+        if let Some(vehicle) = &self.vehicle {
+            return Ok(vehicle.clone());
+        }
+        let (name, text) = self.text()?;
+        let config = parse(&name, &text)?;
+        let vehicle = config["namespace"].as_str();
+        Ok(vehicle.with_context(|| format!("{name} has no `namespace`"))?.to_owned())
+    }
+
     /// The first endpoint at which this process is to listen whose port another one has. Zenoh would wait for it without a word.
     ///
     /// # Errors

@@ -1,25 +1,26 @@
 //! Why nobody answers a tool: Zenoh tries an address again for ever without a word, and a relay says nothing to whom it shuts out.
 
-use std::io::{self, Read};
+use std::io;
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use rustls::pki_types::ServerName;
-use rustls::{CertificateError, ClientConfig, ClientConnection, RootCertStore, Stream};
+use rustls::{CertificateError, ClientConfig, ClientConnection, RootCertStore};
+use tokio::sync::oneshot;
 use tokio::time::timeout;
 
 use crate::endpoint::{self, Endpoint};
 use crate::key_pair;
 
-/// Maximum time for a connection, and for each step of the exchange of certificates.
+/// Maximum time for a connection, and for the exchange of certificates.
 const PATIENCE: Duration = Duration::from_secs(1);
 /// Maximum time for an address altogether: the system may look a name up for longer.
 const MAX_TIME: Duration = Duration::from_secs(4);
-/// Who refuses a certificate says so at once; a relay that accepts it waits for the first message.
-const REFUSAL: Duration = Duration::from_millis(300);
+/// Who refuses a certificate says so one round trip later; a relay that accepts it waits for the first message.
+const MIN_REFUSAL: Duration = Duration::from_millis(300);
 /// Addresses that are tried; a session has one, or the few of its site.
 const MAX_PLACES: usize = 4;
 /// What to do about an address.
@@ -62,6 +63,8 @@ enum Finding {
     Unreachable(io::Error),
     /// The exchange of certificates failed.
     Refused(io::Error),
+    /// Nothing of all that was known in time.
+    Slow,
     /// The files of the own key cannot be used.
     Keys(anyhow::Error),
     Accepted,
@@ -110,26 +113,33 @@ impl Reach {
     pub(crate) async fn explain(&self) -> String {
         let mut reasons = Vec::new();
         for place in &self.places {
-            let (place, keys) = (place.clone(), self.keys.clone());
-            let described = place.clone();
-            let finding = tokio::task::spawn_blocking(move || place.finding(keys.as_ref()));
-            let finding = match timeout(MAX_TIME, finding).await {
-                Ok(Ok(finding)) => finding,
-                // The system still looks the name up.
-                Ok(Err(_)) | Err(_) => Finding::Unknown(io::ErrorKind::TimedOut.into()),
-            };
-            reasons.push(self.reason(&described, &finding));
+            let finding = self.finding(place).await;
+            reasons.push(self.reason(place, &finding));
         }
         if let Some(port) = self.meet {
             reasons.push(format!(
                 "no process of the vehicle `{}` meets at port {port} of this machine: `alight up` and `alight land` say at which \
-                 port theirs do (`--meet`, ALIGHT_MEET)",
+                 port theirs do (`--meet`, ALIGHT_MEET), and of which vehicle (`--vehicle`, ALIGHT_VEHICLE)",
                 self.vehicle
             ));
         }
         match reasons.is_empty() {
             true => format!("is one running for the vehicle `{}`?", self.vehicle),
             false => reasons.join("; "),
+        }
+    }
+
+    /// Asks in a thread, which nobody waits for: neither the runtime's workers nor the end of the process.
+    async fn finding(&self, place: &Place) -> Finding {
+        let (place, keys) = (place.clone(), self.keys.clone());
+        let (sender, receiver) = oneshot::channel();
+        let asks = move || drop(sender.send(place.finding(keys.as_ref())));
+        if let Err(cause) = std::thread::Builder::new().name("reach".into()).spawn(asks) {
+            return Finding::Keys(anyhow!("starting a thread that looks who is there: {cause}"));
+        }
+        match timeout(MAX_TIME, receiver).await {
+            Ok(Ok(finding)) => finding,
+            Ok(Err(_)) | Err(_) => Finding::Slow,
         }
     }
 
@@ -150,6 +160,10 @@ impl Reach {
             Finding::Unreachable(cause) => format!(
                 "{at} is out of reach ({cause}): is it switched on, and is this machine in its network? Else {CORRECT}"
             ),
+            Finding::Slow => format!(
+                "{at} was not reached within {} s: its name is looked up for long, or it is out of reach; {CORRECT}",
+                MAX_TIME.as_secs()
+            ),
             Finding::Keys(cause) => format!("{cause:#}"),
             Finding::Refused(cause) => match rustls_error(cause) {
                 Some(rustls::Error::AlertReceived(alert)) => format!(
@@ -165,6 +179,9 @@ impl Reach {
                      (`--keys`); else {CORRECT}"
                 ),
             },
+            Finding::Accepted if place.is_encrypted && self.keys.is_none() => {
+                format!("the relay at {at} wants a key, and this process has none (`--keys`)")
+            }
             Finding::Accepted if place.is_encrypted => format!(
                 "the relay at {at} accepts the certificate {own}, and shows it nothing: its holder was revoked, is of another vehicle than \
                  `{}`, or is not in the relay's holders.txt, which `alight keys issue` and `revoke` write beside the authority's key, and \
@@ -211,21 +228,70 @@ fn greet(mut stream: TcpStream, host: &str, keys: &Keys) -> Finding {
         Ok(connection) => connection,
         Err(cause) => return Finding::Keys(cause),
     };
-    let shaken = (|| {
-        stream.set_read_timeout(Some(PATIENCE))?;
-        stream.set_write_timeout(Some(PATIENCE))?;
-        while connection.is_handshaking() {
-            connection.complete_io(&mut stream)?;
-        }
-        stream.set_read_timeout(Some(REFUSAL))?;
-        Stream::new(&mut connection, &mut stream).read(&mut [0; 1])
-    })();
-    match shaken {
-        Ok(0) => Finding::Refused(io::ErrorKind::UnexpectedEof.into()),
-        Ok(_) => Finding::Accepted,
-        Err(cause) if !connection.is_handshaking() && is_timeout(&cause) => Finding::Accepted,
+    let begun = Instant::now();
+    let outcome = shake(&mut connection, &mut stream, begun + PATIENCE).and_then(|()| {
+        let patience = begun.elapsed().clamp(MIN_REFUSAL, PATIENCE);
+        is_taken(&mut connection, &mut stream, Instant::now() + patience)
+    });
+    match outcome {
+        Ok(()) => Finding::Accepted,
         Err(cause) => Finding::Refused(cause),
     }
+}
+
+/// Exchanges certificates.
+fn shake(
+    connection: &mut ClientConnection,
+    stream: &mut TcpStream,
+    end: Instant,
+) -> io::Result<()> {
+    while connection.is_handshaking() {
+        if connection.wants_write() {
+            stream.set_write_timeout(Some(left(end)?))?;
+            connection.write_tls(stream)?;
+        } else {
+            hear(connection, stream, end)?;
+        }
+    }
+    while connection.wants_write() {
+        stream.set_write_timeout(Some(left(end)?))?;
+        connection.write_tls(stream)?;
+    }
+    Ok(())
+}
+
+/// Waits whether the certificate is refused: then the other end says so, or closes the connection.
+fn is_taken(
+    connection: &mut ClientConnection,
+    stream: &mut TcpStream,
+    end: Instant,
+) -> io::Result<()> {
+    loop {
+        match hear(connection, stream, end) {
+            Ok(()) => {}
+            Err(cause) if is_timeout(&cause) => return Ok(()),
+            Err(cause) => return Err(cause),
+        }
+    }
+}
+
+/// Reads once, until then.
+fn hear(connection: &mut ClientConnection, stream: &mut TcpStream, end: Instant) -> io::Result<()> {
+    stream.set_read_timeout(Some(left(end)?))?;
+    if connection.read_tls(stream)? == 0 {
+        return Err(io::ErrorKind::UnexpectedEof.into());
+    }
+    let state = connection.process_new_packets().map_err(io::Error::other)?;
+    if state.peer_has_closed() {
+        return Err(io::ErrorKind::UnexpectedEof.into());
+    }
+    Ok(())
+}
+
+/// The time until then.
+fn left(end: Instant) -> io::Result<Duration> {
+    let left = end.saturating_duration_since(Instant::now());
+    if left.is_zero() { Err(io::ErrorKind::TimedOut.into()) } else { Ok(left) }
 }
 
 fn connection(host: &str, keys: &Keys) -> anyhow::Result<ClientConnection> {

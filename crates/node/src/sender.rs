@@ -8,8 +8,8 @@ use crate::clock::host_name;
 use crate::identity::Identity;
 use crate::key_pair;
 
-/// Maximum length of a name, in bytes; a longer one ends there.
-const MAX_LEN: usize = 160;
+/// Maximum number of letters of a name; a longer one ends there.
+const MAX_LETTERS: usize = 160;
 /// Variables of the environment that name the user.
 const USER: [&str; 2] = ["USER", "LOGNAME"];
 
@@ -19,13 +19,16 @@ pub(crate) fn name(identity: &Identity, certificate: Option<&Path>) -> String {
     let user = || USER.iter().find_map(|name| std::env::var(name).ok()).filter(|it| !it.is_empty());
     let who = holder.or_else(user).unwrap_or_else(|| "somebody".to_owned());
     let Identity { service, instance } = identity;
-    shown(format!("{who}, {service} {instance} on {}", host_name()).as_bytes())
+    let name = format!("{who}, {service} {instance} on {}", host_name());
+    // It is a parameter of a selector, whose own signs it must not have.
+    let is_plain = |it: char| it.is_alphanumeric() || " .,@_-".contains(it);
+    shown(&name.replace(|it| !is_plain(it), "_"))
 }
 
-/// A sender's name as it came, without what a terminal or a log would take for its own.
-pub(crate) fn shown(name: &[u8]) -> String {
-    let text = String::from_utf8_lossy(name.get(..MAX_LEN).unwrap_or(name));
-    let shown: String = text.chars().filter(|character| !character.is_control()).collect();
+/// A name as it came from the network, short and without what a terminal or a log would take for its own.
+pub(crate) fn shown(name: &str) -> String {
+    let letters = name.chars().filter(|character| !character.is_control());
+    let shown: String = letters.take(MAX_LETTERS).collect();
     if shown.trim().is_empty() { "a sender without a name".to_owned() } else { shown }
 }
 
@@ -38,12 +41,13 @@ mod tests {
         let identity = Identity { service: "alight", instance: "command-7".to_owned() };
         let own = name(&identity, None);
         assert!(own.ends_with(&format!(", alight command-7 on {}", host_name())), "{own}");
-        assert_eq!(shown(own.as_bytes()), own);
-        assert_eq!(shown(b"anna\n2026 INFO Landed\x1b[2J\x00"), "anna2026 INFO Landed[2J");
-        assert_eq!(shown("\u{e4}".repeat(1000).as_bytes()).len(), MAX_LEN);
-        for none in [&b""[..], b"\r\n", b" "] {
+        assert_eq!(shown(&own), own);
+        let odd = Identity { service: "alight", instance: "a;b=c?d\ne".to_owned() };
+        assert!(name(&odd, None).contains("alight a_b_c_d_e on "), "{}", name(&odd, None));
+        assert_eq!(shown("anna\n2026 INFO Landed\x1b[2J\0"), "anna2026 INFO Landed[2J");
+        assert_eq!(shown(&"\u{e4}".repeat(1000)).chars().count(), MAX_LETTERS);
+        for none in ["", "\r\n", " "] {
             assert_eq!(shown(none), "a sender without a name");
         }
-        assert!(!shown(&[0xff; 3]).is_empty());
     }
 }

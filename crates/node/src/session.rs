@@ -241,21 +241,30 @@ impl Node {
         })
     }
 
-    /// Why no instance of a service answers, and what to do: for a tool that gives up.
-    pub fn explain_silence<'a>(&'a self, service: &'a str) -> BoxFuture<'a, String> {
+    /// Why a service does not answer, the one with this name if one is wanted, and what to do: for a tool that gives up.
+    pub fn explain_silence<'a>(
+        &'a self,
+        service: &'a str,
+        wanted: Option<&'a str>,
+    ) -> BoxFuture<'a, String> {
         Box::pin(async move {
             let ready = self.list_peers().await.unwrap_or_default();
             if ready.is_empty() {
                 return self.reach.explain().await;
             }
-            if ready.iter().any(|(name, _)| name == service) {
+            let is_wanted = |(name, id): &(String, String)| {
+                name == service && wanted.is_none_or(|wanted| wanted == id)
+            };
+            if ready.iter().any(is_wanted) {
                 let role = match self.reach.certificate() {
-                    Some(_) => ", or the role of this key may not command (`operator` may)",
+                    Some(_) => ", or the role of this key may not command",
                     None => "",
                 };
-                return format!("a {service} is there: it stands still, or is too busy{role}");
+                return format!("the {service} is there: it stands still, or is too busy{role}");
             }
-            let names: Vec<_> = ready.iter().map(|(name, id)| format!("{name} `{id}`")).collect();
+            // Anybody who may be present chooses its name.
+            let names = ready.iter().map(|(name, id)| format!("{name} `{id}`"));
+            let names: Vec<_> = names.map(|name| sender::shown(&name)).collect();
             let vehicle = self.reach.vehicle();
             format!("of the vehicle `{vehicle}` there is only {}", names.join(", "))
         })

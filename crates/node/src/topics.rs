@@ -31,6 +31,8 @@ pub(crate) const REPLY_TIMEOUT: Duration = Duration::from_secs(2);
 const RETRY_PAUSE: Duration = Duration::from_millis(100);
 /// Letters of a command in the log.
 const MAX_LOGGED: usize = 200;
+/// The parameter of a query's selector that names the sender of a command.
+const SENDER: &str = "from";
 /// The attachment of a query that asks for the recipient's time.
 const ASKS_TIME: &[u8] = b"time?";
 
@@ -291,14 +293,13 @@ impl Node {
                 }
             }
             let sent = match told {
-                Some(Reply::Time(time_ns)) => {
-                    [&time_ns.to_le_bytes(), self.sender.as_bytes()].concat()
-                }
+                Some(Reply::Time(time_ns)) => time_ns.to_le_bytes().to_vec(),
                 // A recipient that tells no time.
                 Some(Reply::Command(_)) => Vec::new(),
                 None => return Err(self.unanswered(&key).await),
             };
-            match self.query(&key, &command, &sent, REPLY_TIMEOUT).await? {
+            let named = format!("{key}?{SENDER}={}", self.sender);
+            match self.query(&named, &command, &sent, REPLY_TIMEOUT).await? {
                 Some(Reply::Command(reply)) => Ok(reply),
                 Some(Reply::Time(_)) | None => Err(self.unanswered(&key).await),
             }
@@ -307,8 +308,11 @@ impl Node {
 
     async fn unanswered(&self, key: &str) -> anyhow::Error {
         let who = key.rsplit_once('/').map_or(key, |(who, _command)| who);
-        let service = who.split('/').next().unwrap_or(who);
-        let why = self.explain_silence(service).await;
+        let (service, wanted) = match who.split_once('/') {
+            Some((service, instance)) => (service, Some(instance)),
+            None => (who, None),
+        };
+        let why = self.explain_silence(service, wanted).await;
         anyhow!("no {who} answered within {} s: {why}", REPLY_TIMEOUT.as_secs())
     }
 
@@ -342,13 +346,7 @@ fn nanoseconds(ns: i64) -> Duration {
 
 /// The time in an attachment, in nanoseconds.
 fn time(attachment: &ZBytes) -> Option<i64> {
-    Some(i64::from_le_bytes(*attachment.to_bytes().first_chunk()?))
-}
-
-/// The name of a command's sender, which follows the time.
-fn sender(attachment: &ZBytes) -> String {
-    let bytes = attachment.to_bytes();
-    sender::shown(bytes.get(size_of::<i64>()..).unwrap_or_default())
+    Some(i64::from_le_bytes(attachment.to_bytes().as_ref().try_into().ok()?))
 }
 
 /// A query with the quality of service of commands; its replies get the same.
@@ -378,7 +376,7 @@ impl<M: Message> Commands<M> {
                 continue;
             }
             let sent_ns = attachment.and_then(time);
-            let sender = attachment.map_or_else(|| sender::shown(&[]), sender);
+            let sender = sender::shown(query.parameters().get(SENDER).unwrap_or_default());
             let payload = query.payload().map(|p| p.to_bytes().into_owned()).unwrap_or_default();
             let reason = match decode(&payload) {
                 Ok(message) => match refusal(sent_ns, now_ns()) {
@@ -441,8 +439,8 @@ impl<M: Message> Request<M> {
         let command: String = command.chars().take(MAX_LOGGED).collect();
         let (sender, reason) = (&self.sender, &reply.reason);
         match reply.accepted {
-            true => tracing::info!(%command, %sender, reason, "Command accepted"),
-            false => tracing::warn!(%command, %sender, reason, "Command refused"),
+            true => tracing::info!(command, sender, reason, "Command accepted"),
+            false => tracing::warn!(command, sender, reason, "Command refused"),
         }
         answer(self.query, encode(reply)).await;
     }

@@ -308,8 +308,8 @@ async fn a_command_that_waited_until_its_sender_gave_up_is_refused() -> anyhow::
         assert_eq!(reply.accepted, accepted, "{reply:?}");
         assert!(accepted || reply.reason.contains("give it again"), "{reply:?}");
     }
-    let named = [&now_ns().to_le_bytes()[..], b"anna\x1b[2J\n"].concat();
-    let named = foreign.ask("drone/controller/command", &start, &named).await?.0;
+    let time = now_ns().to_le_bytes();
+    let named = foreign.ask("drone/controller/command?from=anna\x1b[2J\n", &start, &time).await?.0;
     assert_eq!(decode::<CommandReply>(&named)?.reason, "true anna[2J");
     let undated: CommandReply =
         decode(&foreign.ask("drone/controller/command", &start, &[]).await?.0)?;

@@ -214,7 +214,7 @@ async fn whom_a_relay_shuts_out_is_told_why() -> anyhow::Result<()> {
     contains(&eve?, &["of another authority"])?;
     contains(&named?, &["not valid for the address `localhost`", "--address"])?;
     controller.announce().await?;
-    contains(&told(&ground(&mallory)).await?, &["a controller is there", "role of this key"])?;
+    contains(&told(&ground(&mallory)).await?, &["the controller is there", "role of this key"])?;
     relay.close().await;
 
     // A relay that has no keys yet.

@@ -352,10 +352,10 @@ fn a_pad_far_below_is_followed_while_the_tilt_wanders() {
         }
         refused
     };
-    assert!(fly(0.008, 0.0) <= 8, "{} refused", fly(0.008, 0.0));
+    assert!(fly(0.008, 0.0) <= 5, "{} refused", fly(0.008, 0.0));
     assert_eq!(fly(0.0, 0.0), 0);
-    // What is seen from now on is another marker.
-    assert!(fly(0.0, 1.0) >= 7, "{} refused", fly(0.0, 1.0));
+    // What is seen from now on is another marker, until it is the one that is there.
+    assert!(fly(0.0, 1.0) >= 5, "{} refused", fly(0.0, 1.0));
 }
 
 #[test]
