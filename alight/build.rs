@@ -36,13 +36,11 @@ fn main() {
 /// The commit, its date, and whether the sources differ from it; cargo asks again once that may have changed.
 fn commit(root: &Path) -> Option<String> {
     let folder = git(root, &["rev-parse", "--absolute-git-dir"])?;
-    // Each commit, checkout and reset adds a line to the log, where there is one; else the branch changes, as a file or in the list of all.
-    let branch = git(root, &["rev-parse", "--symbolic-full-name", "HEAD"]).unwrap_or_default();
-    let branch = git(root, &["rev-parse", "--git-path", &branch]).unwrap_or_default();
-    let packed = git(root, &["rev-parse", "--git-path", "packed-refs"]).unwrap_or_default();
+    // Each commit, checkout and reset adds a line to the log, where there is one; else a branch changes.
+    let branches = git(root, &["rev-parse", "--git-path", "refs/heads"]).unwrap_or_default();
     let own = ["HEAD", "logs/HEAD"].map(|file| Path::new(&folder).join(file));
-    for file in own.into_iter().chain([root.join(branch), root.join(packed)]) {
-        if file.is_file() {
+    for file in own.into_iter().chain([root.join(branches)]) {
+        if file.exists() {
             println!("cargo::rerun-if-changed={}", file.display());
         }
     }

@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use experiments::landing::outcome::FAR_M;
 use messages::{ControllerStatus, Health, Phase, RecorderStatus, Touchdown, Truth};
 use serde::Serialize;
 
@@ -312,7 +311,7 @@ impl LandingSummary {
             }),
             is_beside: down
                 && status.is_some_and(|it| it.phase == Phase::Landed && it.landed_for().is_none())
-                && touchdown.is_some_and(|it| it.error_m > FAR_M),
+                && touchdown.is_some_and(|it| it.error_m > Touchdown::MAX_ERROR_M),
             is_to_be_recorded: self.recorded_by.is_some(),
         }
     }
@@ -321,9 +320,10 @@ impl LandingSummary {
     fn elsewhere(&self, touchdown: &Touchdown) -> Option<String> {
         let status = self.last_status.as_ref()?;
         let error_m = touchdown.error_m;
-        let limit = format!("more than the {FAR_M} m within which a landing counts");
+        let limit =
+            format!("more than the {} m within which a landing counts", Touchdown::MAX_ERROR_M);
         let (why, beyond) = match (status.phase, status.landed_for()) {
-            (Phase::Landed, None) if error_m <= FAR_M => return None,
+            (Phase::Landed, None) if error_m <= Touchdown::MAX_ERROR_M => return None,
             (Phase::Landed, None) => (status.why.clone(), format!(", {limit}")),
             (Phase::Landed, Some(cause)) => (cause.to_owned(), String::new()),
             _ => (status.sentence(), String::new()),
@@ -344,7 +344,9 @@ impl LandingSummary {
             match standing_ns.filter(|_| truth.on_ground) {
                 Some(standing_ns) => self.disarmed_ns.is_none() && standing_ns < MAX_DISARMING_NS,
                 // A pilot pauses, and LAND brakes first.
-                None => self.sank_ns.is_some_and(|it| truth.stamp_ns - it < MAX_PAUSE_NS),
+                None => self.sank_ns.is_some_and(|it| {
+                    (0..MAX_PAUSE_NS).contains(&truth.stamp_ns.saturating_sub(it))
+                }),
             }
         })
     }

@@ -45,18 +45,25 @@ impl Checked {
     /// Checks the files of a network's key by their name.
     fn key(&mut self, findings: &mut Findings, network: &Network, name: &str) {
         let Some(keys) = network.keys.as_deref() else { return };
-        // A name that is wrong is told where the network is joined.
-        let vehicle = network.vehicle_name().unwrap_or_default();
+        // What is wrong with the network's file is told where the network is joined.
+        let Ok(vehicle) = network.vehicle_name() else { return };
         let vehicle = vehicle.as_str();
-        if let Err(cause) = std::fs::read_dir(keys)
-            && cause.kind() == ErrorKind::PermissionDenied
-        {
-            if self.authorities.insert(keys.to_owned()) {
-                not_checked(findings, keys);
-            }
+        if !self.keys.insert((keys.to_owned(), name.to_owned())) {
             return;
         }
-        if !self.keys.insert((keys.to_owned(), name.to_owned())) {
+        let files = [AUTHORITY.to_owned(), format!("{name}.pem"), format!("{name}.key")];
+        let is_denied = |path: &PathBuf| {
+            File::open(path).is_err_and(|cause| cause.kind() == ErrorKind::PermissionDenied)
+        };
+        if let Some(denied) = files.map(|file| keys.join(file)).iter().find(|it| is_denied(it)) {
+            findings.doubtful(
+                "keys",
+                format!(
+                    "the key `{name}` was not checked: this user may not read {}",
+                    denied.display()
+                ),
+                "run this as the user that runs the services: `sudo -u USER alight doctor ...`",
+            );
             return;
         }
         if self.authorities.insert(keys.to_owned()) {
@@ -84,15 +91,6 @@ fn issue(name: &str, vehicle: &str) -> String {
         "make it where the authority is, into a new directory (`alight keys issue {arguments} --vehicle {vehicle} --authority DIR -o NEW`), \
          and copy it here"
     )
-}
-
-/// Tells that files are another user's.
-fn not_checked(findings: &mut Findings, path: &Path) {
-    findings.doubtful(
-        "keys",
-        format!("{} was not checked: this user may not read it", path.display()),
-        "run this as the user that runs the services: `sudo -u USER alight doctor ...`",
-    );
 }
 
 /// What cannot be done without a key.
@@ -200,10 +198,6 @@ fn check_key(findings: &mut Findings, keys: &Path, name: &str, vehicle: &str) {
         Err(cause) if cause.kind() == ErrorKind::NotFound => {
             let told = format!("there is no {told}{}", without(name));
             findings.wrong("keys", told, &issue(name, vehicle));
-            return;
-        }
-        Err(cause) if cause.kind() == ErrorKind::PermissionDenied => {
-            not_checked(findings, &path);
             return;
         }
         Err(cause) => {

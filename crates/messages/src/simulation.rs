@@ -45,6 +45,11 @@ pub struct Touchdown {
     pub lateral_speed_m_s: f64,
 }
 
+impl Touchdown {
+    /// Horizontal distance beyond which a touchdown is beside the pad, in metres.
+    pub const MAX_ERROR_M: f64 = 0.3;
+}
+
 /// The wind at the vehicle.
 #[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Wind {

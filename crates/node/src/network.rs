@@ -162,7 +162,7 @@ impl Network {
     /// The vehicle's name, by its setting or by the configuration.
     ///
     /// # Errors
-    /// As [`Network::source`], or when the configuration has none.
+    /// When the configuration cannot be read, or has none.
     pub fn vehicle_name(&self) -> anyhow::Result<String> {
         if let Some(vehicle) = &self.vehicle {
             return Ok(vehicle.clone());

@@ -118,8 +118,8 @@ impl Reach {
         }
         if let Some(port) = self.meet {
             reasons.push(format!(
-                "no process of the vehicle `{}` meets at port {port} of this machine: `alight up` and `alight land` say at which \
-                 port theirs do (`--meet`, ALIGHT_MEET), and of which vehicle (`--vehicle`, ALIGHT_VEHICLE)",
+                "no process of the vehicle `{}` meets at port {port} of this machine: `alight land` says at which port its own do (`--meet`, \
+                 ALIGHT_MEET) and of which vehicle (`--vehicle`, ALIGHT_VEHICLE); for `alight up` the site says it",
                 self.vehicle
             ));
         }
@@ -161,7 +161,7 @@ impl Reach {
                 "{at} is out of reach ({cause}): is it switched on, and is this machine in its network? Else {CORRECT}"
             ),
             Finding::Slow => format!(
-                "{at} was not reached within {} s: its name is looked up for long, or it is out of reach; {CORRECT}",
+                "{at} was not reached, or has not answered, within {} s: its name is looked up for long, or it is out of reach; {CORRECT}",
                 MAX_TIME.as_secs()
             ),
             Finding::Keys(cause) => format!("{cause:#}"),
@@ -230,7 +230,7 @@ fn greet(mut stream: TcpStream, host: &str, keys: &Keys) -> Finding {
     };
     let begun = Instant::now();
     let outcome = shake(&mut connection, &mut stream, begun + PATIENCE).and_then(|()| {
-        let patience = begun.elapsed().clamp(MIN_REFUSAL, PATIENCE);
+        let patience = (2 * begun.elapsed()).clamp(MIN_REFUSAL, PATIENCE);
         is_taken(&mut connection, &mut stream, Instant::now() + patience)
     });
     match outcome {
@@ -278,14 +278,21 @@ fn is_taken(
 /// Reads once, until then.
 fn hear(connection: &mut ClientConnection, stream: &mut TcpStream, end: Instant) -> io::Result<()> {
     stream.set_read_timeout(Some(left(end)?))?;
-    if connection.read_tls(stream)? == 0 {
-        return Err(io::ErrorKind::UnexpectedEof.into());
+    match connection.read_tls(stream) {
+        Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
+        // As after a pause of the process.
+        Err(cause) if cause.kind() == io::ErrorKind::Interrupted => return Ok(()),
+        read => read?,
+    };
+    match connection.process_new_packets() {
+        Ok(state) if state.peer_has_closed() => Err(io::ErrorKind::UnexpectedEof.into()),
+        Ok(_) => Ok(()),
+        Err(cause) => {
+            // The other end is told why, if it still listens.
+            drop(connection.write_tls(stream));
+            Err(io::Error::other(cause))
+        }
     }
-    let state = connection.process_new_packets().map_err(io::Error::other)?;
-    if state.peer_has_closed() {
-        return Err(io::ErrorKind::UnexpectedEof.into());
-    }
-    Ok(())
 }
 
 /// The time until then.

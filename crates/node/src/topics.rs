@@ -376,9 +376,14 @@ impl<M: Message> Commands<M> {
                 continue;
             }
             let sent_ns = attachment.and_then(time);
+            let is_odd = attachment.is_some_and(|it| !it.is_empty() && sent_ns.is_none());
             let sender = sender::shown(query.parameters().get(SENDER).unwrap_or_default());
             let payload = query.payload().map(|p| p.to_bytes().into_owned()).unwrap_or_default();
             let reason = match decode(&payload) {
+                Ok(_) if is_odd => {
+                    self.health.failed("commands: an attachment that is no time");
+                    "the command's attachment is no time (8 bytes), so it is not known how old the command is".to_owned()
+                }
                 Ok(message) => match refusal(sent_ns, now_ns()) {
                     None => return Some(Request { message, sent_ns, sender, query }),
                     Some(reason) => {

@@ -311,6 +311,10 @@ async fn a_command_that_waited_until_its_sender_gave_up_is_refused() -> anyhow::
     let time = now_ns().to_le_bytes();
     let named = foreign.ask("drone/controller/command?from=anna\x1b[2J\n", &start, &time).await?.0;
     assert_eq!(decode::<CommandReply>(&named)?.reason, "true anna[2J");
+    let odd = [&now_ns().to_le_bytes()[..], b"anna"].concat();
+    let odd = foreign.ask("drone/controller/command", &start, &odd).await?.0;
+    let odd: CommandReply = decode(&odd)?;
+    assert!(!odd.accepted && odd.reason.contains("is no time (8 bytes)"), "{odd:?}");
     let undated: CommandReply =
         decode(&foreign.ask("drone/controller/command", &start, &[]).await?.0)?;
     let reason = "false a sender without a name".to_owned();

@@ -141,7 +141,7 @@ impl Writer {
     fn head(&mut self, letter: &str, summary: &Summary) {
         self.line(&format!("{letter}{}", summary.name), TITLE);
         let rgb = match (summary.landed, summary.phase.as_deref()) {
-            (Some(true), _) if summary.was_led_to_the_marker() => GREEN,
+            (Some(true), _) if summary.is_on_the_pad() => GREEN,
             (_, None) => QUIET,
             _ => RED,
         };

@@ -77,7 +77,7 @@ fn head(views: &[&View<'_>]) -> String {
             _ => "B: ",
         };
         let mood = match (summary.landed, summary.phase.as_deref()) {
-            (Some(true), _) if summary.was_led_to_the_marker() => "good",
+            (Some(true), _) if summary.is_on_the_pad() => "good",
             (_, None) => "quiet",
             _ => "bad",
         };

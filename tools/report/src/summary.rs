@@ -1,6 +1,6 @@
 //! A flight in numbers, and in one line.
 
-use messages::{LandedState, Phase, topic};
+use messages::{LandedState, Phase, Touchdown, topic};
 use node::stats::quantile;
 use serde::Serialize;
 
@@ -191,9 +191,14 @@ impl Summary {
         self.why.as_deref()?.split_once(": ").map(|(_, cause)| cause)
     }
 
-    /// Whether it landed, and was led to the marker.
-    pub fn was_led_to_the_marker(&self) -> bool {
-        self.landed == Some(true) && self.landed_for().is_none()
+    /// Whether it landed on the pad, led there by the marker.
+    pub fn is_on_the_pad(&self) -> bool {
+        self.landed == Some(true) && self.landed_for().is_none() && self.beside_m().is_none()
+    }
+
+    /// How far from the pad's centre it touched down, if that is beside the pad.
+    fn beside_m(&self) -> Option<f64> {
+        self.touchdown_error_m.filter(|error_m| *error_m > Touchdown::MAX_ERROR_M)
     }
 
     /// How it ended, in a few words.
@@ -201,7 +206,12 @@ impl Summary {
         match (&self.phase, &self.why) {
             _ if self.landed == Some(true) => match self.landed_for() {
                 Some(cause) => format!("landed, but not led to the marker: {cause}"),
-                None => "landed".to_owned(),
+                None => match self.beside_m() {
+                    Some(error_m) => {
+                        format!("landed, beside the pad: {error_m:.3} m from its centre")
+                    }
+                    None => "landed".to_owned(),
+                },
             },
             (Some(phase), Some(why)) if why.starts_with(phase) => why.clone(),
             (Some(phase), Some(why)) => format!("{phase}: {why}"),

@@ -589,13 +589,24 @@ fn what_a_text_of_the_autopilot_says_stays_text() {
 #[test]
 fn what_landed_by_a_command_was_not_led_to_the_marker() {
     let mut flight = read(&landing().recording);
-    assert!(summary(&flight).was_led_to_the_marker());
+    assert!(summary(&flight).is_on_the_pad());
     let why = "on the ground, disarmed: the operator's command to land here";
     why.clone_into(&mut flight.statuses.last_mut().unwrap().why);
     let told = summary(&flight);
-    assert!(!told.was_led_to_the_marker());
+    assert!(!told.is_on_the_pad());
     let outcome = "landed, but not led to the marker: the operator's command to land here";
     assert_eq!(told.outcome(), outcome);
+    assert!(page(&flight).unwrap().contains("class=\"outcome bad\""));
+}
+
+#[test]
+fn what_touched_down_beside_the_pad_is_told() {
+    let mut flight = read(&landing().recording);
+    let touchdowns = flight.truth.iter_mut().filter_map(|truth| truth.touchdown.as_mut());
+    touchdowns.for_each(|touchdown| touchdown.error_m = 0.44);
+    let told = summary(&flight);
+    assert_eq!(told.outcome(), "landed, beside the pad: 0.440 m from its centre");
+    assert!(!told.is_on_the_pad());
     assert!(page(&flight).unwrap().contains("class=\"outcome bad\""));
 }
 

@@ -1,11 +1,10 @@
 //! The result of a flight.
 
+use messages::Touchdown;
 use serde::Serialize;
 
 use super::plan::Planned;
 
-/// Specified limit of the touchdown error, in metres.
-pub const FAR_M: f64 = 0.3;
 /// Specified limit of the vertical speed at touchdown, in m/s.
 pub const HARD_M_S: f64 = 0.6;
 /// Specified limit of the horizontal speed at touchdown, in m/s.
@@ -125,7 +124,7 @@ impl Outcome {
     pub fn is_unsafe(&self) -> bool {
         let beyond = |value: Option<f64>, limit: f64| value.is_some_and(|value| value > limit);
         self.ending != Ending::Aborted
-            && (beyond(self.error_m, FAR_M)
+            && (beyond(self.error_m, Touchdown::MAX_ERROR_M)
                 || beyond(self.sink_m_s, CRASH_SINK_M_S)
                 || beyond(self.slide_m_s, CRASH_SLIDE_M_S))
     }

@@ -1,11 +1,12 @@
 //! Plots of many flights, as SVG.
 
 use anyhow::anyhow;
+use messages::Touchdown;
 use node::stats::quantile;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 
-use super::outcome::{Ending, FAR_M, Outcome};
+use super::outcome::{Ending, Outcome};
 use super::table::{Column, cells, median_interval, numbers, share_interval};
 use crate::results::PLOTS;
 
@@ -154,7 +155,7 @@ fn touchdowns(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
         .filter_map(|o| Some((o.error_east_m?, o.error_north_m?, o.is_unsafe())))
         .collect();
     let far = places.iter().map(|p| p.0.abs().max(p.1.abs())).fold(0.11, f64::max);
-    let reach = if far > FAR_M { 1.1 * far } else { far.max(0.12) * 1.1 };
+    let reach = if far > Touchdown::MAX_ERROR_M { 1.1 * far } else { far.max(0.12) * 1.1 };
     let mut chart = ChartBuilder::on(area)
         .caption("Touchdowns relative to the pad's centre", ("sans-serif", 20))
         .margin(12)
@@ -162,7 +163,7 @@ fn touchdowns(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
         .y_label_area_size(56)
         .build_cartesian_2d(-reach..reach, -reach..reach)?;
     chart.configure_mesh().x_desc("east, m").y_desc("north, m").draw()?;
-    for (index, radius) in [0.05, 0.1, FAR_M].into_iter().enumerate() {
+    for (index, radius) in [0.05, 0.1, Touchdown::MAX_ERROR_M].into_iter().enumerate() {
         let circle = (0..=72).map(|i| {
             let (sin, cos) = (f64::from(i) * std::f64::consts::TAU / 72.0).sin_cos();
             (radius * sin, radius * cos)
