@@ -8,6 +8,7 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use anyhow::Context;
+use node::Network;
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::process::{Child, Command};
@@ -69,34 +70,21 @@ pub(crate) struct Children<K> {
     events: mpsc::Receiver<ChildEvent<K>>,
 }
 
-/// How the processes of one landing meet.
-pub(crate) struct Meeting<'a> {
-    /// Their Zenoh configuration.
-    pub(crate) zenoh: &'a Path,
-    /// The port that replaces that of the file.
-    pub(crate) port: Option<u16>,
-    /// The name that replaces the vehicle's in the file.
-    pub(crate) vehicle: Option<&'a str>,
+/// The options with which a service joins a network.
+fn options(network: &Network) -> Vec<OsString> {
+    let named = [
+        ("--zenoh", network.config.clone().map(Into::into)),
+        ("--meet", network.meet.map(|port| port.to_string().into())),
+        ("--vehicle", network.vehicle.clone().map(Into::into)),
+    ];
+    let given = named.into_iter().filter_map(|(name, value)| Some([name.into(), value?]));
+    given.flatten().collect()
 }
 
-impl Meeting<'_> {
-    /// The options of a service.
-    fn options(&self) -> Vec<OsString> {
-        let mut options = vec!["--zenoh".into(), self.zenoh.into()];
-        if let Some(port) = self.port {
-            options.extend(["--meet".into(), port.to_string().into()]);
-        }
-        if let Some(vehicle) = self.vehicle {
-            options.extend(["--vehicle".into(), vehicle.into()]);
-        }
-        options
-    }
-
-    /// The options of a service, for a shell.
-    pub(crate) fn for_shell(&self) -> String {
-        let options = self.options();
-        options.iter().map(|it| word(&it.to_string_lossy())).collect::<Vec<_>>().join(" ")
-    }
+/// The same for a shell.
+pub(crate) fn options_for_shell(network: &Network) -> String {
+    let words: Vec<_> = options(network).iter().map(|it| word(&it.to_string_lossy())).collect();
+    words.join(" ")
 }
 
 impl Children<Service> {
@@ -104,13 +92,13 @@ impl Children<Service> {
     pub(crate) fn start(
         &mut self,
         service: Service,
-        meeting: &Meeting<'_>,
+        network: &Network,
         settings: &[String],
         state: Option<&Path>,
     ) -> anyhow::Result<Started> {
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
-        command.arg(service.name()).args(meeting.options());
+        command.arg(service.name()).args(options(network));
         command.arg("--stop-with-parent").arg(std::process::id().to_string());
         // That of this process may be another one than what it joined itself.
         command.env_remove(node::network::variable::MEET);
@@ -124,14 +112,14 @@ impl Children<Service> {
             command.env("ALIGHT_LOG", "warn");
         }
         let number = self.spawn(service, command, service.name())?;
-        Ok(Started { service, number, by_hand: by_hand(service, meeting, settings, state) })
+        Ok(Started { service, number, by_hand: by_hand(service, network, settings, state) })
     }
 }
 
 /// The command that starts a service again.
 fn by_hand(
     service: Service,
-    meeting: &Meeting<'_>,
+    network: &Network,
     settings: &[String],
     state: Option<&Path>,
 ) -> String {
@@ -139,7 +127,7 @@ fn by_hand(
     if let Some(state) = state {
         command = format!("{}={} ", node::STATE_VARIABLE, for_shell(state));
     }
-    command.push_str(&format!("alight {} {}", service.name(), meeting.for_shell()));
+    command.push_str(&format!("alight {} {}", service.name(), options_for_shell(network)));
     let is_start =
         |setting: &str| setting.split('=').next().is_some_and(|key| key.trim() == "start");
     let mut set = |setting: &str| command.push_str(&format!(" --set {}", word(setting)));
@@ -283,18 +271,19 @@ mod tests {
 
     #[test]
     fn the_command_by_hand_has_each_setting_as_it_was_given() {
-        let zenoh = Path::new("my flights/zenoh.json5");
         let settings = ["id=\"it's $HOME\"", "start=\"airborne\"", "file=/a b"].map(str::to_owned);
-        let meeting = Meeting { zenoh, port: None, vehicle: None };
-        let words = |service| shlex::split(&by_hand(service, &meeting, &settings, None)).unwrap();
+        let config = Some("my flights/zenoh.json5".into());
+        let network = Network { config, ..Network::default() };
+        let words = |service| shlex::split(&by_hand(service, &network, &settings, None)).unwrap();
         let start = ["alight", "detector", "--zenoh", "my flights/zenoh.json5"];
         let set = settings.each_ref().map(|setting| ["--set", setting]);
         assert_eq!(words(Service::Detector), [&start[..], &set.concat()].concat());
         // A controller resumes, however it was started.
         let words = words(Service::Controller);
         assert_eq!(words[4..], ["--set", &settings[0], "--set", &settings[2], "--set", RESUME]);
-        let with_notes = by_hand(Service::Detector, &meeting, &[], Some(Path::new("a b")));
-        let elsewhere = Meeting { port: Some(28_111), vehicle: Some("kestrel"), ..meeting };
+        let with_notes = by_hand(Service::Detector, &network, &[], Some(Path::new("a b")));
+        let elsewhere =
+            Network { meet: Some(28_111), vehicle: Some("kestrel".into()), ..network.clone() };
         let options = "--zenoh 'my flights/zenoh.json5' --meet 28111 --vehicle kestrel";
         assert_eq!(
             by_hand(Service::Detector, &elsewhere, &[], None),

@@ -13,9 +13,10 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use anyhow::{Context, anyhow, ensure};
+use anyhow::{Context, ensure};
 use clap::{Args, Subcommand, ValueEnum};
 use node::access::{HOLDERS, Holder, Holders};
+use node::certificate::{Certificate, certificate};
 use node::network::{AUTHORITY, check_private};
 use rcgen::{
     BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
@@ -150,14 +151,6 @@ impl Role {
     }
 }
 
-/// A certificate, as far as it is of interest.
-pub(crate) struct Certificate {
-    /// The common name.
-    pub(crate) common_name: String,
-    /// Seconds until it ends; negative when it has.
-    pub(crate) expires_in_s: i64,
-}
-
 /// Who may connect, by name.
 #[derive(Debug, Serialize)]
 struct HolderList {
@@ -231,35 +224,6 @@ pub(crate) fn run(args: &KeysArgs) -> anyhow::Result<ExitCode> {
         print(&path.display().to_string())?;
     }
     Ok(ExitCode::SUCCESS)
-}
-
-/// Reads a certificate.
-pub(crate) fn certificate(path: &Path) -> anyhow::Result<Certificate> {
-    let text = fs::read(path).with_context(|| format!("reading the certificate {path:?}"))?;
-    let (_, pem) = x509_parser::pem::parse_x509_pem(&text)
-        .map_err(|cause| anyhow!("{path:?} is not a certificate: {cause}"))?;
-    let certificate =
-        pem.parse_x509().map_err(|cause| anyhow!("{path:?} is not a certificate: {cause}"))?;
-    let name = certificate.subject().iter_common_name().next();
-    let common_name = name.and_then(|name| name.as_str().ok()).unwrap_or_default().to_owned();
-    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
-    let expires_in_s = certificate.validity().not_after.timestamp() - now.cast_signed();
-    Ok(Certificate { common_name, expires_in_s })
-}
-
-/// Whether an authority has signed a certificate.
-///
-/// # Errors
-/// When a file is not a certificate.
-pub(crate) fn is_signed_by(certificate: &Path, authority: &Path) -> anyhow::Result<bool> {
-    let [signed, signer] = [certificate, authority].map(|path| {
-        let text = fs::read(path).with_context(|| format!("reading the certificate {path:?}"))?;
-        let pem = x509_parser::pem::parse_x509_pem(&text).map(|(_, pem)| pem);
-        pem.map_err(|cause| anyhow!("{path:?} is not a certificate: {cause}"))
-    });
-    let (signed, signer) = (signed?, signer?);
-    let (signed, signer) = (signed.parse_x509()?, signer.parse_x509()?);
-    Ok(signed.verify_signature(Some(signer.public_key())).is_ok())
 }
 
 fn init(output: &Path, days: u32) -> anyhow::Result<Vec<PathBuf>> {

@@ -17,7 +17,7 @@ use tempfile::TempDir;
 use tokio::time::Instant;
 
 use crate::args::{Format, OPERATOR, address};
-use crate::children::{ChildEvent, Children, Meeting};
+use crate::children::{ChildEvent, Children, options_for_shell};
 use crate::ending::recording;
 use crate::outcome::{LandingSummary, OurRecorder};
 use crate::progress::Progress;
@@ -273,8 +273,6 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     let rendezvous = Rendezvous::new(args.zenoh.as_deref(), args.meet)?;
     // Its own file is checked as those of the services are: nothing listens beyond this machine by accident.
     let meet = args.zenoh.as_ref().and(args.meet);
-    let vehicle = args.vehicle.as_deref();
-    let meeting = Meeting { zenoh: &rendezvous.file, port: meet, vehicle };
     let network = Network {
         config: Some(rendezvous.file.clone()),
         meet,
@@ -287,7 +285,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     progress.say(&format!(
         "Zenoh: {}. To add a second detector: alight detector {} --set id=spare",
         rendezvous.description,
-        meeting.for_shell()
+        options_for_shell(&network)
     ));
     if let Some(port) = rendezvous.unusual_port {
         progress.say(&format!(
@@ -296,7 +294,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
             wanted = args.meet.unwrap_or(node::session::LOCAL_PORT)
         ));
     }
-    if let Some(vehicle) = vehicle {
+    if let Some(vehicle) = &args.vehicle {
         progress.say(&format!(
             "Other commands find this vehicle with `export {}={vehicle}`",
             variable::VEHICLE
@@ -314,7 +312,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     let mut resume = String::new();
     for (service, settings) in &settings.by_service {
         let notes = notes_in.filter(|_| *service == Service::Controller);
-        let started = children.start(*service, &meeting, settings, notes)?;
+        let started = children.start(*service, &network, settings, notes)?;
         progress.debug(&started.to_string());
         if *service == Service::Controller {
             resume = started.by_hand;

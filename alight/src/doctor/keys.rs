@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 
 use node::Network;
 use node::access::{HOLDERS, Holder, Holders};
+use node::certificate::{Certificate, certificate, is_signed_by};
 use node::network::{AUTHORITY, check_pair, check_private, issue_arguments};
 
 use super::Findings;
 use crate::args::OPERATOR;
-use crate::keys::{Certificate, certificate, is_signed_by};
 use crate::site::Job;
 
 /// Certificates that expire within this time are reported, in seconds.

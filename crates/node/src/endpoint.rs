@@ -30,6 +30,11 @@ impl Endpoint {
         format!("{}/{}:{}{}", self.protocol, self.host, self.port, self.rest)
     }
 
+    /// Whether the processes of this machine meet there; else it is the other side of a link, of which each connection has settings.
+    pub(crate) fn is_rendezvous(&self) -> bool {
+        self.protocol == "tcp" && self.rest.is_empty() && self.is_local()
+    }
+
     /// Whether only processes of this machine can connect there.
     pub(crate) fn is_local(&self) -> bool {
         let host = self.host.trim_matches(['[', ']']);

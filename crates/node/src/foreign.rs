@@ -12,7 +12,7 @@ use tokio::sync::oneshot;
 use tokio::time::{Instant, timeout, timeout_at};
 
 use crate::boxed::BoxFuture;
-use crate::endpoint;
+use crate::endpoint::{self, Endpoint};
 
 /// Maximum time for which the start of a tool waits for answers: a process on this machine gives one within milliseconds.
 const AT_START: Duration = Duration::from_millis(300);
@@ -220,10 +220,9 @@ impl Contacts {
 impl Contact {
     /// `tcp/127.0.0.1:7447`, or `tcp/10.42.0.1:7448?prio=1-4#dscp=0xb8`: each connection of the air link has settings.
     fn of(endpoint: &str) -> Option<Self> {
-        let text = endpoint.strip_prefix("tcp/")?;
-        let plain = text.split(['?', '#']).next()?;
-        let address: SocketAddr = plain.parse().ok()?;
-        Some(Self { is_rendezvous: address.ip().is_loopback() && plain == text, address })
+        let endpoint = Endpoint::parse(endpoint).filter(|it| it.protocol == "tcp")?;
+        let address = format!("{}:{}", endpoint.host, endpoint.port).parse().ok()?;
+        Some(Self { is_rendezvous: endpoint.is_rendezvous(), address })
     }
 
     /// What is wrong with an answer, and what to do.

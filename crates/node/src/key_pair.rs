@@ -9,17 +9,13 @@ use rustls::RootCertStore;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::sign::CertifiedKey;
-use x509_parser::prelude::{FromDer, X509Certificate};
 
 /// Checks the certificate of an authority, a certificate and its private key.
 ///
 /// # Errors
 /// Names the file that is no certificate or no key, or the key that belongs to another certificate.
 pub(crate) fn check(authority: &Path, certificate: &Path, key: &Path) -> anyhow::Result<()> {
-    let root = certificate_of(authority)?;
-    RootCertStore::empty()
-        .add(root)
-        .with_context(|| format!("{authority:?} is no certificate of an authority"))?;
+    trusted(authority)?;
     let own = certificate_of(certificate)?;
     let private = private_of(key)?;
     let provider = rustls::crypto::ring::default_provider();
@@ -31,14 +27,13 @@ pub(crate) fn check(authority: &Path, certificate: &Path, key: &Path) -> anyhow:
     Ok(())
 }
 
-/// The common name of a certificate: its holder.
-pub(crate) fn common_name(path: &Path) -> anyhow::Result<String> {
-    let der = certificate_of(path)?;
-    let (_, certificate) =
-        X509Certificate::from_der(&der).with_context(|| format!("{path:?} is no certificate"))?;
-    let name = certificate.subject().iter_common_name().next();
-    let name = name.with_context(|| format!("{path:?} has no common name"))?;
-    Ok(name.as_str().with_context(|| format!("the common name of {path:?}"))?.to_owned())
+/// The authority in whose certificates a process trusts.
+pub(crate) fn trusted(authority: &Path) -> anyhow::Result<RootCertStore> {
+    let mut roots = RootCertStore::empty();
+    roots
+        .add(certificate_of(authority)?)
+        .with_context(|| format!("{authority:?} is no certificate of an authority"))?;
+    Ok(roots)
 }
 
 /// The private key of a file.

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
 use rustls::pki_types::ServerName;
-use rustls::{CertificateError, ClientConfig, ClientConnection, RootCertStore};
+use rustls::{CertificateError, ClientConfig, ClientConnection};
 use tokio::sync::oneshot;
 use tokio::time::timeout;
 
@@ -76,12 +76,11 @@ impl Reach {
         let text = |key: &str| serde_json::from_str::<Option<String>>(&part(key)).ok().flatten();
         let mut reach = Self { vehicle: text("namespace").unwrap_or_default(), ..Self::default() };
         for endpoint in endpoint::connected(&part("mode"), &part("connect/endpoints")) {
-            let Some(Endpoint { protocol, host, port, rest }) = Endpoint::parse(&endpoint) else {
-                continue;
-            };
-            let is_encrypted = protocol == "tls";
-            let place = Place { host, port, is_encrypted };
-            if place.is_loopback() && rest.is_empty() && !is_encrypted {
+            let Some(endpoint) = Endpoint::parse(&endpoint) else { continue };
+            let is_rendezvous = endpoint.is_rendezvous();
+            let Endpoint { protocol, host, port, .. } = endpoint;
+            let place = Place { host, port, is_encrypted: protocol == "tls" };
+            if is_rendezvous {
                 reach.meet = Some(port);
             } else if ["tcp", "tls"].contains(&protocol.as_str())
                 && reach.places.len() < MAX_PLACES
@@ -197,10 +196,6 @@ impl Reach {
 }
 
 impl Place {
-    fn is_loopback(&self) -> bool {
-        self.host.parse().is_ok_and(|address: std::net::IpAddr| address.is_loopback())
-    }
-
     /// Connects, and exchanges certificates where that is asked for.
     fn finding(&self, keys: Option<&Keys>) -> Finding {
         let host = self.host.trim_matches(['[', ']']);
@@ -303,24 +298,17 @@ fn left(end: Instant) -> io::Result<Duration> {
 
 fn connection(host: &str, keys: &Keys) -> anyhow::Result<ClientConnection> {
     let Keys { authority, certificate, private } = keys;
-    let mut roots = RootCertStore::empty();
-    roots
-        .add(key_pair::certificate_of(authority)?)
-        .with_context(|| format!("{authority:?} is no certificate of an authority"))?;
+    let roots = key_pair::trusted(authority)?;
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let own = (vec![key_pair::certificate_of(certificate)?], key_pair::private_of(private)?);
     let config = ClientConfig::builder_with_provider(provider)
         .with_safe_default_protocol_versions()?
         .with_root_certificates(roots)
         .with_client_auth_cert(own.0, own.1)
-        .with_context(|| mismatch(private, certificate))?;
+        .with_context(|| format!("{private:?} does not belong to {certificate:?}"))?;
     let name = ServerName::try_from(host.to_owned())
         .with_context(|| format!("`{host}` is no name that a certificate can have"))?;
     Ok(ClientConnection::new(Arc::new(config), name)?)
-}
-
-fn mismatch(private: &Path, certificate: &Path) -> String {
-    format!("{private:?} does not belong to {certificate:?}")
 }
 
 fn is_timeout(cause: &io::Error) -> bool {

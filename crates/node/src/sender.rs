@@ -4,9 +4,9 @@
 
 use std::path::Path;
 
+use crate::certificate;
 use crate::clock::host_name;
 use crate::identity::Identity;
-use crate::key_pair;
 
 /// Maximum number of letters of a name; a longer one ends there.
 const MAX_LETTERS: usize = 160;
@@ -14,8 +14,9 @@ const MAX_LETTERS: usize = 160;
 const USER: [&str; 2] = ["USER", "LOGNAME"];
 
 /// The name of this process as a sender: `operator.anna@drone, alight command-4711 on laptop`.
-pub(crate) fn name(identity: &Identity, certificate: Option<&Path>) -> String {
-    let holder = certificate.and_then(|path| key_pair::common_name(path).ok());
+pub(crate) fn name(identity: &Identity, own: Option<&Path>) -> String {
+    let holder = own.and_then(|path| certificate::certificate(path).ok());
+    let holder = holder.map(|it| it.common_name).filter(|it| !it.is_empty());
     let user = || USER.iter().find_map(|name| std::env::var(name).ok()).filter(|it| !it.is_empty());
     let who = holder.or_else(user).unwrap_or_else(|| "somebody".to_owned());
     let Identity { service, instance } = identity;

@@ -76,8 +76,6 @@ pub struct Node {
     /// The configuration that the service has changed to, as TOML; `None` while it is that of its start.
     changed: Arc<watch::Sender<Option<String>>>,
     reach: Arc<Reach>,
-    /// Who this process is to those that it commands.
-    pub(crate) sender: Arc<str>,
     started_ns: i64,
 }
 
@@ -125,7 +123,6 @@ impl Node {
     async fn open_with(identity: Identity, mut config: zenoh::Config) -> anyhow::Result<Self> {
         let has_shared_memory = share_memory(&mut config)?;
         let reach = Arc::new(Reach::of(&config));
-        let sender = sender::name(&identity, reach.certificate()).into();
         let session = zenoh::open(config)
             .await
             .map_err(|cause| anyhow!("opening the Zenoh session of {identity}: {cause}"))?;
@@ -138,9 +135,13 @@ impl Node {
             claim: Arc::default(),
             changed: Arc::new(watch::Sender::new(None)),
             reach,
-            sender,
             started_ns: now_ns(),
         })
+    }
+
+    /// Who this process is to those that it commands.
+    pub(crate) fn sender(&self) -> String {
+        sender::name(&self.identity, self.reach.certificate())
     }
 
     /// The identity of this process.

@@ -298,7 +298,7 @@ impl Node {
                 Some(Reply::Command(_)) => Vec::new(),
                 None => return Err(self.unanswered(&key).await),
             };
-            let named = format!("{key}?{SENDER}={}", self.sender);
+            let named = format!("{key}?{SENDER}={}", self.sender());
             match self.query(&named, &command, &sent, REPLY_TIMEOUT).await? {
                 Some(Reply::Command(reply)) => Ok(reply),
                 Some(Reply::Time(_)) | None => Err(self.unanswered(&key).await),

@@ -24,6 +24,9 @@ pub struct Summary {
     pub why: Option<String>,
     /// Whether it landed and its motors stopped; `None` without a status of a controller.
     pub landed: Option<bool>,
+    /// The alarm or the command for which it landed where it was, which is in its reason.
+    #[serde(skip)]
+    pub landed_for: Option<String>,
     /// Why no status of a controller could be read, where there are some.
     pub unreadable_status: Option<String>,
     /// From the start of the landing to disarmed motors, in seconds.
@@ -115,6 +118,7 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
         phase: last.map(|status| status.phase.name().to_owned()),
         why: last.map(|status| status.why.clone()),
         landed: last.map(|status| status.phase == Phase::Landed),
+        landed_for: last.and_then(|status| status.landed_for()).map(str::to_owned),
         unreadable_status: flight
             .unreadable
             .get(&topic::STATUS.key(&[]))
@@ -186,14 +190,9 @@ fn battery_min(flight: &Flight) -> Option<f64> {
 }
 
 impl Summary {
-    /// The alarm or the command for which it landed where it was.
-    fn landed_for(&self) -> Option<&str> {
-        self.why.as_deref()?.split_once(": ").map(|(_, cause)| cause)
-    }
-
     /// Whether it landed on the pad, led there by the marker.
     pub fn is_on_the_pad(&self) -> bool {
-        self.landed == Some(true) && self.landed_for().is_none() && self.beside_m().is_none()
+        self.landed == Some(true) && self.landed_for.is_none() && self.beside_m().is_none()
     }
 
     /// How far from the pad's centre it touched down, if that is beside the pad.
@@ -204,7 +203,7 @@ impl Summary {
     /// How it ended, in a few words.
     pub fn outcome(&self) -> String {
         match (&self.phase, &self.why) {
-            _ if self.landed == Some(true) => match self.landed_for() {
+            _ if self.landed == Some(true) => match &self.landed_for {
                 Some(cause) => format!("landed, but not led to the marker: {cause}"),
                 None => match self.beside_m() {
                     Some(error_m) => {
