@@ -57,9 +57,7 @@ impl Progress {
 
     /// Shows a change of phase or of detector.
     pub(crate) fn status(&mut self, status: &ControllerStatus) {
-        // A change of numbers alone, as of a distance, is not shown.
-        let matter = |text: &String| text.chars().filter(|c| !c.is_ascii_digit()).collect();
-        let why: String = matter(&status.why);
+        let why = matter(&status.why);
         // An autopilot may take a minute until it lets the vehicle take off, and says what it waits for.
         let is_other_reason = self.live.is_none()
             && matches!(status.phase, Phase::Idle | Phase::Takeoff)
@@ -73,7 +71,7 @@ impl Progress {
             let name = status.active_detector.as_deref().unwrap_or("none");
             self.say(&format!("active detector: {name}: {}", status.detector_why));
         }
-        let matters: Vec<String> = status.warnings.iter().map(matter).collect();
+        let matters: Vec<String> = status.warnings.iter().map(|text| matter(text)).collect();
         for (text, matter) in status.warnings.iter().zip(&matters) {
             if !self.warnings.contains(matter) {
                 self.say(&format!("warning: {text}"));
@@ -95,6 +93,13 @@ impl Progress {
             bar.finish_and_clear();
         }
     }
+}
+
+/// A text without its numbers, apart from names in backquotes: a change of numbers alone, as of a distance, is not shown.
+fn matter(text: &str) -> String {
+    let numberless = |part: &str| part.replace(|c: char| c.is_ascii_digit(), "");
+    let parts = text.split('`').enumerate();
+    parts.map(|(i, part)| if i % 2 == 0 { numberless(part) } else { part.to_owned() }).collect()
 }
 
 fn live_lines(status: &ControllerStatus, frame_rate_hz: Option<f64>) -> String {
@@ -215,6 +220,14 @@ impl Seldom {
 mod tests {
     use super::*;
     use messages::Candidate;
+
+    #[test]
+    fn a_warning_with_other_numbers_is_the_same_and_with_another_name_is_not() {
+        let silent =
+            |camera: &str, s: u32| matter(&format!("no frame from camera `{camera}` for {s} s"));
+        assert_eq!(silent("cam1", 2), silent("cam1", 13));
+        assert_ne!(silent("cam1", 2), silent("cam2", 2));
+    }
 
     #[test]
     fn lines_become_rarer_the_longer_it_takes() {

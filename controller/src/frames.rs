@@ -9,18 +9,13 @@ use crate::agreement::Sight;
 use crate::cameras::{Cameras, Reception};
 use crate::config::{Config, DetectorSettings, PreferredPlace};
 use crate::refusals::{Refusals, Warning};
+use crate::searches::Searches;
 use crate::selection::{Limits, MAX_DETECTORS, Preference, Selection};
 use crate::wire;
 
 /// Time without detections that can be used after which a refusal is taken for their absence, in
 /// nanoseconds.
 const UNUSABLE_NS: i64 = 1_000_000_000;
-/// Time without a searched frame, while detectors are there, after which it is told, in nanoseconds.
-const NO_FRAME_NS: i64 = 2_000_000_000;
-/// The same before the first frame: a camera takes seconds to start.
-const NO_FIRST_FRAME_NS: i64 = 10_000_000_000;
-/// Silence of all detectors, which tell about themselves each second, after which none is there, in nanoseconds.
-const UNHEARD_NS: i64 = 3_500_000_000;
 
 /// The newest frame of each detector, and the choice among them.
 #[derive(Debug)]
@@ -43,18 +38,7 @@ pub struct Frames {
     /// Late frames of the active detector are used only if they are newer than the last one of its
     /// predecessor.
     handover_stamp_ns: i64,
-    searched: Option<Searched>,
-}
-
-/// When detectors have last searched a frame, and when they were last heard.
-#[derive(Clone, Debug)]
-struct Searched {
-    /// The camera of the newest frame; before the first, that of the newest detector.
-    camera: String,
-    /// Of the newest frame; before the first, when a detector was first heard.
-    at_ns: i64,
-    has_frame: bool,
-    heard_ns: i64,
+    searches: Searches,
 }
 
 /// What becomes of detections on arrival.
@@ -94,43 +78,26 @@ impl Frames {
             known_changes: 0,
             used_stamp_ns: i64::MIN,
             handover_stamp_ns: i64::MIN,
-            searched: None,
+            searches: Searches::default(),
         }
     }
 
     /// A detector told which camera's frames it searches: it is there.
-    pub fn heard(&mut self, now_ns: i64, camera: &str) {
-        let searched = self.searched.get_or_insert_with(|| Searched {
-            camera: camera.to_owned(),
-            at_ns: now_ns,
-            has_frame: false,
-            heard_ns: now_ns,
-        });
-        searched.heard_ns = now_ns;
-        if !searched.has_frame && searched.camera != camera {
-            camera.clone_into(&mut searched.camera);
-        }
+    pub fn heard(&mut self, now_ns: i64, detector: &str, camera: &str) {
+        self.searches.heard(now_ns, detector, camera);
     }
 
     /// A detector came or went.
     pub fn presence(&mut self, now_ns: i64, detector: &str, alive: bool) {
         self.selection.presence(now_ns, detector, alive);
-        if !alive && self.selection.is_blind() {
-            // Without a detector nothing tells whether the camera has frames.
-            self.searched = None;
+        if !alive {
+            self.searches.ended(detector);
         }
     }
 
-    /// That detectors are there and get no frames, with the time; `None` where they do, or where there is none.
+    /// That detectors are there and none gets frames, with the time; `None` where one does, or where there is none.
     pub fn no_frame(&self, now_ns: i64) -> Option<String> {
-        let Searched { camera, at_ns, has_frame, heard_ns } = self.searched.as_ref()?;
-        let silence_ns = now_ns.saturating_sub(*at_ns);
-        let limit_ns = if *has_frame { NO_FRAME_NS } else { NO_FIRST_FRAME_NS };
-        let is_there = now_ns.saturating_sub(*heard_ns) <= UNHEARD_NS;
-        (is_there && silence_ns > limit_ns).then(|| {
-            let silence_s = silence_ns / 1_000_000_000;
-            format!("no frame from camera `{camera}` for {silence_s} s: check the camera, and whether its detector hangs")
-        })
+        self.searches.no_frame(now_ns)
     }
 
     /// Adds a camera's calibration and mount, or refuses them; `is_flying` says that a landing is active.
@@ -154,8 +121,7 @@ impl Frames {
                 )
             });
         }
-        let camera = header.camera.clone();
-        self.searched = Some(Searched { camera, at_ns: now_ns, has_frame: true, heard_ns: now_ns });
+        self.searches.searched(now_ns, publisher, &header.camera);
         if header.clock != self.clock {
             let ours = self.clock.clone();
             return self.refuse(now_ns, "another-clock", || {
@@ -242,8 +208,7 @@ impl Frames {
     pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
         let mut warnings: Vec<_> = self.refusals.lasting(now_ns).collect();
         warnings.extend(self.selection.warnings(now_ns));
-        let no_frame = self.no_frame(now_ns);
-        warnings.extend(no_frame.map(|text| Warning { matter: "no frame".to_owned(), text }));
+        warnings.extend(self.searches.warnings(now_ns));
         warnings
     }
 

@@ -31,6 +31,7 @@ pub mod note_file;
 pub mod offboard_watch;
 pub mod pad_note;
 pub mod refusals;
+pub mod searches;
 pub mod selection;
 pub mod service;
 pub mod setpoints;

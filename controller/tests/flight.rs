@@ -517,19 +517,23 @@ fn a_landing_for_an_alarm_or_a_command_tells_why_until_after_it() {
     assert_eq!(landed, "on the ground, disarmed: the operator's command to land here");
 }
 
+fn detector_info(detector: &str, camera: &str) -> DetectorInfo {
+    DetectorInfo {
+        detector: detector.into(),
+        host: "drone".into(),
+        place: Place::Onboard,
+        camera: camera.into(),
+        markers: Vec::new(),
+        version: "test".into(),
+        pid: 1,
+    }
+}
+
 #[test]
 fn a_camera_that_sends_nothing_is_told_of_and_its_detectors_are_not_said_to_have_gone() {
     let mut flight = in_flight("airborne");
     hover(&mut flight, 1000, 3000, 4);
-    let info = DetectorInfo {
-        detector: "main".into(),
-        host: "drone".into(),
-        place: Place::Onboard,
-        camera: "down".into(),
-        markers: Vec::new(),
-        version: "test".into(),
-        pid: 1,
-    };
+    let info = detector_info("main", "down");
     let told = |status: &ControllerStatus| status.warnings.iter().any(|it| it.contains("no frame"));
     // The frames end; the detector goes on telling about itself. After a minute the selection forgets it.
     for ms in (3000..80_000).step_by(20) {
@@ -557,6 +561,45 @@ fn a_camera_that_sends_nothing_is_told_of_and_its_detectors_are_not_said_to_have
     let status = flight.status(80_001 * MS);
     assert!(!told(&status), "{status:?}");
     assert_eq!(status.why, "no detector is alive, nothing descends");
+}
+
+#[test]
+fn a_camera_that_sends_nothing_is_told_of_beside_one_that_does() {
+    let mut flight = in_flight("airborne");
+    let (main, other) = (detector_info("main", "down"), detector_info("other", "wide"));
+    let dead = |s: i64| {
+        format!(
+            "no frame from camera `wide` for {s} s: check the camera, and whether its detector hangs"
+        )
+    };
+    for s in 1..40 {
+        hover(&mut flight, s * 1000, (s + 1) * 1000, 4);
+        let now_ns = (s + 1) * 1000 * MS;
+        flight.on_detector_info(now_ns, "main", &main);
+        let (since, is_there) = match s {
+            // The other camera takes more than ten seconds to start.
+            3..18 => (3, true),
+            // Its detector ends and comes back: nothing tells of the camera, and it has time to start again.
+            24..40 => (24, s < 36),
+            _ => (s, false),
+        };
+        if is_there {
+            flight.on_detector_info(now_ns, "other", &other);
+        }
+        if s == 18 {
+            flight.presence(now_ns, "other", false);
+        }
+        let status = flight.status(now_ns);
+        let silence_s = s - since;
+        // A detector that tells nothing for three and a half seconds is not there.
+        let is_forgotten = s >= 39;
+        let is_told = silence_s > 10 && !is_forgotten;
+        let expected: Vec<_> = is_told.then(|| dead(silence_s)).into_iter().collect();
+        let warnings: Vec<_> =
+            status.warnings.iter().filter(|it| it.contains("no frame")).collect();
+        assert_eq!(warnings, expected.iter().collect::<Vec<_>>(), "after {s} s: {status:?}");
+        assert!(!status.why.contains("nothing descends"), "{status:?}");
+    }
 }
 
 #[test]
