@@ -394,16 +394,18 @@ impl Swap<'_> {
 
     /// Waits for the controller's configuration, which it publishes every few seconds: the limit is in it.
     async fn learn_limit(&mut self) {
-        let waiting = async {
-            while !self.comparison.is_configured() {
-                match self.configurations.next().await {
+        // Without it the keys of the limit are named, and not their values.
+        let deadline = Instant::now() + CONFIGURATION_TIMEOUT;
+        while !self.comparison.is_configured() {
+            tokio::select! {
+                configuration = self.configurations.next() => match configuration {
                     Some(configuration) => self.comparison.configured(&configuration),
                     None => return,
-                }
+                },
+                () = self.shutdown.requested() => return,
+                () = sleep_until(deadline) => return,
             }
-        };
-        // Without it the keys of the limit are named, and not their values.
-        let _ = timeout(CONFIGURATION_TIMEOUT, waiting).await;
+        }
     }
 
     /// In what it differs.
