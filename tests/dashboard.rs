@@ -145,7 +145,7 @@ async fn what_is_drawn_over_a_picture_was_found_in_that_very_picture() -> anyhow
 #[tokio::test(flavor = "multi_thread")]
 async fn twenty_browsers_and_a_page_that_is_stopped_and_killed_change_no_decision()
 -> anyhow::Result<()> {
-    let _alone = alone().await?;
+    let _flight = time_for(3).await?;
     with_second_try(async || {
         let folder = tempfile::tempdir()?;
         let file = folder.path().join("flight.mcap");

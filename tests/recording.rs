@@ -8,7 +8,7 @@ use std::process::Command;
 use anyhow::{Context, ensure};
 use testing::{node, node_passes, python, python_passes, with_second_try};
 
-use crate::flight::{ALIGHT, Landing, alone, beside_another, output_of};
+use crate::flight::{ALIGHT, Landing, alone, beside_another, output_of, time_for};
 use crate::recorders::{self, Contents, kills};
 
 #[tokio::test(flavor = "multi_thread")]
@@ -176,7 +176,7 @@ async fn a_disk_that_is_full_read_only_or_removed_is_told_and_the_landing_goes_o
 #[tokio::test(flavor = "multi_thread")]
 async fn what_waits_for_a_disk_that_stands_still_is_bounded_and_what_fails_is_told_soon()
 -> anyhow::Result<()> {
-    let _alone = alone().await?;
+    let _flight = time_for(2).await?;
     with_second_try(disks::beside_a_flight).await
 }
 
