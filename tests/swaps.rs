@@ -11,7 +11,7 @@ use node::{Node, Subscriber, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::time::{sleep, timeout};
 
-use crate::flight::{ALIGHT, LONG, Landing, PATIENCE, output_of, seconds, time_for};
+use crate::flight::{ALIGHT, LONG, Landing, PATIENCE, alone, output_of, seconds};
 
 /// Ends processes that outlive those who started them.
 #[derive(Default)]
@@ -178,7 +178,7 @@ fn droughts(heard: &[Heard]) -> Vec<(i64, f64, String)> {
 /// the same hold without them. False when the machine had no time for it: then frames were late whoever found the
 /// marker in them, and what a hand-over missed is not known.
 pub(crate) async fn swaps(number: usize) -> anyhow::Result<bool> {
-    let _flight = time_for(2).await?;
+    let _alone = alone().await?;
     let directory = tempfile::tempdir()?;
     let (pad, detectors) = pad_and_detectors(directory.path())?;
     let mut outliving = Outliving::default();

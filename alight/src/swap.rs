@@ -394,18 +394,12 @@ impl Swap<'_> {
 
     /// Waits for the controller's configuration, which it publishes every few seconds: the limit is in it.
     async fn learn_limit(&mut self) {
-        // Without it the keys of the limit are named, and not their values.
         let deadline = Instant::now() + CONFIGURATION_TIMEOUT;
-        while !self.comparison.is_configured() {
-            tokio::select! {
-                configuration = self.configurations.next() => match configuration {
-                    Some(configuration) => self.comparison.configured(&configuration),
-                    None => return,
-                },
-                () = self.shutdown.requested() => return,
-                () = sleep_until(deadline) => return,
-            }
-        }
+        let waiting_for = "the controller tells its configuration";
+        // Without it the keys of the limit are named, and not their values.
+        while !self.comparison.is_configured()
+            && self.next_event(deadline, waiting_for).await.is_ok()
+        {}
     }
 
     /// In what it differs.

@@ -341,7 +341,7 @@ impl Flight {
             self.journal.reject("another-detectors-name");
             return;
         }
-        self.frames.heard(now_ns, publisher, &info.camera);
+        self.frames.camera_watch.heard(now_ns, publisher, &info.camera);
         self.frames.selection.set_place(now_ns, publisher, info.place);
         self.use_newest(now_ns);
     }

@@ -6,10 +6,10 @@ use landing::{FrameObservation, Timestamp};
 use messages::{CameraInfo, Detections, Place};
 
 use crate::agreement::Sight;
+use crate::camera_watch::CameraWatch;
 use crate::cameras::{Cameras, Reception};
 use crate::config::{Config, DetectorSettings, PreferredPlace};
 use crate::refusals::{Refusals, Warning};
-use crate::searches::Searches;
 use crate::selection::{Limits, MAX_DETECTORS, Preference, Selection};
 use crate::wire;
 
@@ -26,6 +26,8 @@ pub struct Frames {
     max_future_s: f64,
     /// The detectors and the active one.
     pub selection: Selection,
+    /// The cameras whose detectors get no frames.
+    pub camera_watch: CameraWatch,
     /// The newest frame of each detector, to be used when it becomes the active one.
     newest: BTreeMap<String, FrameObservation>,
     cameras: Cameras,
@@ -38,7 +40,6 @@ pub struct Frames {
     /// Late frames of the active detector are used only if they are newer than the last one of its
     /// predecessor.
     handover_stamp_ns: i64,
-    searches: Searches,
 }
 
 /// What becomes of detections on arrival.
@@ -78,26 +79,16 @@ impl Frames {
             known_changes: 0,
             used_stamp_ns: i64::MIN,
             handover_stamp_ns: i64::MIN,
-            searches: Searches::default(),
+            camera_watch: CameraWatch::default(),
         }
-    }
-
-    /// A detector told which camera's frames it searches: it is there.
-    pub fn heard(&mut self, now_ns: i64, detector: &str, camera: &str) {
-        self.searches.heard(now_ns, detector, camera);
     }
 
     /// A detector came or went.
     pub fn presence(&mut self, now_ns: i64, detector: &str, alive: bool) {
         self.selection.presence(now_ns, detector, alive);
         if !alive {
-            self.searches.ended(detector);
+            self.camera_watch.ended(detector);
         }
-    }
-
-    /// That detectors are there and none gets frames, with the time; `None` where one does, or where there is none.
-    pub fn no_frame(&self, now_ns: i64) -> Option<String> {
-        self.searches.no_frame(now_ns)
     }
 
     /// Adds a camera's calibration and mount, or refuses them; `is_flying` says that a landing is active.
@@ -121,7 +112,7 @@ impl Frames {
                 )
             });
         }
-        self.searches.searched(now_ns, publisher, &header.camera);
+        self.camera_watch.searched(now_ns, publisher, &header.camera);
         if header.clock != self.clock {
             let ours = self.clock.clone();
             return self.refuse(now_ns, "another-clock", || {
@@ -208,7 +199,7 @@ impl Frames {
     pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
         let mut warnings: Vec<_> = self.refusals.lasting(now_ns).collect();
         warnings.extend(self.selection.warnings(now_ns));
-        warnings.extend(self.searches.warnings(now_ns));
+        warnings.extend(self.camera_watch.warnings(now_ns));
         warnings
     }
 

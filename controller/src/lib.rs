@@ -17,6 +17,7 @@
 
 pub mod agreement;
 pub mod alarms;
+pub mod camera_watch;
 pub mod cameras;
 pub mod config;
 pub mod control;
@@ -31,7 +32,6 @@ pub mod note_file;
 pub mod offboard_watch;
 pub mod pad_note;
 pub mod refusals;
-pub mod searches;
 pub mod selection;
 pub mod service;
 pub mod setpoints;

@@ -160,7 +160,7 @@ impl View<'_> {
         // In LAND it descends whatever is seen.
         let needs_marker = self.is_landing() && self.lander.phase() != landing::Phase::Final;
         let is_blind = needs_marker && self.frames.selection.is_blind();
-        let no_frame = self.frames.no_frame(now_ns).filter(|_| needs_marker);
+        let no_frame = self.frames.camera_watch.no_frame(now_ns).filter(|_| needs_marker);
         let reason = self.decision.map(|decision| decision.why);
         let why = match (reason, no_frame) {
             // A detector that has searched nothing for long is forgotten by the selection, and is there all the same.

@@ -54,7 +54,7 @@ pub(crate) async fn time_for(landings: u32) -> anyhow::Result<SemaphorePermit<'s
     Ok(FLIGHTS.acquire_many(landings).await?)
 }
 
-/// Waits until no landing is under way that waited for its time, and lets none begin: for what loads the machine by itself.
+/// Waits until no landing is under way that waited for its time, and lets none begin: for what loads the machine by itself, or measures milliseconds.
 pub(crate) async fn alone() -> anyhow::Result<SemaphorePermit<'static>> {
     time_for(MAX_AT_ONCE).await
 }

@@ -1,4 +1,4 @@
-//! Which cameras give no frames, by what their detectors search.
+//! Tells of cameras that give no frames, by when their detectors have last searched one.
 
 use std::collections::BTreeMap;
 
@@ -16,13 +16,13 @@ const MAX_TOLD: usize = 4;
 
 /// The detectors that are there, and when each has last searched a frame.
 #[derive(Debug, Default)]
-pub struct Searches {
+pub struct CameraWatch {
     /// At most [`MAX_DETECTORS`], by name.
-    detectors: BTreeMap<String, Search>,
+    detectors: BTreeMap<String, LastFrame>,
 }
 
 #[derive(Debug)]
-struct Search {
+struct LastFrame {
     /// The camera of the newest frame; before the first, that of which the detector tells.
     camera: String,
     /// Of the newest frame; before the first, when the detector was first heard.
@@ -31,7 +31,7 @@ struct Search {
     heard_ns: i64,
 }
 
-impl Search {
+impl LastFrame {
     fn is_there(&self, now_ns: i64) -> bool {
         now_ns.saturating_sub(self.heard_ns) <= UNHEARD_NS
     }
@@ -44,23 +44,21 @@ impl Search {
     }
 }
 
-impl Searches {
+impl CameraWatch {
     /// A detector told which camera's frames it searches: it is there.
     pub fn heard(&mut self, now_ns: i64, detector: &str, camera: &str) {
-        let search = self.of(now_ns, detector, camera);
-        search.heard_ns = now_ns;
-        if !search.has_frame && search.camera != camera {
-            camera.clone_into(&mut search.camera);
+        let last = self.of(now_ns, detector, camera);
+        last.heard_ns = now_ns;
+        if !last.has_frame {
+            camera.clone_into(&mut last.camera);
         }
     }
 
     /// A detector has searched a frame of a camera.
     pub fn searched(&mut self, now_ns: i64, detector: &str, camera: &str) {
-        let search = self.of(now_ns, detector, camera);
-        (search.at_ns, search.heard_ns, search.has_frame) = (now_ns, now_ns, true);
-        if search.camera != camera {
-            camera.clone_into(&mut search.camera);
-        }
+        let last = self.of(now_ns, detector, camera);
+        (last.at_ns, last.heard_ns, last.has_frame) = (now_ns, now_ns, true);
+        camera.clone_into(&mut last.camera);
     }
 
     /// A detector has ended: without it nothing tells whether the camera has frames.
@@ -80,9 +78,9 @@ impl Searches {
     /// The cameras of which no detector that is there gets frames.
     pub fn warnings(&self, now_ns: i64) -> impl Iterator<Item = Warning> {
         let mut silences = BTreeMap::<&str, Option<i64>>::new();
-        for search in self.detectors.values().filter(|it| it.is_there(now_ns)) {
-            let silence_ns = search.silence_ns(now_ns);
-            let shortest = silences.entry(&search.camera).or_insert(silence_ns);
+        for last in self.detectors.values().filter(|it| it.is_there(now_ns)) {
+            let silence_ns = last.silence_ns(now_ns);
+            let shortest = silences.entry(&last.camera).or_insert(silence_ns);
             *shortest = silence_ns.min(*shortest);
         }
         let silent =
@@ -94,14 +92,14 @@ impl Searches {
     }
 
     /// A detector, known from now on; where there are too many, in the place of the one that was heard the longest ago.
-    fn of(&mut self, now_ns: i64, detector: &str, camera: &str) -> &mut Search {
+    fn of(&mut self, now_ns: i64, detector: &str, camera: &str) -> &mut LastFrame {
         if self.detectors.len() >= MAX_DETECTORS && !self.detectors.contains_key(detector) {
             let oldest = self.detectors.iter().min_by_key(|(_, it)| it.heard_ns);
             if let Some(name) = oldest.map(|(name, _)| name.clone()) {
                 self.detectors.remove(&name);
             }
         }
-        self.detectors.entry(detector.to_owned()).or_insert_with(|| Search {
+        self.detectors.entry(detector.to_owned()).or_insert_with(|| LastFrame {
             camera: camera.to_owned(),
             at_ns: now_ns,
             has_frame: false,
@@ -123,76 +121,76 @@ mod tests {
 
     const S: i64 = 1_000_000_000;
 
-    fn told(searches: &Searches, now_ns: i64) -> Vec<String> {
-        searches.warnings(now_ns).map(|it| it.text).collect()
+    fn told(watch: &CameraWatch, now_ns: i64) -> Vec<String> {
+        watch.warnings(now_ns).map(|it| it.text).collect()
     }
 
     #[test]
     fn a_camera_is_silent_when_all_its_detectors_are() {
-        let mut searches = Searches::default();
-        searches.searched(0, "main", "down");
-        searches.searched(0, "other", "down");
-        searches.searched(3 * S, "other", "down");
-        searches.heard(3 * S, "main", "down");
-        assert!(told(&searches, 3 * S).is_empty());
-        searches.heard(6 * S, "main", "down");
-        searches.heard(6 * S, "other", "down");
+        let mut watch = CameraWatch::default();
+        watch.searched(0, "main", "down");
+        watch.searched(0, "other", "down");
+        watch.searched(3 * S, "other", "down");
+        watch.heard(3 * S, "main", "down");
+        assert!(told(&watch, 3 * S).is_empty());
+        watch.heard(6 * S, "main", "down");
+        watch.heard(6 * S, "other", "down");
         let silent =
             "no frame from camera `down` for 3 s: check the camera, and whether its detector hangs";
-        assert_eq!(told(&searches, 6 * S), [silent]);
-        assert_eq!(searches.no_frame(6 * S).as_deref(), Some(silent));
+        assert_eq!(told(&watch, 6 * S), [silent]);
+        assert_eq!(watch.no_frame(6 * S).as_deref(), Some(silent));
     }
 
     #[test]
     fn a_detector_that_ends_leaves_nothing_to_tell_and_has_its_time_again() {
-        let mut searches = Searches::default();
-        searches.searched(0, "main", "down");
-        searches.searched(0, "other", "wide");
-        searches.ended("other");
-        searches.searched(3 * S, "main", "down");
-        assert!(told(&searches, 3 * S).is_empty());
-        searches.heard(3 * S, "other", "wide");
-        searches.searched(12 * S, "main", "down");
-        searches.heard(12 * S, "other", "wide");
-        assert!(told(&searches, 12 * S).is_empty());
-        searches.searched(14 * S, "main", "down");
-        searches.heard(14 * S, "other", "wide");
-        assert_eq!(told(&searches, 14 * S).len(), 1);
-        assert_eq!(searches.no_frame(14 * S), None, "the other camera has frames");
+        let mut watch = CameraWatch::default();
+        watch.searched(0, "main", "down");
+        watch.searched(0, "other", "wide");
+        watch.ended("other");
+        watch.searched(3 * S, "main", "down");
+        assert!(told(&watch, 3 * S).is_empty());
+        watch.heard(3 * S, "other", "wide");
+        watch.searched(12 * S, "main", "down");
+        watch.heard(12 * S, "other", "wide");
+        assert!(told(&watch, 12 * S).is_empty());
+        watch.searched(14 * S, "main", "down");
+        watch.heard(14 * S, "other", "wide");
+        assert_eq!(told(&watch, 14 * S).len(), 1);
+        assert_eq!(watch.no_frame(14 * S), None, "the other camera has frames");
     }
 
     #[test]
     fn a_gap_in_what_a_detector_tells_begins_no_new_time() {
-        let mut searches = Searches::default();
-        searches.searched(0, "main", "down");
+        let mut watch = CameraWatch::default();
+        watch.searched(0, "main", "down");
         for s in [1, 6, 11] {
-            searches.heard(s * S, "main", "down");
-            assert_eq!(told(&searches, s * S).len(), usize::from(s > 2), "{s} s");
-            assert!(told(&searches, (s + 4) * S).is_empty(), "it is not there");
+            watch.heard(s * S, "main", "down");
+            assert_eq!(told(&watch, s * S).len(), usize::from(s > 2), "{s} s");
+            assert!(told(&watch, (s + 4) * S).is_empty(), "it is not there");
         }
     }
 
     #[test]
     fn frames_may_give_the_camera_another_name_than_the_detector_does() {
-        let mut searches = Searches::default();
+        let mut watch = CameraWatch::default();
         for s in 0..30 {
-            searches.heard(s * S, "main", "down");
-            searches.searched(s * S, "main", "front");
-            assert!(told(&searches, s * S).is_empty(), "{s} s");
+            watch.heard(s * S, "main", "down");
+            watch.searched(s * S, "main", "front");
+            assert!(told(&watch, s * S).is_empty(), "{s} s");
         }
     }
 
     #[test]
     fn invented_names_are_bounded() {
-        let mut searches = Searches::default();
+        let mut watch = CameraWatch::default();
         for number in 0..1000 {
-            searches.heard(number, &format!("{number}"), &format!("{number}"));
+            watch.heard(number, &format!("{number}"), &format!("{number}"));
         }
-        assert_eq!(searches.detectors.len(), MAX_DETECTORS);
+        assert_eq!(watch.detectors.len(), MAX_DETECTORS);
         let later_ns = 1000 + NO_FIRST_FRAME_NS;
         for number in 950..1000 {
-            searches.heard(later_ns, &format!("{number}"), &format!("{number}"));
+            watch.heard(later_ns, &format!("{number}"), &format!("{number}"));
         }
-        assert_eq!(searches.warnings(later_ns).count(), MAX_TOLD);
+        assert_eq!(watch.warnings(later_ns).count(), MAX_TOLD);
     }
 }
