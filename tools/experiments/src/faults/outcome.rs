@@ -3,13 +3,12 @@
 use serde::Serialize;
 
 use super::plan::Planned;
+use crate::landing::outcome::MAX_HOP_M;
 
 /// Maximum downward speed of a safe touchdown, in m/s.
 pub const MAX_SINK_M_S: f64 = 0.8;
 /// Maximum horizontal speed of a safe touchdown, in m/s.
 pub const MAX_SLIDE_M_S: f64 = 0.3;
-/// Height over the place of the first touch, in metres, beyond which a vehicle has left the ground again.
-pub const MAX_HOP_M: f64 = 0.15;
 
 /// How it ended.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize)]

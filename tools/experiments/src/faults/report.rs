@@ -3,7 +3,8 @@
 use std::fmt::Write as _;
 
 use super::kind::Kind;
-use super::outcome::{Ending, MAX_HOP_M, MAX_SINK_M_S, MAX_SLIDE_M_S, Outcome};
+use super::outcome::{Ending, MAX_SINK_M_S, MAX_SLIDE_M_S, Outcome};
+use crate::landing::outcome::MAX_HOP_M;
 use crate::landing::report::{csv, json_lines};
 use crate::results::{self, FAULTS_HEADING, FLIGHTS_AS_CSV, FLIGHTS_AS_JSON, Folder, REPORT};
 

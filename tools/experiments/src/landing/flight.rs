@@ -14,7 +14,7 @@ use world::World;
 use world::vehicle::VehicleTruth;
 use world::world::STEP_S;
 
-use super::outcome::{Ending, Outcome};
+use super::outcome::{Ending, MAX_HOP_M, Outcome};
 use super::plan::Planned;
 use super::recording::Recording;
 use super::sim_vision::{Arrival, DETECTOR, SimVision};
@@ -90,6 +90,8 @@ struct LockstepFlight<'a> {
     in_transit: VecDeque<Arrival>,
     start_s: Option<f64>,
     was_in_retry: bool,
+    /// Greatest height over the pad since the last touch, in metres.
+    hop_m: Option<f64>,
     outcome: Outcome,
 }
 
@@ -123,6 +125,7 @@ impl<'a> LockstepFlight<'a> {
             in_transit: VecDeque::new(),
             start_s: None,
             was_in_retry: false,
+            hop_m: None,
             outcome: Outcome::new(planned),
         })
     }
@@ -233,16 +236,21 @@ impl<'a> LockstepFlight<'a> {
             self.outcome.max_tilt_deg = self.outcome.max_tilt_deg.max(tilt_deg);
         }
         let since_s = self.world.now_s() - start_s;
-        if now.on_ground && !before.on_ground && self.outcome.touchdown_s.is_none() {
-            let pad = self.world.pad_at(self.world.now_s());
-            let away = now.position - pad.position;
+        let pad = self.world.pad_at(self.world.now_s());
+        let away = now.position - pad.position;
+        // What is less than a hop is the contact of one touchdown.
+        let hop_m = self.hop_m.map(|hop_m| hop_m.max(-away.z()));
+        (self.hop_m, self.outcome.hop_m) = (hop_m, greater(self.outcome.hop_m, hop_m));
+        let is_touch = now.on_ground && !before.on_ground;
+        if is_touch && hop_m.is_none_or(|hop_m| hop_m > MAX_HOP_M) {
+            self.hop_m = Some(0.0);
             let speed = before.velocity - pad.velocity;
             self.outcome.touchdown_s = Some(since_s);
             self.outcome.error_m = Some(away.horizontal_norm());
             self.outcome.error_north_m = Some(away.x());
             self.outcome.error_east_m = Some(away.y());
-            self.outcome.sink_m_s = Some(speed.z());
-            self.outcome.slide_m_s = Some(speed.horizontal_norm());
+            self.outcome.sink_m_s = greater(self.outcome.sink_m_s, Some(speed.z()));
+            self.outcome.slide_m_s = greater(self.outcome.slide_m_s, Some(speed.horizontal_norm()));
             self.outcome.touch_tilt_deg = Some(before.tilt_rad().to_degrees());
         }
         let pilot = self.world.autopilot();
@@ -293,6 +301,11 @@ impl<'a> LockstepFlight<'a> {
             _ => Ending::Unfinished,
         };
     }
+}
+
+/// The greater one of those that are there.
+fn greater(before: Option<f64>, value: Option<f64>) -> Option<f64> {
+    value.map_or(before, |value| Some(before.map_or(value, |before| before.max(value))))
 }
 
 fn stamp_ns(time_s: f64) -> i64 {

@@ -15,6 +15,8 @@ pub const TILTED_DEG: f64 = 10.0;
 pub const CRASH_SINK_M_S: f64 = 0.8;
 /// Horizontal speed at touchdown above which the vehicle may tip over, in m/s.
 pub const CRASH_SLIDE_M_S: f64 = 0.5;
+/// Height after a touch, in metres, beyond which a vehicle has left the ground again.
+pub const MAX_HOP_M: f64 = 0.15;
 
 /// How it ended.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize)]
@@ -55,23 +57,25 @@ pub struct Outcome {
     pub phase: messages::Phase,
     /// Its last reason.
     pub why: String,
-    /// Horizontal distance from the pad at the touch, in metres.
+    /// Horizontal distance from the pad at the touch, in metres; of several, at the last.
     pub error_m: Option<f64>,
     /// Its north component.
     pub error_north_m: Option<f64>,
     /// Its east component.
     pub error_east_m: Option<f64>,
-    /// Downward speed at touchdown, relative to the pad, in m/s.
+    /// Downward speed at touchdown, relative to the pad, in m/s; of several, the greatest.
     pub sink_m_s: Option<f64>,
-    /// Horizontal speed at touchdown, relative to the pad, in m/s.
+    /// Horizontal speed at touchdown, relative to the pad, in m/s; of several, the greatest.
     pub slide_m_s: Option<f64>,
+    /// Greatest height over the pad after a touch, in metres.
+    pub hop_m: Option<f64>,
     /// Tilt at touchdown, in degrees.
     pub touch_tilt_deg: Option<f64>,
     /// Maximum tilt during the landing, in degrees.
     pub max_tilt_deg: f64,
     /// Time until LAND.
     pub land_s: Option<f64>,
-    /// Time until touchdown.
+    /// Time until touchdown; of several, the last.
     pub touchdown_s: Option<f64>,
     /// Time until disarmed.
     pub disarm_s: Option<f64>,
@@ -104,6 +108,7 @@ impl Outcome {
             error_east_m: None,
             sink_m_s: None,
             slide_m_s: None,
+            hop_m: None,
             touch_tilt_deg: None,
             max_tilt_deg: 0.0,
             land_s: None,
@@ -127,6 +132,11 @@ impl Outcome {
             && (beyond(self.error_m, Touchdown::MAX_ERROR_M)
                 || beyond(self.sink_m_s, CRASH_SINK_M_S)
                 || beyond(self.slide_m_s, CRASH_SLIDE_M_S))
+    }
+
+    /// Whether it left the ground again after a touch.
+    pub fn has_left_ground(&self) -> bool {
+        self.hop_m.is_some_and(|hop_m| hop_m > MAX_HOP_M)
     }
 
     /// Whether it is unsafe, inaccurate, unfinished or aborted.

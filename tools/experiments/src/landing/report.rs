@@ -10,7 +10,7 @@ use serde::Serialize;
 use serde_json::Value;
 
 use super::flight::{fly, fly_recorded};
-use super::outcome::{Ending, Outcome};
+use super::outcome::{Ending, MAX_HOP_M, Outcome};
 use super::plan::{Planned, Request};
 use super::table::{markdown, share_interval};
 use super::{in_parallel_until, plots, thesis_figures};
@@ -61,8 +61,9 @@ fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
     let within = outcomes.iter().filter(|o| o.is_within(0.1)).count();
     let [low, high] = share_interval(within, outcomes.len());
     let dangerous = outcomes.iter().filter(|o| o.is_unsafe()).count();
+    let again = outcomes.iter().filter(|o| o.has_left_ground()).count();
     format!(
-        "{LANDINGS_HEADING}\n{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe.\n\n\
+        "{LANDINGS_HEADING}\n{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe, {again} left the ground again after a touch (by more than {MAX_HOP_M} m).\n\n\
          Unsafe: touched down, without having given up, more than 0.3 m off, faster than 0.8 m/s down or 0.5 m/s sideways. Times count from the start of the landing. \
          Numbers of error, time, speed and tilt are of those that landed.\n\n",
         results::interrupted(outcomes.len(), planned),
