@@ -50,14 +50,12 @@ impl Alarms {
     /// The most severe alarm that is to be raised now.
     pub fn tick(&mut self, now_ns: i64, battery: Option<&Battery>) -> Option<Alarm> {
         let s = &self.settings;
-        let is_below = |charge: f64, volts: f64| {
-            battery.is_some_and(|b| {
-                b.remaining.is_some_and(|left| left < charge)
-                    || b.voltage_v.is_some_and(|v| v > 0.0 && v < volts)
-            })
+        let is_at = |charge: f64, volts: f64| {
+            battery
+                .is_some_and(|it| charge_at(it, charge).is_some() || volts_at(it, volts).is_some())
         };
-        let low = is_below(s.battery_low, s.battery_low_v);
-        let critical = is_below(s.battery_critical, s.battery_critical_v);
+        let low = is_at(s.battery_low, s.battery_low_v);
+        let critical = is_at(s.battery_critical, s.battery_critical_v);
         since(&mut self.low_since_ns, low, now_ns);
         since(&mut self.critical_since_ns, critical, now_ns);
         let lasts = |from: Option<i64>, limit_s: f64| {
@@ -85,21 +83,27 @@ impl Alarms {
 /// waits, as the voltage drops in a climb; before it motors take nothing.
 pub fn too_empty(settings: &AlarmSettings, battery: &Battery) -> Option<String> {
     let AlarmSettings { battery_critical, battery_critical_v, .. } = *settings;
-    let volts = battery.voltage_v.filter(|volts| *volts > 0.0);
-    if let Some(volts) =
-        volts.filter(|volts| battery_critical_v > 0.0 && *volts <= battery_critical_v)
-    {
+    if let Some(volts) = volts_at(battery, battery_critical_v) {
         return Some(format!(
             "no takeoff: the battery has {volts:.1} V, and is critical at {battery_critical_v} V and below (`alarms.battery_critical_v`); charge it, or correct the limit, and start the controller again"
         ));
     }
-    let charge =
-        battery.remaining.filter(|it| battery_critical > 0.0 && *it <= battery_critical)?;
+    let charge = charge_at(battery, battery_critical)?;
     Some(format!(
         "no takeoff: the battery has {:.0} % of its charge, and is critical at {:.0} % and below (`alarms.battery_critical`); charge it, or correct the limit, and start the controller again",
         100.0 * charge,
         100.0 * battery_critical
     ))
+}
+
+/// The charge, where it is at a limit or below; a limit of 0 is none.
+fn charge_at(battery: &Battery, limit: f64) -> Option<f64> {
+    battery.remaining.filter(|charge| limit > 0.0 && *charge <= limit)
+}
+
+/// The same of the voltage in V; an autopilot without a sensor says 0 V.
+fn volts_at(battery: &Battery, limit_v: f64) -> Option<f64> {
+    battery.voltage_v.filter(|volts| *volts > 0.0 && *volts <= limit_v)
 }
 
 /// Keeps since when a condition has held.
@@ -146,7 +150,8 @@ mod tests {
         }
         assert_eq!(raised, [(23, Alarm::BatteryLow), (33, Alarm::BatteryCritical)]);
         alarms.begin();
-        let again = alarms.tick(60 * SECOND, Some(&battery(0.15, 12.0)));
+        // At the limit, and no more than once.
+        let again = alarms.tick(60 * SECOND, Some(&battery(0.2, 12.0)));
         assert_eq!(again, Some(Alarm::BatteryLow), "of the next landing");
     }
 
@@ -183,7 +188,6 @@ mod tests {
         assert!(told.contains("10.5 V") && told.contains("battery_critical_v"), "{told}");
         let told = why(battery(0.1, 12.0)).unwrap();
         assert!(told.contains("10 %") && told.contains("`alarms.battery_critical`"), "{told}");
-        // An autopilot without a sensor says 0 V; and a limit of 0 is none.
         assert_eq!(why(battery(0.5, 0.0)), None);
         let off = AlarmSettings { battery_critical: 0.0, battery_critical_v: 0.0, ..settings };
         assert_eq!(too_empty(&off, &battery(0.0, 1.0)), None);

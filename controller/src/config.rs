@@ -84,13 +84,13 @@ pub enum LandingTargetSource {
 #[derive(Copy, Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct AlarmSettings {
-    /// Charge below which the battery is low, from 0 to 1.
+    /// Charge at or below which the battery is low, from 0 to 1.
     pub battery_low: f64,
-    /// Charge below which the battery is critical, from 0 to 1.
+    /// Charge at or below which the battery is critical, from 0 to 1.
     pub battery_critical: f64,
-    /// Voltage below which the battery is low, in V.
+    /// Voltage at or below which the battery is low, in V.
     pub battery_low_v: f64,
-    /// Voltage below which the battery is critical, in V.
+    /// Voltage at or below which the battery is critical, in V.
     pub battery_critical_v: f64,
     /// Time for which the battery must be below a limit, in seconds.
     pub battery_s: f64,
