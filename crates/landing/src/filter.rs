@@ -52,6 +52,9 @@ const MAX_NOISE_SCALE: f64 = 30.0;
 const WANDER_M: f64 = 0.02;
 const WANDER_M_S: f64 = 0.5;
 const MAX_WANDER_S: f64 = 0.3;
+/// How far its height may have wandered per second, in m/s. More is a wrong stamp in a descent: taken for a height, it makes the pad
+/// sink or rise.
+const HEIGHT_WANDER_M_S: f64 = 0.2;
 /// How far its roll and pitch may have wandered, in radians: at once, and per second. By 0.01 rad they err where the velocity errs by
 /// 0.3 m/s for seconds, as that of PX4 does in its own simulation. A pad that does not move seems displaced by as much for each metre
 /// of range.
@@ -187,7 +190,10 @@ impl State {
         let lever_m = if config.pad_speed_m_s > 0.0 { 0.0 } else { measurement.range_m };
         let wander_m =
             WANDER_M + WANDER_M_S * wander_s + lever_m * (WANDER_RAD + WANDER_RAD_S * wander_s);
-        let is_near = self.innovation(measurement).norm() <= wander_m;
+        let innovation = self.innovation(measurement);
+        let height_noise_m = fmax(measurement.noise[(2, 2)], 0.0).sqrt();
+        let height_wander_m = WANDER_M + HEIGHT_WANDER_M_S * wander_s + height_noise_m;
+        let is_near = innovation.norm() <= wander_m && innovation.z.abs() <= height_wander_m;
         if !(nis > config.gate && nis.is_finite() && is_near) {
             return Fit { nis, is_inlier: is_inlier(nis) };
         }

@@ -335,6 +335,25 @@ fn a_position_that_wanders_low_over_the_pad_is_followed() {
 }
 
 #[test]
+fn a_height_that_jumps_is_no_pad_that_sinks() {
+    // As of a descending vehicle's frames whose stamps are too old by several hundredths of a second.
+    let mut scene = Scene::new(EstimatorConfig::default(), 5);
+    scene.noise_m = [0.001; 3];
+    let home = scene.pad;
+    for _ in 0..290 {
+        scene.advance(0.07);
+        assert_eq!(scene.see(0.03), Ok(()));
+    }
+    for wrong_m in [0.06, 0.12] {
+        scene.advance(0.07);
+        scene.pad = home + Vector::new(0.0, 0.0, wrong_m);
+        assert_eq!(scene.see(0.03), Err(Rejection::Outlier), "{wrong_m} m");
+    }
+    let down_m_s = scene.estimate().velocity.z();
+    assert!(down_m_s.abs() < 0.05, "{down_m_s} m/s");
+}
+
+#[test]
 fn a_pad_far_below_is_followed_while_the_tilt_wanders() {
     // As of an autopilot whose velocity errs by 0.3 m/s; far up the detector finds the marker now and then only.
     let fly = |tilt_rad: f64, decoy_m: f64| {
