@@ -22,8 +22,10 @@ use crate::time::Timestamp;
 /// Maximum speed of a vehicle that stands, in m/s.
 pub(crate) const MAX_STANDING_M_S: f64 = 0.2;
 /// Maximum height over the one it stands with, in metres, distance from the pad, and standard deviation of that, in metres,
-/// at which a still vehicle may stand on the pad. From there LAND is safe if it does not.
+/// at which a still vehicle may stand on the pad. From there LAND is safe if it does not. The height of a vehicle whose states came
+/// without a gap: that it stands would have shown, and in wind LAND is led by a velocity that may err.
 const MAX_STANDING_M: f64 = 0.3;
+const MAX_STEERED_STANDING_M: f64 = 0.15;
 const MAX_STANDING_ASIDE_M: f64 = 0.3;
 const MAX_STANDING_DEVIATION_M: f64 = 0.2;
 /// How much more height per second since the newest detection: the autopilot's height drifts, in m/s.
@@ -143,7 +145,7 @@ impl Resumed {
         };
         let is_beside = below.lateral_m <= MAX_BESIDE_M
             && below.height_m >= -MAX_STILL_HEIGHT_M
-            && is_low(config, &below);
+            && is_low(config, &below, MAX_STANDING_M);
         is_right_over(situation, config, &below) || is_still && is_beside
     }
 }
@@ -157,8 +159,7 @@ struct Below {
     velocity: Vector<Ned>,
 }
 
-/// True when the vehicle is still and the pad is known to be right below it: it may have touched down while nothing arrived
-/// from it.
+/// True when the vehicle is still and the pad is known to be right below it: it may have touched down.
 pub(crate) fn may_stand(situation: &Situation<'_>, config: &Config) -> bool {
     let Some(target) = situation.target else { return false };
     let below = Below {
@@ -168,7 +169,9 @@ pub(crate) fn may_stand(situation: &Situation<'_>, config: &Config) -> bool {
         age_s: target.age_s,
         velocity: target.velocity,
     };
-    !target.ambiguous && is_right_over(situation, config, &below)
+    !target.ambiguous
+        && is_low(config, &below, MAX_STEERED_STANDING_M)
+        && is_right_over(situation, config, &below)
 }
 
 /// The pad's place, for a lander that has to take over; `None` where it is not known well.
@@ -188,11 +191,11 @@ fn is_right_over(situation: &Situation<'_>, config: &Config, below: &Below) -> b
     let is_still = (situation.vehicle.velocity - below.velocity).norm() <= max_m_s;
     let is_over_pad =
         below.lateral_m <= MAX_STANDING_ASIDE_M && below.deviation_m <= MAX_STANDING_DEVIATION_M;
-    is_recent(situation, config) && is_still && is_low(config, below) && is_over_pad
+    is_recent(situation, config) && is_still && is_low(config, below, MAX_STANDING_M) && is_over_pad
 }
 
-fn is_low(config: &Config, below: &Below) -> bool {
-    let max_m = MAX_STANDING_M + STANDING_DRIFT_M_S * below.age_s;
+fn is_low(config: &Config, below: &Below, max_m: f64) -> bool {
+    let max_m = max_m + STANDING_DRIFT_M_S * below.age_s;
     below.height_m - standing_height_m(config) <= max_m
 }
 

@@ -94,10 +94,15 @@ fn no_fault_leads_to_an_unsafe_touchdown() {
 
 /// The flights of these seeds in wind of 4 m/s, from 10 m, as `alight experiment landing` flies them.
 fn with_fault(fault: &str, seeds: &[u64]) -> Vec<(Planned, Outcome)> {
+    let wind = Values::List(vec![4.0]);
+    fly_seeds(Plan { wind, ..Plan::default() }, fault, seeds)
+}
+
+/// Those of a plan.
+fn fly_seeds(plan: Plan, fault: &str, seeds: &[u64]) -> Vec<(Planned, Outcome)> {
     let flights = seeds.iter().flat_map(|seed| {
         let faults = vec![fault.parse().unwrap_or(Fault::NONE)];
-        let wind = Values::List(vec![4.0]);
-        Plan { faults, wind, flights: 1, seed: *seed, ..Plan::default() }.flights()
+        Plan { faults, flights: 1, seed: *seed, ..plan.clone() }.flights()
     });
     let flights = flights.collect::<Vec<_>>();
     let outcomes = fly_all(&flights);
@@ -119,6 +124,30 @@ fn a_gust_close_to_the_ground_does_not_cause_a_sliding_touchdown() {
     for (planned, outcome) in with_fault("gust", &[26, 64, 68, 74, 92, 129]) {
         let is_slow = outcome.slide_m_s.is_some_and(|slide| slide < 0.4);
         expect(&planned, &outcome, outcome.is_within(0.3) && is_slow);
+    }
+}
+
+#[test]
+fn a_vehicle_that_has_touched_down_does_not_leave_the_ground_again() {
+    // On these seeds the estimate became too unsure, ambiguous or false just before the contact or soon after it.
+    let plan = || Plan {
+        wind: Values::Range(0.0, 9.0),
+        turbulence: Values::Range(0.0, 3.0),
+        height: Values::Range(2.0, 30.0),
+        ..Plan::default()
+    };
+    let wandering =
+        [120_002, 120_008, 120_061, 120_076, 120_091, 120_137, 120_175, 120_241, 150_089];
+    let confused = [120_006, 120_020, 120_026, 120_043];
+    let jumping = [120_148, 120_166, 120_218];
+    for (fault, seeds) in [
+        ("velocity-wander", &wandering[..]),
+        ("wrong-marker", &confused),
+        ("stamp-jumps", &jumping),
+    ] {
+        for (planned, outcome) in fly_seeds(plan(), fault, seeds) {
+            expect(&planned, &outcome, !outcome.has_left_ground() && outcome.is_within(0.3));
+        }
     }
 }
 

@@ -106,6 +106,12 @@ const TOUCHING_S: f64 = 0.25;
 /// Maximum climb speed of a vehicle that may stand, in m/s: the reported one errs.
 const MAX_RISING_M_S: f64 = 0.1;
 
+/// Height below which a descent is no slower than what shows whether the vehicle stands, in metres.
+const PUSHING_HEIGHT_M: f64 = 0.1;
+/// Time within which a vehicle that sinks stops when it touches the ground, in seconds: states arrive ten times a second or
+/// more often.
+const CONTACT_S: f64 = 0.3;
+
 /// Height below which the rest of the descent takes less time than another try, in metres, and the factor by
 /// which the allowed deviation grows there.
 const NEAR_M: f64 = 0.3;
@@ -133,13 +139,17 @@ pub struct Metric {
     observer: Option<Observer>,
     waiting_since: Option<Timestamp>,
     standing_since: Option<Timestamp>,
+    /// When it was last so low and sank so fast that it reaches the ground whatever is commanded.
+    bound_to_touch_at: Option<Timestamp>,
 }
 
 impl Guidance for Metric {
-    /// True when the target is recent, or low below and well known, and no other place may be the pad.
+    /// True when the target is recent, or low below and well known, and no other place may be the pad; or when the vehicle
+    /// touches down in any case.
     fn may_descend(&self, situation: &Situation<'_>) -> bool {
         let is_ambiguous = situation.target.is_some_and(|target| target.ambiguous);
-        situation.level_because.is_none() && !is_ambiguous && self.knows_target(situation)
+        let is_sure = !is_ambiguous && self.knows_target(situation);
+        situation.level_because.is_none() && (is_sure || self.touches_down(situation))
     }
 
     fn has_target(&self, situation: &Situation<'_>) -> bool {
@@ -182,8 +192,8 @@ impl Guidance for Metric {
                 Reason::LowAndUnseen
             });
         }
-        let waited_s = self.waited_s(situation);
-        if waited_s > 2.0 * self.config.settle_s && (error >= 1.0 || is_hasty) {
+        let waits_in_vain = self.waited_s(situation) > 2.0 * self.config.settle_s;
+        if waits_in_vain && (error >= 1.0 || is_hasty) && !self.touches_down(situation) {
             return Progress::Stuck;
         }
         match (is_visible, error) {
@@ -203,12 +213,14 @@ impl Guidance for Metric {
         let (mut lateral, (mut descent_m_s, why)) =
             (self.lateral(&observer, situation, &target), self.descent(situation, &target));
         // A vehicle that is out of its funnel is to climb, also from the ground.
-        if descent_m_s >= 0.0
-            && let Some(touching_s) = self.touching_s(situation, &target)
-        {
+        if descent_m_s >= 0.0 {
+            let touching_s = self.touching_s(situation, &target);
+            let is_low = descent_m_s > 0.0 && self.height_m(&target) <= PUSHING_HEIGHT_M;
             // Whether it stands shows while it is pushed down.
-            descent_m_s = fmax(descent_m_s, 2.0 * PUSHING_M_S);
-            if touching_s >= TOUCHING_S {
+            if is_low || touching_s.is_some() || self.touches_down(situation) {
+                descent_m_s = fmax(descent_m_s, 2.0 * PUSHING_M_S);
+            }
+            if touching_s.is_some_and(|touching_s| touching_s >= TOUCHING_S) {
                 // The velocity that the autopilot reports of a vehicle that stands.
                 lateral = horizontal(target.velocity) - observer.bias;
                 observer.path = Path::new(lateral);
@@ -251,13 +263,20 @@ impl Guidance for Metric {
         self.observer = None;
         self.waiting_since = None;
         self.standing_since = None;
+        self.bound_to_touch_at = None;
     }
 }
 
 impl Metric {
     /// A guidance without memory.
     pub fn new(config: MetricConfig) -> Self {
-        Self { config, observer: None, waiting_since: None, standing_since: None }
+        Self {
+            config,
+            observer: None,
+            waiting_since: None,
+            standing_since: None,
+            bound_to_touch_at: None,
+        }
     }
 
     fn knows_target(&self, situation: &Situation<'_>) -> bool {
@@ -371,7 +390,8 @@ impl Metric {
         self.closing(situation, target).norm() / (fmin(max_m_s, MAX_TOUCHDOWN_M_S) * share)
     }
 
-    /// Notes since when the vehicle is low, and since when it stands still although commanded down.
+    /// Notes since when the vehicle is low, since when it stands still although commanded down, and whether it is bound to
+    /// touch the ground.
     fn note_waiting(&mut self, situation: &Situation<'_>, target: &TargetEstimate) {
         let height_m = self.height_m(target);
         if height_m <= LOW_M {
@@ -388,12 +408,33 @@ impl Metric {
         } else {
             self.standing_since = None;
         }
+        if self.is_bound_to_touch(situation, target) {
+            self.bound_to_touch_at = Some(situation.now);
+        }
+    }
+
+    /// True when the vehicle reaches the ground before a climb that is commanded now would stop it.
+    fn is_bound_to_touch(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {
+        let height_m = self.height_m(target);
+        let sinking_m_s = situation.vehicle.velocity.z() - target.velocity.z();
+        let lag_s = self.config.descend_lag_s + extra_delay_s(situation);
+        let stopping_m = sinking_m_s * lag_s
+            + squared(sinking_m_s) / (2.0 * situation.limits.vertical_acceleration_m_s2);
+        sinking_m_s >= PUSHING_M_S && height_m <= fmin(stopping_m, NEAR_M)
+    }
+
+    /// True when the vehicle is bound to touch the ground, or was and has stopped there. What is seen, or not seen any more, is
+    /// then no reason to climb: that would be from the ground, and the estimate of a vehicle that stands drifts.
+    fn touches_down(&self, situation: &Situation<'_>) -> bool {
+        let stopped = self.standing_since.unwrap_or(situation.now);
+        situation.target.is_some_and(|it| self.height_m(&it) <= NEAR_M && !rises(situation, &it))
+            && self.bound_to_touch_at.is_some_and(|at| stopped.seconds_since(at) <= CONTACT_S)
     }
 
     /// For how long a vehicle near the ground has not sunk although it is commanded down; `None` if it sinks, or rises as in a gust.
     fn touching_s(&self, situation: &Situation<'_>, target: &TargetEstimate) -> Option<f64> {
-        let rises = target.velocity.z() - situation.vehicle.velocity.z() > MAX_RISING_M_S;
-        let since = self.standing_since.filter(|_| self.height_m(target) <= NEAR_M && !rises)?;
+        let may_stand = self.height_m(target) <= NEAR_M && !rises(situation, target);
+        let since = self.standing_since.filter(|_| may_stand)?;
         Some(situation.now.seconds_since(since))
     }
 
@@ -443,10 +484,11 @@ impl Metric {
     /// Speed towards the pad, and why.
     fn descent(&self, situation: &Situation<'_>, target: &TargetEstimate) -> (f64, Reason) {
         let config = &self.config;
-        if target.ambiguous {
+        let touches_down = self.touches_down(situation);
+        if target.ambiguous && !touches_down {
             return (0.0, Reason::Ambiguous);
         }
-        if !self.knows_target(situation) {
+        if !self.knows_target(situation) && !touches_down {
             return (0.0, Reason::TargetAging);
         }
         let error = self.funnel_error(situation, target);
@@ -465,7 +507,8 @@ impl Metric {
         } else {
             Reason::DescendingUnseen
         };
-        if error > FUNNEL_HYSTERESIS && height_m < LOW_M {
+        let has_touched = touches_down && self.standing_since.is_some();
+        if error > FUNNEL_HYSTERESIS && height_m < LOW_M && !has_touched {
             // Tilting against a gust costs height, and the vehicle must not touch down sliding.
             return (-fmin(ROOM_GAIN * (LOW_M - height_m), ROOM_M_S), Reason::Settling);
         }
@@ -512,6 +555,11 @@ impl Metric {
         }
         ((stale_s - situation.age_s) / (stale_s - fresh_s)).clamp(0.0, 1.0)
     }
+}
+
+/// True when the vehicle rises as in a gust.
+fn rises(situation: &Situation<'_>, target: &TargetEstimate) -> bool {
+    target.velocity.z() - situation.vehicle.velocity.z() > MAX_RISING_M_S
 }
 
 /// The part of the link's delay that `dead_time_s` does not contain, in seconds.

@@ -165,6 +165,67 @@ fn a_vehicle_that_stands_is_pushed_down_and_not_steered_whatever_it_says_of_its_
     assert!(stands.is_some_and(|s| s < 0.5), "{stands:?} s");
 }
 
+/// The least speed down, in m/s, that is asked from 0.2 m down to the ground and for 0.6 s there, of a vehicle that sinks at
+/// 0.5 m/s while the estimate of its pad changes by the time in seconds; and whether it is known to stand at the end.
+fn touched(change: impl Fn(f64, &mut TargetEstimate)) -> (f64, bool) {
+    let mut metric = Metric::new(MetricConfig::default());
+    let (mut down_m_s, mut stands) = (f64::INFINITY, false);
+    for i in 0..64u32 {
+        // On the ground from 1 s on.
+        let s = f64::from(i) / 40.0;
+        let (height_m, sinking_m_s) = if s < 1.0 { (0.5 - 0.5 * s, 0.5) } else { (0.0, 0.0) };
+        let vehicle =
+            vehicle(s, Point::new(0.0, 0.0, -height_m), Vector::new(0.0, 0.0, sinking_m_s));
+        let mut situation = situation(&vehicle);
+        situation.target.as_mut().into_iter().for_each(|target| change(s, target));
+        situation.age_s = situation.target.unwrap().age_s;
+        stands = matches!(metric.progress(&situation), Progress::Ready(Reason::TouchedEarly));
+        let (setpoint, _) = metric.velocity(&situation);
+        if height_m <= 0.2 {
+            assert!(metric.may_descend(&situation), "{s}");
+            down_m_s = down_m_s.min(setpoint.z());
+        }
+    }
+    (down_m_s, stands)
+}
+
+#[test]
+fn nothing_that_the_estimate_becomes_lifts_a_vehicle_that_touches_down() {
+    let low = |s: f64| s > 0.7;
+    let unsure = touched(|s, target| {
+        (target.age_s, target.deviation_m) = (s, if low(s) { 0.3 } else { 0.03 });
+    });
+    let ambiguous = touched(|s, target| target.ambiguous = low(s));
+    let old = touched(|s, target| target.age_s = if low(s) { 10.0 } else { s });
+    let aside = touched(|s, target| {
+        target.position = Point::new(if s > 1.1 { 0.3 } else { 0.0 }, 0.0, 0.0);
+    });
+    for (name, (down_m_s, stands)) in
+        [("unsure", unsure), ("ambiguous", ambiguous), ("old", old), ("aside", aside)]
+    {
+        assert!(stands && down_m_s >= 2.0 * PUSHING_M_S - 1e-9, "{name}: {down_m_s} m/s, {stands}");
+    }
+}
+
+#[test]
+fn a_gentle_descent_ends_with_a_push_that_shows_whether_the_vehicle_stands() {
+    let mut metric = Metric::new(MetricConfig::default());
+    let mut stands = None;
+    for i in 0..120u32 {
+        // It stands from 0.75 s on, nearly out of its funnel, where a descent is slow.
+        let s = f64::from(i) / 40.0;
+        let (height_m, sinking_m_s) = if s < 0.75 { (0.1 - 0.08 * s, 0.08) } else { (0.04, 0.0) };
+        let vehicle =
+            vehicle(s, Point::new(0.1, 0.0, -height_m), Vector::new(0.0, 0.0, sinking_m_s));
+        let situation = situation(&vehicle);
+        if matches!(metric.progress(&situation), Progress::Ready(Reason::TouchedEarly)) {
+            stands.get_or_insert(s - 0.75);
+        }
+        let _ = metric.velocity(&situation);
+    }
+    assert!(stands.is_some_and(|s| s > 0.3 && s < 0.6), "{stands:?} s");
+}
+
 #[test]
 fn a_gust_that_lifts_a_vehicle_near_the_ground_leaves_it_steered_and_free_to_climb() {
     let mut metric = Metric::new(MetricConfig::default());
