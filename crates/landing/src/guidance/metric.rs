@@ -413,21 +413,23 @@ impl Metric {
         }
     }
 
-    /// True when the vehicle reaches the ground before a climb that is commanded now would stop it.
+    /// True when the vehicle reaches the ground before a climb that is commanded now would stop it; not where it has sunk so far
+    /// below the ground that the height must be wrong.
     fn is_bound_to_touch(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {
         let height_m = self.height_m(target);
         let sinking_m_s = situation.vehicle.velocity.z() - target.velocity.z();
         let lag_s = self.config.descend_lag_s + extra_delay_s(situation);
         let stopping_m = sinking_m_s * lag_s
             + squared(sinking_m_s) / (2.0 * situation.limits.vertical_acceleration_m_s2);
-        sinking_m_s >= PUSHING_M_S && height_m <= fmin(stopping_m, NEAR_M)
+        sinking_m_s >= PUSHING_M_S && height_m <= stopping_m && height_m.abs() <= NEAR_M
     }
 
     /// True when the vehicle is bound to touch the ground, or was and has stopped there. What is seen, or not seen any more, is
     /// then no reason to climb: that would be from the ground, and the estimate of a vehicle that stands drifts.
     fn touches_down(&self, situation: &Situation<'_>) -> bool {
         let stopped = self.standing_since.unwrap_or(situation.now);
-        situation.target.is_some_and(|it| self.height_m(&it) <= NEAR_M && !rises(situation, &it))
+        let is_near = |it: &TargetEstimate| self.height_m(it).abs() <= NEAR_M;
+        situation.target.is_some_and(|it| is_near(&it) && !rises(situation, &it))
             && self.bound_to_touch_at.is_some_and(|at| stopped.seconds_since(at) <= CONTACT_S)
     }
 

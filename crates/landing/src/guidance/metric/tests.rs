@@ -208,6 +208,24 @@ fn nothing_that_the_estimate_becomes_lifts_a_vehicle_that_touches_down() {
 }
 
 #[test]
+fn a_height_that_is_wrong_ends_the_descent_of_a_vehicle_that_was_to_touch_down() {
+    let mut metric = Metric::new(MetricConfig::default());
+    for i in 0..80u32 {
+        // The ground is lower than the estimate says, and the pad was not seen for long.
+        let s = f64::from(i) / 40.0;
+        let height_m = 0.5 - 0.5 * s;
+        let vehicle = vehicle(s, Point::new(0.0, 0.0, -height_m), Vector::new(0.0, 0.0, 0.5));
+        let mut situation = situation(&vehicle);
+        situation.age_s = if height_m < 0.2 { 10.0 } else { 0.05 };
+        let (setpoint, _) = metric.velocity(&situation);
+        let descends = metric.may_descend(&situation) && setpoint.z() > 0.0;
+        if (height_m + NEAR_M).abs() > 0.01 {
+            assert_eq!(descends, height_m > -NEAR_M, "{height_m} m: {setpoint:?}");
+        }
+    }
+}
+
+#[test]
 fn a_gentle_descent_ends_with_a_push_that_shows_whether_the_vehicle_stands() {
     let mut metric = Metric::new(MetricConfig::default());
     let mut stands = None;
