@@ -192,7 +192,12 @@ impl State {
             WANDER_M + WANDER_M_S * wander_s + lever_m * (WANDER_RAD + WANDER_RAD_S * wander_s);
         let innovation = self.innovation(measurement);
         let height_noise_m = fmax(measurement.noise[(2, 2)], 0.0).sqrt();
-        let height_wander_m = WANDER_M + HEIGHT_WANDER_M_S * wander_s + height_noise_m;
+        // A tilt lifts what is seen aside.
+        let aside_m = if lever_m > 0.0 { measurement.tilt.row(2).norm() } else { 0.0 };
+        let height_wander_m = WANDER_M
+            + (HEIGHT_WANDER_M_S + config.pad_heave_m_s) * wander_s
+            + aside_m * (WANDER_RAD + WANDER_RAD_S * wander_s)
+            + height_noise_m;
         let is_near = innovation.norm() <= wander_m && innovation.z.abs() <= height_wander_m;
         if !(nis > config.gate && nis.is_finite() && is_near) {
             return Fit { nis, is_inlier: is_inlier(nis) };

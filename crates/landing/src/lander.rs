@@ -449,7 +449,8 @@ impl Lander {
         self.history.newest().is_some_and(|vehicle| {
             let situation = self.situation(now, vehicle);
             let resumed = self.resumed;
-            may_stand(&situation, &self.config)
+            let is_steered = matches!(self.state_machine.phase(), Phase::Approach | Phase::Descend);
+            may_stand(&situation, &self.config, is_steered)
                 || resumed.is_some_and(|resumed| resumed.may_stand(&situation, &self.config))
         })
     }

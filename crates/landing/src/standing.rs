@@ -22,8 +22,8 @@ use crate::time::Timestamp;
 /// Maximum speed of a vehicle that stands, in m/s.
 pub(crate) const MAX_STANDING_M_S: f64 = 0.2;
 /// Maximum height over the one it stands with, in metres, distance from the pad, and standard deviation of that, in metres,
-/// at which a still vehicle may stand on the pad. From there LAND is safe if it does not. The height of a vehicle whose states came
-/// without a gap: that it stands would have shown, and in wind LAND is led by a velocity that may err.
+/// at which a still vehicle may stand on the pad. From there LAND is safe if it does not. The height of a vehicle that the guidance
+/// steers, which notices a touchdown by itself, is less: in wind LAND is led by a velocity that may err.
 const MAX_STANDING_M: f64 = 0.3;
 const MAX_STEERED_STANDING_M: f64 = 0.15;
 const MAX_STANDING_ASIDE_M: f64 = 0.3;
@@ -146,7 +146,7 @@ impl Resumed {
         let is_beside = below.lateral_m <= MAX_BESIDE_M
             && below.height_m >= -MAX_STILL_HEIGHT_M
             && is_low(config, &below, MAX_STANDING_M);
-        is_right_over(situation, config, &below) || is_still && is_beside
+        is_right_over(situation, config, &below, MAX_STANDING_M) || is_still && is_beside
     }
 }
 
@@ -160,7 +160,7 @@ struct Below {
 }
 
 /// True when the vehicle is still and the pad is known to be right below it: it may have touched down.
-pub(crate) fn may_stand(situation: &Situation<'_>, config: &Config) -> bool {
+pub(crate) fn may_stand(situation: &Situation<'_>, config: &Config, is_steered: bool) -> bool {
     let Some(target) = situation.target else { return false };
     let below = Below {
         height_m: target.height_m,
@@ -169,9 +169,8 @@ pub(crate) fn may_stand(situation: &Situation<'_>, config: &Config) -> bool {
         age_s: target.age_s,
         velocity: target.velocity,
     };
-    !target.ambiguous
-        && is_low(config, &below, MAX_STEERED_STANDING_M)
-        && is_right_over(situation, config, &below)
+    let max_m = if is_steered { MAX_STEERED_STANDING_M } else { MAX_STANDING_M };
+    !target.ambiguous && is_right_over(situation, config, &below, max_m)
 }
 
 /// The pad's place, for a lander that has to take over; `None` where it is not known well.
@@ -186,16 +185,22 @@ pub(crate) fn to_remember(now: Timestamp, target: &TargetEstimate) -> Option<Rem
     })
 }
 
-fn is_right_over(situation: &Situation<'_>, config: &Config, below: &Below) -> bool {
+/// With heights up to `max_height_m`.
+fn is_right_over(
+    situation: &Situation<'_>,
+    config: &Config,
+    below: &Below,
+    max_height_m: f64,
+) -> bool {
     let max_m_s = MAX_STANDING_M_S + situation.pad_heave_m_s;
     let is_still = (situation.vehicle.velocity - below.velocity).norm() <= max_m_s;
     let is_over_pad =
         below.lateral_m <= MAX_STANDING_ASIDE_M && below.deviation_m <= MAX_STANDING_DEVIATION_M;
-    is_recent(situation, config) && is_still && is_low(config, below, MAX_STANDING_M) && is_over_pad
+    is_recent(situation, config) && is_still && is_low(config, below, max_height_m) && is_over_pad
 }
 
-fn is_low(config: &Config, below: &Below, max_m: f64) -> bool {
-    let max_m = max_m + STANDING_DRIFT_M_S * below.age_s;
+fn is_low(config: &Config, below: &Below, max_height_m: f64) -> bool {
+    let max_m = max_height_m + STANDING_DRIFT_M_S * below.age_s;
     below.height_m - standing_height_m(config) <= max_m
 }
 

@@ -98,10 +98,10 @@ fn with_fault(fault: &str, seeds: &[u64]) -> Vec<(Planned, Outcome)> {
     fly_seeds(Plan { wind, ..Plan::default() }, fault, seeds)
 }
 
-/// Those of a plan.
+/// The flights of a plan with these seeds and this fault.
 fn fly_seeds(plan: Plan, fault: &str, seeds: &[u64]) -> Vec<(Planned, Outcome)> {
     let flights = seeds.iter().flat_map(|seed| {
-        let faults = vec![fault.parse().unwrap_or(Fault::NONE)];
+        let faults = fault.parse().into_iter().collect();
         Plan { faults, flights: 1, seed: *seed, ..plan.clone() }.flights()
     });
     let flights = flights.collect::<Vec<_>>();

@@ -108,8 +108,7 @@ const MAX_RISING_M_S: f64 = 0.1;
 
 /// Height below which a descent is no slower than what shows whether the vehicle stands, in metres.
 const PUSHING_HEIGHT_M: f64 = 0.1;
-/// Time within which a vehicle that sinks stops when it touches the ground, in seconds: states arrive ten times a second or
-/// more often.
+/// Maximum time from the state in which a vehicle is bound to touch the ground to one in which it stays there, in seconds.
 const CONTACT_S: f64 = 0.3;
 
 /// Height below which the rest of the descent takes less time than another try, in metres, and the factor by
@@ -139,8 +138,8 @@ pub struct Metric {
     observer: Option<Observer>,
     waiting_since: Option<Timestamp>,
     standing_since: Option<Timestamp>,
-    /// When it was last so low and sank so fast that it reaches the ground whatever is commanded.
-    bound_to_touch_at: Option<Timestamp>,
+    /// When it was last bound to touch the ground, or stayed there since.
+    touching_at: Option<Timestamp>,
 }
 
 impl Guidance for Metric {
@@ -170,7 +169,9 @@ impl Guidance for Metric {
     fn progress(&mut self, situation: &Situation<'_>) -> Progress {
         let Some(target) = situation.target else { return Progress::Unchanged };
         if !self.may_descend(situation) {
-            return Progress::Unchanged;
+            // Also where nothing may descend, a climb would come too late.
+            let touches_down = self.touches_down(situation);
+            return if touches_down { Progress::Blind } else { Progress::Unchanged };
         }
         if self.stands(situation, &target) {
             return Progress::Ready(Reason::TouchedEarly);
@@ -218,7 +219,7 @@ impl Guidance for Metric {
             let is_low = descent_m_s > 0.0 && self.height_m(&target) <= PUSHING_HEIGHT_M;
             // Whether it stands shows while it is pushed down.
             if is_low || touching_s.is_some() || self.touches_down(situation) {
-                descent_m_s = fmax(descent_m_s, 2.0 * PUSHING_M_S);
+                descent_m_s = fmax(descent_m_s, self.push_m_s());
             }
             if touching_s.is_some_and(|touching_s| touching_s >= TOUCHING_S) {
                 // The velocity that the autopilot reports of a vehicle that stands.
@@ -263,7 +264,7 @@ impl Guidance for Metric {
         self.observer = None;
         self.waiting_since = None;
         self.standing_since = None;
-        self.bound_to_touch_at = None;
+        self.touching_at = None;
     }
 }
 
@@ -275,7 +276,7 @@ impl Metric {
             observer: None,
             waiting_since: None,
             standing_since: None,
-            bound_to_touch_at: None,
+            touching_at: None,
         }
     }
 
@@ -399,22 +400,30 @@ impl Metric {
         } else if height_m > LOW_M + LOW_HYSTERESIS_M {
             self.waiting_since = None;
         }
-        let is_pushing = self
-            .observer
-            .is_some_and(|observer| observer.setpoint.z() - target.velocity.z() >= PUSHING_M_S);
         let is_still = situation.vehicle.velocity.z() - target.velocity.z() < 0.3 * PUSHING_M_S;
-        if is_pushing && is_still && height_m <= LOW_M {
+        if self.is_pushed(target) && is_still && height_m <= LOW_M {
             self.standing_since.get_or_insert(situation.now);
         } else {
             self.standing_since = None;
         }
-        if self.is_bound_to_touch(situation, target) {
-            self.bound_to_touch_at = Some(situation.now);
+        if self.is_bound_to_touch(situation, target) || self.has_touched(situation, target) {
+            self.touching_at = Some(situation.now);
         }
     }
 
-    /// True when the vehicle reaches the ground before a climb that is commanded now would stop it; not where it has sunk so far
-    /// below the ground that the height must be wrong.
+    /// The speed down that shows whether a vehicle stands, in m/s: that of the touchdown, within limits.
+    fn push_m_s(&self) -> f64 {
+        self.config.touchdown_descend_m_s.clamp(1.2 * PUSHING_M_S, 2.0 * PUSHING_M_S)
+    }
+
+    /// True when the last setpoint was down, fast enough to show whether the vehicle stands.
+    fn is_pushed(&self, target: &TargetEstimate) -> bool {
+        self.observer
+            .is_some_and(|observer| observer.setpoint.z() - target.velocity.z() >= PUSHING_M_S)
+    }
+
+    /// True when the vehicle is so low that a climb which is commanded now would stop it on the ground or a few centimetres above; not
+    /// where it has sunk so far below the ground that the height must be wrong.
     fn is_bound_to_touch(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {
         let height_m = self.height_m(target);
         let sinking_m_s = situation.vehicle.velocity.z() - target.velocity.z();
@@ -424,13 +433,19 @@ impl Metric {
         sinking_m_s >= PUSHING_M_S && height_m <= stopping_m && height_m.abs() <= NEAR_M
     }
 
-    /// True when the vehicle is bound to touch the ground, or was and has stopped there. What is seen, or not seen any more, is
+    /// True when the vehicle is bound to touch the ground, or was and has stayed there. What is seen, or not seen any more, is
     /// then no reason to climb: that would be from the ground, and the estimate of a vehicle that stands drifts.
     fn touches_down(&self, situation: &Situation<'_>) -> bool {
-        let stopped = self.standing_since.unwrap_or(situation.now);
         let is_near = |it: &TargetEstimate| self.height_m(it).abs() <= NEAR_M;
         situation.target.is_some_and(|it| is_near(&it) && !rises(situation, &it))
-            && self.bound_to_touch_at.is_some_and(|at| stopped.seconds_since(at) <= CONTACT_S)
+            && self.touching_at.is_some_and(|at| situation.now.seconds_since(at) <= CONTACT_S)
+    }
+
+    /// True when it was bound to touch the ground, and does not sink any more though it is pushed down: its speed may err by more than
+    /// counts as standing still.
+    fn has_touched(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {
+        let sinking_m_s = situation.vehicle.velocity.z() - target.velocity.z();
+        self.touches_down(situation) && self.is_pushed(target) && sinking_m_s < PUSHING_M_S
     }
 
     /// For how long a vehicle near the ground has not sunk although it is commanded down; `None` if it sinks, or rises as in a gust.
@@ -509,8 +524,8 @@ impl Metric {
         } else {
             Reason::DescendingUnseen
         };
-        let has_touched = touches_down && self.standing_since.is_some();
-        if error > FUNNEL_HYSTERESIS && height_m < LOW_M && !has_touched {
+        let is_low = height_m < LOW_M && !self.has_touched(situation, target);
+        if error > FUNNEL_HYSTERESIS && is_low {
             // Tilting against a gust costs height, and the vehicle must not touch down sliding.
             return (-fmin(ROOM_GAIN * (LOW_M - height_m), ROOM_M_S), Reason::Settling);
         }

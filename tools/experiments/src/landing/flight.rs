@@ -242,15 +242,17 @@ impl<'a> LockstepFlight<'a> {
         let hop_m = self.hop_m.map(|hop_m| hop_m.max(-away.z()));
         (self.hop_m, self.outcome.hop_m) = (hop_m, greater(self.outcome.hop_m, hop_m));
         let is_touch = now.on_ground && !before.on_ground;
+        if is_touch {
+            let (speed, outcome) = (before.velocity - pad.velocity, &mut self.outcome);
+            outcome.sink_m_s = greater(outcome.sink_m_s, Some(speed.z()));
+            outcome.slide_m_s = greater(outcome.slide_m_s, Some(speed.horizontal_norm()));
+        }
         if is_touch && hop_m.is_none_or(|hop_m| hop_m > MAX_HOP_M) {
             self.hop_m = Some(0.0);
-            let speed = before.velocity - pad.velocity;
             self.outcome.touchdown_s = Some(since_s);
             self.outcome.error_m = Some(away.horizontal_norm());
             self.outcome.error_north_m = Some(away.x());
             self.outcome.error_east_m = Some(away.y());
-            self.outcome.sink_m_s = greater(self.outcome.sink_m_s, Some(speed.z()));
-            self.outcome.slide_m_s = greater(self.outcome.slide_m_s, Some(speed.horizontal_norm()));
             self.outcome.touch_tilt_deg = Some(before.tilt_rad().to_degrees());
         }
         let pilot = self.world.autopilot();

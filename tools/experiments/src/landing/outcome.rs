@@ -69,7 +69,7 @@ pub struct Outcome {
     pub slide_m_s: Option<f64>,
     /// Greatest height over the pad after a touch, in metres.
     pub hop_m: Option<f64>,
-    /// Tilt at touchdown, in degrees.
+    /// Tilt at touchdown, in degrees; of several, at the last.
     pub touch_tilt_deg: Option<f64>,
     /// Maximum tilt during the landing, in degrees.
     pub max_tilt_deg: f64,

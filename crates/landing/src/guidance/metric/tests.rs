@@ -165,15 +165,19 @@ fn a_vehicle_that_stands_is_pushed_down_and_not_steered_whatever_it_says_of_its_
     assert!(stands.is_some_and(|s| s < 0.5), "{stands:?} s");
 }
 
-/// The least speed down, in m/s, that is asked from 0.2 m down to the ground and for 0.6 s there, of a vehicle that sinks at
+/// The least speed down, in m/s, that is asked from 0.2 m down to the ground and for a second there, of a vehicle that sinks at
 /// 0.5 m/s while the estimate of its pad changes by the time in seconds; and whether it is known to stand at the end.
-fn touched(change: impl Fn(f64, &mut TargetEstimate)) -> (f64, bool) {
+fn touched(noise_m_s: f64, change: impl Fn(f64, &mut TargetEstimate)) -> (f64, bool) {
     let mut metric = Metric::new(MetricConfig::default());
     let (mut down_m_s, mut stands) = (f64::INFINITY, false);
-    for i in 0..64u32 {
+    for i in 0..80u32 {
         // On the ground from 1 s on.
         let s = f64::from(i) / 40.0;
-        let (height_m, sinking_m_s) = if s < 1.0 { (0.5 - 0.5 * s, 0.5) } else { (0.0, 0.0) };
+        let (height_m, sinking_m_s) = match s {
+            s if s < 1.0 => (0.5 - 0.5 * s, 0.5),
+            // For a moment its speed errs.
+            s => (0.0, if s > 1.35 && s < 1.4 { noise_m_s } else { 0.0 }),
+        };
         let vehicle =
             vehicle(s, Point::new(0.0, 0.0, -height_m), Vector::new(0.0, 0.0, sinking_m_s));
         let mut situation = situation(&vehicle);
@@ -192,12 +196,12 @@ fn touched(change: impl Fn(f64, &mut TargetEstimate)) -> (f64, bool) {
 #[test]
 fn nothing_that_the_estimate_becomes_lifts_a_vehicle_that_touches_down() {
     let low = |s: f64| s > 0.7;
-    let unsure = touched(|s, target| {
+    let unsure = touched(0.06, |s, target| {
         (target.age_s, target.deviation_m) = (s, if low(s) { 0.3 } else { 0.03 });
     });
-    let ambiguous = touched(|s, target| target.ambiguous = low(s));
-    let old = touched(|s, target| target.age_s = if low(s) { 10.0 } else { s });
-    let aside = touched(|s, target| {
+    let ambiguous = touched(0.06, |s, target| target.ambiguous = low(s));
+    let old = touched(0.0, |s, target| target.age_s = if low(s) { 10.0 } else { s });
+    let aside = touched(0.06, |s, target| {
         target.position = Point::new(if s > 1.1 { 0.3 } else { 0.0 }, 0.0, 0.0);
     });
     for (name, (down_m_s, stands)) in
@@ -222,6 +226,23 @@ fn a_height_that_is_wrong_ends_the_descent_of_a_vehicle_that_was_to_touch_down()
         if (height_m + NEAR_M).abs() > 0.01 {
             assert_eq!(descends, height_m > -NEAR_M, "{height_m} m: {setpoint:?}");
         }
+    }
+}
+
+#[test]
+fn a_gap_in_the_states_of_a_vehicle_that_touches_down_is_no_loss_of_its_marker() {
+    let mut metric = Metric::new(MetricConfig::default());
+    for i in 0..40u32 {
+        let s = f64::from(i) / 40.0;
+        let height_m = 0.5 - 0.5 * s;
+        let vehicle = vehicle(s, Point::new(0.0, 0.0, -height_m), Vector::new(0.0, 0.0, 0.5));
+        let mut situation = situation(&vehicle);
+        let is_gap = i == 36;
+        situation.level_because = is_gap.then_some(Reason::VehicleStale);
+        let progress = metric.progress(&situation);
+        assert!(!is_gap || matches!(progress, Progress::Blind), "{progress:?}");
+        assert_eq!(metric.may_descend(&situation), !is_gap, "{s}");
+        let _ = metric.velocity(&situation);
     }
 }
 
