@@ -187,16 +187,15 @@ impl State {
         // What is not a number, and what a covariance that is none makes negative, is no inlier.
         let is_inlier = |nis: f64| (0.0..=config.gate).contains(&nis);
         let wander_s = fmin(dt_s, MAX_WANDER_S);
-        let lever_m = if config.pad_speed_m_s > 0.0 { 0.0 } else { measurement.range_m };
-        let wander_m =
-            WANDER_M + WANDER_M_S * wander_s + lever_m * (WANDER_RAD + WANDER_RAD_S * wander_s);
+        let is_still = config.pad_speed_m_s <= 0.0;
+        let wander_rad = if is_still { WANDER_RAD + WANDER_RAD_S * wander_s } else { 0.0 };
+        let wander_m = WANDER_M + WANDER_M_S * wander_s + measurement.range_m * wander_rad;
         let innovation = self.innovation(measurement);
         let height_noise_m = fmax(measurement.noise[(2, 2)], 0.0).sqrt();
         // A tilt lifts what is seen aside.
-        let aside_m = if lever_m > 0.0 { measurement.tilt.row(2).norm() } else { 0.0 };
         let height_wander_m = WANDER_M
             + (HEIGHT_WANDER_M_S + config.pad_heave_m_s) * wander_s
-            + aside_m * (WANDER_RAD + WANDER_RAD_S * wander_s)
+            + measurement.tilt.row(2).norm() * wander_rad
             + height_noise_m;
         let is_near = innovation.norm() <= wander_m && innovation.z.abs() <= height_wander_m;
         if !(nis > config.gate && nis.is_finite() && is_near) {

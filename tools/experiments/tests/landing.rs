@@ -95,11 +95,11 @@ fn no_fault_leads_to_an_unsafe_touchdown() {
 /// The flights of these seeds in wind of 4 m/s, from 10 m, as `alight experiment landing` flies them.
 fn with_fault(fault: &str, seeds: &[u64]) -> Vec<(Planned, Outcome)> {
     let wind = Values::List(vec![4.0]);
-    fly_seeds(Plan { wind, ..Plan::default() }, fault, seeds)
+    fly_seeds(&Plan { wind, ..Plan::default() }, fault, seeds)
 }
 
 /// The flights of a plan with these seeds and this fault.
-fn fly_seeds(plan: Plan, fault: &str, seeds: &[u64]) -> Vec<(Planned, Outcome)> {
+fn fly_seeds(plan: &Plan, fault: &str, seeds: &[u64]) -> Vec<(Planned, Outcome)> {
     let flights = seeds.iter().flat_map(|seed| {
         let faults = fault.parse().into_iter().collect();
         Plan { faults, flights: 1, seed: *seed, ..plan.clone() }.flights()
@@ -130,7 +130,7 @@ fn a_gust_close_to_the_ground_does_not_cause_a_sliding_touchdown() {
 #[test]
 fn a_vehicle_that_has_touched_down_does_not_leave_the_ground_again() {
     // On these seeds the estimate became too unsure, ambiguous or false just before the contact or soon after it.
-    let plan = || Plan {
+    let plan = Plan {
         wind: Values::Range(0.0, 9.0),
         turbulence: Values::Range(0.0, 3.0),
         height: Values::Range(2.0, 30.0),
@@ -145,7 +145,7 @@ fn a_vehicle_that_has_touched_down_does_not_leave_the_ground_again() {
         ("wrong-marker", &confused),
         ("stamp-jumps", &jumping),
     ] {
-        for (planned, outcome) in fly_seeds(plan(), fault, seeds) {
+        for (planned, outcome) in fly_seeds(&plan, fault, seeds) {
             expect(&planned, &outcome, !outcome.has_left_ground() && outcome.is_within(0.3));
         }
     }

@@ -400,7 +400,7 @@ impl Metric {
         } else if height_m > LOW_M + LOW_HYSTERESIS_M {
             self.waiting_since = None;
         }
-        let is_still = situation.vehicle.velocity.z() - target.velocity.z() < 0.3 * PUSHING_M_S;
+        let is_still = sinking_m_s(situation, target) < 0.3 * PUSHING_M_S;
         if self.is_pushed(target) && is_still && height_m <= LOW_M {
             self.standing_since.get_or_insert(situation.now);
         } else {
@@ -425,8 +425,7 @@ impl Metric {
     /// True when the vehicle is so low that a climb which is commanded now would stop it on the ground or a few centimetres above; not
     /// where it has sunk so far below the ground that the height must be wrong.
     fn is_bound_to_touch(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {
-        let height_m = self.height_m(target);
-        let sinking_m_s = situation.vehicle.velocity.z() - target.velocity.z();
+        let (height_m, sinking_m_s) = (self.height_m(target), sinking_m_s(situation, target));
         let lag_s = self.config.descend_lag_s + extra_delay_s(situation);
         let stopping_m = sinking_m_s * lag_s
             + squared(sinking_m_s) / (2.0 * situation.limits.vertical_acceleration_m_s2);
@@ -444,8 +443,9 @@ impl Metric {
     /// True when it was bound to touch the ground, and does not sink any more though it is pushed down: its speed may err by more than
     /// counts as standing still.
     fn has_touched(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {
-        let sinking_m_s = situation.vehicle.velocity.z() - target.velocity.z();
-        self.touches_down(situation) && self.is_pushed(target) && sinking_m_s < PUSHING_M_S
+        self.touches_down(situation)
+            && self.is_pushed(target)
+            && sinking_m_s(situation, target) < PUSHING_M_S
     }
 
     /// For how long a vehicle near the ground has not sunk although it is commanded down; `None` if it sinks, or rises as in a gust.
@@ -529,7 +529,7 @@ impl Metric {
             // Tilting against a gust costs height, and the vehicle must not touch down sliding.
             return (-fmin(ROOM_GAIN * (LOW_M - height_m), ROOM_M_S), Reason::Settling);
         }
-        let sinking_m_s = fmax(situation.vehicle.velocity.z() - target.velocity.z(), 0.0);
+        let sinking_m_s = fmax(sinking_m_s(situation, target), 0.0);
         // Over a slow link it is already lower, and lower still when the setpoint arrives.
         let height_m = height_m - sinking_m_s * extra_delay_s(situation);
         let ahead_m = height_m
@@ -574,9 +574,14 @@ impl Metric {
     }
 }
 
+/// Speed of the vehicle down towards the pad, in m/s.
+fn sinking_m_s(situation: &Situation<'_>, target: &TargetEstimate) -> f64 {
+    situation.vehicle.velocity.z() - target.velocity.z()
+}
+
 /// True when the vehicle rises as in a gust.
 fn rises(situation: &Situation<'_>, target: &TargetEstimate) -> bool {
-    target.velocity.z() - situation.vehicle.velocity.z() > MAX_RISING_M_S
+    sinking_m_s(situation, target) < -MAX_RISING_M_S
 }
 
 /// The part of the link's delay that `dead_time_s` does not contain, in seconds.

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::plan::Planned;
-use crate::landing::outcome::MAX_HOP_M;
+use crate::landing::outcome::{MAX_HOP_M, greater};
 
 /// Maximum downward speed of a safe touchdown, in m/s.
 pub const MAX_SINK_M_S: f64 = 0.8;
@@ -94,14 +94,14 @@ impl Outcome {
     /// Notes a touch of the ground with these speeds in m/s, this far from the pad in metres.
     pub fn touch(&mut self, sink_m_s: f64, slide_m_s: f64, error_m: f64) {
         self.touches += 1;
-        self.sink_m_s = Some(self.sink_m_s.map_or(sink_m_s, |before| before.max(sink_m_s)));
-        self.slide_m_s = Some(self.slide_m_s.map_or(slide_m_s, |before| before.max(slide_m_s)));
+        self.sink_m_s = greater(self.sink_m_s, Some(sink_m_s));
+        self.slide_m_s = greater(self.slide_m_s, Some(slide_m_s));
         self.error_m = Some(error_m);
     }
 
     /// Notes the height over the place of the first touch in metres.
     pub fn hop(&mut self, height_m: f64) {
-        self.hop_m = Some(self.hop_m.map_or(height_m, |before| before.max(height_m)));
+        self.hop_m = greater(self.hop_m, Some(height_m));
     }
 
     /// True when it stood on the ground and flew again.

@@ -14,7 +14,7 @@ use world::World;
 use world::vehicle::VehicleTruth;
 use world::world::STEP_S;
 
-use super::outcome::{Ending, MAX_HOP_M, Outcome};
+use super::outcome::{Ending, MAX_HOP_M, Outcome, greater};
 use super::plan::Planned;
 use super::recording::Recording;
 use super::sim_vision::{Arrival, DETECTOR, SimVision};
@@ -303,11 +303,6 @@ impl<'a> LockstepFlight<'a> {
             _ => Ending::Unfinished,
         };
     }
-}
-
-/// The greater one of those that are there.
-fn greater(before: Option<f64>, value: Option<f64>) -> Option<f64> {
-    value.map_or(before, |value| Some(before.map_or(value, |before| before.max(value))))
 }
 
 fn stamp_ns(time_s: f64) -> i64 {

@@ -18,6 +18,11 @@ pub const CRASH_SLIDE_M_S: f64 = 0.5;
 /// Height after a touch, in metres, beyond which a vehicle has left the ground again.
 pub const MAX_HOP_M: f64 = 0.15;
 
+/// The greater one of those that are there.
+pub(crate) fn greater(before: Option<f64>, value: Option<f64>) -> Option<f64> {
+    before.into_iter().chain(value).reduce(f64::max)
+}
+
 /// How it ended.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]

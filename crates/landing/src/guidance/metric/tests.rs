@@ -87,6 +87,11 @@ fn vehicle(seconds: f64, position: Point<Ned>, velocity: Vector<Ned>) -> Vehicle
 }
 
 /// A well-known target at the origin.
+/// One that sinks this far aside of its target.
+fn sinking(s: f64, aside_m: f64, height_m: f64, down_m_s: f64) -> VehicleState {
+    vehicle(s, Point::new(aside_m, 0.0, -height_m), Vector::new(0.0, 0.0, down_m_s))
+}
+
 fn situation(vehicle: &VehicleState) -> Situation<'_> {
     let offset = Point::origin() - vehicle.position;
     let target = TargetEstimate {
@@ -178,8 +183,7 @@ fn touched(noise_m_s: f64, change: impl Fn(f64, &mut TargetEstimate)) -> (f64, b
             // For a moment its speed errs.
             s => (0.0, if s > 1.35 && s < 1.4 { noise_m_s } else { 0.0 }),
         };
-        let vehicle =
-            vehicle(s, Point::new(0.0, 0.0, -height_m), Vector::new(0.0, 0.0, sinking_m_s));
+        let vehicle = sinking(s, 0.0, height_m, sinking_m_s);
         let mut situation = situation(&vehicle);
         situation.target.as_mut().into_iter().for_each(|target| change(s, target));
         situation.age_s = situation.target.unwrap().age_s;
@@ -218,7 +222,7 @@ fn a_height_that_is_wrong_ends_the_descent_of_a_vehicle_that_was_to_touch_down()
         // The ground is lower than the estimate says, and the pad was not seen for long.
         let s = f64::from(i) / 40.0;
         let height_m = 0.5 - 0.5 * s;
-        let vehicle = vehicle(s, Point::new(0.0, 0.0, -height_m), Vector::new(0.0, 0.0, 0.5));
+        let vehicle = sinking(s, 0.0, height_m, 0.5);
         let mut situation = situation(&vehicle);
         situation.age_s = if height_m < 0.2 { 10.0 } else { 0.05 };
         let (setpoint, _) = metric.velocity(&situation);
@@ -235,7 +239,7 @@ fn a_gap_in_the_states_of_a_vehicle_that_touches_down_is_no_loss_of_its_marker()
     for i in 0..40u32 {
         let s = f64::from(i) / 40.0;
         let height_m = 0.5 - 0.5 * s;
-        let vehicle = vehicle(s, Point::new(0.0, 0.0, -height_m), Vector::new(0.0, 0.0, 0.5));
+        let vehicle = sinking(s, 0.0, height_m, 0.5);
         let mut situation = situation(&vehicle);
         let is_gap = i == 36;
         situation.level_because = is_gap.then_some(Reason::VehicleStale);
@@ -254,8 +258,7 @@ fn a_gentle_descent_ends_with_a_push_that_shows_whether_the_vehicle_stands() {
         // It stands from 0.75 s on, nearly out of its funnel, where a descent is slow.
         let s = f64::from(i) / 40.0;
         let (height_m, sinking_m_s) = if s < 0.75 { (0.1 - 0.08 * s, 0.08) } else { (0.04, 0.0) };
-        let vehicle =
-            vehicle(s, Point::new(0.1, 0.0, -height_m), Vector::new(0.0, 0.0, sinking_m_s));
+        let vehicle = sinking(s, 0.1, height_m, sinking_m_s);
         let situation = situation(&vehicle);
         if matches!(metric.progress(&situation), Progress::Ready(Reason::TouchedEarly)) {
             stands.get_or_insert(s - 0.75);
