@@ -656,6 +656,7 @@ impl Lander {
         let is_steered = matches!(self.state_machine.phase(), Phase::Approach | Phase::Descend);
         if self.disputed.is_some()
             && is_steered
+            && !self.guidance.touches_down(&situation)
             && self.config.phases.dispute_height_m > 0.0
             && let Some(target) = situation.target
         {

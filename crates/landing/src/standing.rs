@@ -214,3 +214,21 @@ fn standing_height_m(config: &Config) -> f64 {
         GuidanceConfig::Thesis(_) => 0.0,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::guidance::metric::tests::{sinking, situation};
+
+    #[test]
+    fn a_vehicle_that_is_steered_may_stand_only_where_it_is_lower() {
+        for (height_m, steered, unsteered) in
+            [(0.1, true, true), (0.2, false, true), (0.35, false, false)]
+        {
+            let vehicle = sinking(0.0, 0.0, height_m, 0.0);
+            let may_stand =
+                |is_steered| may_stand(&situation(&vehicle), &Config::default(), is_steered);
+            assert_eq!((may_stand(true), may_stand(false)), (steered, unsteered), "{height_m} m");
+        }
+    }
+}

@@ -204,6 +204,32 @@ fn a_marker_lost_for_good_below_two_metres_is_landed_on_from_memory() {
 }
 
 #[test]
+fn a_dispute_of_detectors_lifts_a_vehicle_to_wait_but_not_one_that_touches_down() {
+    let disputed = |below_m: f64, seed: u64| {
+        // On a pad that may move the touchdown comes before LAND.
+        let flight = Scene::windy(seed, 5.0, 1.0).with(|scene| {
+            scene.config.estimator.pad_speed_m_s = 0.5;
+            scene.disputed_below_m = below_m;
+        });
+        let flight = flight.fly();
+        let risen_m = flight.samples.iter().scan(f64::INFINITY, |lowest_m, sample| {
+            let height_m = sample.pad.z() - sample.position.z();
+            *lowest_m = lowest_m.min(height_m);
+            Some(height_m - *lowest_m)
+        });
+        (risen_m.fold(0.0, f64::max), flight.error_m)
+    };
+    for seed in 0..6 {
+        let (risen_m, error_m) = disputed(1.0, seed);
+        assert!(risen_m > 0.5 && error_m.is_infinite(), "{seed}: {risen_m} m, {error_m} m");
+        for below_m in [0.0, 0.02, 0.05] {
+            let (risen_m, error_m) = disputed(below_m, seed);
+            assert!(risen_m < 0.15 && error_m < 0.15, "{seed}, {below_m} m: {risen_m}, {error_m}");
+        }
+    }
+}
+
+#[test]
 fn a_retry_climbs_a_little_and_is_not_repeated_for_ever() {
     let unsure = |scene: Scene| {
         let metric = MetricConfig { blind_height_m: 0.0, ..MetricConfig::default() };

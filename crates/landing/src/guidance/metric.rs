@@ -157,6 +157,14 @@ impl Guidance for Metric {
             .is_some_and(|target| target.deviation_m <= KNOWN_M && target.age_s <= KNOWN_S)
     }
 
+    /// True when the vehicle is bound to touch the ground, or was and has stayed there. What is seen, or not seen any more, is
+    /// then no reason to climb: that would be from the ground, and the estimate of a vehicle that stands drifts.
+    fn touches_down(&self, situation: &Situation<'_>) -> bool {
+        let is_near = |it: &TargetEstimate| self.height_m(it).abs() <= NEAR_M;
+        situation.target.is_some_and(|it| is_near(&it) && !rises(situation, &it))
+            && self.touching_at.is_some_and(|at| situation.now.seconds_since(at) <= CONTACT_S)
+    }
+
     fn steers_until_land(&self) -> bool {
         true
     }
@@ -432,14 +440,6 @@ impl Metric {
         sinking_m_s >= PUSHING_M_S && height_m <= stopping_m && height_m.abs() <= NEAR_M
     }
 
-    /// True when the vehicle is bound to touch the ground, or was and has stayed there. What is seen, or not seen any more, is
-    /// then no reason to climb: that would be from the ground, and the estimate of a vehicle that stands drifts.
-    fn touches_down(&self, situation: &Situation<'_>) -> bool {
-        let is_near = |it: &TargetEstimate| self.height_m(it).abs() <= NEAR_M;
-        situation.target.is_some_and(|it| is_near(&it) && !rises(situation, &it))
-            && self.touching_at.is_some_and(|at| situation.now.seconds_since(at) <= CONTACT_S)
-    }
-
     /// True when it was bound to touch the ground, and does not sink any more though it is pushed down: its speed may err by more than
     /// counts as standing still.
     fn has_touched(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {
@@ -513,16 +513,16 @@ impl Metric {
         let centred = fmax(1.0 - error * error, 0.0) * fmax(1.0 - speed_scale * speed_scale, 0.0);
         let fresh = self.freshness(situation);
         let height_m = self.height_m(target);
-        let why = if centred == 0.0 && height_m <= LOW_M {
+        let why = if touches_down {
+            self.descending(situation)
+        } else if centred == 0.0 && height_m <= LOW_M {
             Reason::Settling
         } else if centred == 0.0 {
             Reason::Aligning
         } else if fresh == 0.0 {
             Reason::TargetAging
-        } else if self.is_visible(situation) {
-            Reason::Descending
         } else {
-            Reason::DescendingUnseen
+            self.descending(situation)
         };
         let is_low = height_m < LOW_M && !self.has_touched(situation, target);
         if error > FUNNEL_HYSTERESIS && is_low {
@@ -547,6 +547,11 @@ impl Metric {
             Some(reason) if centred * fresh > 0.0 => (0.0, reason),
             _ => (max_m_s * centred * fresh, why),
         }
+    }
+
+    /// Why it descends.
+    fn descending(&self, situation: &Situation<'_>) -> Reason {
+        if self.is_visible(situation) { Reason::Descending } else { Reason::DescendingUnseen }
     }
 
     /// The fastest descent from which the vehicle, should no setpoint follow, reaches the ground no faster than
@@ -600,4 +605,4 @@ fn approach_speed(last: f64, wanted: f64, step: f64) -> f64 {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

@@ -58,6 +58,11 @@ pub trait Guidance {
         false
     }
 
+    /// True when the vehicle touches the ground, or is so low and fast that it will: what would have it climb comes too late.
+    fn touches_down(&self, _situation: &Situation<'_>) -> bool {
+        false
+    }
+
     /// True when it also steers the vehicle while LAND is awaited.
     fn steers_until_land(&self) -> bool {
         false

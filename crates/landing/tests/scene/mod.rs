@@ -65,6 +65,8 @@ pub(crate) struct Scene {
     pub(crate) refuses_land: bool,
     /// The pilot takes over at this time.
     pub(crate) pilot_s: Option<f64>,
+    /// From this height over the pad down, in metres, two detectors see the marker at two places.
+    pub(crate) disputed_below_m: f64,
     /// The lander falls silent in the descent.
     pub(crate) silence: Option<Silence>,
     /// The autopilot does not say in GUIDED that it is on the ground, as ArduPilot's for 7 s after the touchdown.
@@ -175,6 +177,7 @@ impl Scene {
             commands: vec![(0.0, OperatorCommand::Start)],
             refuses_land: false,
             pilot_s: None,
+            disputed_below_m: f64::NEG_INFINITY,
             silence: None,
             is_ground_told_late: false,
             setpoint_timeout_s: 0.5,
@@ -340,6 +343,7 @@ struct Run<'a> {
     eyes: Eyes,
     commands: VecDeque<(f64, OperatorCommand)>,
     sent_s: f64,
+    is_disputed: bool,
     /// When the silence began.
     silent_s: Option<f64>,
     /// When another lander is told to begin.
@@ -358,6 +362,7 @@ impl<'a> Run<'a> {
             eyes: Eyes::new(scene),
             commands: scene.commands.iter().copied().collect(),
             sent_s: f64::NEG_INFINITY,
+            is_disputed: false,
             silent_s: None,
             resume_s: None,
             world,
@@ -377,10 +382,14 @@ impl<'a> Run<'a> {
         self.eyes.look(self.scene, &self.world, self.seconds());
     }
 
+    fn height_m(&self) -> f64 {
+        let pad = self.world.pad_at(self.world.now_s());
+        pad.position.z() - self.world.truth().position.z()
+    }
+
     fn is_silent(&mut self) -> bool {
         let Some(silence) = self.scene.silence else { return false };
-        let pad = self.world.pad_at(self.world.now_s());
-        let height_m = pad.position.z() - self.world.truth().position.z();
+        let height_m = self.height_m();
         if height_m <= silence.below_m && !self.world.truth().on_ground {
             self.silent_s.get_or_insert(self.seconds());
         }
@@ -399,6 +408,10 @@ impl<'a> Run<'a> {
             events.push(Event::Vehicle(self.state()));
         }
         events.extend(self.eyes.arrived(now_s).map(Event::Frame));
+        self.is_disputed |= self.height_m() <= self.scene.disputed_below_m;
+        if self.is_disputed {
+            events.push(Event::Dispute(true));
+        }
         if step.is_multiple_of(TICK_STEPS) {
             events.push(Event::Tick);
         }

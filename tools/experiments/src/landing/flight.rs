@@ -25,8 +25,9 @@ const TICK_STEPS: u64 = 10;
 const START_TIMEOUT_S: f64 = 30.0;
 /// Timeout for the landing, in seconds: a little more than the controller's.
 const LANDING_TIMEOUT_S: f64 = 320.0;
-/// Time recorded after the controller has finished, in seconds.
+/// Time recorded after the controller has finished, in seconds: one that gave up may have the vehicle climb, also from the ground.
 const AFTER_S: f64 = 0.5;
+const AFTER_ABORT_S: f64 = 2.0;
 /// Time recorded after disarming, in seconds: the autopilot reports it once per second.
 const AFTER_DISARM_S: f64 = 3.0;
 /// The controller's clock at time 0 of the world, in nanoseconds.
@@ -169,7 +170,9 @@ impl<'a> LockstepFlight<'a> {
             let waited_s = now_s - self.start_s.unwrap_or(opened_s);
             let timeout_s =
                 if self.start_s.is_some() { LANDING_TIMEOUT_S } else { START_TIMEOUT_S };
-            if over_s.is_some_and(|at_s| now_s - at_s > AFTER_S) || waited_s > timeout_s {
+            let is_landed = self.outcome.phase == Phase::Landed;
+            let after_s = if is_landed { AFTER_S } else { AFTER_ABORT_S };
+            if over_s.is_some_and(|at_s| now_s - at_s > after_s) || waited_s > timeout_s {
                 self.finish();
                 let recording = self.recording.take();
                 let end_ns = stamp_ns(self.world.now_s());

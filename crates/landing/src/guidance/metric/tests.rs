@@ -86,13 +86,13 @@ fn vehicle(seconds: f64, position: Point<Ned>, velocity: Vector<Ned>) -> Vehicle
     }
 }
 
-/// A well-known target at the origin.
 /// One that sinks this far aside of its target.
-fn sinking(s: f64, aside_m: f64, height_m: f64, down_m_s: f64) -> VehicleState {
+pub(crate) fn sinking(s: f64, aside_m: f64, height_m: f64, down_m_s: f64) -> VehicleState {
     vehicle(s, Point::new(aside_m, 0.0, -height_m), Vector::new(0.0, 0.0, down_m_s))
 }
 
-fn situation(vehicle: &VehicleState) -> Situation<'_> {
+/// With a well-known target at the origin.
+pub(crate) fn situation(vehicle: &VehicleState) -> Situation<'_> {
     let offset = Point::origin() - vehicle.position;
     let target = TargetEstimate {
         position: Point::origin(),
