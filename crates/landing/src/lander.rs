@@ -631,7 +631,11 @@ impl Lander {
     /// The hold after too long a wait over the target while detectors see the marker at two places.
     fn dispute_alarm(&self, now: Timestamp) -> Option<(AlarmAction, Reason)> {
         let phases = &self.config.phases;
-        let is_low = self.target(now)?.height_m <= phases.dispute_height_m + DISPUTE_MARGIN_M;
+        let situation = self.situation(now, self.history.newest()?);
+        if phases.dispute_height_m == 0.0 || self.guidance.touches_down(&situation) {
+            return None;
+        }
+        let is_low = situation.target?.height_m <= phases.dispute_height_m + DISPUTE_MARGIN_M;
         let is_steered = matches!(self.state_machine.phase(), Phase::Approach | Phase::Descend);
         let is_long =
             self.disputed.is_some_and(|since| now.seconds_since(since) > phases.dispute_timeout_s);

@@ -230,6 +230,17 @@ fn a_dispute_of_detectors_lifts_a_vehicle_to_wait_but_not_one_that_touches_down(
 }
 
 #[test]
+fn a_dispute_that_is_to_be_ignored_is_also_after_its_time() {
+    let flight = Scene::new(1).with(|scene| {
+        scene.config.phases.dispute_height_m = 0.0;
+        scene.config.phases.dispute_timeout_s = 1.0;
+        scene.disputed_below_m = 3.0;
+    });
+    let flight = flight.fly();
+    assert!(flight.phase == Phase::Landed && flight.error_m < 0.1, "{:?}", flight.phase);
+}
+
+#[test]
 fn a_retry_climbs_a_little_and_is_not_repeated_for_ever() {
     let unsure = |scene: Scene| {
         let metric = MetricConfig { blind_height_m: 0.0, ..MetricConfig::default() };
