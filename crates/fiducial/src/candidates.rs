@@ -9,3 +9,4 @@ pub(crate) mod quiet_zone;
 pub(crate) mod ring;
 pub(crate) mod ring_profile;
 pub(crate) mod segment_quads;
+pub(crate) mod sides;

@@ -12,13 +12,22 @@ use rendering::views::{Binning, TestScene, View};
 /// What a detector may allocate at first, in frames.
 const MAX_FRAMES: f64 = 8.0;
 
-/// A marker on painted asphalt, from several heights.
-fn frames(binning: Binning) -> [Vec<u8>; 4] {
+/// A marker on painted asphalt, from several heights; and tiles, among whose joints there are as many quads as are
+/// kept.
+fn frames(binning: Binning) -> Vec<Vec<u8>> {
     let mut scene = TestScene::new(binning).unwrap();
-    [3, 2, 6, 9].map(|height_m| {
+    let asphalt = [3, 2, 6, 9].map(|height_m| {
         let view = View { binning, height_m, lateral_m: 0.0, tilt_deg: 5.0, repeat: 0 };
         scene.render(&view).unwrap().0
-    })
+    });
+    let camera = binning.camera();
+    let (width, height) = (camera.width as usize, camera.height as usize);
+    let grey = |x: usize, y: usize| {
+        let is_joint = (x + y / 8) % 72 < 6 || (y + 1000 - x / 8) % 72 < 6;
+        if is_joint { 30 } else { 120 + ((x / 72 * 37 + y / 72 * 91) % 60) as u8 }
+    };
+    let tiles = (0..width * height).map(|i| grey(i % width, i / width)).collect();
+    asphalt.into_iter().chain([tiles]).collect()
 }
 
 fn detect(detector: &mut Detector, camera: &CameraModel, pixels: &[u8]) -> AllocationInfo {

@@ -14,7 +14,8 @@ use render::Random;
 
 fn look_at(name: &str, data: &[u8], width: usize, height: usize) {
     let view = GrayView::packed(data, width, height).unwrap();
-    let markers = ["rings:0.1", "rings-thesis:0.1"].map(|m| m.parse().unwrap());
+    let names = ["rings:0.1", "rings-thesis:0.1", "apriltag-36h11:*:0.1", "stag-hd23:*:0.1"];
+    let markers = names.map(|m| m.parse().unwrap());
     let mut detector = Detector::new(&markers, Settings::default()).unwrap();
     let camera = CameraModel::pinhole(width as u32, height as u32, 100.0);
     let start = Instant::now();
@@ -54,6 +55,15 @@ fn patterns_of_pixels() {
     look_at("dots", &image(&|x, y| black_or_white(x % 3 == 0 && y % 3 == 0)), width, height);
     look_at("stripes", &image(&|x, _| black_or_white(x % 2 == 0)), width, height);
     look_at("ramp", &image(&|x, y| ((x + y) % 256) as u8), width, height);
+    // Every side of these has dozens of others beside it.
+    for period in [6, 10, 24] {
+        let squares =
+            |x: usize, y: usize| x.abs_diff(648).max(y.abs_diff(486)) % period < period / 2;
+        look_at("squares", &image(&|x, y| black_or_white(squares(x, y))), width, height);
+        let tiles =
+            |x: usize, y: usize| (x * 5 + y) / 5 % period < 2 || (y * 6 + x) / 6 % period < 2;
+        look_at("joints", &image(&|x, y| black_or_white(tiles(x, y))), width, height);
+    }
     // Thousands of small rings side by side, and rings about one centre.
     let radius = |x: usize, y: usize, cell: usize| {
         let half = (cell / 2) as f64;

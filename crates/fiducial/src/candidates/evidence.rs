@@ -44,6 +44,10 @@ const PAPER_PERCENT: u8 = 35;
 /// search found all but one, of 9 px on bright ground, had 57 % at least.
 const SHADED_PERCENT: u8 = 45;
 
+/// Minimum contrast between places, in percent, where arcs of rings of medium size are searched. Of 560 rings outdoors, 32 to 160 px large
+/// and partly covered, all that this search finds in the whole image are found with 100 %, and two less with 200 %.
+const INK_PERCENT: u8 = 100;
+
 /// What a family needs of an image.
 #[derive(Copy, Clone, Debug, Default)]
 pub(crate) struct Needs {
@@ -144,6 +148,11 @@ impl Evidence {
         (&mut self.outlines, self.contrast.places(self.min_percent))
     }
 
+    /// Whether there is any of these places.
+    pub(crate) fn has_places(&self) -> bool {
+        self.contrast.reaches(self.min_percent)
+    }
+
     /// Makes what a step of the fallbacks needs, of the image that it searches.
     pub(crate) fn prepare(
         &mut self,
@@ -157,7 +166,8 @@ impl Evidence {
             self.min_percent = self.contrast.reached_in(PAPER_SHARE).min(PAPER_PERCENT);
         }
         match step {
-            FallbackStep::Arcs | FallbackStep::Blobs => {}
+            FallbackStep::Arcs => self.min_percent = INK_PERCENT,
+            FallbackStep::Blobs => {}
             FallbackStep::Brightened => {
                 // Of the image itself.
                 self.min_percent = SHADED_PERCENT;

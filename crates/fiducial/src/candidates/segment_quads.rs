@@ -11,6 +11,9 @@ use imaging::pyramid::to_level_0;
 use imaging::{GrayView, Pyramid, Segment, SegmentLimits, Segments};
 
 use crate::candidates::quad::Quad;
+use crate::candidates::sides::{
+    CELL_PX, Side, SideGrid, cross, distance, dot, intersection, minus, mix, plus,
+};
 
 /// A quad, and how much of it is visible.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -61,6 +64,8 @@ pub(crate) struct ImageQuads {
     segments: Segments,
     joining: SegmentQuads,
     quads: Vec<Quad>,
+    /// Those with two hidden corners.
+    hidden: Vec<Quad>,
     /// The levels still to be searched.
     scales: [Option<Scale>; 2],
 }
@@ -75,7 +80,9 @@ impl ImageQuads {
         self.segments.make_room(width, height);
         self.joining.make_room([width, height]);
         self.quads.clear();
-        self.quads.reserve(2 * Scale::ALL.len() * MAX_QUADS);
+        self.quads.reserve(2 * Scale::ALL.len() * (MAX_QUADS + MAX_HIDDEN));
+        self.hidden.clear();
+        self.hidden.reserve(2 * Scale::ALL.len() * MAX_HIDDEN);
     }
 
     /// Begins another image, of which these levels are to be searched.
@@ -88,10 +95,12 @@ impl ImageQuads {
     pub(crate) fn make(&mut self, view: GrayView<'_>, pyramid: &Pyramid) -> bool {
         let scales = std::mem::take(&mut self.scales);
         scales.iter().flatten().for_each(|scale| self.add(view, pyramid, *scale));
+        self.quads.append(&mut self.hidden);
         scales.iter().any(Option::is_some)
     }
 
-    /// The quads: of the finer level first, on each the dark ones first, then by score.
+    /// The quads: of the finer level first, on each the dark ones first, then by score; after all of them, in the same order, those
+    /// with two hidden corners.
     pub(crate) fn quads(&self) -> &[Quad] {
         &self.quads
     }
@@ -106,10 +115,10 @@ impl ImageQuads {
         let segments = self.segments.find(image, segment_limits(far));
         let offset = to_level_0(0.0, level) as f32;
         let placement = Placement { scale: 1.0 + 2.0 * offset, offset };
-        let size = [image.width(), image.height()];
         for inverted in [false, true] {
-            let found = self.joining.find(segments, size, placement, inverted);
-            self.quads.extend(found.iter().map(|found| found.quad));
+            let [quads, hidden] = self.joining.find(segments, image, placement, inverted);
+            self.quads.extend(quads.iter().map(|found| found.quad));
+            self.hidden.extend(hidden.iter().map(|found| found.quad));
         }
     }
 }
@@ -127,33 +136,39 @@ const MAX_SIDES: usize = 6000;
 const MAX_CORNERS: usize = 16_000;
 const MAX_CORNERS_PER_SIDE: usize = 6;
 const MAX_PROPOSALS: usize = 4000;
-/// Largest number of quads returned, of either polarity.
+/// Largest number of quads of either polarity, and of quads with two hidden corners beside those.
 const MAX_QUADS: usize = 150;
+const MAX_HIDDEN: usize = 60;
+/// Largest ratio of two sides of a quad.
+const MAX_ASPECT: f32 = 4.0;
 
-/// Cell size of the grid in which sides are looked up, in pixels.
-const CELL_PX: f32 = 16.0;
+/// Largest number of sides looked at beyond hidden corners.
+const MAX_LOOKS: usize = 200_000;
+/// Quads with two hidden corners: smallest length of the sides beside these, in pixels, largest ratio of two sides, and smallest
+/// share of the perimeter that is visible.
+const MIN_OPPOSITE_PX: f32 = 8.0;
+const MAX_HIDDEN_ASPECT: f32 = 2.5;
+const MIN_HIDDEN_VISIBLE: f32 = 0.65;
+/// How far hidden corners are searched, over the length of the longest side that is seen.
+const MAX_STRETCH: f32 = 1.3;
+/// Their border is looked at in twelve places, so deep inside of the quad and as far outside, as a share of its size; in so many of
+/// them it must stand out.
+const BORDER_DEPTH: f32 = 0.06;
+const MIN_BORDER_PLACES: usize = 7;
 
 /// Joins segments to quads. It keeps its memory from image to image.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct SegmentQuads {
     sides: Vec<Side>,
-    starts: Grid,
+    starts: SideGrid,
     corners: Vec<Corner>,
     /// Index in `corners` of the first corner at the end of each side.
     corners_from: Vec<u32>,
     proposals: Vec<Proposal>,
+    /// Those with two hidden corners.
+    hidden: Vec<Proposal>,
+    chosen: Vec<Proposal>,
     found: Vec<SegmentQuad>,
-}
-
-/// A straight side: a segment, or several in one line.
-#[derive(Copy, Clone, Debug)]
-struct Side {
-    start: [f32; 2],
-    end: [f32; 2],
-    direction: [f32; 2],
-    length: f32,
-    /// The length over which there is an edge.
-    visible: f32,
 }
 
 /// Where a side ends and the next one begins.
@@ -167,12 +182,14 @@ struct Corner {
 #[derive(Copy, Clone, Debug)]
 struct Proposal {
     corners: [[f32; 2]; 4],
+    /// Mean of the corners.
+    middle: [f32; 2],
     visible: f32,
     score: f32,
 }
 
 impl SegmentQuads {
-    fn make_room(&mut self, [width, height]: [usize; 2]) {
+    fn make_room(&mut self, size: [usize; 2]) {
         fn reserve<T>(list: &mut Vec<T>, count: usize) {
             list.reserve(count.saturating_sub(list.len()));
         }
@@ -180,21 +197,22 @@ impl SegmentQuads {
         reserve(&mut self.corners, MAX_CORNERS + MAX_CORNERS);
         reserve(&mut self.corners_from, MAX_SIDES + 1);
         reserve(&mut self.proposals, MAX_PROPOSALS);
-        reserve(&mut self.found, MAX_QUADS);
-        reserve(&mut self.starts.sides, MAX_SIDES);
-        let cells = (width / CELL_PX as usize + 1) * (height / CELL_PX as usize + 1);
-        reserve(&mut self.starts.from, cells + 1);
+        reserve(&mut self.hidden, MAX_PROPOSALS);
+        reserve(&mut self.chosen, MAX_QUADS + MAX_HIDDEN);
+        reserve(&mut self.found, MAX_QUADS + MAX_HIDDEN);
+        self.starts.make_room(MAX_SIDES, size);
     }
 
-    /// The quads of these segments of a level of `size` pixels, in the image's pixels, best first: dark ones,
-    /// or bright ones when `inverted`.
+    /// The quads of these segments of a level of the pyramid, in the image's pixels, and those with two hidden corners, both
+    /// by score: dark ones, or bright ones when `inverted`.
     pub(crate) fn find(
         &mut self,
         segments: &[Segment],
-        size: [usize; 2],
+        image: GrayView<'_>,
         placement: Placement,
         inverted: bool,
-    ) -> &[SegmentQuad] {
+    ) -> [&[SegmentQuad]; 2] {
+        let size = [image.width(), image.height()];
         self.found.clear();
         self.sides.clear();
         let sides = segments.iter().filter_map(|segment| Side::from_segment(segment, inverted));
@@ -204,8 +222,10 @@ impl SegmentQuads {
         self.starts.fill(&self.sides, size);
         self.find_corners();
         self.propose(size);
-        self.choose(placement, inverted);
-        &self.found
+        self.propose_hidden(image, inverted);
+        let whole = self.choose(placement, inverted);
+        let (quads, hidden) = self.found.split_at(whole);
+        [quads, hidden]
     }
 
     /// Adds sides that consist of several segments on one line.
@@ -268,8 +288,9 @@ impl SegmentQuads {
             }
             let side = self.sides[index];
             let reach = 3.0 + 0.08 * side.length.min(80.0);
-            for cell in self.starts.around(side.end, reach) {
-                for other in self.starts.within(cell) {
+            let [x, y] = side.end;
+            for sides in self.starts.touching(&[[x - reach, y - reach], [x + reach, y + reach]]) {
+                for other in sides {
                     let next = &self.sides[*other as usize];
                     if let Some((place, gap)) = side.corner_with(next, reach) {
                         self.corners.push(Corner { next: *other, place, gap });
@@ -318,27 +339,153 @@ impl SegmentQuads {
         self.proposals = proposals;
     }
 
-    /// Keeps the best proposals, each place once.
-    fn choose(&mut self, placement: Placement, inverted: bool) {
-        self.proposals.sort_unstable_by(|a, b| b.score.total_cmp(&a.score));
+    /// Proposes quads around four sides of which two corners are hidden.
+    fn propose_hidden(&mut self, image: GrayView<'_>, inverted: bool) {
+        let mut hidden = std::mem::take(&mut self.hidden);
+        hidden.clear();
+        let border = Border { image, inverted };
+        let mut search = HiddenSearch { border, looks: MAX_LOOKS, out: &mut hidden };
+        for (index, a) in self.sides.iter().enumerate() {
+            for first in self.corners_of(index) {
+                let b = &self.sides[first.next as usize];
+                self.opposite_corner(index, b, first.place, &mut search);
+                for second in self.corners_of(first.next as usize) {
+                    let c = &self.sides[second.next as usize];
+                    if c.is_opposite(a) {
+                        self.fourth_side([a, b, c], [first.place, second.place], &mut search);
+                    }
+                }
+            }
+            if search.is_over() {
+                break;
+            }
+        }
+        self.hidden = hidden;
+    }
+
+    /// Proposes quads around three sides and a fourth whose corners are both hidden.
+    fn fourth_side(
+        &self,
+        sides: [&Side; 3],
+        [ab, bc]: [[f32; 2]; 2],
+        search: &mut HiddenSearch<'_>,
+    ) {
+        let [a, b, c] = sides;
+        let [a_px, b_px, c_px] = [distance(a.start, ab), distance(ab, bc), distance(bc, c.end)];
+        if a.length.min(c.length) < MIN_OPPOSITE_PX || a_px.max(c_px) > MAX_HIDDEN_ASPECT * b_px {
+            return;
+        }
+        // It is no nearer than the ends of its neighbours.
+        let far_px = MAX_STRETCH * b_px.max(a_px).max(c_px);
+        let places = [a.start, a.before_start(far_px - a_px), c.end, c.after_end(far_px - c_px)];
+        for other in self.starts.touching(&places).flatten() {
+            if !search.looks_on() {
+                return;
+            }
+            let d = &self.sides[*other as usize];
+            if !d.is_opposite(b) {
+                continue;
+            }
+            let (Some(cd), Some(da)) = (intersection(c, d), intersection(d, a)) else { continue };
+            if c.ends_before(cd) && d.begins_after(cd) && d.ends_before(da) && a.begins_after(da) {
+                search.add([da, ab, bc, cd], [a, b, c, d]);
+            }
+        }
+    }
+
+    /// Proposes quads around two sides and two others, which meet in the opposite corner, where the corners between are hidden.
+    fn opposite_corner(&self, index: usize, b: &Side, ab: [f32; 2], search: &mut HiddenSearch<'_>) {
+        let a = &self.sides[index];
+        if a.length.min(b.length) < MIN_OPPOSITE_PX {
+            return;
+        }
+        let [a_px, b_px] = [distance(a.start, ab), distance(ab, b.end)];
+        let far_px = MAX_STRETCH * a_px.max(b_px);
+        let back = |[x, y]: [f32; 2]| [x - far_px * a.direction[0], y - far_px * a.direction[1]];
+        let far = b.after_end(far_px - b_px);
+        for third in self.starts.touching(&[b.end, far, back(b.end), back(far)]).flatten() {
+            if !search.looks_on() {
+                return;
+            }
+            // From the other corner it would be found again.
+            let (third, c) = (*third as usize, &self.sides[*third as usize]);
+            if third < index || !c.is_opposite(a) {
+                continue;
+            }
+            let Some(bc) = intersection(b, c) else { continue };
+            if !(b.ends_before(bc) && c.begins_after(bc)) {
+                continue;
+            }
+            for corner in self.corners_of(third) {
+                let d = &self.sides[corner.next as usize];
+                if !d.is_opposite(b) {
+                    continue;
+                }
+                let Some(da) = intersection(d, a) else { continue };
+                if d.ends_before(da) && a.begins_after(da) {
+                    search.add([da, ab, bc, corner.place], [a, b, c, d]);
+                }
+            }
+        }
+    }
+
+    /// Keeps the best proposals, each place once; returns the number of those without two hidden corners.
+    fn choose(&mut self, placement: Placement, inverted: bool) -> usize {
         let place = |p: [f32; 2]| {
             let [x, y] = p.map(|v| f64::from(v * placement.scale + placement.offset));
             Pixel::new(x, y)
         };
-        let mut kept = 0;
-        for index in 0..self.proposals.len() {
-            let proposal = self.proposals[index];
-            if self.proposals[..kept].iter().any(|other| other.is_like(&proposal)) {
-                continue;
-            }
-            self.proposals[kept] = proposal;
-            kept += 1;
-            let quad = Quad { corners: proposal.corners.map(place), inverted };
-            self.found.push(SegmentQuad { quad, visible: proposal.visible });
-            if kept == MAX_QUADS {
-                return;
+        let mut whole = 0;
+        self.chosen.clear();
+        for (list, max) in [(&mut self.proposals, MAX_QUADS), (&mut self.hidden, MAX_HIDDEN)] {
+            list.sort_unstable_by(|a, b| b.score.total_cmp(&a.score));
+            whole = self.chosen.len();
+            for proposal in list.iter() {
+                if self.chosen.len() == whole + max {
+                    break;
+                }
+                if !self.chosen.iter().any(|other| other.is_like(proposal)) {
+                    self.chosen.push(*proposal);
+                }
             }
         }
+        self.found.extend(self.chosen.iter().map(|proposal| SegmentQuad {
+            quad: Quad { corners: proposal.corners.map(place), inverted },
+            visible: proposal.visible,
+        }));
+        whole
+    }
+}
+
+/// The search for quads with two hidden corners.
+struct HiddenSearch<'a> {
+    border: Border<'a>,
+    /// How many sides may still be looked at.
+    looks: usize,
+    out: &'a mut Vec<Proposal>,
+}
+
+impl HiddenSearch<'_> {
+    fn is_over(&self) -> bool {
+        self.looks == 0 || self.out.len() >= MAX_PROPOSALS
+    }
+
+    /// Whether one side more may be looked at, which is then counted.
+    fn looks_on(&mut self) -> bool {
+        let looks_on = !self.is_over();
+        self.looks -= usize::from(looks_on);
+        looks_on
+    }
+
+    /// Adds a quad if enough of it is visible, and it has a border.
+    fn add(&mut self, corners: [[f32; 2]; 4], sides: [&Side; 4]) {
+        if self.is_over() {
+            return;
+        }
+        let proposal = Proposal::new(corners, &sides, MAX_HIDDEN_ASPECT);
+        let is_likely =
+            |it: &Proposal| it.visible >= MIN_HIDDEN_VISIBLE && self.border.is_around(&it.corners);
+        self.out.extend(proposal.filter(is_likely));
     }
 }
 
@@ -404,9 +551,45 @@ fn two_sides([a, b]: [&Side; 2], ab: [f32; 2], out: &mut Vec<Proposal>) {
     Proposal::add([a.start, ab, b.end, last], [a, b], out);
 }
 
+/// The level of the image in which a quad may have a dark border, or a bright one.
+#[derive(Copy, Clone)]
+struct Border<'a> {
+    image: GrayView<'a>,
+    inverted: bool,
+}
+
+impl Border<'_> {
+    /// Whether most of a quad is darker along its sides than right outside: the joint between two tiles is too narrow for a border.
+    fn is_around(&self, corners: &[[f32; 2]; 4]) -> bool {
+        let mut seen = 0;
+        for side in 0..4 {
+            let [p, q, r, s] = [0, 1, 2, 3].map(|i| corners[(side + i) % 4]);
+            for along in [0.25, 0.5, 0.75] {
+                let (near, far) = (mix(p, q, along), mix(s, r, along));
+                let grey = |depth: f32| {
+                    let [x, y] = mix(near, far, depth).map(f64::from);
+                    imaging::bilinear(self.image, x, y)
+                };
+                if let (Some(inside), Some(outside)) = (grey(BORDER_DEPTH), grey(-BORDER_DEPTH)) {
+                    let step = if self.inverted { inside - outside } else { outside - inside };
+                    seen += usize::from(step >= f64::from(MIN_GRADIENT));
+                }
+            }
+        }
+        seen >= MIN_BORDER_PLACES
+    }
+}
+
 impl Proposal {
     /// Adds the quad with these corners if it may be the image of a square.
     fn add<const N: usize>(corners: [[f32; 2]; 4], sides: [&Side; N], out: &mut Vec<Self>) {
+        if out.len() < MAX_PROPOSALS {
+            out.extend(Self::new(corners, &sides, MAX_ASPECT));
+        }
+    }
+
+    /// The quad with these corners if it may be the image of a square, none of its sides longer than another by more than a ratio.
+    fn new(corners: [[f32; 2]; 4], sides: &[&Side], max_aspect: f32) -> Option<Self> {
         let mut perimeter = 0.0;
         let (mut shortest, mut longest) = (f32::INFINITY, 0.0_f32);
         for i in 0..4 {
@@ -415,24 +598,31 @@ impl Proposal {
             let length = distance(p, q);
             // At each corner it turns right by at least 25 degrees.
             if cross(side, next) < 0.42 * length * distance(q, r) {
-                return;
+                return None;
             }
             perimeter += length;
             shortest = shortest.min(length);
             longest = longest.max(length);
         }
-        if shortest < 5.0 || longest > 4.0 * shortest || out.len() >= MAX_PROPOSALS {
-            return;
+        if shortest < 5.0 || longest > max_aspect * shortest {
+            return None;
         }
         let visible: f32 = sides.iter().map(|side| side.visible).sum();
         let visible = (visible / perimeter).min(1.0);
         let score = visible * visible * (1.0 + perimeter / 200.0).min(2.0);
-        out.push(Self { corners, visible, score });
+        let middle =
+            [0, 1].map(|axis| 0.25 * corners.iter().map(|corner| corner[axis]).sum::<f32>());
+        Some(Self { corners, middle, visible, score })
     }
 
     fn is_like(&self, other: &Self) -> bool {
         let edge = distance(self.corners[0], self.corners[1]);
         let near = 0.03 * edge + 0.5;
+        // Where all corners are near the middles are, too, but for rounding.
+        let [dx, dy] = minus(self.middle, other.middle);
+        if dx.abs().max(dy.abs()) > 1.01 * near {
+            return false;
+        }
         (0..4).any(|turn| {
             (0..4).all(|i| {
                 let [dx, dy] = minus(self.corners[i], other.corners[(i + turn) % 4]);
@@ -440,183 +630,4 @@ impl Proposal {
             })
         })
     }
-}
-
-impl Side {
-    /// A segment with the dark side on the right, or the bright one when `inverted`.
-    fn from_segment(segment: &Segment, inverted: bool) -> Option<Self> {
-        let length = segment.length();
-        let (start, end) = (segment.start, segment.end);
-        let (start, end) = if inverted { (end, start) } else { (start, end) };
-        (length > 1.0).then(|| Self::between(start, end, length))
-    }
-
-    fn between(start: [f32; 2], end: [f32; 2], visible: f32) -> Self {
-        let along = minus(end, start);
-        let length = dot(along, along).sqrt().max(1e-3);
-        Self { start, end, direction: along.map(|v| v / length), length, visible }
-    }
-
-    /// The gap to the start of a side that continues this one's line.
-    fn gap_to(&self, other: &Self) -> Option<f32> {
-        // Few others have its direction.
-        let is_along = dot(self.direction, other.direction) > 0.98;
-        if !is_along {
-            return None;
-        }
-        let to_start = minus(other.start, self.end);
-        let along = dot(to_start, self.direction);
-        let to_end = minus(other.end, self.end);
-        let far = dot(to_end, self.direction);
-        let offset = |to: [f32; 2], along: f32| {
-            cross(self.direction, to).abs() <= 0.8 + 0.03 * along.max(0.0)
-        };
-        let in_line = along > -2.0
-            && far > along
-            && along < 1.5 * (self.length + other.length)
-            && offset(to_start, along)
-            && offset(to_end, far);
-        in_line.then_some(along.max(0.0))
-    }
-
-    /// One side for this one and one that continues it: the line through both, weighted by their visible
-    /// lengths.
-    fn joined(&self, other: &Self) -> Self {
-        let middle = |side: &Self| mix(side.start, side.end, 0.5);
-        let (a, b) = (middle(self), middle(other));
-        let weight = other.visible / (self.visible + other.visible);
-        let centre = mix(a, b, weight);
-        // Second moments of two rods.
-        let mut xx = 0.0;
-        let mut xy = 0.0;
-        let mut yy = 0.0;
-        for (side, middle) in [(self, a), (other, b)] {
-            let [dx, dy] = minus(middle, centre);
-            let spread = side.visible * side.length * side.length / 12.0;
-            xx += side.visible * dx * dx + spread * side.direction[0] * side.direction[0];
-            xy += side.visible * dx * dy + spread * side.direction[0] * side.direction[1];
-            yy += side.visible * dy * dy + spread * side.direction[1] * side.direction[1];
-        }
-        let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
-        let (dy, dx) = angle.sin_cos();
-        let beside = |p: [f32; 2]| {
-            let along = dot(minus(p, centre), [dx, dy]);
-            [centre[0] + along * dx, centre[1] + along * dy]
-        };
-        Self::between(beside(self.start), beside(other.end), self.visible + other.visible)
-    }
-
-    /// Where this side meets the next one, and how much of both is missing there.
-    fn corner_with(&self, next: &Self, reach: f32) -> Option<([f32; 2], f32)> {
-        let between = minus(next.start, self.end);
-        if between[0].abs() > 2.0 * reach || between[1].abs() > 2.0 * reach {
-            return None;
-        }
-        if cross(self.direction, next.direction) < 0.42
-            || self.length > 8.0 * next.length
-            || next.length > 8.0 * self.length
-        {
-            return None;
-        }
-        let place = intersection(self, next)?;
-        let (first, second) = (distance(place, self.end), distance(place, next.start));
-        (first <= reach && second <= reach).then_some((place, first + second))
-    }
-}
-
-/// Look-up of sides by their start.
-#[derive(Clone, Debug, Default)]
-struct Grid {
-    columns: usize,
-    rows: usize,
-    from: Vec<u32>,
-    sides: Vec<u32>,
-}
-
-impl Grid {
-    fn fill(&mut self, sides: &[Side], [width, height]: [usize; 2]) {
-        self.columns = width / CELL_PX as usize + 1;
-        self.rows = height / CELL_PX as usize + 1;
-        self.from.clear();
-        self.from.resize(self.columns * self.rows + 1, 0);
-        for side in sides {
-            if let Some(cell) = self.cell(side.start) {
-                self.from[cell] += 1;
-            }
-        }
-        let mut sum = 0;
-        for from in &mut self.from {
-            sum += *from;
-            *from = sum;
-        }
-        self.sides.clear();
-        self.sides.resize(sum as usize, 0);
-        for (index, side) in sides.iter().enumerate() {
-            if let Some(cell) = self.cell(side.start) {
-                self.from[cell] -= 1;
-                self.sides[self.from[cell] as usize] = index as u32;
-            }
-        }
-    }
-
-    fn cell(&self, [x, y]: [f32; 2]) -> Option<usize> {
-        // NaN is outside.
-        if !(x >= 0.0 && y >= 0.0) {
-            return None;
-        }
-        let (column, row) = ((x / CELL_PX) as usize, (y / CELL_PX) as usize);
-        (column < self.columns && row < self.rows).then(|| row * self.columns + column)
-    }
-
-    fn within(&self, cell: usize) -> &[u32] {
-        &self.sides[self.from[cell] as usize..self.from[cell + 1] as usize]
-    }
-
-    /// The cells that touch a square around a place.
-    fn around(&self, [x, y]: [f32; 2], reach: f32) -> impl Iterator<Item = usize> + use<> {
-        let range = |v: f32, count: usize| {
-            let last = count.saturating_sub(1);
-            let from = ((v - reach).max(0.0) / CELL_PX) as usize;
-            let to = ((v + reach).max(0.0) / CELL_PX) as usize;
-            from.min(last)..to.min(last) + 1
-        };
-        let (columns, rows) = (range(x, self.columns), range(y, self.rows));
-        let width = self.columns;
-        rows.flat_map(move |row| columns.clone().map(move |column| row * width + column))
-    }
-}
-
-/// Where the lines of two sides meet; `None` when they are parallel.
-fn intersection(a: &Side, b: &Side) -> Option<[f32; 2]> {
-    let sine = cross(a.direction, b.direction);
-    if sine.abs() < 0.1 {
-        return None;
-    }
-    let along = cross(minus(b.start, a.end), b.direction) / sine;
-    Some([a.end[0] + along * a.direction[0], a.end[1] + along * a.direction[1]])
-}
-
-fn dot(a: [f32; 2], b: [f32; 2]) -> f32 {
-    a[0] * b[0] + a[1] * b[1]
-}
-
-fn cross(a: [f32; 2], b: [f32; 2]) -> f32 {
-    a[0] * b[1] - a[1] * b[0]
-}
-
-fn minus(a: [f32; 2], b: [f32; 2]) -> [f32; 2] {
-    [a[0] - b[0], a[1] - b[1]]
-}
-
-fn plus(a: [f32; 2], b: [f32; 2]) -> [f32; 2] {
-    [a[0] + b[0], a[1] + b[1]]
-}
-
-fn mix(a: [f32; 2], b: [f32; 2], share: f32) -> [f32; 2] {
-    [a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])]
-}
-
-fn distance(a: [f32; 2], b: [f32; 2]) -> f32 {
-    let difference = minus(a, b);
-    dot(difference, difference).sqrt()
 }

@@ -283,6 +283,20 @@ mod tests {
     }
 
     #[test]
+    fn a_marker_of_which_two_corners_are_covered_is_found() {
+        let opposite = [[-0.5, -0.5], [0.5, 0.5]];
+        let at_one_side = [[-0.5, -0.5], [0.5, -0.5]];
+        for corners in [opposite, at_one_side] {
+            for level in [20.0, 90.0, 230.0] {
+                expect(Family::AprilTag36h11, MIDDLE, 1.5, |[u, v], grey| {
+                    let covered = |[x, y]: [f64; 2]| (u - x).hypot(v - y) < 0.22;
+                    if corners.into_iter().any(covered) { level } else { grey }
+                });
+            }
+        }
+    }
+
+    #[test]
     fn a_marker_with_a_reflection_is_found() {
         expect(Family::AprilTag36h11, MIDDLE, 3.0, |[u, v], grey| {
             let away = (u - 0.35).hypot(v + 0.2) / 0.15;

@@ -42,8 +42,11 @@ use measure::{Buffers, MeasuredMarker, ring_with_circle};
 enum RingPass {
     /// Complete ellipses, on these levels of the pyramid.
     Ellipses(Range<usize>),
-    /// Arcs of ellipses.
+    /// Arcs of ellipses, on coarse levels.
     Arcs,
+    /// The same on a finer level, for markers of 32 to 72 px, only in places with the contrast of ink on paper: elsewhere there are
+    /// too many of them.
+    FineArcs,
     /// Bright blobs, which may be the paper of a marker far away.
     Blobs,
 }
@@ -54,7 +57,7 @@ const PASSES: [RingPass; 3] =
 
 /// Regions of any shape that are large enough to show arcs.
 const ARC_REGIONS: outline::Settings = outline::Settings {
-    dark_from: Some(2),
+    dark_from: Some(1),
     bright_from: None,
     whole_level: 2,
     min_size_px: 16,
@@ -84,7 +87,7 @@ impl RingPass {
     fn name(&self) -> &'static str {
         match self {
             Self::Ellipses(_) => "ellipses",
-            Self::Arcs => "arcs",
+            Self::Arcs | Self::FineArcs => "arcs",
             Self::Blobs => "blobs",
         }
     }
@@ -228,7 +231,12 @@ impl RingDetector {
             }
             RingPass::Arcs => {
                 let first = outlines.len();
-                outlines.add(view, &ARC_REGIONS, 0..usize::MAX);
+                outlines.add(view, &ARC_REGIONS, 2..usize::MAX);
+                self.find_arcs(view, outlines, first);
+            }
+            RingPass::FineArcs => {
+                let first = outlines.len();
+                outlines.add_at(places, view, &ARC_REGIONS, 1..2);
                 self.find_arcs(view, outlines, first);
             }
             RingPass::Blobs => {
@@ -418,7 +426,13 @@ impl FamilyDetector for RingDetector {
 
     fn fallback(&mut self, step: FallbackStep, input: FrameInput<'_>, out: &mut Output<'_>) {
         match step {
-            FallbackStep::Arcs => self.run(&RingPass::Arcs, input, out),
+            FallbackStep::Arcs => {
+                let mut input = input;
+                self.run(&RingPass::Arcs, input.again(), out);
+                if out.found.len() == self.first && input.evidence.has_places() {
+                    self.run(&RingPass::FineArcs, input, out);
+                }
+            }
             FallbackStep::Blobs => self.run(&RingPass::Blobs, input, out),
             FallbackStep::Brightened => self.search(input, out),
             _ => {}
