@@ -231,7 +231,7 @@ impl LandingSummary {
             Some(exit) => format!(
                 "the controller exited ({exit}), and none resumed the landing before the timeout (--timeout-s)"
             ),
-            None => "timeout before the landing (--timeout-s)".to_owned(),
+            None => "timeout before the end of the landing (--timeout-s)".to_owned(),
         });
     }
 
@@ -655,7 +655,7 @@ mod tests {
         assert!(!outcome.landed);
         assert_eq!(outcome.outcome, "interrupted; it was in search: because");
         landing.timed_out(None);
-        assert!(landing.outcome().outcome.starts_with("timeout before the landing"));
+        assert!(landing.outcome().outcome.starts_with("timeout before the end of the landing ("));
         landing.timed_out(Some("signal: 9 (SIGKILL)"));
         let outcome = landing.outcome().outcome;
         assert!(outcome.starts_with("the controller exited (signal: 9 (SIGKILL))"), "{outcome}");
