@@ -87,7 +87,8 @@ impl RingPass {
     fn name(&self) -> &'static str {
         match self {
             Self::Ellipses(_) => "ellipses",
-            Self::Arcs | Self::FineArcs => "arcs",
+            Self::Arcs => "arcs",
+            Self::FineArcs => "fine arcs",
             Self::Blobs => "blobs",
         }
     }
