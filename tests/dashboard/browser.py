@@ -74,7 +74,7 @@ def press_space(page, command):
     wait(page, f"!document.querySelector('button[data-command={command}]').disabled")
     tab_to(page, command)
     page.keyboard.down("Space")
-    time.sleep(1.4)
+    hold_on(page)
     page.keyboard.up("Space")
     accepted(page, command)
 
@@ -85,9 +85,14 @@ def point_at(page, command):
     # Once it no longer moves: lines come and go above it.
     page.locator(f"button[data-command={command}]").hover(position={"x": 9, "y": 9})
     page.mouse.down()
-    time.sleep(1.4)
+    hold_on(page)
     page.mouse.up()
     accepted(page, command)
+
+
+def hold_on(page):
+    """Holds a button as long as the page asks for it."""
+    wait(page, "!/^Keep holding/.test(document.getElementById('reply').textContent)")
 
 
 def accepted(page, command):
