@@ -631,15 +631,20 @@ impl Lander {
     /// The hold after too long a wait over the target while detectors see the marker at two places.
     fn dispute_alarm(&self, now: Timestamp) -> Option<(AlarmAction, Reason)> {
         let phases = &self.config.phases;
+        let since = self.disputed?;
         let situation = self.situation(now, self.history.newest()?);
-        if phases.dispute_height_m == 0.0 || self.guidance.touches_down(&situation) {
-            return None;
-        }
         let is_low = situation.target?.height_m <= phases.dispute_height_m + DISPUTE_MARGIN_M;
-        let is_steered = matches!(self.state_machine.phase(), Phase::Approach | Phase::Descend);
-        let is_long =
-            self.disputed.is_some_and(|since| now.seconds_since(since) > phases.dispute_timeout_s);
-        (is_low && is_steered && is_long).then_some((AlarmAction::Hold, Reason::Disputed))
+        let is_long = now.seconds_since(since) > phases.dispute_timeout_s;
+        (is_low && is_long && self.waits_for_agreement(&situation))
+            .then_some((AlarmAction::Hold, Reason::Disputed))
+    }
+
+    /// True when a dispute of two detectors keeps the vehicle from descending.
+    fn waits_for_agreement(&self, situation: &Situation<'_>) -> bool {
+        self.disputed.is_some()
+            && matches!(self.state_machine.phase(), Phase::Approach | Phase::Descend)
+            && self.config.phases.dispute_height_m > 0.0
+            && !self.guidance.touches_down(situation)
     }
 
     /// The velocity while detectors see the marker at two places: not below a height from which the vehicle
@@ -657,11 +662,7 @@ impl Lander {
         };
         let situation = self.situation(now, &vehicle);
         let (mut wanted, mut why) = self.guidance.velocity(&situation);
-        let is_steered = matches!(self.state_machine.phase(), Phase::Approach | Phase::Descend);
-        if self.disputed.is_some()
-            && is_steered
-            && !self.guidance.touches_down(&situation)
-            && self.config.phases.dispute_height_m > 0.0
+        if self.waits_for_agreement(&situation)
             && let Some(target) = situation.target
         {
             let level = self.disputed_velocity(target.height_m, wanted);

@@ -44,7 +44,7 @@ const PAPER_PERCENT: u8 = 35;
 /// search found all but one, of 9 px on bright ground, had 57 % at least.
 const SHADED_PERCENT: u8 = 45;
 
-/// Minimum contrast between places, in percent, where arcs of rings of medium size are searched. Of 560 rings outdoors, 32 to 160 px large
+/// Minimum contrast between places, in percent, where arcs of rings of medium size are searched. Of 560 rings outdoors, 40 to 160 px large
 /// and partly covered, all that this search finds in the whole image are found with 100 %, and two less with 200 %.
 const INK_PERCENT: u8 = 100;
 
@@ -161,16 +161,18 @@ impl Evidence {
         schedule: PassSchedule,
         stages: &mut dyn StageObserver,
     ) {
-        self.min_percent = 0;
-        if matches!(step, FallbackStep::Blobs | FallbackStep::QuietZones) {
-            self.min_percent = self.contrast.reached_in(PAPER_SHARE).min(PAPER_PERCENT);
-        }
+        self.min_percent = match step {
+            FallbackStep::Arcs => INK_PERCENT,
+            FallbackStep::Blobs | FallbackStep::QuietZones => {
+                self.contrast.reached_in(PAPER_SHARE).min(PAPER_PERCENT)
+            }
+            // Of the image itself.
+            FallbackStep::Brightened => SHADED_PERCENT,
+            FallbackStep::Segments | FallbackStep::LateSegments => 0,
+        };
         match step {
-            FallbackStep::Arcs => self.min_percent = INK_PERCENT,
-            FallbackStep::Blobs => {}
+            FallbackStep::Arcs | FallbackStep::Blobs => {}
             FallbackStep::Brightened => {
-                // Of the image itself.
-                self.min_percent = SHADED_PERCENT;
                 self.has_outlines = false;
                 self.outlines.begin(view);
                 stages.ended("brightened");

@@ -15,14 +15,6 @@ use crate::candidates::sides::{
     CELL_PX, Side, SideGrid, cross, distance, dot, intersection, minus, mix, plus,
 };
 
-/// A quad, and how much of it is visible.
-#[derive(Copy, Clone, Debug, PartialEq)]
-pub(crate) struct SegmentQuad {
-    pub(crate) quad: Quad,
-    /// The fraction of its perimeter on which there are edges.
-    pub(crate) visible: f32,
-}
-
 /// From pixels of a pyramid level to pixels of the image: `scale` times the level's, plus `offset`.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) struct Placement {
@@ -117,8 +109,8 @@ impl ImageQuads {
         let placement = Placement { scale: 1.0 + 2.0 * offset, offset };
         for inverted in [false, true] {
             let [quads, hidden] = self.joining.find(segments, image, placement, inverted);
-            self.quads.extend(quads.iter().map(|found| found.quad));
-            self.hidden.extend(hidden.iter().map(|found| found.quad));
+            self.quads.extend_from_slice(quads);
+            self.hidden.extend_from_slice(hidden);
         }
     }
 }
@@ -168,7 +160,7 @@ pub(crate) struct SegmentQuads {
     /// Those with two hidden corners.
     hidden: Vec<Proposal>,
     chosen: Vec<Proposal>,
-    found: Vec<SegmentQuad>,
+    found: Vec<Quad>,
 }
 
 /// Where a side ends and the next one begins.
@@ -211,7 +203,7 @@ impl SegmentQuads {
         image: GrayView<'_>,
         placement: Placement,
         inverted: bool,
-    ) -> [&[SegmentQuad]; 2] {
+    ) -> [&[Quad]; 2] {
         let size = [image.width(), image.height()];
         self.found.clear();
         self.sides.clear();
@@ -449,10 +441,8 @@ impl SegmentQuads {
                 }
             }
         }
-        self.found.extend(self.chosen.iter().map(|proposal| SegmentQuad {
-            quad: Quad { corners: proposal.corners.map(place), inverted },
-            visible: proposal.visible,
-        }));
+        let quad = |it: &Proposal| Quad { corners: it.corners.map(place), inverted };
+        self.found.extend(self.chosen.iter().map(quad));
         whole
     }
 }

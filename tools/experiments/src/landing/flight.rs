@@ -25,7 +25,8 @@ const TICK_STEPS: u64 = 10;
 const START_TIMEOUT_S: f64 = 30.0;
 /// Timeout for the landing, in seconds: a little more than the controller's.
 const LANDING_TIMEOUT_S: f64 = 320.0;
-/// Time recorded after the controller has finished, in seconds: one that gave up may have the vehicle climb, also from the ground.
+/// Time recorded after a landing, in seconds; and after the end of a controller that gave up, which may have the vehicle climb from
+/// the ground.
 const AFTER_S: f64 = 0.5;
 const AFTER_ABORT_S: f64 = 2.0;
 /// Time recorded after disarming, in seconds: the autopilot reports it once per second.
