@@ -12,9 +12,10 @@ Exit status: 0 all was found, 1 something was not, 77 pymavlink is missing (pip 
 import argparse
 import json
 import os
-import random
 import sys
 import time
+
+from losses import Losses
 
 os.environ.setdefault("MAVLINK20", "1")
 try:
@@ -46,12 +47,11 @@ class Link:
     def __init__(self, connection, loss, seed):
         self.connection = connection
         self.loss = loss
-        self.random = random.Random(seed)
-        self.heard = []
+        self.losses = Losses(loss, seed)
         self.vehicle = None
 
     def command(self, component, command, *params):
-        if self.random.random() >= self.loss:
+        if not self.losses.takes("command", component, command, *params):
             params = (list(params) + [0] * 7)[:7]
             self.connection.mav.command_long_send(self.vehicle, component, command, 0, *params)
 
@@ -60,10 +60,8 @@ class Link:
         until = time.monotonic() + seconds
         while time.monotonic() < until:
             message = self.connection.recv_match(blocking=True, timeout=0.05)
-            if message is None or message.get_type() == "BAD_DATA" or self.random.random() < self.loss:
-                continue
-            is_it = message.get_type() == kind and message.get_srcComponent() == component
-            if is_it and fits(message):
+            is_it = message is not None and message.get_type() == kind and message.get_srcComponent() == component
+            if is_it and fits(message) and not self.losses.takes(kind, component):
                 return message
         return None
 

@@ -11,9 +11,10 @@ Exit status: 0 all was there, 1 something was not, 77 pymavlink is missing (pip 
 import argparse
 import json
 import os
-import random
 import sys
 import time
+
+from losses import Losses
 
 os.environ.setdefault("MAVLINK20", "1")
 try:
@@ -37,12 +38,11 @@ class Link:
 
     def __init__(self, connection, loss, seed):
         self.connection = connection
-        self.loss = loss
-        self.random = random.Random(seed)
+        self.losses = Losses(loss, seed)
         self.vehicle = None
 
     def send(self, send, *fields):
-        if self.random.random() >= self.loss:
+        if not self.losses.takes(send.__name__, *fields):
             send(*fields)
 
     def next(self, kinds, seconds):
@@ -50,7 +50,9 @@ class Link:
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
             message = self.connection.recv_match(type=kinds, blocking=True, timeout=left)
-            if message and message.get_srcComponent() == COMPANION and self.random.random() >= self.loss:
+            if message is None or message.get_srcComponent() != COMPANION:
+                continue
+            if not self.losses.takes(message.get_type(), getattr(message, "param_id", "")):
                 return message
         return None
 
