@@ -25,6 +25,7 @@ use crate::standing::{
 use crate::state_machine::{Inputs, StateMachine, VehicleInputs, reaction};
 use crate::target_filter::{Sightings, TargetFilter};
 use crate::time::Timestamp;
+use crate::view::View;
 
 /// Largest position and velocity that is plausible, in m and m/s.
 const MAX_PLAUSIBLE: f64 = 1e6;
@@ -193,6 +194,7 @@ impl Lander {
             alarm,
             vehicle: self.vehicle_inputs(now),
             target_age_s: self.sightings.age_s(now),
+            target_missed_s: self.sightings.missed_s(now),
             target_confirmed: self.sightings.in_a_row >= self.config.target.confirm_after,
             target_known: self.has_target(now),
             target_refused: self.sightings.is_refused(now, self.config.phases.stale_target_s),
@@ -379,10 +381,26 @@ impl Lander {
         self.half_view_rad = focal_px.map(|focal_px| libm::atan(0.5 * short_px / focal_px));
         if frame.marker.is_none() {
             self.target_filter.miss(frame, &self.history);
+            if self.is_out_of_view(frame) {
+                self.sightings.miss_out_of_view(frame.stamp);
+            }
         }
         let result = frame.marker.map_or(Ok(()), |marker| self.marker(frame, &marker));
         self.inform_guidance(frame, result.is_ok());
         result
+    }
+
+    /// True when the pad's place is known, and the camera of a vehicle that is not low over it did not show it: low down, one that
+    /// waits to see it is moved by a gust meanwhile.
+    fn is_out_of_view(&self, frame: &FrameObservation) -> bool {
+        let (Some(view), Some(motion), Some(target)) =
+            (View::from_frame(frame), self.history.at(frame.stamp), self.target(frame.stamp))
+        else {
+            return false;
+        };
+        let place = self.history.ned_from_odometry().inverse() * target.position;
+        let is_low = target.height_m <= self.config.phases.regain_height_m;
+        !is_low && self.has_target(frame.stamp) && !view.shows(place, &motion)
     }
 
     /// Fuses a marker; one without a pose is used only by a guidance that needs none.

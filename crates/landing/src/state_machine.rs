@@ -93,6 +93,8 @@ pub struct Inputs {
     pub vehicle: Option<VehicleInputs>,
     /// Age of the newest detection used, in seconds; infinite without one.
     pub target_age_s: f64,
+    /// The same without the time for which the camera did not show its place, up to a limit.
+    pub target_missed_s: f64,
     /// True when there were enough detections without a long gap.
     pub target_confirmed: bool,
     /// True when the marker's place is known well enough to wait for it there.
@@ -503,9 +505,12 @@ impl StateMachine {
             Progress::Blind if inputs.may_descend => {
                 Some((Phase::Descend, Reason::DescendingUnseen))
             }
-            _ if self.target_lost(inputs) => Some(self.retry_or_abort(inputs, Reason::Retrying)),
+            // To accelerate towards the target the vehicle tilts the camera away from it.
+            _ if inputs.target_missed_s > self.config.lost_target_s => {
+                Some(self.retry_or_abort(inputs, Reason::Retrying))
+            }
             Progress::Stuck => Some(self.retry_or_abort(inputs, Reason::NotSettling)),
-            Progress::Descending if inputs.may_descend => {
+            Progress::Descending if inputs.may_descend && !self.target_lost(inputs) => {
                 Some((Phase::Descend, Reason::Descending))
             }
             Progress::Descending | Progress::Blind | Progress::Aligning | Progress::Unchanged => {

@@ -18,12 +18,17 @@ pub(crate) enum TargetFilter {
     Kalman(Estimator),
 }
 
+/// Maximum time after the newest marker for which it is not missed while its place is out of the camera's view, in seconds.
+const MAX_OUT_OF_VIEW_S: f64 = 2.0;
+
 /// The stamps of the markers used.
 #[derive(Copy, Clone, Debug, Default)]
 pub(crate) struct Sightings {
     pub(crate) newest: Option<Timestamp>,
     /// Number of markers without a long gap.
     pub(crate) in_a_row: u32,
+    /// The newest frame without one whose camera did not show the pad's place.
+    out_of_view: Option<Timestamp>,
     /// When one was last seen too far from the estimate to be used, and when before that.
     refused: [Option<Timestamp>; 2],
 }
@@ -102,6 +107,21 @@ impl Sightings {
         is_recent && self.newest.is_none_or(|used| before > used)
     }
 
+    /// Notes a frame whose camera does not show the pad's place.
+    pub(crate) fn miss_out_of_view(&mut self, stamp: Timestamp) {
+        self.out_of_view = self.out_of_view.max(Some(stamp));
+    }
+
+    /// For how long the marker was not seen though it should have been, in seconds.
+    pub(crate) fn missed_s(&self, now: Timestamp) -> f64 {
+        let age_s = self.age_s(now);
+        let out_of_view_s = self
+            .out_of_view
+            .zip(self.newest)
+            .map_or(0.0, |(last, newest)| last.seconds_since(newest).clamp(0.0, MAX_OUT_OF_VIEW_S));
+        age_s - out_of_view_s
+    }
+
     pub(crate) fn age_s(&self, now: Timestamp) -> f64 {
         self.newest.map_or(f64::INFINITY, |newest| now.seconds_since(newest))
     }
@@ -148,5 +168,20 @@ mod tests {
         assert!(sightings.is_refused(at(2.0), 0.4));
         sightings.add(at(1.85), 1.0);
         assert!(!sightings.is_refused(at(2.0), 0.4));
+    }
+
+    #[test]
+    fn a_marker_whose_place_is_out_of_view_is_not_missed_for_a_while() {
+        let mut sightings = Sightings::default();
+        assert!(sightings.missed_s(at(3.0)).is_infinite());
+        sightings.add(at(1.0), 1.0);
+        sightings.miss_out_of_view(at(0.9));
+        assert!((sightings.missed_s(at(3.0)) - 2.0).abs() < 1e-9, "before the newest");
+        sightings.miss_out_of_view(at(2.5));
+        assert!((sightings.missed_s(at(3.0)) - 0.5).abs() < 1e-9);
+        sightings.miss_out_of_view(at(9.0));
+        assert!((sightings.missed_s(at(9.0)) - 6.0).abs() < 1e-9, "no longer than a while");
+        sightings.add(at(9.1), 1.0);
+        assert!((sightings.missed_s(at(9.5)) - 0.4).abs() < 1e-9);
     }
 }

@@ -89,8 +89,14 @@ fn height_m(sample: &Sample) -> f64 {
     sample.pad.z() - sample.position.z()
 }
 
+/// True where the lander has the vehicle climb.
+fn climbs(sample: &Sample) -> bool {
+    matches!(sample.decision.action, landing::Action::Velocity { velocity, .. } if velocity.z() < 0.0)
+}
+
 /// Flights whose lander is silent below this height: vehicles that stand at its end must stay on the ground. One that hovers so
-/// low that wind lets it touch the ground may fly on. Returns how many stood.
+/// low that wind lets it touch the ground may fly on: a lander that knows of no pad has it climb, where wind has lifted it before.
+/// Returns how many stood.
 fn check_stays_down(below_m: f64, then: Then, seeds: std::ops::Range<u64>) -> u32 {
     let mut table = String::new();
     let (mut is_safe, mut stood) = (true, 0);
@@ -103,10 +109,12 @@ fn check_stays_down(below_m: f64, then: Then, seeds: std::ops::Range<u64>) -> u3
                 let mut pairs = flight.samples.windows(2);
                 let end = pairs.find(|pair| pair[1].seconds - pair[0].seconds > 0.5 * for_s);
                 let Some(end) = end.map(|pair| &pair[1]) else { continue };
-                if end.on_ground_s < MIN_STANDING_S {
+                let after = flight.samples.iter().filter(|it| it.seconds > end.seconds);
+                let mut unmoved = after.clone().take_while(|it| !climbs(it));
+                let is_lifted = then == Then::Another && unmoved.any(|it| it.on_ground_s == 0.0);
+                if end.on_ground_s < MIN_STANDING_S || is_lifted {
                     continue;
                 }
-                let after = flight.samples.iter().filter(|it| it.seconds > end.seconds);
                 let hop_m = after.map(height_m).fold(0.0, f64::max);
                 stood += 1;
                 is_safe &= hop_m <= MAX_HOP_M && flight.phase == landing::Phase::Landed;

@@ -20,6 +20,7 @@ fn at(seconds: f64) -> Inputs {
         alarm: None,
         vehicle: Some(FLYING),
         target_age_s: f64::INFINITY,
+        target_missed_s: f64::INFINITY,
         target_confirmed: false,
         target_known: false,
         target_refused: false,
@@ -32,7 +33,13 @@ fn at(seconds: f64) -> Inputs {
 }
 
 fn seen(seconds: f64, progress: Progress) -> Inputs {
-    Inputs { target_age_s: 0.1, target_confirmed: true, progress, ..at(seconds) }
+    Inputs {
+        target_age_s: 0.1,
+        target_missed_s: 0.1,
+        target_confirmed: true,
+        progress,
+        ..at(seconds)
+    }
 }
 
 fn commanded(seconds: f64, command: OperatorCommand) -> Inputs {
@@ -570,15 +577,20 @@ mod every_transition {
                         continue;
                     }
                     for progress in progresses {
-                        for (target_age_s, target_known) in
-                            [(0.1, true), (0.7, true), (5.0, true), (5.0, false)]
-                        {
+                        for (target_age_s, target_missed_s, target_known) in [
+                            (0.1, 0.1, true),
+                            (0.7, 0.7, true),
+                            (5.0, 5.0, true),
+                            (5.0, 5.0, false),
+                            (2.5, 0.5, true),
+                        ] {
                             all.push(Inputs {
                                 now: now(),
                                 operator,
                                 alarm,
                                 vehicle,
                                 target_age_s,
+                                target_missed_s,
                                 target_confirmed: true,
                                 target_known,
                                 target_refused: false,
