@@ -62,6 +62,11 @@ const MIN_SILENCE_S: f64 = 0.6;
 /// Minimum time of a search by a lander that takes over before it climbs, in seconds: the vehicle may stand.
 const MIN_RESUMED_LOOK_S: f64 = 1.5;
 
+/// Minimum height over the pad, in metres, and maximum standard deviation of its place, in metres, at which the vehicle waits for
+/// the marker to come back into the camera's view: what moves it meanwhile, and what is not known for much longer, is to be seen.
+const MIN_WAIT_HEIGHT_M: f64 = 1.5;
+const MAX_WAIT_DEVIATION_M: f64 = 0.2;
+
 /// Maximum age of the newest detection, in seconds, up to which heights are those over the target.
 const MAX_TARGET_AGE_S: f64 = 20.0;
 
@@ -375,14 +380,15 @@ impl Lander {
         if is_late {
             return frame.marker.map_or(Ok(()), |marker| self.marker(frame, &marker));
         }
-        self.newest_frame = Some(frame.stamp);
+        let before = self.newest_frame.replace(frame.stamp);
         let short_px = f64::from(frame.image_size.0.min(frame.image_size.1));
         let focal_px = frame.focal_px.filter(|focal_px| *focal_px > 1.0);
         self.half_view_rad = focal_px.map(|focal_px| libm::atan(0.5 * short_px / focal_px));
         if frame.marker.is_none() {
             self.target_filter.miss(frame, &self.history);
             if self.is_out_of_view(frame) {
-                self.sightings.miss_out_of_view(frame.stamp);
+                let after_s = before.map_or(0.0, |before| frame.stamp.seconds_since(before));
+                self.sightings.miss_out_of_view(after_s);
             }
         }
         let result = frame.marker.map_or(Ok(()), |marker| self.marker(frame, &marker));
@@ -390,8 +396,8 @@ impl Lander {
         result
     }
 
-    /// True when the pad's place is known, and the camera of a vehicle that is not low over it did not show it: low down, one that
-    /// waits to see it is moved by a gust meanwhile.
+    /// True when the place of a pad that does not move is well known, and the camera of a vehicle that is not low over it did not
+    /// show it: low down, one that waits to see it is moved by a gust meanwhile.
     fn is_out_of_view(&self, frame: &FrameObservation) -> bool {
         let (Some(view), Some(motion), Some(target)) =
             (View::from_frame(frame), self.history.at(frame.stamp), self.target(frame.stamp))
@@ -399,8 +405,9 @@ impl Lander {
             return false;
         };
         let place = self.history.ned_from_odometry().inverse() * target.position;
-        let is_low = target.height_m <= self.config.phases.regain_height_m;
-        !is_low && self.has_target(frame.stamp) && !view.shows(place, &motion)
+        let is_known = self.has_target(frame.stamp) && target.deviation_m <= MAX_WAIT_DEVIATION_M;
+        let is_low = target.height_m <= MIN_WAIT_HEIGHT_M;
+        is_known && !is_low && !self.pad_moves() && !view.shows(place, &motion)
     }
 
     /// Fuses a marker; one without a pose is used only by a guidance that needs none.
@@ -574,8 +581,9 @@ impl Lander {
 
     /// Why the vehicle must not descend now.
     fn level_because(&self, now: Timestamp) -> Option<Reason> {
-        let is_checking =
-            self.state_machine.phase() == Phase::Approach && !self.is_axis_check_done(now);
+        let is_approach = self.state_machine.phase() == Phase::Approach;
+        let is_checking = is_approach && !self.is_axis_check_done(now);
+        let is_lost = self.sightings.age_s(now) > self.config.phases.lost_target_s;
         // The end of the last detector is known at once, so this does not wait until the target is stale.
         let alone = (!self.detectors_alive).then_some(Reason::NoDetector);
         let is_aging = self.history.newest().is_some_and(|vehicle| {
@@ -585,6 +593,7 @@ impl Lander {
         alone
             .or_else(|| is_aging.then_some(Reason::VehicleAging))
             .or_else(|| is_checking.then_some(Reason::AxisCheck))
+            .or_else(|| (is_approach && is_lost).then_some(Reason::Aligning))
     }
 
     fn progress(&mut self, now: Timestamp) -> Progress {

@@ -93,7 +93,7 @@ pub struct Inputs {
     pub vehicle: Option<VehicleInputs>,
     /// Age of the newest detection used, in seconds; infinite without one.
     pub target_age_s: f64,
-    /// The same without the time for which the camera did not show its place, up to a limit.
+    /// The same without the time for which the camera did not show the pad's place, up to a limit.
     pub target_missed_s: f64,
     /// True when there were enough detections without a long gap.
     pub target_confirmed: bool,
@@ -500,17 +500,19 @@ impl StateMachine {
     }
 
     fn after_approach(&mut self, inputs: &Inputs) -> Option<(Phase, Reason)> {
+        let is_lost = self.target_lost(inputs);
+        // To accelerate towards the target the vehicle tilts the camera away from it: a while it waits to see it again, and does
+        // not descend unseen.
+        let was_out_of_view = is_lost && inputs.target_missed_s < inputs.target_age_s;
+        let waits = was_out_of_view && inputs.target_missed_s <= self.config.lost_target_s;
         match inputs.progress {
             Progress::Ready(reason) => Some((Phase::Final, reason)),
-            Progress::Blind if inputs.may_descend => {
+            Progress::Blind if inputs.may_descend && !was_out_of_view => {
                 Some((Phase::Descend, Reason::DescendingUnseen))
             }
-            // To accelerate towards the target the vehicle tilts the camera away from it.
-            _ if inputs.target_missed_s > self.config.lost_target_s => {
-                Some(self.retry_or_abort(inputs, Reason::Retrying))
-            }
+            _ if is_lost && !waits => Some(self.retry_or_abort(inputs, Reason::Retrying)),
             Progress::Stuck => Some(self.retry_or_abort(inputs, Reason::NotSettling)),
-            Progress::Descending if inputs.may_descend && !self.target_lost(inputs) => {
+            Progress::Descending if inputs.may_descend && !waits => {
                 Some((Phase::Descend, Reason::Descending))
             }
             Progress::Descending | Progress::Blind | Progress::Aligning | Progress::Unchanged => {

@@ -18,8 +18,10 @@ pub(crate) enum TargetFilter {
     Kalman(Estimator),
 }
 
-/// Maximum time after the newest marker for which it is not missed while its place is out of the camera's view, in seconds.
+/// Maximum time for which a marker is not missed while its place is out of the camera's view, in seconds, and maximum time
+/// between two frames for which that is known.
 const MAX_OUT_OF_VIEW_S: f64 = 2.0;
+const MAX_FRAME_GAP_S: f64 = 0.2;
 
 /// The stamps of the markers used.
 #[derive(Copy, Clone, Debug, Default)]
@@ -27,8 +29,8 @@ pub(crate) struct Sightings {
     pub(crate) newest: Option<Timestamp>,
     /// Number of markers without a long gap.
     pub(crate) in_a_row: u32,
-    /// The newest frame without one whose camera did not show the pad's place.
-    out_of_view: Option<Timestamp>,
+    /// For how long since then the camera did not show the pad's place, in seconds.
+    out_of_view_s: f64,
     /// When one was last seen too far from the estimate to be used, and when before that.
     refused: [Option<Timestamp>; 2],
 }
@@ -87,6 +89,7 @@ impl Sightings {
         }
         self.in_a_row = if gap_s > max_gap_s { 1 } else { self.in_a_row.saturating_add(1) };
         self.newest = Some(stamp);
+        self.out_of_view_s = 0.0;
     }
 
     /// Notes a marker that was refused; frames may come late and twice.
@@ -107,19 +110,15 @@ impl Sightings {
         is_recent && self.newest.is_none_or(|used| before > used)
     }
 
-    /// Notes a frame whose camera does not show the pad's place.
-    pub(crate) fn miss_out_of_view(&mut self, stamp: Timestamp) {
-        self.out_of_view = self.out_of_view.max(Some(stamp));
+    /// Notes a frame without a marker whose camera did not show the pad's place, and the time since the frame before it.
+    pub(crate) fn miss_out_of_view(&mut self, after_s: f64) {
+        let out_of_view_s = self.out_of_view_s + after_s.clamp(0.0, MAX_FRAME_GAP_S);
+        self.out_of_view_s = libm::fmin(out_of_view_s, MAX_OUT_OF_VIEW_S);
     }
 
-    /// For how long the marker was not seen though it should have been, in seconds.
+    /// For how long the marker was not seen, without the time for which its place was out of view, in seconds.
     pub(crate) fn missed_s(&self, now: Timestamp) -> f64 {
-        let age_s = self.age_s(now);
-        let out_of_view_s = self
-            .out_of_view
-            .zip(self.newest)
-            .map_or(0.0, |(last, newest)| last.seconds_since(newest).clamp(0.0, MAX_OUT_OF_VIEW_S));
-        age_s - out_of_view_s
+        self.age_s(now) - self.out_of_view_s
     }
 
     pub(crate) fn age_s(&self, now: Timestamp) -> f64 {
@@ -174,12 +173,14 @@ mod tests {
     fn a_marker_whose_place_is_out_of_view_is_not_missed_for_a_while() {
         let mut sightings = Sightings::default();
         assert!(sightings.missed_s(at(3.0)).is_infinite());
+        sightings.miss_out_of_view(0.1);
         sightings.add(at(1.0), 1.0);
-        sightings.miss_out_of_view(at(0.9));
         assert!((sightings.missed_s(at(3.0)) - 2.0).abs() < 1e-9, "before the newest");
-        sightings.miss_out_of_view(at(2.5));
-        assert!((sightings.missed_s(at(3.0)) - 0.5).abs() < 1e-9);
-        sightings.miss_out_of_view(at(9.0));
+        (0..5).for_each(|_| sightings.miss_out_of_view(0.1));
+        assert!((sightings.missed_s(at(3.0)) - 1.5).abs() < 1e-9, "seconds in between are not");
+        sightings.miss_out_of_view(1.0);
+        assert!((sightings.missed_s(at(3.0)) - 1.3).abs() < 1e-9, "without frames");
+        (0..50).for_each(|_| sightings.miss_out_of_view(0.1));
         assert!((sightings.missed_s(at(9.0)) - 6.0).abs() < 1e-9, "no longer than a while");
         sightings.add(at(9.1), 1.0);
         assert!((sightings.missed_s(at(9.5)) - 0.4).abs() < 1e-9);

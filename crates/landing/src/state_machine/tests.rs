@@ -108,6 +108,28 @@ fn a_landing_goes_through_its_phases() {
 }
 
 #[test]
+fn a_marker_out_of_the_cameras_view_is_waited_for_and_not_descended_to() {
+    let gone = |seconds, target_missed_s, progress| Inputs {
+        target_age_s: 2.5,
+        target_missed_s,
+        target_known: true,
+        progress,
+        ..at(seconds)
+    };
+    let approach = [start(), seen(1.0, Progress::Unchanged)];
+    for progress in [Progress::Unchanged, Progress::Aligning, Progress::Descending, Progress::Blind]
+    {
+        let waits = gone(2.0, 0.5, progress);
+        check(&[approach[0], approach[1], waits], Phase::Approach, Reason::Aligning);
+        let missed = gone(2.5, 1.1, progress);
+        check(&[approach[0], approach[1], waits, missed], Phase::Retry, Reason::Retrying);
+    }
+    let descent = seen(2.0, Progress::Descending);
+    let lost = gone(3.0, 0.5, Progress::Unchanged);
+    check(&[approach[0], approach[1], descent, lost], Phase::Retry, Reason::Retrying);
+}
+
+#[test]
 fn every_wait_has_a_timeout() {
     let approach = [start(), seen(1.0, Progress::Unchanged)];
     check(&[start(), at(60.1)], Phase::Hold, Reason::TargetNotFound);
