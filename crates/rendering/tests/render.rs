@@ -282,6 +282,37 @@ fn adjacent_cells_have_no_seams() {
     }
 }
 
+/// A black square in so many lines, as a bent print is drawn.
+fn scene_of_lines(count: u32) -> Scene {
+    let size_m = 0.15341;
+    let place = |line: u32| (f64::from(line) / f64::from(count) - 0.5) * size_m;
+    let rectangle = |line: u32| Shape::Rectangle {
+        min_m: [-0.5 * size_m, place(line)],
+        max_m: [0.5 * size_m, place(line + 1)],
+    };
+    let layer = |line: u32| Layer { shape: rectangle(line), ink: Ink::Black };
+    let mut scene = plain_scene();
+    scene.pads[0].drawing =
+        Drawing { half_extent_m: 0.6 * size_m, layers: (0..count).map(layer).collect() };
+    scene
+}
+
+#[test]
+fn lines_thinner_than_a_subsample_cover_no_more_than_there_is_of_them() {
+    let settings = exact_settings();
+    let at = |height_m: f64, off_px: [f64; 2]| pose(height_m, 0.2, 0.05, 0.7, off_px);
+    for (name, poses, half) in [
+        ("5 m, 0.3 px", vec![at(5.0, [0.3, 0.4])], 34),
+        ("10 m, 0.1 px", vec![at(10.0, [0.3, 0.4])], 20),
+        ("25 m, 0.06 px", vec![at(25.0, [0.3, 0.4])], 9),
+        ("10 m, 0.1 px, moving 4 px", vec![at(10.0, [-1.5, 1.0]), at(10.0, [1.5, -1.0])], 20),
+    ] {
+        let window = Window { centre: [648, 486], half };
+        let worst = check(name, &scene_of_lines(200), &settings, &poses, window);
+        assert!(worst <= WORST_LEVELS, "{name}: {worst}");
+    }
+}
+
 #[test]
 fn an_occluder_changes_the_light_before_the_sensor() {
     let settings = exact_settings();

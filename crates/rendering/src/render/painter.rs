@@ -270,6 +270,9 @@ enum Outline {
 struct HalfPlane {
     depth: [f32; 3],
     motion: f32,
+    /// Depth behind the opposite edge of a strip that is thinner than the profile: such edges cover together what is between
+    /// them, and not the product of what each covers by itself.
+    opposite: Option<[f32; 3]>,
 }
 
 /// Coverage across an edge: the integral of a biweight kernel.
@@ -344,7 +347,7 @@ impl Outlines {
                     Outline::Disc { quadratic, motion, bounds }
                 }
                 Area::Rectangle(min, max) => {
-                    self.polygon(plane, &rectangle(min, max), motion_of_polygons, reach)
+                    self.rectangle(plane, &rectangle(min, max), motion_of_polygons, reach)
                 }
                 Area::Box => self.polygon(plane, sight.outline(), motion_of_polygons, reach),
             };
@@ -362,15 +365,50 @@ impl Outlines {
     ) -> Outline {
         let first = self.half_planes.len();
         for edge in edges {
-            let depth = depth_px(plane, edge);
-            let moved = (depth[1] * motion[0] + depth[2] * motion[1]).abs();
-            let min = depth[0] - (depth[1].abs() + depth[2].abs()) * reach;
-            if min < f64::from(self.profile.width) + moved {
-                let depth = depth.map(|d| d as f32);
-                self.half_planes.push(HalfPlane { depth, motion: moved as f32 });
+            let half_plane = self.half_plane(plane, edge, motion, reach);
+            self.half_planes.extend(half_plane);
+        }
+        Outline::Polygon { first, len: self.half_planes.len() - first }
+    }
+
+    /// The same of a rectangle, of which each edge is followed by the opposite one.
+    fn rectangle(
+        &mut self,
+        plane: &[Affine; 3],
+        edges: &[Affine; 4],
+        motion: [f64; 2],
+        reach: f64,
+    ) -> Outline {
+        let first = self.half_planes.len();
+        let [right, left, top, bottom] =
+            edges.each_ref().map(|edge| self.half_plane(plane, edge, motion, reach));
+        for pair in [[right, left], [top, bottom]] {
+            match pair {
+                [Some(one), Some(other)]
+                    if one.depth[0] + other.depth[0] < self.profile.width + one.motion =>
+                {
+                    self.half_planes.push(HalfPlane { opposite: Some(other.depth), ..one });
+                }
+                _ => self.half_planes.extend(pair.into_iter().flatten()),
             }
         }
         Outline::Polygon { first, len: self.half_planes.len() - first }
+    }
+
+    /// The half-plane behind an edge; `None` where it covers all of the tile.
+    fn half_plane(
+        &self,
+        plane: &[Affine; 3],
+        edge: &Affine,
+        motion: [f64; 2],
+        reach: f64,
+    ) -> Option<HalfPlane> {
+        let depth = depth_px(plane, edge);
+        let moved = (depth[1] * motion[0] + depth[2] * motion[1]).abs();
+        let min = depth[0] - (depth[1].abs() + depth[2].abs()) * reach;
+        let has_edge = min < f64::from(self.profile.width) + moved;
+        let depth = depth.map(|d| d as f32);
+        has_edge.then_some(HalfPlane { depth, motion: moved as f32, opposite: None })
     }
 
     /// The part of row `v` of a tile, which spans `from` to `to`, that an outline may cover.
@@ -400,12 +438,15 @@ impl Outlines {
                 let planes = self.half_planes.get(*first..first + len).unwrap_or(&[]);
                 let mut reach = [from, to];
                 for plane in planes {
-                    let [start, per_u, per_v] = plane.depth;
-                    let start = start + per_v * v + self.profile.margin([plane.motion, 0.0]);
-                    if per_u > 1e-6 {
-                        reach[0] = reach[0].max(-start / per_u);
-                    } else if per_u < -1e-6 {
-                        reach[1] = reach[1].min(-start / per_u);
+                    let margin = self.profile.margin([plane.motion, 0.0]);
+                    for [start, per_u, per_v] in std::iter::once(plane.depth).chain(plane.opposite)
+                    {
+                        let start = start + per_v * v + margin;
+                        if per_u > 1e-6 {
+                            reach[0] = reach[0].max(-start / per_u);
+                        } else if per_u < -1e-6 {
+                            reach[1] = reach[1].min(-start / per_u);
+                        }
                     }
                 }
                 (reach[0] <= reach[1]).then_some(reach)
@@ -436,7 +477,9 @@ impl Outlines {
                 for plane in planes {
                     let [start, per_u, per_v] = plane.depth;
                     let margin = self.profile.margin([plane.motion, 0.0]);
-                    if ends.iter().any(|u| start + per_v * v + per_u * u < margin) {
+                    if let Some(opposite) = plane.opposite {
+                        self.strip_row(plane, opposite, v, offsets, cover);
+                    } else if ends.iter().any(|u| start + per_v * v + per_u * u < margin) {
                         self.half_plane_row(plane, v, offsets, cover);
                     }
                 }
@@ -463,6 +506,29 @@ impl Outlines {
             for (cover, u) in cover.iter_mut().zip(offsets) {
                 *cover *= self.profile.mean_cover(start + per_u * u, plane.motion);
             }
+        }
+    }
+
+    /// Multiplies the coverage with that of what is between two edges, which are nearly parallel: what is beyond the one is behind
+    /// the other, so only once it is subtracted.
+    fn strip_row(
+        &self,
+        plane: &HalfPlane,
+        opposite: [f32; 3],
+        v: f32,
+        offsets: &[f32],
+        cover: &mut [f32],
+    ) {
+        let cover_of = |[start, per_u, per_v]: [f32; 3], u: f32| {
+            let depth = start + per_v * v + per_u * u;
+            if plane.motion < STILL_PX {
+                self.profile.cover(depth)
+            } else {
+                self.profile.mean_cover(depth, plane.motion)
+            }
+        };
+        for (cover, u) in cover.iter_mut().zip(offsets) {
+            *cover *= (cover_of(plane.depth, *u) + cover_of(opposite, *u) - 1.0).max(0.0);
         }
     }
 
