@@ -11,6 +11,7 @@ use experiments::landing::fault::Fault;
 use experiments::landing::plan::{self, Plan, Values, Vision};
 use experiments::landing::{self, Watch};
 use experiments::markers::{self, Request, Step};
+use experiments::record::Ids;
 use experiments::results::Folder;
 use experiments::set::Set;
 use experiments::sets::Variant;
@@ -124,6 +125,10 @@ struct MarkersArgs {
     /// (2592 x 1944, RGGB), instead of in the sensor. Only with `--set positions`.
     #[arg(long)]
     binned: bool,
+    /// Look for the id that a frame shows, as a landing on that marker does, instead of any of its family. Results are in
+    /// `results-known-id`.
+    #[arg(long)]
+    known_id: bool,
     /// Seed of poses, ids, grounds and noise. With 0 they are those on which the detector was developed.
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
@@ -190,6 +195,7 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
         !args.binned || (args.processings == [Preset::Linear] && args.sets == [Set::Positions]),
         "`--binned` is for `--set positions` and `--processing linear`: the thesis' frames, of a camera that gives out raw ones"
     );
+    let ids = if args.known_id { Ids::Shown } else { Ids::Any };
     let sets = if args.sets.is_empty() { Set::ALL.to_vec() } else { args.sets };
     let mut photographs = args.photographs;
     let requests: Vec<Request> = args
@@ -207,7 +213,7 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
                 families: args.families.clone(),
                 // They have been through a camera already: once is enough.
                 photographs: photographs.take(),
-                ..Request::within(&args.output, variant)
+                ..Request::within(&args.output, variant, ids)
             }
         })
         .collect();

@@ -7,6 +7,7 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use experiments::markers::{Request, Step, run};
+use experiments::record::Ids;
 use experiments::set::Set;
 use experiments::sets::Variant;
 
@@ -20,6 +21,7 @@ fn main() -> anyhow::Result<()> {
         families: Vec::new(),
         photographs: None,
         variant: Variant::default(),
+        ids: Ids::Any,
     };
     for argument in arguments {
         match argument.split_once('=') {

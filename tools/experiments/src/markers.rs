@@ -12,7 +12,7 @@ use markers::{Family, Marker};
 use crate::figures::{self, FIGURES};
 use crate::frame_spec::FrameRenderer;
 use crate::photographs;
-use crate::record::{self, ALL_AT_ONCE, FOLLOWING, OURS, Record};
+use crate::record::{self, ALL_AT_ONCE, FOLLOWING, Ids, OURS, Record};
 use crate::report;
 use crate::set::{MARKERS, SIZE_M, Set};
 use crate::sets::Variant;
@@ -34,23 +34,29 @@ pub struct Request {
     pub photographs: Option<PathBuf>,
     /// Which frames of the sets.
     pub variant: Variant,
+    /// The ids that are looked for in frames with a marker.
+    pub ids: Ids,
 }
 
 impl Request {
     /// All sets and families of the experiment in one working folder, which has a folder for each variant but
     /// the default.
-    pub fn within(folder: &Path, variant: Variant) -> Self {
+    pub fn within(folder: &Path, variant: Variant, ids: Ids) -> Self {
         let folder = match variant.name() {
             Some(name) => folder.join(name),
             None => folder.to_owned(),
         };
         Self {
             sets_in: folder.join("sets"),
-            results_in: folder.join("results"),
+            results_in: folder.join(match ids {
+                Ids::Any => "results",
+                Ids::Shown => "results-known-id",
+            }),
             sets: Set::ALL.to_vec(),
             families: Vec::new(),
             photographs: None,
             variant,
+            ids,
         }
     }
 }
@@ -118,12 +124,12 @@ pub fn run(
         let folder = store::folder(sets_in, set, marker);
         if set.has_marker() {
             let any = Marker { id: None, ..marker };
-            detect(results_in, set, name, &folder, &[any])?;
+            detect(results_in, set, name, &folder, &[any], request.ids)?;
             time(results_in, set, any, &folder)?;
         } else {
             for (name, families) in photographs::families_for_negatives() {
                 let markers = sized(&families);
-                detect(results_in, set, name, &folder, &markers)?;
+                detect(results_in, set, name, &folder, &markers, Ids::Any)?;
             }
         }
         done += 1;
@@ -141,6 +147,9 @@ pub fn run(
         true => format!("Interrupted after {done} of {of} sets and families.\n\n"),
         false => String::new(),
     };
+    if request.ids == Ids::Shown {
+        text += "The id that a frame shows is known, as in a landing.\n\n";
+    }
     text += &(report::text(&runs) + &extra);
     for table in tables::all(&runs) {
         text.push_str(&format!("\n{}", table.markdown));
@@ -203,10 +212,11 @@ fn detect(
     name: &str,
     folder: &Path,
     markers: &[Marker],
+    ids: Ids,
 ) -> anyhow::Result<()> {
     let is_timed = matches!(set, Set::Textured | Set::Tracking);
     let runs = if is_timed { TIMED_RUNS } else { 1 };
-    let answers = record::run(folder, markers, runs)?;
+    let answers = record::run(folder, markers, ids, runs)?;
     let file = record::file(results, OURS, set, name);
     record::write(&file, answers.iter().map(|(_, record)| record))
 }
@@ -217,7 +227,7 @@ fn time(results: &Path, set: Set, marker: Marker, folder: &Path) -> anyhow::Resu
     let name = marker.family.name();
     if set == Set::Textured {
         let [(_, families), _] = photographs::families_for_negatives();
-        let answers = record::run(folder, &sized(&families), TIMED_RUNS)?;
+        let answers = record::run(folder, &sized(&families), Ids::Any, TIMED_RUNS)?;
         let file = record::file(results, ALL_AT_ONCE, set, name);
         record::write(&file, answers.iter().map(|(_, record)| record))?;
     }

@@ -126,6 +126,16 @@ pub fn answer(
     Ok((shortest, found))
 }
 
+/// The ids that a detector looks for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Ids {
+    /// All of the family.
+    #[default]
+    Any,
+    /// The one that a frame shows, as a landing on that marker does: less evidence is enough to tell one id from no marker.
+    Shown,
+}
+
 /// Runs the detector for `markers` over the frames of a folder.
 ///
 /// # Errors
@@ -133,13 +143,22 @@ pub fn answer(
 pub fn run(
     folder: &Path,
     markers: &[Marker],
+    ids: Ids,
     runs: usize,
 ) -> anyhow::Result<Vec<(StoredFrame, Record)>> {
     let mut detector = Detector::new(markers, Settings::default())?;
+    let mut known = None;
     store::frames(folder)?
         .into_iter()
         .map(|frame| {
             let image = read(&folder.join(&frame.image))?;
+            let shown = frame.marker.as_ref().and_then(|truth| truth.id);
+            if ids == Ids::Shown && shown != known {
+                let of_id = |marker: &Marker| Marker { id: shown, ..*marker };
+                let markers: Vec<Marker> = markers.iter().map(of_id).collect();
+                detector = Detector::new(&markers, Settings::default())?;
+                known = shown;
+            }
             let (ms, found) = answer(&mut detector, &image, Some(&frame.camera.model()), runs)?;
             let record = Record { image: frame.image.clone(), ms, found };
             Ok((frame, record))
