@@ -169,6 +169,8 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
             .kill_on_drop(true)
+            // Ctrl-C in a terminal is for this process, which stops them in their order.
+            .process_group(0)
             .spawn()
             .with_context(|| format!("starting {name}"))?;
         let pid = child.id().and_then(|id| i32::try_from(id).ok()).and_then(Pid::from_raw);
@@ -188,39 +190,32 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
     }
 
     /// Stops a child, by SIGKILL if it ignores SIGTERM; events until then go to `on_event`.
-    pub(crate) async fn stop_one(&mut self, key: &K, mut on_event: impl FnMut(&ChildEvent<K>)) {
-        for signal in [Signal::TERM, Signal::KILL] {
-            let Some((_, pid)) = self.pids.iter().find(|(running, _)| running == key) else {
-                return;
-            };
-            // Fails when the child has exited already.
-            let _ = kill_process(*pid, signal);
-            let exited = async {
-                while let Some(event) = self.events.recv().await {
-                    on_event(&event);
-                    if let ChildEvent::Exited(ended, _) = event {
-                        self.pids.retain(|(running, _)| *running != ended);
-                        if ended == *key {
-                            return;
-                        }
-                    }
-                }
-            };
-            if tokio::time::timeout(STOP_TIMEOUT, exited).await.is_ok() {
-                return;
-            }
-        }
+    pub(crate) async fn stop_one(&mut self, key: &K, on_event: impl FnMut(&ChildEvent<K>)) {
+        self.stop_those(|running| running == key, on_event).await;
     }
 
     /// Stops all children, by SIGKILL those that ignore SIGTERM; events until then go to `on_event`.
-    pub(crate) async fn stop(mut self, mut on_event: impl FnMut(&ChildEvent<K>)) {
+    pub(crate) async fn stop(mut self, on_event: impl FnMut(&ChildEvent<K>)) {
+        self.stop_those(|_| true, on_event).await;
+    }
+
+    /// The same, but one.
+    pub(crate) async fn stop_all_but(&mut self, key: &K, on_event: impl FnMut(&ChildEvent<K>)) {
+        self.stop_those(|running| running != key, on_event).await;
+    }
+
+    async fn stop_those(
+        &mut self,
+        is_stopped: impl Fn(&K) -> bool,
+        mut on_event: impl FnMut(&ChildEvent<K>),
+    ) {
         for signal in [Signal::TERM, Signal::KILL] {
-            for (_, pid) in &self.pids {
+            for (_, pid) in self.pids.iter().filter(|(running, _)| is_stopped(running)) {
                 // Fails when the child has exited already.
                 let _ = kill_process(*pid, signal);
             }
             let all_exited = async {
-                while !self.pids.is_empty() {
+                while self.pids.iter().any(|(running, _)| is_stopped(running)) {
                     let Some(event) = self.events.recv().await else { return };
                     on_event(&event);
                     if let ChildEvent::Exited(ended, _) = event {

@@ -609,11 +609,22 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
     let Some(status) = &seen.status else { return };
     let text = format!("{} ({}); autopilot: {}", status.phase, status.why, status.autopilot);
     findings.good("controller", text);
+    // The state of the link is told as text only: `system 1 in GUIDED` where the autopilot is heard.
+    let link = &status.autopilot;
+    let is_heard = link.starts_with("system ") && !link.ends_with("is silent");
+    if !is_heard {
+        findings.wrong(
+            "autopilot",
+            format!("the controller does not hear it: {link}"),
+            "no landing starts without it: check that it is on, its cable and baud rate, and `autopilot.address`",
+        );
+    }
     match status.setpoint_timeout_s {
         Some(seconds) => findings.good(
             "setpoint timeout",
             format!("without setpoints the autopilot stops after {seconds:.1} s; a landing shortens this to `autopilot.setpoint_timeout_s`"),
         ),
+        None if !is_heard => {}
         None => findings.doubtful(
             "setpoint timeout",
             "the autopilot has not told its GUID_TIMEOUT or COM_OF_LOSS_T; landings are slower for it".to_owned(),

@@ -323,12 +323,15 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     let watched = watch(&node, settings, &mut children, &resume, &mut progress, limits).await;
     progress.finish();
     let mut recorders_end = None;
-    let note_end = |event: &ChildEvent<Service>| match event {
+    let mut note_end = |event: &ChildEvent<Service>| match event {
         ChildEvent::Exited(Service::Recorder, exit) if exit.status != Some(0) => {
             recorders_end = Some(exit.clone());
         }
         ChildEvent::Exited(..) | ChildEvent::Line(..) => {}
     };
+    // The controller stops while the autopilot and the recorder still take its last messages, and the recorder last.
+    children.stop_one(&Service::Controller, &mut note_end).await;
+    children.stop_all_but(&Service::Recorder, &mut note_end).await;
     children.stop(note_end).await;
     // In a user's own network, and beside another landing, detectors may be meant to go on.
     if args.zenoh.is_none()
@@ -398,7 +401,7 @@ async fn watch(
                 }
                 ChildEvent::Exited(service, exit) => {
                     children.remove(&service);
-                    // Ctrl-C in a terminal reaches the services as well, which may exit first.
+                    // A signal may reach the services as well, which may exit first.
                     if tokio::time::timeout(SIGNAL_GRACE, shutdown.requested()).await.is_ok() {
                         landing.interrupted("interrupted");
                         return Ok(landing);

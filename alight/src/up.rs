@@ -311,8 +311,6 @@ fn start(
     };
     let mut command = Command::new(file);
     command.args(rest).envs(job.network.environment()).current_dir(&site.folder);
-    // Ctrl-C in a terminal goes to the supervisor only, which stops its processes in order.
-    command.process_group(0);
     if own {
         command.arg("--stop-with-parent").arg(std::process::id().to_string());
     }

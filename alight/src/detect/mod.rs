@@ -86,6 +86,11 @@ impl Examiner {
         for pad in &pads {
             pad.add_markers(&mut markers);
         }
+        if !pads.is_empty() && matches!(lens, Lens::Unknown) {
+            write_error(
+                "a pad as a whole is found only by a camera that is known: give --camera or --focal-px; now its markers are found one by one",
+            );
+        }
         Ok(Self {
             markers,
             pads,

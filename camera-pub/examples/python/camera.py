@@ -5,7 +5,8 @@ Put your camera in the place of `pictures`. docs/wire-format.md explains every b
 
     python3 camera-pub/examples/python/camera.py --picture marker.pgm --focal-px 1000
 
-Needed: pip install eclipse-zenoh. Exit status 77 when it is missing.
+It connects to a service of Alight that runs (`alight detector`, `alight land`): start that first. A picture as PGM:
+`ffmpeg -i marker.png -pix_fmt gray marker.pgm`. Needed: pip install eclipse-zenoh. Exit status 77 when it is missing.
 """
 
 import argparse
@@ -81,8 +82,11 @@ def camera_info(camera, size, focal_px):
 
 def read_pgm(path):
     """Width, height and grey pixels of a binary PGM file."""
-    with open(path, "rb") as file:
-        data = file.read()
+    try:
+        with open(path, "rb") as file:
+            data = file.read()
+    except OSError as problem:
+        sys.exit(f"the picture cannot be read: {problem}")
     words, at = [], 0
     while len(words) < 4:
         end = at
@@ -154,7 +158,11 @@ def main():
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
-    with zenoh.open(config) as session:
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as problem:
+        sys.exit(f"no service of Alight is there: start one first, as `alight land` or `alight detector` ({problem})")
+    with session:
         print(f"Ready: {args.id}", file=sys.stderr, flush=True)
         publish(session, prefix, args, stopped)
     return 0

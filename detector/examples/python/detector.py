@@ -10,7 +10,8 @@ unchanged, tells about itself, declares its presence, and answers commands. docs
 
     alight swap --to 'python3 detector/examples/python/detector.py --id python --marker aruco-4x4-50:7:0.15'
 
-Needed: pip install eclipse-zenoh numpy opencv-python-headless. Exit status 77 when one of them is missing.
+It connects to a service of Alight that runs: start that first. Needed: pip install eclipse-zenoh numpy
+opencv-python-headless. Exit status 77 when one of them is missing.
 """
 
 import argparse
@@ -395,7 +396,11 @@ def main():
     args = parser.parse_args()
     cv2.setNumThreads(1)
     config, prefix = configuration(args)
-    with zenoh.open(config) as session:
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as problem:
+        sys.exit(f"no service of Alight is there: start one first, as `alight land` or `alight detector` ({problem})")
+    with session:
         detector = Detector(session, prefix, args)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: detector.stopped.set())
