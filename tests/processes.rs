@@ -343,7 +343,10 @@ async fn a_second_controller_and_a_port_in_use_are_refused_in_words() -> anyhow:
 }
 
 async fn a_second_one_is_refused() -> anyhow::Result<()> {
-    let mut landing = Landing::start(&["--seed", "7"]).await?;
+    let folder = tempfile::tempdir()?;
+    let recording = folder.path().join("flight.mcap");
+    let file = recording.to_string_lossy();
+    let mut landing = Landing::start(&["--seed", "7", "--record", &file]).await?;
     landing.status("the controller is there", |_| true).await?;
     let second =
         output_of(Command::new(ALIGHT).args(&landing.service("controller")?.by_hand).args([
@@ -361,7 +364,8 @@ async fn a_second_one_is_refused() -> anyhow::Result<()> {
         twin.status.code() == Some(1) && said.contains("has the name `main` already"),
         "{said}"
     );
-    // The first still flies; it is asked to stop, and stops all of its services.
+    // The first still flies; in its descent it is asked to stop, and stops all of its services, the recorder last.
+    landing.status("it descends", |status| status.phase == Phase::Descend).await?;
     let pids: Vec<Pid> = landing.services.iter().map(|s| s.pid).collect();
     kill_process(Pid::from_raw(i32::try_from(landing.land.id())?).context("pid")?, Signal::TERM)?;
     let status = tokio::task::block_in_place(|| landing.land.wait())?;
@@ -369,6 +373,11 @@ async fn a_second_one_is_refused() -> anyhow::Result<()> {
     for pid in pids {
         ensure!(rustix::process::test_kill_process(pid).is_err(), "{pid:?} still runs");
     }
+    let replay = output_of(Command::new(ALIGHT).args(["replay", &file, "--verify"]))?;
+    let said = [&replay.stdout[..], &replay.stderr].concat();
+    let said = String::from_utf8_lossy(&said);
+    ensure!(replay.status.success() && said.contains("verified"), "{said}");
+    ensure!(!said.contains("has no end"), "{said}");
     Ok(())
 }
 
