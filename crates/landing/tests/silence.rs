@@ -111,8 +111,9 @@ fn check_stays_down(below_m: f64, then: Then, seeds: std::ops::Range<u64>) -> u3
                 let Some(end) = end.map(|pair| &pair[1]) else { continue };
                 let after = flight.samples.iter().filter(|it| it.seconds > end.seconds);
                 let mut unmoved = after.clone().take_while(|it| !climbs(it));
-                let mut is_lifted = || wind_m_s > 0.0 && unmoved.any(|it| it.on_ground_s == 0.0);
-                let is_lifted = then == Then::Another && is_lifted();
+                let is_lifted = then == Then::Another
+                    && wind_m_s > 0.0
+                    && unmoved.any(|it| it.on_ground_s == 0.0);
                 if end.on_ground_s < MIN_STANDING_S || is_lifted {
                     continue;
                 }

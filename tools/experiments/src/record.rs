@@ -127,10 +127,9 @@ pub fn answer(
 }
 
 /// The ids that a detector looks for.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ids {
     /// All of the family.
-    #[default]
     Any,
     /// The one that a frame shows, as a landing on that marker does: less evidence is enough to tell one id from no marker.
     Shown,

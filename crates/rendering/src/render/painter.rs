@@ -509,8 +509,8 @@ impl Outlines {
         }
     }
 
-    /// Multiplies the coverage with that of what is between two edges, which are nearly parallel: what is beyond the one is behind
-    /// the other, so only once it is subtracted.
+    /// Multiplies the coverage with that of a strip between two nearly parallel edges. What of the kernel is beyond one edge is all
+    /// behind the other, so the strip has what both cover, less one.
     fn strip_row(
         &self,
         plane: &HalfPlane,
