@@ -500,17 +500,15 @@ impl StateMachine {
     }
 
     fn after_approach(&mut self, inputs: &Inputs) -> Option<(Phase, Reason)> {
-        let is_lost = self.target_lost(inputs);
-        // To accelerate towards the target the vehicle tilts the camera away from it: a while it waits to see it again, and does
-        // not descend unseen.
-        let was_out_of_view = is_lost && inputs.target_missed_s < inputs.target_age_s;
-        let waits = was_out_of_view && inputs.target_missed_s <= self.config.lost_target_s;
+        let waits = self.waits_for_view(inputs);
         match inputs.progress {
             Progress::Ready(reason) => Some((Phase::Final, reason)),
-            Progress::Blind if inputs.may_descend && !was_out_of_view => {
+            Progress::Blind if inputs.may_descend && !self.was_out_of_view(inputs) => {
                 Some((Phase::Descend, Reason::DescendingUnseen))
             }
-            _ if is_lost && !waits => Some(self.retry_or_abort(inputs, Reason::Retrying)),
+            _ if self.target_lost(inputs) && !waits => {
+                Some(self.retry_or_abort(inputs, Reason::Retrying))
+            }
             Progress::Stuck => Some(self.retry_or_abort(inputs, Reason::NotSettling)),
             Progress::Descending if inputs.may_descend && !waits => {
                 Some((Phase::Descend, Reason::Descending))
@@ -528,7 +526,11 @@ impl StateMachine {
             Progress::Descending | Progress::Aligning | Progress::Unchanged
                 if self.target_lost(inputs) =>
             {
-                Some(self.retry_or_abort(inputs, Reason::Retrying))
+                // On approach it is waited for.
+                Some(match self.waits_for_view(inputs) {
+                    true => (Phase::Approach, Reason::Aligning),
+                    false => self.retry_or_abort(inputs, Reason::Retrying),
+                })
             }
             Progress::Stuck => Some(self.retry_or_abort(inputs, Reason::NotSettling)),
             Progress::Aligning => Some((Phase::Approach, Reason::Aligning)),
@@ -536,6 +538,17 @@ impl StateMachine {
                 .timed_out(inputs, self.config.descend_timeout_s)
                 .then_some((Phase::Hold, Reason::NoProgress)),
         }
+    }
+
+    /// True for a lost target whose place was out of the camera's view meanwhile.
+    fn was_out_of_view(&self, inputs: &Inputs) -> bool {
+        self.target_lost(inputs) && inputs.target_missed_s < inputs.target_age_s
+    }
+
+    /// True while such a target is waited for, and not descended upon unseen: to accelerate towards it the vehicle tilts the camera
+    /// away from it.
+    fn waits_for_view(&self, inputs: &Inputs) -> bool {
+        self.was_out_of_view(inputs) && inputs.target_missed_s <= self.config.lost_target_s
     }
 
     /// A retry while one is left; a hold where the marker's place is unknown.

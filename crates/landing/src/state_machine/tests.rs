@@ -125,8 +125,13 @@ fn a_marker_out_of_the_cameras_view_is_waited_for_and_not_descended_to() {
         check(&[approach[0], approach[1], waits, missed], Phase::Retry, Reason::Retrying);
     }
     let descent = seen(2.0, Progress::Descending);
-    let lost = gone(3.0, 0.5, Progress::Unchanged);
-    check(&[approach[0], approach[1], descent, lost], Phase::Retry, Reason::Retrying);
+    for progress in [Progress::Unchanged, Progress::Aligning, Progress::Descending] {
+        let descends = [approach[0], approach[1], descent];
+        let [waits, missed] = [gone(3.0, 0.5, progress), gone(3.5, 1.1, progress)];
+        check(&[&descends[..], &[waits]].concat(), Phase::Approach, Reason::Aligning);
+        check(&[&descends[..], &[waits, missed]].concat(), Phase::Retry, Reason::Retrying);
+        check(&[&descends[..], &[missed]].concat(), Phase::Retry, Reason::Retrying);
+    }
 }
 
 #[test]
