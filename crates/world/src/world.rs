@@ -131,9 +131,14 @@ impl World {
 
     /// Takes a packet for the autopilot, now.
     pub fn handle(&mut self, packet: &Packet) {
-        let now_s = self.now_s();
+        self.handle_at(self.now_s(), packet);
+    }
+
+    /// Takes a packet for the autopilot at `time_s`, which is before the next step. An answer with the time has this one: that of
+    /// the last step would be half a step too early on average, and so would the offset of the clocks that is learnt from it.
+    pub fn handle_at(&mut self, time_s: f64, packet: &Packet) {
         if !self.link_is_lost() {
-            self.autopilot.handle(now_s, packet);
+            self.autopilot.handle(time_s, packet);
         }
     }
 

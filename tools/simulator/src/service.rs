@@ -232,7 +232,7 @@ async fn advance(node: &Node, config: &Config, simulation: &Simulation) -> anyho
             // Time advances first, however many packets arrive.
             biased;
             _ = ticks.tick() => {}
-            () = mavlink.receive(simulation) => continue,
+            () = mavlink.receive(node, simulation) => continue,
         }
         tick += 1;
         mavlink.send(node, simulation).await;
@@ -300,15 +300,22 @@ impl AutopilotSide {
         })
     }
 
-    /// Receives and handles the next packet.
-    async fn receive(&mut self, simulation: &Simulation) {
+    /// Receives and handles the next packet. Answers go out at once: one that waited for the next tick would make the way back
+    /// longer than the way there, and the controller's clock of the autopilot wrong by half of that.
+    async fn receive(&mut self, node: &Node, simulation: &Simulation) {
         match self {
             Self::Link(link) => {
-                if let LinkEvent::Packet { packet, .. } = link.recv().await
-                    && let VehicleSource::Simulated(world) = &mut *simulation.source()
-                {
-                    world.advance_to(simulation.now_s());
-                    world.handle(&packet);
+                if let LinkEvent::Packet { packet, .. } = link.recv().await {
+                    let answers = match &mut *simulation.source() {
+                        VehicleSource::Simulated(world) => {
+                            let now_s = simulation.now_s();
+                            world.advance_to(now_s);
+                            world.handle_at(now_s, &packet);
+                            world.outgoing().collect()
+                        }
+                        VehicleSource::Reported(_) => Vec::new(),
+                    };
+                    send_all(node, link, answers);
                 }
             }
             Self::Topics { packets, system, .. } => {
@@ -340,11 +347,7 @@ impl AutopilotSide {
                     }
                     VehicleSource::Reported(_) => Vec::new(),
                 };
-                for packet in packets {
-                    if link.send(&packet).is_err() {
-                        node.health().dropped("packets without a listener");
-                    }
-                }
+                send_all(node, link, packets);
             }
             Self::Topics { requests, requested_s, unanswered, system: Some(system), .. } => {
                 let now_s = simulation.now_s();
@@ -367,6 +370,14 @@ impl AutopilotSide {
                 }
             }
             Self::Topics { system: None, .. } => {}
+        }
+    }
+}
+
+fn send_all(node: &Node, link: &mut Link, packets: Vec<Vec<u8>>) {
+    for packet in packets {
+        if link.send(&packet).is_err() {
+            node.health().dropped("packets without a listener");
         }
     }
 }
