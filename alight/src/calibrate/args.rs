@@ -48,6 +48,9 @@ pub(crate) struct BoardArgs {
     /// The calibration file to write. Its name ends in .yaml, or in .json or .xml for OpenCV's.
     #[arg(short, long, value_name = "FILE", value_parser = calibration_file)]
     pub(super) output: Option<PathBuf>,
+    /// Replace the file of `--output` where it is there already, as the calibration in use; without it that file is refused.
+    #[arg(long)]
+    pub(super) replace: bool,
     /// The sensor's size, kept in the file, when the images show it binned or a part of it; other modes of the same camera are
     /// then calculated from this calibration.
     #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = sensor_px)]

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context, ensure};
+use anyhow::Context;
 use calibration::{FlightCalibration, FlightEstimate, Quantity, calibrate_flight};
 use clap::Args;
 use serde_json::{Value, json};
@@ -47,10 +47,7 @@ pub(crate) struct FlightArgs {
 pub(super) fn run(args: &FlightArgs) -> anyhow::Result<ExitCode> {
     let FlightArgs { file, camera, detector, marker, output, replace, .. } = args;
     if let Some(path) = output {
-        ensure!(
-            *replace || !path.exists(),
-            "{path:?} is there already, and may be of another flight: name another with `--output`, or replace it with `--replace`"
-        );
+        super::refuse_existing(path, *replace, "and may be of another flight")?;
     }
     let wanted = Wanted {
         camera: camera.as_deref(),

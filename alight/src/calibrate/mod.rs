@@ -10,10 +10,11 @@ mod recorded;
 mod report;
 mod sharpness;
 
+use std::path::Path;
 use std::process::ExitCode;
 use std::time::SystemTime;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use calibration::{Calibration, Refusal, calibrate, calibrate_unjudged};
 use clap::{Args, Subcommand};
 use media::{CalibrationDetails, CalibrationNote, write_calibration};
@@ -60,6 +61,15 @@ pub(crate) fn run(args: &CalibrateArgs) -> anyhow::Result<ExitCode> {
     }
 }
 
+/// Refuses a file that is there already and is not to be replaced, before anything is calibrated.
+fn refuse_existing(path: &Path, is_replaced: bool, may_be: &str) -> anyhow::Result<()> {
+    ensure!(
+        is_replaced || !path.exists(),
+        "{path:?} is there already, {may_be}: name another with `--output`, or replace it with `--replace`"
+    );
+    Ok(())
+}
+
 fn board(args: &BoardArgs) -> anyhow::Result<ExitCode> {
     let board = args.board()?;
     if let Some(output) = &args.print {
@@ -76,6 +86,9 @@ fn board(args: &BoardArgs) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     args.check()?;
+    if let Some(path) = &args.output {
+        refuse_existing(path, args.replace, "and may be the calibration in use")?;
+    }
     let mut finder = Finder::new(&board)?;
     let mut found = match &args.live {
         Some(camera) => watch_camera(&mut finder, camera, args)?,

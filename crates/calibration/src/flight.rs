@@ -147,6 +147,8 @@ pub enum FlightRefusal {
     },
 }
 
+/// What the image's scale has, which an error of the attitude makes smaller.
+const SCALE: [Quantity; 2] = [Quantity::FocalScale, Quantity::K1];
 /// The fewest detections of a flight.
 pub const MIN_MARKERS: usize = 60;
 /// Largest time offset that is believed, in seconds.
@@ -198,6 +200,13 @@ pub fn calibrate_flight(
         noise = scale::noise(&model.linearised(&parameters), &parameters, &prior, noise);
         (parameters, result) = minimum(&model, &prior, &noise, parameters)?;
     }
+    let attenuation = excitation.attenuation(noise.lean_rad);
+    let is_scale_shown = attenuation <= Quantity::FocalScale.max_deviation();
+    if !is_scale_shown {
+        // The attitude's errors have too large a part in the tilts: what they make of the scale would be taken for the camera's.
+        let prior = SCALE.into_iter().fold(prior, |prior, quantity| prior.with(quantity, 0.0));
+        (parameters, result) = minimum(&model, &prior, &noise, parameters)?;
+    }
     if parameters[OFFSET].abs() > MAX_OFFSET_S {
         return Err(FlightRefusal::Offset { offset_s: parameters[OFFSET] });
     }
@@ -206,7 +215,10 @@ pub fn calibrate_flight(
         return Err(FlightRefusal::Contradiction { wander_m, share: result.outliers });
     }
     is_settled(&result)?;
-    let told = Told { configured, markers: model.markers().len(), excitation, noise };
+    let shown = QUANTITIES.map(|quantity| {
+        excitation.shows(quantity) && (is_scale_shown || !SCALE.contains(&quantity))
+    });
+    let told = Told { configured, markers: model.markers().len(), excitation, noise, shown };
     Ok(told.calibration(&parameters, &result))
 }
 
@@ -268,21 +280,31 @@ struct Told<'a> {
     markers: usize,
     excitation: Excitation,
     noise: Noise,
+    /// Whether the flight can show each of [`QUANTITIES`].
+    shown: [bool; QUANTITIES.len()],
 }
 
 impl Told<'_> {
+    /// What the attitude's errors make of the focal length no length of the flight averages out.
+    fn bias_variance(&self, quantity: Quantity) -> f64 {
+        match quantity {
+            Quantity::FocalScale => squared(self.excitation.attenuation(self.noise.lean_rad)),
+            _ => 0.0,
+        }
+    }
+
     fn calibration(&self, parameters: &Parameters, result: &Filtered) -> FlightCalibration {
         let covariance: SMatrix<f64, 6, 6> = SMatrix::from_fn(|i, j| {
             let [one, other] = [QUANTITIES[i], QUANTITIES[j]];
             match i == j {
-                true => variance(result, one),
+                true => variance(result, one) + self.bias_variance(one),
                 false => result.covariance[(one.index(), other.index())],
             }
         });
         let estimates: [FlightEstimate; 6] = std::array::from_fn(|i| {
             let quantity = QUANTITIES[i];
             let (value, variance) = (parameters[quantity.index()], covariance[(i, i)]);
-            match self.excitation.shows(quantity) {
+            match self.shown[i] {
                 true => {
                     FlightEstimate { quantity, value, deviation: libm::fmax(variance, 0.0).sqrt() }
                 }

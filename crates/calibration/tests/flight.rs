@@ -287,6 +287,27 @@ fn a_descent_without_turns_shows_roll_and_pitch_of_the_mount_alone() {
 }
 
 #[test]
+fn tilts_that_are_hardly_larger_than_the_attitudes_errors_correct_no_scale() {
+    let (mut smallest, mut largest, mut shown) = (f64::INFINITY, 0.0, 0);
+    for sway_m in [0.07, 0.1, 0.15, 0.25, 0.35] {
+        for seed in 0..5 {
+            let flown = Flown { sway_m, turn_rad: 0.0, ..Flown::landing(7000 + seed) };
+            let result = solved(flown, &Truth::default()).unwrap();
+            let tilt_deg = result.excitation.tilt_rad.to_degrees();
+            (smallest, largest) = (f64::min(smallest, tilt_deg), f64::max(largest, tilt_deg));
+            for estimate in &result.estimates[4..] {
+                assert_eq!(estimate.correction(), 0.0, "{tilt_deg} deg, {seed}: {estimate:?}");
+                let is_honest = estimate.value.abs() < 4.0 * estimate.deviation;
+                assert!(is_honest, "{tilt_deg} deg, {seed}: {estimate:?}");
+                shown += u32::from(estimate.is_observable());
+            }
+        }
+    }
+    println!("tilts of {smallest:.2} to {largest:.2} deg, {shown} of 50 shown");
+    assert!(smallest < 0.6 && largest > 2.0 && shown > 5, "{smallest} {largest} {shown}");
+}
+
+#[test]
 fn stamps_of_another_clock_are_refused() {
     for offset_s in [7.0, -2.5] {
         let (vehicle, markers) = flown(Flown::landing(4), &Truth { offset_s, ..WRONG });
