@@ -52,6 +52,18 @@ fn free_page() -> anyhow::Result<String> {
     Ok(format!("127.0.0.1:{port}"))
 }
 
+#[test]
+fn a_landing_does_not_begin_when_another_program_has_the_port_of_its_page() -> anyhow::Result<()> {
+    let taken = std::net::TcpListener::bind("127.0.0.1:0")?;
+    let page = taken.local_addr()?.to_string();
+    let output =
+        output_of(std::process::Command::new(ALIGHT).args(["land", "--dashboard", &page]))?;
+    let problem = String::from_utf8_lossy(&output.stderr);
+    ensure!(!output.status.success() && !problem.contains("takeoff"), "{output:?}");
+    ensure!(problem.contains(&page) && problem.contains("`--dashboard IP:PORT`"), "{problem}");
+    Ok(())
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_landing_is_shown_and_goes_on_when_the_page_is_killed() -> anyhow::Result<()> {
     let _flight = beside_another().await?;

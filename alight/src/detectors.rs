@@ -93,8 +93,10 @@ fn list(network: &NetworkArgs, format: Format) -> anyhow::Result<ExitCode> {
 async fn listen(node: &Node) -> anyhow::Result<Overview> {
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     let infos = node.subscriber(topic::DETECTOR_INFO, &[]).await?;
+    let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
     let configurations = node.subscriber(topic::CONFIGURATION, &["controller"]).await?;
     let (mut status, mut announced, mut marker) = (None, BTreeMap::new(), None);
+    let mut published: BTreeMap<String, u32> = BTreeMap::new();
     let receive = async {
         loop {
             tokio::select! {
@@ -103,6 +105,10 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
                     // A detector is identified by its key, not by the message.
                     let name = topic::DETECTOR_INFO.first_name(&key).unwrap_or_default();
                     announced.insert(name.to_owned(), info);
+                }
+                Some((key, _)) = detections.next_with_key() => {
+                    let name = topic::DETECTIONS.first_name(&key).unwrap_or_default();
+                    *published.entry(name.to_owned()).or_default() += 1;
                 }
                 Some(configuration) = configurations.next() => marker = marker_of(&configuration),
                 else => return,
@@ -115,7 +121,10 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
         let next = tokio::time::timeout(CONFIGURATION_PATIENCE, configurations.next()).await;
         marker = next.ok().flatten().as_ref().and_then(marker_of);
     }
-    let ready = node.alive("detector", "*").await?.into_iter().collect();
+    let ready: BTreeSet<String> = node.alive("detector", "*").await?.into_iter().collect();
+    let rate_hz = |count| f64::from(count) / LISTENING.as_secs_f64();
+    let mut running: BTreeMap<String, f64> = ready.into_iter().map(|name| (name, 0.0)).collect();
+    running.extend(published.into_iter().map(|(name, count)| (name, rate_hz(count))));
     let controller = match (status, &marker) {
         (Some(status), _) => Controller::Read(Box::new(status)),
         (None, None) if node.alive("controller", "*").await?.is_empty() => {
@@ -123,7 +132,7 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
         }
         (None, _) => Controller::Unread,
     };
-    Ok(Overview::new(controller, marker, &announced, ready))
+    Ok(Overview::new(controller, marker, &announced, &running))
 }
 
 /// The marker of a controller's landing.
@@ -182,7 +191,8 @@ struct Overview {
 struct Entry {
     id: String,
     /// `active`, `shadow`, `stale`, `blind`, `outvoted`; `waiting` for one from which the controller has received nothing, and
-    /// `other-marker` for one that answers and never reports the marker of the landing.
+    /// `other-marker` for one that answers and never reports the marker of the landing. Where no controller's status is read,
+    /// `publishing`, or `silent` for one of which nothing came.
     state: &'static str,
     place: Option<Place>,
     host: Option<String>,
@@ -201,7 +211,7 @@ impl Overview {
         controller: Controller,
         marker: Option<String>,
         announced: &BTreeMap<String, DetectorInfo>,
-        ready: BTreeSet<String>,
+        running: &BTreeMap<String, f64>,
     ) -> Self {
         let (controller, status_read, status) = match controller {
             Controller::Absent(detector_why) => {
@@ -213,10 +223,18 @@ impl Overview {
         let candidates: BTreeMap<&str, &Candidate> =
             status.candidates.iter().map(|c| (c.detector.as_str(), c)).collect();
         let mut names: BTreeSet<&str> = candidates.keys().copied().collect();
-        names.extend(ready.iter().map(String::as_str));
+        names.extend(running.keys().map(String::as_str));
         let entry = |name: &str| {
             let (candidate, info) = (candidates.get(name).copied(), announced.get(name));
-            Entry::new(name, candidate, info, marker.as_deref())
+            let received_hz = running.get(name).copied().filter(|rate_hz| *rate_hz > 0.0);
+            let mut entry = Entry::new(name, candidate, info, marker.as_deref());
+            if candidate.is_none() {
+                entry.rate_hz = received_hz;
+                if !status_read {
+                    entry.state = if received_hz.is_some() { "publishing" } else { "silent" };
+                }
+            }
+            entry
         };
         let mut detectors: Vec<Entry> = names.into_iter().map(entry).collect();
         detectors.sort_by_key(|entry| entry.state != "active");
@@ -379,9 +397,9 @@ mod tests {
             pid: 7,
         };
         let announced = [("main".to_owned(), info)].into();
-        let ready = ["main".to_owned(), "late".to_owned()].into();
+        let running = [("main".to_owned(), 10.0), ("late".to_owned(), 0.0)].into();
         let table =
-            Overview::new(Controller::Read(Box::new(status)), None, &announced, ready).table();
+            Overview::new(Controller::Read(Box::new(status)), None, &announced, &running).table();
         let lines: Vec<&str> = table.lines().collect();
         assert!(lines[1].starts_with("main") && lines[1].contains("rings:0.15341"), "{table}");
         assert!(lines[2].contains("shadow") && lines[2].contains("29 of 30, 0.012 m"), "{table}");
@@ -389,12 +407,15 @@ mod tests {
         assert!(lines[4].contains("preferred: ground; 3 changes"), "{table}");
         assert!(lines[5].starts_with("Warning: detections of `late`"), "{table}");
         let absent = Controller::Absent("nobody listens at 10.0.0.1:7448".to_owned());
-        let nobody = Overview::new(absent, None, &announced, BTreeSet::new()).table();
+        let nobody = Overview::new(absent, None, &announced, &running).table();
+        let lines: Vec<&str> = nobody.lines().collect();
+        assert!(lines[1].starts_with("late") && lines[1].contains("silent"), "{nobody}");
+        assert!(lines[2].contains("publishing") && lines[2].contains("10.0 Hz"), "{nobody}");
         assert!(nobody.contains("No controller answers"), "{nobody}");
         assert!(nobody.contains("nobody listens at 10.0.0.1:7448"), "{nobody}");
         // As its configuration is read, whose version is the same.
         let marker = Some("rings".to_owned());
-        let unread = Overview::new(Controller::Unread, marker, &announced, BTreeSet::new());
+        let unread = Overview::new(Controller::Unread, marker, &announced, &BTreeMap::new());
         assert!(unread.controller && !unread.status_read);
         let unread = unread.table();
         assert!(unread.contains("A controller is running") && !unread.contains("No controller"));
@@ -435,7 +456,7 @@ mod tests {
             toml: "marker = \"rings\"".into(),
         });
         let overview =
-            Overview::new(Controller::Read(Box::new(status)), marker, &announced, BTreeSet::new());
+            Overview::new(Controller::Read(Box::new(status)), marker, &announced, &BTreeMap::new());
         let told: Vec<_> = overview.detectors.iter().map(|it| (it.id.as_str(), it.state)).collect();
         let expected = [
             ("main", "active"),

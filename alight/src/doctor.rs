@@ -6,7 +6,7 @@ mod cameras;
 mod focus;
 mod keys;
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -358,8 +358,8 @@ struct Seen {
     healths: Vec<Health>,
     cameras: Vec<CameraInfo>,
     status: Option<ControllerStatus>,
-    /// Detectors that told about themselves or what they found: some tell no health.
-    detectors: BTreeSet<String>,
+    /// How often detectors that told about themselves said what they found: some tell no health.
+    detectors: BTreeMap<String, Searched>,
     /// The time at the end of the watch, in nanoseconds.
     ended_ns: i64,
     /// As JPEG.
@@ -371,7 +371,7 @@ impl Seen {
     /// Whether a camera or a detector was heard by what it is there for.
     fn hears(&self, service: &str, instance: &str) -> bool {
         match service {
-            "detector" => self.detectors.contains(instance),
+            "detector" => self.detectors.contains_key(instance),
             "camera-pub" => {
                 let mut frames = self.frames.iter().chain(&self.raw_frames);
                 self.cameras.iter().any(|info| info.camera == instance)
@@ -400,6 +400,13 @@ fn has_camera(expected: &[Job]) -> bool {
     expected.iter().any(|job| job.service == Some(Service::CameraPub))
 }
 
+/// Frames that a detector searched, and those in which it found a marker.
+#[derive(Copy, Clone, Debug, Default)]
+struct Searched {
+    frames: u32,
+    found: u32,
+}
+
 struct ReceivedFrame {
     header: FrameHeader,
     bytes: usize,
@@ -416,6 +423,7 @@ async fn check_network(findings: &mut Findings, node: Node, watched: Watched, ex
             check_replies(findings, &node, &seen).await;
             check_healths(findings, &seen);
             cameras::check(findings, &seen, watched, has_camera(expected));
+            check_detectors(findings, &seen, watched);
             check_landing(findings, &seen);
         }
         Err(problem) => findings.wrong("network", format!("{problem:#}"), "start it again"),
@@ -453,8 +461,12 @@ async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result
                     keep(&mut seen.cameras, camera, |a, b| a.camera == b.camera);
                 }
                 Some(status) = statuses.next() => seen.status = Some(status),
-                Some(info) = infos.next() => drop(seen.detectors.insert(info.detector)),
-                Some(found) = detections.next() => drop(seen.detectors.insert(found.detector)),
+                Some(info) = infos.next() => drop(seen.detectors.entry(info.detector).or_default()),
+                Some(found) = detections.next() => {
+                    let Searched { frames, found: showing } = seen.detectors.entry(found.detector).or_default();
+                    *frames += 1;
+                    *showing += u32::from(!found.detections.is_empty());
+                }
                 Some(frame) = frames.next() => seen.frames.push(focus.received(frame)),
                 Some(frame) = next_raw() => seen.raw_frames.push(focus.received(frame)),
             }
@@ -591,6 +603,24 @@ fn check_healths(findings: &mut Findings, seen: &Seen) {
     }
 }
 
+fn check_detectors(findings: &mut Findings, seen: &Seen, watched: Watched) {
+    for (name, searched) in &seen.detectors {
+        let Searched { frames, found } = *searched;
+        let rate_hz = f64::from(frames) / watched.duration.as_secs_f64();
+        match frames {
+            0 => findings.doubtful(
+                "detector",
+                format!("`{name}` searches no frame"),
+                "it needs frames of its camera (`camera` in its configuration): see the lines of the cameras above, and its log",
+            ),
+            _ => findings.good(
+                "detector",
+                format!("`{name}` searches {rate_hz:.1} frames/s; a marker in {found} of {frames}"),
+            ),
+        }
+    }
+}
+
 /// Compares the version of another process with that of this program.
 fn check_version(findings: &mut Findings, who: &str, theirs: &str, ours: &str) {
     let told = format!("{who} is alight {theirs}, this is {ours}");
@@ -671,12 +701,26 @@ mod tests {
     }
 
     #[test]
+    fn a_detector_that_searches_nothing_is_doubtful() {
+        let searched = Searched { frames: 30, found: 27 };
+        let detectors = [("idle", Searched::default()), ("main", searched)];
+        let detectors = detectors.map(|(name, searched)| (name.to_owned(), searched)).into();
+        let watched = Watched { duration: Duration::from_secs(3), has_raw_frames: true };
+        let mut findings = Findings::default();
+        check_detectors(&mut findings, &Seen { detectors, ..Seen::default() }, watched);
+        let text = findings.text();
+        assert!(text.contains("`idle` searches no frame"), "{text}");
+        assert!(text.contains("`main` searches 10.0 frames/s; a marker in 27 of 30"), "{text}");
+        assert!(text.ends_with("0 wrong, 1 doubtful."), "{text}");
+    }
+
+    #[test]
     fn a_camera_or_detector_that_tells_no_health_is_well_while_it_is_heard() {
         let model = geometry::CameraModel::pinhole(640, 480, 1800.0);
         let info = CameraInfo::new("down", &model, &geometry::Transform::identity());
         let seen = Seen {
             cameras: vec![info],
-            detectors: BTreeSet::from(["mine".to_owned()]),
+            detectors: BTreeMap::from([("mine".to_owned(), Searched::default())]),
             ..Seen::default()
         };
         let told = |service, instance| {

@@ -270,6 +270,14 @@ fn ground_station(autopilot: Option<&str>) -> Vec<String> {
 
 async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<LandingSummary> {
     let shutdown = Shutdown::on_signals()?;
+    if let Some(address) = args.dashboard {
+        // Before anything flies: later a landing goes on without its page.
+        TcpListener::bind(address).with_context(|| {
+            format!(
+                "showing the page at {address}; choose another address with `--dashboard IP:PORT`"
+            )
+        })?;
+    }
     let rendezvous = Rendezvous::new(args.zenoh.as_deref(), args.meet)?;
     // Its own file is checked as those of the services are: nothing listens beyond this machine by accident.
     let meet = args.zenoh.as_ref().and(args.meet);

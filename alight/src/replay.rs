@@ -9,8 +9,9 @@ use std::time::Instant;
 use anyhow::{Context, ensure};
 use clap::{Args, ValueEnum};
 use flightlog::{RecordedTape, TapeReader};
+use messages::Phase;
 use node::stats::quantile;
-use replay::{Again, Change, End, Searched, change, search, verify};
+use replay::{Again, Begun, Change, End, Searched, change, search, verify};
 
 use crate::args::NetworkArgs;
 use crate::terminal::{aligned, print, write_error};
@@ -180,6 +181,9 @@ fn one(tape: &RecordedTape, args: &ReplayArgs) -> anyhow::Result<bool> {
         }
         if args.from.is_some() || !args.set.is_empty() {
             print(&told(&change))?;
+            if change.other_phase > 0 && ends_with_pilot(&change.phases) {
+                print(RECORDED_MODES)?;
+            }
         }
         change.end
     };
@@ -206,6 +210,14 @@ fn one(tape: &RecordedTape, args: &ReplayArgs) -> anyhow::Result<bool> {
         print("the tape has no end: the controller was killed, or the end was not recorded")?;
     }
     Ok(end.stop.is_none() && other_state.is_none())
+}
+
+/// Why a landing that is replayed with other settings may end with a pilot that nobody was.
+const RECORDED_MODES: &str = "pilot-in-command may be the recording's doing: its autopilot changes modes when the recorded landing \
+                              asked for them, and this landing did not ask then; fly it (`alight land --set ...`) to see its end";
+
+fn ends_with_pilot(phases: &[Begun]) -> bool {
+    phases.last().is_some_and(|begun| begun.phase == Phase::PilotInCommand)
 }
 
 fn told(change: &Change) -> String {

@@ -18,7 +18,7 @@ pub mod truth;
 pub mod verify;
 
 pub use brightness::{Brightness, Meter};
-pub use change::{Change, change};
+pub use change::{Begun, Change, change};
 pub use frames::{Again, Searched, search};
 pub use restamp::Restamp;
 pub use run::{End, Replayed, Stop, run};

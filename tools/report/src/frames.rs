@@ -133,6 +133,12 @@ impl Frames {
         self.all.iter().filter(|frame| frame.fate == *fate).count()
     }
 
+    /// How many the detector in use searched during the landing.
+    pub fn of_landing(&self) -> usize {
+        let is_needed = |fate: &Fate| !matches!(fate, Fate::Standby | Fate::NotNeeded);
+        self.all.iter().filter(|frame| is_needed(&frame.fate)).count()
+    }
+
     /// What became of frames, the best first.
     pub fn fates(&self) -> BTreeSet<Fate> {
         self.all.iter().map(|frame| frame.fate.clone()).collect()

@@ -128,7 +128,7 @@ static FIGURES: [Figure; 18] = [
     figure("speed aside at touchdown", |s| s.touchdown_lateral_speed_m_s, 2, "m/s"),
     figure("largest tilt", |s| s.max_tilt_deg, 1, "deg"),
     figure("frames used", |s| Some(s.frames_used as f64), 0, ""),
-    figure("frames searched", |s| Some(s.frames as f64), 0, ""),
+    figure("frames of the landing", |s| Some(s.frames as f64), 0, ""),
     figure("frames refused", |s| Some(s.frames_refused as f64), 0, ""),
     figure("exposure to setpoint, median", |s| s.latency_p50_ms, 0, "ms"),
     figure("exposure to setpoint, 99 %", |s| s.latency_p99_ms, 0, "ms"),

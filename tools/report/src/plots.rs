@@ -246,7 +246,12 @@ pub fn detections(view: &View<'_>) -> Vec<Chart> {
         view,
         "Surprise of each detection (normalised innovation squared)",
         "",
-        vec![layer("about 3 for a consistent filter; cut at 30", Ink::Blue, Shape::Dots, nis)],
+        vec![layer(
+            "mean 3: as sure as it says, less: more careful; cut at 30",
+            Ink::Blue,
+            Shape::Dots,
+            nis,
+        )],
     );
     consistency.height = HEIGHT;
     vec![chart, consistency, light(view)]

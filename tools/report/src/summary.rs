@@ -47,7 +47,7 @@ pub struct Summary {
     pub estimate_error_p50_m: Option<f64>,
     /// Its 95th percentile, in metres.
     pub estimate_error_p95_m: Option<f64>,
-    /// Frames that detectors searched.
+    /// Frames that the detector in use searched during the landing.
     pub frames: usize,
     /// Frames that the estimate used.
     pub frames_used: usize,
@@ -136,7 +136,7 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
         max_tilt_deg: max_tilt_deg(flight),
         estimate_error_p50_m: quantile(&errors_m, 0.5),
         estimate_error_p95_m: quantile(&errors_m, 0.95),
-        frames: frames.all.len(),
+        frames: frames.of_landing(),
         frames_used: frames.count(&Fate::Used),
         frames_without_marker: frames.count(&Fate::NoMarker),
         frames_refused: frames.refused(),
@@ -158,7 +158,7 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
         tape_verified: flight.replayed.as_ref().map(|it| it.is_verified),
         tape: flight.replayed.as_ref().map(|it| it.text.clone()),
         problems: losses::recording(flight),
-        light: match frames.count(&Fate::NoMarker) * 2 > frames.all.len() {
+        light: match frames.count(&Fate::NoMarker) * 2 > frames.of_landing() {
             true => light::warnings(flight),
             false => Vec::new(),
         },
@@ -235,7 +235,7 @@ impl Summary {
             number(self.max_tilt_deg, 1, "deg", " tilt at most"),
             number(self.wind_mean_m_s, 1, "m/s", " mean wind"),
             Some(format!(
-                "{} of {} frames used, {} refused, {} without the marker",
+                "{} of {} frames of the landing used, {} refused, {} without the marker",
                 self.frames_used, self.frames, self.frames_refused, self.frames_without_marker
             )),
             latency.map(|(p50, p99)| format!("exposure to setpoint {p50:.0} ms, 99 % {p99:.0} ms")),
