@@ -17,6 +17,8 @@ const BLUE: Colour = [70, 140, 255];
 const YELLOW: Colour = [255, 235, 80];
 const WHITE: Colour = [255, 255, 255];
 
+/// Height of a line of a label, in dots of the font.
+const LINE_DOTS: f64 = 9.0;
 /// Images narrower than this, in pixels, are enlarged to make room for labels.
 const MIN_WIDTH_PX: usize = 900;
 /// Markers smaller than this, in pixels of the drawing, get a circle of this radius.
@@ -210,9 +212,12 @@ impl Brush {
         };
         let reach = if seen.size_px * self.scale < MIN_VISIBLE_PX { MIN_VISIBLE_PX } else { reach };
         let dot = self.dot_px as f64;
+        // At the lower edge all lines move up together: each by itself would end on the others.
+        let lowest = self.canvas.height as f64 - LINE_DOTS * dot * lines.len() as f64;
+        let first = (y + reach + 4.0 * dot).min(lowest).max(0.0);
         for (index, text) in (0..).zip(&lines) {
             let left = x - 3.0 * dot * text.len() as f64;
-            let top = y + reach + (4.0 + 9.0 * f64::from(index)) * dot;
+            let top = first + LINE_DOTS * dot * f64::from(index);
             let colour = if index == 0 { YELLOW } else { WHITE };
             self.canvas.text([left, top], text, self.dot_px, colour);
         }
@@ -269,5 +274,38 @@ mod tests {
         let drawn = draw(image.view().unwrap(), &[], None);
         assert_eq!((drawn.width, drawn.height, drawn.data.len()), (900, 300, 900 * 300 * 3));
         assert!(drawn.data.chunks(3).any(|pixel| pixel == YELLOW));
+    }
+
+    #[test]
+    fn the_lines_of_a_label_at_the_lower_edge_are_apart() {
+        let place = Transform::new(geometry::Rotation::identity(), Point::new(0.0, 0.1, 1.0));
+        let pose = fiducial::MarkerPose {
+            camera_from_marker: place,
+            reprojection_rms_px: 0.1,
+            covariance: nalgebra::Matrix6::identity(),
+            alternative: None,
+        };
+        let seen = Observation {
+            family: markers::Family::Rings,
+            id: None,
+            centre: Pixel::new(450.0, 590.0),
+            centre_covariance_px2: nalgebra::Matrix2::identity(),
+            corners: None,
+            wrong_bits: 0,
+            size_px: 60.0,
+            confidence: 1.0,
+            pose: Some(pose),
+            response: None,
+        };
+        let image = GrayImage::filled(900, 600, 80);
+        let drawn = draw(image.view().unwrap(), &[seen], None);
+        let rows = |colour: Colour| {
+            let is_in = |row: &[u8]| row.chunks(3).any(|pixel| pixel == colour);
+            let rows: Vec<usize> =
+                (0..600).filter(|y| is_in(&drawn.data[y * 2700..][..2700])).collect();
+            (rows[0], rows[rows.len() - 1])
+        };
+        let [(_, name_ends), (place_begins, place_ends)] = [YELLOW, WHITE].map(rows);
+        assert!(name_ends < place_begins && place_ends < 600, "{name_ends} {place_begins}");
     }
 }

@@ -253,7 +253,8 @@ impl Settings for Config {
         self.wind.check_ranges(check);
         self.pad.check_ranges(check);
         check.parses("pad.marker", self.pad_marker());
-        check.parses("pad.markers", self.printed());
+        let printed = if self.pad.markers.is_empty() { "pad.marker" } else { "pad.markers" };
+        check.parses(printed, self.printed());
         check.parses("pad.wrong_marker", self.wrong_marker());
         check.parses("ground.surface", self.ground.surface.parse::<Surface>());
         self.ground.check_ranges(check);
@@ -291,7 +292,7 @@ impl Config {
         if name.is_empty() {
             let marker = self.pad_marker()?;
             let drawing = marker.size_m.and_then(|size_m| Drawing::new(&marker, size_m));
-            return drawing.ok_or_else(|| format!("`{marker}` cannot be printed: it needs an id"));
+            return drawing.ok_or_else(|| format!("`{marker}` cannot be printed: it needs an id, as FAMILY:ID:SIZE_M"));
         }
         let pad = Pad::named(name, |file| read_text(file));
         let pad = pad.map_err(|problem| problem.to_string())?;

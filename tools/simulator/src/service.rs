@@ -305,12 +305,13 @@ impl AutopilotSide {
     async fn receive(&mut self, node: &Node, simulation: &Simulation) {
         match self {
             Self::Link(link) => {
-                if let LinkEvent::Packet { packet, .. } = link.recv().await {
+                if let LinkEvent::Packet { packet, received } = link.recv().await {
                     let answers = match &mut *simulation.source() {
                         VehicleSource::Simulated(world) => {
-                            let now_s = simulation.now_s();
-                            world.advance_to(now_s);
-                            world.handle_at(now_s, &packet);
+                            // What the packet waited here is no part of the link's delay.
+                            let received_s = simulation.now_s() - received.elapsed().as_secs_f64();
+                            world.advance_to(received_s);
+                            world.handle_at(received_s.max(world.now_s()), &packet);
                             world.outgoing().collect()
                         }
                         VehicleSource::Reported(_) => Vec::new(),

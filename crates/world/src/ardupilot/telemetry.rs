@@ -166,8 +166,10 @@ pub(super) struct Telemetry<'a> {
 }
 
 impl Telemetry<'_> {
+    /// Whole milliseconds that have passed, as the autopilots count them. A step ends on a half one at least, so that a little
+    /// more is no other one.
     fn time_boot_ms(&self) -> u32 {
-        (self.now_s * 1000.0).round().max(0.0) as u32
+        (self.now_s * 1000.0 + 1e-3).max(0.0) as u32
     }
 
     fn time_usec(&self) -> u64 {
