@@ -242,10 +242,14 @@ impl Chart {
     fn spans(&self, size: [u32; 2]) -> (Range<f64>, Range<f64>) {
         let Axes { x, y, is_equal, .. } = self.axes.clone();
         let [x, y] = [x, y].map(drawable);
-        if !is_equal {
-            return (x, y);
-        }
         let [width, height] = size;
+        if !is_equal {
+            // A line for the names of the phases above all curves.
+            let line = if self.bands.is_empty() { 0.0 } else { f64::from(FONT) };
+            let up = f64::from(height.saturating_sub(BELOW + 2 * MARGIN)).max(4.0 * line);
+            let above = (y.end - y.start) * line / (up - line).max(1.0);
+            return (x, y.start..y.end + above);
+        }
         let across = f64::from(width.saturating_sub(self.left() + 2 * MARGIN));
         let up = f64::from(height.saturating_sub(BELOW + 2 * MARGIN));
         let per_pixel = ((x.end - x.start) / across).max((y.end - y.start) / up);

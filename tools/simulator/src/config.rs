@@ -292,7 +292,9 @@ impl Config {
         if name.is_empty() {
             let marker = self.pad_marker()?;
             let drawing = marker.size_m.and_then(|size_m| Drawing::new(&marker, size_m));
-            return drawing.ok_or_else(|| format!("`{marker}` cannot be printed: it needs an id, as FAMILY:ID:SIZE_M"));
+            return drawing.ok_or_else(|| {
+                format!("`{marker}` cannot be printed: it needs an id, as FAMILY:ID:SIZE_M")
+            });
         }
         let pad = Pad::named(name, |file| read_text(file));
         let pad = pad.map_err(|problem| problem.to_string())?;
