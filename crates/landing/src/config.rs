@@ -164,8 +164,8 @@ settings! {
         /// Maximum age of the newest detection for the marker to count as visible, in s.
         stale_target_s: f64 = 0.4, 0.1..=5.0;
         /// Age of the newest detection beyond which the marker is lost and the vehicle holds or retries, in
-        /// s. On the approach, more than 1.5 m over the pad, up to 2 s in which the camera does not show the
-        /// pad's place do not count.
+        /// s. More than 1.5 m over the pad, up to 2 s in which the camera does not show the pad's place do not
+        /// count.
         lost_target_s: f64 = 1.0, 0.1..=10.0;
         /// Age of the vehicle's state beyond which the vehicle holds, in s.
         stale_vehicle_s: f64 = 0.5, 0.1..=5.0;
