@@ -62,10 +62,14 @@ const MIN_SILENCE_S: f64 = 0.6;
 /// Minimum time of a search by a lander that takes over before it climbs, in seconds: the vehicle may stand.
 const MIN_RESUMED_LOOK_S: f64 = 1.5;
 
-/// Minimum height over the pad, in metres, and maximum standard deviation of its place, in metres, at which the vehicle waits for
-/// the marker to come back into the camera's view: what moves it meanwhile, and what is not known for much longer, is to be seen.
+/// Minimum height over the pad, in metres, and maximum standard deviation of its place, in metres, at which time without the marker
+/// in the camera's view is waiting time: what moves the vehicle meanwhile, and what is not known for much longer, is to be seen.
 const MIN_WAIT_HEIGHT_M: f64 = 1.5;
 const MAX_WAIT_DEVIATION_M: f64 = 0.2;
+
+/// Time without a marker that could be used, in seconds, from which on markers too far from the estimate make it doubtful: of
+/// three frames in a row at 15 Hz.
+const MIN_REFUSED_S: f64 = 0.2;
 
 /// Maximum age of the newest detection, in seconds, up to which heights are those over the target.
 const MAX_TARGET_AGE_S: f64 = 20.0;
@@ -697,6 +701,9 @@ impl Lander {
                 (wanted, why) = (level, Reason::Disputed);
             }
         }
+        if self.is_estimate_doubtful(now) {
+            (wanted, why) = (Vector::zero(), Reason::TargetRefused);
+        }
         let may_descend =
             self.guidance.may_descend(&situation) && situation.level_because.is_none();
         if let Some(reason) = situation.level_because.filter(|_| wanted.z() > 0.0) {
@@ -708,7 +715,16 @@ impl Lander {
         (Action::Velocity { velocity, yaw_rate }, why)
     }
 
-    /// Stays where the marker must be in view, and climbs, never above the height where the landing started.
+    /// True while every marker that is seen from high up is too far from the estimate of a pad that does not move. The estimate may
+    /// be what is wrong, and a vehicle that follows it leaves the marker behind; one that waits sees which of the two stays.
+    fn is_estimate_doubtful(&self, now: Timestamp) -> bool {
+        let is_high = self.target(now).is_some_and(|it| it.height_m > MIN_WAIT_HEIGHT_M);
+        let is_refused = self.sightings.is_refused(now, self.config.phases.stale_target_s);
+        is_high && !self.pad_moves() && is_refused && self.sightings.age_s(now) > MIN_REFUSED_S
+    }
+
+    /// Stays where the marker must be in view, and climbs, never above the height where the landing started. After markers that
+    /// were too far from the estimate it climbs where it is.
     fn retry(&mut self, now: Timestamp) -> Action {
         let Some(vehicle) = self.history.newest().copied() else { return Action::hover() };
         let phases = self.config.phases;
@@ -719,7 +735,11 @@ impl Lander {
         let situation = self.situation(now, &vehicle);
         let (wanted, _) = self.guidance.velocity(&situation);
         let climb_m_s = self.climb_speed(to_m - altitude_m);
-        let wanted = Vector::new(wanted.x(), wanted.y(), -climb_m_s);
+        let aside = match self.state_machine.reason() {
+            Reason::RetryingRefused if !self.pad_moves() => Vector::zero(),
+            _ => wanted,
+        };
+        let wanted = Vector::new(aside.x(), aside.y(), -climb_m_s);
         let wanted = envelope::below_fence(&phases, vehicle.position, wanted);
         let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
         self.guidance.on_setpoint_sent(velocity);

@@ -7,7 +7,7 @@
 //!     Search --> Approach: marker visible
 //!     Search --> Hold: not found
 //!     Approach --> Descend: inside the funnel
-//!     Descend --> Approach: outside
+//!     Descend --> Approach: outside, or marker out of the camera's view
 //!     Approach --> Retry: marker lost, its place known
 //!     Descend --> Retry: marker lost or not settling, its place known
 //!     Retry --> Approach: marker visible

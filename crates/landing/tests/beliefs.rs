@@ -139,6 +139,28 @@ impl Told {
 }
 
 #[test]
+fn an_estimate_that_every_marker_contradicts_is_not_followed() {
+    let mut told = Told::started(Config::default(), 8.0);
+    told.pad = Some(Point::new(2.0, 0.0, 0.0));
+    told.fly(1.2);
+    let begun = matches!(told.phase(), Phase::Approach | Phase::Descend);
+    assert!(begun && told.position.x() < 1.5, "{:?} in {:?}", told.position, told.phase());
+    let seen_elsewhere_s = told.seconds;
+    told.pad = Some(Point::new(2.0, 0.8, 0.0));
+    told.fly(1.0);
+    let doubtful = told.decisions.iter().filter(|(seconds, _)| *seconds > seen_elsewhere_s + 0.3);
+    assert!(doubtful.clone().count() > 50);
+    for (seconds, decision) in doubtful {
+        let stays = Action::Velocity { velocity: Vector::zero(), yaw_rate: 0.0 };
+        assert_eq!((decision.action, decision.why), (stays, Reason::TargetRefused), "{seconds}");
+    }
+    // It is the pad, as it goes on being there.
+    told.fly(8.0);
+    let apart_m = (told.position - Point::new(2.0, 0.8, 0.0)).horizontal_norm();
+    assert!(apart_m < 0.1, "{apart_m} m in {:?}", told.phase());
+}
+
+#[test]
 fn the_pilot_is_seen_without_a_position_and_keeps_the_vehicle() {
     for mode in [Mode::Other, Mode::Land] {
         let mut told = Told::started(Config::default(), 5.0);

@@ -21,6 +21,8 @@ pub struct CameraFaults {
     pub stamp_jumps: f64,
     /// Maximum size of these jumps, in either direction, in seconds.
     pub stamp_jump_s: f64,
+    /// When stamps jump: start and duration, in seconds; `None` at any time.
+    pub stamp_jumps_in_s: Option<(f64, f64)>,
     /// Outage of the camera: start and duration, in seconds.
     pub outage_s: Option<(f64, f64)>,
     /// Outage that starts below a height over the pad, in metres, with its duration in seconds.
@@ -73,8 +75,11 @@ impl Shutter {
             return None;
         }
         let faults = &self.faults;
-        let jump_s =
-            if jumps < faults.stamp_jumps { faults.stamp_jump_s * (2.0 * jump - 1.0) } else { 0.0 };
+        let may_jump = faults.stamp_jumps_in_s.is_none_or(|(from_s, for_s)| {
+            begun_s.is_some_and(|s| (from_s..from_s + for_s).contains(&s))
+        });
+        let is_jump = may_jump && jumps < faults.stamp_jumps;
+        let jump_s = if is_jump { faults.stamp_jump_s * (2.0 * jump - 1.0) } else { 0.0 };
         let arrives_after_s = faults.latency_s + faults.jitter_s * jitter;
         Some(Passage {
             stamp_error_s: jump_s - faults.stamp_early_s,

@@ -23,7 +23,7 @@ pub struct Change {
 /// A row of the table of faults: its name, its description, and its changes for a random number from 0 to 1.
 type Row = (&'static str, &'static str, fn(f64) -> Change);
 
-const TABLE: [Row; 23] = [
+const TABLE: [Row; 24] = [
     ("none", "nothing goes wrong", |_| Change::default()),
     ("lost-below-2m", "no frame is taken from 2 m on", |_| {
         simulator(&["camera.outage_below_m=2", "camera.outage_below_for_s=3600"])
@@ -52,6 +52,15 @@ const TABLE: [Row; 23] = [
     }),
     ("stamp-jumps", "a tenth of the stamps jumps by up to 250 ms", |_| {
         simulator(&["camera.stamp_jumps=0.1", "camera.stamp_jump_ms=250"])
+    }),
+    ("stamp-burst", "all stamps jump by up to 120 ms for half a second, at any time", |part| {
+        let at = format!("camera.stamp_jumps_at_s={:.3}", 1.0 + 9.0 * part);
+        simulator(&[
+            "camera.stamp_jumps=1",
+            "camera.stamp_jump_ms=120",
+            &at,
+            "camera.stamp_jumps_for_s=0.5",
+        ])
     }),
     ("stamps-early", "all stamps are 50 ms early", |_| simulator(&["camera.stamp_early_ms=50"])),
     ("gnss-drift", "the believed position drifts by 0.05 m/s", |part| {
