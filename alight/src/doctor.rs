@@ -610,12 +610,12 @@ fn check_detectors(findings: &mut Findings, seen: &Seen, watched: Watched) {
         match frames {
             0 => findings.doubtful(
                 "detector",
-                format!("`{name}` searches no frame"),
+                format!("`{name}`: detections of no frame came"),
                 "it needs frames of its camera (`camera` in its configuration): see the lines of the cameras above, and its log",
             ),
             _ => findings.good(
                 "detector",
-                format!("`{name}` searches {rate_hz:.1} frames/s; a marker in {found} of {frames}"),
+                format!("`{name}`: detections of {rate_hz:.1} frames/s came; a marker in {found} of {frames}"),
             ),
         }
     }
@@ -709,8 +709,11 @@ mod tests {
         let mut findings = Findings::default();
         check_detectors(&mut findings, &Seen { detectors, ..Seen::default() }, watched);
         let text = findings.text();
-        assert!(text.contains("`idle` searches no frame"), "{text}");
-        assert!(text.contains("`main` searches 10.0 frames/s; a marker in 27 of 30"), "{text}");
+        assert!(text.contains("`idle`: detections of no frame came"), "{text}");
+        assert!(
+            text.contains("`main`: detections of 10.0 frames/s came; a marker in 27 of 30"),
+            "{text}"
+        );
         assert!(text.ends_with("0 wrong, 1 doubtful."), "{text}");
     }
 

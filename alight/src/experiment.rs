@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use clap::{Args, Subcommand, ValueEnum};
 use experiments::Preset;
 use experiments::landing::fault::Fault;
@@ -13,7 +13,7 @@ use experiments::landing::{self, Watch};
 use experiments::markers::{self, Request, Step};
 use experiments::record::Ids;
 use experiments::results::Folder;
-use experiments::set::Set;
+use experiments::set::{MARKERS, Set};
 use experiments::sets::Variant;
 
 use crate::args::flight_setting;
@@ -103,8 +103,8 @@ enum VisionArg {
 
 #[derive(Args)]
 struct MarkersArgs {
-    /// Working folder: frames in `sets`; results, tables and figures in `results`. Existing frames are not
-    /// rendered again.
+    /// Working folder: frames in `sets`; results, tables and figures in `results`, with `--seed`, `--every` or `--processing` in a
+    /// folder of that name. Existing frames are not rendered again.
     #[arg(short, long, value_name = "DIR", default_value = "experiment-markers")]
     output: PathBuf,
     /// Only this set: positions, far, landing, adverse, tilt, blur, noise, light, rolling, shade, ground, cut, textured,
@@ -112,7 +112,7 @@ struct MarkersArgs {
     #[arg(long = "set", value_name = "NAME")]
     sets: Vec<Set>,
     /// Only this family. May be repeated.
-    #[arg(long = "family", value_name = "FAMILY")]
+    #[arg(long = "family", value_name = "FAMILY", value_parser = family_name)]
     families: Vec<String>,
     /// Folder of photographs with `labels.jsonl`, to test on as well.
     #[arg(long, value_name = "DIR")]
@@ -146,7 +146,39 @@ pub(crate) fn run(args: ExperimentArgs) -> anyhow::Result<ExitCode> {
     }
 }
 
+/// Settings of which a flight has a value of its own, by which its results are sorted, and the options that choose them.
+const SWEPT: [(&str, &str); 7] = [
+    ("simulator.wind.mean_m_s", "--wind"),
+    ("simulator.wind.turbulence", "--turbulence"),
+    ("simulator.camera.latency_ms", "--latency"),
+    ("simulator.start.height_m", "--height"),
+    ("simulator.start.north_m", "--offset"),
+    ("simulator.start.east_m", "--offset"),
+    ("simulator.seed", "--seed"),
+];
+
+/// Refuses a setting that would make a flight another one than its results say.
+fn check_settings(settings: &[String]) -> anyhow::Result<()> {
+    for setting in settings {
+        let key = setting.split('=').next().unwrap_or_default().trim();
+        if let Some((_, option)) = SWEPT.iter().find(|(swept, _)| *swept == key) {
+            bail!("`--set {setting}`: results are sorted by it, so say it with `{option}`");
+        }
+    }
+    Ok(())
+}
+
+/// A family that has frames.
+fn family_name(text: &str) -> Result<String, String> {
+    let names: Vec<&str> = MARKERS.iter().filter_map(|name| name.split(':').next()).collect();
+    match names.contains(&text) {
+        true => Ok(text.to_owned()),
+        false => Err(format!("the families that are compared are {}", names.join(", "))),
+    }
+}
+
 fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
+    check_settings(&args.set)?;
     let mut faults = Vec::new();
     for name in &args.faults {
         match name.as_str() {
@@ -279,6 +311,22 @@ mod tests {
             Experiment::Landing(args) => args.output,
             Experiment::Faults(args) => args.output,
             Experiment::Markers(args) => args.output,
+        }
+    }
+
+    #[test]
+    fn a_setting_that_results_are_sorted_by_and_a_family_without_frames_are_refused() {
+        let told = |setting: &str| {
+            let refusal = check_settings(&[setting.to_owned()]).err();
+            refusal.map(|refusal| refusal.to_string()).unwrap_or_default()
+        };
+        assert!(told("simulator.wind.mean_m_s=7").contains("`--wind`"));
+        assert!(told("simulator.camera.latency_ms=400").contains("`--latency`"));
+        assert_eq!(told("simulator.camera.rate_hz=20"), "");
+        assert_eq!(told(QUOTED), "");
+        assert_eq!(family_name("aruco-4x4-50").as_deref(), Ok("aruco-4x4-50"));
+        for other in ["aruco", "apriltag-36h11:7", "bogus"] {
+            assert!(family_name(other).unwrap_err().contains("stag-hd23"), "{other}");
         }
     }
 

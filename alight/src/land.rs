@@ -240,6 +240,15 @@ impl ServiceSettings {
         Ok(Some(OurRecorder { name: recorder.id, file: recorder.file }))
     }
 
+    /// The page of the landing, if it is to have one.
+    fn page(&self) -> anyhow::Result<Option<dashboard::Config>> {
+        let set = self.of(Service::Dashboard).to_vec();
+        if set.is_empty() {
+            return Ok(None);
+        }
+        Ok(Some(Layers { file: None, set }.load::<dashboard::Config>()?.settings))
+    }
+
     /// Whether the controller's vehicle is the simulated one of this landing, which nobody meets again.
     fn is_simulated(&self) -> bool {
         let layers = Layers { file: None, set: self.of(Service::Controller).to_vec() };
@@ -270,11 +279,13 @@ fn ground_station(autopilot: Option<&str>) -> Vec<String> {
 
 async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<LandingSummary> {
     let shutdown = Shutdown::on_signals()?;
-    if let Some(address) = args.dashboard {
+    let page = settings.page()?;
+    if let Some(page) = &page {
         // Before anything flies: later a landing goes on without its page.
-        TcpListener::bind(address).with_context(|| {
+        TcpListener::bind(&page.listen).with_context(|| {
             format!(
-                "showing the page at {address}; choose another address with `--dashboard IP:PORT`"
+                "showing the page at {}; choose another address with `--dashboard IP:PORT`",
+                page.listen
             )
         })?;
     }
@@ -308,11 +319,9 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
             variable::VEHICLE
         ));
     }
-    if let Some(address) = args.dashboard {
-        let layers = Layers { file: None, set: settings.of(Service::Dashboard).to_vec() };
-        let is_encrypted = layers.load::<dashboard::Config>()?.settings.certificate().is_some();
-        let scheme = if is_encrypted { "https" } else { "http" };
-        progress.say(&format!("The page is at {scheme}://{address}/"));
+    if let Some(page) = &page {
+        let scheme = if page.certificate().is_some() { "https" } else { "http" };
+        progress.say(&format!("The page is at {scheme}://{}/", page.listen));
     }
     // What a controller notes of a simulated vehicle is of use to those that resume this landing, and to nobody after it.
     let notes_in = settings.is_simulated().then(|| rendezvous.directory.path());

@@ -341,10 +341,15 @@ impl Swap<'_> {
 
     async fn until_ready(&mut self, expected: Option<String>) -> anyhow::Result<String> {
         let deadline = Instant::now() + Duration::from_secs(self.args.ready_s);
+        let taken: Vec<&str> = self.existing.iter().map(String::as_str).collect();
+        let waiting_for = match taken.is_empty() {
+            true => "the new detector is ready".to_owned(),
+            false => {
+                format!("the new detector is ready, with another name than {}", taken.join(", "))
+            }
+        };
         loop {
-            if let Event::Joined(name) =
-                self.next_event(deadline, "the new detector is ready").await?
-            {
+            if let Event::Joined(name) = self.next_event(deadline, &waiting_for).await? {
                 let is_new = expected.as_ref().is_none_or(|expected| *expected == name);
                 if is_new && !self.existing.contains(&name) {
                     return Ok(name);
@@ -356,8 +361,9 @@ impl Swap<'_> {
     async fn until_agreed(&mut self, new: &str, report: &mut Report) -> anyhow::Result<()> {
         let deadline = Instant::now() + Duration::from_secs(self.args.agree_s);
         self.comparison.of(report.from.as_deref(), new);
+        let mut unfit = None;
         loop {
-            let waiting_for = match (report.compared, report.agreed) {
+            let waiting_for = unfit.clone().unwrap_or_else(|| match (report.compared, report.agreed) {
                 (0, _) => "it can be compared: the active detector sees no marker, or the new one searches \
                            other frames"
                     .to_owned(),
@@ -366,7 +372,7 @@ impl Swap<'_> {
                     let differs = differs.map_or_else(String::new, |text| format!("; {text}"));
                     format!("it agrees, so far in {agreed} of {compared} frames{differs}")
                 }
-            };
+            });
             match self.next_event(deadline, &waiting_for).await? {
                 Event::Left(name) if name == new => bail!("the new detector left the network"),
                 Event::Status(status) if status.active_detector.as_deref() == Some(new) => {
@@ -378,6 +384,7 @@ impl Swap<'_> {
                     (report.compared, report.agreed) = (shadow.compared, shadow.agreed);
                     report.disagreement_m = shadow.disagreement_m;
                     self.comparison.of(status.active_detector.as_deref(), new);
+                    unfit = unfit_because(shadow, self.args.frames);
                     match verdict(shadow, self.args.frames) {
                         Some(Verdict::Agrees) => return Ok(()),
                         Some(Verdict::Differs(why)) => {
@@ -523,6 +530,24 @@ fn verdict(shadow: &Candidate, frames: u32) -> Option<Verdict> {
         .then(|| Verdict::Differs(format!("it agrees in only {agreed} of {compared} frames")))
 }
 
+/// What keeps a detector that agrees from being used.
+fn unfit_because(shadow: &Candidate, frames: u32) -> Option<String> {
+    let Candidate { state, agreed, compared, age_ms, latency_ms, .. } = shadow;
+    let agrees = *compared >= frames && f64::from(*agreed) >= MIN_AGREEMENT * f64::from(*compared);
+    let what = match state {
+        DetectorState::Active | DetectorState::Shadow => return None,
+        DetectorState::Stale => "stale",
+        DetectorState::Blind => "blind",
+        DetectorState::Outvoted => "outvoted",
+    };
+    agrees.then(|| {
+        format!(
+            "it can be used: it agrees in {agreed} of {compared} frames and is {what} (detections come {latency_ms:.0} ms after their \
+             frames, the newest frame is {age_ms:.0} ms old)"
+        )
+    })
+}
+
 fn last_lines(log: &Path) -> Option<String> {
     let text = std::fs::read_to_string(log).ok()?;
     let lines: Vec<&str> = text.lines().collect();
@@ -549,6 +574,14 @@ mod tests {
         assert!(verdict(&shadow(14, 14), 15).is_none());
         assert_eq!(verdict(&shadow(15, 14), 15), Some(Verdict::Agrees));
         assert!(verdict(&shadow(15, 10), 15).is_none(), "undecided");
+        let late = Candidate { state: DetectorState::Stale, latency_ms: 201.0, ..shadow(30, 30) };
+        assert!(verdict(&late, 15).is_none());
+        let unfit = unfit_because(&late, 15).unwrap();
+        assert!(
+            unfit.contains("30 of 30 frames and is stale") && unfit.contains("201 ms"),
+            "{unfit}"
+        );
+        assert_eq!(unfit_because(&shadow(30, 30), 15), None);
         let refused = Verdict::Differs("it agrees in only 3 of 15 frames".into());
         assert_eq!(verdict(&shadow(15, 3), 15), Some(refused));
         let stale = Candidate { state: DetectorState::Stale, ..shadow(15, 15) };

@@ -107,7 +107,9 @@ fn verdict(estimate: &FlightEstimate, changes: &Changes) -> String {
             };
         }
         (false, true) => "not observable, stays: too uncertain",
-        (false, false) => "not observable, stays: the vehicle did not move so that it shows",
+        (false, false) => {
+            "not observable, stays: the vehicle did not move so that it shows, or its attitude errs by too much for that"
+        }
     };
     stays.to_owned()
 }

@@ -147,6 +147,8 @@ pub enum FlightRefusal {
     },
 }
 
+/// Where the focal length is among [`QUANTITIES`].
+const FOCAL_SCALE: usize = 4;
 /// What the image's scale has, which an error of the attitude makes smaller.
 const SCALE: [Quantity; 2] = [Quantity::FocalScale, Quantity::K1];
 /// The fewest detections of a flight.
@@ -206,6 +208,10 @@ pub fn calibrate_flight(
         // The attitude's errors have too large a part in the tilts: what they make of the scale would be taken for the camera's.
         let prior = SCALE.into_iter().fold(prior, |prior, quantity| prior.with(quantity, 0.0));
         (parameters, result) = minimum(&model, &prior, &noise, parameters)?;
+        for _ in 0..NOISE_ROUNDS {
+            noise = scale::noise(&model.linearised(&parameters), &parameters, &prior, noise);
+            (parameters, result) = minimum(&model, &prior, &noise, parameters)?;
+        }
     }
     if parameters[OFFSET].abs() > MAX_OFFSET_S {
         return Err(FlightRefusal::Offset { offset_s: parameters[OFFSET] });
@@ -288,7 +294,9 @@ impl Told<'_> {
     /// What the attitude's errors make of the focal length no length of the flight averages out.
     fn bias_variance(&self, quantity: Quantity) -> f64 {
         match quantity {
-            Quantity::FocalScale => squared(self.excitation.attenuation(self.noise.lean_rad)),
+            Quantity::FocalScale if self.shown[FOCAL_SCALE] => {
+                squared(self.excitation.attenuation(self.noise.lean_rad))
+            }
             _ => 0.0,
         }
     }

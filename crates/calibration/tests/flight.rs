@@ -308,6 +308,22 @@ fn tilts_that_are_hardly_larger_than_the_attitudes_errors_correct_no_scale() {
 }
 
 #[test]
+fn a_focal_length_that_small_tilts_do_not_show_spoils_nothing_else() {
+    for (seed, focal) in [(7100, 0.08), (7101, -0.08), (7102, 0.05)] {
+        let truth = Truth { focal, ..WRONG };
+        let flown = Flown { sway_m: 0.12, ..Flown::landing(seed) };
+        let result = solved(flown, &truth).unwrap();
+        assert!(!result.estimates[4].is_observable(), "{seed}: {:?}", result.estimates[4]);
+        for estimate in &result.estimates[..4] {
+            let error = estimate.value - true_value(&truth, estimate.quantity);
+            println!("{seed} {:?} {error:+.5} +- {:.5}", estimate.quantity, estimate.deviation);
+            assert!(error.abs() < 4.0 * estimate.deviation, "{seed}: {error} {estimate:?}");
+        }
+        assert!(result.covariance.iter().all(|value| value.is_finite()), "{:?}", result.covariance);
+    }
+}
+
+#[test]
 fn stamps_of_another_clock_are_refused() {
     for offset_s in [7.0, -2.5] {
         let (vehicle, markers) = flown(Flown::landing(4), &Truth { offset_s, ..WRONG });

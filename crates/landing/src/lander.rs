@@ -1,6 +1,7 @@
 //! The landing decision as one function of time and events.
 
 mod aborted;
+mod lost;
 
 use aborted::AbortClimb;
 use geometry::{Ned, Odometry, Point, Vector};
@@ -25,7 +26,6 @@ use crate::standing::{
 use crate::state_machine::{Inputs, StateMachine, VehicleInputs, reaction};
 use crate::target_filter::{Sightings, TargetFilter};
 use crate::time::Timestamp;
-use crate::view::View;
 
 /// Largest position and velocity that is plausible, in m and m/s.
 const MAX_PLAUSIBLE: f64 = 1e6;
@@ -61,15 +61,6 @@ const MIN_SILENCE_S: f64 = 0.6;
 
 /// Minimum time of a search by a lander that takes over before it climbs, in seconds: the vehicle may stand.
 const MIN_RESUMED_LOOK_S: f64 = 1.5;
-
-/// Minimum height over the pad, in metres, and maximum standard deviation of its place, in metres, at which time without the marker
-/// in the camera's view is waiting time: what moves the vehicle meanwhile, and what is not known for much longer, is to be seen.
-const MIN_WAIT_HEIGHT_M: f64 = 1.5;
-const MAX_WAIT_DEVIATION_M: f64 = 0.2;
-
-/// Time without a marker that could be used, in seconds, from which on markers too far from the estimate make it doubtful: of
-/// three frames in a row at 15 Hz.
-const MIN_REFUSED_S: f64 = 0.2;
 
 /// Maximum age of the newest detection, in seconds, up to which heights are those over the target.
 const MAX_TARGET_AGE_S: f64 = 20.0;
@@ -400,20 +391,6 @@ impl Lander {
         result
     }
 
-    /// True when the place of a pad that does not move is well known, and the camera of a vehicle that is not low over it did not
-    /// show it: low down, one that waits to see it is moved by a gust meanwhile.
-    fn is_out_of_view(&self, frame: &FrameObservation) -> bool {
-        let (Some(view), Some(motion), Some(target)) =
-            (View::from_frame(frame), self.history.at(frame.stamp), self.target(frame.stamp))
-        else {
-            return false;
-        };
-        let place = self.history.ned_from_odometry().inverse() * target.position;
-        let is_known = self.has_target(frame.stamp) && target.deviation_m <= MAX_WAIT_DEVIATION_M;
-        let is_low = target.height_m <= MIN_WAIT_HEIGHT_M;
-        is_known && !is_low && !self.pad_moves() && !view.shows(place, &motion)
-    }
-
     /// Fuses a marker; one without a pose is used only by a guidance that needs none.
     fn marker(
         &mut self,
@@ -713,37 +690,6 @@ impl Lander {
         let yaw_rate = self.guidance.yaw_rate(&situation);
         self.guidance.on_setpoint_sent(velocity);
         (Action::Velocity { velocity, yaw_rate }, why)
-    }
-
-    /// True while every marker that is seen from high up is too far from the estimate of a pad that does not move. The estimate may
-    /// be what is wrong, and a vehicle that follows it leaves the marker behind; one that waits sees which of the two stays.
-    fn is_estimate_doubtful(&self, now: Timestamp) -> bool {
-        let is_high = self.target(now).is_some_and(|it| it.height_m > MIN_WAIT_HEIGHT_M);
-        let is_refused = self.sightings.is_refused(now, self.config.phases.stale_target_s);
-        is_high && !self.pad_moves() && is_refused && self.sightings.age_s(now) > MIN_REFUSED_S
-    }
-
-    /// Stays where the marker must be in view, and climbs, never above the height where the landing started. After markers that
-    /// were too far from the estimate it climbs where it is.
-    fn retry(&mut self, now: Timestamp) -> Action {
-        let Some(vehicle) = self.history.newest().copied() else { return Action::hover() };
-        let phases = self.config.phases;
-        let altitude_m = -vehicle.position.z();
-        let ceiling_m = self.altitude_of(self.start);
-        let climbed_m = libm::fmin(altitude_m + phases.retry_climb_m, ceiling_m);
-        let to_m = *self.retry_to_m.get_or_insert(climbed_m);
-        let situation = self.situation(now, &vehicle);
-        let (wanted, _) = self.guidance.velocity(&situation);
-        let climb_m_s = self.climb_speed(to_m - altitude_m);
-        let aside = match self.state_machine.reason() {
-            Reason::RetryingRefused if !self.pad_moves() => Vector::zero(),
-            _ => wanted,
-        };
-        let wanted = Vector::new(aside.x(), aside.y(), -climb_m_s);
-        let wanted = envelope::below_fence(&phases, vehicle.position, wanted);
-        let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
-        self.guidance.on_setpoint_sent(velocity);
-        Action::Velocity { velocity, yaw_rate: 0.0 }
     }
 
     /// Climbs to where the legs overlap in the camera's view, as far as the fence allows, and flies the

@@ -224,12 +224,11 @@ fn append_positions(text: &mut String, runs: &[Run]) {
                 }))
             };
             let (all, near, last) = (of(1, 13), of(1, 10), of(13, 13));
-            let complete = (1..=13)
-                .take_while(|height| {
-                    let row = of(*height, *height);
-                    row.found == row.frames
-                })
-                .count();
+            let row = |height: &u32| of(*height, *height);
+            let until_missed =
+                (1..=13).take_while(|height| row(height).found == row(height).frames);
+            // A set of which only some frames are taken lacks heights.
+            let complete = until_missed.filter(|height| row(height).frames > 0).last().unwrap_or(0);
             let (all, near, last) = (all.summary(), near.summary(), last.summary());
             let _ = writeln!(
                 text,
@@ -258,12 +257,13 @@ fn append_farthest(text: &mut String, runs: &[Run]) {
     for run in runs.iter().filter(|run| run.set == Set::Far) {
         let groups = groups(run);
         let at = |height: u32| groups.get(&format!("{height}m"));
-        let is_complete =
-            |height: &u32| at(*height).is_some_and(|score| score.found == score.frames);
-        let farthest = (10..=40).step_by(2).take_while(is_complete).last().unwrap_or(0);
+        let is_complete = |height: &u32| at(*height).is_none_or(|it| it.found == it.frames);
+        let until_missed = (10..=40).step_by(2).take_while(is_complete);
+        // A set of which only some frames are taken lacks heights.
+        let farthest = until_missed.filter(|height| at(*height).is_some()).last().unwrap_or(0);
         let _ = write!(text, "| {} | {} | {farthest} |", run.family, run.detector);
         for height in [20, 24, 28, 30, 32, 34, 36, 38, 40] {
-            let found = at(height).map_or(0, |score| score.found);
+            let found = at(height).map_or_else(|| "-".to_owned(), |it| it.found.to_string());
             let _ = write!(text, " {found} |");
         }
         text.push('\n');

@@ -239,9 +239,13 @@ pub fn detections(view: &View<'_>) -> Vec<Chart> {
     chart.axes.y = -0.6..fates.len().max(1) as f64 - 0.1;
     chart.rows = fates.iter().map(|fate| fate.name().to_owned()).collect();
     chart.height = 150 + 26 * fates.len() as u32;
-    let nis = view.curve(&view.flight.targets, |it| {
-        Some(at(view.flight.at_s(it.stamp_ns), it.nis?.min(30.0)))
-    });
+    // Estimates without a new detection repeat that of the last one.
+    let targets = &view.flight.targets;
+    let before = std::iter::once(None).chain(targets.iter().map(|it| it.nis));
+    let with_new = targets.iter().zip(before).filter(|(it, before)| it.nis != *before);
+    let with_new: Vec<_> = with_new.map(|(it, _)| it).collect();
+    let nis =
+        view.curve(&with_new, |it| Some(at(view.flight.at_s(it.stamp_ns), it.nis?.min(30.0))));
     let mut consistency = over_time(
         view,
         "Surprise of each detection (normalised innovation squared)",

@@ -21,12 +21,12 @@ pub struct Excitation {
     pub turn_rad: f64,
 }
 
-/// The tilt that shows time offset, mount yaw and focal length: ten times what an autopilot's attitude errs by, whose part in it
-/// is then 1 %.
+/// The tilt that shows time offset and mount yaw: ten times what an autopilot's attitude errs by. The focal length needs more
+/// ([`Excitation::attenuation`]).
 const MIN_TILT_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 /// By how much more errors of the attitude count than their variance says, as the position's drift explains slow tilts away. Focal
 /// lengths came out too short by 2.5 to 3.2 times that part in flights of the tests with tilts from 0.5 to 2 degrees, by about
-/// once in simulated landings.
+/// once in simulated landings; this is between, as a deviation.
 const SLOW_TILTS: f64 = 2.0;
 /// Distances or headings that show the mount's roll and pitch.
 const MIN_DISTANCE_RATIO: f64 = 1.5;

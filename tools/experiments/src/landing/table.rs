@@ -1,6 +1,6 @@
 //! Summaries of many flights, as tables.
 
-use node::stats::quantile;
+use node::stats::{interpolated_quantile, quantile};
 
 use super::outcome::{Ending, HARD_M_S, Outcome, SLIDING_M_S, TILTED_DEG};
 
@@ -54,7 +54,7 @@ pub fn markdown(outcomes: &[Outcome]) -> String {
 fn row(name: &str, members: &[&Outcome]) -> String {
     let count = |of: &dyn Fn(&Outcome) -> bool| members.iter().filter(|o| of(o)).count();
     let text = |of: Column, part: f64, digits: usize| {
-        quantile(&numbers(members, of), part)
+        interpolated_quantile(&numbers(members, of), part)
             .map_or_else(|| "-".to_owned(), |number| format!("{number:.digits$}"))
     };
     let beyond = |of: Column, limit: f64| {
