@@ -174,9 +174,8 @@ impl State {
 
     /// Advances the state by `dt_s` to a detection, and returns how it fits. A detection beyond the gate that
     /// is as near as the autopilot's position and tilt may have wandered since the last one is none of another place: the covariance of
-    /// the position is widened by the factor by which it is beyond (a fading factor: Xia, Rao, Ying, Shen: Adaptive Fading
-    /// Kalman Filter with an Application, Automatica 30, 1994), and that of a moving pad's velocity as well. Of a pad that stands a
-    /// velocity would be learnt from a few frames with wrong stamps, and lead the vehicle away from it.
+    /// position and velocity is widened by the factor by which it is beyond (a fading factor: Xia, Rao, Ying, Shen: Adaptive Fading
+    /// Kalman Filter with an Application, Automatica 30, 1994).
     pub(crate) fn predict_to(
         &mut self,
         config: &EstimatorConfig,
@@ -203,8 +202,7 @@ impl State {
             return Fit { nis, is_inlier: is_inlier(nis) };
         }
         let factor = (nis / config.gate).sqrt();
-        let widened = if is_still { U } else { TILT };
-        let factor_of = |state: usize| if state < widened { factor } else { 1.0 };
+        let factor_of = |state: usize| if state < TILT { factor } else { 1.0 };
         for i in 0..STATES {
             for j in 0..STATES {
                 self.covariance[(i, j)] *= factor_of(i) * factor_of(j);
