@@ -678,9 +678,6 @@ impl Lander {
                 (wanted, why) = (level, Reason::Disputed);
             }
         }
-        if self.is_estimate_doubtful(now) {
-            (wanted, why) = (Vector::zero(), Reason::TargetRefused);
-        }
         let may_descend =
             self.guidance.may_descend(&situation) && situation.level_because.is_none();
         if let Some(reason) = situation.level_because.filter(|_| wanted.z() > 0.0) {

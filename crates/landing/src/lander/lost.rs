@@ -14,10 +14,6 @@ use crate::view::View;
 const MIN_WAIT_HEIGHT_M: f64 = 1.5;
 const MAX_WAIT_DEVIATION_M: f64 = 0.2;
 
-/// Time without a marker that could be used, in seconds, from which on markers too far from the estimate make it doubtful: of
-/// three frames in a row at 15 Hz.
-const MIN_REFUSED_S: f64 = 0.2;
-
 impl Lander {
     /// True when the place of a pad that does not move is well known, and the camera of a vehicle that is not low over it did not
     /// show it: low down, one that waits to see it is moved by a gust meanwhile.
@@ -33,16 +29,9 @@ impl Lander {
         is_known && !is_low && !self.pad_moves() && !view.shows(place, &motion)
     }
 
-    /// True while every marker that is seen from high up is too far from the estimate of a pad that does not move. The estimate may
-    /// be what is wrong, and a vehicle that follows it leaves the marker behind; one that waits sees which of the two stays.
-    pub(super) fn is_estimate_doubtful(&self, now: Timestamp) -> bool {
-        let is_high = self.target(now).is_some_and(|it| it.height_m > MIN_WAIT_HEIGHT_M);
-        let is_refused = self.sightings.is_refused(now, self.config.phases.stale_target_s);
-        is_high && !self.pad_moves() && is_refused && self.sightings.age_s(now) > MIN_REFUSED_S
-    }
-
     /// Stays where the marker must be in view, and climbs, never above the height where the landing started. After markers that
-    /// were too far from the estimate it climbs where it is.
+    /// were too far from the estimate of a pad that stands it climbs where it is: the estimate may be what is wrong, and who follows
+    /// it leaves the marker behind.
     pub(super) fn retry(&mut self, now: Timestamp) -> Action {
         let Some(vehicle) = self.history.newest().copied() else { return Action::hover() };
         let phases = self.config.phases;
