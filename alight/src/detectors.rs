@@ -227,14 +227,7 @@ impl Overview {
         let entry = |name: &str| {
             let (candidate, info) = (candidates.get(name).copied(), announced.get(name));
             let received_hz = running.get(name).copied().filter(|rate_hz| *rate_hz > 0.0);
-            let mut entry = Entry::new(name, candidate, info, marker.as_deref());
-            if candidate.is_none() {
-                entry.rate_hz = received_hz;
-                if !status_read {
-                    entry.state = if received_hz.is_some() { "publishing" } else { "silent" };
-                }
-            }
-            entry
+            Entry::new(name, candidate, info, marker.as_deref(), status_read, received_hz)
         };
         let mut detectors: Vec<Entry> = names.into_iter().map(entry).collect();
         detectors.sort_by_key(|entry| entry.state != "active");
@@ -330,6 +323,8 @@ impl Entry {
         candidate: Option<&Candidate>,
         info: Option<&DetectorInfo>,
         wanted: Option<&str>,
+        status_read: bool,
+        received_hz: Option<f64>,
     ) -> Self {
         let looks_for_others =
             wanted.zip(info).is_some_and(|(wanted, info)| looks_for_others(&info.markers, wanted));
@@ -342,13 +337,15 @@ impl Entry {
                 Some(DetectorState::Shadow) => "shadow",
                 Some(DetectorState::Blind) => "blind",
                 Some(DetectorState::Outvoted) => "outvoted",
-                None => "waiting",
+                None if status_read => "waiting",
+                None if received_hz.is_some() => "publishing",
+                None => "silent",
             },
             place: candidate.and_then(|c| c.place).or(info.map(|info| info.place)),
             host: info.map(|info| info.host.clone()),
             markers: info.map(|info| info.markers.clone()).unwrap_or_default(),
             version: info.map(|info| info.version.clone()),
-            rate_hz: candidate.map(|c| c.rate_hz),
+            rate_hz: candidate.map(|c| c.rate_hz).or(received_hz),
             latency_ms: candidate.map(|c| c.latency_ms),
             age_ms: candidate.map(|c| c.age_ms),
             compared: candidate.map(|c| c.compared),

@@ -358,7 +358,7 @@ struct Seen {
     healths: Vec<Health>,
     cameras: Vec<CameraInfo>,
     status: Option<ControllerStatus>,
-    /// How often detectors that told about themselves said what they found: some tell no health.
+    /// What came of each detector's detections, by its name; some detectors tell no health.
     detectors: BTreeMap<String, Searched>,
     /// The time at the end of the watch, in nanoseconds.
     ended_ns: i64,
@@ -463,9 +463,9 @@ async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result
                 Some(status) = statuses.next() => seen.status = Some(status),
                 Some(info) = infos.next() => drop(seen.detectors.entry(info.detector).or_default()),
                 Some(found) = detections.next() => {
-                    let Searched { frames, found: showing } = seen.detectors.entry(found.detector).or_default();
-                    *frames += 1;
-                    *showing += u32::from(!found.detections.is_empty());
+                    let searched = seen.detectors.entry(found.detector).or_default();
+                    searched.frames += 1;
+                    searched.found += u32::from(!found.detections.is_empty());
                 }
                 Some(frame) = frames.next() => seen.frames.push(focus.received(frame)),
                 Some(frame) = next_raw() => seen.raw_frames.push(focus.received(frame)),

@@ -522,7 +522,7 @@ fn verdict(shadow: &Candidate, frames: u32) -> Option<Verdict> {
     if compared < frames {
         return None;
     }
-    let ratio = f64::from(agreed) / f64::from(compared);
+    let ratio = agreement(shadow);
     if ratio >= MIN_AGREEMENT && shadow.state == DetectorState::Shadow {
         return Some(Verdict::Agrees);
     }
@@ -530,10 +530,15 @@ fn verdict(shadow: &Candidate, frames: u32) -> Option<Verdict> {
         .then(|| Verdict::Differs(format!("it agrees in only {agreed} of {compared} frames")))
 }
 
+/// The part of the compared frames in which a detector agrees.
+fn agreement(shadow: &Candidate) -> f64 {
+    f64::from(shadow.agreed) / f64::from(shadow.compared)
+}
+
 /// What keeps a detector that agrees from being used.
 fn unfit_because(shadow: &Candidate, frames: u32) -> Option<String> {
     let Candidate { state, agreed, compared, age_ms, latency_ms, .. } = shadow;
-    let agrees = *compared >= frames && f64::from(*agreed) >= MIN_AGREEMENT * f64::from(*compared);
+    let agrees = *compared >= frames && agreement(shadow) >= MIN_AGREEMENT;
     let what = match state {
         DetectorState::Active | DetectorState::Shadow => return None,
         DetectorState::Stale => "stale",

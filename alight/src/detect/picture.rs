@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use fiducial::Observation;
-use fiducial::overlay::canvas::{Colour, RgbImageBuf};
+use fiducial::overlay::canvas::{Colour, LINE, RgbImageBuf};
 use geometry::{CameraModel, Pixel, Point, Transform};
 use imaging::{GrayImage, GrayView};
 
@@ -17,8 +17,6 @@ const BLUE: Colour = [70, 140, 255];
 const YELLOW: Colour = [255, 235, 80];
 const WHITE: Colour = [255, 255, 255];
 
-/// Height of a line of a label, in dots of the font.
-const LINE_DOTS: f64 = 9.0;
 /// Images narrower than this, in pixels, are enlarged to make room for labels.
 const MIN_WIDTH_PX: usize = 900;
 /// Markers smaller than this, in pixels of the drawing, get a circle of this radius.
@@ -213,11 +211,11 @@ impl Brush {
         let reach = if seen.size_px * self.scale < MIN_VISIBLE_PX { MIN_VISIBLE_PX } else { reach };
         let dot = self.dot_px as f64;
         // At the lower edge all lines move up together: each by itself would end on the others.
-        let lowest = self.canvas.height as f64 - LINE_DOTS * dot * lines.len() as f64;
+        let lowest = self.canvas.height as f64 - LINE * dot * lines.len() as f64;
         let first = (y + reach + 4.0 * dot).min(lowest).max(0.0);
         for (index, text) in (0..).zip(&lines) {
             let left = x - 3.0 * dot * text.len() as f64;
-            let top = first + LINE_DOTS * dot * f64::from(index);
+            let top = first + LINE * dot * f64::from(index);
             let colour = if index == 0 { YELLOW } else { WHITE };
             self.canvas.text([left, top], text, self.dot_px, colour);
         }

@@ -147,8 +147,6 @@ pub enum FlightRefusal {
     },
 }
 
-/// Where the focal length is among [`QUANTITIES`].
-const FOCAL_SCALE: usize = 4;
 /// What the image's scale has, which an error of the attitude makes smaller.
 const SCALE: [Quantity; 2] = [Quantity::FocalScale, Quantity::K1];
 /// The fewest detections of a flight.
@@ -196,23 +194,16 @@ pub fn calibrate_flight(
     let unknown = Prior::around(&begin);
     let hidden = QUANTITIES.into_iter().filter(|quantity| !excitation.shows(*quantity));
     let prior = hidden.fold(unknown, |prior, quantity| prior.with(quantity, 0.0));
-    let mut noise = Noise::default();
-    let (mut parameters, mut result) = minimum(&model, &prior, &noise, begin)?;
-    for _ in 0..NOISE_ROUNDS {
-        noise = scale::noise(&model.linearised(&parameters), &parameters, &prior, noise);
-        (parameters, result) = minimum(&model, &prior, &noise, parameters)?;
-    }
-    let attenuation = excitation.attenuation(noise.lean_rad);
-    let is_scale_shown = attenuation <= Quantity::FocalScale.max_deviation();
-    if !is_scale_shown {
-        // The attitude's errors have too large a part in the tilts: what they make of the scale would be taken for the camera's.
+    let mut solution = solved(&model, &prior, Noise::default(), begin)?;
+    // The attitude's errors may have too large a part in the tilts: what they make of the scale would be taken for the camera's.
+    let shows_scale = excitation.shows(Quantity::FocalScale);
+    let scale_bias = Some(excitation.attenuation(solution.noise.lean_rad))
+        .filter(|bias| shows_scale && *bias <= Quantity::FocalScale.max_deviation());
+    if shows_scale && scale_bias.is_none() {
         let prior = SCALE.into_iter().fold(prior, |prior, quantity| prior.with(quantity, 0.0));
-        (parameters, result) = minimum(&model, &prior, &noise, parameters)?;
-        for _ in 0..NOISE_ROUNDS {
-            noise = scale::noise(&model.linearised(&parameters), &parameters, &prior, noise);
-            (parameters, result) = minimum(&model, &prior, &noise, parameters)?;
-        }
+        solution = solved(&model, &prior, solution.noise, solution.parameters)?;
     }
+    let Solution { parameters, result, noise } = solution;
     if parameters[OFFSET].abs() > MAX_OFFSET_S {
         return Err(FlightRefusal::Offset { offset_s: parameters[OFFSET] });
     }
@@ -221,11 +212,30 @@ pub fn calibrate_flight(
         return Err(FlightRefusal::Contradiction { wander_m, share: result.outliers });
     }
     is_settled(&result)?;
-    let shown = QUANTITIES.map(|quantity| {
-        excitation.shows(quantity) && (is_scale_shown || !SCALE.contains(&quantity))
-    });
-    let told = Told { configured, markers: model.markers().len(), excitation, noise, shown };
+    let told = Told { configured, markers: model.markers().len(), excitation, noise, scale_bias };
     Ok(told.calibration(&parameters, &result))
+}
+
+/// The parameters that explain a flight best, and the size of the errors.
+struct Solution {
+    parameters: Parameters,
+    result: Filtered,
+    noise: Noise,
+}
+
+/// Solves for both in turn, from some size of the errors and some parameters on.
+fn solved(
+    model: &Model<'_>,
+    prior: &Prior,
+    mut noise: Noise,
+    begin: Parameters,
+) -> Result<Solution, FlightRefusal> {
+    let (mut parameters, mut result) = minimum(model, prior, &noise, begin)?;
+    for _ in 0..NOISE_ROUNDS {
+        noise = scale::noise(&model.linearised(&parameters), &parameters, prior, noise);
+        (parameters, result) = minimum(model, prior, &noise, parameters)?;
+    }
+    Ok(Solution { parameters, result, noise })
 }
 
 /// The parameters that explain the flight best, for errors of this size: Gauss and Newton's steps, none of which is long.
@@ -286,17 +296,20 @@ struct Told<'a> {
     markers: usize,
     excitation: Excitation,
     noise: Noise,
-    /// Whether the flight can show each of [`QUANTITIES`].
-    shown: [bool; QUANTITIES.len()],
+    /// The part by which the attitude's errors may make the focal length too short; `None` where the flight does not show it.
+    scale_bias: Option<f64>,
 }
 
 impl Told<'_> {
+    fn shows(&self, quantity: Quantity) -> bool {
+        let is_scale = SCALE.contains(&quantity);
+        self.excitation.shows(quantity) && (!is_scale || self.scale_bias.is_some())
+    }
+
     /// What the attitude's errors make of the focal length no length of the flight averages out.
     fn bias_variance(&self, quantity: Quantity) -> f64 {
         match quantity {
-            Quantity::FocalScale if self.shown[FOCAL_SCALE] => {
-                squared(self.excitation.attenuation(self.noise.lean_rad))
-            }
+            Quantity::FocalScale => self.scale_bias.map_or(0.0, squared),
             _ => 0.0,
         }
     }
@@ -312,7 +325,7 @@ impl Told<'_> {
         let estimates: [FlightEstimate; 6] = std::array::from_fn(|i| {
             let quantity = QUANTITIES[i];
             let (value, variance) = (parameters[quantity.index()], covariance[(i, i)]);
-            match self.shown[i] {
+            match self.shows(quantity) {
                 true => {
                     FlightEstimate { quantity, value, deviation: libm::fmax(variance, 0.0).sqrt() }
                 }

@@ -209,6 +209,13 @@ pub fn height_m(group: &str) -> Option<u32> {
     group.split('-').nth(1)?.get(..2)?.parse().ok()
 }
 
+/// The last height, in metres, up to which every frame is found; a set of which only some frames are taken lacks heights.
+fn complete_to(heights: impl Iterator<Item = u32>, score_at: impl Fn(u32) -> Score) -> u32 {
+    let scores = heights.map(|height| (height, score_at(height)));
+    let complete = scores.take_while(|(_, score)| score.found == score.frames);
+    complete.filter(|(_, score)| score.frames > 0).last().map_or(0, |(height, _)| height)
+}
+
 fn append_positions(text: &mut String, runs: &[Run]) {
     let _ = writeln!(
         text,
@@ -224,11 +231,7 @@ fn append_positions(text: &mut String, runs: &[Run]) {
                 }))
             };
             let (all, near, last) = (of(1, 13), of(1, 10), of(13, 13));
-            let row = |height: &u32| of(*height, *height);
-            let until_missed =
-                (1..=13).take_while(|height| row(height).found == row(height).frames);
-            // A set of which only some frames are taken lacks heights.
-            let complete = until_missed.filter(|height| row(height).frames > 0).last().unwrap_or(0);
+            let complete = complete_to(1..=13, |height| of(height, height));
             let (all, near, last) = (all.summary(), near.summary(), last.summary());
             let _ = writeln!(
                 text,
@@ -257,10 +260,8 @@ fn append_farthest(text: &mut String, runs: &[Run]) {
     for run in runs.iter().filter(|run| run.set == Set::Far) {
         let groups = groups(run);
         let at = |height: u32| groups.get(&format!("{height}m"));
-        let is_complete = |height: &u32| at(*height).is_none_or(|it| it.found == it.frames);
-        let until_missed = (10..=40).step_by(2).take_while(is_complete);
-        // A set of which only some frames are taken lacks heights.
-        let farthest = until_missed.filter(|height| at(*height).is_some()).last().unwrap_or(0);
+        let farthest =
+            complete_to((10..=40).step_by(2), |height| at(height).cloned().unwrap_or_default());
         let _ = write!(text, "| {} | {} | {farthest} |", run.family, run.detector);
         for height in [20, 24, 28, 30, 32, 34, 36, 38, 40] {
             let found = at(height).map_or_else(|| "-".to_owned(), |it| it.found.to_string());

@@ -20,9 +20,10 @@ pub struct RgbImageBuf {
 /// Red, green and blue.
 pub type Colour = [u8; 3];
 
-/// Distance from one letter to the next, and from one line to the next, in dots.
+/// Distance from one letter to the next, in dots.
 const ADVANCE: f64 = 6.0;
-const LINE: f64 = 9.0;
+/// Distance from one line to the next, in dots.
+pub const LINE: f64 = 9.0;
 /// Largest number of dots of an ellipse or a line, for those far larger than the image.
 const MAX_DOTS: f64 = 40_000.0;
 
