@@ -8,6 +8,8 @@ use landing::{
 use node::{Check, Settings, clock_name, state_directory};
 use serde::{Deserialize, Serialize};
 
+use crate::wind::Drag;
+
 /// The keys of `controller.toml`, which has their meanings, units and ranges.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
@@ -146,8 +148,17 @@ pub struct AutopilotSettings {
     pub ground_may: String,
     /// Whether to synchronise with the autopilot's clock.
     pub timesync: bool,
-    /// The vehicle's drag, for the estimate of the wind, in 1/s; 0 turns it off.
+    /// The part of the vehicle's drag that grows with the airspeed, for the estimate of the wind, in 1/s.
     pub drag_per_s: f64,
+    /// The part that grows with its square, in 1/m; both 0 turn the estimate off.
+    pub drag_per_m: f64,
+}
+
+impl AutopilotSettings {
+    /// The vehicle's drag.
+    pub fn drag(&self) -> Drag {
+        Drag { linear_per_s: self.drag_per_s, quadratic_per_m: self.drag_per_m }
+    }
 }
 
 /// The choice of the detector.
@@ -209,6 +220,7 @@ impl Settings for Config {
             check.name("detectors.preferred", &self.detectors.preferred);
         }
         check.range("autopilot.drag_per_s", self.autopilot.drag_per_s, 0.0..=5.0);
+        check.range("autopilot.drag_per_m", self.autopilot.drag_per_m, 0.0..=1.0);
         check.range("landing_target.steady_s", self.landing_target.steady_s, 0.0..=30.0);
         self.alarms.check(check);
         // A stale state makes the vehicle hold already; the alarm is for a longer silence.

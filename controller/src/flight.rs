@@ -431,7 +431,7 @@ impl Flight {
             journal: &self.journal,
             setpoint: self.setpoints.last(),
             used: self.used,
-            wind_ned_m_s: self.wind.velocity_m_s(self.config.autopilot.drag_per_s),
+            wind_ned_m_s: self.wind.velocity_m_s(self.config.autopilot.drag()),
         }
     }
 

@@ -1,17 +1,36 @@
 //! Wind estimate from the vehicle's tilt.
 //!
-//! The tilt accelerates the vehicle against a drag proportional to the airspeed: `dv/dt = tilt - drag * (v -
-//! wind)`.
+//! The tilt accelerates the vehicle against a drag that grows with the airspeed `w = v - wind`, by the momentum that rotors
+//! take from the air (proportional to `|w|`) and by the body's shape (to its square): `dv/dt = tilt - (linear + quadratic |w|) w`.
 
 use geometry::{Body, Vector};
 use landing::VehicleState;
-use libm::{exp, fmax};
+use libm::{exp, fmax, hypot, sqrt};
 
 const GRAVITY_M_S2: f64 = 9.806_65;
 /// Time constant of the mean, in seconds.
 const MEAN_S: f64 = 3.0;
 /// Maximum gap between two states, in seconds; after a longer one the mean starts again.
 const MAX_GAP_S: f64 = 1.0;
+
+/// The vehicle's drag: the acceleration against the air that passes.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Drag {
+    /// Per airspeed, in 1/s.
+    pub linear_per_s: f64,
+    /// Per squared airspeed, in 1/m.
+    pub quadratic_per_m: f64,
+}
+
+impl Drag {
+    /// The airspeed at which the drag is so large, per drag, in s; `None` without drag.
+    fn airspeed_per_drag_s(self, drag_m_s2: f64) -> Option<f64> {
+        let Self { linear_per_s: linear, quadratic_per_m: quadratic } = self;
+        // The positive root of `quadratic s^2 + linear s = drag`, in the form without a difference.
+        let divisor = linear + sqrt(linear * linear + 4.0 * quadratic * drag_m_s2);
+        (divisor > 0.0).then(|| 2.0 / divisor)
+    }
+}
 
 /// Estimates the wind at one vehicle.
 #[derive(Clone, Debug, Default)]
@@ -51,16 +70,16 @@ impl WindEstimate {
         self.mean = Some(mean);
     }
 
-    /// The wind's velocity, north and east in m/s, for a drag in 1/s; `None` until the mean has settled.
-    pub fn velocity_m_s(&self, drag_per_s: f64) -> Option<[f64; 2]> {
+    /// The wind's velocity, north and east in m/s; `None` until the mean has settled, and without drag.
+    pub fn velocity_m_s(&self, drag: Drag) -> Option<[f64; 2]> {
         let mean = self.mean.filter(|mean| mean.stamp_s - mean.since_s > 2.0 * MEAN_S)?;
-        (drag_per_s > 0.0).then(|| {
-            [0, 1].map(|axis| {
-                // The lag of the mean is proportional to the mean acceleration.
-                let acceleration = (mean.newest[axis] - mean.velocity[axis]) / MEAN_S;
-                mean.velocity[axis] + (acceleration - mean.tilt[axis]) / drag_per_s
-            })
-        })
+        let forces = [0, 1].map(|axis| {
+            // The lag of the mean is proportional to the mean acceleration.
+            let acceleration = (mean.newest[axis] - mean.velocity[axis]) / MEAN_S;
+            mean.tilt[axis] - acceleration
+        });
+        let scale_s = drag.airspeed_per_drag_s(hypot(forces[0], forces[1]))?;
+        Some([0, 1].map(|axis| mean.velocity[axis] - forces[axis] * scale_s))
     }
 }
 
@@ -72,16 +91,30 @@ mod tests {
 
     #[test]
     fn the_wind_is_found_hovering_and_on_the_move() {
-        let (drag, wind) = (0.3, [4.0, -2.0]);
+        let wind = [4.0, -2.0];
+        for (linear_per_s, quadratic_per_m) in [(0.3, 0.0), (0.25, 0.0314), (0.0, 0.05)] {
+            let drag = Drag { linear_per_s, quadratic_per_m };
+            let found = estimated(drag, wind).unwrap();
+            let is_near = (found[0] - wind[0]).abs() < 0.3 && (found[1] - wind[1]).abs() < 0.1;
+            assert!(is_near, "{drag:?}: {found:?}");
+        }
+        let none = Drag { linear_per_s: 0.0, quadratic_per_m: 0.0 };
+        assert_eq!(estimated(none, wind), None);
+        assert_eq!(WindEstimate::default().velocity_m_s(none), None);
+    }
+
+    /// What is estimated at a vehicle of this drag that moves in this wind.
+    fn estimated(drag: Drag, wind: [f64; 2]) -> Option<[f64; 2]> {
         let mut estimate = WindEstimate::default();
-        assert_eq!(estimate.velocity_m_s(drag), None);
         for i in 0..1500 {
             let t = f64::from(i) * 0.02;
             // A sine to the north, steady to the east.
             let velocity = [(0.5 * t).sin(), 0.7];
             let acceleration = [0.5 * (0.5 * t).cos(), 0.0];
-            let tilt: [f64; 2] =
-                [0, 1].map(|axis| acceleration[axis] + drag * (velocity[axis] - wind[axis]));
+            let airspeed = [0, 1].map(|axis| velocity[axis] - wind[axis]);
+            let per_speed =
+                drag.linear_per_s + drag.quadratic_per_m * hypot(airspeed[0], airspeed[1]);
+            let tilt: [f64; 2] = [0, 1].map(|axis| acceleration[axis] + per_speed * airspeed[axis]);
             let (roll, pitch) = ((tilt[1] / GRAVITY_M_S2).atan(), -(tilt[0] / GRAVITY_M_S2).atan());
             estimate.update(&VehicleState {
                 stamp: Timestamp::from_seconds(t),
@@ -93,8 +126,6 @@ mod tests {
                 landed: Landed::InAir,
             });
         }
-        let found = estimate.velocity_m_s(drag).unwrap();
-        assert!((found[0] - wind[0]).abs() < 0.3 && (found[1] - wind[1]).abs() < 0.1, "{found:?}");
-        assert_eq!(estimate.velocity_m_s(0.0), None);
+        estimate.velocity_m_s(drag)
     }
 }
