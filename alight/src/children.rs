@@ -145,6 +145,12 @@ pub(crate) fn for_shell(path: &Path) -> String {
     word(&path.to_string_lossy())
 }
 
+/// This command, as a shell takes it.
+pub(crate) fn this_command() -> String {
+    let words = std::env::args_os().skip(1).map(|word| for_shell(Path::new(&word)));
+    std::iter::once("alight".to_owned()).chain(words).collect::<Vec<_>>().join(" ")
+}
+
 /// A text as a shell takes it for one word.
 fn word(text: &str) -> String {
     // Only a zero byte cannot be quoted, and no argument has one.

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use node::{ConfigError, Layers};
 
 use crate::args::ServiceArgs;
@@ -100,7 +100,8 @@ struct ConfigArgs {
 
 /// Runs the subcommand; errors go to standard error.
 pub(crate) fn run() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = Cli::from_arg_matches(&with_negative_numbers(Cli::command()).get_matches())
+        .unwrap_or_else(|problem| problem.exit());
     let result = match cli.command.unwrap_or(Command::Land(cli.land)) {
         Command::Land(args) => land::run(&args),
         Command::Up(args) => up::run(&args),
@@ -133,6 +134,18 @@ pub(crate) fn run() -> ExitCode {
     })
 }
 
+/// A command whose options take a number with a minus for a value, and say what is wrong with it, not for an unknown option.
+fn with_negative_numbers(command: clap::Command) -> clap::Command {
+    let takes_one =
+        |argument: &clap::Arg| !argument.is_positional() && argument.get_action().takes_values();
+    command
+        .mut_args(|argument| match takes_one(&argument) {
+            true => argument.allow_negative_numbers(true),
+            false => argument,
+        })
+        .mut_subcommands(with_negative_numbers)
+}
+
 /// Whether an error is due to the command line or the configuration.
 fn is_wrong_use(problem: &anyhow::Error) -> bool {
     problem.is::<ConfigError>()
@@ -160,6 +173,15 @@ mod tests {
     use std::path::Path;
 
     use super::*;
+
+    #[test]
+    fn a_negative_number_is_told_by_its_option() {
+        let command = with_negative_numbers(Cli::command());
+        let problem =
+            command.try_get_matches_from(["alight", "experiment", "landing", "--wind", "-3"]);
+        let told = problem.unwrap_err().to_string();
+        assert!(told.contains("invalid value '-3' for '--wind"), "{told}");
+    }
 
     #[test]
     fn the_version_tells_the_commit_of_the_repository_in_which_it_is_built() {

@@ -13,10 +13,11 @@ use experiments::landing::{self, Watch};
 use experiments::markers::{self, Request, Step};
 use experiments::record::Ids;
 use experiments::results::Folder;
-use experiments::set::{MARKERS, Set};
+use experiments::set::{Set, families};
 use experiments::sets::Variant;
 
 use crate::args::flight_setting;
+use crate::children::this_command;
 use crate::faults::{self, FaultsArgs};
 use crate::interruption::{FLIGHTS_END, Interruption};
 use crate::progress::Steps;
@@ -76,8 +77,8 @@ struct LandingArgs {
     #[arg(long, value_name = "M", default_value = "2.12")]
     offset: Values,
     /// Fault; `all` for each of them. May be repeated. An unknown name lists all.
-    #[arg(long = "fault", value_name = "NAME", default_value = "none")]
-    faults: Vec<String>,
+    #[arg(long = "fault", value_name = "NAME", default_value = "none", value_parser = faults_named)]
+    faults: Vec<Faults>,
     /// One further setting: simulator.KEY=VALUE or controller.KEY=VALUE. May be repeated.
     #[arg(long, value_name = "SERVICE.KEY=VALUE", value_parser = flight_setting)]
     set: Vec<String>,
@@ -111,7 +112,7 @@ struct MarkersArgs {
     /// tracking, negatives or circles. May be repeated.
     #[arg(long = "set", value_name = "NAME")]
     sets: Vec<Set>,
-    /// Only this family. May be repeated.
+    /// Only this family, also of the photographs with a marker. May be repeated. The report is of all results in the folder.
     #[arg(long = "family", value_name = "FAMILY", value_parser = family_name)]
     families: Vec<String>,
     /// Folder of photographs with `labels.jsonl`, to test on as well.
@@ -146,31 +147,31 @@ pub(crate) fn run(args: ExperimentArgs) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// Settings of which a flight has a value of its own, by which its results are sorted, and the options that choose them.
-const SWEPT: [(&str, &str); 7] = [
-    ("simulator.wind.mean_m_s", "--wind"),
-    ("simulator.wind.turbulence", "--turbulence"),
-    ("simulator.camera.latency_ms", "--latency"),
-    ("simulator.start.height_m", "--height"),
-    ("simulator.start.north_m", "--offset"),
-    ("simulator.start.east_m", "--offset"),
-    ("simulator.seed", "--seed"),
-];
-
 /// Refuses a setting that would make a flight another one than its results say.
 fn check_settings(settings: &[String]) -> anyhow::Result<()> {
     for setting in settings {
         let key = setting.split('=').next().unwrap_or_default().trim();
-        if let Some((_, option)) = SWEPT.iter().find(|(swept, _)| *swept == key) {
+        if let Some((_, option)) = plan::SWEPT.iter().find(|(swept, _)| *swept == key) {
             bail!("`--set {setting}`: results are sorted by it, so say it with `{option}`");
         }
     }
     Ok(())
 }
 
+/// One fault, or all.
+#[derive(Clone)]
+struct Faults(Vec<Fault>);
+
+fn faults_named(text: &str) -> Result<Faults, String> {
+    match text {
+        "all" => Ok(Faults(Fault::all().collect())),
+        name => Ok(Faults(vec![name.parse()?])),
+    }
+}
+
 /// A family that has frames.
 fn family_name(text: &str) -> Result<String, String> {
-    let names: Vec<&str> = MARKERS.iter().filter_map(|name| name.split(':').next()).collect();
+    let names: Vec<&str> = families().collect();
     match names.contains(&text) {
         true => Ok(text.to_owned()),
         false => Err(format!("the families that are compared are {}", names.join(", "))),
@@ -179,14 +180,9 @@ fn family_name(text: &str) -> Result<String, String> {
 
 fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
     check_settings(&args.set)?;
-    let mut faults = Vec::new();
-    for name in &args.faults {
-        match name.as_str() {
-            "all" => faults.extend(Fault::all()),
-            name => faults.push(name.parse::<Fault>().map_err(anyhow::Error::msg)?),
-        }
-    }
+    let faults = args.faults.into_iter().flat_map(|Faults(faults)| faults).collect();
     let request = plan::Request {
+        command: this_command(),
         plan: Plan {
             vision: match args.vision {
                 VisionArg::Rendered => Vision::Rendered,
@@ -241,6 +237,7 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
                 is_binned: args.binned,
             };
             Request {
+                command: this_command(),
                 sets: sets.clone(),
                 families: args.families.clone(),
                 // They have been through a camera already: once is enough.

@@ -14,6 +14,7 @@ use experiments::landing::plan::Values;
 use experiments::results::{self, Folder};
 
 use crate::args::flight_setting;
+use crate::children::this_command;
 use crate::interruption::{FLIGHTS_END, Interruption};
 use crate::progress::Steps;
 use crate::real_time;
@@ -131,7 +132,8 @@ fn run_in_real_time(
     let flights = request.plan.flights();
     let planned = flights.len();
     let steps = Steps::of_flights();
-    let title = format!("Flights in real time, seeds from {}", request.plan.seed);
+    let origin = results::origin(&request.command);
+    let title = format!("{origin}Flights in real time, seeds from {}", request.plan.seed);
     let mut findings = Findings { report: String::new(), outcomes: Vec::new(), planned };
     for flight in &flights {
         let logs = folder.begin_logs(flight.seed)?;
@@ -193,7 +195,7 @@ pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
     let (output, jobs) = (args.output.clone(), args.jobs.unwrap_or_else(cores));
     let (real_time, tapes_in, replaces) = (args.real_time, args.record_tapes.clone(), args.replace);
     let plan = args.plan().map_err(anyhow::Error::msg)?;
-    let request = Request { plan, tapes_in, jobs };
+    let request = Request { command: this_command(), plan, tapes_in, jobs };
     let mut folder = Folder::claim(&output, replaces)?;
     request.tapes_in.as_deref().map_or(Ok(()), results::claim_for_recordings)?;
     let interruption = Interruption::on_signals(match real_time {

@@ -149,7 +149,7 @@ fn compared(searched: &Searched) -> String {
     row("marker", &|it| it.marker.clone());
     row("found", &|it| share(it.frames, searched.searched));
     if let Some(showing) = searched.showing_the_pad {
-        row("found where the pad is in the picture", &|it| share(it.visible, showing));
+        row("found in flight, pad in the picture", &|it| share(it.visible, showing));
         row("error against truth, median", &|it| at(&it.errors_m, 0.5, 1e3, 1, "mm"));
         row("error against truth, 95 %", &|it| at(&it.errors_m, 0.95, 1e3, 1, "mm"));
     }
@@ -163,6 +163,13 @@ fn compared(searched: &Searched) -> String {
         at(&searched.apart_m, 0.5, 1e3, 1, "mm"),
         at(&searched.apart_m, 1.0, 1e3, 1, "mm")
     ));
+    if now.frames == 0 {
+        text.push_str(&format!(
+            "the detector looks for {} (`--set detector.markers=...`), the controller wants {} (`--set marker=...`)\n",
+            searched.looked_for.join(", "),
+            now.marker
+        ));
+    }
     text
 }
 

@@ -15,6 +15,7 @@ fn main() -> anyhow::Result<()> {
     let mut arguments = std::env::args().skip(1);
     let mut folder = || arguments.next().map(PathBuf::from).ok_or_else(usage);
     let mut request = Request {
+        command: String::new(),
         sets_in: folder()?,
         results_in: folder()?,
         sets: Vec::new(),

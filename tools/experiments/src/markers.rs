@@ -14,6 +14,7 @@ use crate::frame_spec::FrameRenderer;
 use crate::photographs;
 use crate::record::{self, ALL_AT_ONCE, FOLLOWING, Ids, OURS, Record};
 use crate::report;
+use crate::results;
 use crate::set::{MARKERS, SIZE_M, Set};
 use crate::sets::Variant;
 use crate::store;
@@ -22,6 +23,8 @@ use crate::tables;
 /// What to run.
 #[derive(Clone, Debug)]
 pub struct Request {
+    /// The command that asked for it, for the report.
+    pub command: String,
     /// Folder of the sets; missing ones are rendered.
     pub sets_in: PathBuf,
     /// Folder of results, scores and figures.
@@ -47,6 +50,7 @@ impl Request {
             None => folder.to_owned(),
         };
         Self {
+            command: String::new(),
             sets_in: folder.join("sets"),
             results_in: folder.join(match ids {
                 Ids::Any => "results",
@@ -138,7 +142,7 @@ pub fn run(
         && done + 1 == of
         && begins(Step { what: "photographs", number: of, of }).is_continue()
     {
-        extra = run_photographs(folder, results_in)?;
+        extra = run_photographs(folder, results_in, &request.families)?;
         done += 1;
     }
     let is_interrupted = done < of;
@@ -147,6 +151,7 @@ pub fn run(
         true => format!("Interrupted after {done} of {of} sets and families.\n\n"),
         false => String::new(),
     };
+    text += &results::origin(&request.command);
     if request.ids == Ids::Shown {
         text += "The id that a frame shows is known, as in a landing.\n\n";
     }
@@ -241,8 +246,12 @@ fn time(results: &Path, set: Set, marker: Marker, folder: &Path) -> anyhow::Resu
 /// The folder of a detector's results on photographs.
 const PHOTOGRAPHS: &str = "photographs";
 
-fn run_photographs(folder: &Path, results: &Path) -> anyhow::Result<String> {
+/// Searches the photographs for the labelled markers of these families, of all without one, and those without a marker for all.
+fn run_photographs(folder: &Path, results: &Path, wanted: &[String]) -> anyhow::Result<String> {
     for (_, name) in photographs::FAMILIES {
+        if !wanted.is_empty() && !wanted.iter().any(|wanted| wanted == name) {
+            continue;
+        }
         if let Some(family) = Family::ALL.into_iter().find(|family| family.name() == name) {
             let records = photographs::run(folder, family)?;
             record::write(&photographs_file(results, OURS, name), &records)?;

@@ -215,10 +215,8 @@ pub fn recall(folder: &Path, family: &str, records: &[Record]) -> anyhow::Result
 
 /// The families to find in negatives: those of the experiment, and all.
 pub fn families_for_negatives() -> [(&'static str, Vec<Family>); 2] {
-    let thesis = crate::set::MARKERS.iter().filter_map(|name| {
-        let name = name.split(':').next()?;
-        Family::ALL.into_iter().find(|family| family.name() == name)
-    });
+    let thesis = crate::set::families()
+        .filter_map(|name| Family::ALL.into_iter().find(|family| family.name() == name));
     let all = Family::ALL.into_iter().filter(|family| *family != Family::RingsThesis);
     [("experiment", thesis.collect()), ("all", all.collect())]
 }

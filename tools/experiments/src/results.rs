@@ -19,6 +19,14 @@ pub const REPORT: &str = "report.md";
 pub const LANDINGS_HEADING: &str = "# Landings\n";
 /// See [`LANDINGS_HEADING`].
 pub const FAULTS_HEADING: &str = "# Faults\n";
+/// The paragraph of a report that says by which command and version it was made; nothing for an experiment that no command asked for.
+pub fn origin(command: &str) -> String {
+    match command {
+        "" => String::new(),
+        _ => format!("By `{command}`, alight {}.\n\n", node::version()),
+    }
+}
+
 /// The names of the plots of landings.
 pub const PLOTS: [&str; 5] = [
     "error-against-wind.svg",
@@ -300,6 +308,29 @@ mod tests {
         let path = folder.join(name);
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
         std::fs::write(path, text).unwrap();
+    }
+
+    /// The names of the values in a row.
+    fn names_of(row: &impl serde::Serialize) -> Vec<String> {
+        let row = serde_json::to_value(row).unwrap();
+        row.as_object().unwrap().keys().cloned().collect()
+    }
+
+    #[test]
+    fn each_name_in_a_row_is_explained() {
+        let text = include_str!("../../../docs/experiments.md");
+        let landings = crate::landing::plan::Plan::default().flights();
+        let faults = crate::faults::plan::Plan { flights: 1, ..Default::default() }.flights();
+        let scores = crate::score::Score::default().summary();
+        let names = [
+            names_of(&crate::landing::outcome::Outcome::new(&landings[0])),
+            names_of(&crate::faults::outcome::Outcome::new(&faults[0])),
+            names_of(&scores),
+        ];
+        assert!(names.iter().all(|names| names.len() > 15));
+        for name in names.concat() {
+            assert!(text.contains(&format!("`{name}`")), "`{name}` is not in docs/experiments.md");
+        }
     }
 
     fn refusal(folder: &Path, replaces: bool) -> String {

@@ -7,6 +7,11 @@ pub const SIZE_M: f64 = rendering::views::SIZE_M;
 pub const MARKERS: [&str; 5] =
     ["rings", "apriltag-16h5:0", "aruco-4x4-50:0", "stag-hd23:0", "apriltag-36h11:0"];
 
+/// The families of [`MARKERS`], in their order.
+pub fn families() -> impl Iterator<Item = &'static str> {
+    MARKERS.iter().filter_map(|marker| marker.split(':').next())
+}
+
 /// A set of frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Set {

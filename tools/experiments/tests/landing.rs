@@ -199,7 +199,7 @@ fn the_worst_flight_of_each_row_is_written_as_a_recording() {
     let mut results = Folder::claim(&folder, true).unwrap();
     let wind = Values::List(vec![0.0, 3.0]);
     let plan = Plan { wind, ..plan(Vision::Modelled, 2) };
-    let request = Request { plan, jobs: 2, recordings: 1 };
+    let request = Request { plan, jobs: 2, recordings: 1, ..Request::default() };
     let watch = Watch { progress: &|_, _| {}, is_interrupted: &|| false };
     let report = landing::run(&request, &mut results, watch).unwrap().report;
     let names: Vec<&str> = report
@@ -229,7 +229,7 @@ fn an_interruption_leaves_the_results_of_the_flights_that_were_flown() {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("interrupted-flights");
     let mut results = Folder::claim(&folder, true).unwrap();
     let plan = plan(Vision::Modelled, 5);
-    let request = Request { plan, jobs: 1, recordings: 1 };
+    let request = Request { plan, jobs: 1, recordings: 1, ..Request::default() };
     let flown = AtomicUsize::new(0);
     let mut run = |flights: usize| {
         flown.store(0, Ordering::Relaxed);
@@ -256,7 +256,7 @@ fn old_results_outlast_a_run_that_gives_none() {
     let run = |set: &[&str], is_interrupted: bool| {
         let set = set.iter().map(|&it| it.to_owned()).collect();
         let plan = Plan { set, ..plan(Vision::Modelled, 1) };
-        let request = Request { plan, jobs: 1, recordings: 0 };
+        let request = Request { plan, jobs: 1, recordings: 0, ..Request::default() };
         let watch = Watch { progress: &|_, _| {}, is_interrupted: &|| is_interrupted };
         let mut results = Folder::claim(folder.path(), true).unwrap();
         landing::run(&request, &mut results, watch)

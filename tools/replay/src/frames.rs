@@ -37,7 +37,7 @@ pub struct Found {
     pub marker: String,
     /// Frames in which it was found.
     pub frames: usize,
-    /// Those of them whose picture shows the pad, by truth.
+    /// Those of them that were taken in flight and show the pad, by truth.
     pub visible: usize,
     /// Distances between the marker as it was found and the true pad, in metres in space, in the order of the frames.
     pub errors_m: Vec<f64>,
@@ -52,13 +52,15 @@ pub struct Searched {
     pub detector: String,
     /// Its camera.
     pub camera: String,
+    /// The markers and pads that are looked for now.
+    pub looked_for: Vec<String>,
     /// Whether the pictures lost something when they were recorded (JPEG).
     pub is_lossy: bool,
     /// Frames that were searched then, as far as the recording has what was found.
     pub searched_then: usize,
     /// Frames that were searched now: those of them whose picture was recorded and can be read.
     pub searched: usize,
-    /// Those of them that show the pad; `None` where the truth is not known.
+    /// Those of them that were taken in flight and show the pad; `None` where the truth is not known.
     pub showing_the_pad: Option<usize>,
     /// Frames whose picture cannot be read.
     pub unreadable: usize,
@@ -194,6 +196,7 @@ pub fn search(
         searched: Searched {
             detector: name.clone(),
             camera: config.camera,
+            looked_for: [config.markers, config.pads].concat(),
             then: Found { marker: facts.marker(tapes, &[])?, ..Found::default() },
             now: Found { marker: facts.marker(tapes, &again.of_controller)?, ..Found::default() },
             ..Searched::default()
@@ -299,7 +302,9 @@ impl Frames {
         let Some(then) = then.get(&now.header.stamp_ns) else { return };
         let pad = info.as_ref().and_then(|it| truths.pad_in_camera(now.header.stamp_ns, it));
         let model = info.as_ref().and_then(CameraInfo::model);
-        let is_visible = pad.zip(model).is_some_and(|(pad, model)| is_in_picture(pad, &model));
+        // On the ground the picture shows a part of the marker at most.
+        let is_visible = !truths.is_on_ground(now.header.stamp_ns)
+            && pad.zip(model).is_some_and(|(pad, model)| is_in_picture(pad, &model));
         if let Some(showing) = &mut searched.showing_the_pad {
             *showing += usize::from(is_visible);
         }

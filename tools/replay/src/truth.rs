@@ -24,6 +24,12 @@ impl Truths {
         self.samples.is_empty()
     }
 
+    /// Whether the vehicle stood on the ground at the first sample from a time on.
+    pub fn is_on_ground(&self, stamp_ns: i64) -> bool {
+        let next = self.samples.partition_point(|it| it.stamp_ns < stamp_ns);
+        self.samples.get(next).is_some_and(|it| it.on_ground)
+    }
+
     /// The pad's landing point in a camera at a time; `None` where the truth is not known.
     pub fn pad_in_camera(&self, stamp_ns: i64, camera: &CameraInfo) -> Option<Point<Camera>> {
         let after = self.samples.partition_point(|it| it.stamp_ns < stamp_ns);

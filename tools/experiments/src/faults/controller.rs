@@ -102,7 +102,8 @@ impl Controller {
 
     fn start(&mut self, now_ns: i64, more: Option<&str>) -> anyhow::Result<()> {
         let set = self.settings.iter().cloned().chain(more.map(str::to_owned)).collect();
-        let config = Layers { file: None, set }.load::<controller::Config>()?.settings;
+        let config = Layers { file: None, set }.load::<controller::Config>();
+        let config = config.map_err(|problem| problem.of_service("controller"))?.settings;
         let mut flight = TapedFlight::new(now_ns, config, std::sync::Arc::default())?;
         if let Some(note) = self.pad_file.clone() {
             flight.take_over_pad(now_ns, note);

@@ -110,7 +110,8 @@ struct FaultyFlight<'a> {
 impl<'a> FaultyFlight<'a> {
     fn new(planned: &'a Planned) -> anyhow::Result<Self> {
         let layers = Layers { file: None, set: planned.simulator.clone() };
-        let simulated = layers.load::<simulator::Config>()?.settings;
+        let simulated = layers.load::<simulator::Config>();
+        let simulated = simulated.map_err(|problem| problem.of_service("simulator"))?.settings;
         let world = World::new(&simulated.world(), simulated.seed);
         let vision = SimVision::new(&simulated, Vision::Modelled, VisionFaults::default())?;
         let order =

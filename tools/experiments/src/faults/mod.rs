@@ -22,7 +22,7 @@ pub mod tape_file;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use crate::landing::{Watch, in_parallel_until};
-use crate::results::Folder;
+use crate::results::{self, Folder};
 use flight::{fly, fly_with_tape};
 use outcome::Outcome;
 use plan::Request;
@@ -60,8 +60,12 @@ pub fn run(request: &Request, folder: &mut Folder, watch: Watch<'_>) -> anyhow::
         Ok(outcome)
     })?;
     let outcomes: Vec<Outcome> = outcomes.into_iter().flatten().collect();
-    let title =
-        format!("{} flights in lock-step, seeds from {}", outcomes.len(), request.plan.seed);
+    let title = format!(
+        "{}{} flights in lock-step, seeds from {}",
+        results::origin(&request.command),
+        outcomes.len(),
+        request.plan.seed
+    );
     let report = report::write(folder, &title, &outcomes, planned, false)?;
     Ok(Findings { report, outcomes, planned })
 }

@@ -70,6 +70,8 @@ impl Default for Plan {
 /// What to run.
 #[derive(Clone, Debug)]
 pub struct Request {
+    /// The command that asked for it, for the report.
+    pub command: String,
     /// The flights.
     pub plan: Plan,
     /// Folder of the recordings with the controllers' tapes, where they are wanted.

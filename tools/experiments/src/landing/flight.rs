@@ -100,8 +100,12 @@ struct LockstepFlight<'a> {
 impl<'a> LockstepFlight<'a> {
     fn new(planned: &Planned) -> anyhow::Result<Self> {
         let layers = |set: &[String]| Layers { file: None, set: set.to_vec() };
-        let simulated = layers(&planned.change.simulator).load::<simulator::Config>()?;
-        let controlled = layers(&planned.change.controller).load::<controller::Config>()?;
+        let simulated = layers(&planned.change.simulator)
+            .load::<simulator::Config>()
+            .map_err(|problem| problem.of_service("simulator"))?;
+        let controlled = layers(&planned.change.controller)
+            .load::<controller::Config>()
+            .map_err(|problem| problem.of_service("controller"))?;
         let configurations = BTreeMap::from([
             ("simulator", simulated.table.to_string()),
             ("controller", controlled.table.to_string()),

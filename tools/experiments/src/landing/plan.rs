@@ -145,9 +145,22 @@ impl Default for Plan {
     }
 }
 
+/// Settings of which a flight has a value of its own, by which its results are sorted, and the options of `alight experiment landing` that choose them.
+pub const SWEPT: [(&str, &str); 7] = [
+    ("simulator.wind.mean_m_s", "--wind"),
+    ("simulator.wind.turbulence", "--turbulence"),
+    ("simulator.camera.latency_ms", "--latency"),
+    ("simulator.start.height_m", "--height"),
+    ("simulator.start.north_m", "--offset"),
+    ("simulator.start.east_m", "--offset"),
+    ("simulator.seed", "--seed"),
+];
+
 /// What to run.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Request {
+    /// The command that asked for it, for the report.
+    pub command: String,
     /// The flights.
     pub plan: Plan,
     /// Number of flights in parallel.

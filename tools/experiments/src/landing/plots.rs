@@ -162,8 +162,17 @@ fn touchdowns(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
         .x_label_area_size(40)
         .y_label_area_size(56)
         .build_cartesian_2d(-reach..reach, -reach..reach)?;
-    chart.configure_mesh().x_desc("east, m").y_desc("north, m").draw()?;
-    for (index, radius) in [0.05, 0.1, Touchdown::MAX_ERROR_M].into_iter().enumerate() {
+    // Adding zero makes 0 of -0.
+    let metres = |m: &f64| format!("{}", (m * 1e3).round() / 1e3 + 0.0);
+    chart
+        .configure_mesh()
+        .x_desc("east, m")
+        .y_desc("north, m")
+        .x_label_formatter(&metres)
+        .y_label_formatter(&metres)
+        .draw()?;
+    let radii = [0.05, 0.1, Touchdown::MAX_ERROR_M].into_iter().enumerate();
+    for (index, radius) in radii.filter(|(_, radius)| *radius < reach) {
         let circle = (0..=72).map(|i| {
             let (sin, cos) = (f64::from(i) * std::f64::consts::TAU / 72.0).sin_cos();
             (radius * sin, radius * cos)
@@ -179,7 +188,7 @@ fn touchdowns(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     }
     chart.draw_series(places.iter().map(|(east, north, is_unsafe)| {
         let colour = if *is_unsafe { COLOURS[1] } else { COLOURS[0] };
-        Circle::new((*east, *north), 2, colour.mix(0.6).filled())
+        Circle::new((*east, *north), 4, colour.mix(0.5).filled())
     }))?;
     legend(&mut chart, SeriesLabelPosition::UpperRight)
 }
@@ -228,21 +237,71 @@ fn success(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     Ok(())
 }
 
-/// The complementary cumulative distribution of the error.
+/// The complementary cumulative distribution of the error, for each cell where they can be told apart.
 fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
-    let landed: Vec<&Outcome> = outcomes.iter().filter(|o| o.ending == Ending::Landed).collect();
-    let mut errors = numbers(&landed, |o| o.error_m.map(|error| 100.0 * error));
-    errors.sort_by(f64::total_cmp);
-    let max = errors.last().copied().unwrap_or(1.0).max(1.0) * 1.1;
-    let count = errors.len().max(1) as f64;
+    let mut cells = cells(outcomes);
+    if cells.len() > COLOURS.len() {
+        cells = vec![("all", outcomes.iter().collect())];
+    }
+    let distributions: Vec<(&str, Vec<f64>)> = cells
+        .into_iter()
+        .map(|(name, mut members)| {
+            members.retain(|outcome| outcome.ending == Ending::Landed);
+            let mut errors = numbers(&members, |o| o.error_m.map(|error| 100.0 * error));
+            errors.sort_by(f64::total_cmp);
+            (name, errors)
+        })
+        .collect();
+    let errors = || distributions.iter().flat_map(|(_, errors)| errors.iter().copied());
+    let most = distributions.iter().map(|(_, errors)| errors.len()).max().unwrap_or(0).max(1);
+    let (max_cm, least) = (1.1 * errors().fold(1.0, f64::max), 0.7 / most as f64);
     let mut chart = ChartBuilder::on(area)
         .caption("Proportion of the landings with a larger error", ("sans-serif", 20))
         .margin(12)
         .x_label_area_size(40)
         .y_label_area_size(64)
-        .build_cartesian_2d(0.0..max, (0.5 / count)..1.0)?;
-    drop(chart.configure_mesh().x_desc("touchdown error, cm").y_desc("proportion").draw());
-    let curve = errors.iter().enumerate().map(|(i, error)| (*error, 1.0 - i as f64 / count));
-    chart.draw_series(LineSeries::new(curve, COLOURS[0].stroke_width(2)))?;
+        .build_cartesian_2d(0.0..max_cm, (least..1.0).log_scale())?;
+    chart
+        .configure_mesh()
+        .x_desc("touchdown error, cm")
+        .y_desc("proportion")
+        .y_label_formatter(&|share| format!("{}", (share * 1e6).round() / 1e6))
+        .draw()?;
+    for ((name, errors), colour) in distributions.iter().zip(COLOURS) {
+        let short: String = name.chars().take(70).collect();
+        chart
+            .draw_series(LineSeries::new(steps(errors, least), colour.stroke_width(2)))?
+            .label(format!("{short} ({})", errors.len()))
+            .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
+    }
+    chart
+        .configure_series_labels()
+        .position(SeriesLabelPosition::UpperRight)
+        .background_style(WHITE.mix(0.85))
+        .border_style(BLACK)
+        .draw()?;
     Ok(())
+}
+
+/// The proportion of ascending errors that are larger than each, as the corners of its steps; the last falls to `least`, where a
+/// logarithmic axis ends.
+fn steps(errors: &[f64], least: f64) -> Vec<(f64, f64)> {
+    let count = errors.len() as f64;
+    let corners = errors.iter().enumerate().flat_map(|(i, error)| {
+        let larger = [i, i + 1].map(|smaller| (1.0 - smaller as f64 / count).max(least));
+        larger.map(|proportion| (*error, proportion))
+    });
+    std::iter::once((0.0, 1.0)).chain(corners).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_proportion_with_a_larger_error_falls_at_each_error() {
+        let corners = steps(&[1.0, 2.0], 0.1);
+        assert_eq!(corners, [(0.0, 1.0), (1.0, 1.0), (1.0, 0.5), (2.0, 0.5), (2.0, 0.1)]);
+        assert_eq!(steps(&[], 0.1), [(0.0, 1.0)]);
+    }
 }

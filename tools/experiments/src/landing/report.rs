@@ -63,10 +63,11 @@ fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
     let dangerous = outcomes.iter().filter(|o| o.is_unsafe()).count();
     let again = outcomes.iter().filter(|o| o.has_left_ground()).count();
     format!(
-        "{LANDINGS_HEADING}\n{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe, {again} left the ground again after a touch (by more than {MAX_HOP_M} m).\n\n\
+        "{LANDINGS_HEADING}\n{}{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe, {again} left the ground again after a touch (by more than {MAX_HOP_M} m).\n\n\
          Unsafe: touched down, without having given up, more than 0.3 m off, faster than 0.8 m/s down or 0.5 m/s sideways. Times count from the start of the landing. \
          Numbers of error, time, speed and tilt are of those that landed.\n\n",
         results::interrupted(outcomes.len(), planned),
+        results::origin(&request.command),
         outcomes.len(),
         plan.vision.name(),
         plan.seed,
