@@ -4,7 +4,7 @@
 //! This is the only crate that uses Zenoh. It knows nothing of images, markers or autopilots.
 //!
 //! Modules in reading order: [`config`] merges a user's settings into the defaults; [`service`] runs a
-//! service from start to shutdown; [`network`] configures the network, its `endpoint`s and, from [`access`], the rights of others by their [`certificate`]s,
+//! service from start to shutdown; [`network`] configures the network, its `endpoint`s and, from [`access`], the rights of others by their [`certificate`]s and the `cipher` of links,
 //! and [`session`] joins it under an [`identity`], a tool's unless `foreign` programs answer there (`reach` says why nobody does), with shared memory where `memory`
 //! says that it can; [`topics`] has typed messages and commands, with their `sender`, [`frames`] pixels,
 //! and [`tap`] everything as it came; [`health`] counts, with [`stats`]; [`denied`] counts what access control
@@ -15,6 +15,7 @@ pub mod access;
 mod block_on;
 mod boxed;
 pub mod certificate;
+mod cipher;
 pub mod clock;
 pub mod config;
 pub mod denied;

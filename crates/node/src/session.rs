@@ -12,6 +12,7 @@ use zenoh::liveliness::LivelinessToken;
 use zenoh::sample::{Sample, SampleKind};
 
 use crate::boxed::BoxFuture;
+use crate::cipher;
 use crate::clock::{host_name, now_ns};
 use crate::foreign;
 use crate::health::HealthCounters;
@@ -123,6 +124,7 @@ impl Node {
     async fn open_with(identity: Identity, mut config: zenoh::Config) -> anyhow::Result<Self> {
         let has_shared_memory = share_memory(&mut config)?;
         let reach = Arc::new(Reach::of(&config));
+        cipher::choose();
         let session = zenoh::open(config)
             .await
             .map_err(|cause| anyhow!("opening the Zenoh session of {identity}: {cause}"))?;

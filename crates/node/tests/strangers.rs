@@ -7,6 +7,7 @@
 mod common;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::TcpStream;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -14,7 +15,12 @@ use std::time::Duration;
 use anyhow::{Context, anyhow, ensure};
 use common::Authority;
 use messages::{Delivery, MONITORS, TOPICS};
+use node::network::AUTHORITY;
 use node::{Identity, Network, Node, denied};
+use rustls::crypto::{CryptoProvider, ring};
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
+use rustls::{ClientConfig, ClientConnection, RootCertStore, SupportedCipherSuite};
 use testing::ports;
 use tokio::time::{sleep, timeout};
 use zenoh::Session;
@@ -384,6 +390,42 @@ async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
     println!("| key | what | {} | who subscribes |", names.join(" | "));
     println!("|---|---|{}---|", "---|".repeat(names.len()));
     rows.iter().for_each(|row| println!("{row}"));
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_encrypted_link_takes_the_cipher_that_needs_no_change_of_keys() -> anyhow::Result<()> {
+    let home = tempfile::tempdir()?;
+    Authority::new()?.issue(home.path(), "drone@drone")?;
+    common::list(home.path(), "drone@drone")?;
+    let drone = Drone::start(home.path()).await?;
+    let file = |name: &str| home.path().join(name);
+    let mut roots = RootCertStore::empty();
+    roots.add(CertificateDer::from_pem_file(file(AUTHORITY))?)?;
+    let own = vec![CertificateDer::from_pem_file(file("drone.pem"))?];
+    let private = PrivateKeyDer::from_pem_file(file("drone.key"))?;
+    // Somebody who would take any.
+    let config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
+        .with_safe_default_protocol_versions()?
+        .with_root_certificates(roots)
+        .with_client_auth_cert(own, private)?;
+    let mut stranger = ClientConnection::new(Arc::new(config), ServerName::try_from("127.0.0.1")?)?;
+    let mut stream = TcpStream::connect(&drone.air)?;
+    stream.set_read_timeout(Some(PATIENCE))?;
+    tokio::task::block_in_place(|| {
+        while stranger.is_handshaking() {
+            stranger.complete_io(&mut stream)?;
+        }
+        anyhow::Ok(())
+    })?;
+    let is_without_limit = |suite: &SupportedCipherSuite| {
+        suite.tls13().is_some_and(|it| it.common.confidentiality_limit == u64::MAX)
+    };
+    let taken = stranger.negotiated_cipher_suite().context("a cipher")?;
+    ensure!(is_without_limit(&taken), "{taken:?}");
+    // What our own connections offer.
+    let offered = &CryptoProvider::get_default().context("a default")?.cipher_suites;
+    ensure!(!offered.is_empty() && offered.iter().all(is_without_limit), "{offered:?}");
     Ok(())
 }
 
