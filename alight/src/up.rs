@@ -2,11 +2,14 @@
 //! in order.
 
 use std::collections::VecDeque;
+use std::io::ErrorKind;
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixListener};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use node::Shutdown;
 use tokio::process::Command;
@@ -64,8 +67,23 @@ pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
     if args.dry_run {
         return Ok(ExitCode::SUCCESS);
     }
+    let _only = only_supervisor(&site.instance(args.role))?;
     node::start_logging("warn");
     block_on(supervise(&site, args.role, jobs))?
+}
+
+/// Takes the place of the only supervisor with this name, until what is returned is dropped: a second one would start every process
+/// again beside those of the first. It is a name in the kernel, of the same scope as the port at which processes meet (a network
+/// namespace), and gone with the process that has it.
+fn only_supervisor(name: &str) -> anyhow::Result<UnixListener> {
+    let address = SocketAddr::from_abstract_name(format!("alight-up-{name}"))?;
+    UnixListener::bind_addr(&address).map_err(|problem| match problem.kind() {
+        ErrorKind::AddrInUse => anyhow!(
+            "an `alight up` of this role, vehicle and port ({name}) runs on this machine already; stop that one first, or give this \
+             site a `vehicle` or `meet` of its own"
+        ),
+        _ => anyhow!("taking the name of the supervisor {name}: {problem}"),
+    })
 }
 
 /// Prints a line. A failure is ignored: the supervisor continues without a terminal.
@@ -340,6 +358,17 @@ mod tests {
 
     fn failure(status: i32) -> Exit {
         Exit { words: format!("exit status: {status}"), status: Some(status) }
+    }
+
+    #[test]
+    fn a_second_supervisor_of_the_same_name_is_refused_while_the_first_is_there() {
+        let name = format!("test-{}", std::process::id());
+        let first = only_supervisor(&name).unwrap();
+        let refusal = only_supervisor(&name).unwrap_err().to_string();
+        assert!(refusal.contains("runs on this machine already"), "{refusal}");
+        only_supervisor(&format!("{name}-other")).unwrap();
+        drop(first);
+        only_supervisor(&name).unwrap();
     }
 
     #[test]
