@@ -26,9 +26,12 @@ impl Drag {
     /// The airspeed at which the drag is so large, per drag, in s; `None` without drag.
     fn airspeed_per_drag_s(self, drag_m_s2: f64) -> Option<f64> {
         let Self { linear_per_s: linear, quadratic_per_m: quadratic } = self;
+        if linear <= 0.0 && quadratic <= 0.0 {
+            return None;
+        }
         // The positive root of `quadratic s^2 + linear s = drag`, in the form without a difference.
         let divisor = linear + sqrt(linear * linear + 4.0 * quadratic * drag_m_s2);
-        (divisor > 0.0).then(|| 2.0 / divisor)
+        Some(if divisor > 0.0 { 2.0 / divisor } else { 0.0 })
     }
 }
 
@@ -88,6 +91,10 @@ mod tests {
     use super::*;
     use geometry::{Point, Rotation};
     use landing::{Landed, Mode, Timestamp};
+    use node::Layers;
+    use world::vehicle::VehicleConfig;
+
+    use crate::config::Config;
 
     #[test]
     fn the_wind_is_found_hovering_and_on_the_move() {
@@ -98,6 +105,9 @@ mod tests {
             let is_near = (found[0] - wind[0]).abs() < 0.3 && (found[1] - wind[1]).abs() < 0.1;
             assert!(is_near, "{drag:?}: {found:?}");
         }
+        // Where nothing pushes, the air goes along.
+        let quadratic = Drag { linear_per_s: 0.0, quadratic_per_m: 0.05 };
+        assert_eq!(quadratic.airspeed_per_drag_s(0.0), Some(0.0));
         let none = Drag { linear_per_s: 0.0, quadratic_per_m: 0.0 };
         assert_eq!(estimated(none, wind), None);
         assert_eq!(WindEstimate::default().velocity_m_s(none), None);
@@ -127,5 +137,13 @@ mod tests {
             });
         }
         estimate.velocity_m_s(drag)
+    }
+
+    #[test]
+    fn the_default_is_the_simulated_vehicles_drag() {
+        let drag = Layers::default().load::<Config>().unwrap().settings.autopilot.drag();
+        let simulated = VehicleConfig::default();
+        assert_eq!(drag.linear_per_s, simulated.linear_drag);
+        assert_eq!(drag.quadratic_per_m, simulated.quadratic_drag);
     }
 }
