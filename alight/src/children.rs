@@ -147,7 +147,7 @@ pub(crate) fn for_shell(path: &Path) -> String {
 
 /// This command, as a shell takes it.
 pub(crate) fn this_command() -> String {
-    let words = std::env::args_os().skip(1).map(|word| for_shell(Path::new(&word)));
+    let words = std::env::args_os().skip(1).map(|argument| word(&argument.to_string_lossy()));
     std::iter::once("alight".to_owned()).chain(words).collect::<Vec<_>>().join(" ")
 }
 

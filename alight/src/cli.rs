@@ -100,8 +100,9 @@ struct ConfigArgs {
 
 /// Runs the subcommand; errors go to standard error.
 pub(crate) fn run() -> ExitCode {
-    let cli = Cli::from_arg_matches(&with_negative_numbers(Cli::command()).get_matches())
-        .unwrap_or_else(|problem| problem.exit());
+    let mut command = with_negative_numbers(Cli::command());
+    let cli = Cli::from_arg_matches(&command.get_matches_mut())
+        .unwrap_or_else(|problem| problem.format(&mut command).exit());
     let result = match cli.command.unwrap_or(Command::Land(cli.land)) {
         Command::Land(args) => land::run(&args),
         Command::Up(args) => up::run(&args),
@@ -134,7 +135,8 @@ pub(crate) fn run() -> ExitCode {
     })
 }
 
-/// A command whose options take a number with a minus for a value, and say what is wrong with it, not for an unknown option.
+/// A command whose options take one number with a minus for a value, and say what is wrong with it; otherwise it is told as an unknown
+/// option.
 fn with_negative_numbers(command: clap::Command) -> clap::Command {
     let takes_one =
         |argument: &clap::Arg| !argument.is_positional() && argument.get_action().takes_values();

@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use clap::{Args, Subcommand, ValueEnum};
 use experiments::Preset;
 use experiments::landing::fault::Fault;
@@ -112,7 +112,8 @@ struct MarkersArgs {
     /// tracking, negatives or circles. May be repeated.
     #[arg(long = "set", value_name = "NAME")]
     sets: Vec<Set>,
-    /// Only this family, also of the photographs with a marker. May be repeated. The report is of all results in the folder.
+    /// Only this family; of `--photographs` only apriltag-36h11 has some with a marker. May be repeated. The report is of all results in
+    /// the folder.
     #[arg(long = "family", value_name = "FAMILY", value_parser = family_name)]
     families: Vec<String>,
     /// Folder of photographs with `labels.jsonl`, to test on as well.
@@ -147,17 +148,6 @@ pub(crate) fn run(args: ExperimentArgs) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// Refuses a setting that would make a flight another one than its results say.
-fn check_settings(settings: &[String]) -> anyhow::Result<()> {
-    for setting in settings {
-        let key = setting.split('=').next().unwrap_or_default().trim();
-        if let Some((_, option)) = plan::SWEPT.iter().find(|(swept, _)| *swept == key) {
-            bail!("`--set {setting}`: results are sorted by it, so say it with `{option}`");
-        }
-    }
-    Ok(())
-}
-
 /// One fault, or all.
 #[derive(Clone)]
 struct Faults(Vec<Fault>);
@@ -179,7 +169,7 @@ fn family_name(text: &str) -> Result<String, String> {
 }
 
 fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
-    check_settings(&args.set)?;
+    plan::refuse_swept(&args.set, &plan::SWEPT)?;
     let faults = args.faults.into_iter().flat_map(|Faults(faults)| faults).collect();
     let request = plan::Request {
         command: this_command(),
@@ -314,7 +304,7 @@ mod tests {
     #[test]
     fn a_setting_that_results_are_sorted_by_and_a_family_without_frames_are_refused() {
         let told = |setting: &str| {
-            let refusal = check_settings(&[setting.to_owned()]).err();
+            let refusal = plan::refuse_swept(&[setting.to_owned()], &plan::SWEPT).err();
             refusal.map(|refusal| refusal.to_string()).unwrap_or_default()
         };
         assert!(told("simulator.wind.mean_m_s=7").contains("`--wind`"));

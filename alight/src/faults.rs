@@ -6,11 +6,11 @@ use std::process::ExitCode;
 use anyhow::Context;
 use clap::Args;
 use experiments::faults::kind::Kind;
-use experiments::faults::plan::{Plan, Request, Second};
+use experiments::faults::plan::{Plan, Request, SWEPT, Second};
 use experiments::faults::report;
 use experiments::faults::{self, Findings};
 use experiments::landing::Watch;
-use experiments::landing::plan::Values;
+use experiments::landing::plan::{Values, refuse_swept};
 use experiments::results::{self, Folder};
 
 use crate::args::flight_setting;
@@ -194,6 +194,7 @@ fn run_in_lockstep(
 pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
     let (output, jobs) = (args.output.clone(), args.jobs.unwrap_or_else(cores));
     let (real_time, tapes_in, replaces) = (args.real_time, args.record_tapes.clone(), args.replace);
+    refuse_swept(&args.set, &SWEPT)?;
     let plan = args.plan().map_err(anyhow::Error::msg)?;
     let request = Request { command: this_command(), plan, tapes_in, jobs };
     let mut folder = Folder::claim(&output, replaces)?;

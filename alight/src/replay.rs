@@ -163,7 +163,9 @@ fn compared(searched: &Searched) -> String {
         at(&searched.apart_m, 0.5, 1e3, 1, "mm"),
         at(&searched.apart_m, 1.0, 1e3, 1, "mm")
     ));
-    if now.frames == 0 {
+    let family = now.marker.split(':').next().unwrap_or_default();
+    let looks_for_it = |marker: &String| marker.split(':').next() == Some(family);
+    if now.frames == 0 && !searched.looked_for.iter().any(looks_for_it) {
         text.push_str(&format!(
             "the detector looks for {} (`--set detector.markers=...`), the controller wants {} (`--set marker=...`)\n",
             searched.looked_for.join(", "),
@@ -254,6 +256,20 @@ mod tests {
     use super::*;
     use clap::Parser;
     use messages::{Message as _, Tape, TapeEvent, TapeOutput, TapeWriter, encode, topic};
+
+    #[test]
+    fn a_marker_that_the_detector_does_not_look_for_is_told() {
+        let searched = |marker: &str| Searched {
+            looked_for: vec!["rings:0.15341".to_owned(), "stag-hd23:4:0.2".to_owned()],
+            now: replay::frames::Found { marker: marker.to_owned(), ..Default::default() },
+            ..Searched::default()
+        };
+        let told = compared(&searched("aruco-4x4-50:7"));
+        assert!(told.contains("looks for rings:0.15341, stag-hd23:4:0.2"), "{told}");
+        for marker in ["rings", "stag-hd23:4"] {
+            assert!(!compared(&searched(marker)).contains("looks for"), "{marker}");
+        }
+    }
 
     #[derive(Parser)]
     struct Program {

@@ -79,7 +79,8 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     for flight in &mut flights {
         let (name, number) = (flight.name.clone(), args.landing.unwrap_or(0));
         flight.keep_landing(args.landing).map_err(|of| {
-            anyhow::anyhow!("`--landing {number}`: {name} has {of} landings, counted from 1")
+            let of = summary::counted(of as u64, "landing", "landings");
+            anyhow::anyhow!("`--landing {number}`: {name} has {of}, counted from 1")
         })?;
     }
     ensure!(

@@ -6,7 +6,7 @@
     reason = "a test says what it found, and where it fails"
 )]
 
-use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
+use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage, TIMESYNC_DATA};
 use autopilot::{
     Autopilot, Command, CommandStatus, Config, Event, FlightMode, Parser, Sender, Takeoff,
     TakeoffError, TakeoffProgress,
@@ -14,7 +14,7 @@ use autopilot::{
 use geometry::Vector;
 use world::ardupilot::Firmware;
 use world::wind::WindConfig;
-use world::world::{World, WorldConfig};
+use world::world::{STEP_S, World, WorldConfig};
 
 const TICK_S: f64 = 0.02;
 
@@ -187,6 +187,50 @@ fn px4_takes_no_command_that_is_addressed_to_all_systems() {
         });
         assert_eq!(answers, taken, "{firmware:?}");
     }
+}
+
+#[test]
+fn a_clock_round_trip_is_answered_with_the_time_of_its_arrival_and_milliseconds_are_whole_ones() {
+    let mut world = World::new(&WorldConfig::default(), 4);
+    world.advance_to(1.0);
+    let _ = world.outgoing().count();
+    let sender = Sender { system: 255, component: 192 };
+    let request = TIMESYNC_DATA { tc1: 0, ts1: 42, ..TIMESYNC_DATA::default() };
+    let request = autopilot::packet::encode(sender, 0, &MavMessage::TIMESYNC(request));
+    let arrived_s = world.now_s() + 0.6 * STEP_S;
+    for packet in Parser::new().push(&request) {
+        world.handle_at(arrived_s, &packet);
+    }
+    let sent: Vec<u8> = world.outgoing().flatten().collect();
+    let answers: Vec<(i64, i64)> = Parser::new()
+        .push(&sent)
+        .iter()
+        .filter_map(|packet| match &packet.message {
+            Some(MavMessage::TIMESYNC(answer)) => Some((answer.tc1, answer.ts1)),
+            _ => None,
+        })
+        .collect();
+    assert_eq!(answers, [((arrived_s * 1e9) as i64, 42)]);
+
+    // As a real one counts them, which is half of one late on average.
+    let mut pair = Pair::new(&WorldConfig::default(), 4);
+    let mut parser = Parser::new();
+    let mut counted = 0;
+    while pair.world.now_s() < 10.0 {
+        let before_s = pair.world.now_s();
+        pair.tick();
+        pair.world.advance_to(pair.world.now_s() + STEP_S);
+        let now_s = pair.world.now_s();
+        let sent: Vec<u8> = pair.world.outgoing().flatten().collect();
+        for packet in parser.push(&sent) {
+            if let Some(MavMessage::ATTITUDE(attitude)) = packet.message {
+                let told_s = f64::from(attitude.time_boot_ms) * 1e-3;
+                assert!((before_s - 0.001..=now_s + 1e-5).contains(&told_s), "{told_s} at {now_s}");
+                counted += 1;
+            }
+        }
+    }
+    assert!(counted > 10, "{counted}");
 }
 
 #[test]

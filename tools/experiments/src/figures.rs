@@ -6,6 +6,7 @@ use plotters::coord::Shift;
 use plotters::prelude::*;
 use rendering::views::{Binning, View, views};
 
+use crate::landing::plots::COLOURS;
 use crate::record::OURS;
 use crate::report::Run;
 use crate::set::{Set, families};
@@ -15,22 +16,13 @@ use crate::thesis::TABLES;
 /// The figures and their binnings.
 pub const FIGURES: [(&str, &str); 2] = [("figure-4-7", "2x2"), ("figure-4-8", "4x4")];
 
-const COLOURS: [RGBColor; 6] = [
-    RGBColor(31, 119, 180),
-    RGBColor(214, 39, 40),
-    RGBColor(44, 160, 44),
-    RGBColor(148, 103, 189),
-    RGBColor(255, 127, 14),
-    RGBColor(23, 190, 207),
-];
-
 /// One curve: a family, and the mean error at each position in metres.
 type Curve = (String, Vec<Option<f64>>);
 
 /// The colour of a family, whichever were run.
 fn colour_of(family: &str) -> RGBColor {
-    let place = families().position(|name| name == family).unwrap_or(COLOURS.len() - 1);
-    COLOURS[place % COLOURS.len()]
+    let place = families().position(|name| name == family).unwrap_or(usize::MAX);
+    COLOURS[place.min(COLOURS.len() - 1)]
 }
 
 /// The figure of a binning as SVG: the estimated distances with those of the thesis above, their errors

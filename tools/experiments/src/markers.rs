@@ -152,6 +152,10 @@ pub fn run(
         false => String::new(),
     };
     text += &results::origin(&request.command);
+    if !request.command.is_empty() {
+        text +=
+            "Rows of other sets, families and detectors are of earlier runs in this folder.\n\n";
+    }
     if request.ids == Ids::Shown {
         text += "The id that a frame shows is known, as in a landing.\n\n";
     }
@@ -246,7 +250,7 @@ fn time(results: &Path, set: Set, marker: Marker, folder: &Path) -> anyhow::Resu
 /// The folder of a detector's results on photographs.
 const PHOTOGRAPHS: &str = "photographs";
 
-/// Searches the photographs for the labelled markers of these families, of all without one, and those without a marker for all.
+/// Searches labelled photographs for these families (for all when none is given), and those without a marker for every family.
 fn run_photographs(folder: &Path, results: &Path, wanted: &[String]) -> anyhow::Result<String> {
     for (_, name) in photographs::FAMILIES {
         if !wanted.is_empty() && !wanted.iter().any(|wanted| wanted == name) {
@@ -279,7 +283,10 @@ fn run_photographs(folder: &Path, results: &Path, wanted: &[String]) -> anyhow::
         for (image, found) in wrong {
             let names: Vec<String> = found
                 .iter()
-                .map(|f| format!("{}:{:?} confidence {:.2}", f.family, f.id, f.confidence))
+                .map(|f| {
+                    let confidence = f.confidence.unwrap_or(f64::NAN);
+                    format!("{}:{:?} confidence {confidence:.2}", f.family, f.id)
+                })
                 .collect();
             text.push_str(&format!("- {image}: {}\n", names.join(", ")));
         }

@@ -270,6 +270,9 @@ pub fn text(recalls: &Recalls) -> String {
             of_family.iter().map(move |(detector, recall)| (family, detector, recall))
         })
     };
+    if recalls.is_empty() {
+        return String::new();
+    }
     let mut text = String::from(
         "\n## Labelled photographs\n\n| marker | detector | found | wrong ids | elsewhere | unlabelled |\n|---|---|---|---|---|---|\n",
     );

@@ -57,7 +57,7 @@ pub struct Found {
     pub range_variance_m2: Option<f64>,
     /// The confidence, on the detector's own scale.
     #[serde(default)]
-    pub confidence: f64,
+    pub confidence: Option<f64>,
 }
 
 impl From<&Observation> for Found {
@@ -74,7 +74,7 @@ impl From<&Observation> for Found {
                 [origin.x(), origin.y(), origin.z()]
             }),
             range_variance_m2: seen.pose.map(|pose| pose.covariance[(2, 2)]),
-            confidence: seen.confidence,
+            confidence: Some(seen.confidence),
         }
     }
 }
@@ -221,7 +221,7 @@ pub fn write<'a>(path: &Path, records: impl IntoIterator<Item = &'a Record>) -> 
 /// The results of a detector with the frames of a folder; `None` if there are none.
 ///
 /// # Errors
-/// When the results are damaged or of other frames.
+/// When the results are damaged, or lack a frame.
 pub fn join(path: &Path, folder: &Path) -> anyhow::Result<Option<Vec<(StoredFrame, Record)>>> {
     let Ok(text) = std::fs::read_to_string(path) else { return Ok(None) };
     let mut records = std::collections::HashMap::new();
@@ -230,12 +230,11 @@ pub fn join(path: &Path, folder: &Path) -> anyhow::Result<Option<Vec<(StoredFram
             serde_json::from_str(line).with_context(|| path.display().to_string())?;
         records.insert(record.image.clone(), record);
     }
-    let joined: Option<Vec<_>> = store::frames(folder)?
-        .into_iter()
-        .map(|frame| {
-            let record = records.remove(&frame.image)?;
-            Some((frame, record))
-        })
-        .collect();
-    Ok(Some(joined.with_context(|| format!("{} is of other frames", path.display()))?))
+    let joined = store::frames(folder)?.into_iter().map(|frame| {
+        let record = records.remove(&frame.image).with_context(|| {
+            format!("{} has no line for the frame {}", path.display(), frame.image)
+        })?;
+        Ok((frame, record))
+    });
+    joined.collect::<anyhow::Result<_>>().map(Some)
 }

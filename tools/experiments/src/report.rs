@@ -27,7 +27,7 @@ pub struct Run {
     pub answers: Vec<(StoredFrame, Record)>,
 }
 
-/// A line of `summary.jsonl`.
+/// A line of `scores.jsonl`.
 #[derive(Serialize)]
 struct Line<'a> {
     detector: &'a str,

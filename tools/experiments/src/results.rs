@@ -317,19 +317,33 @@ mod tests {
     }
 
     #[test]
-    fn each_name_in_a_row_is_explained() {
+    fn each_name_in_a_row_is_explained_in_its_section() {
         let text = include_str!("../../../docs/experiments.md");
         let landings = crate::landing::plan::Plan::default().flights();
         let faults = crate::faults::plan::Plan { flights: 1, ..Default::default() }.flights();
-        let scores = crate::score::Score::default().summary();
-        let names = [
-            names_of(&crate::landing::outcome::Outcome::new(&landings[0])),
-            names_of(&crate::faults::outcome::Outcome::new(&faults[0])),
-            names_of(&scores),
+        let found = crate::record::Found {
+            family: "rings".to_owned(),
+            id: None,
+            centre_px: [0.0; 2],
+            covariance_px2: None,
+            corners_px: None,
+            translation_m: None,
+            range_variance_m2: None,
+            confidence: None,
+        };
+        let sections = [
+            ("## Markers\n", names_of(&crate::score::Score::default().summary())),
+            ("## Markers\n", names_of(&found)),
+            ("## Landings\n", names_of(&crate::landing::outcome::Outcome::new(&landings[0]))),
+            ("## Faults\n", names_of(&crate::faults::outcome::Outcome::new(&faults[0]))),
         ];
-        assert!(names.iter().all(|names| names.len() > 15));
-        for name in names.concat() {
-            assert!(text.contains(&format!("`{name}`")), "`{name}` is not in docs/experiments.md");
+        for (heading, names) in sections {
+            assert!(names.len() > 7, "{names:?}");
+            let (_, section) = text.split_once(heading).unwrap();
+            let section = section.split("\n## ").next().unwrap();
+            for name in names {
+                assert!(section.contains(&format!("`{name}`")), "`{name}` is not in {heading}");
+            }
         }
     }
 

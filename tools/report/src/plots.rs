@@ -59,8 +59,10 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
     let step = estimated.len().div_ceil(CIRCLES).max(1);
     // A circle is whole or not there: those of moderate size make the picture larger, the others would make the rest small.
     let max_radius_m = MAX_CIRCLE * (reach.end - reach.start);
+    // An estimate without a deviation, as the thesis' guidance has none, is not a sure one.
+    let with_deviation = || estimated.iter().filter(|it| it.deviation_m > 0.0);
     let (drawn, left_out): (Vec<&Place>, Vec<&Place>) =
-        estimated.iter().step_by(step).partition(|it| SIGMAS * it.deviation_m <= max_radius_m);
+        with_deviation().step_by(step).partition(|it| SIGMAS * it.deviation_m <= max_radius_m);
     let circles: Vec<At> = drawn.into_iter().flat_map(circle).collect();
     let around = circles.iter().flat_map(|it| [it.x, it.y]).filter(|it| it.is_finite());
     let reach = span(around, reach);
@@ -88,8 +90,8 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
         let x_m = along(it) + sign * SIGMAS * it.deviation_m;
         at(x_m.clamp(x.start, x.end), it.height_m)
     };
-    let left = estimated.iter().map(|it| edge(it, -1.0));
-    let right = estimated.iter().rev().map(|it| edge(it, 1.0));
+    let left = with_deviation().map(|it| edge(it, -1.0));
+    let right = with_deviation().rev().map(|it| edge(it, 1.0));
     let layers = vec![
         layer("2 standard deviations", Ink::Blue, Shape::Area, left.chain(right)),
         layer("truth", Ink::Orange, Shape::Wide, from_the_side(&truth)),

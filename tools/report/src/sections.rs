@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::chart::Chart;
 use crate::frames::Fate;
 use crate::html::{Block, Cell, count, details, missing, number, paragraph, table, text};
+use crate::summary::counted;
 use crate::view::View;
 use crate::{journal, light, losses, plots};
 
@@ -300,8 +301,8 @@ fn detectors(view: &View<'_>) -> Section {
         before = now;
     }
     section.before.push(paragraph(&format!(
-        "{} changes; preferred at the end: {}.",
-        view.summary.detector_changes.unwrap_or(0),
+        "{}; preferred at the end: {}.",
+        counted(view.summary.detector_changes.unwrap_or(0), "change", "changes"),
         if last.preference.is_empty() { "nothing" } else { &last.preference }
     )));
     section.after.push(table(&["at", "from", "to", "why"], changes));

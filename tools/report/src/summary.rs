@@ -239,9 +239,11 @@ impl Summary {
                 self.frames_used, self.frames, self.frames_refused, self.frames_without_marker
             )),
             latency.map(|(p50, p99)| format!("exposure to setpoint {p50:.0} ms, 99 % {p99:.0} ms")),
-            self.detector_changes.map(|changes| format!("{changes} changes of the detector")),
-            self.retries.map(|retries| format!("{retries} retries")),
-            Some(format!("recorder lost {} messages", self.messages_lost)),
+            self.detector_changes.map(|changes| {
+                format!("{} of the detector", counted(changes, "change", "changes"))
+            }),
+            self.retries.map(|retries| counted(retries as u64, "retry", "retries")),
+            Some(format!("recorder lost {}", counted(self.messages_lost, "message", "messages"))),
             self.tape.clone(),
             (!self.light.is_empty()).then(|| self.light.join("; ")),
             (!self.problems.is_empty()).then(|| format!("recording: {}", self.problems.join("; "))),
@@ -252,4 +254,9 @@ impl Summary {
         let Self { name, .. } = self;
         format!("{name} [{program}, {guidance}] {}; {}", self.outcome(), parts.join("; "))
     }
+}
+
+/// A number of things: `1 change`, `2 changes`.
+pub fn counted(number: u64, one: &str, several: &str) -> String {
+    format!("{number} {}", if number == 1 { one } else { several })
 }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::kind::{Kind, LIAR};
 use crate::landing::fault::{START_ANGLE, drawn, drawn_angle};
-use crate::landing::plan::{Values, set_option};
+use crate::landing::plan::{Swept, Values, set_option};
 
 /// Durations that are drawn, in seconds; infinity is for ever.
 pub const DURATIONS_S: [f64; 4] = [0.5, 2.0, 5.0, f64::INFINITY];
@@ -66,6 +66,10 @@ impl Default for Plan {
         }
     }
 }
+
+/// The settings of which a flight of `alight experiment faults` has a value of its own.
+pub const SWEPT: [Swept; 2] =
+    [Swept::new("simulator.wind.mean_m_s", "--wind"), Swept::new("simulator.seed", "--seed")];
 
 /// What to run.
 #[derive(Clone, Debug)]

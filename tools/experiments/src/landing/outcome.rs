@@ -29,9 +29,9 @@ pub(crate) fn greater(before: Option<f64>, value: Option<f64>) -> Option<f64> {
 pub enum Ending {
     /// On the ground, disarmed.
     Landed,
-    /// Aborted in the air.
+    /// Aborted, in the air or on the ground.
     Aborted,
-    /// Neither before the timeout.
+    /// Neither before the timeout, or a pilot took over.
     Unfinished,
 }
 

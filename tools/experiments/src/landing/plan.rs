@@ -4,6 +4,8 @@ use std::borrow::Cow;
 use std::ops::RangeInclusive;
 use std::str::FromStr;
 
+use anyhow::bail;
+
 use super::fault::{Change, Fault, START_ANGLE, drawn, drawn_angle};
 
 /// The vision of a flight.
@@ -145,16 +147,44 @@ impl Default for Plan {
     }
 }
 
-/// Settings of which a flight has a value of its own, by which its results are sorted, and the options of `alight experiment landing` that choose them.
-pub const SWEPT: [(&str, &str); 7] = [
-    ("simulator.wind.mean_m_s", "--wind"),
-    ("simulator.wind.turbulence", "--turbulence"),
-    ("simulator.camera.latency_ms", "--latency"),
-    ("simulator.start.height_m", "--height"),
-    ("simulator.start.north_m", "--offset"),
-    ("simulator.start.east_m", "--offset"),
-    ("simulator.seed", "--seed"),
+/// A setting of which each flight has a value of its own, and the option that chooses it.
+#[derive(Copy, Clone, Debug)]
+pub struct Swept {
+    setting: &'static str,
+    option: &'static str,
+}
+
+impl Swept {
+    /// With the service's name before the setting.
+    pub const fn new(setting: &'static str, option: &'static str) -> Self {
+        Self { setting, option }
+    }
+}
+
+/// Those of `alight experiment landing`.
+pub const SWEPT: [Swept; 7] = [
+    Swept::new("simulator.wind.mean_m_s", "--wind"),
+    Swept::new("simulator.wind.turbulence", "--turbulence"),
+    Swept::new("simulator.camera.latency_ms", "--latency"),
+    Swept::new("simulator.start.height_m", "--height"),
+    Swept::new("simulator.start.north_m", "--offset"),
+    Swept::new("simulator.start.east_m", "--offset"),
+    Swept::new("simulator.seed", "--seed"),
 ];
+
+/// Refuses a setting that would make a flight another one than its results say, with the option that chooses it.
+///
+/// # Errors
+/// When there is such a setting.
+pub fn refuse_swept(settings: &[String], swept: &[Swept]) -> anyhow::Result<()> {
+    for setting in settings {
+        let key = setting.split('=').next().unwrap_or_default().trim();
+        if let Some(Swept { option, .. }) = swept.iter().find(|swept| swept.setting == key) {
+            bail!("`--set {setting}`: results are sorted by it, so say it with `{option}`");
+        }
+    }
+    Ok(())
+}
 
 /// What to run.
 #[derive(Clone, Debug, Default)]

@@ -268,7 +268,7 @@ fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
         .y_label_formatter(&|share| format!("{}", (share * 1e6).round() / 1e6))
         .draw()?;
     for ((name, errors), colour) in distributions.iter().zip(COLOURS) {
-        let short: String = name.chars().take(70).collect();
+        let short: String = name.chars().take(80).collect();
         chart
             .draw_series(LineSeries::new(steps(errors, least), colour.stroke_width(2)))?
             .label(format!("{short} ({})", errors.len()))
