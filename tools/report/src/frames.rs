@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use autopilot::Parser;
 use autopilot::dialect::MavMessage;
 use flightlog::RecordedTape;
-use messages::{Detections, StageTime, TapeDecision, TapeEvent};
+use messages::{Detections, LandedState, StageTime, TapeDecision, TapeEvent};
 
 use crate::flight::{Flight, Found};
 
@@ -31,6 +31,8 @@ pub enum Fate {
     Standby,
     /// No landing was under way.
     NotNeeded,
+    /// The estimate did not use it, and the vehicle stood on the ground by then: at most a part of the marker is in view, level with it.
+    OnGround,
     /// The controller refused it before the estimate, or another frame had overtaken it.
     NotTaken,
     /// The recording does not say.
@@ -46,6 +48,7 @@ impl Fate {
             Self::Refused(why) => why,
             Self::Standby => "standby",
             Self::NotNeeded => "not needed",
+            Self::OnGround => "on the ground",
             Self::NotTaken => "not taken",
             Self::Unknown => "not known",
         }
@@ -59,6 +62,7 @@ impl Fate {
             Self::Refused(why) => refusal(why).to_owned(),
             Self::Standby => "another detector was in use".to_owned(),
             Self::NotNeeded => "no landing was under way".to_owned(),
+            Self::OnGround => "not used, as the vehicle stood on the ground by then".to_owned(),
             Self::NotTaken => "overtaken by another frame, or refused before the estimate: of another clock or camera, or by \
                                another detector's name (the controller's losses count those)"
                 .to_owned(),
@@ -122,10 +126,17 @@ impl Frames {
         if let Some(landing) = &flight.landing {
             all.retain(|it| landing.time_ns.contains(&it.handled_ns));
         }
-        match all.is_empty() {
+        let mut frames = match all.is_empty() {
             false => Self { is_from_tape: true, all },
             true => Self { is_from_tape: false, all: of_messages(flight, marker.as_deref()) },
+        };
+        for frame in &mut frames.all {
+            let is_unused = matches!(frame.fate, Fate::Refused(_) | Fate::NoMarker);
+            if is_unused && stands(flight, frame.handled_ns) {
+                frame.fate = Fate::OnGround;
+            }
         }
+        frames
     }
 
     /// How many became this.
@@ -133,9 +144,10 @@ impl Frames {
         self.all.iter().filter(|frame| frame.fate == *fate).count()
     }
 
-    /// How many the detector in use searched during the landing.
+    /// How many the detector in use searched during the landing, until the vehicle stood.
     pub fn of_landing(&self) -> usize {
-        let is_needed = |fate: &Fate| !matches!(fate, Fate::Standby | Fate::NotNeeded);
+        let is_needed =
+            |fate: &Fate| !matches!(fate, Fate::Standby | Fate::NotNeeded | Fate::OnGround);
         self.all.iter().filter(|frame| is_needed(&frame.fate)).count()
     }
 
@@ -148,6 +160,13 @@ impl Frames {
     pub fn refused(&self) -> usize {
         self.all.iter().filter(|frame| matches!(frame.fate, Fate::Refused(_))).count()
     }
+}
+
+/// Whether the vehicle stood on the ground at a time, by its autopilot.
+fn stands(flight: &Flight, at_ns: i64) -> bool {
+    let later = flight.vehicle.partition_point(|it| it.stamp_ns <= at_ns);
+    let last = later.checked_sub(1).and_then(|index| flight.vehicle.get(index));
+    last.is_some_and(|it| it.landed == LandedState::OnGround)
 }
 
 /// Whether the wanted marker is in a frame; without its name, whether any is.

@@ -230,7 +230,9 @@ pub fn detections(view: &View<'_>) -> Vec<Chart> {
             Fate::Used => Ink::Green,
             Fate::Refused(_) => Ink::Red,
             Fate::NoMarker => Ink::Orange,
-            Fate::Standby | Fate::NotNeeded | Fate::NotTaken | Fate::Unknown => Ink::Grey,
+            Fate::Standby | Fate::NotNeeded | Fate::OnGround | Fate::NotTaken | Fate::Unknown => {
+                Ink::Grey
+            }
         };
         let frames = view.frames.all.iter().filter(|it| it.fate == *fate);
         let points = frames.map(|it| at(view.flight.at_s(it.exposed_ns), row as f64));

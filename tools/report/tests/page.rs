@@ -207,7 +207,9 @@ fn the_numbers_are_those_of_the_flight_itself() {
     // The controller counts the same frames as used.
     assert_eq!(found.frames_used as u64, outcome.detections);
     let frames = report::frames::Frames::of(&flight);
-    let outside = frames.count(&Fate::Standby) + frames.count(&Fate::NotNeeded);
+    let outside = [Fate::Standby, Fate::NotNeeded, Fate::OnGround].map(|it| frames.count(&it));
+    assert!(outside[2] > 0, "no frame was searched on the ground");
+    let outside: usize = outside.iter().sum();
     assert_eq!(found.frames + outside, flight.found.len());
     // Latency: each frame's detections came a modelled time after its exposure.
     let times: Vec<f64> = flight
@@ -376,6 +378,10 @@ fn of_a_recording_with_two_landings_each_has_its_own_numbers() {
         it
     });
     both.statuses.extend(statuses);
+    both.vehicle.extend(one.vehicle.iter().cloned().map(|mut it| {
+        it.stamp_ns += LATER_NS;
+        it
+    }));
     let first_touchdown = one.truth.last().unwrap().touchdown;
     both.truth.extend(one.truth.iter().cloned().map(|mut it| {
         it.stamp_ns += LATER_NS;
