@@ -508,8 +508,21 @@ fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job], watche
         return;
     }
     for job in expected {
-        let Some(service) = job.service else { continue };
-        if !seen.peers.iter().any(|(alive, _)| alive == service.name()) {
+        let (Some(service), Some(instance)) = (job.service, &job.instance) else { continue };
+        let ready = seen.peers.iter().filter(|(alive, _)| alive == service.name());
+        let ready: Vec<&str> = ready.map(|(_, instance)| instance.as_str()).collect();
+        if !ready.is_empty() && !ready.contains(&instance.as_str()) {
+            findings.doubtful(
+                "services",
+                format!(
+                    "no {} `{instance}` is ready, but this machine should run one; ready: {}",
+                    service.name(),
+                    ready.join(", ")
+                ),
+                "see the output of `alight up`; a detector that `alight swap` replaced stays away while the other runs",
+            );
+        }
+        if ready.is_empty() {
             findings.wrong(
                 "services",
                 format!("no {} is ready, but this machine should run one", service.name()),
@@ -715,6 +728,29 @@ mod tests {
             "{text}"
         );
         assert!(text.ends_with("0 wrong, 1 doubtful."), "{text}");
+    }
+
+    #[test]
+    fn a_service_of_the_site_is_missed_by_its_name() {
+        let site: Site = toml::from_str(
+            "address = '10.42.0.1'\ninsecure = true\nground = [{ run = 'detector', set = ['id=\"ground\"'] }]",
+        )
+        .unwrap();
+        let expected = site.jobs(Role::Ground).unwrap();
+        let told = |ready: &[&str]| {
+            let peers = ready.iter().map(|name| ("detector".to_owned(), (*name).to_owned()));
+            let peers = [("controller".to_owned(), "main".to_owned())].into_iter().chain(peers);
+            let seen = Seen { peers: peers.collect(), ..Seen::default() };
+            let watched = Watched { duration: Duration::from_secs(3), has_raw_frames: false };
+            let mut findings = Findings::default();
+            check_presence(&mut findings, &seen, &expected, watched);
+            findings.text()
+        };
+        assert!(told(&["onboard", "ground"]).ends_with("Nothing is wrong."));
+        let another = told(&["onboard"]);
+        assert!(another.contains("no detector `ground` is ready"), "{another}");
+        assert!(another.ends_with("0 wrong, 1 doubtful."), "{another}");
+        assert!(told(&[]).ends_with("1 wrong, 0 doubtful."));
     }
 
     #[test]

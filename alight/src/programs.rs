@@ -52,6 +52,7 @@ mod tests {
         Job {
             name: service.name().to_owned(),
             service: Some(service),
+            instance: None,
             command: command.iter().map(|&it| it.to_owned()).collect(),
             network: node::Network::default(),
             key: service.name().to_owned(),

@@ -86,6 +86,8 @@ pub(crate) struct Job {
     pub(crate) name: String,
     /// The service, unless it is the relay or another program.
     pub(crate) service: Option<Service>,
+    /// The service's instance; none of the relay and of another program.
+    pub(crate) instance: Option<String>,
     /// The program and its arguments; `alight` for this program.
     pub(crate) command: Vec<String>,
     /// The network that it joins.
@@ -228,6 +230,7 @@ impl Site {
         Ok(Some(Job {
             name: RELAY.to_owned(),
             service: None,
+            instance: None,
             command: vec![
                 "alight".to_owned(),
                 RELAY.to_owned(),
@@ -285,9 +288,10 @@ impl Site {
         let name = entry.name.clone().or(own_name).unwrap_or_default();
         // Another program is a detector of its own name.
         let instance = config.as_ref().and_then(|config| config.get("id")?.as_str());
+        let instance = instance.map(str::to_owned);
         let role = service.map_or(Service::Detector.name(), Service::name);
-        let key = key_name(role, instance.unwrap_or(&name));
-        Ok(Job { name, service, command, network, key, layers })
+        let key = key_name(role, instance.as_deref().unwrap_or(&name));
+        Ok(Job { name, service, instance, command, network, key, layers })
     }
 }
 

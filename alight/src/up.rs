@@ -348,6 +348,7 @@ mod tests {
         let job = Job {
             name: "detector".to_owned(),
             service: Some(Service::Detector),
+            instance: None,
             command: vec!["alight".to_owned(), "detector".to_owned()],
             network: node::Network::default(),
             key: "detector".to_owned(),
