@@ -511,7 +511,13 @@ fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job], watche
         let (Some(service), Some(instance)) = (job.service, &job.instance) else { continue };
         let ready = seen.peers.iter().filter(|(alive, _)| alive == service.name());
         let ready: Vec<&str> = ready.map(|(_, instance)| instance.as_str()).collect();
-        if !ready.is_empty() && !ready.contains(&instance.as_str()) {
+        if ready.is_empty() {
+            findings.wrong(
+                "services",
+                format!("no {} is ready, but this machine should run one", service.name()),
+                "see the output of `alight up`",
+            );
+        } else if !ready.contains(&instance.as_str()) {
             findings.doubtful(
                 "services",
                 format!(
@@ -520,13 +526,6 @@ fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job], watche
                     ready.join(", ")
                 ),
                 "see the output of `alight up`; a detector that `alight swap` replaced stays away while the other runs",
-            );
-        }
-        if ready.is_empty() {
-            findings.wrong(
-                "services",
-                format!("no {} is ready, but this machine should run one", service.name()),
-                "see the output of `alight up`",
             );
         }
     }

@@ -287,8 +287,8 @@ impl Site {
         let own_name = program.map(|p| p.rsplit('/').next().unwrap_or(p).to_owned());
         let name = entry.name.clone().or(own_name).unwrap_or_default();
         // Another program is a detector of its own name.
-        let instance = config.as_ref().and_then(|config| config.get("id")?.as_str());
-        let instance = instance.map(str::to_owned);
+        let instance =
+            config.as_ref().and_then(|config| Some(config.get("id")?.as_str()?.to_owned()));
         let role = service.map_or(Service::Detector.name(), Service::name);
         let key = key_name(role, instance.as_deref().unwrap_or(&name));
         Ok(Job { name, service, instance, command, network, key, layers })

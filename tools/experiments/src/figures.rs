@@ -6,7 +6,7 @@ use plotters::coord::Shift;
 use plotters::prelude::*;
 use rendering::views::{Binning, View, views};
 
-use crate::landing::plots::COLOURS;
+use crate::landing::plots::{COLOURS, legend};
 use crate::record::OURS;
 use crate::report::Run;
 use crate::set::{Set, families};
@@ -128,12 +128,7 @@ fn draw(
                 .legend(move |(x, y)| Circle::new((x + 8, y), 3, colour));
         }
     }
-    chart
-        .configure_series_labels()
-        .position(SeriesLabelPosition::UpperLeft)
-        .background_style(WHITE.mix(0.8))
-        .border_style(BLACK)
-        .draw()?;
+    legend(&mut chart, SeriesLabelPosition::UpperLeft)?;
     draw_errors(&lower, places, ours)
 }
 

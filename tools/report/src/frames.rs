@@ -164,9 +164,14 @@ impl Frames {
 
 /// Whether the vehicle stood on the ground at a time, by its autopilot.
 fn stands(flight: &Flight, at_ns: i64) -> bool {
-    let later = flight.vehicle.partition_point(|it| it.stamp_ns <= at_ns);
-    let last = later.checked_sub(1).and_then(|index| flight.vehicle.get(index));
-    last.is_some_and(|it| it.landed == LandedState::OnGround)
+    newest(&flight.vehicle, at_ns, |it| it.stamp_ns)
+        .is_some_and(|it| it.landed == LandedState::OnGround)
+}
+
+/// The newest of some messages, in the order of their stamps, up to a time.
+fn newest<T>(messages: &[T], at_ns: i64, stamp_ns: impl Fn(&T) -> i64) -> Option<&T> {
+    let later = messages.partition_point(|it| stamp_ns(it) <= at_ns);
+    messages.get(later.checked_sub(1)?)
 }
 
 /// Whether the wanted marker is in a frame; without its name, whether any is.
@@ -267,8 +272,7 @@ fn of_messages(flight: &Flight, marker: Option<&str>) -> Vec<Handled> {
         used.range(near).next().is_some()
     };
     let fate = |found: &Found, handled_ns: i64| {
-        let before = flight.statuses.partition_point(|it| it.stamp_ns <= handled_ns);
-        let status = before.checked_sub(1).and_then(|at| flight.statuses.get(at));
+        let status = newest(&flight.statuses, handled_ns, |it| it.stamp_ns);
         let active = status.and_then(|status| status.active_detector.as_deref());
         if active.is_some_and(|active| active != found.detector) {
             return Fate::Standby;

@@ -6,7 +6,8 @@ use autopilot::Parser;
 use controller::pad_note::PadNote;
 use controller::tape::TapedFlight;
 use messages::{CameraInfo, ControllerStatus, Detections, Phase, Tape};
-use node::Layers;
+
+use crate::landing::configuration;
 
 /// Packets that a socket keeps for a process that does not read them; newer ones are lost.
 const MAX_PACKETS: usize = 256;
@@ -101,9 +102,9 @@ impl Controller {
     }
 
     fn start(&mut self, now_ns: i64, more: Option<&str>) -> anyhow::Result<()> {
-        let set = self.settings.iter().cloned().chain(more.map(str::to_owned)).collect();
-        let config = Layers { file: None, set }.load::<controller::Config>();
-        let config = config.map_err(|problem| problem.of_service("controller"))?.settings;
+        let settings = self.settings.iter().cloned().chain(more.map(str::to_owned));
+        let set: Vec<String> = settings.collect();
+        let config = configuration::<controller::Config>("controller", &set)?.settings;
         let mut flight = TapedFlight::new(now_ns, config, std::sync::Arc::default())?;
         if let Some(note) = self.pad_file.clone() {
             flight.take_over_pad(now_ns, note);

@@ -4,7 +4,6 @@
 use anyhow::Context;
 use autopilot::Parser;
 use messages::{Detections, Phase, Tape};
-use node::Layers;
 use world::World;
 use world::vehicle::VehicleTruth;
 use world::vision::VisionFaults;
@@ -18,6 +17,7 @@ use super::link::FaultyLink;
 use super::outcome::{Ending, Outcome};
 use super::peers::{Lie, babble, liar, strange_camera, stranger};
 use super::plan::Planned;
+use crate::landing::configuration;
 use crate::landing::plan::Vision;
 use crate::landing::sim_vision::{Arrival, DETECTOR, SimVision};
 
@@ -109,9 +109,8 @@ struct FaultyFlight<'a> {
 
 impl<'a> FaultyFlight<'a> {
     fn new(planned: &'a Planned) -> anyhow::Result<Self> {
-        let layers = Layers { file: None, set: planned.simulator.clone() };
-        let simulated = layers.load::<simulator::Config>();
-        let simulated = simulated.map_err(|problem| problem.of_service("simulator"))?.settings;
+        let simulated =
+            configuration::<simulator::Config>("simulator", &planned.simulator)?.settings;
         let world = World::new(&simulated.world(), simulated.seed);
         let vision = SimVision::new(&simulated, Vision::Modelled, VisionFaults::default())?;
         let order =

@@ -9,11 +9,11 @@ use autopilot::Parser;
 use controller::tape::TapedFlight;
 use geometry::{Ned, Point, Vector};
 use messages::Phase;
-use node::Layers;
 use world::World;
 use world::vehicle::VehicleTruth;
 use world::world::STEP_S;
 
+use super::configuration;
 use super::outcome::{Ending, MAX_HOP_M, Outcome, greater};
 use super::plan::Planned;
 use super::recording::Recording;
@@ -99,13 +99,9 @@ struct LockstepFlight<'a> {
 
 impl<'a> LockstepFlight<'a> {
     fn new(planned: &Planned) -> anyhow::Result<Self> {
-        let layers = |set: &[String]| Layers { file: None, set: set.to_vec() };
-        let simulated = layers(&planned.change.simulator)
-            .load::<simulator::Config>()
-            .map_err(|problem| problem.of_service("simulator"))?;
-        let controlled = layers(&planned.change.controller)
-            .load::<controller::Config>()
-            .map_err(|problem| problem.of_service("controller"))?;
+        let simulated = configuration::<simulator::Config>("simulator", &planned.change.simulator)?;
+        let controlled =
+            configuration::<controller::Config>("controller", &planned.change.controller)?;
         let configurations = BTreeMap::from([
             ("simulator", simulated.table.to_string()),
             ("controller", controlled.table.to_string()),

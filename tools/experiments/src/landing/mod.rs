@@ -20,10 +20,20 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use flight::fly;
+use node::{ConfigError, Effective, Layers, Settings};
 use outcome::Outcome;
 use plan::{Planned, Request};
 
 use crate::results::Folder;
+
+/// The configuration of a service by these settings over its defaults; a problem names the service.
+pub(crate) fn configuration<T: Settings>(
+    service: &str,
+    set: &[String],
+) -> Result<Effective<T>, ConfigError> {
+    let layers = Layers { file: None, set: set.to_vec() };
+    layers.load().map_err(|problem| problem.of_service(service))
+}
 
 /// How flights are watched.
 #[derive(Copy, Clone)]

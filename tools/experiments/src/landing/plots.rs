@@ -3,6 +3,7 @@
 use anyhow::anyhow;
 use messages::Touchdown;
 use node::stats::quantile;
+use plotters::coord::CoordTranslate;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 
@@ -135,8 +136,8 @@ fn error_bar(
 ///
 /// # Errors
 /// When it cannot be drawn.
-pub fn legend<'a, 'b: 'a>(
-    chart: &mut Chart<'a, 'b>,
+pub fn legend<'a, 'b: 'a, Axes: CoordTranslate>(
+    chart: &mut ChartContext<'a, SVGBackend<'b>, Axes>,
     position: SeriesLabelPosition,
 ) -> Result<(), DrawError> {
     chart
@@ -245,8 +246,7 @@ fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     }
     let distributions: Vec<(&str, Vec<f64>)> = cells
         .into_iter()
-        .map(|(name, mut members)| {
-            members.retain(|outcome| outcome.ending == Ending::Landed);
+        .map(|(name, members)| {
             let mut errors = numbers(&members, |o| o.error_m.map(|error| 100.0 * error));
             errors.sort_by(f64::total_cmp);
             (name, errors)
@@ -274,13 +274,7 @@ fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
             .label(format!("{short} ({})", errors.len()))
             .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
     }
-    chart
-        .configure_series_labels()
-        .position(SeriesLabelPosition::UpperRight)
-        .background_style(WHITE.mix(0.85))
-        .border_style(BLACK)
-        .draw()?;
-    Ok(())
+    legend(&mut chart, SeriesLabelPosition::UpperRight)
 }
 
 /// The proportion of ascending errors that are larger than each, as the corners of its steps; the last falls to `least`, where a
