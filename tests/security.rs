@@ -7,9 +7,9 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail, ensure};
-use messages::{CommandReply, ControllerCommand, FrameAck, Health, topic};
+use messages::{CommandReply, ControllerCommand, DetectorCommand, FrameAck, Health, Place, topic};
 use node::{Identity, Network, Node, Subscriber};
-use testing::ports;
+use testing::{ports, python, python_passes};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
@@ -196,6 +196,50 @@ async fn each_says_what_its_role_may_and_strangers_nothing() -> anyhow::Result<(
     is_heard(&detector, &drone.controller).await?;
     answering.abort();
     Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_program_in_another_language_joins_by_the_session_that_is_printed() -> anyhow::Result<()>
+{
+    let _flight = beside_another().await?;
+    let script = "detector/examples/python/detector.py";
+    let Some(probe) = python(script, &["--help"]) else { return Ok(()) };
+    if !python_passes(&probe.wait_with_output()?)? {
+        return Ok(());
+    }
+    let drone = Drone::start().await?;
+    let home = text(drone.folder.path())?;
+    let network = ["--zenoh", "ground", "--connect", &drone.air, "--keys", home];
+    let session = |role| output_of(&[&["config", "--session", role], &network[..]].concat());
+    let lacking = session("detector.python")?;
+    let said = String::from_utf8_lossy(&lacking.stderr).into_owned();
+    ensure!(said.contains("issue --role detector --name python"), "{said}");
+    let nobody = session("detector")?;
+    let said = String::from_utf8_lossy(&nobody.stderr).into_owned();
+    ensure!(nobody.status.code() == Some(2) && said.contains("`detector.NAME`"), "{said}");
+
+    keys(&["issue", "--role", "detector", "--name", "python", "-o", home])?;
+    let printed = session("detector.python")?;
+    ensure!(printed.status.success(), "{printed:?}");
+    let file = drone.folder.path().join("session.json");
+    std::fs::write(&file, printed.stdout)?;
+    // The relay reads the list of those who may connect anew within seconds.
+    let infos = drone.controller.subscriber(topic::DETECTOR_INFO, &["python"]).await?;
+    let marker = ["--id", "python", "--place", "ground", "--marker", "aruco-4x4-50:7:0.3"];
+    let python = python(script, &[&marker[..], &["--zenoh", text(&file)?]].concat());
+    let mut python = python.context("it started a moment ago")?;
+    let joined = async {
+        let info = timeout(PATIENCE, infos.next()).await.context("it is not heard")?;
+        ensure!(info.is_some_and(|info| info.place == Place::Ground), "the ground's detector");
+        let stop = DetectorCommand::Stop;
+        let stopped = drone.controller.command(topic::DETECTOR_COMMAND, &["python"], &stop);
+        ensure!(stopped.await?.accepted, "it may not be commanded");
+        anyhow::Ok(())
+    };
+    let joined = joined.await;
+    let _ = python.kill();
+    python.wait()?;
+    joined
 }
 
 #[tokio::test(flavor = "multi_thread")]

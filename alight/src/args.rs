@@ -3,6 +3,7 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
+use anyhow::Context;
 use clap::builder::FalseyValueParser;
 use clap::{Args, ValueEnum};
 use node::network::variable;
@@ -68,6 +69,15 @@ impl NetworkArgs {
     /// The session's configuration for a process with this key.
     pub(crate) fn source(&self, key_name: &str) -> anyhow::Result<ZenohSource> {
         self.network().source(key_name)
+    }
+
+    /// The session's configuration for a program that may be started in any directory: paths of keys are absolute.
+    pub(crate) fn session(&self, key_name: &str) -> anyhow::Result<serde_json::Value> {
+        let mut network = self.network();
+        if let Some(keys) = &mut network.keys {
+            *keys = std::path::absolute(&keys).with_context(|| format!("the path {keys:?}"))?;
+        }
+        network.configuration(key_name)
     }
 
     pub(crate) fn network(&self) -> Network {

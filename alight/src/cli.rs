@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use node::{ConfigError, Layers};
 
-use crate::args::ServiceArgs;
+use crate::args::{NetworkArgs, ServiceArgs};
 use crate::services::{self, Service};
 use crate::terminal::{print, write_error};
 use crate::{
@@ -75,7 +75,7 @@ enum Command {
     Marker(marker::MarkerArgs),
     /// Repeat the thesis' experiments.
     Experiment(experiment::ExperimentArgs),
-    /// Print the effective configuration of a service, or of all.
+    /// Print the effective configuration of a service, or of all; or that of a Zenoh session.
     Config(ConfigArgs),
     /// Send a command to a running controller, or change a parameter of a running detector.
     Command(command::CommandArgs),
@@ -96,6 +96,12 @@ struct ConfigArgs {
     /// One setting over the file. May be repeated.
     #[arg(long, value_name = "KEY=VALUE", requires = "service")]
     set: Vec<String>,
+    /// Print, as JSON, what a Zenoh program of your own opens its session with in the network of the options below: ROLE, of a detector
+    /// `detector.NAME`, is whose key it has there, if the network has keys.
+    #[arg(long, value_name = "ROLE", conflicts_with = "service", value_parser = keys::key_name_of)]
+    session: Option<String>,
+    #[command(flatten)]
+    network: NetworkArgs,
 }
 
 /// Runs the subcommand; errors go to standard error.
@@ -161,6 +167,10 @@ fn is_wrong_use(problem: &anyhow::Error) -> bool {
 }
 
 fn print_config(args: ConfigArgs) -> anyhow::Result<ExitCode> {
+    if let Some(role) = &args.session {
+        print(&format!("{:#}", args.network.session(role)?))?;
+        return Ok(ExitCode::SUCCESS);
+    }
     let layers = Layers { file: args.config, set: args.set };
     let is_chosen = |s: &Service| args.service.is_none_or(|service| service == *s);
     for service in Service::value_variants().iter().copied().filter(is_chosen) {

@@ -15,7 +15,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, ensure};
 use clap::{Args, Subcommand, ValueEnum};
-use node::access::{HOLDERS, Holder, Holders};
+use node::access::{HOLDERS, Holder, Holders, key_name};
 use node::certificate::{Certificate, certificate};
 use node::network::{AUTHORITY, check_private};
 use rcgen::{
@@ -137,6 +137,18 @@ pub(crate) enum Role {
     Dashboard,
     /// Simulates camera and vehicle.
     Simulator,
+}
+
+/// The name of a key's files by what is written at the command line: ROLE, or `detector.NAME`.
+pub(crate) fn key_name_of(text: &str) -> Result<String, String> {
+    let (role, name) = text.split_once('.').map_or((text, None), |(role, name)| (role, Some(name)));
+    let is_role = Role::from_str(role, false).is_ok() && (role == "detector") == name.is_some();
+    if !is_role || name.is_some_and(|name| !node::config::is_name(name)) {
+        let others = Role::value_variants().iter().filter(|role| **role != Role::Detector);
+        let others: Vec<_> = others.map(|role| role.name()).collect();
+        return Err(format!("write `detector.NAME`, or one of {}", others.join(", ")));
+    }
+    Ok(key_name(role, name.unwrap_or_default()))
 }
 
 impl Role {

@@ -10,8 +10,9 @@ unchanged, tells about itself, declares its presence, and answers commands. docs
 
     alight swap --to 'python3 detector/examples/python/detector.py --id python --marker aruco-4x4-50:7:0.15'
 
-It connects to a service of Alight that runs: start that first. Needed: pip install eclipse-zenoh numpy
-opencv-python-headless. Exit status 77 when one of them is missing.
+It connects to a service of Alight that runs: start that first. On the ground, `--zenoh ground` with the variables ALIGHT_CONNECT and
+ALIGHT_KEYS joins the vehicle's network as Alight's own programs do (`alight config --session` writes the configuration).
+Needed: pip install eclipse-zenoh numpy opencv-python-headless. Exit status 77 when one of them is missing.
 """
 
 import argparse
@@ -20,6 +21,7 @@ import os
 import platform
 import signal
 import struct
+import subprocess
 import sys
 import threading
 import time
@@ -371,9 +373,19 @@ class Detector:
 
 def configuration(args):
     """The session's configuration, and what keys begin with."""
-    if args.zenoh:
+    if os.path.isfile(args.zenoh):
         # A file of the project: a peer like all others, whose keys get the vehicle's name from `namespace`.
         return zenoh.Config.from_file(args.zenoh), ""
+    if args.zenoh not in ("", "local"):
+        # With the addresses and keys of the environment; what is wrong with them it says itself.
+        ask = [args.alight, "config", "--session", f"detector.{args.id}", "--zenoh", args.zenoh]
+        try:
+            session = subprocess.run(ask, stdout=subprocess.PIPE, text=True, check=True)
+        except OSError as problem:
+            sys.exit(f"`--zenoh {args.zenoh}` needs the program `alight` (--alight PROGRAM): {problem}")
+        except subprocess.CalledProcessError as problem:
+            sys.exit(problem.returncode)
+        return zenoh.Config.from_json5(session.stdout), ""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([args.connect]))
@@ -384,13 +396,13 @@ def configuration(args):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     port = os.environ.get("ALIGHT_MEET", "7447")
-    file = os.environ.get("ALIGHT_ZENOH", "")
     parser.add_argument("--id", default="python")
     parser.add_argument("--place", choices=("onboard", "ground"), default="onboard")
     parser.add_argument("--camera", default="down")
     parser.add_argument("--marker", type=Marker, required=True, help="FAMILY:ID:SIZE_M")
     parser.add_argument("--input", choices=("raw", "jpeg"), default="raw")
-    parser.add_argument("--zenoh", default=file if os.path.isfile(file) else "", help="a Zenoh configuration (JSON5)")
+    parser.add_argument("--zenoh", default=os.environ.get("ALIGHT_ZENOH", ""), help="`ground`, or a JSON5 file")
+    parser.add_argument("--alight", default="alight", help="the program, for --zenoh ground")
     parser.add_argument("--connect", default=f"tcp/127.0.0.1:{port}", help="the rendezvous, without --zenoh")
     parser.add_argument("--vehicle", default=os.environ.get("ALIGHT_VEHICLE", "drone"))
     args = parser.parse_args()
