@@ -188,11 +188,12 @@ mod tests {
 
     #[test]
     fn a_negative_number_is_told_by_its_option() {
-        let command = with_negative_numbers(Cli::command());
-        let problem =
-            command.try_get_matches_from(["alight", "experiment", "landing", "--wind", "-3"]);
-        let told = problem.unwrap_err().to_string();
-        assert!(told.contains("invalid value '-3' for '--wind"), "{told}");
+        for (command, value) in [("landing", "-3"), ("landing", "-3,5"), ("faults", "-3,5")] {
+            let arguments = ["alight", "experiment", command, "--wind", value];
+            let problem = with_negative_numbers(Cli::command()).try_get_matches_from(arguments);
+            let told = problem.unwrap_err().to_string();
+            assert!(told.contains("invalid value '-3") && told.contains("for '--wind"), "{told}");
+        }
     }
 
     #[test]

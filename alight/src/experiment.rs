@@ -60,21 +60,21 @@ struct LandingArgs {
     #[arg(long, value_enum, default_value_t = VisionArg::Modelled)]
     vision: VisionArg,
     /// Mean wind in m/s: a value, a list 0,5,8, or a range 0..8 with a random value for each seed.
-    #[arg(long, value_name = "M/S", default_value = "0,2,5,8")]
+    #[arg(long, allow_hyphen_values = true, value_name = "M/S", default_value = "0,2,5,8")]
     wind: Values,
     /// Strength of the turbulence: 1 is that of ArduPilot's simulator with "turbulence 1". A list or range as
     /// well.
-    #[arg(long, value_name = "STRENGTH", default_value = "1")]
+    #[arg(long, allow_hyphen_values = true, value_name = "STRENGTH", default_value = "1")]
     turbulence: Values,
     /// Latency from exposure to the arrival of detections, in milliseconds, with 25 % random jitter. A list
     /// or range as well.
-    #[arg(long, value_name = "MS", default_value = "80")]
+    #[arg(long, allow_hyphen_values = true, value_name = "MS", default_value = "80")]
     latency: Values,
     /// Height at the start, in metres, from 0.1 to 100. A list or range as well.
-    #[arg(long, value_name = "M", default_value = "10", value_parser = plan::heights)]
+    #[arg(long, allow_hyphen_values = true, value_name = "M", default_value = "10", value_parser = plan::heights)]
     height: Values,
     /// Horizontal distance from the pad at the start, in metres. A list or range as well.
-    #[arg(long, value_name = "M", default_value = "2.12")]
+    #[arg(long, allow_hyphen_values = true, value_name = "M", default_value = "2.12")]
     offset: Values,
     /// Fault; `all` for each of them. May be repeated. An unknown name lists all.
     #[arg(long = "fault", value_name = "NAME", default_value = "none", value_parser = faults_named)]

@@ -43,13 +43,13 @@ pub(crate) struct FaultsArgs {
     #[arg(long = "kind", value_name = "NAME")]
     kinds: Vec<Kind>,
     /// Height over the pad at which it begins, in metres: a value, a list 0.3,2,5, or a range.
-    #[arg(long, value_name = "M", default_value = "0.2..9")]
+    #[arg(long, allow_hyphen_values = true, value_name = "M", default_value = "0.2..9")]
     height: Values,
     /// How long it lasts, in seconds, or `ever`; a list as well [default: one of 0.5, 2, 5 and ever].
     #[arg(long = "for", value_name = "S", value_delimiter = ',', value_parser = duration_s)]
     durations_s: Vec<f64>,
     /// Mean wind, in m/s; a list as well [default: 0 or 5].
-    #[arg(long, value_name = "M/S", value_delimiter = ',', value_parser = wind_m_s)]
+    #[arg(long, allow_hyphen_values = true, value_name = "M/S", value_delimiter = ',', value_parser = wind_m_s)]
     wind: Vec<f64>,
     /// A second fault at the same time: a kind, or `none` [default: any, in a fifth of the flights].
     #[arg(long, value_name = "NAME")]

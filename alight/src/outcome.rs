@@ -66,8 +66,8 @@ pub(crate) struct Outcome {
 /// What was recorded of it.
 #[derive(Serialize)]
 struct Recording {
-    /// The last file.
-    file: String,
+    /// The last file; none where it ended before one was begun.
+    file: Option<String>,
     kept: u64,
     dropped: u64,
     /// Frames whose numbers are missing.
@@ -303,7 +303,7 @@ impl LandingSummary {
             guidance: status.map_or_else(String::new, |s| s.guidance.clone()),
             processes: self.processes(),
             recording: self.recorder.as_ref().map(|recorder| Recording {
-                file: recorder.file.clone(),
+                file: Some(&recorder.file).filter(|file| !file.is_empty()).cloned(),
                 kept: recorder.kept,
                 dropped: recorder.lost(),
                 never_came: recorder.never_came(),
@@ -419,7 +419,7 @@ impl Outcome {
                 count => format!("; {count} frames never came"),
             };
             let problem = problem.as_ref().map_or_else(String::new, |it| format!("; {it}"));
-            let file = if file.is_empty() { "no file" } else { file };
+            let file = file.as_deref().unwrap_or("no file");
             line(format_args!("recorded {kept} messages, lost {dropped}{unseen}: {file}{problem}"));
         }
         text.truncate(text.trim_end().len());
