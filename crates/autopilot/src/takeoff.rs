@@ -164,6 +164,8 @@ enum Part {
 /// Attempts to arm.
 #[derive(Clone, Debug)]
 struct Arming {
+    /// The mode in which it began.
+    mode: Option<FlightMode>,
     request: Option<CommandId>,
     retry_ns: i64,
     refused: Option<CommandError>,
@@ -244,7 +246,15 @@ impl Takeoff {
             !waiting && [FlightMode::AUTO_TAKEOFF, FlightMode::AUTO_HOLD].contains(&state.mode);
         let guided = state.mode.is_guided() || rises;
         self.guided |= guided;
-        let taken = if waiting { state.armed } else { self.guided };
+        let taken = match &self.part {
+            Part::Ready => state.armed,
+            // PX4 is armed in the pilot's own mode.
+            Part::Arm(arming) => {
+                let is_changed = arming.mode.is_some_and(|mode| mode != state.mode);
+                self.guided || is_changed || state.armed && arming.request.is_none()
+            }
+            _ => self.guided,
+        };
         if taken && !guided {
             let (mode, landed) = (state.mode, state.landed);
             return Err(TakeoffError::PilotInCommand { mode, landed });
@@ -278,7 +288,7 @@ impl Takeoff {
             Some(state) if self.found_armed && !state.armed => return Err(TakeoffError::Disarmed),
             Some(state) if state.ready && !state.armed && state.landed == LandedState::OnGround => {
                 if autopilot.firmware() == Some(Firmware::Px4) {
-                    self.begin_arming(now_ns);
+                    self.begin_arming(now_ns, autopilot);
                 } else {
                     let request = autopilot.request(now_ns, Command::SetMode(FlightMode::Guided));
                     self.begin(now_ns, Part::Mode(request), self.limits.ready);
@@ -325,14 +335,15 @@ impl Takeoff {
             if self.risen {
                 self.part = Part::Done;
             } else {
-                self.begin_arming(now_ns);
+                self.begin_arming(now_ns, autopilot);
             }
         }
         Ok(())
     }
 
-    fn begin_arming(&mut self, now_ns: i64) {
-        let arming = Arming { request: None, retry_ns: now_ns, refused: None };
+    fn begin_arming(&mut self, now_ns: i64, autopilot: &Autopilot) {
+        let mode = autopilot.state().map(|state| state.mode);
+        let arming = Arming { mode, request: None, retry_ns: now_ns, refused: None };
         self.begin(now_ns, Part::Arm(arming), self.limits.arm);
     }
 
@@ -362,7 +373,8 @@ impl Takeoff {
                 if self.until_ns.is_some_and(|until_ns| now_ns < until_ns) =>
             {
                 let retry_ns = now_ns.saturating_add(ns(ARM_RETRY));
-                self.part = Part::Arm(Arming { request: None, retry_ns, refused: Some(error) });
+                let refused = Some(error);
+                self.part = Part::Arm(Arming { request: None, retry_ns, refused, ..arming });
             }
             Err(error) => return Err(error.into()),
         }

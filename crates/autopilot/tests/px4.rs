@@ -757,6 +757,35 @@ fn the_pilots_mode_change_ends_the_takeoff() {
 }
 
 #[test]
+fn a_pilot_who_arms_or_changes_the_mode_while_arming_is_refused_ends_the_takeoff() {
+    let (position, manual) = (FlightMode::Px4(3 << 16), FlightMode::Px4(1 << 16));
+    for is_armed in [true, false] {
+        let mut world = World::with(|px4| px4.mode = position);
+        world.px4.refuses = true;
+        let mut takeoff = Takeoff::new(10.0);
+        let mut step = |world: &mut World| {
+            world.step();
+            takeoff.step(world.now, &mut world.client)
+        };
+        let is_refused =
+            |progress| matches!(progress, TakeoffProgress::Arming { refused: Some(_) });
+        while !is_refused(step(&mut world)) {
+            assert!(world.now < 120 * SECOND, "it is not refused");
+        }
+        world.px4.refuses = false;
+        match is_armed {
+            true => world.px4.armed = true,
+            false => world.px4.mode = manual,
+        }
+        let steps = (0..10 * SECOND / STEP).map(|_| step(&mut world)).last();
+        let Some(TakeoffProgress::Failed(problem)) = steps else { panic!("{steps:?}") };
+        let name = if is_armed { "PX4 POSITION" } else { "PX4 MANUAL" };
+        assert!(problem.to_string().contains(name), "{problem}");
+        assert_eq!(world.px4.climbs_to_m, None);
+    }
+}
+
+#[test]
 fn a_mode_requested_again_before_the_heartbeat_is_sent_once() {
     let mut world = World::flying(5.0);
     let land = Command::SetMode(FlightMode::AUTO_LAND);
