@@ -81,6 +81,8 @@ pub struct Limits {
     note: Option<Note>,
     /// The autopilot did not take the timeout in this landing.
     is_refused: bool,
+    /// The timeout is being put back.
+    is_restoring: bool,
     active_ns: Option<i64>,
     known: Option<AutopilotLimits>,
     is_told_of_silence: bool,
@@ -95,6 +97,7 @@ impl Limits {
             left: None,
             note: None,
             is_refused: false,
+            is_restoring: false,
             active_ns: None,
             known: None,
             is_told_of_silence: false,
@@ -173,29 +176,43 @@ impl Limits {
         self.note.as_ref().or(self.left.as_ref())
     }
 
-    /// Puts the timeout back, if it was changed; true while the autopilot has not confirmed it.
+    /// Puts the timeout back, if it may have been changed; true while the autopilot has not confirmed it. One that has not reported
+    /// the shorter timeout may have taken it all the same.
     pub fn restore(&mut self, autopilot: &mut Autopilot) -> bool {
         let Some(note) = &self.note else { return false };
-        let Some(timeout_s) = timeout_s(autopilot) else { return false };
-        let is_ours = (timeout_s - note.set_s).abs() < SAME_S;
-        if is_ours && name(autopilot) == Some(note.parameter.as_str()) {
-            autopilot.set_parameter(&note.parameter, note.original_s);
-            return true;
+        let (Some(timeout_s), Some(name)) = (timeout_s(autopilot), name(autopilot)) else {
+            return false;
+        };
+        let is_at = |seconds: f64| (timeout_s - seconds).abs() < SAME_S;
+        let is_others = name != note.parameter || !is_at(note.set_s) && !is_at(note.original_s);
+        if !is_others {
+            if !std::mem::replace(&mut self.is_restoring, true) {
+                autopilot.set_parameter(name, note.original_s);
+                return true;
+            }
+            if autopilot.is_setting(name) {
+                return true;
+            }
+            if autopilot.is_unanswered(name) || !is_at(note.original_s) {
+                self.is_restoring = false;
+                return true;
+            }
         }
-        if (timeout_s - note.original_s).abs() < SAME_S {
-            tracing::info!(
-                parameter = note.parameter,
-                seconds = timeout_s,
-                "Setpoint timeout is put back"
-            );
-        } else {
+        if is_others {
             tracing::warn!(
                 parameter = note.parameter,
                 seconds = timeout_s,
                 "Setpoint timeout was changed by somebody else; it stays so"
             );
+        } else {
+            tracing::info!(
+                parameter = note.parameter,
+                seconds = timeout_s,
+                "Setpoint timeout is put back"
+            );
         }
         self.note = None;
+        self.is_restoring = false;
         false
     }
 
@@ -213,17 +230,23 @@ impl Limits {
     }
 
     fn shorten(&mut self, name: &'static str, timeout_s: f64, autopilot: &mut Autopilot) {
-        if self.wanted_s <= 0.0 || timeout_s <= self.wanted_s + SAME_S || self.is_refused {
+        let is_short = timeout_s <= self.wanted_s + SAME_S && !self.is_restoring;
+        if self.wanted_s <= 0.0 || is_short || self.is_refused {
             return;
         }
         let Some(system) = autopilot.system() else { return };
-        let is_begun = self.note.as_ref().is_some_and(|note| note.set_s == self.wanted_s);
+        let is_restoring = std::mem::take(&mut self.is_restoring);
+        let ours = self.note.as_ref().filter(|note| note.parameter == name);
+        let is_begun = ours.is_some_and(|note| note.set_s == self.wanted_s) && !is_restoring;
         if !is_begun {
+            // What an earlier landing set is not the vehicle's own.
+            let is_ours = |note: &&Note| is_restoring || (timeout_s - note.set_s).abs() < SAME_S;
+            let original_s = ours.filter(is_ours).map_or(timeout_s, |note| note.original_s);
             self.note = Some(Note {
                 address: self.address.clone(),
                 system,
                 parameter: name.to_owned(),
-                original_s: timeout_s,
+                original_s,
                 set_s: self.wanted_s,
             });
             tracing::info!(

@@ -11,6 +11,7 @@ use autopilot::dialect::{MavLandedState, MavMessage, MavParamType, PARAM_VALUE_D
 use controller::Config;
 use controller::flight::Flight;
 use controller::limits::Note;
+use messages::ControllerCommand;
 use node::Layers;
 use packets::{MS, attitude, contact, heartbeat, position};
 
@@ -24,6 +25,8 @@ struct Conversation {
     timeout_s: f32,
     /// It refuses to change the parameter.
     refuses: bool,
+    /// Its reports of the parameter are lost.
+    is_mute: bool,
     /// The values to which the parameter was set.
     set_s: Vec<f32>,
     /// The downward velocities of all setpoints, in m/s.
@@ -33,12 +36,18 @@ struct Conversation {
 
 impl Conversation {
     fn new(start: &str, timeout_s: f32) -> Self {
-        let layers = Layers { file: None, set: vec![format!("start={start}")] };
+        Self::with(&[&format!("start={start}")], timeout_s)
+    }
+
+    fn with(set: &[&str], timeout_s: f32) -> Self {
+        let set = set.iter().map(|&it| it.to_owned()).collect();
+        let layers = Layers { file: None, set };
         let config = layers.load::<Config>().unwrap().settings;
         Self {
             flight: Flight::new(config, Arc::default()).unwrap(),
             timeout_s,
             refuses: false,
+            is_mute: false,
             set_s: Vec::new(),
             down_m_s: Vec::new(),
             now_ns: 0,
@@ -88,7 +97,7 @@ impl Conversation {
                 }
             }
         }
-        if reports {
+        if reports && !self.is_mute {
             self.receive(&MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
                 param_value: self.timeout_s,
                 param_id: "GUID_TIMEOUT".into(),
@@ -178,6 +187,76 @@ fn an_orderly_end_puts_it_back_at_once_and_sends_no_descent() {
     }
     assert_eq!((it.timeout_s, it.flight.note()), (3.0, None));
     assert_eq!(it.down_m_s, [0.0]);
+}
+
+#[test]
+fn a_change_whose_report_was_lost_is_put_back_all_the_same() {
+    // An orderly end, within a round trip of the change.
+    let mut it = Conversation::new("airborne", 3.0);
+    it.fly(1, LOITER);
+    it.is_mute = true;
+    it.fly(1, GUIDED);
+    assert_eq!((it.timeout_s, it.shown_s()), (0.5, Some(3.0)));
+    for step in 0..400 {
+        it.is_mute = step < 200;
+        let is_pending = it.flight.shutdown(it.now_ns);
+        assert_eq!(is_pending, it.flight.note().is_some(), "the note stays until it is confirmed");
+        if !is_pending {
+            break;
+        }
+        it.now_ns += 25 * MS;
+        it.answer();
+        it.receive(&heartbeat(GUIDED, true));
+        it.receive(&attitude(it.now_ns));
+    }
+    assert_eq!((it.timeout_s, it.flight.note()), (3.0, None));
+    // A takeover while all reports are lost.
+    let mut it = Conversation::new("airborne", 3.0);
+    it.fly(1, LOITER);
+    it.is_mute = true;
+    it.fly(2, GUIDED);
+    it.fly(8, LOITER);
+    assert!(it.flight.note().is_some(), "nothing was confirmed");
+    it.is_mute = false;
+    it.fly(4, LOITER);
+    assert_eq!((it.timeout_s, it.flight.note()), (3.0, None));
+}
+
+#[test]
+fn a_landing_that_begins_while_the_timeout_is_put_back_has_it_shortened_again() {
+    let mut it = Conversation::new("command", 3.0);
+    let start = |it: &mut Conversation| {
+        it.fly(1, GUIDED);
+        let reply = it.flight.command(it.now_ns, &ControllerCommand::Start);
+        assert!(reply.accepted, "{reply:?}");
+        it.fly(2, GUIDED);
+    };
+    start(&mut it);
+    assert_eq!(it.timeout_s, 0.5);
+    // The timeout is put back two seconds after the takeover, and all that reports it is lost.
+    it.is_mute = true;
+    it.fly(3, LOITER);
+    assert_eq!((it.timeout_s, it.shown_s()), (3.0, Some(0.5)));
+    start(&mut it);
+    it.is_mute = false;
+    it.fly(2, GUIDED);
+    assert_eq!((it.timeout_s, it.shown_s()), (0.5, Some(0.5)));
+    assert_eq!(it.flight.note().map(|note| note.original_s), Some(3.0));
+    it.fly(4, LOITER);
+    assert_eq!((it.timeout_s, it.flight.note()), (3.0, None));
+}
+
+#[test]
+fn what_an_earlier_controller_set_is_not_taken_for_the_vehicles_own() {
+    let mut killed = Conversation::new("airborne", 3.0);
+    killed.fly(3, GUIDED);
+    let note = killed.flight.note().cloned().unwrap();
+    let mut next = Conversation::with(&["start=resume", "autopilot.setpoint_timeout_s=0.3"], 0.5);
+    next.flight.take_over(note);
+    next.fly(3, GUIDED);
+    assert_eq!(next.timeout_s, 0.3);
+    next.fly(4, LOITER);
+    assert_eq!((next.timeout_s, next.flight.note()), (3.0, None));
 }
 
 #[test]

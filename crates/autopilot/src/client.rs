@@ -260,6 +260,11 @@ impl Autopilot {
         self.parameters.is_setting(name)
     }
 
+    /// True when a parameter was set as often as it may be, and its value has not been reported since: it is not known.
+    pub fn is_unanswered(&self, name: &str) -> bool {
+        self.parameters.is_unanswered(name)
+    }
+
     /// Sends a velocity of zero to a vehicle of which only the system id is known, before its heartbeat says
     /// more: outside of GUIDED or OFFBOARD an autopilot ignores it.
     pub fn send_stop(&mut self, now_ns: i64, system: u8) {

@@ -42,11 +42,13 @@ struct Wanted {
     value: Option<f64>,
     /// The value to set, until the autopilot reports it or the attempts are used up.
     set: Option<f64>,
+    /// The attempts of the last value to set were used up, and it has not been reported since.
+    is_unanswered: bool,
 }
 
 impl Wanted {
     fn new(name: &'static str) -> Self {
-        Self { name, attempts: 0, value: None, set: None }
+        Self { name, attempts: 0, value: None, set: None, is_unanswered: false }
     }
 
     fn is_pending(&self) -> bool {
@@ -108,6 +110,7 @@ impl Parameters {
             && wanted.set.is_none_or(|set| !is_same(set, value))
         {
             wanted.set = Some(value);
+            wanted.is_unanswered = false;
             wanted.attempts = 0;
             self.due_ns = i64::MIN;
         }
@@ -122,6 +125,11 @@ impl Parameters {
             .is_some_and(|wanted| wanted.set.is_some() && wanted.is_pending())
     }
 
+    /// True when a value was set as often as it may be, and none has been reported since.
+    pub(crate) fn is_unanswered(&self, name: &str) -> bool {
+        self.list.iter().any(|wanted| wanted.name == name && wanted.is_unanswered)
+    }
+
     /// The next request, if one is due.
     pub(crate) fn request(&mut self, now_ns: i64, system: u8, component: u8) -> Option<MavMessage> {
         if now_ns < self.due_ns {
@@ -134,7 +142,7 @@ impl Parameters {
         wanted.attempts += 1;
         self.due_ns = now_ns.saturating_add(REPLY_TIMEOUT_NS);
         if wanted.attempts > ATTEMPTS {
-            wanted.set = None;
+            wanted.is_unanswered = wanted.set.take().is_some();
             return None;
         }
         Some(wanted.request(system, component))
@@ -152,7 +160,10 @@ impl Parameters {
         };
         if value.is_finite() {
             wanted.value = Some(value);
-            wanted.set = wanted.set.filter(|set| !is_same(*set, value));
+            wanted.is_unanswered = false;
+            // Before the first request it answers another one.
+            let is_answer = wanted.attempts > 0;
+            wanted.set = wanted.set.filter(|set| !(is_answer && is_same(*set, value)));
             self.due_ns = i64::MIN;
         }
     }
@@ -234,5 +245,26 @@ mod tests {
         assert_eq!(sent, ATTEMPTS as usize);
         assert!(!parameters.is_setting("GUID_TIMEOUT"));
         assert_eq!(parameters.get("GUID_TIMEOUT"), Parameter::Value(0.5));
+    }
+
+    #[test]
+    fn a_value_that_is_known_already_is_sent_all_the_same_and_silence_is_no_confirmation() {
+        let mut parameters = Parameters::new(&["GUID_TIMEOUT"]);
+        let real = |x| value("GUID_TIMEOUT", x, MavParamType::MAV_PARAM_TYPE_REAL32);
+        parameters.take(Firmware::Copter, &real(3.0));
+        parameters.set("GUID_TIMEOUT", 3.0);
+        parameters.take(Firmware::Copter, &real(3.0));
+        assert!(parameters.is_setting("GUID_TIMEOUT"), "nothing was sent yet");
+        for now_ns in (0..20_000_000_000).step_by(100_000_000) {
+            assert!(!parameters.is_unanswered("GUID_TIMEOUT") || now_ns >= 3_000_000_000);
+            parameters.request(now_ns, 1, 1);
+        }
+        assert!(parameters.is_unanswered("GUID_TIMEOUT") && !parameters.is_setting("GUID_TIMEOUT"));
+        parameters.set("GUID_TIMEOUT", 3.0);
+        assert!(parameters.request(30_000_000_000, 1, 1).is_some());
+        parameters.take(Firmware::Copter, &real(3.0));
+        assert!(
+            !parameters.is_unanswered("GUID_TIMEOUT") && !parameters.is_setting("GUID_TIMEOUT")
+        );
     }
 }
