@@ -29,9 +29,10 @@ impl Alarms {
         }
     }
 
-    /// A landing begins: every alarm may be raised again.
+    /// A landing begins: every alarm may be raised again, and a battery is low once it was so for long in this landing.
     pub fn begin(&mut self) {
         self.raised.clear();
+        (self.low_since_ns, self.critical_since_ns) = (None, None);
     }
 
     /// A command or a heartbeat of the ground station was received.
@@ -149,10 +150,14 @@ mod tests {
                 .extend(alarms.tick(second * SECOND, Some(&battery)).map(|alarm| (second, alarm)));
         }
         assert_eq!(raised, [(23, Alarm::BatteryLow), (33, Alarm::BatteryCritical)]);
-        alarms.begin();
         // At the limit, and no more than once.
-        let again = alarms.tick(60 * SECOND, Some(&battery(0.2, 12.0)));
-        assert_eq!(again, Some(Alarm::BatteryLow), "of the next landing");
+        alarms.begin();
+        let mut again = Vec::new();
+        for second in 600..610 {
+            let alarm = alarms.tick(second * SECOND, Some(&battery(0.2, 12.0)));
+            again.extend(alarm.map(|alarm| (second, alarm)));
+        }
+        assert_eq!(again, [(603, Alarm::BatteryLow)], "a dip begins anew with the next landing");
     }
 
     #[test]

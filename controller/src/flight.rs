@@ -479,16 +479,14 @@ impl Flight {
                 "no landing was started: the vehicle is in {mode}; change to HOLD, from which it is asked to follow setpoints"
             ));
         }
-        let awaits_takeoff = self.mission.is_awaiting_takeoff();
+        let before = self.mission.clone();
         self.begin(now_ns);
-        let why = self.why();
-        match self.lander.phase() {
-            Phase::Idle | Phase::Landed | Phase::PilotInCommand | Phase::Aborted => {
-                self.mission.stand_down(awaits_takeoff);
-                Err(format!("no landing was started: {why}"))
-            }
-            phase => Ok(format!("in phase `{phase}`: {why}")),
+        let (why, phase) = (self.why(), self.lander.phase());
+        if phase.is_terminal() {
+            self.mission = before;
+            return Err(format!("no landing was started: {why}"));
         }
+        Ok(format!("in phase `{phase}`: {why}"))
     }
 
     fn start_landing_target(&mut self, now_ns: i64) -> Result<String, String> {
@@ -576,7 +574,9 @@ impl Flight {
                 "the autopilot's landing is not interrupted: the vehicle is below {no_return_m} m, or an abort would land as well"
             ));
         }
-        if before == after {
+        // Held already for another reason, it is held by the operator.
+        let is_held = command == OperatorCommand::Hold && after == Phase::Hold;
+        if before == after && !is_held {
             return Err(format!("no effect in phase `{after}`: {why}"));
         }
         Ok(format!("in phase `{after}`: {why}"))
@@ -686,13 +686,18 @@ impl Flight {
                     let is_finished = self.view().is_finished();
                     self.mission.armed_changed(now_ns, armed, is_finished);
                 }
-                Event::Restarted if self.mission.started_ns().is_some() => {
+                Event::Restarted if self.mission.started_ns().is_some() && !self.is_over() => {
                     let why = "the autopilot restarted in flight".to_owned();
                     self.mission.fail(&mut self.autopilot, why);
                 }
                 _ => {}
             }
         }
+    }
+
+    /// True after a landing, once the motors are off.
+    fn is_over(&self) -> bool {
+        self.view().is_finished() && self.autopilot.state().is_some_and(|state| !state.armed)
     }
 
     /// The pilot has taken over: what was requested before is not repeated against the pilot. A take-off passes
@@ -712,11 +717,13 @@ impl Flight {
     }
 
     fn step(&mut self, now_ns: i64, event: LanderEvent) {
-        let before = self.lander.phase();
+        let (before, was_recalling) = (self.lander.phase(), self.lander.is_recalling());
         let decision = self.lander.step(Timestamp::from_nanos(now_ns), event);
         if decision.phase != before {
             self.journal.phase_changed(before, &decision);
-            // A LAND that was lost on the way must not be repeated after the pilot took over.
+        }
+        // A LAND that was lost on the way must not be repeated after the pilot took over, nor GUIDED on the ground.
+        if decision.phase != before || was_recalling && !self.lander.is_recalling() {
             self.autopilot.withdraw();
         }
         self.decision = Some(decision);

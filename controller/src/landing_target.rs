@@ -20,6 +20,12 @@ const MAVLINK: f64 = 1.0;
 /// Maximum gap between two landing targets, in nanoseconds; after a longer one ArduPilot starts a new
 /// estimate.
 const MAX_GAP_NS: i64 = 500_000_000;
+/// Time after an abort in which LAND, asked for before it, may still show, in nanoseconds: heartbeats come each second, and one
+/// may be lost.
+const MAX_LATE_LAND_NS: i64 = 2_500_000_000;
+
+/// Why an aborted landing ended that the autopilot had not begun.
+const ABORTED: &str = "aborted by the operator; hovering";
 
 /// A precision landing by the autopilot.
 #[derive(Debug)]
@@ -50,6 +56,8 @@ enum State {
     Commanding(CommandId),
     /// The autopilot lands.
     Landing,
+    /// Aborted while LAND was asked for; if it shows until this time, the autopilot is taken back from it.
+    AbortedEarly(i64),
     /// The autopilot is taken back from landing, for this reason.
     Recalling(CommandId, String),
     /// On the ground, disarmed.
@@ -116,6 +124,9 @@ impl LandingTargetMode {
                 }
                 _ => self.state = State::Ended(why),
             },
+            State::AbortedEarly(until_ns) if lands && now_ns <= until_ns => {
+                self.recall(now_ns, autopilot);
+            }
             // By the pilot or a mission, or as requested.
             _ if lands => {
                 autopilot.withdraw();
@@ -138,9 +149,21 @@ impl LandingTargetMode {
                     self.state = State::Ended(problem.to_string());
                 }
             }
-            State::Idle | State::Landed | State::Ended(_) => {}
+            State::Idle | State::AbortedEarly(_) | State::Landed | State::Ended(_) => {}
         }
         false
+    }
+
+    /// Takes the autopilot back from landing to the mode in which it hovers; returns why.
+    fn recall(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> String {
+        let hover = match autopilot.firmware() {
+            Some(Firmware::Px4) => FlightMode::AUTO_HOLD,
+            _ => FlightMode::Guided,
+        };
+        let request = autopilot.request(now_ns, Command::SetMode(hover));
+        let why = format!("aborted by the operator; hovering in {hover}");
+        self.state = State::Recalling(request, why.clone());
+        why
     }
 
     fn command_when_steady(&mut self, now_ns: i64, since_ns: i64, autopilot: &mut Autopilot) {
@@ -170,27 +193,27 @@ impl LandingTargetMode {
         no_return_m: f64,
         autopilot: &mut Autopilot,
     ) -> Result<String, String> {
+        let is_low = height_m.is_some_and(|height_m| height_m <= no_return_m);
         match self.state {
             State::Stabilising(_) | State::Commanding(_) => {
                 autopilot.withdraw();
-                let why = "aborted by the operator; hovering".to_owned();
-                self.state = State::Ended(why.clone());
-                Ok(why)
+                self.state = match self.state {
+                    State::Commanding(_) if !is_low => {
+                        State::AbortedEarly(now_ns.saturating_add(MAX_LATE_LAND_NS))
+                    }
+                    _ => State::Ended(ABORTED.to_owned()),
+                };
+                Ok(ABORTED.to_owned())
             }
-            State::Landing if height_m.is_some_and(|height_m| height_m <= no_return_m) => {
+            State::Landing if is_low => {
                 Err(format!("below {no_return_m} m the autopilot's landing is not interrupted"))
             }
-            State::Landing => {
-                let hover = match autopilot.firmware() {
-                    Some(Firmware::Px4) => FlightMode::AUTO_HOLD,
-                    _ => FlightMode::Guided,
-                };
-                let request = autopilot.request(now_ns, Command::SetMode(hover));
-                let why = format!("aborted by the operator; hovering in {hover}");
-                self.state = State::Recalling(request, why.clone());
-                Ok(why)
-            }
-            State::Idle | State::Recalling(..) | State::Landed | State::Ended(_) => {
+            State::Landing => Ok(self.recall(now_ns, autopilot)),
+            State::Idle
+            | State::AbortedEarly(_)
+            | State::Recalling(..)
+            | State::Landed
+            | State::Ended(_) => {
                 Err(format!("no landing is active (phase `{}`)", self.phase(now_ns, None).0))
             }
         }
@@ -218,6 +241,7 @@ impl LandingTargetMode {
             State::Commanding(_) => (Phase::Final, "requesting LAND".to_owned()),
             State::Landing => (Phase::Final, format!("the autopilot lands; {target}")),
             State::Landed => (Phase::Landed, landing::Reason::TouchedDown.to_string()),
+            State::AbortedEarly(_) => (Phase::Aborted, ABORTED.to_owned()),
             State::Recalling(_, why) | State::Ended(why) => (Phase::Aborted, why.clone()),
         }
     }
@@ -229,7 +253,7 @@ impl LandingTargetMode {
 
     /// True once a landing has ended.
     pub fn is_finished(&self) -> bool {
-        matches!(self.state, State::Landed | State::Ended(_))
+        matches!(self.state, State::AbortedEarly(_) | State::Landed | State::Ended(_))
     }
 
     /// True in the modes in which the vehicle hovers until LAND is requested.

@@ -5,7 +5,7 @@ use autopilot::{
 };
 
 use crate::config::Start;
-use crate::control::{ControlProgress, TakingControl, hover_in_offboard};
+use crate::control::{ControlProgress, TakingControl, hover_in_offboard, is_holding_px4};
 
 /// Time within which motors that run again mean that a landing had not ended, in nanoseconds: nobody prepares the next
 /// flight so soon, and the autopilot's heartbeat may have been wrong.
@@ -289,6 +289,11 @@ impl Mission {
                     if let Some(obstacle) = obstacle {
                         obstacle.clone_into(why);
                         hover_in_offboard(now_ns, autopilot);
+                        if let Some(end) = end_of_waiting(autopilot) {
+                            let why = format!("{end} while the landing waited: {obstacle}");
+                            tracing::error!("No landing after the take-off: {why}");
+                            self.fail(autopilot, why);
+                        }
                         return None;
                     }
                     Some(match end {
@@ -363,6 +368,18 @@ impl Mission {
 /// True when the vehicle flies in the mode that follows setpoints.
 pub fn is_flying_guided(autopilot: &Autopilot) -> bool {
     autopilot.state().is_some_and(|s| s.armed && s.mode.is_guided() && s.landed.is_flying())
+}
+
+/// What ends the wait of a vehicle that took off for its landing: motors that are off, or a pilot. A PX4 that holds its place does
+/// not end it, as it does so by itself where setpoints are late.
+fn end_of_waiting(autopilot: &Autopilot) -> Option<String> {
+    let state = autopilot.state().filter(|state| state.connected)?;
+    let is_ours = state.mode.is_guided() || state.mode.is_landing() || is_holding_px4(autopilot);
+    match (state.armed, is_ours) {
+        (false, _) => Some("the motors were stopped".to_owned()),
+        (true, false) => Some(format!("the pilot took over, in {},", state.mode)),
+        (true, true) => None,
+    }
 }
 
 /// True when there is no landing to resume: it has ended, though the motors may still run, or the pilot flies. A vehicle

@@ -338,6 +338,54 @@ fn the_pilots_landing_gets_the_target_and_is_recalled_from_high_up() {
 }
 
 #[test]
+fn an_abort_while_land_is_asked_for_takes_the_autopilot_back_from_it() {
+    for (shown_after_ms, asked, phase) in
+        [(400, vec![4.0], Phase::Aborted), (3000, vec![], Phase::Final)]
+    {
+        let mut flight = landing_target("airborne");
+        parameter(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
+        parameter(&mut flight, 2 * MS, "PLND_TYPE", 1.0);
+        let asked_for_land = hover(&mut flight, 1000, 6000, 4).modes;
+        assert_eq!(asked_for_land.first(), Some(&9.0));
+        let reply = flight.command(6000 * MS, &ControllerCommand::Abort);
+        assert!(reply.accepted, "{reply:?}");
+        assert_eq!(flight.status(6000 * MS).phase, Phase::Aborted);
+        let early = hover(&mut flight, 6020, 6000 + shown_after_ms, 4);
+        assert!(early.modes.is_empty(), "{:?}", early.modes);
+        receive(&mut flight, (6000 + shown_after_ms) * MS, &heartbeat(9, true));
+        let after = hover(&mut flight, 6020 + shown_after_ms, 6500 + shown_after_ms, 9);
+        assert_eq!(after.modes, asked, "LAND shows after {shown_after_ms} ms");
+        assert_eq!(flight.status((6500 + shown_after_ms) * MS).phase, phase);
+    }
+}
+
+#[test]
+fn a_vehicle_that_is_called_back_from_land_is_left_to_it_low_over_the_ground() {
+    let mut flight = in_flight("airborne");
+    let land = |flight: &mut Flight, from_ms: i64, to_ms: i64, height_m: f32| {
+        let mut sent = Sent::default();
+        for ms in (from_ms..to_ms).step_by(20) {
+            if ms % 1000 == 0 {
+                receive(flight, ms * MS, &heartbeat(9, true));
+            }
+            pose_at(flight, ms * MS, height_m);
+            flight.tick(ms * MS + 3);
+            sent.take(flight);
+        }
+        sent.modes
+    };
+    hover(&mut flight, 20, 1000, 4);
+    assert!(flight.command(1000 * MS, &ControllerCommand::LandHere).accepted);
+    land(&mut flight, 1000, 2000, 1.6);
+    assert!(flight.command(2000 * MS, &ControllerCommand::Abort).accepted);
+    assert!(land(&mut flight, 2000, 3000, 1.6).contains(&4.0), "GUIDED is asked for");
+    // It does not come: all of it is lost on the way.
+    land(&mut flight, 3000, 3020, 0.9);
+    assert_eq!(land(&mut flight, 3020, 9000, 0.9), Vec::<f32>::new());
+    assert_eq!(flight.status(9000 * MS).phase, Phase::Aborted);
+}
+
+#[test]
 fn a_start_is_refused_while_all_detections_are_and_the_reason_is_told() {
     let mut flight = in_flight("command");
     flight.camera(0, CameraInfo::sample());
@@ -711,6 +759,103 @@ fn a_pilot_who_arms_again_at_once_after_a_landing_has_the_next_flight_landed() {
     assert_eq!(phase_at(&mut flight, 1020, 2000), Phase::Landed, "it stands, armed");
     receive(&mut flight, 2000 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
     assert_eq!(phase_at(&mut flight, 2020, 2500), Phase::Search);
+}
+
+#[test]
+fn a_pilot_ends_the_wait_of_a_vehicle_that_took_off_for_its_landing() {
+    for (mode, armed, told) in [(5, true, "the pilot took over, in LOITER"), (4, false, "stopped")]
+    {
+        let mut flight = in_flight("takeoff");
+        flight.camera(0, CameraInfo::sample());
+        let foreign = |stamp_ns| Detections {
+            header: FrameHeader { clock: "monotonic/myhost".into(), ..header(stamp_ns) },
+            ..Detections::sample()
+        };
+        for ms in (20..2600).step_by(20) {
+            flight.detections(ms * MS, "main", &foreign(ms * MS));
+            if ms > 1600 {
+                pose(&mut flight, ms * MS);
+            }
+            if ms % 1000 == 0 {
+                receive(&mut flight, ms * MS, &heartbeat(4, true));
+            }
+            flight.tick(ms * MS + 3);
+        }
+        let status = flight.status(2600 * MS);
+        assert!(status.phase == Phase::Takeoff && status.why.contains("myhost"), "{status:?}");
+        receive(&mut flight, 2600 * MS, &heartbeat(mode, armed));
+        hover(&mut flight, 2620, 2700, mode);
+        let status = flight.status(2700 * MS);
+        assert!(status.phase == Phase::Failed && status.why.contains(told), "{status:?}");
+        // Back in GUIDED, with nothing in the way any more, only a command begins.
+        receive(&mut flight, 5000 * MS, &heartbeat(4, true));
+        hover(&mut flight, 5020, 8000, 4);
+        assert_eq!(flight.status(8000 * MS).phase, Phase::Failed);
+        let reply = flight.command(8000 * MS, &ControllerCommand::Start);
+        assert!(reply.accepted, "{reply:?}");
+    }
+}
+
+#[test]
+fn a_start_that_is_refused_takes_nothing_back() {
+    // After a landing the next flight is landed by itself.
+    let mut flight = in_flight("airborne");
+    hover(&mut flight, 20, 1000, 4);
+    let (off, down) = (heartbeat(4, false), contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+    receive(&mut flight, 1000 * MS, &off);
+    receive(&mut flight, 1001 * MS, &down);
+    pose(&mut flight, 1020 * MS);
+    flight.tick(1021 * MS);
+    assert_eq!(flight.status(1021 * MS).phase, Phase::Landed);
+    let reply = flight.command(1100 * MS, &ControllerCommand::Start);
+    assert!(!reply.accepted, "{reply:?}");
+    assert_eq!(flight.status(1100 * MS).phase, Phase::Landed);
+    receive(&mut flight, 20_000 * MS, &heartbeat(4, true));
+    receive(&mut flight, 20_001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    hover(&mut flight, 20_020, 20_500, 4);
+    let phase = flight.status(20_500 * MS).phase;
+    assert!(matches!(phase, Phase::Search | Phase::Approach), "{phase}");
+}
+
+#[test]
+fn a_hold_is_taken_in_a_hold_of_another_reason() {
+    let mut flight = in_flight("airborne");
+    for ms in (20..62_000).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(&mut flight, ms * MS, &heartbeat(4, true));
+        }
+        pose(&mut flight, ms * MS);
+        flight.tick(ms * MS + 3);
+        sent(&mut flight);
+    }
+    let before = flight.status(62_000 * MS);
+    assert_eq!(before.phase, Phase::Hold);
+    for _ in 0..2 {
+        let reply = flight.command(62_000 * MS, &ControllerCommand::Hold);
+        assert!(reply.accepted && reply.reason.contains("operator"), "{reply:?}");
+    }
+}
+
+#[test]
+fn an_autopilot_that_is_restarted_after_a_landing_is_no_failure() {
+    let mut flight = in_flight("airborne");
+    let poses = |flight: &mut Flight, from_ms: i64, to_ms: i64, booted_ms: i64| {
+        for ms in (from_ms..to_ms).step_by(20) {
+            receive(flight, ms * MS, &attitude((ms - booted_ms) * MS));
+            receive(flight, ms * MS + 1, &position((ms - booted_ms) * MS, 5.0));
+            flight.tick(ms * MS + 3);
+        }
+        flight.status(to_ms * MS).phase
+    };
+    poses(&mut flight, 20, 500, 0);
+    receive(&mut flight, 500 * MS, &heartbeat(4, false));
+    receive(&mut flight, 501 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+    assert_eq!(poses(&mut flight, 520, 8000, 0), Phase::Landed);
+    receive(&mut flight, 13_000 * MS, &heartbeat(4, false));
+    assert_eq!(poses(&mut flight, 13_020, 14_000, 10_000), Phase::Landed);
+    receive(&mut flight, 30_000 * MS, &heartbeat(4, true));
+    receive(&mut flight, 30_001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    assert_eq!(poses(&mut flight, 30_020, 31_000, 10_000), Phase::Search);
 }
 
 #[test]

@@ -246,6 +246,11 @@ impl Lander {
         self.state_machine.phase()
     }
 
+    /// True while an aborted vehicle is being commanded from LAND back to GUIDED.
+    pub fn is_recalling(&self) -> bool {
+        self.state_machine.is_recalling()
+    }
+
     /// The alarm or the operator's command for which the vehicle lands, or has landed, away from the marker.
     pub fn cause(&self) -> Option<Reason> {
         self.state_machine.cause()

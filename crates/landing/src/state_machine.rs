@@ -30,7 +30,8 @@
 //!
 //! | event | next phase |
 //! |---|---|
-//! | the operator's abort, `landing_timeout_s` over | Aborted; in LAND only above `no_return_height_m`, back to GUIDED |
+//! | the operator's abort | Aborted; in LAND only above `no_return_height_m`, back to GUIDED |
+//! | `landing_timeout_s` over | Aborted; not in Final |
 //! | the operator's hold | Hold; ignored in LAND and while it is asked for |
 //! | the axes of camera and autopilot do not match | Hold |
 //! | the vehicle's state is stale, or its mode not known | Hold; Final waits |
@@ -50,7 +51,7 @@
 //! | Retry | `retry_timeout_s`, and `retries` times | Search |
 //! | Hold | `hold_timeout_s`, by the operator `operator_hold_timeout_s` | Aborted |
 //! | Final | `land_timeout_s` until LAND; until the ground `touchdown_timeout_s` and what the autopilot's landing speed takes from there | Aborted, Landed |
-//! | all together until LAND | `landing_timeout_s` | Aborted |
+//! | all together until Final, and Final while the mode is not known | `landing_timeout_s` | Aborted |
 
 use crate::config::{AlarmAction, OnAbort, PhaseConfig};
 use crate::decision::{Phase, Reason};
@@ -358,7 +359,8 @@ impl StateMachine {
             self.is_recalling = true;
         }
         let in_time = !self.timed_out(inputs, self.config.land_timeout_s);
-        self.is_recalling &= vehicle.mode == Mode::Land && in_time;
+        // One that would stop low over the ground, or on it with its motors running, is landed instead.
+        self.is_recalling &= vehicle.mode == Mode::Land && in_time && self.is_high(vehicle);
         let is_foreign = matches!(vehicle.mode, Mode::Land | Mode::Other);
         self.released |= is_foreign && !self.is_recalling;
     }
@@ -414,7 +416,11 @@ impl StateMachine {
         if inputs.operator == Some(OperatorCommand::Hold) && !asks_for_land {
             return Some((Phase::Hold, Reason::OperatorHold));
         }
-        if inputs.now.seconds_since(self.started) > self.config.landing_timeout_s {
+        // Final has timeouts of its own, but for the wait until the mode is known.
+        let is_bounded = self.phase == Phase::Final
+            && inputs.vehicle.is_some_and(|vehicle| vehicle.mode != Mode::Unknown);
+        let lasted_s = inputs.now.seconds_since(self.started);
+        if lasted_s > self.config.landing_timeout_s && !is_bounded {
             return Some((Phase::Aborted, Reason::LandingTooLong));
         }
         let is_moving =
@@ -436,13 +442,16 @@ impl StateMachine {
     }
 
     fn can_recall(&self, inputs: &Inputs) -> bool {
-        let is_high = inputs.vehicle.is_some_and(|vehicle| {
-            // Below the place where it took off nothing is known of the ground; what sinks flies, and what is not in LAND yet.
-            let flies = vehicle.landed != Landed::OnGround && (vehicle.sinks || !self.landing);
-            let is_in_valley = !vehicle.is_over_target && vehicle.height_m < 0.0 && flies;
-            vehicle.height_m > self.config.no_return_height_m || is_in_valley
-        });
+        let is_high = inputs.vehicle.is_some_and(|vehicle| self.is_high(vehicle));
         is_high && self.config.on_abort != OnAbort::Land
+    }
+
+    /// Whether the vehicle is so high that it can still be called back from LAND.
+    fn is_high(&self, vehicle: VehicleInputs) -> bool {
+        // Below the place where it took off nothing is known of the ground; what sinks flies, and what is not in LAND yet.
+        let flies = vehicle.landed != Landed::OnGround && (vehicle.sinks || !self.landing);
+        let is_in_valley = !vehicle.is_over_target && vehicle.height_m < 0.0 && flies;
+        vehicle.height_m > self.config.no_return_height_m || is_in_valley
     }
 
     /// The end of a landing whose motors are off.

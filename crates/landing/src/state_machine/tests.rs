@@ -169,6 +169,28 @@ fn every_wait_has_a_timeout() {
 }
 
 #[test]
+fn a_landing_that_lasts_long_is_not_broken_off_on_its_last_metre() {
+    let long_s = PhaseConfig::default().landing_timeout_s;
+    let hold = commanded(long_s - 60.0, OperatorCommand::Hold);
+    let land = commanded(long_s - 1.0, OperatorCommand::LandHere);
+    check(&[start(), hold, land, at(long_s + 1.0)], Phase::Final, Reason::OperatorLand);
+    check(&[start(), hold, land, at(long_s + 5.0)], Phase::Aborted, Reason::LandRefused);
+    let resume = commanded(long_s - 59.0, OperatorCommand::Resume);
+    let seen_low =
+        [long_s - 58.0, long_s - 57.0].map(|s| seen(s, Progress::Ready(Reason::LowAndAligned)));
+    let refused = [start(), hold, resume, seen_low[0], seen_low[1], at(long_s - 51.0)];
+    check(&refused, Phase::Final, Reason::LandingBySetpoints);
+    let late = [&refused[..], &[at(long_s + 1.0)]].concat();
+    check(&late, Phase::Final, Reason::LandingBySetpoints);
+    // Without a heartbeat LAND cannot be asked for, and Final waits.
+    let unknown = |seconds| flown(seconds, |v| v.mode = Mode::Unknown);
+    let waits = [start(), hold, land, unknown(long_s - 0.5)];
+    check(&waits, Phase::Final, Reason::OperatorLand);
+    let late = [&waits[..], &[unknown(long_s + 1.0)]].concat();
+    check(&late, Phase::Aborted, Reason::LandingTooLong);
+}
+
+#[test]
 fn an_abort_ends_land_only_while_the_vehicle_is_high() {
     let ready = seen(9.0, Progress::Ready(Reason::LowAndAligned));
     let land =
@@ -188,7 +210,9 @@ fn an_abort_ends_land_only_while_the_vehicle_is_high() {
     assert_eq!(after(&[]), (true, false));
     assert_eq!(after(&[land(9.4, 3.0)]), (true, false));
     assert_eq!(after(&[land(9.4, 3.0), at(9.6)]), (false, false), "it follows again");
-    assert_eq!(after(&[land(15.0, 1.0)]), (false, true), "it did not come back");
+    assert_eq!(after(&[land(15.0, 3.0)]), (false, true), "it did not come back");
+    assert_eq!(after(&[land(10.0, 0.9)]), (false, true), "it is as good as down");
+    assert_eq!(after(&[land(10.0, 0.9), land(10.2, 1.1)]), (false, true), "it stays released");
     assert_eq!(after(&[flown(9.4, |v| v.mode = Mode::Other)]), (false, true));
     let landing = PhaseConfig { on_abort: OnAbort::Land, ..PhaseConfig::default() };
     let mut machine = StateMachine::new(landing);
