@@ -10,7 +10,7 @@ use autopilot::dialect::{MavMessage, MavType};
 use autopilot::{Autopilot, Event, FlightMode, LandedState, Packet};
 use landing::{
     Action, AlarmAction, Decision, Event as LanderEvent, FrameObservation, Lander, OperatorCommand,
-    Phase, Timestamp,
+    Phase, Reason, Timestamp,
 };
 use messages::{
     CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorInfo,
@@ -684,7 +684,9 @@ impl Flight {
                 Event::ModeChanged { to, .. } => self.withdraw_from(to),
                 Event::ArmedChanged(armed) => {
                     let is_finished = self.view().is_finished();
-                    self.mission.armed_changed(now_ns, armed, is_finished);
+                    let why = self.decision.map(|decision| decision.why);
+                    let by_motors = matches!(why, Some(Reason::TouchedDown | Reason::Disarmed));
+                    self.mission.armed_changed(now_ns, armed, is_finished, by_motors);
                 }
                 Event::Restarted if self.mission.started_ns().is_some() && !self.is_over() => {
                     let why = "the autopilot restarted in flight".to_owned();

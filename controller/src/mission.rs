@@ -7,8 +7,8 @@ use autopilot::{
 use crate::config::Start;
 use crate::control::{ControlProgress, TakingControl, hover_in_offboard, is_holding_px4};
 
-/// Time within which motors that run again mean that a landing had not ended, in nanoseconds: nobody prepares the next
-/// flight so soon, and the autopilot's heartbeat may have been wrong.
+/// Time within which the motors of a vehicle that flies in our mode, and whose landing had ended with them, mean that it had not
+/// ended, in nanoseconds: the autopilot's heartbeat may have been wrong. One that stands has landed.
 const MAX_REARMED_NS: i64 = 10_000_000_000;
 
 /// The mission of a flight.
@@ -254,15 +254,17 @@ impl Mission {
     ) -> Option<Trigger> {
         let is_known = obstacle.is_none();
         if let Some(until_ns) = self.goes_on_until_ns {
-            let is_ours = autopilot
-                .state()
-                .is_some_and(|s| s.armed && (s.mode.is_guided() || s.mode.is_landing()));
-            if now_ns <= until_ns && is_known && steers && is_ours {
-                return Some(Trigger::ArmedAgain);
-            }
-            if now_ns > until_ns && is_known {
+            let armed = autopilot.state().filter(|state| state.armed);
+            let is_pilots = armed.is_some_and(|s| !s.mode.is_guided() && !s.mode.is_landing());
+            let stands = armed.is_some_and(|state| state.landed == LandedState::OnGround);
+            if is_pilots || now_ns > until_ns && is_known {
                 self.goes_on_until_ns = None;
                 self.await_next_flight();
+            } else if stands {
+                self.goes_on_until_ns = None;
+                self.stay_landed();
+            } else if armed.is_some() && is_known && steers {
+                return Some(Trigger::ArmedAgain);
             }
         }
         let lands = autopilot.state().is_some_and(|state| {
@@ -343,8 +345,8 @@ impl Mission {
         }
     }
 
-    /// The motors were armed or disarmed; `is_finished` says that the landing had ended.
-    pub fn armed_changed(&mut self, now_ns: i64, armed: bool, is_finished: bool) {
+    /// The motors were armed or disarmed; `is_finished` says that the landing had ended, and `by_motors` that their stop had ended it.
+    pub fn armed_changed(&mut self, now_ns: i64, armed: bool, is_finished: bool, by_motors: bool) {
         if !armed && self.started_ns.is_some() {
             self.disarmed_ns = self.disarmed_ns.or(Some(now_ns));
         }
@@ -357,7 +359,7 @@ impl Mission {
         let is_over = is_finished && !matches!(self.state, State::Failed { .. });
         if armed && is_over {
             let until_ns = self.disarmed_ns.map(|at_ns| at_ns.saturating_add(MAX_REARMED_NS));
-            self.goes_on_until_ns = until_ns.filter(|until_ns| now_ns <= *until_ns);
+            self.goes_on_until_ns = until_ns.filter(|until_ns| by_motors && now_ns <= *until_ns);
             if self.goes_on_until_ns.is_none() {
                 self.await_next_flight();
             }

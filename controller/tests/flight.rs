@@ -797,6 +797,52 @@ fn a_pilot_ends_the_wait_of_a_vehicle_that_took_off_for_its_landing() {
 }
 
 #[test]
+fn a_flight_that_follows_a_landing_within_seconds_is_not_landed_without_a_command() {
+    let (on_ground, in_air) =
+        (MavLandedState::MAV_LANDED_STATE_ON_GROUND, MavLandedState::MAV_LANDED_STATE_IN_AIR);
+    let fly = |flight: &mut Flight, from_ms: i64, to_ms: i64, mode: u32| {
+        for ms in (from_ms..to_ms).step_by(20) {
+            if ms % 1000 == 0 {
+                receive(flight, ms * MS, &heartbeat(mode, true));
+            }
+            pose(flight, ms * MS);
+            flight.tick(ms * MS + 3);
+        }
+    };
+    // The mode in which the motors are started again; GUIDED comes later.
+    for (start, mode, is_aborted) in
+        [("command", 5, false), ("command", 4, false), ("command", 4, true), ("takeoff", 5, false)]
+    {
+        let mut flight = in_flight(start);
+        fly(&mut flight, 20, 500, 4);
+        if start == "command" {
+            let reply = flight.command(500 * MS, &ControllerCommand::Start);
+            assert!(reply.accepted, "{reply:?}");
+        }
+        fly(&mut flight, 520, 1000, 4);
+        if is_aborted {
+            assert!(flight.command(1000 * MS, &ControllerCommand::Abort).accepted);
+        }
+        fly(&mut flight, 1020, 2000, 4);
+        let ended = if is_aborted { Phase::Aborted } else { Phase::Landed };
+        receive(&mut flight, 2000 * MS, &heartbeat(4, false));
+        receive(&mut flight, 2001 * MS, &contact(on_ground));
+        pose(&mut flight, 2020 * MS);
+        flight.tick(2021 * MS);
+        assert_eq!(flight.status(2021 * MS).phase, ended);
+        receive(&mut flight, 3000 * MS, &heartbeat(mode, true));
+        fly(&mut flight, 3020, 4000, mode);
+        receive(&mut flight, 4000 * MS, &contact(in_air));
+        fly(&mut flight, 4020, 6000, mode);
+        receive(&mut flight, 6000 * MS, &heartbeat(4, true));
+        fly(&mut flight, 6020, 9000, 4);
+        let status = flight.status(9000 * MS);
+        assert_eq!(status.phase, ended, "{start} in {mode}: {status:?}");
+        assert_eq!(status.disarmed_ns, Some(2000 * MS), "of the landing that was");
+    }
+}
+
+#[test]
 fn a_start_that_is_refused_takes_nothing_back() {
     // After a landing the next flight is landed by itself.
     let mut flight = in_flight("airborne");
