@@ -52,7 +52,7 @@ pub struct Used {
 impl View<'_> {
     /// The estimate of the landing point.
     pub fn target(&self, now_ns: i64) -> TargetEstimate {
-        let target = self.decision.and_then(|decision| decision.target);
+        let target = self.present_target(now_ns);
         TargetEstimate {
             stamp_ns: now_ns,
             position_ned_m: target.map(|t| t.position.coords.into()),
@@ -72,7 +72,7 @@ impl View<'_> {
 
     /// What is being done, and why.
     pub fn status(&self, now_ns: i64) -> ControllerStatus {
-        let target = self.decision.and_then(|decision| decision.target);
+        let target = self.present_target(now_ns);
         let position = self.autopilot.state().and_then(|state| state.position);
         let above_origin_m = position.map(|position| -position.position.z());
         let selection = &self.frames.selection;
@@ -238,6 +238,13 @@ impl View<'_> {
             (Some(system), false) => format!("system {system} is silent"),
             (None, _) => "no heartbeat yet".to_owned(),
         }
+    }
+
+    /// The estimate, unless no detection was used for so long that the next one begins another.
+    fn present_target(&self, now_ns: i64) -> Option<landing::TargetEstimate> {
+        let limit_ms = self.config.estimator.forget_after_s * 1e3;
+        let is_present = self.detection_age_ms(now_ns).is_some_and(|age_ms| age_ms <= limit_ms);
+        self.decision.and_then(|decision| decision.target).filter(|_| is_present)
     }
 
     fn detection_age_ms(&self, now_ns: i64) -> Option<f64> {

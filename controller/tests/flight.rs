@@ -864,6 +864,27 @@ fn a_start_that_is_refused_takes_nothing_back() {
 }
 
 #[test]
+fn a_pad_that_was_seen_long_ago_is_not_told_as_seen() {
+    let mut flight = in_flight("airborne");
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    hover(&mut flight, 20, 2000, 4);
+    let told = |flight: &Flight, now_ms: i64| {
+        let status = flight.status(now_ms * MS);
+        (status.lateral_error_m.is_some(), flight.target(now_ms * MS).position_ned_m.is_some())
+    };
+    assert_eq!(told(&flight, 2000), (true, true));
+    for ms in (2000..14_000).step_by(20) {
+        pose(&mut flight, ms * MS);
+        flight.tick(ms * MS + 3);
+        sent(&mut flight);
+    }
+    assert_eq!(told(&flight, 11_000), (true, true));
+    assert_eq!(told(&flight, 14_000), (false, false));
+    assert!(flight.status(14_000 * MS).height_m.is_some(), "over the place of the take-off");
+}
+
+#[test]
 fn a_hold_is_taken_in_a_hold_of_another_reason() {
     let mut flight = in_flight("airborne");
     for ms in (20..62_000).step_by(20) {
