@@ -462,7 +462,10 @@ impl Flight {
             return Err("the vehicle is just being taken back to HOLD".to_owned());
         }
         if self.autopilot.state().and_then(wire::vehicle).is_none() {
-            return Err("attitude and position of the vehicle are not known".to_owned());
+            return Err(
+                "no landing was started: attitude and position of the vehicle are not known"
+                    .to_owned(),
+            );
         }
         if let Some(obstacle) = self.frames.obstacle(now_ns) {
             return Err(format!("no landing was started: {obstacle}"));
@@ -554,7 +557,11 @@ impl Flight {
         }
         if !self.is_landing() {
             let (phase, _) = self.view().phase(now_ns);
-            return Err(format!("no landing is active (phase `{phase}`)"));
+            let start = match command {
+                OperatorCommand::Resume => "; `start` begins one",
+                _ => "",
+            };
+            return Err(format!("no landing is active (phase `{phase}`){start}"));
         }
         let no_return_m = self.config.phases.no_return_height_m;
         if let Some(landing_target) = &mut self.landing_target

@@ -11,7 +11,9 @@ use std::time::Duration;
 use airlink::AirSender;
 use anyhow::Context;
 use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
-use autopilot::{Address, Link, LinkEvent, Parser, Peering, Sender, SigningConfig};
+use autopilot::{
+    Address, Firmware, Link, LinkEvent, Packet, Parser, Peering, Sender, SigningConfig,
+};
 use messages::{
     CameraInfo, ControllerStatus, Detections, FrameHeader, MavlinkBytes, PixelFormat, Touchdown,
     Truth, Wind, topic,
@@ -43,8 +45,9 @@ const MAX_DELAYED: usize = 32;
 const TOO_LONG: &str = "frames that took too long to render";
 /// Time without the truth after which it is requested again.
 const REQUEST_PERIOD: Duration = Duration::from_secs(1);
-/// Ids of the messages with the truth of a simulated ArduPilot (SIM_STATE) and PX4 (HIL_STATE_QUATERNION).
-const TRUTH_MESSAGES: [f32; 2] = [108.0, 115.0];
+/// Ids of the messages with the truth of a simulated ArduPilot and PX4. Asked for one that it does not know, ArduPilot tells the pilot.
+const SIM_STATE: f32 = 108.0;
+const HIL_STATE_QUATERNION: f32 = 115.0;
 /// Number of such requests without an answer after which it is told.
 const MAX_UNANSWERED: u32 = 5;
 const NO_TRUTH: &str = "the autopilot sends no truth of its simulation (SIM_STATE, HIL_STATE_QUATERNION), so the camera and the touchdown's error follow its estimate";
@@ -272,9 +275,30 @@ enum AutopilotSide {
         requested_s: f64,
         /// Requests since the truth came last.
         unanswered: u32,
-        /// The autopilot's MAVLink system id, once it has spoken.
-        system: Option<u8>,
+        /// The autopilot, once its heartbeat has come.
+        autopilot: Option<TruthOf>,
+        /// It has sent something since the last request.
+        has_spoken: bool,
     },
+}
+
+/// Whose truth is asked for: the autopilot's MAVLink system id, and the id of the message.
+#[derive(Copy, Clone)]
+struct TruthOf {
+    system: u8,
+    message: f32,
+}
+
+impl TruthOf {
+    /// From a packet of an autopilot that tells its firmware.
+    fn new(packet: &Packet) -> Option<Self> {
+        let Some(MavMessage::HEARTBEAT(heartbeat)) = &packet.message else { return None };
+        let message = match Firmware::of(heartbeat) {
+            Firmware::Px4 | Firmware::OtherPx4 => HIL_STATE_QUATERNION,
+            _ => SIM_STATE,
+        };
+        Some(Self { system: packet.sender.system, message })
+    }
 }
 
 impl AutopilotSide {
@@ -295,7 +319,8 @@ impl AutopilotSide {
                 requests: node.publisher(topic::TO_AUTOPILOT, &[]).await?,
                 requested_s: f64::NEG_INFINITY,
                 unanswered: 0,
-                system: None,
+                autopilot: None,
+                has_spoken: false,
             },
         })
     }
@@ -319,7 +344,7 @@ impl AutopilotSide {
                     send_all(node, link, answers);
                 }
             }
-            Self::Topics { packets, system, .. } => {
+            Self::Topics { packets, autopilot, has_spoken, .. } => {
                 let Some(message) = packets.next().await else {
                     return std::future::pending().await;
                 };
@@ -327,8 +352,9 @@ impl AutopilotSide {
                 let mut packets = parser.push(&message.packet);
                 packets.extend(parser.finish());
                 let now_s = simulation.now_s();
-                let newest = packets.iter().rev().find(|it| it.sender.component == AUTOPILOT);
-                *system = newest.map(|it| it.sender.system).or(*system);
+                let of_autopilot = || packets.iter().filter(|it| it.sender.component == AUTOPILOT);
+                *has_spoken |= of_autopilot().next().is_some();
+                *autopilot = of_autopilot().rev().find_map(TruthOf::new).or(*autopilot);
                 if let VehicleSource::Reported(reported) = &mut *simulation.source() {
                     packets.iter().for_each(|packet| reported.handle(now_s, packet));
                 }
@@ -350,7 +376,14 @@ impl AutopilotSide {
                 };
                 send_all(node, link, packets);
             }
-            Self::Topics { requests, requested_s, unanswered, system: Some(system), .. } => {
+            Self::Topics {
+                requests,
+                requested_s,
+                unanswered,
+                autopilot: Some(autopilot),
+                has_spoken,
+                ..
+            } => {
                 let now_s = simulation.now_s();
                 let is_true = match &*simulation.source() {
                     VehicleSource::Reported(reported) => reported.is_true(now_s),
@@ -360,17 +393,18 @@ impl AutopilotSide {
                     *unanswered = 0;
                 } else if now_s - *requested_s > REQUEST_PERIOD.as_secs_f64() {
                     *requested_s = now_s;
-                    *unanswered += 1;
-                    if *unanswered > MAX_UNANSWERED && node.health().failed(NO_TRUTH) {
+                    // One that is silent does not lack the truth alone.
+                    let has_spoken = std::mem::take(has_spoken);
+                    *unanswered += u32::from(has_spoken);
+                    let lacks_it = has_spoken && *unanswered > MAX_UNANSWERED;
+                    if lacks_it && node.health().failed(NO_TRUTH) {
                         tracing::warn!("{NO_TRUTH}");
                     }
-                    for message in TRUTH_MESSAGES {
-                        let packet = request_for(message, *system);
-                        requests.publish(&MavlinkBytes { packet }).await;
-                    }
+                    let packet = request_for(*autopilot);
+                    requests.publish(&MavlinkBytes { packet }).await;
                 }
             }
-            Self::Topics { system: None, .. } => {}
+            Self::Topics { autopilot: None, .. } => {}
         }
     }
 }
@@ -384,12 +418,12 @@ fn send_all(node: &Node, link: &mut Link, packets: Vec<Vec<u8>>) {
 }
 
 /// SET_MESSAGE_INTERVAL for a message. PX4 takes no command that is addressed to all systems.
-fn request_for(message: f32, system: u8) -> Vec<u8> {
+fn request_for(truth: TruthOf) -> Vec<u8> {
     let message = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
-        param1: message,
+        param1: truth.message,
         param2: TRUTH_INTERVAL_US,
         command: MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
-        target_system: system,
+        target_system: truth.system,
         target_component: AUTOPILOT,
         ..COMMAND_LONG_DATA::default()
     });
