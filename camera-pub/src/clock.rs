@@ -6,7 +6,9 @@ const SPAN_NS: i64 = 5_000_000_000;
 /// Number of frames before the quickest is believed.
 const MIN_FRAMES: u32 = 10;
 /// Offsets that differ by more than this are of a camera that was started again, or whose clock was set, in nanoseconds.
-const MAX_JUMP_NS: u64 = 500_000_000;
+const MAX_JUMP_NS: i64 = 500_000_000;
+/// Frames may be late by more than that for so long, where their stamps go on: they waited on their way, in nanoseconds.
+const MAX_FAR_NS: i64 = 2_000_000_000;
 
 /// So many frames in a row that are all later than the quickest by so much are of a clock that was set, where nothing else delays
 /// frames for that long.
@@ -24,6 +26,10 @@ pub(crate) struct CameraClock {
     /// The least difference since then, and that of the span before.
     min_ns: Option<i64>,
     before_ns: Option<i64>,
+    /// The stamp of the newest frame.
+    stamp_ns: Option<i64>,
+    /// Since when all frames have been late by more than a jump.
+    far_since_ns: Option<i64>,
     /// Whether late frames say that the clock was set.
     is_direct: bool,
     late: u32,
@@ -45,14 +51,14 @@ impl CameraClock {
         arrival_ns: i64,
     ) -> Option<i64> {
         let apart_ns = arrival_ns.saturating_sub(stamp_ns).saturating_sub(until_sent_ns);
+        let went_back = self.stamp_ns.is_some_and(|before_ns| stamp_ns < before_ns);
         if let Some(offset_ns) = self.offset_ns() {
-            let is_late = apart_ns.saturating_sub(offset_ns) > MIN_STEP_NS;
-            self.late = if is_late { self.late.saturating_add(1) } else { 0 };
-            let was_set = self.is_direct && self.late >= STEP_FRAMES;
-            if was_set || apart_ns.abs_diff(offset_ns) > MAX_JUMP_NS {
+            let late_ns = apart_ns.saturating_sub(offset_ns);
+            if self.was_set(late_ns, went_back, arrival_ns) {
                 *self = Self { is_direct: self.is_direct, ..Self::default() };
             }
         }
+        self.stamp_ns = Some(stamp_ns);
         if arrival_ns.saturating_sub(self.began_ns) > SPAN_NS {
             self.began_ns = arrival_ns;
             self.before_ns = self.min_ns.take();
@@ -61,6 +67,21 @@ impl CameraClock {
         self.frames = self.frames.saturating_add(1);
         let offset_ns = self.offset_ns().filter(|_| self.frames >= MIN_FRAMES)?;
         Some(stamp_ns.saturating_add(offset_ns))
+    }
+
+    /// Whether a frame that is later than the quickest by so much says that the clock is no longer the same.
+    ///
+    /// A frame that is early by a jump does, as none is quicker than the way allows. One that is late by a jump may only have
+    /// waited, unless its stamp went back.
+    fn was_set(&mut self, late_ns: i64, went_back: bool, arrival_ns: i64) -> bool {
+        self.late = if late_ns > MIN_STEP_NS { self.late.saturating_add(1) } else { 0 };
+        let has_stepped = self.is_direct && self.late >= STEP_FRAMES;
+        if late_ns <= MAX_JUMP_NS {
+            self.far_since_ns = None;
+            return has_stepped || late_ns < -MAX_JUMP_NS;
+        }
+        let since_ns = *self.far_since_ns.get_or_insert(arrival_ns);
+        has_stepped || went_back || arrival_ns.saturating_sub(since_ns) > MAX_FAR_NS
     }
 
     fn offset_ns(&self) -> Option<i64> {
@@ -172,6 +193,42 @@ mod tests {
             }
             let late = errors_ns[79..].iter().flatten().all(|error_ns| error_ns.abs() <= MS);
             assert_eq!(late, is_noticed, "{errors_ns:?}");
+        }
+    }
+
+    #[test]
+    fn a_burst_of_late_frames_moves_no_stamp() {
+        for mut clock in [CameraClock::default(), CameraClock::direct()] {
+            for number in 0..200 {
+                let truth_ns = 50_000 * MS + number * 40 * MS;
+                // From the hundredth on all wait for 700 ms, and come one after the other then.
+                let late_ns =
+                    if number < 100 { 0 } else { (700 - (number - 100) * 40).max(0) * MS };
+                let told_ns = clock.host_ns(number * 40 * MS, 0, truth_ns + late_ns);
+                let expected_ns = (number >= 9).then_some(truth_ns);
+                assert_eq!(told_ns, expected_ns, "{number}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_clock_that_is_set_by_much_is_learnt_anew() {
+        // Ahead, at once; back, at once where the stamps show it, and after two seconds where the camera sent nothing meanwhile.
+        for (set_ns, pause_ns, anew) in
+            [(1000 * MS, 0, 9), (-1000 * MS, 0, 9), (-1000 * MS, 3000 * MS, 60)]
+        {
+            let mut clock = CameraClock::default();
+            let mut first = None;
+            for number in 0..200 {
+                let is_set = number >= 100;
+                let truth_ns = 50_000 * MS + number * 40 * MS + if is_set { pause_ns } else { 0 };
+                let stamp_ns = truth_ns - 49_000 * MS + if is_set { set_ns } else { 0 };
+                let told_ns = clock.host_ns(stamp_ns, 0, truth_ns);
+                if is_set && told_ns == Some(truth_ns) {
+                    first.get_or_insert(number - 100);
+                }
+            }
+            assert_eq!(first, Some(anew), "{set_ns} {pause_ns}");
         }
     }
 
