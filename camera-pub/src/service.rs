@@ -500,6 +500,7 @@ impl Stream {
             }
         }
         for (reason, count) in [
+            ("frames that were queued", counts.queued),
             ("frames that the driver could not store", counts.missed),
             ("frames that the driver marked as damaged", counts.damaged),
             ("frames of another length", counts.cut),

@@ -100,6 +100,8 @@ pub(crate) enum Lost {
 pub(crate) struct Counts {
     /// Frames that the driver could not store, by the gaps of its numbers.
     pub(crate) missed: u64,
+    /// Frames that waited in the driver's buffers until a newer one was there.
+    pub(crate) queued: u64,
     /// Frames that the driver marked as damaged.
     pub(crate) damaged: u64,
     /// Frames of another length.
@@ -248,11 +250,34 @@ impl<D: Device> Capture<D> {
         Ok(())
     }
 
-    /// Takes the next frame that is whole; `None` when there is none within `timeout`, or only damaged ones.
+    /// Takes the newest frame, if it is whole; `None` when there is none within `timeout`, or a damaged one.
     ///
     /// # Errors
     /// The device is gone, or what it gives is not what was agreed on.
     pub(crate) fn take(&mut self, timeout: Duration) -> Result<Option<Taken>, Lost> {
+        let Some(mut buffer) = self.dequeue(timeout)? else { return Ok(None) };
+        // Whoever takes longer than a period for a frame would else be given the oldest, which wait until all buffers are full.
+        for _ in 1..self.buffers.len() {
+            let Some(newer) = self.dequeue(Duration::ZERO)? else { break };
+            self.counts.queued += 1;
+            self.queue(buffer.index)?;
+            buffer = newer;
+        }
+        let arrival_ns = self.device.now_ns();
+        match self.check(&buffer, arrival_ns) {
+            Ok(Some(exposure)) => {
+                let bytes = buffer.bytesused as usize;
+                Ok(Some(Taken { index: buffer.index, bytes, exposure }))
+            }
+            refused => {
+                self.queue(buffer.index)?;
+                refused.map(|_none| None)
+            }
+        }
+    }
+
+    /// A buffer that the driver has filled; `None` when there is none within `timeout`.
+    fn dequeue(&mut self, timeout: Duration) -> Result<Option<Buffer>, Lost> {
         if !failed("poll", self.device.wait(timeout))? {
             return Ok(None);
         }
@@ -266,23 +291,13 @@ impl<D: Device> Capture<D> {
             }
             Err(cause) => return failed("VIDIOC_DQBUF", Err(cause)),
         }
-        let arrival_ns = self.device.now_ns();
         if let Some(exposer) = &mut self.exposer {
             exposer.frame();
         }
         if let Some(last) = self.last_sequence.replace(buffer.sequence) {
             self.counts.missed += u64::from(buffer.sequence.wrapping_sub(last).saturating_sub(1));
         }
-        match self.check(&buffer, arrival_ns) {
-            Ok(Some(exposure)) => {
-                let bytes = buffer.bytesused as usize;
-                Ok(Some(Taken { index: buffer.index, bytes, exposure }))
-            }
-            refused => {
-                self.queue(buffer.index)?;
-                refused.map(|_none| None)
-            }
-        }
+        Ok(Some(buffer))
     }
 
     /// When a buffer's frame was exposed; `None` when it is damaged.

@@ -115,12 +115,21 @@ struct State {
     bytes: usize,
     memory: Vec<Rc<RefCell<Vec<u8>>>>,
     queued: VecDeque<u32>,
+    /// Buffers with frames that have not been given, the oldest first.
+    filled: VecDeque<Filled>,
     is_streaming: bool,
-    /// The first frame that has not been given.
+    /// The first frame that is in no buffer yet.
     next: u32,
     has_stalled: bool,
     is_resized: bool,
     skipped: u32,
+}
+
+/// A buffer and the frame in it.
+#[derive(Copy, Clone)]
+struct Filled {
+    index: u32,
+    number: u32,
 }
 
 /// One of its buffers.
@@ -311,6 +320,7 @@ impl Device for FakeDevice {
             return Err(errno(libc::ENODEV));
         }
         let mut state = self.state.borrow_mut();
+        self.store(&mut state);
         match call {
             Call::QueryCap(capability) => {
                 let is_usb = self.fake.stamps == Stamps::FirstPacket;
@@ -367,7 +377,11 @@ impl Device for FakeDevice {
                 // The first frame that begins now.
                 state.next = (self.now_ns() / PERIOD_NS + 1) as u32;
             }
-            Call::StreamOff => (state.is_streaming, state.queued) = (false, VecDeque::new()),
+            Call::StreamOff => {
+                state.is_streaming = false;
+                state.queued.clear();
+                state.filled.clear();
+            }
             Call::QueryExtCtrl(control) => next_control(control)?,
             Call::GetControl(control) if control.id == CID_EXPOSURE_AUTO => {
                 control.value = if self.fake.is_metering.get() { 3 } else { 1 };
@@ -397,15 +411,28 @@ impl Device for FakeDevice {
             return Ok(true);
         }
         let until_ns = self.now_ns() + timeout.as_nanos() as i64;
-        let state = self.state.borrow();
+        let mut state = self.state.borrow_mut();
+        self.store(&mut state);
         let ready_ns = self.fake.ready_ns(state.next);
-        let is_ready = state.is_streaming && !state.has_stalled && ready_ns <= until_ns;
-        self.fake.now_ns.set(if is_ready { self.now_ns().max(ready_ns) } else { until_ns });
-        Ok(is_ready)
+        if state.filled.is_empty() && state.is_storing() && ready_ns <= until_ns {
+            self.fake.now_ns.set(ready_ns);
+            self.store(&mut state);
+        }
+        if state.filled.is_empty() {
+            self.fake.now_ns.set(until_ns);
+        }
+        Ok(!state.filled.is_empty())
     }
 
     fn now_ns(&self) -> i64 {
         self.fake.now_ns.get()
+    }
+}
+
+impl State {
+    /// Whether the next frame will find a buffer.
+    fn is_storing(&self) -> bool {
+        self.is_streaming && !self.has_stalled && !self.queued.is_empty()
     }
 }
 
@@ -422,11 +449,22 @@ impl FakeDevice {
         Ok(())
     }
 
-    fn dequeue(&self, state: &mut State, buffer: &mut Buffer) -> io::Result<()> {
-        let number = state.next;
-        if !state.is_streaming || state.has_stalled || self.now_ns() < self.fake.ready_ns(number) {
-            return Err(errno(libc::EAGAIN));
+    /// Puts the frames that have come since the last call into buffers; those that find none are lost.
+    fn store(&self, state: &mut State) {
+        while state.is_streaming
+            && !state.has_stalled
+            && self.fake.ready_ns(state.next) <= self.now_ns()
+        {
+            if let Some(index) = state.queued.pop_front() {
+                state.filled.push_back(Filled { index, number: state.next });
+            }
+            state.next += 1;
         }
+    }
+
+    fn dequeue(&self, state: &mut State, buffer: &mut Buffer) -> io::Result<()> {
+        let oldest = state.filled.front().copied();
+        let Filled { index, number } = oldest.ok_or_else(|| errno(libc::EAGAIN))?;
         let happening = {
             let mut script = self.fake.script.borrow_mut();
             let due = script.iter().position(|(at, _)| *at <= number);
@@ -435,6 +473,7 @@ impl FakeDevice {
         match happening {
             Some(Happening::Stalled) => {
                 state.has_stalled = true;
+                state.filled.clear();
                 return Err(errno(libc::EAGAIN));
             }
             Some(Happening::IoError) => return Err(errno(libc::EIO)),
@@ -451,9 +490,9 @@ impl FakeDevice {
         state.skipped = 0;
         // A frame that comes while another is read.
         self.fake.now_ns.set(self.now_ns().max(self.fake.ready_ns(number)));
-        let index = state.queued.pop_front().ok_or_else(|| errno(libc::EAGAIN))?;
+        state.filled.pop_front();
         let bytes = self.fill(state, index, number);
-        state.next = number + 1;
+        state.next = state.next.max(number + 1);
         let is_cut = happening == Some(Happening::Cut) || state.is_resized;
         self.describe(buffer, number);
         buffer.index = index;

@@ -171,6 +171,7 @@ fn open<P: Port>(port: &P, wanted: &Wanted) -> Result<Capture<P::Device>, Lost> 
 mod tests {
     use super::*;
     use crate::exposure::StampedAt;
+    use crate::v4l2::capture::Counts;
     use crate::v4l2::fake::{Fake, Happening, MS, Stamps};
     use std::rc::Rc;
 
@@ -320,6 +321,31 @@ mod tests {
             assert!((0..=max_ms).contains(&back_ms), "{reason}: {back_ms} ms");
             assert!(seen.frames > 300 && seen.worst_ns <= 1000);
         }
+    }
+
+    #[test]
+    fn a_slow_reader_gets_the_newest_frame_and_those_before_it_are_counted() {
+        let fake = Fake::of("GREY", Stamps::ExposureStart, 0);
+        let mut video = Video::start(Rc::clone(&fake), wanted(&fake)).unwrap();
+        let slow = Duration::from_millis(350);
+        let (mut frames, mut counts) = (0, Counts::default());
+        while fake.now_ns() < 20_000 * MS {
+            let Next::Frame(taken) = video.next().unwrap() else { continue };
+            let exposure = taken.exposure;
+            let age_ns = fake.now_ns() - exposure.mid_ns;
+            fake.pass(slow);
+            let capture = video.capture().unwrap();
+            capture.give_back(taken).unwrap();
+            let more = capture.take_counts();
+            counts.queued += more.queued;
+            counts.missed += more.missed;
+            frames += 1;
+            assert!(exposure.is_exact(), "frame {frames}");
+            assert!(age_ns < slow.as_nanos() as i64, "frame {frames}: {} ms", age_ns / MS);
+        }
+        // Three buffers are filled while the fourth is read, and the frames after them find none.
+        assert_eq!((frames, counts.queued), (58, 2 * 57));
+        assert!(counts.missed > 30 * 57, "{counts:?}");
     }
 
     #[test]
