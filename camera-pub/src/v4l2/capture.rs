@@ -198,6 +198,16 @@ impl<D: Device> Capture<D> {
         self.rate_hz
     }
 
+    /// True once a stamp was of the host's clock.
+    pub(crate) fn has_clock(&self) -> bool {
+        self.has_clock
+    }
+
+    /// Its stamps have been of the host's clock before it was opened: where they are not, frames are stamped by their arrival.
+    pub(crate) fn believe_clock(&mut self) {
+        self.has_clock = true;
+    }
+
     /// How the newest frame was exposed; `None` where the exposure does not follow the marker.
     pub(crate) fn exposed(&self) -> Option<Exposed> {
         let exposer = self.exposer.as_ref()?;
@@ -350,11 +360,6 @@ impl<D: Device> Capture<D> {
         let is_known = unsure_ns < MAX_UNSURE_NS;
         let exposure_ns = if is_known { self.exposure_ns } else { 0 };
         let delay_ns = arrival_ns.saturating_sub(stamp_ns);
-        if (0..shutter.until_read_ns(0)).contains(&delay_ns) {
-            // A camera that reads a frame into its own memory sends it sooner than it was read: its stamp is of neither.
-            self.counts.early += 1;
-            return Ok(by_arrival);
-        }
         if !(0..=MAX_DELAY_NS).contains(&delay_ns) {
             self.impossible += 1;
             if !self.has_clock && self.impossible == IN_A_ROW {
@@ -363,6 +368,11 @@ impl<D: Device> Capture<D> {
             return Ok(by_arrival);
         }
         (self.has_clock, self.impossible) = (true, 0);
+        if delay_ns < shutter.until_read_ns(0) {
+            // A camera that reads a frame into its own memory sends it sooner than it was read: its stamp is of neither.
+            self.counts.early += 1;
+            return Ok(by_arrival);
+        }
         Ok(Exposure { mid_ns: shutter.mid_exposure_ns(stamp_ns, exposure_ns), exposure_ns })
     }
 

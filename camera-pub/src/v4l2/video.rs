@@ -33,6 +33,8 @@ pub(crate) struct Video<P: Port> {
     port: P,
     wanted: Wanted,
     capture: Option<Capture<P::Device>>,
+    /// Whether its stamps have been of the host's clock: then others end no service.
+    has_clock: bool,
     started_ns: i64,
     last_frame_ns: i64,
     retry_ns: i64,
@@ -69,6 +71,7 @@ impl<P: Port> Video<P> {
             port,
             wanted,
             capture: Some(capture),
+            has_clock: false,
             started_ns: now_ns,
             last_frame_ns: now_ns,
             retry_ns: now_ns,
@@ -128,7 +131,7 @@ impl<P: Port> Video<P> {
 
     /// Closes the camera; it is opened again after a while.
     pub(crate) fn lose(&mut self, lost: &Lost) -> Next {
-        self.capture = None;
+        self.has_clock |= self.capture.take().is_some_and(|capture| capture.has_clock());
         let now_ns = self.port.now_ns();
         self.retry_ns = now_ns + RETRY_NS;
         let problem = lost.to_string();
@@ -143,7 +146,10 @@ impl<P: Port> Video<P> {
 
     fn reopen(&mut self) -> Next {
         match open(&self.port, &self.wanted) {
-            Ok(capture) => {
+            Ok(mut capture) => {
+                if self.has_clock {
+                    capture.believe_clock();
+                }
                 self.capture = Some(capture);
                 self.last_frame_ns = self.port.now_ns();
                 Next::Nothing
@@ -346,6 +352,17 @@ mod tests {
         // Three buffers are filled while the fourth is read, and the frames after them find none.
         assert_eq!((frames, counts.queued), (58, 2 * 57));
         assert!(counts.missed > 30 * 57, "{counts:?}");
+    }
+
+    #[test]
+    fn a_clock_that_was_good_once_ends_no_service_when_the_camera_is_back_with_another() {
+        let fake = Fake::of("GREY", Stamps::ExposureStart, 0);
+        fake.script(100, Happening::Unplugged(300 * MS));
+        fake.script(101, Happening::OtherClock);
+        let mut video = Video::start(Rc::clone(&fake), wanted(&fake)).unwrap();
+        let seen = run(&fake, &mut video, 4000 * MS);
+        assert_eq!(seen.lost, ["camera unplugged"]);
+        assert!(seen.frames - seen.exact > 200 && seen.worst_ns <= 1000, "{}", seen.frames);
     }
 
     #[test]
