@@ -1,8 +1,8 @@
 //! Predicts the region of interest (ROI) of the next frame from the detections of the last ones.
 //!
 //! Each marker's centre moves at constant velocity, from its last two detections; its size stays. Uncertainty
-//! of the motion widens the ROI. A track ends after two frames without a detection: one may have been cut off
-//! by its ROI.
+//! of the motion widens the ROI. A track ends after two frames in which the detector that saw its marker last does not
+//! see it: one may have been cut off by its ROI. Other detectors may look for other markers, or see less.
 
 use messages::{Detection, Detections};
 
@@ -29,6 +29,8 @@ pub struct RoiPredictor {
 
 #[derive(Clone, Debug)]
 struct Track {
+    /// Who saw it last.
+    detector: String,
     family: String,
     id: Option<u32>,
     stamp_ns: i64,
@@ -61,8 +63,9 @@ impl RoiPredictor {
             }
             let has_room = self.tracks.len() < MAX_TRACKS;
             match self.tracks.iter_mut().find(|track| track.is_of(detection)) {
-                Some(track) => track.update(stamp_ns, detection),
+                Some(track) => track.update(message, detection),
                 None if has_room => self.tracks.push(Track {
+                    detector: message.detector.clone(),
                     family: detection.family.clone(),
                     id: detection.id,
                     stamp_ns,
@@ -76,7 +79,8 @@ impl RoiPredictor {
         }
         for track in &mut self.tracks {
             let is_detected = message.detections.iter().any(|detection| track.is_of(detection));
-            if !is_detected && stamp_ns > track.stamp_ns {
+            let is_its_own = track.detector == message.detector;
+            if is_its_own && !is_detected && stamp_ns > track.stamp_ns {
                 track.misses += 1;
             }
         }
@@ -101,7 +105,8 @@ impl Track {
         stamp_ns.saturating_sub(self.stamp_ns) as f64 * 1e-9
     }
 
-    fn update(&mut self, stamp_ns: i64, detection: &Detection) {
+    fn update(&mut self, message: &Detections, detection: &Detection) {
+        let stamp_ns = message.header.stamp_ns;
         let period_s = self.age_s(stamp_ns);
         // Another detector may report the same frame, or an older one.
         if period_s > 1e-3 {
@@ -109,6 +114,7 @@ impl Track {
             if period_s < MAX_AGE_S {
                 self.velocity_px_s = [(new_x - x) / period_s, (new_y - y) / period_s];
             }
+            self.detector.clone_from(&message.detector);
             self.stamp_ns = stamp_ns;
             self.centre_px = detection.centre_px;
             self.size_px = detection.size_px;
@@ -188,6 +194,36 @@ mod tests {
         predictor.update(&detections(200, &[(1, [100.0, 500.0], 40.0)]));
         assert!(predictor.roi(300 * MS).is_some());
         assert!(predictor.roi(950 * MS).is_none());
+    }
+
+    #[test]
+    fn a_detector_that_sees_nothing_ends_no_track_of_another() {
+        let of = |detector: &str, message: Detections| Detections {
+            detector: detector.into(),
+            ..message
+        };
+        let mut predictor = RoiPredictor::default();
+        let marker = [(1, [100.0, 500.0], 40.0)];
+        for frame in 0..20 {
+            let stamp_ms = frame * 66;
+            // One sees the marker in every third frame, the other one never.
+            let seen = if frame % 3 == 0 { &marker[..] } else { &[] };
+            if frame % 3 < 2 {
+                predictor.update(&of("rings", detections(stamp_ms, seen)));
+            }
+            predictor.update(&of("tags", detections(stamp_ms, &[])));
+            assert!(predictor.roi(stamp_ms * MS).is_some(), "frame {frame}");
+        }
+        // Whoever saw it last is the one that misses it.
+        predictor.update(&of("tags", detections(1320, &marker)));
+        for stamp_ms in [1386, 1452] {
+            predictor.update(&of("rings", detections(stamp_ms, &[])));
+            assert!(predictor.roi(stamp_ms * MS).is_some());
+        }
+        for stamp_ms in [1386, 1452] {
+            predictor.update(&of("tags", detections(stamp_ms, &[])));
+        }
+        assert!(predictor.roi(1452 * MS).is_none());
     }
 
     #[test]
