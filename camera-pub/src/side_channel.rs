@@ -22,8 +22,10 @@ use crate::pairing::Pairing;
 pub(crate) const PLACEHOLDER: &str = "{metadata}";
 /// Maximum time to wait for a frame's metadata after its last byte; `rpicam-vid` writes them at once.
 const MAX_WAIT_NS: i64 = 10_000_000;
-/// Number of frames in a row without metadata after which this is said, and they are no longer waited for.
+/// Number of frames in a row without metadata after which this is said, and they are waited for only now and then.
 const SILENT_FRAMES: u32 = 60;
+/// Of so many frames from then on, those of one are waited for: a program may have held them back for a while.
+const RETRY_FRAMES: u32 = 30;
 
 /// Reads metadata and finds each frame's own.
 pub(crate) struct SideChannel {
@@ -82,7 +84,8 @@ impl SideChannel {
     pub(crate) async fn end_frame(&mut self, arrival_ns: i64) -> anyhow::Result<Option<Exposure>> {
         let until_ns = now_ns() + self.wait_ns;
         self.drain();
-        while self.silent < SILENT_FRAMES && !self.pairing.is_settled(arrival_ns) {
+        let is_awaited = self.silent < SILENT_FRAMES || self.silent.is_multiple_of(RETRY_FRAMES);
+        while is_awaited && !self.pairing.is_settled(arrival_ns) {
             let left_ns = u64::try_from(until_ns - now_ns()).unwrap_or(0);
             match timeout(Duration::from_nanos(left_ns), self.input.readable()).await {
                 Ok(Ok(())) if left_ns > 0 => self.drain(),
@@ -126,5 +129,47 @@ impl SideChannel {
         while let Some(record) = self.reader.next() {
             self.pairing.add(record);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::exposure::StampedAt;
+    use std::fs::{File, OpenOptions};
+    use std::io::Write;
+
+    const MS: i64 = 1_000_000;
+
+    /// Ends a frame whose metadata are written once they are waited for, as of a program that writes them right after it.
+    async fn end_frame(channel: &mut SideChannel, pipe: &mut File, arrival_ns: i64) -> bool {
+        let sensor_ns = arrival_ns - 70 * MS + boot_ahead_ns();
+        let line = format!("{{\"SensorTimestamp\": {sensor_ns}, \"ExposureTime\": 4000}}\n");
+        let writing = async { pipe.write_all(line.as_bytes()).unwrap() };
+        let (exposure, ()) = tokio::join!(channel.end_frame(arrival_ns), writing);
+        channel.drain();
+        exposure.unwrap().is_some()
+    }
+
+    #[tokio::test]
+    async fn exact_stamps_come_back_after_frames_without_metadata() {
+        let shutter = Shutter { stamped_at: StampedAt::ReadoutStart, readout_ns: 0 };
+        let mut channel = SideChannel::open(shutter, Duration::from_millis(40)).unwrap();
+        let mut pipe = OpenOptions::new().write(true).open(channel.path()).unwrap();
+        let mut arrival_ns = now_ns();
+        let mut exact = Vec::new();
+        for number in 0..200 {
+            arrival_ns += 40 * MS;
+            let is_exact = if (20..100).contains(&number) {
+                channel.end_frame(arrival_ns).await.unwrap().is_some()
+            } else {
+                end_frame(&mut channel, &mut pipe, arrival_ns).await
+            };
+            exact.extend(is_exact.then_some(number));
+        }
+        let first = exact.iter().find(|number| **number >= 20);
+        assert!(exact.starts_with(&[5, 6, 7]), "{exact:?}");
+        assert!(first.is_some_and(|number| *number <= 130), "{exact:?}");
+        assert!(exact.len() > 80, "{exact:?}");
     }
 }
