@@ -47,6 +47,7 @@ pub(crate) struct SourceConfig {
     fourcc: String,
     controls: Vec<String>,
     pixels: String,
+    bits: u32,
     size_px: [u32; 2],
     binning: u32,
     row_bytes: usize,
@@ -248,6 +249,8 @@ impl Settings for Config {
         check.parses("source.binning", self.source.checked_binning());
         check.range("source.max_megapixels", self.source.max_megapixels, 0.001..=4294.0);
         check.one_of("source.pixels", &self.source.pixels, PIXEL_FORMATS);
+        check.range("source.bits", self.source.bits, 9..=16);
+        check.parses("source.bits", self.source.needs_gray16());
         check.range("source.delay_ms", self.source.delay_ms, 0.0..=10_000.0);
         check.one_of("source.stamp_at", &self.source.stamp_at, STAMP_INSTANTS);
         check.range("source.readout_ms", self.source.readout_ms, 0.0..=1000.0);
@@ -364,8 +367,8 @@ impl SourceConfig {
         let size = self.size("the program's frames")?;
         let FrameSize { width, height } = size;
         let pixels = size.pixels();
-        let bits = if self.pixels == "gray16" { 16 } else { 8 };
-        let row_bytes = width * bits as usize / 8;
+        let bits = if self.pixels == "gray16" { self.bits } else { 8 };
+        let row_bytes = width * bits.div_ceil(8) as usize;
         let stride_bytes = if self.row_bytes == 0 { row_bytes } else { self.row_bytes };
         ensure!(
             (row_bytes..=16 * row_bytes + 4096).contains(&stride_bytes),
@@ -478,6 +481,11 @@ impl SourceConfig {
     /// How many samples, across and down, are averaged to a pixel of a frame.
     pub(crate) fn binning(&self) -> usize {
         self.binning.max(1) as usize
+    }
+
+    fn needs_gray16(&self) -> Result<(), &'static str> {
+        let fits = self.bits == 16 || self.pixels == "gray16";
+        holds(fits, "it is not 16, which needs `source.pixels` gray16")
     }
 
     fn checked_binning(&self) -> anyhow::Result<()> {
@@ -797,6 +805,7 @@ mod tests {
         };
         assert_eq!(format(&[]), samples(5, 5, 0));
         assert_eq!(format(&["source.pixels=gray16"]), samples(10, 10, 0));
+        assert_eq!(format(&["source.pixels=gray16", "source.bits=9"]), samples(10, 10, 0));
         // Two chroma planes of half the width and height, both rounded up.
         assert_eq!(format(&["source.pixels=yuv420"]), samples(5, 5, 12));
         assert_eq!(format(&["source.pixels=yuv420", "source.row_bytes=8"]), samples(5, 8, 16));
@@ -831,6 +840,8 @@ mod tests {
         };
         camera(&["source.paths=['x']"], "`source.paths` must be empty");
         camera(&["source.pixels=rgb"], "gray8, gray16");
+        camera(&["source.pixels=gray16", "source.bits=8"], "from 9 to 16");
+        camera(&["source.bits=10"], "needs `source.pixels` gray16");
         camera(&["source.row_bytes=63"], "a row has 64 bytes");
         camera(&["source.pixels=yuv420", "source.bayer=RGGB"], "gray8 or gray16");
         camera(&["source.delay_ms=-1"], "from 0 to 10000");

@@ -522,12 +522,13 @@ impl Stream {
 
     fn prepare_samples(
         &self,
-        pixels: Loan,
+        mut pixels: Loan,
         size: FrameSize,
         bits: u32,
         bayer: Option<imaging::BayerPattern>,
     ) -> Prepared {
         let FrameSize { width, height } = size;
+        let bits = with_bits_of_a_format(&mut pixels, bits);
         let format = pixel_format(Some(bits), bayer);
         let sample = SampleFormat { bits, bayer };
         let is_wanted = self.needs_grey(format);
@@ -664,11 +665,27 @@ impl Stream {
     }
 }
 
+/// Moves samples of so many bits up to 16 where no format has as many; returns how many they have then.
+fn with_bits_of_a_format(samples: &mut [u8], bits: u32) -> u32 {
+    if matches!(bits, 0..=8 | 10 | 12 | 16..) {
+        return bits;
+    }
+    for pair in samples.as_chunks_mut::<2>().0 {
+        // What is above the significant bits is no light.
+        *pair = (u16::from_le_bytes(*pair) << (16 - bits)).to_le_bytes();
+    }
+    16
+}
+
 /// The format of a frame by the bits of its raw samples; images that are not raw are published in grey.
 fn pixel_format(raw_bits: Option<u32>, bayer: Option<imaging::BayerPattern>) -> PixelFormat {
     let pattern = bayer.map(BayerPattern::from);
     match (raw_bits, pattern) {
+        (Some(10), Some(pattern)) => PixelFormat::Bayer10(pattern),
+        (Some(12), Some(pattern)) => PixelFormat::Bayer12(pattern),
         (Some(9..), Some(pattern)) => PixelFormat::Bayer16(pattern),
+        (Some(10), None) => PixelFormat::Mono10,
+        (Some(12), None) => PixelFormat::Mono12,
         (Some(9..), None) => PixelFormat::Mono16,
         (Some(_), Some(pattern)) => PixelFormat::Bayer8(pattern),
         _ => PixelFormat::Mono8,

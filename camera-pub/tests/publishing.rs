@@ -229,6 +229,46 @@ async fn frames_of_a_program_are_stamped_with_their_arrival() -> anyhow::Result<
     Ok(())
 }
 
+/// The first frame of a program whose pixels are all this sample of gray16, with these keys.
+async fn frame_of_samples(sample: u16, set: &[&str]) -> anyhow::Result<(PixelFormat, Vec<u8>)> {
+    let file = tempfile::NamedTempFile::new()?;
+    std::fs::write(file.path(), sample.to_le_bytes().repeat(64 * 48))?;
+    let forever = format!("while sleep 0.05; do cat '{}'; done", file.path().display());
+    let set = [&["source.pixels=gray16"], set].concat();
+    let config = program(&["sh", "-c", &forever], &set)?;
+    let port = free_port()?;
+    let (camera, viewer) = (open("camera-pub", port).await?, open("gcs-bridge", port).await?);
+    let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await?;
+    let service = tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
+    let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+    let seen = (frame.header.format, frame.bytes().to_vec());
+    service.abort();
+    camera.close().await;
+    viewer.close().await;
+    Ok(seen)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn samples_of_10_to_14_bits_are_as_bright_as_their_bits_say() -> anyhow::Result<()> {
+    let behind_filters = PixelFormat::Bayer12(BayerPattern::Rggb);
+    for (bits, bayer, expected, published) in [
+        (10, "source.bayer=", PixelFormat::Mono10, 1_u16 << 9),
+        (12, "source.bayer=RGGB", behind_filters, 1 << 11),
+        // No format has 14 bits: the samples become those of 16.
+        (14, "source.bayer=", PixelFormat::Mono16, 1 << 15),
+    ] {
+        let (sample, key) = (1_u16 << (bits - 1), format!("source.bits={bits}"));
+        let (format, pixels) = frame_of_samples(sample, &[&key, "source.binning=2"]).await?;
+        ensure!(format == PixelFormat::Mono8 && pixels.len() == 32 * 24, "{bits}: {format:?}");
+        ensure!(pixels.iter().all(|pixel| pixel.abs_diff(128) <= 1), "{bits}: {:?}", pixels[0]);
+        let (format, pixels) = frame_of_samples(sample, &[&key, bayer]).await?;
+        ensure!(format == expected && pixels.len() == 64 * 48 * 2, "{bits}: {format:?}");
+        let pairs = pixels.as_chunks::<2>().0;
+        ensure!(pairs.iter().all(|pair| *pair == published.to_le_bytes()), "{bits}");
+    }
+    Ok(())
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn the_error_says_how_a_camera_program_ended() -> anyhow::Result<()> {
     let problem = async |command: &[&str], set: &[&str]| -> anyhow::Result<String> {
