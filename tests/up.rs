@@ -2,6 +2,7 @@
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::Arc;
@@ -67,7 +68,12 @@ struct Up {
 
 impl Up {
     fn start(folder: &Path, role: &str) -> anyhow::Result<Self> {
-        let mut child = Command::new(ALIGHT)
+        Self::run(Command::new(ALIGHT), folder, role)
+    }
+
+    /// The same of another file of the program, in another environment.
+    fn run(mut program: Command, folder: &Path, role: &str) -> anyhow::Result<Self> {
+        let mut child = program
             .args(["up", role, "--config"])
             .arg(folder.join("site.toml"))
             .stdin(Stdio::null())
@@ -264,6 +270,56 @@ async fn two_roles_meet() -> anyhow::Result<()> {
     ensure!(output.status.code() == Some(1), "{output:?}");
     let text = String::from_utf8_lossy(&output.stdout);
     ensure!(text.contains("does not answer"), "{text}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_program_that_is_removed_takes_no_other_with_it() -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
+    let folder = tempfile::tempdir()?;
+    let ([meet], ..) = ports::free()?;
+    let (program, script) = (folder.path().join("alight"), folder.path().join("own.sh"));
+    std::fs::copy(ALIGHT, &program)?;
+    std::fs::write(&script, "#!/bin/sh\necho meets at ${ALIGHT_MEET} >&2\nexec sleep 600\n")?;
+    std::fs::set_permissions(&script, std::fs::Permissions::from_mode(0o755))?;
+    let site = format!(
+        r#"
+vehicle = "tested"
+meet = {meet}
+[[local]]
+run = "detector"
+[[local]]
+name = "own"
+command = ["./own.sh"]
+"#
+    );
+    std::fs::write(folder.path().join("site.toml"), site)?;
+    let mut alight = Command::new(&program);
+    // What the user's shell has for commands is not the site's.
+    alight.env("ALIGHT_MEET", "1").env("ALIGHT_VEHICLE", "other");
+    let mut up = Up::run(alight, folder.path(), "local")?;
+    let detector = up.process("detector:").await?;
+    let own = up.process("own:").await?;
+    up.says("own:", &format!("meets at {meet}")).await?;
+    let network =
+        Network { meet: Some(meet), vehicle: Some("tested".into()), ..Network::default() };
+    let identity = Identity { service: "controller", instance: "main".into() };
+    let node = Node::open(identity, &network.source("controller")?).await?;
+    let presence = node.presence("detector").await?;
+    let joined = timeout(PATIENCE, presence.next()).await.context("the detector has not joined")?;
+    ensure!(joined == Some(("main".to_owned(), true)), "{joined:?}");
+
+    std::fs::remove_file(&program)?;
+    std::fs::remove_file(&script)?;
+    kill_process(own, Signal::KILL)?;
+    up.says("own:", "restarting").await?;
+    // It cannot be started: that is one more of its ends, and no end of the others.
+    up.says("own:", "./own.sh").await?;
+    kill_process(detector, Signal::KILL)?;
+    let again = up.process("detector:").await?;
+    ensure!(again != detector && test_kill_process(again).is_ok(), "{again:?}");
+    let code = up.stop()?;
+    ensure!(code == Some(0), "{code:?}: {:#?}", up.heard);
     Ok(())
 }
 

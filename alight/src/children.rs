@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use anyhow::Context;
 use node::Network;
-use rustix::process::{Pid, Signal, kill_process};
-use tokio::io::{AsyncBufReadExt, BufReader};
+use rustix::process::{Pid, Signal, kill_process, kill_process_group};
+use tokio::io::{AsyncBufReadExt, AsyncRead, AsyncReadExt, BufReader};
 use tokio::process::{Child, Command};
 use tokio::sync::mpsc;
 
@@ -21,6 +21,10 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(4);
 /// Maximum number of queued output lines; further ones are dropped, so that a service never waits for a
 /// terminal.
 const MAX_QUEUED_LINES: usize = 256;
+/// Longest piece of a line, in bytes.
+const MAX_LINE_BYTES: u64 = 16 * 1024;
+/// Time in which the last lines of a child are read that has ended.
+const LAST_LINES: Duration = Duration::from_millis(200);
 
 /// A restarted controller resumes the landing, and never takes off a second time.
 const RESUME: &str = "start=\"resume\"";
@@ -63,9 +67,25 @@ impl fmt::Display for Started {
     }
 }
 
+/// Takes the network of this process's environment out of a child's: it may be another one than the child is to join.
+pub(crate) fn without_network(command: &mut Command) {
+    for name in node::network::variable::ALL {
+        command.env_remove(name);
+    }
+}
+
+/// Which processes of a child's group are asked to stop; all that is left of it in the end is killed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Reach {
+    /// The child, which stops what it started itself.
+    Leader,
+    /// All: a script may have started the program that is meant.
+    Group,
+}
+
 /// The running children, by key.
 pub(crate) struct Children<K> {
-    pids: Vec<(K, Pid)>,
+    pids: Vec<(K, Pid, Reach)>,
     sender: mpsc::Sender<ChildEvent<K>>,
     events: mpsc::Receiver<ChildEvent<K>>,
 }
@@ -96,12 +116,10 @@ impl Children<Service> {
         settings: &[String],
         state: Option<&Path>,
     ) -> anyhow::Result<Started> {
-        let program = std::env::current_exe().context("finding this program's own file")?;
-        let mut command = Command::new(program);
+        let mut command = Command::new(node::own_program());
         command.arg(service.name()).args(options(network));
         command.arg("--stop-with-parent").arg(std::process::id().to_string());
-        // That of this process may be another one than what it joined itself.
-        command.env_remove(node::network::variable::MEET);
+        without_network(&mut command);
         if let Some(state) = state {
             command.env(node::STATE_VARIABLE, state);
         }
@@ -111,7 +129,7 @@ impl Children<Service> {
         if std::env::var_os("ALIGHT_LOG").is_none() {
             command.env("ALIGHT_LOG", "warn");
         }
-        let number = self.spawn(service, command, service.name())?;
+        let number = self.spawn(service, command, service.name(), Reach::Leader)?;
         Ok(Started { service, number, by_hand: by_hand(service, network, settings, state) })
     }
 }
@@ -169,6 +187,7 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
         key: K,
         mut command: Command,
         name: &str,
+        reach: Reach,
     ) -> anyhow::Result<i32> {
         let child = command
             .stdin(Stdio::null())
@@ -180,8 +199,8 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
             .spawn()
             .with_context(|| format!("starting {name}"))?;
         let pid = child.id().and_then(|id| i32::try_from(id).ok()).and_then(Pid::from_raw);
-        self.pids.extend(pid.map(|pid| (key.clone(), pid)));
-        tokio::spawn(follow(key, child, self.sender.clone()));
+        self.pids.extend(pid.map(|pid| (key.clone(), pid, reach)));
+        tokio::spawn(follow(key, child, pid, self.sender.clone()));
         Ok(pid.map_or(0, |pid| pid.as_raw_nonzero().get()))
     }
 
@@ -192,7 +211,7 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
 
     /// Removes a child that has exited.
     pub(crate) fn remove(&mut self, key: &K) {
-        self.pids.retain(|(running, _)| running != key);
+        self.pids.retain(|(running, ..)| running != key);
     }
 
     /// Stops a child, by SIGKILL if it ignores SIGTERM; events until then go to `on_event`.
@@ -216,12 +235,15 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
         mut on_event: impl FnMut(&ChildEvent<K>),
     ) {
         for signal in [Signal::TERM, Signal::KILL] {
-            for (_, pid) in self.pids.iter().filter(|(running, _)| is_stopped(running)) {
+            for (_, pid, reach) in self.pids.iter().filter(|(running, ..)| is_stopped(running)) {
                 // Fails when the child has exited already.
-                let _ = kill_process(*pid, signal);
+                let _ = match (signal, reach) {
+                    (Signal::TERM, Reach::Leader) => kill_process(*pid, signal),
+                    _ => kill_process_group(*pid, signal),
+                };
             }
             let all_exited = async {
-                while self.pids.iter().any(|(running, _)| is_stopped(running)) {
+                while self.pids.iter().any(|(running, ..)| is_stopped(running)) {
                     let Some(event) = self.events.recv().await else { return };
                     on_event(&event);
                     if let ChildEvent::Exited(ended, _) = event {
@@ -236,21 +258,33 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
     }
 }
 
-/// Sends the output lines of a child, and then its exit.
-async fn follow<K: Clone>(key: K, mut child: Child, events: mpsc::Sender<ChildEvent<K>>) {
-    if let Some(stderr) = child.stderr.take() {
-        let mut lines = BufReader::new(stderr).lines();
-        let mut dropped = 0_u64;
-        while let Ok(Some(line)) = lines.next_line().await {
-            let line = match dropped {
-                0 => line,
-                _ => format!("({dropped} lines dropped) {line}"),
-            };
-            let sent = events.try_send(ChildEvent::Line(key.clone(), line));
-            dropped = if sent.is_ok() { 0 } else { dropped + 1 };
+/// Sends the output lines of a child, and its exit when it has ended. What it started and left behind is ended then, as it would
+/// have the child's name and devices beside the one that is started next.
+async fn follow<K: Clone>(
+    key: K,
+    mut child: Child,
+    pid: Option<Pid>,
+    events: mpsc::Sender<ChildEvent<K>>,
+) {
+    let (stderr, teller, to) = (child.stderr.take(), key.clone(), events.clone());
+    let lines = async move {
+        if let Some(stderr) = stderr {
+            forward(teller, stderr, to).await;
         }
-    }
-    let exit = match child.wait().await {
+    };
+    tokio::pin!(lines);
+    let ended = tokio::select! {
+        ended = child.wait() => {
+            // Whoever has its standard error open still is one that it started.
+            let left = tokio::time::timeout(LAST_LINES, &mut lines).await.is_err();
+            if let Some(pid) = pid.filter(|_| left) {
+                let _ = kill_process_group(pid, Signal::KILL);
+            }
+            ended
+        }
+        () = &mut lines => child.wait().await,
+    };
+    let exit = match ended {
         Ok(status) => Exit { words: status.to_string(), status: status.code() },
         Err(cause) => Exit { words: cause.to_string(), status: None },
     };
@@ -258,9 +292,96 @@ async fn follow<K: Clone>(key: K, mut child: Child, events: mpsc::Sender<ChildEv
     drop(events.send(ChildEvent::Exited(key, exit)).await);
 }
 
+/// Sends the lines of a child, whatever its encoding; a very long one in pieces.
+async fn forward<K: Clone>(
+    key: K,
+    stderr: impl AsyncRead + Unpin,
+    events: mpsc::Sender<ChildEvent<K>>,
+) {
+    let mut stderr = BufReader::new(stderr);
+    let (mut line, mut dropped) = (Vec::new(), 0_u64);
+    loop {
+        line.clear();
+        let mut piece = (&mut stderr).take(MAX_LINE_BYTES);
+        if !matches!(piece.read_until(b'\n', &mut line).await, Ok(1..)) {
+            return;
+        }
+        let text = String::from_utf8_lossy(&line);
+        let text = text.trim_end_matches(['\n', '\r']);
+        let text = match dropped {
+            0 => text.to_owned(),
+            _ => format!("({dropped} lines dropped) {text}"),
+        };
+        let sent = events.try_send(ChildEvent::Line(key.clone(), text));
+        dropped = if sent.is_ok() { 0 } else { dropped + 1 };
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use std::time::Instant;
+
     use super::*;
+
+    /// What is heard of a shell script until it has ended, and how long that took.
+    async fn run(script: &str) -> (Vec<String>, Exit, Duration) {
+        let mut children = Children::new();
+        let mut command = Command::new("sh");
+        command.args(["-c", script]);
+        let began = Instant::now();
+        children.spawn((), command, "sh", Reach::Group).unwrap();
+        let mut lines = Vec::new();
+        loop {
+            match children.next().await.unwrap() {
+                ChildEvent::Line((), line) => lines.push(line),
+                ChildEvent::Exited((), exit) => return (lines, exit, began.elapsed()),
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn the_end_of_a_child_is_noticed_while_what_it_started_goes_on_and_that_is_ended() {
+        let (lines, exit, took) = run("sleep 600 & echo $! >&2; exit 3").await;
+        assert_eq!(exit.status, Some(3));
+        assert!(took < Duration::from_secs(20), "{took:?}");
+        let left: i32 = lines[0].parse().unwrap();
+        let status = format!("/proc/{left}/status");
+        let is_running = || {
+            let status = std::fs::read_to_string(&status).unwrap_or_default();
+            status.contains("State:") && !status.contains("State:\tZ")
+        };
+        let began = Instant::now();
+        while is_running() && began.elapsed() < Duration::from_secs(20) {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        assert!(!is_running(), "process {left} goes on");
+    }
+
+    #[tokio::test]
+    async fn a_line_in_another_encoding_or_without_an_end_is_passed_on_like_others() {
+        let script = r"printf '\377caf\351\n' >&2; echo there still >&2; head -c 40000 /dev/zero | tr '\0' x >&2";
+        let (lines, exit, _) = run(script).await;
+        assert_eq!(exit.status, Some(0));
+        assert_eq!(lines[..2], ["\u{fffd}caf\u{fffd}", "there still"]);
+        let lengths: Vec<_> = lines[2..].iter().map(String::len).collect();
+        assert_eq!(lengths, [16 * 1024, 16 * 1024, 40_000 - 32 * 1024]);
+    }
+
+    #[tokio::test]
+    async fn a_program_behind_a_script_is_asked_to_stop() {
+        let mut children = Children::new();
+        let mut command = Command::new("sh");
+        command.args([
+            "-c",
+            "sh -c 'trap \"echo asked >&2; exit 0\" TERM; echo ready >&2; sleep 600 & wait'; true",
+        ]);
+        children.spawn(1, command, "sh", Reach::Group).unwrap();
+        let is_line = |event: &ChildEvent<i32>, text| matches!(event, ChildEvent::Line(_, line) if line == text);
+        while !is_line(&children.next().await.unwrap(), "ready") {}
+        let mut was_asked = false;
+        children.stop(|event| was_asked |= is_line(event, "asked")).await;
+        assert!(was_asked);
+    }
 
     #[test]
     fn a_path_is_one_word_of_a_shell() {

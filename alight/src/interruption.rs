@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 use anyhow::Context;
+use node::ignores_hangups;
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::watch;
@@ -115,18 +116,6 @@ impl Signals {
     }
 }
 
-/// Whether this process was started with SIGHUP ignored.
-fn ignores_hangups() -> bool {
-    std::fs::read_to_string("/proc/self/status").is_ok_and(|status| is_ignored(&status, HANGUP))
-}
-
-/// Whether a process with this status (`/proc/PID/status`) ignores a signal.
-fn is_ignored(status: &str, signal: u8) -> bool {
-    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
-    let ignored = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
-    ignored.is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
-}
-
 #[cfg(test)]
 mod tests {
     use std::time::Duration;
@@ -159,14 +148,5 @@ mod tests {
             }
             assert_eq!(interruption.exit_code(), ExitCode::from(status), "{signal:?}");
         }
-    }
-
-    #[test]
-    fn an_ignored_signal_is_told_from_the_status_of_the_process() {
-        let status =
-            "SigBlk:\t0000000000000000\nSigIgn:\t0000000000001001\nSigCgt:\t0000000000004002\n";
-        assert!(is_ignored(status, HANGUP));
-        assert!(!is_ignored(status, INTERRUPT) && !is_ignored(status, TERMINATE));
-        assert!(!is_ignored("", HANGUP));
     }
 }

@@ -15,7 +15,7 @@ use node::Shutdown;
 use tokio::process::Command;
 use tokio::time::Instant;
 
-use crate::children::{ChildEvent, Children, Exit};
+use crate::children::{ChildEvent, Children, Exit, Reach, without_network};
 use crate::peers::{LandingMarkerFile, Peers, Slot};
 use crate::programs::{OWN_PROGRAM, missing, missing_of_service};
 use crate::runtime::block_on;
@@ -265,8 +265,14 @@ async fn watch(
                 let Some((_, index)) = next else { continue };
                 let Some(again) = supervised.get_mut(index) else { continue };
                 let start_as = start_mode(&again.job, peers.landing());
-                again.pid = start(children, index, &again.job, start_as, site)?;
-                again.state = State::Running;
+                match start(children, index, &again.job, start_as, site) {
+                    Ok(pid) => (again.pid, again.state) = (pid, State::Running),
+                    // The others go on, and so do the attempts.
+                    Err(problem) => {
+                        let exit = Exit { words: format!("{problem:#}"), status: None };
+                        say(&again.on_exit(&exit, Instant::now()));
+                    }
+                }
             }
         }
     }
@@ -322,18 +328,18 @@ fn start(
     }
     let (program, rest) = command_line.split_first().context("an empty command")?;
     let own = program == OWN_PROGRAM;
-    let file = if own {
-        std::env::current_exe().context("finding this program's own file")?
-    } else {
-        PathBuf::from(program)
+    let mut command = match own {
+        true => Command::new(node::own_program()),
+        false => Command::new(program),
     };
-    let mut command = Command::new(file);
+    without_network(&mut command);
     command.args(rest).envs(job.network.environment()).current_dir(&site.folder);
     if own {
         command.arg("--stop-with-parent").arg(std::process::id().to_string());
     }
+    let reach = if own { Reach::Leader } else { Reach::Group };
     let pid = children
-        .spawn(index, command, &job.name)
+        .spawn(index, command, &job.name, reach)
         .with_context(|| format!("the program `{program}`"))?;
     let mode = start_as.map_or_else(String::new, |start| format!(", start = \"{start}\""));
     say(&format!("{}: started as process {pid}{mode}", job.name));

@@ -48,7 +48,10 @@ pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
 pub use health::HealthCounters;
 pub use identity::Identity;
 pub use network::{INSECURE, Network, OPEN};
-pub use service::{Options, Shutdown, relaunch, relaunch_with_zenoh_threads, run, start_logging};
+pub use service::{
+    Options, Shutdown, ignores_hangups, own_program, relaunch, relaunch_with_zenoh_threads, run,
+    start_logging,
+};
 pub use session::{Announcement, Node, Presence, ZenohSource};
 pub use standstill::Standstill;
 pub use state::{STATE_VARIABLE, state_directory};

@@ -61,6 +61,8 @@ pub mod variable {
     pub const KEYS: &str = "ALIGHT_KEYS";
     /// [`Network::insecure`](super::Network::insecure).
     pub const INSECURE: &str = "ALIGHT_INSECURE";
+    /// All of them.
+    pub const ALL: [&str; 7] = [ZENOH, CONNECT, LISTEN, MEET, VEHICLE, KEYS, INSECURE];
 }
 
 /// A network to join. The default is local to this machine.

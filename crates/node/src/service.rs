@@ -2,6 +2,7 @@
 
 use std::future::Future;
 use std::io::IsTerminal;
+use std::path::PathBuf;
 
 use anyhow::Context;
 use tokio::signal::unix::{SignalKind, signal};
@@ -38,18 +39,30 @@ pub struct Shutdown {
 }
 
 impl Shutdown {
-    /// Requested by SIGINT (Ctrl-C) or SIGTERM.
+    /// Requested by SIGINT (Ctrl-C), SIGTERM, or SIGHUP (the end of a terminal) unless that is ignored, as `nohup` does.
     ///
     /// # Errors
     /// When the signal handlers cannot be installed.
     pub fn on_signals() -> anyhow::Result<Self> {
         let mut interrupt = signal(SignalKind::interrupt()).context("listening to SIGINT")?;
         let mut terminate = signal(SignalKind::terminate()).context("listening to SIGTERM")?;
+        // Whoever listens would undo that it is ignored.
+        let mut hangup = match ignores_hangups() {
+            true => None,
+            false => Some(signal(SignalKind::hangup()).context("listening to SIGHUP")?),
+        };
         let (sender, requested) = watch::channel(false);
         tokio::spawn(async move {
+            let hung_up = async {
+                match &mut hangup {
+                    Some(hangup) => drop(hangup.recv().await),
+                    None => std::future::pending().await,
+                }
+            };
             tokio::select! {
                 _ = interrupt.recv() => {}
                 _ = terminate.recv() => {}
+                () = hung_up => {}
             }
             // There is no receiver left when the service has ended by itself.
             sender.send_replace(true);
@@ -65,6 +78,19 @@ impl Shutdown {
         // The channel closes when the runtime shuts down, which is a request too.
         drop(requested.wait_for(|requested| *requested).await);
     }
+}
+
+/// Whether this process was started with SIGHUP ignored.
+pub fn ignores_hangups() -> bool {
+    const HANGUP: u8 = 1;
+    std::fs::read_to_string("/proc/self/status").is_ok_and(|status| is_ignored(&status, HANGUP))
+}
+
+/// Whether a process with this status (`/proc/PID/status`) ignores a signal.
+fn is_ignored(status: &str, signal: u8) -> bool {
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let ignored = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    ignored.is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
 }
 
 /// Runs a service until it ends, fails or is asked to stop, and publishes its health.
@@ -136,11 +162,28 @@ pub fn relaunch_with_zenoh_threads() {
 /// standard streams stay, and every connection is closed at once. Returns only if that fails.
 pub fn relaunch(environment: &[(&str, &str)]) -> std::io::Error {
     use std::os::unix::process::CommandExt;
-    match std::env::current_exe() {
-        Ok(program) => std::process::Command::new(program)
-            .args(std::env::args_os().skip(1))
-            .envs(environment.iter().copied())
-            .exec(),
-        Err(problem) => problem,
+    std::process::Command::new(own_program())
+        .args(std::env::args_os().skip(1))
+        .envs(environment.iter().copied())
+        .exec()
+}
+
+/// The file of this program, to start it once more: also where it was replaced or removed since it started.
+pub fn own_program() -> PathBuf {
+    let file = std::env::current_exe().ok().filter(|file| file.is_file());
+    file.unwrap_or_else(|| "/proc/self/exe".into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_ignored_signal_is_told_from_the_status_of_the_process() {
+        let status =
+            "SigBlk:\t0000000000000000\nSigIgn:\t0000000000001001\nSigCgt:\t0000000000004002\n";
+        assert!(is_ignored(status, 1));
+        assert!(!is_ignored(status, 2) && !is_ignored(status, 15));
+        assert!(!is_ignored("", 1));
     }
 }
