@@ -278,6 +278,8 @@ named! {
         BadCovariance = "bad-covariance", "its covariance is none: not symmetric, not positive semi-definite or larger than any range";
         /// The detector's confidence is too low.
         LowConfidence = "low-confidence", "its confidence is too low";
+        /// The camera repeats an old picture.
+        RepeatedPicture = "repeated-picture", "its marker stays while the vehicle moves, so the camera repeats an old picture";
         /// A frame of this stamp was used already.
         Duplicate = "duplicate", "a frame of the same stamp was used already";
         /// Too far from the estimate.

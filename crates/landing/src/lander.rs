@@ -19,6 +19,7 @@ use crate::guidance::situation::{Progress, Situation};
 use crate::history::History;
 use crate::limits::ConfigError;
 use crate::mount_check::{MountCheck, MountFindings};
+use crate::repeated_picture::RepeatedPicture;
 use crate::search;
 use crate::standing::{
     MAX_STANDING_M_S, RememberedPad, Resumed, SeenPad, StandingHeight, may_stand, to_remember,
@@ -86,6 +87,7 @@ pub struct Lander {
     start: Point<Odometry>,
     target_filter: TargetFilter,
     sightings: Sightings,
+    repeated_picture: RepeatedPicture,
     newest_frame: Option<Timestamp>,
     guidance: ActiveGuidance,
     axis_check: AxisConsistencyCheck,
@@ -136,6 +138,7 @@ impl Lander {
             start: Point::origin(),
             target_filter: TargetFilter::new(&config),
             sightings: Sightings::default(),
+            repeated_picture: RepeatedPicture::default(),
             newest_frame: None,
             guidance: ActiveGuidance::new(config.guidance),
             axis_check: AxisConsistencyCheck::default(),
@@ -407,6 +410,10 @@ impl Lander {
         }
         if let (Some(pose), Some(motion)) = (marker.body_from_marker, self.history.at(frame.stamp))
         {
+            // Nothing was seen: neither the marker, nor that it is elsewhere.
+            if self.repeated_picture.is_repeated(frame.stamp, &motion, pose.origin()) {
+                return Err(Rejection::RepeatedPicture);
+            }
             self.axis_check.add(frame.stamp, &motion, pose.origin());
         }
         self.mount_check.observe(&self.config.estimator, frame, marker, &self.history);

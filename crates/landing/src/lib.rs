@@ -16,7 +16,7 @@
 //!   the thesis' guidance; `target_filter` is the one that is needed.
 //! - [`guidance`]: from the target to a velocity. [`search`]: where to look for the marker.
 //! - [`axis_check`]: are the axes of camera and autopilot consistent? [`mount_check`]: by how much are they off?
-//!   `standing`: how high does the vehicle stand, and does it?
+//!   `standing`: how high does the vehicle stand, and does it? `repeated_picture`: is what the camera shows an old picture?
 //! - [`state_machine`]: the phases. [`envelope`]: the last check of a setpoint.
 //! - [`lander`] joins them.
 
@@ -37,6 +37,7 @@ mod limits;
 pub mod mean_target;
 mod measurement;
 pub mod mount_check;
+mod repeated_picture;
 pub mod search;
 mod standing;
 pub mod state_machine;

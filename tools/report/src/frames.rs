@@ -83,6 +83,7 @@ fn refusal(name: &str) -> &str {
         "implausible" => "refused: its pose is not below the vehicle",
         "bad-covariance" => "refused: its covariance is none",
         "low-confidence" => "refused: its confidence is too low",
+        "repeated-picture" => "refused: an old picture, which the camera repeats",
         "duplicate" => "refused: a frame of the same stamp was used already",
         "outlier" => "refused: too far from the estimate",
         _ => "refused by the controller, before the estimate",

@@ -3,7 +3,7 @@
 
 use anyhow::Context;
 use autopilot::Parser;
-use messages::{Detections, Phase, Tape};
+use messages::{Detection, Detections, Phase, Tape};
 use world::World;
 use world::vehicle::VehicleTruth;
 use world::vision::VisionFaults;
@@ -51,6 +51,8 @@ const INFO_S: f64 = 1.0;
 const CROWD: usize = 70;
 /// The largest step of a camera's clock, in seconds.
 const MAX_CLOCK_STEP_S: f64 = 2.0;
+/// By how much the places of a marker in one picture differ, as a share of its distance.
+const REPEATED_SHARE: f64 = 5e-6;
 
 /// Flies it.
 ///
@@ -93,6 +95,8 @@ struct FaultyFlight<'a> {
     sequence: u64,
     /// The newest frame of a detector that stands still.
     held: Option<Arrival>,
+    /// What was found in the picture that the camera repeats.
+    picture: Option<Vec<Detection>>,
     detector_alive: bool,
     told_crowd: bool,
     info_due_s: f64,
@@ -130,6 +134,7 @@ impl<'a> FaultyFlight<'a> {
             crowd: (0..CROWD).map(|number| format!("stranger-{number}")).collect(),
             frame_period_s,
             held: None,
+            picture: None,
             detector_alive: true,
             told_crowd: false,
             info_due_s: 0.0,
@@ -334,6 +339,7 @@ impl<'a> FaultyFlight<'a> {
                 let stamp = |time_s: f64| stamp_ns(time_s + step_s);
                 let arrivals = self.vision.observe(&self.world, self.sequence, time_s, stamp)?;
                 for arrival in arrivals {
+                    let arrival = self.repeated(arrival);
                     self.detect(arrival);
                 }
             }
@@ -352,6 +358,24 @@ impl<'a> FaultyFlight<'a> {
             self.controller.detections(LIAR, payload);
         }
         Ok(())
+    }
+
+    /// What is found in the picture of a frame: where the camera repeats one, what was found in that. A detector finds it again to
+    /// within some millionths, as it remembers more of the camera each time.
+    fn repeated(&mut self, arrival: Arrival) -> Arrival {
+        if !self.is_on(Kind::PictureRepeated) {
+            self.picture = None;
+            return arrival;
+        }
+        let mut detections =
+            self.picture.get_or_insert_with(|| arrival.message.detections.clone()).clone();
+        let share = if self.sequence.is_multiple_of(2) { 0.0 } else { REPEATED_SHARE };
+        for pose in detections.iter_mut().filter_map(|it| it.pose.as_mut()) {
+            for number in &mut pose.camera_from_marker.translation_m {
+                *number *= 1.0 + share;
+            }
+        }
+        Arrival { message: Detections { detections, ..arrival.message }, ..arrival }
     }
 
     fn detect(&mut self, arrival: Arrival) {

@@ -52,6 +52,8 @@ pub enum Kind {
     FramesCorruption,
     /// The camera's clock steps: the stamps of its frames are wrong by one amount.
     ClockStep,
+    /// The camera repeats its last picture, with new stamps.
+    PictureRepeated,
     /// A preferred detector says that the marker is 1 m beside its place.
     LiarJumps,
     /// A preferred detector lets the marker drift by 5 cm/s.
@@ -103,7 +105,7 @@ pub enum Kind {
 /// A kind, its name and its description.
 type Row = (Kind, &'static str, &'static str);
 
-const TABLE: [Row; 45] = [
+const TABLE: [Row; 46] = [
     (
         Kind::ControllerKilled,
         "controller-killed",
@@ -130,6 +132,11 @@ const TABLE: [Row; 45] = [
     (Kind::FramesReordering, "frames-reordering", "30 % of them arrive up to 0.3 s later"),
     (Kind::FramesCorruption, "frames-corruption", "30 % of them have flipped bits"),
     (Kind::ClockStep, "clock-step", "frames' stamps are wrong by up to 2 s, either way"),
+    (
+        Kind::PictureRepeated,
+        "picture-repeated",
+        "the camera repeats its last picture, with new stamps",
+    ),
     (Kind::LiarJumps, "liar-jumps", "a preferred detector is 1 m off, from one frame to the next"),
     (Kind::LiarDrifts, "liar-drifts", "a preferred detector drifts by 5 cm/s"),
     (Kind::PreferredIsBlind, "preferred-is-blind", "a preferred detector finds nothing"),
@@ -263,7 +270,7 @@ mod tests {
 
     #[test]
     fn every_kind_has_a_unique_name() {
-        assert_eq!((Kind::all().count(), Kind::in_lockstep().count()), (45, 39));
+        assert_eq!((Kind::all().count(), Kind::in_lockstep().count()), (46, 40));
         for kind in Kind::all() {
             assert_eq!(kind.name().parse(), Ok(kind));
             assert!(!kind.words().is_empty());
