@@ -7,6 +7,7 @@ use ::image::{ColorType, DynamicImage, ImageDecoder, ImageReader, Limits};
 use imaging::{BayerPattern, Converter, GrayImage, GrayView, SampleFormat};
 
 use crate::contained::contained;
+use crate::huffman::with_tables;
 use crate::jpeg::{is_jpeg, jpeg_len};
 
 /// Default limit for the pixels of an image.
@@ -229,6 +230,8 @@ impl DecodedImage {
 
     /// As [`DecodedImage::decode`]; panics where the decoder does.
     fn decode_unchecked(path: &Path, bytes: &[u8], max_pixels: u64) -> Result<Self, ImageError> {
+        // The decoder knows the standard tables only behind the segment that the files of an AVI video have.
+        let bytes = &*with_tables(bytes);
         let mut decoder = decoder(path, bytes, max_pixels)?;
         // The decoder fills the missing part of a JPEG with grey.
         if is_jpeg(bytes) && jpeg_len(bytes).is_none() {

@@ -1,10 +1,18 @@
-//! JPEG files in a stream of bytes: where one starts (SOI) and where it ends (EOI), after ISO/IEC 10918-1,
+//! JPEG files in a stream of bytes: where one starts (SOI) and where it ends (EOI), and its segments, after ISO/IEC 10918-1,
 //! Annex B.
 
 /// Start-of-image marker.
 const SOI: [u8; 2] = [0xff, 0xd8];
 /// End-of-image marker.
 const EOI: [u8; 2] = [0xff, 0xd9];
+/// Second byte of the marker of a frame header: baseline sequential, coded by Huffman's method.
+pub(crate) const SOF_BASELINE: u8 = 0xc0;
+/// The same for an extended sequential frame.
+pub(crate) const SOF_EXTENDED: u8 = 0xc1;
+/// Second byte of the marker of Huffman tables.
+pub(crate) const DHT: u8 = 0xc4;
+/// Second byte of the marker of a scan header, which coded data follow.
+pub(crate) const SOS: u8 = 0xda;
 
 /// True for bytes that begin as a JPEG file does.
 pub(crate) fn is_jpeg(bytes: &[u8]) -> bool {
@@ -50,6 +58,43 @@ fn end_of_image(bytes: &[u8], at: &mut usize) -> Option<usize> {
             _ => {
                 let &[high, low] = bytes.get(code + 1..code + 3)? else { return None };
                 *at = code + 1 + usize::from(u16::from_be_bytes([high, low])).max(2);
+            }
+        }
+    }
+}
+
+/// A segment of a JPEG file.
+pub(crate) struct Segment {
+    /// Second byte of its marker.
+    pub(crate) code: u8,
+    /// Where its marker begins.
+    pub(crate) at: usize,
+}
+
+/// The segments of the JPEG file at the start of `bytes`, up to the header of its first scan.
+pub(crate) fn segments(bytes: &[u8]) -> impl Iterator<Item = Segment> {
+    let mut next = is_jpeg(bytes).then_some(SOI.len());
+    std::iter::from_fn(move || {
+        let (segment, end) = next_segment(bytes, next?)?;
+        next = (segment.code != SOS).then_some(end);
+        Some(segment)
+    })
+}
+
+/// The first segment at or behind `at`, a place between segments, and where it ends.
+fn next_segment(bytes: &[u8], mut at: usize) -> Option<(Segment, usize)> {
+    loop {
+        at += bytes.get(at..)?.iter().position(|byte| *byte == 0xff)?;
+        let code = *bytes.get(at + 1)?;
+        match code {
+            // A fill byte may be the first byte of a marker itself.
+            0xff => at += 1,
+            0x00 | 0x01 | 0xd0..=0xd8 => at += 2,
+            0xd9 => return None,
+            _ => {
+                let length = bytes.get(at + 2..)?.first_chunk()?;
+                let end = at + 2 + usize::from(u16::from_be_bytes(*length));
+                return (end <= bytes.len()).then_some((Segment { code, at }, end));
             }
         }
     }
@@ -132,6 +177,16 @@ mod tests {
         for len in 0..FILE.len() {
             assert_eq!(jpeg_len(&FILE[..len]), None, "{len}");
         }
+    }
+
+    #[test]
+    fn the_segments_of_a_file_end_with_its_scan_header() {
+        let found = |file| segments(file).map(|it| (it.code, it.at)).collect::<Vec<_>>();
+        let comment = (0xfe, 3);
+        assert_eq!(found(FILE), [comment, (SOS, 11)]);
+        assert_eq!(found(&FILE[..14]), [comment]);
+        assert_eq!(found(&FILE[..10]), []);
+        assert_eq!(found(&FILE[1..]), []);
     }
 
     #[test]
