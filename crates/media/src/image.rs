@@ -9,6 +9,7 @@ use imaging::{BayerPattern, Converter, GrayImage, GrayView, SampleFormat};
 use crate::contained::contained;
 use crate::huffman::with_tables;
 use crate::jpeg::{is_jpeg, jpeg_len};
+use crate::scan::check_scan;
 
 /// Default limit for the pixels of an image.
 pub const DEFAULT_MAX_PIXELS: u64 = 100_000_000;
@@ -237,12 +238,14 @@ impl DecodedImage {
         if is_jpeg(bytes) && jpeg_len(bytes).is_none() {
             return Err(ImageError::Cut { path: path.to_owned() });
         }
-        let damaged = |cause: ::image::ImageError| ImageError::Damaged {
+        let damaged = |cause: &dyn std::fmt::Display| ImageError::Damaged {
             path: path.to_owned(),
             cause: cause.to_string(),
         };
-        let orientation = decoder.orientation().map_err(damaged)?;
-        let mut image = DynamicImage::from_decoder(decoder).map_err(damaged)?;
+        // The decoder takes the blocks behind a hole for those within it.
+        check_scan(bytes).map_err(|fault| damaged(&fault))?;
+        let orientation = decoder.orientation().map_err(|cause| damaged(&cause))?;
+        let mut image = DynamicImage::from_decoder(decoder).map_err(|cause| damaged(&cause))?;
         image.apply_orientation(orientation);
         Ok(Self { image })
     }

@@ -11,6 +11,8 @@ pub(crate) const SOF_BASELINE: u8 = 0xc0;
 pub(crate) const SOF_EXTENDED: u8 = 0xc1;
 /// Second byte of the marker of Huffman tables.
 pub(crate) const DHT: u8 = 0xc4;
+/// Second byte of the marker of a restart interval's length.
+pub(crate) const DRI: u8 = 0xdd;
 /// Second byte of the marker of a scan header, which coded data follow.
 pub(crate) const SOS: u8 = 0xda;
 
@@ -64,15 +66,17 @@ fn end_of_image(bytes: &[u8], at: &mut usize) -> Option<usize> {
 }
 
 /// A segment of a JPEG file.
-pub(crate) struct Segment {
+pub(crate) struct Segment<'a> {
     /// Second byte of its marker.
     pub(crate) code: u8,
     /// Where its marker begins.
     pub(crate) at: usize,
+    /// What follows its length.
+    pub(crate) parameters: &'a [u8],
 }
 
 /// The segments of the JPEG file at the start of `bytes`, up to the header of its first scan.
-pub(crate) fn segments(bytes: &[u8]) -> impl Iterator<Item = Segment> {
+pub(crate) fn segments(bytes: &[u8]) -> impl Iterator<Item = Segment<'_>> {
     let mut next = is_jpeg(bytes).then_some(SOI.len());
     std::iter::from_fn(move || {
         let (segment, end) = next_segment(bytes, next?)?;
@@ -82,7 +86,7 @@ pub(crate) fn segments(bytes: &[u8]) -> impl Iterator<Item = Segment> {
 }
 
 /// The first segment at or behind `at`, a place between segments, and where it ends.
-fn next_segment(bytes: &[u8], mut at: usize) -> Option<(Segment, usize)> {
+fn next_segment(bytes: &[u8], mut at: usize) -> Option<(Segment<'_>, usize)> {
     loop {
         at += bytes.get(at..)?.iter().position(|byte| *byte == 0xff)?;
         let code = *bytes.get(at + 1)?;
@@ -94,7 +98,8 @@ fn next_segment(bytes: &[u8], mut at: usize) -> Option<(Segment, usize)> {
             _ => {
                 let length = bytes.get(at + 2..)?.first_chunk()?;
                 let end = at + 2 + usize::from(u16::from_be_bytes(*length));
-                return (end <= bytes.len()).then_some((Segment { code, at }, end));
+                let parameters = bytes.get(at + 4..end)?;
+                return Some((Segment { code, at, parameters }, end));
             }
         }
     }
@@ -181,9 +186,10 @@ mod tests {
 
     #[test]
     fn the_segments_of_a_file_end_with_its_scan_header() {
-        let found = |file| segments(file).map(|it| (it.code, it.at)).collect::<Vec<_>>();
-        let comment = (0xfe, 3);
-        assert_eq!(found(FILE), [comment, (SOS, 11)]);
+        let found =
+            |file| segments(file).map(|it| (it.code, it.at, it.parameters)).collect::<Vec<_>>();
+        let comment = (0xfe, 3, &FILE[7..11]);
+        assert_eq!(found(FILE), [comment, (SOS, 11, &[])]);
         assert_eq!(found(&FILE[..14]), [comment]);
         assert_eq!(found(&FILE[..10]), []);
         assert_eq!(found(&FILE[1..]), []);

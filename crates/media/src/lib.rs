@@ -3,8 +3,9 @@
 //! The crate knows no marker, no camera that is connected, and no other process.
 //!
 //! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, `huffman` gives them the tables that a camera leaves
-//! out, [`image`] reads image files, [`video`] reads videos frame by frame, [`h264`] decodes what a camera streams, [`calibration`]
-//! reads and writes the calibration files of other programs, [`rectify`] takes a lens's distortion out of images.
+//! out, `scan` says whether their data are whole, [`image`] reads image files, [`video`] reads videos frame by frame, [`h264`]
+//! decodes what a camera streams, [`calibration`] reads and writes the calibration files of other programs, [`rectify`] takes a
+//! lens's distortion out of images.
 
 mod boxes;
 mod budget;
@@ -15,6 +16,7 @@ mod huffman;
 pub mod image;
 pub mod jpeg;
 pub mod rectify;
+mod scan;
 pub mod video;
 
 pub use calibration::{
