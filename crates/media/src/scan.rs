@@ -377,10 +377,10 @@ impl<'a> Scan<'a> {
         Ok(())
     }
 
-    /// True when what follows the last block are blocks, too: it begins within a byte, or ends with an MCU where the data do.
+    /// True when what follows the last block are blocks, too: they end with an MCU where the data do.
     fn goes_on(&self, mut bits: Bits<'_>) -> bool {
-        if bits.is_at_marker() || !bits.is_filled() {
-            return !bits.is_at_marker();
+        if bits.is_at_marker() {
+            return false;
         }
         while self.skip_mcu(&mut bits, &mut 0).is_ok() {
             if bits.is_at_marker() {
