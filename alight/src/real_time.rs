@@ -176,7 +176,7 @@ impl<'a> RealFlight<'a> {
     }
 
     fn start(&mut self, part: Part, settings: &[String]) -> anyhow::Result<()> {
-        let program = std::env::current_exe().context("finding this program's own file")?;
+        let program = node::own_program();
         let is_apart = part == Part::World && self.has_own_camera();
         let (meet, vehicle) = if is_apart { (self.apart, WORLD) } else { (self.meet, VEHICLE) };
         let mut command = if self.has(|kind| kind == Kind::FullSharedMemory) {

@@ -198,14 +198,15 @@ impl NewDetector {
                 None => layers.load::<detector::Config>()?.settings.id,
             };
             let id = free_name(&wanted, existing);
-            let layers = Layers { set: vec![format!("id={id}")], ..layers };
-            layers.load::<detector::Config>()?;
-            let words = ["detector", "--config", &args.to, "--set", &format!("id={id}")];
-            return Ok(Self {
-                program: std::env::current_exe().context("finding this program's own file")?,
-                args: words.map(str::to_owned).into(),
-                id: Some(id),
-            });
+            let network = args.network.network();
+            // As a site's detectors on the ground have it: it takes the place of one of those.
+            let is_ground = network.config.is_some_and(|config| config == Path::new("ground"));
+            let place = is_ground.then(|| "place=ground".to_owned());
+            let set: Vec<_> = place.into_iter().chain([format!("id={id}")]).collect();
+            let mut words = vec!["detector".to_owned(), "--config".to_owned(), args.to.clone()];
+            words.extend(set.iter().flat_map(|setting| ["--set".to_owned(), setting.clone()]));
+            Layers { set, ..layers }.load::<detector::Config>()?;
+            return Ok(Self { program: node::own_program(), args: words, id: Some(id) });
         }
         let words = shlex::split(&args.to).filter(|words| !words.is_empty());
         let mut words = words

@@ -110,7 +110,7 @@ pub(crate) fn run(
     without: &[String],
     network: &NetworkArgs,
 ) -> anyhow::Result<ExitCode> {
-    let overview = overview(&files, without)?;
+    let (files, overview) = in_order(files, without)?;
     let first_ns = overview.first_ns.context("nothing in the recording is to be published")?;
     with_node(network, "replay", async |node| {
         for pause in LOOKS {
@@ -143,21 +143,37 @@ pub(crate) fn run(
     Ok(ExitCode::SUCCESS)
 }
 
-fn overview(files: &[Vec<u8>], without: &[String]) -> anyhow::Result<Overview> {
-    let mut overview = Overview::default();
+/// The files of a recording in the order in which they were written, and what they say together.
+fn in_order(files: Vec<Vec<u8>>, without: &[String]) -> anyhow::Result<(Vec<Vec<u8>>, Overview)> {
+    let mut whole = Overview::default();
+    let mut parts = Vec::new();
     for file in files {
-        flightlog::read(file, |entry| {
-            let Entry::Message(Received { key, received_ns, .. }) = entry else { return };
-            let Some(row) = played(key, without) else { return };
-            if row.delivery != Delivery::LastValue {
-                overview.first_ns.get_or_insert(received_ns);
-            }
-            overview.last_ns = overview.last_ns.max(received_ns);
-            if let Some(name) = Name::of_health(key) {
-                overview.services.insert(name, received_ns);
-            }
-        })?;
+        let part = overview(&file, without)?;
+        whole.first_ns = whole.first_ns.into_iter().chain(part.first_ns).min();
+        whole.last_ns = whole.last_ns.max(part.last_ns);
+        for (name, last_ns) in part.services {
+            let newest_ns = whole.services.entry(name).or_insert(last_ns);
+            *newest_ns = last_ns.max(*newest_ns);
+        }
+        parts.push((part.first_ns, file));
     }
+    parts.sort_by_key(|(first_ns, _)| *first_ns);
+    Ok((parts.into_iter().map(|(_, file)| file).collect(), whole))
+}
+
+fn overview(file: &[u8], without: &[String]) -> anyhow::Result<Overview> {
+    let mut overview = Overview::default();
+    flightlog::read(file, |entry| {
+        let Entry::Message(Received { key, received_ns, .. }) = entry else { return };
+        let Some(row) = played(key, without) else { return };
+        if row.delivery != Delivery::LastValue {
+            overview.first_ns.get_or_insert(received_ns);
+        }
+        overview.last_ns = overview.last_ns.max(received_ns);
+        if let Some(name) = Name::of_health(key) {
+            overview.services.insert(name, received_ns);
+        }
+    })?;
     Ok(overview)
 }
 

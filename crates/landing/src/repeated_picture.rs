@@ -64,6 +64,7 @@ mod tests {
     fn motion(height_m: f64) -> Motion {
         Motion {
             ned_from_body: Rotation::identity(),
+            position: Point::new(0.0, 0.0, -height_m),
             odometry: Point::<Odometry>::new(0.0, 0.0, -height_m),
             velocity: Vector::zero(),
             rate: Vector::zero(),

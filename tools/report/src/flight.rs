@@ -64,6 +64,8 @@ pub struct Unreadable {
 /// The first and the last health of a process.
 #[derive(Clone, Debug)]
 pub struct Process {
+    /// When the recorder got the first, in nanoseconds of the recorder's clock: a process may stamp by the clock of another machine.
+    pub first_ns: i64,
     /// The first.
     pub first: Health,
     /// The last.
@@ -383,7 +385,7 @@ impl Flight {
             }
             ["health", ..] => {
                 let health = self.decoded(topic::HEALTH, key, payload);
-                health.into_iter().for_each(|health| self.add_health(health));
+                health.into_iter().for_each(|health| self.add_health(health, received_ns));
             }
             ["config", ..] => {
                 if let Some(configuration) = self.decoded(topic::CONFIGURATION, key, payload) {
@@ -431,12 +433,13 @@ impl Flight {
         }
     }
 
-    fn add_health(&mut self, health: Health) {
+    fn add_health(&mut self, health: Health, received_ns: i64) {
         let name = format!("{}/{} ({})", health.service, health.instance, health.pid);
         match self.processes.get_mut(&name) {
             Some(process) => process.last = health,
             None => {
-                self.processes.insert(name, Process { first: health.clone(), last: health });
+                let (first_ns, first) = (received_ns, health.clone());
+                self.processes.insert(name, Process { first_ns, first, last: health });
             }
         }
     }

@@ -149,7 +149,7 @@ fn processes(flight: &Flight) -> Vec<Line> {
         if said.insert(name) {
             let health = &process.first;
             lines.push(Line {
-                time_s: flight.at_s(flight.vehicle_ns(health.stamp_ns)),
+                time_s: flight.at_s(flight.vehicle_ns(process.first_ns)),
                 who: health.service.clone(),
                 is_warning: false,
                 text: format!(
