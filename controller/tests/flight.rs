@@ -482,7 +482,8 @@ fn a_strangers_calibration_is_refused_in_flight_and_told() {
 
 #[test]
 fn while_two_detectors_see_the_marker_at_two_places_nothing_descends_near_the_ground() {
-    let descent = |height_m: f32, lie_m: f64| {
+    // It comes down to a height from where the landing began, so much higher.
+    let descent_from = |above_m: f32, end_m: f32, lie_m: f64| {
         let mut flight = flight("airborne");
         flight.camera(0, CameraInfo::sample());
         flight.presence(0, "main", true);
@@ -492,6 +493,7 @@ fn while_two_detectors_see_the_marker_at_two_places_nothing_descends_near_the_gr
             if ms % 1000 == 0 {
                 receive(&mut flight, ms * MS, &heartbeat(4, true));
             }
+            let height_m = end_m + above_m * (1.0 - ms as f32 / 1000.0).max(0.0);
             pose_at(&mut flight, ms * MS, height_m);
             if ms % 60 == 0 {
                 for (name, lie_m) in [("main", 0.0), ("other", lie_m)] {
@@ -506,11 +508,14 @@ fn while_two_detectors_see_the_marker_at_two_places_nothing_descends_near_the_gr
         let status = flight.status(4000 * MS);
         (status.setpoint.unwrap().velocity_ned_m_s[2], status)
     };
+    let descent = |end_m: f32, lie_m: f64| descent_from(1.0, end_m, lie_m);
     let (down_m_s, status) = descent(2.0, 0.0);
     assert!(down_m_s > 0.0, "{status:?}");
     let (down_m_s, status) = descent(2.0, 1.0);
     assert!(down_m_s < 0.0 && status.why.contains("at two places"), "{status:?}");
     assert!(status.warnings[0].contains("1.00 m apart"), "{status:?}");
+    let (down_m_s, status) = descent_from(0.0, 2.0, 1.0);
+    assert!(down_m_s == 0.0 && status.why.contains("at two places"), "it began there: {status:?}");
     let (down_m_s, status) = descent(6.0, 1.0);
     assert!(down_m_s > 0.0, "high up it goes on: {status:?}");
 }

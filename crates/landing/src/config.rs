@@ -187,8 +187,8 @@ settings! {
         search_radius_m: f64 = 5.0, 0.0..=50.0;
         /// Radius about the local origin that the search does not leave, in m; 0 sets none.
         fence_radius_m: f64 = 0.0, 0.0..=10_000.0;
-        /// Height over the local origin that neither search nor retry nor the climb of an aborted landing
-        /// exceeds, in m; 0 sets none.
+        /// Height over the local origin that neither search nor retry nor the climb of an aborted landing or of
+        /// a dispute exceeds, in m; 0 sets none.
         fence_height_m: f64 = 0.0, 0.0..=1_000.0;
         /// Maximum wait before the descent for natural motion that shows whether the axes of camera and
         /// autopilot agree, in s; 0 turns the check off.
@@ -218,7 +218,8 @@ settings! {
         /// Maximum duration of a retry, in s; then the search starts.
         retry_timeout_s: f64 = 8.0, 1.0..=60.0;
         /// Height over the target above which the vehicle stays while two detectors see the marker at two
-        /// places, in m; 0 lets it descend.
+        /// places, in m; from below it climbs back, but not above the height where the landing started. 0 lets it
+        /// descend.
         dispute_height_m: f64 = 2.5, 0.0..=50.0;
         /// Maximum time there until the vehicle holds, in s.
         dispute_timeout_s: f64 = 15.0, 1.0..=600.0;

@@ -668,12 +668,21 @@ impl Lander {
     }
 
     /// The velocity while detectors see the marker at two places: not below a height from which the vehicle
-    /// can still be led to either, and back up to it.
-    fn disputed_velocity(&self, height_m: f64, wanted: Vector<Ned>) -> Vector<Ned> {
+    /// can still be led to either, and back up to it, but neither over the fence nor over the height where the
+    /// landing started.
+    fn disputed_velocity(
+        &self,
+        place: Point<Ned>,
+        target: &TargetEstimate,
+        wanted: Vector<Ned>,
+    ) -> Vector<Ned> {
         let phases = &self.config.phases;
-        let above_m = height_m - phases.dispute_height_m;
-        let down_m_s = above_m.clamp(-phases.retry_climb_m_s, f64::MAX);
-        Vector::new(wanted.x(), wanted.y(), libm::fmin(wanted.z(), down_m_s))
+        let above_m = target.height_m - phases.dispute_height_m;
+        let below_start_m = libm::fmax(self.altitude_of(self.start) + place.z(), 0.0);
+        let max_climb_m_s = libm::fmin(phases.retry_climb_m_s, below_start_m);
+        let down_m_s = libm::fmax(above_m, -max_climb_m_s);
+        let level = Vector::new(wanted.x(), wanted.y(), libm::fmin(wanted.z(), down_m_s));
+        envelope::below_fence(phases, place, level)
     }
 
     fn guided(&mut self, now: Timestamp) -> (Action, Reason) {
@@ -685,7 +694,7 @@ impl Lander {
         if self.waits_for_agreement(&situation)
             && let Some(target) = situation.target
         {
-            let level = self.disputed_velocity(target.height_m, wanted);
+            let level = self.disputed_velocity(vehicle.position, &target, wanted);
             if level.z() < wanted.z() {
                 (wanted, why) = (level, Reason::Disputed);
             }

@@ -403,6 +403,50 @@ fn a_retry_stays_below_the_fence() {
     assert!(has_retried && highest_m < 4.3, "{has_retried} {highest_m}");
 }
 
+/// The height to which a vehicle climbs that is 1 m over the pad when two detectors begin to differ, in metres.
+fn climbed_in_a_dispute_m(config: Config, started_m: f64) -> f64 {
+    let mut told = Told::started(config, started_m);
+    told.pad = Some(Point::origin());
+    for _ in 0..1200 {
+        if told.position.z() > -1.0 {
+            break;
+        }
+        told.fly(STEP_S);
+    }
+    assert!(told.position.z() > -1.0 && told.phase() == Phase::Descend, "{:?}", told.position);
+    told.tell(Event::Dispute(true));
+    let mut highest_m = 0.0f64;
+    for _ in 0..400 {
+        told.fly(STEP_S);
+        highest_m = highest_m.max(-told.position.z());
+    }
+    highest_m
+}
+
+#[test]
+fn the_climb_of_a_dispute_stays_below_the_fence_and_the_start() {
+    let config = Config::default();
+    let free_m = climbed_in_a_dispute_m(config, 6.0);
+    assert!((free_m - 2.5).abs() < 0.1, "{free_m} m");
+    let low_m = climbed_in_a_dispute_m(config, 1.6);
+    assert!((low_m - 1.6).abs() < 0.1, "{low_m} m");
+    let mut fenced = config;
+    fenced.phases.fence_height_m = 2.0;
+    let fenced_m = climbed_in_a_dispute_m(fenced, 6.0);
+    assert!(fenced_m < 2.0, "{fenced_m} m");
+}
+
+#[test]
+fn a_dispute_over_a_pad_that_is_higher_than_the_start_lets_nothing_descend() {
+    let mut told = Told::started(Config::default(), 1.0);
+    told.rise(8.0);
+    told.tell(Event::Dispute(true));
+    told.pad = Some(Point::new(0.0, 0.0, -3.0));
+    told.fly(14.0);
+    let height_m = -told.position.z() - 3.0;
+    assert!((height_m - 2.5).abs() < 0.2, "{height_m} m");
+}
+
 #[test]
 fn numbers_of_a_detector_that_make_no_sense_are_refused() {
     let mut told = Told::started(Config::default(), 5.0);
