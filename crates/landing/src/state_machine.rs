@@ -37,7 +37,7 @@
 //! | the vehicle's state is stale, or its mode not known | Hold; Final waits |
 //! | the link to the autopilot is slow | Hold |
 //! | a mode that is neither GUIDED nor the requested LAND; GUIDED again in LAND, `MAX_OVERTAKEN_S` after it began | PilotInCommand |
-//! | on the ground; still and low over the pad, where Search or Retry would follow, or in Search | Final |
+//! | on the ground; still and low over the pad, where Search or Retry would follow, in Search, or where the link is slow | Final |
 //! | disarmed | Landed on the ground or in LAND, else, half a second later, Aborted |
 //! | an alarm | as configured for it |
 //!
@@ -252,8 +252,12 @@ impl StateMachine {
         let is_disarmed = inputs.vehicle.is_some_and(|vehicle| !vehicle.armed);
         self.disarmed = is_disarmed.then(|| self.disarmed.unwrap_or(inputs.now));
         if let Some((phase, reason)) = self.interruption(inputs).or_else(|| self.next(inputs)) {
-            // Search and retry climb. An autopilot reports the ground seconds late: ArduPilot 7 s after the touchdown.
-            let climbs = matches!(phase, Phase::Search | Phase::Retry);
+            // Search and retry climb, and so does a low hold over a slow link. An autopilot reports the ground seconds late:
+            // ArduPilot 7 s after the touchdown.
+            let climbs = matches!(
+                (phase, reason),
+                (Phase::Search | Phase::Retry, _) | (Phase::Hold, Reason::LinkSlow)
+            );
             let (phase, reason) = if climbs && inputs.may_stand {
                 (Phase::Final, Reason::MayStand)
             } else {
@@ -606,6 +610,9 @@ impl StateMachine {
         };
         if self.timed_out(inputs, timeout_s) {
             return Some((Phase::Aborted, Reason::HeldTooLong));
+        }
+        if self.reason == Reason::LinkSlow && inputs.may_stand && !is_stale {
+            return Some((Phase::Final, Reason::MayStand));
         }
         let resumes = match self.reason {
             Reason::TargetLost | Reason::TargetRefused | Reason::TargetNotFound => {

@@ -498,6 +498,27 @@ fn a_slow_link_holds_until_it_is_quick_again() {
 }
 
 #[test]
+fn a_vehicle_that_may_stand_is_landed_and_not_lifted_when_its_link_becomes_slow() {
+    let [a, b, c] = [start(), seen(1.0, Progress::Unchanged), seen(2.0, Progress::Descending)];
+    let slow = |seconds, may_stand| Inputs {
+        is_link_slow: true,
+        may_stand,
+        ..seen(seconds, Progress::Descending)
+    };
+    check(&[a, b, c, slow(3.0, true)], Phase::Final, Reason::MayStand);
+    check(&[a, b, c, slow(3.0, false)], Phase::Hold, Reason::LinkSlow);
+    // It touches down after the link has become slow.
+    check(&[a, b, c, slow(3.0, false), slow(3.5, true)], Phase::Final, Reason::MayStand);
+    // Without a heartbeat LAND cannot be asked for.
+    let unknown =
+        Inputs { vehicle: flown(3.5, |v| v.mode = Mode::Unknown).vehicle, ..slow(3.5, true) };
+    check(&[a, b, c, slow(3.0, false), unknown], Phase::Hold, Reason::LinkSlow);
+    // Another hold is the operator's to end.
+    let held = commanded(3.0, OperatorCommand::Hold);
+    check(&[a, b, c, held, slow(3.5, true)], Phase::Hold, Reason::OperatorHold);
+}
+
+#[test]
 fn a_running_axis_check_also_delays_a_descent_without_the_marker() {
     let blind = Inputs { may_descend: false, ..seen(2.0, Progress::Blind) };
     check(&[start(), seen(1.0, Progress::Unchanged), blind], Phase::Approach, Reason::Aligning);
