@@ -22,7 +22,8 @@ use crate::mount_check::{MountCheck, MountFindings};
 use crate::repeated_picture::RepeatedPicture;
 use crate::search;
 use crate::standing::{
-    MAX_STANDING_M_S, RememberedPad, Resumed, SeenPad, StandingHeight, may_stand, to_remember,
+    MAX_STANDING_M_S, RememberedPad, Resumed, SeenPad, StandingHeight, may_stand,
+    standing_height_m, to_remember,
 };
 use crate::state_machine::{Inputs, StateMachine, VehicleInputs, reaction};
 use crate::target_filter::{Sightings, TargetFilter};
@@ -37,6 +38,10 @@ const HAND_OVER_S: f64 = 1.0;
 /// Height over the one at which it waits for detectors to agree, at which the vehicle counts as waiting, in
 /// metres.
 const DISPUTE_MARGIN_M: f64 = 0.5;
+
+/// Height over the one that it stands with, in metres, up to which LAND is asked for although detectors do not agree: a climb may
+/// be one from the ground.
+const MAX_DISPUTED_LAND_M: f64 = 0.3;
 
 /// Maximum height over the target or the ground, in metres, at which the autopilot's report of the ground is
 /// believed: estimates of the height err by decimetres.
@@ -595,7 +600,22 @@ impl Lander {
         }
         let Some(vehicle) = self.history.newest().copied() else { return Progress::Unchanged };
         let situation = self.situation(now, &vehicle);
-        self.guidance.progress(&situation)
+        match self.guidance.progress(&situation) {
+            Progress::Ready(reason)
+                if reason != Reason::TouchedEarly
+                    && self.waits_for_agreement(&situation)
+                    && self.is_over_contact(&situation) =>
+            {
+                Progress::Unchanged
+            }
+            progress => progress,
+        }
+    }
+
+    /// True where the vehicle is certainly not about to stand on the target.
+    fn is_over_contact(&self, situation: &Situation<'_>) -> bool {
+        let standing_m = standing_height_m(&self.config);
+        situation.target.is_some_and(|target| target.height_m - standing_m > MAX_DISPUTED_LAND_M)
     }
 
     /// The action of the present phase.

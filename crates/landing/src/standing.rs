@@ -208,7 +208,8 @@ fn is_recent(situation: &Situation<'_>, config: &Config) -> bool {
     situation.now.seconds_since(situation.vehicle.stamp) <= config.phases.stale_vehicle_s
 }
 
-fn standing_height_m(config: &Config) -> f64 {
+/// Height over the pad of the body's origin of a vehicle that stands on it, in metres.
+pub(crate) fn standing_height_m(config: &Config) -> f64 {
     match &config.guidance {
         GuidanceConfig::Metric(metric) => metric.standing_height_m,
         GuidanceConfig::Thesis(_) => 0.0,

@@ -4,8 +4,9 @@
 
 use geometry::{Body, Marker, Ned, Pixel, Point, Rotation, Transform, Vector};
 use landing::{
-    Action, Alarm, Config, Decision, Event, FrameObservation, Landed, Lander, MarkerInFrame, Mode,
-    OnAbort, OperatorCommand, Phase, Reason, Rejection, Timestamp, VehicleState, VehicleStatus,
+    Action, Alarm, Config, Decision, Event, FrameObservation, GuidanceConfig, Landed, Lander,
+    MarkerInFrame, MetricConfig, Mode, OnAbort, OperatorCommand, Phase, Reason, Rejection,
+    ThesisConfig, Timestamp, VehicleState, VehicleStatus,
 };
 use nalgebra::Matrix3;
 
@@ -445,6 +446,27 @@ fn a_dispute_over_a_pad_that_is_higher_than_the_start_lets_nothing_descend() {
     told.fly(14.0);
     let height_m = -told.position.z() - 3.0;
     assert!((height_m - 2.5).abs() < 0.2, "{height_m} m");
+}
+
+#[test]
+fn land_is_not_asked_for_above_the_height_of_a_dispute_while_detectors_disagree() {
+    let metric = MetricConfig { land_height_m: 3.0, ..MetricConfig::default() };
+    let thesis = ThesisConfig { land_altitude_m: 3.0, ..ThesisConfig::default() };
+    for guidance in [GuidanceConfig::Metric(metric), GuidanceConfig::Thesis(thesis)] {
+        let config = Config { guidance, ..Config::default() };
+        let mut told = Told::started(config, 6.0);
+        told.pad = Some(Point::origin());
+        told.fly(1.0);
+        told.tell(Event::Dispute(true));
+        told.fly(14.0);
+        assert!(!told.has_asked_for_land() && told.phase() != Phase::Final);
+        assert!(told.position.z() < -2.3, "{:?}", told.position);
+        told.fly(16.0);
+        assert_eq!((told.phase(), told.has_asked_for_land()), (Phase::Hold, false));
+        told.tell(Event::Dispute(false));
+        told.fly(8.0);
+        assert!(told.has_asked_for_land(), "{:?} {:?}", told.phase(), told.position);
+    }
 }
 
 #[test]
