@@ -470,6 +470,24 @@ fn land_is_not_asked_for_above_the_height_of_a_dispute_while_detectors_disagree(
 }
 
 #[test]
+fn a_retry_that_cannot_rise_has_the_time_of_the_first_try() {
+    // The landing began so low that no retry rises above the height of waiting, and the pad stays aside.
+    let mut told = Told::started(Config::default(), 0.45);
+    told.pad = Some(Point::new(0.4, 0.0, 0.0));
+    told.run(60.0, true);
+    let mut retries = Vec::new();
+    for pair in told.decisions.windows(2) {
+        if pair[0].1.phase != Phase::Retry && pair[1].1.phase == Phase::Retry {
+            retries.push(pair[1].0);
+        }
+    }
+    assert!(retries.len() > 2, "{retries:?}");
+    for pair in retries.windows(2) {
+        assert!(pair[1] - pair[0] > 8.0, "{retries:?}");
+    }
+}
+
+#[test]
 fn numbers_of_a_detector_that_make_no_sense_are_refused() {
     let mut told = Told::started(Config::default(), 5.0);
     let mut refused = |change: fn(&mut MarkerInFrame)| {

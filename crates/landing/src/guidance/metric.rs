@@ -268,6 +268,10 @@ impl Guidance for Metric {
         (error * TURN_GAIN).clamp(-self.config.turn_rad_s, self.config.turn_rad_s)
     }
 
+    fn begin_retry(&mut self) {
+        self.waiting_since = None;
+    }
+
     fn reset(&mut self) {
         self.observer = None;
         self.waiting_since = None;

@@ -91,6 +91,9 @@ pub trait Guidance {
         0.0
     }
 
+    /// A retry begins: it has the time of the first try, also where it cannot climb.
+    fn begin_retry(&mut self) {}
+
     /// Forgets what builds up while guiding: the vehicle is not guided now.
     fn reset(&mut self);
 }

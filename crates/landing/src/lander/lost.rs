@@ -38,6 +38,9 @@ impl Lander {
         let altitude_m = -vehicle.position.z();
         let ceiling_m = self.altitude_of(self.start);
         let climbed_m = libm::fmin(altitude_m + phases.retry_climb_m, ceiling_m);
+        if self.retry_to_m.is_none() {
+            self.guidance.begin_retry();
+        }
         let to_m = *self.retry_to_m.get_or_insert(climbed_m);
         let situation = self.situation(now, &vehicle);
         let (wanted, _) = self.guidance.velocity(&situation);

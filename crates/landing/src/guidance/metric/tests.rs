@@ -146,6 +146,24 @@ fn waiting_ends_also_for_a_vehicle_that_sways_about_the_waiting_height() {
 }
 
 #[test]
+fn a_retry_has_the_time_of_the_first_try_at_the_height_of_waiting_as_well() {
+    let mut metric = Metric::new(MetricConfig::default());
+    let mut stuck = Vec::new();
+    for i in 0..1200u32 {
+        // Always beside its target, and low.
+        let s = f64::from(i) / 40.0;
+        let vehicle = vehicle(s, Point::new(0.6, 0.0, -0.4), Vector::zero());
+        let situation = situation(&vehicle);
+        if matches!(metric.progress(&situation), Progress::Stuck) {
+            stuck.push(s);
+            metric.begin_retry();
+        }
+        let _ = metric.velocity(&situation);
+    }
+    assert_eq!(stuck.len(), 2, "{stuck:?}");
+}
+
+#[test]
 fn a_vehicle_that_stands_is_pushed_down_and_not_steered_whatever_it_says_of_its_velocity() {
     let mut metric = Metric::new(MetricConfig::default());
     let (mut asked_m_s, mut stands) = (0.0f64, None);
