@@ -747,6 +747,8 @@ impl Lander {
             vehicle.position,
             Vector::new(0.0, 0.0, -phases.search_climb_m_s),
         );
+        // Where the envelope allows no climb the legs are flown from where it is.
+        let up = envelope::clamp_setpoint(&self.config.envelope, up, false);
         let is_low = altitude_m < self.altitude_m(now, phases.search_height_m);
         let height_m = self.height_m(now);
         let wanted = if self.square.is_none() && is_low && up.z() < 0.0 {

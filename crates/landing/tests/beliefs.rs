@@ -488,6 +488,20 @@ fn a_retry_that_cannot_rise_has_the_time_of_the_first_try() {
 }
 
 #[test]
+fn a_search_that_may_not_climb_flies_its_legs() {
+    let mut config = Config::default();
+    config.envelope.climb_m_s = 0.0;
+    let mut told = Told::started(config, 2.0);
+    let mut farthest_m = 0.0f64;
+    for _ in 0..400 {
+        told.fly(STEP_S);
+        farthest_m = farthest_m.max(told.position.x().hypot(told.position.y()));
+    }
+    assert!(farthest_m > 2.0, "{farthest_m} m");
+    assert!((told.position.z() + 2.0).abs() < 1e-9, "{:?}", told.position);
+}
+
+#[test]
 fn numbers_of_a_detector_that_make_no_sense_are_refused() {
     let mut told = Told::started(Config::default(), 5.0);
     let mut refused = |change: fn(&mut MarkerInFrame)| {
