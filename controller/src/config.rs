@@ -8,7 +8,11 @@ use landing::{
 use node::{Check, Settings, clock_name, state_directory};
 use serde::{Deserialize, Serialize};
 
+use crate::service::TICK;
 use crate::wind::Drag;
+
+/// Periods of the setpoints that the autopilot's setpoint timeout must last: with 2 of them one lost setpoint is survived.
+const MIN_TIMEOUT_PERIODS: f64 = 2.5;
 
 /// The keys of `controller.toml`, which has their meanings, units and ranges.
 #[derive(Clone, Debug, Deserialize, Serialize)]
@@ -159,6 +163,24 @@ impl AutopilotSettings {
     pub fn drag(&self) -> Drag {
         Drag { linear_per_s: self.drag_per_s, quadratic_per_m: self.drag_per_m }
     }
+
+    /// The timeout must outlast a lost setpoint, or the vehicle stops between two of them.
+    fn check_setpoint_timeout(&self, check: &mut Check<'_>) {
+        let (timeout_s, rate_hz) = (self.setpoint_timeout_s, self.setpoint_rate_hz);
+        if timeout_s == 0.0 {
+            return;
+        }
+        let key = "autopilot.setpoint_timeout_s";
+        check.range(key, timeout_s, 0.2..=5.0);
+        // A setpoint that is due waits for the next tick.
+        let min_s = MIN_TIMEOUT_PERIODS / rate_hz + TICK.as_secs_f64();
+        let is_kept = timeout_s >= min_s;
+        check.parses(key, is_kept.then_some(()).ok_or_else(|| {
+            format!(
+                "with `autopilot.setpoint_rate_hz` = {rate_hz} it must be at least {min_s:.3}, or the autopilot stops where a setpoint is lost; raise one of the two"
+            )
+        }));
+    }
 }
 
 /// The choice of the detector.
@@ -209,13 +231,7 @@ impl Settings for Config {
         check.range("autopilot.component_id", self.autopilot.component_id, 1..=255);
         check.range("autopilot.state_rate_hz", self.autopilot.state_rate_hz, 10.0..=200.0);
         check.range("autopilot.setpoint_rate_hz", self.autopilot.setpoint_rate_hz, 5.0..=100.0);
-        if self.autopilot.setpoint_timeout_s != 0.0 {
-            check.range(
-                "autopilot.setpoint_timeout_s",
-                self.autopilot.setpoint_timeout_s,
-                0.2..=5.0,
-            );
-        }
+        self.autopilot.check_setpoint_timeout(check);
         if !self.detectors.preferred.is_empty() {
             check.name("detectors.preferred", &self.detectors.preferred);
         }
@@ -340,6 +356,28 @@ mod tests {
         let metric = load(&[]).unwrap();
         assert_eq!(metric.lander(), landing::Config::default());
         assert_eq!(metric.thesis, ThesisConfig::default());
+    }
+
+    #[test]
+    fn a_setpoint_timeout_that_the_setpoints_rate_cannot_keep_is_refused() {
+        let refused = |set: &[&str]| load(set).unwrap_err();
+        let problem = refused(&["autopilot.setpoint_rate_hz=5"]);
+        for part in [
+            "`autopilot.setpoint_timeout_s` = 0.5",
+            "at least 0.525",
+            "`autopilot.setpoint_rate_hz` = 5",
+            "raise one of the two",
+        ] {
+            assert!(problem.contains(part), "`{part}` is not in: {problem}");
+        }
+        refused(&["autopilot.setpoint_timeout_s=0.2", "autopilot.setpoint_rate_hz=14"]);
+        for set in [
+            ["autopilot.setpoint_timeout_s=0.2", "autopilot.setpoint_rate_hz=15"],
+            ["autopilot.setpoint_timeout_s=0.53", "autopilot.setpoint_rate_hz=5"],
+            ["autopilot.setpoint_timeout_s=0", "autopilot.setpoint_rate_hz=5"],
+        ] {
+            assert!(load(&set).is_ok(), "{set:?}");
+        }
     }
 
     #[test]

@@ -21,7 +21,7 @@ use crate::note_file::{NoteFile, PadFile, remove_useless_pads};
 use crate::tape::TapedFlight;
 
 /// Period of the flight's ticks.
-const TICK: Duration = Duration::from_millis(25);
+pub(crate) const TICK: Duration = Duration::from_millis(25);
 /// Longest wait at shutdown for the autopilot to confirm that its parameter is put back, and for the heartbeats, one a second, after
 /// which a PX4 is asked to hold its place, and which shows that it does.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
