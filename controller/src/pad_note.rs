@@ -10,6 +10,9 @@ use serde::{Deserialize, Serialize};
 
 /// Heights over the pad at which its place is noted in a descent, in metres. Few, as each is written to a file.
 const LEVELS_M: [f64; 4] = [3.0, 1.5, 0.7, 0.3];
+/// Age after which the note of a vehicle that is below the first of them is renewed, in nanoseconds: the autopilot's position
+/// drifts, and an old note is not used.
+const MAX_NOTE_AGE_NS: i64 = 10_000_000_000;
 /// Climb above the first of them after which the note is dropped, in metres.
 const CLIMBED_M: f64 = 0.5;
 
@@ -78,7 +81,11 @@ impl PadNotes {
             return;
         };
         let level = LEVELS_M.iter().filter(|level_m| height_m <= **level_m).count();
-        if level > self.level {
+        let is_old = self
+            .note
+            .as_ref()
+            .is_some_and(|note| pad.stamp.nanos().saturating_sub(note.stamp_ns) > MAX_NOTE_AGE_NS);
+        if level > self.level || (level > 0 && is_old) {
             self.level = level;
             self.note = Some(PadNote {
                 address: address.to_owned(),
@@ -120,6 +127,43 @@ mod tests {
         assert_eq!(notes.pad("udpin:127.0.0.1:14551", Some(1)), None);
         notes.step(false, None, ADDRESS, Some(1));
         assert_eq!(notes.note(), None);
+    }
+
+    /// The stamps of the notes, in seconds, of a vehicle that is seen over the pad at these heights, 40 times a second.
+    fn noted_at_s(seconds: f64, height_m: impl Fn(f64) -> f64) -> Vec<f64> {
+        let mut notes = PadNotes::default();
+        let mut kept = Vec::new();
+        for i in 0..(seconds * 40.0) as u32 {
+            let s = f64::from(i) / 40.0;
+            let pad = RememberedPad {
+                position: Point::new(1.0, 2.0, 0.1),
+                deviation_m: 0.02,
+                stamp: Timestamp::from_seconds(s),
+            };
+            let seen = SeenPad { pad, height_m: height_m(s) };
+            notes.step(true, Some(seen), ADDRESS, Some(1));
+            let stamp_s = notes.note().map(|note| note.stamp_ns as f64 * 1e-9);
+            if stamp_s != kept.last().copied() {
+                kept.extend(stamp_s);
+            }
+        }
+        kept
+    }
+
+    #[test]
+    fn the_place_is_noted_again_in_a_second_descent_and_seldom_in_a_long_wait() {
+        // It descends, climbs to 3.2 m to try again, and descends once more, half a minute later.
+        let again = |s: f64| match s {
+            s if s < 10.0 => 3.3 - 0.32 * s,
+            s if s < 15.0 => 0.1 + 0.62 * (s - 10.0),
+            s if s < 40.0 => 3.2,
+            s => 3.2 - 0.31 * (s - 40.0),
+        };
+        let second: Vec<_> = noted_at_s(50.0, again).into_iter().filter(|s| *s > 40.0).collect();
+        assert_eq!(second.len(), 4, "{second:?}");
+        let waits = noted_at_s(60.0, |s| 0.7 + 0.05 * (3.0 * s).sin());
+        assert!((5..=12).contains(&waits.len()), "{waits:?}");
+        assert!(waits.last().is_some_and(|last_s| *last_s > 49.0), "{waits:?}");
     }
 
     #[test]
