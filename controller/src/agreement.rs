@@ -91,6 +91,9 @@ impl Common {
             while theirs.next_if(|(other, _)| other > stamp).is_some() {}
             let Some((_, theirs)) = theirs.next_if(|(other, _)| other == stamp) else { continue };
             common.add(*ours, *theirs, tolerance);
+            if common.both >= MIN_COMMON && common.second_saw >= MAX_SEEN {
+                break;
+            }
         }
         common
     }

@@ -24,8 +24,12 @@ const MAX_NAME_BYTES: usize = 64;
 pub const MAX_DETECTORS: usize = 64;
 /// Maximum number of frames and intervals kept for each detector.
 const MAX_SAMPLES: usize = 16;
-/// Maximum number of frames whose markers are kept for each detector: some search only every other frame.
-const MAX_SIGHTS: usize = 32;
+/// Time for which the markers of a detector's frames are kept, in nanoseconds: another one may search few of them, and later.
+const SIGHTS_NS: i64 = 4_000_000_000;
+/// Number of those frames, whatever that time: at least, at most, and of all detectors together, as their comparison takes time.
+const MIN_SIGHTS: usize = 32;
+const MAX_SIGHTS: usize = 300;
+const MAX_ALL_SIGHTS: usize = MIN_SIGHTS * MAX_DETECTORS;
 /// Maximum number of detectors that are warned of.
 const MAX_WARNINGS: usize = 4;
 /// Time for which it is told that there is no room for a name, in nanoseconds.
@@ -166,11 +170,13 @@ impl Selection {
         sight: Option<Sight>,
     ) -> bool {
         let others_ns = self.newest_of_others_ns(name);
+        let share = MAX_ALL_SIGHTS / self.known.len().max(1);
         let worth = if sight.is_some() { Worth::Sees } else { Worth::Answers };
         let Some(known) = self.known_mut(now_ns, name, worth) else { return false };
         let is_newer = stamp_ns > known.stamp_ns;
         if is_newer {
-            known.take(now_ns, stamp_ns, sight, others_ns);
+            known.take(now_ns, stamp_ns, others_ns);
+            known.keep_sight(stamp_ns, sight, share.clamp(MIN_SIGHTS, MAX_SIGHTS));
             for other in self.known.iter_mut().filter(|other| other.name != name) {
                 if other.stamp_ns < stamp_ns {
                     other.overtaken_ns = other.overtaken_ns.or(Some(now_ns));
@@ -672,16 +678,24 @@ impl Known {
     }
 
     /// Registers a newer frame.
-    fn take(&mut self, now_ns: i64, stamp_ns: i64, sight: Option<Sight>, others_ns: i64) {
+    fn take(&mut self, now_ns: i64, stamp_ns: i64, others_ns: i64) {
         if self.has_frame() {
             keep(&mut self.intervals_ns, now_ns.saturating_sub(self.received_ns), MAX_SAMPLES);
         }
         keep(&mut self.latencies_ns, now_ns.saturating_sub(stamp_ns).max(0), MAX_SAMPLES / 2);
-        keep(&mut self.sights, (stamp_ns, sight), MAX_SIGHTS);
         self.received_ns = now_ns;
         self.stamp_ns = stamp_ns;
         self.overtaken_ns = (others_ns > stamp_ns).then_some(now_ns);
         self.alive |= stamp_ns > self.gone_ns;
+    }
+
+    /// Keeps what it saw in a newer frame, and forgets what is old.
+    fn keep_sight(&mut self, stamp_ns: i64, sight: Option<Sight>, max: usize) {
+        let is_old = |(old_ns, _): &(i64, _)| stamp_ns.saturating_sub(*old_ns) > SIGHTS_NS;
+        while self.sights.len() > MIN_SIGHTS && self.sights.front().is_some_and(is_old) {
+            self.sights.pop_front();
+        }
+        keep(&mut self.sights, (stamp_ns, sight), max);
     }
 
     fn has_frame(&self) -> bool {
@@ -702,7 +716,9 @@ impl Known {
     }
 
     fn sight_at(&self, stamp_ns: i64) -> Option<Option<Sight>> {
-        self.sights.iter().find(|(stamp, _)| *stamp == stamp_ns).map(|(_, sight)| *sight)
+        // Only newer frames are taken, so they are in order.
+        let index = self.sights.binary_search_by_key(&stamp_ns, |(stamp, _)| *stamp).ok()?;
+        self.sights.get(index).map(|(_, sight)| *sight)
     }
 
     /// Compares this detector's marker in a frame with the active detector's. Without a marker from the

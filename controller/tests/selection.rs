@@ -414,6 +414,58 @@ fn a_dispute_lasts_while_both_are_late_or_see_nothing() {
     assert_eq!(bench.selection.dispute(), None);
 }
 
+/// Tells of detectors that search frames of a camera with 30 Hz, each every so many frames and with its latency.
+fn told_at_rates(
+    bench: &mut Bench,
+    frames: std::ops::Range<i64>,
+    answers: &[(&str, i64, i64, Option<Sight>)],
+) {
+    let period = 33 * MS;
+    let ended_ns = frames.end * period;
+    let ticks = (frames.start * period..ended_ns).step_by(25 * MS as usize);
+    let mut events: Vec<_> = ticks.map(|at| (at, None)).collect();
+    for (name, every, late, sight) in answers {
+        let searched = frames.clone().filter(|i| i % every == 0);
+        events.extend(searched.map(|i| (i * period + late, Some((*name, i * period, *sight)))));
+    }
+    events.retain(|(at, _)| *at <= ended_ns);
+    events.sort_by_key(|(at, _)| *at);
+    for (at, event) in events {
+        bench.now_ns = bench.now_ns.max(at);
+        match event {
+            Some((name, stamp, sight)) => {
+                bench.selection.received(bench.now_ns, name, stamp, sight);
+            }
+            None => bench.selection.tick(bench.now_ns),
+        }
+        bench.note();
+    }
+}
+
+#[test]
+fn detectors_of_different_rate_and_latency_are_compared_as_well() {
+    for (every, late) in [(3, 300 * MS), (6, 500 * MS), (10, 100 * MS)] {
+        // Two that differ.
+        let mut bench = Bench::new(preferring(None, None));
+        let [quick, slow] = [("quick", 1, 30 * MS), ("slow", every, 30 * MS + late)];
+        let seen = |(name, every, late): (_, _, _), sight| (name, every, late, sight);
+        told_at_rates(&mut bench, 0..150, &[seen(quick, at(0.0)), seen(slow, at(1.0))]);
+        assert!(bench.selection.dispute().is_some(), "{every} {late}");
+        // Until they agree.
+        told_at_rates(&mut bench, 150..300, &[seen(quick, at(0.0)), seen(slow, at(0.0))]);
+        assert_eq!(bench.selection.dispute(), None, "{every} {late}");
+        // A preferred one that sees nothing.
+        let mut bench = Bench::new(preferring(Some("quick"), None));
+        told_at_rates(&mut bench, 0..150, &[seen(quick, None), seen(slow, at(0.0))]);
+        assert_eq!(bench.state("quick"), DetectorState::Blind, "{every} {late}");
+        // Of three the odd one.
+        let mut bench = Bench::new(preferring(Some("quick"), None));
+        let second = ("second", every, 40 * MS + late, at(0.0));
+        told_at_rates(&mut bench, 0..150, &[seen(quick, at(1.0)), seen(slow, at(0.0)), second]);
+        assert_eq!(bench.state("quick"), DetectorState::Outvoted, "{every} {late}");
+    }
+}
+
 #[test]
 fn who_names_a_detector_in_a_dispute_has_decided_it() {
     let mut bench = Bench::new(preferring(None, None));
