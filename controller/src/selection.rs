@@ -451,17 +451,17 @@ impl Selection {
     }
 
     /// The dispute between the active detector and another one. It lasts until they agree: where neither sees
-    /// the marker nothing is decided.
+    /// the marker, or one is silent, nothing is decided.
     fn present_dispute(&self, now_ns: i64, tolerance: Tolerance) -> Option<Dispute> {
         let active = self.known_active().filter(|active| active.fault.is_none())?;
         let is_opponent = |known: &&Known| {
             known.name != active.name
-                && known.has_opinion(now_ns)
+                && known.alive
                 && !self.overruled.contains(&known.name)
                 && !matches!(known.fault, Some(Fault::Outvoted { .. }))
         };
-        let others: Vec<Voter<'_>> =
-            self.known.iter().filter(is_opponent).map(Known::voter).collect();
+        let answers = self.known.iter().filter(is_opponent).filter(|it| it.has_opinion(now_ns));
+        let others: Vec<Voter<'_>> = answers.map(Known::voter).collect();
         if let Some(dispute) = agreement::dispute(active.voter(), &others, tolerance) {
             return Some(dispute);
         }

@@ -467,6 +467,39 @@ fn detectors_of_different_rate_and_latency_are_compared_as_well() {
 }
 
 #[test]
+fn a_dispute_outlasts_the_silence_of_one_of_both_and_ends_when_it_is_stopped() {
+    for silent in ["main", "spare"] {
+        let mut bench = Bench::new(preferring(None, None));
+        let all = [("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(1.0))];
+        for i in 0..20 {
+            bench.frame_seen(i * PERIOD, &all);
+        }
+        assert!(bench.selection.dispute().is_some());
+        let other: Vec<_> = all.into_iter().filter(|(name, ..)| *name != silent).collect();
+        for i in 20..80 {
+            bench.frame_seen(i * PERIOD, &other);
+            assert!(bench.selection.dispute().is_some(), "{silent}, frame {i}");
+        }
+        for i in 80..90 {
+            bench.frame_seen(i * PERIOD, &all);
+            assert!(bench.selection.dispute().is_some(), "{silent}, frame {i}");
+        }
+        bench.gone(silent);
+        bench.frame_seen(90 * PERIOD, &other);
+        assert_eq!(bench.selection.dispute(), None, "{silent}");
+    }
+    // One of which nothing is heard any more, not even its end, is forgotten.
+    let mut bench = Bench::new(preferring(None, None));
+    for i in 0..20 {
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(1.0))]);
+    }
+    for i in 20..1000 {
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, at(0.0))]);
+    }
+    assert_eq!(bench.selection.dispute(), None);
+}
+
+#[test]
 fn who_names_a_detector_in_a_dispute_has_decided_it() {
     let mut bench = Bench::new(preferring(None, None));
     let answers = [("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(1.0))];
