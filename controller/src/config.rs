@@ -245,6 +245,7 @@ impl Settings for Config {
             check.at_least("alarms.autopilot_lost_s", lost_s, "phases.stale_vehicle_s", stale_s);
         }
         self.detectors.check(check);
+        check.parses("metric.turn_rad_s", self.turn());
         // Both guidances are checked, so that a wrong number is found before it is used.
         for guidance in [GuidanceConfig::Metric(self.metric), GuidanceConfig::Thesis(self.thesis)] {
             if let Err(problem) = self.landing(guidance).validate() {
@@ -294,6 +295,20 @@ impl Config {
         }
         let name = format!("controller-{}", self.id);
         SigningConfig::read(signing_key.as_ref(), *component_id, state_directory(), &name).map(Some)
+    }
+
+    /// Whether the vehicle can turn to the marker's heading: rings look the same from all sides, so the upper edge that their pose has
+    /// is the image's, and turns with the vehicle.
+    fn turn(&self) -> Result<(), String> {
+        let is_round =
+            crate::wire::marker_name(&self.marker).is_ok_and(|(family, _)| family == "rings");
+        if self.metric.turn_rad_s > 0.0 && is_round {
+            let marker = &self.marker;
+            return Err(format!(
+                "it must be 0 with `marker` = {marker}, which has no heading; choose a square marker, a STag or a pad"
+            ));
+        }
+        Ok(())
     }
 
     /// The take-off of `start = "takeoff"`.
@@ -377,6 +392,18 @@ mod tests {
             ["autopilot.setpoint_timeout_s=0", "autopilot.setpoint_rate_hz=5"],
         ] {
             assert!(load(&set).is_ok(), "{set:?}");
+        }
+    }
+
+    #[test]
+    fn a_turn_to_the_heading_of_a_marker_that_has_none_is_refused() {
+        let problem = load(&["metric.turn_rad_s=0.3"]).unwrap_err();
+        for part in ["`metric.turn_rad_s` = 0.3", "it must be 0", "`marker` = rings", "no heading"]
+        {
+            assert!(problem.contains(part), "`{part}` is not in: {problem}");
+        }
+        for marker in ["marker=aruco-4x4-50:7", "marker=pad:1"] {
+            assert!(load(&["metric.turn_rad_s=0.3", marker]).is_ok(), "{marker}");
         }
     }
 
