@@ -383,7 +383,9 @@ fn list(directory: &Path) -> anyhow::Result<HolderList> {
     paths.sort();
     for path in paths {
         // Certificates of pages and others may be there as well.
-        let Ok(Certificate { common_name, expires_in_s }) = certificate(&path) else { continue };
+        let Ok(Certificate { common_name, expires_in_s, .. }) = certificate(&path) else {
+            continue;
+        };
         if common_name.parse::<Holder>().is_err() {
             continue;
         }

@@ -109,7 +109,7 @@ fn check_authority(findings: &mut Findings, path: &Path) {
     }
 }
 
-/// Tells how long a certificate is valid.
+/// Tells from when until when a certificate is valid.
 fn tell_validity(
     findings: &mut Findings,
     read: &Certificate,
@@ -117,8 +117,20 @@ fn tell_validity(
     path: &Path,
     again: &str,
 ) {
-    let days = read.expires_in_s.unsigned_abs() / DAY_S.unsigned_abs();
     let path = path.display();
+    if read.begins_in_s > 0 {
+        let days = read.begins_in_s.unsigned_abs().div_ceil(DAY_S.unsigned_abs());
+        findings.wrong(
+            "keys",
+            format!(
+                "{whose} is not valid yet, for {days} days more: the clock of this machine is behind, or that of the machine that made \
+                 it was ahead: {path}"
+            ),
+            "set the clock (`timedatectl` shows it, and whether NTP keeps it), then run this again",
+        );
+        return;
+    }
+    let days = read.expires_in_s.unsigned_abs() / DAY_S.unsigned_abs();
     match read.expires_in_s {
         ..0 => findings.wrong(
             "keys",
@@ -347,10 +359,29 @@ mod tests {
     }
 
     #[test]
+    fn a_certificate_that_is_not_valid_yet_is_told_with_the_clock() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(AUTHORITY);
+        let mut params = rcgen::CertificateParams::default();
+        params.not_before = rcgen::date_time_ymd(3000, 1, 1);
+        params.not_after = rcgen::date_time_ymd(3010, 1, 1);
+        let key = rcgen::KeyPair::generate().unwrap();
+        std::fs::write(&path, params.self_signed(&key).unwrap().pem()).unwrap();
+        let mut findings = Findings::default();
+        check_authority(&mut findings, &path);
+        let text = findings.text();
+        for part in ["WRONG", "the authority is not valid yet", "the clock of this machine"] {
+            assert!(text.contains(part), "`{part}` is not in: {text}");
+        }
+        assert!(text.contains("timedatectl") && !text.contains("make a new"), "{text}");
+    }
+
+    #[test]
     fn a_certificate_that_ends_soon_or_has_ended_is_told() {
         let told = |expires_in_s| {
             let mut findings = Findings::default();
-            let read = Certificate { common_name: String::new(), expires_in_s };
+            let begins_in_s = -DAY_S;
+            let read = Certificate { common_name: String::new(), begins_in_s, expires_in_s };
             tell_validity(&mut findings, &read, "the key", Path::new("x.pem"), "again");
             findings.text()
         };

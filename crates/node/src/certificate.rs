@@ -1,4 +1,4 @@
-//! What a certificate says: whose it is, until when, and by whom it is signed.
+//! What a certificate says: whose it is, from when until when, and by whom it is signed.
 
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -10,6 +10,8 @@ use x509_parser::pem::{Pem, parse_x509_pem};
 pub struct Certificate {
     /// The common name: the holder.
     pub common_name: String,
+    /// Seconds until it begins to be valid; negative when it has.
+    pub begins_in_s: i64,
     /// Seconds until it ends; negative when it has.
     pub expires_in_s: i64,
 }
@@ -25,8 +27,10 @@ pub fn certificate(path: &Path) -> anyhow::Result<Certificate> {
     let name = certificate.subject().iter_common_name().next();
     let common_name = name.and_then(|name| name.as_str().ok()).unwrap_or_default().to_owned();
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
-    let expires_in_s = certificate.validity().not_after.timestamp() - now.cast_signed();
-    Ok(Certificate { common_name, expires_in_s })
+    let validity = certificate.validity();
+    let [begins_in_s, expires_in_s] = [validity.not_before, validity.not_after]
+        .map(|time| time.timestamp().saturating_sub(now.cast_signed()));
+    Ok(Certificate { common_name, begins_in_s, expires_in_s })
 }
 
 /// Whether an authority has signed a certificate.
@@ -44,4 +48,26 @@ fn pem_of(path: &Path) -> anyhow::Result<Pem> {
     let (_, pem) =
         parse_x509_pem(&text).map_err(|cause| anyhow!("{path:?} is not a certificate: {cause}"))?;
     Ok(pem)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_certificate_tells_from_when_until_when_it_is_valid() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x.pem");
+        let key = rcgen::KeyPair::generate().unwrap();
+        let mut params = rcgen::CertificateParams::default();
+        for (years, is_begun, is_over) in
+            [((2001, 3000), true, false), ((2999, 3000), false, false), ((2001, 2002), true, true)]
+        {
+            params.not_before = rcgen::date_time_ymd(years.0, 1, 1);
+            params.not_after = rcgen::date_time_ymd(years.1, 1, 1);
+            std::fs::write(&path, params.self_signed(&key).unwrap().pem()).unwrap();
+            let read = certificate(&path).unwrap();
+            assert_eq!((read.begins_in_s < 0, read.expires_in_s < 0), (is_begun, is_over));
+        }
+    }
 }

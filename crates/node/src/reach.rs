@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
 use rustls::pki_types::ServerName;
-use rustls::{CertificateError, ClientConfig, ClientConnection};
+use rustls::{AlertDescription, CertificateError, ClientConfig, ClientConnection};
 use tokio::sync::oneshot;
 use tokio::time::timeout;
 
@@ -165,8 +165,15 @@ impl Reach {
             ),
             Finding::Keys(cause) => format!("{cause:#}"),
             Finding::Refused(cause) => match rustls_error(cause) {
+                // Also said of one that is not valid yet.
+                Some(rustls::Error::AlertReceived(AlertDescription::CertificateExpired)) => {
+                    format!(
+                        "the relay at {at} refuses the certificate {own}, as not valid at this time: it has expired (`alight keys issue` makes \
+                         another), or the clock of that machine is wrong, as without NTP after a start: set it there (`timedatectl` shows it)"
+                    )
+                }
                 Some(rustls::Error::AlertReceived(alert)) => format!(
-                    "the relay at {at} refuses the certificate {own} ({alert:?}): it has expired, or is of another authority; \
+                    "the relay at {at} refuses the certificate {own} ({alert:?}): it is of another authority, or cannot be used; \
                      `alight keys issue` makes another"
                 ),
                 Some(rustls::Error::InvalidCertificate(problem)) => {
@@ -331,10 +338,39 @@ fn certificate_problem(problem: &CertificateError, host: &str) -> String {
         CertificateError::Expired | CertificateError::ExpiredContext { .. } => {
             "that has expired (if this machine's clock is right): `alight keys issue` makes another".to_owned()
         }
+        CertificateError::NotValidYet | CertificateError::NotValidYetContext { .. } => {
+            "that is not valid yet: this machine's clock is wrong, as without NTP after a start; set it (`timedatectl` shows it)".to_owned()
+        }
         // Authorities may have the same name.
         CertificateError::UnknownIssuer | CertificateError::BadSignature => {
             "of another authority than that of this key: it is another vehicle's, or one of both has old keys".to_owned()
         }
         other => format!("that is not valid: {other}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_clock_that_is_wrong_is_told_where_a_certificate_is_not_valid_at_this_time() {
+        let place = Place { host: "10.0.0.1".to_owned(), port: 7448, is_encrypted: true };
+        let told = |problem: rustls::Error| {
+            Reach::default().reason(&place, &Finding::Refused(io::Error::other(problem)))
+        };
+        // A relay says so of a certificate that is not valid yet as well.
+        let expired = AlertDescription::CertificateExpired;
+        let refused = told(rustls::Error::AlertReceived(expired));
+        for part in ["has expired", "alight keys issue", "clock of that machine", "timedatectl"] {
+            assert!(refused.contains(part), "`{part}` is not in: {refused}");
+        }
+        let other = told(rustls::Error::AlertReceived(AlertDescription::UnknownCA));
+        assert!(other.contains("another authority") && !other.contains("clock"), "{other}");
+        let early = told(rustls::Error::InvalidCertificate(CertificateError::NotValidYet));
+        for part in ["not valid yet", "this machine's clock", "timedatectl"] {
+            assert!(early.contains(part), "`{part}` is not in: {early}");
+        }
+        assert!(!early.contains("alight keys issue"), "{early}");
     }
 }
