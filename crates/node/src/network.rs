@@ -145,9 +145,12 @@ impl Network {
             let address = Address::parse(address)?;
             each_endpoint(&mut config, &["listen"], |e| e.redirect("0.0.0.0", &address));
         }
-        let missing = endpoints(&config, "connect").any(|e| e.contains(ADDRESS_PLACEHOLDER));
+        let is_missing = self.connect.is_none()
+            && endpoints(&config, "connect")
+                .filter_map(Endpoint::parse)
+                .any(|endpoint| endpoint.host == ADDRESS_PLACEHOLDER);
         ensure!(
-            !missing,
+            !is_missing,
             "{name} needs the address of the drone: `--connect ADDRESS`, or ALIGHT_CONNECT in the environment"
         );
         if let Some(endpoint) = open_endpoint(&config).filter(|_| !self.insecure) {
@@ -278,8 +281,9 @@ fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()>
     let mut layer = parse("secured.json5", SECURED_CONFIG)?;
     let directory = keys.to_str().context("the path of the key directory is not valid UTF-8")?;
     for value in layer["transport"]["link"]["tls"].as_object_mut().into_iter().flatten() {
-        if let Some(file) = value.1.as_str() {
-            *value.1 = json!(file.replace("DIRECTORY", directory).replace("NAME", key_name));
+        // In the file's own text only: directories and detectors may be named as the placeholders are.
+        if let Some(file) = value.1.as_str().and_then(|path| path.strip_prefix("DIRECTORY/")) {
+            *value.1 = json!(format!("{directory}/{}", file.replace("NAME", key_name)));
         }
     }
     let path = keys.join(HOLDERS);
@@ -501,6 +505,18 @@ mod tests {
     }
 
     #[test]
+    fn a_host_may_be_named_as_the_placeholder_is() {
+        for (connect, host) in
+            [("DRONE.local", "DRONE.local"), ("MYDRONE:9000", "MYDRONE"), ("DRONE", "DRONE")]
+        {
+            let network = Network { connect: Some(connect.into()), ..built_in("ground") };
+            let config = configured(&network).unwrap();
+            let first = endpoints(&config, "connect").next().unwrap();
+            assert!(first.starts_with(&format!("tcp/{host}:")), "{connect}: {first}");
+        }
+    }
+
+    #[test]
     fn invalid_networks_are_rejected_with_the_reason() {
         let refused = |network: Network, part: &str| {
             let problem = configured(&network).unwrap_err();
@@ -626,6 +642,26 @@ mod tests {
             assert_eq!(endpoints(&config, "listen").collect::<Vec<_>>(), ["tls/0.0.0.0:7448"]);
             assert_eq!(config["access_control"]["enabled"], true, "{listen}");
             assert_eq!(open_endpoint(&config), None);
+        }
+    }
+
+    #[test]
+    fn a_directory_of_keys_may_be_named_as_a_placeholder_is() {
+        let folder = tempfile::tempdir().unwrap();
+        let keys = folder.path().join("NAMES").join("DIRECTORY");
+        std::fs::create_dir_all(&keys).unwrap();
+        let key_name = "detector.DIRECTORY";
+        write_keys(&keys, key_name);
+        let mut config = parse("ground", GROUND_CONFIG).unwrap();
+        secure(&mut config, &keys, key_name).unwrap();
+        let tls = &config["transport"]["link"]["tls"];
+        for (part, file) in [
+            ("root_ca_certificate", AUTHORITY),
+            ("listen_certificate", "detector.DIRECTORY.pem"),
+            ("connect_private_key", "detector.DIRECTORY.key"),
+        ] {
+            let path = tls[part].as_str().map(Path::new);
+            assert_eq!(path, Some(keys.join(file).as_path()), "{part}");
         }
     }
 
