@@ -5,10 +5,10 @@
 //! beside the authority's key says who may connect; who is revoked there stays out.
 
 use std::collections::BTreeMap;
-use std::fs::{self, OpenOptions};
+use std::fs::{self, File, OpenOptions, Permissions};
 use std::io::{self, Write};
 use std::net::IpAddr;
-use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt, fchown};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -32,6 +32,8 @@ use crate::terminal::{aligned, print};
 const AUTHORITY_KEY: &str = "authority.key";
 /// Certificates are valid a day early, as a drone's clock may be slow before it is synchronised.
 const BACKDATING: Duration = DAY;
+/// The mode of a new list of holders, which is no secret.
+const LIST_MODE: u32 = 0o644;
 /// The letters and digits of a passphrase: 32 that are not mistaken for each other.
 const LETTERS: &[u8; 32] = b"abcdefghijkmnpqrstuvwxyz23456789";
 /// Number of letters of a passphrase.
@@ -416,10 +418,24 @@ fn write_holders(directory: &Path, holders: &Holders) -> anyhow::Result<PathBuf>
     let path = directory.join(HOLDERS);
     let written = tempfile::NamedTempFile::new_in(directory).and_then(|mut file| {
         file.write_all(holders.to_string().as_bytes())?;
+        keep_access(file.as_file(), &path)?;
         file.persist(&path).map_err(|failed| failed.error)
     });
     written.with_context(|| format!("writing {path:?}"))?;
     Ok(path)
+}
+
+/// Gives a new list owner and mode of the one that it replaces: a relay that may not read it goes on with the old one.
+fn keep_access(file: &File, replaced: &Path) -> io::Result<()> {
+    let mode = match fs::metadata(replaced) {
+        Ok(before) => {
+            // Who may not give it to another user leaves it readable for that one.
+            let is_kept = fchown(file, Some(before.uid()), Some(before.gid())).is_ok();
+            before.permissions().mode() & 0o777 | if is_kept { 0 } else { LIST_MODE }
+        }
+        Err(_) => LIST_MODE,
+    };
+    file.set_permissions(Permissions::from_mode(mode))
 }
 
 /// The keys of all roles in one directory, with those of these detectors.
@@ -504,8 +520,6 @@ fn write_new(path: &Path, text: &str) -> anyhow::Result<()> {
 
 #[cfg(test)]
 mod tests {
-    use std::os::unix::fs::PermissionsExt;
-
     use super::*;
 
     fn issue_for(
@@ -528,7 +542,7 @@ mod tests {
         let read = certificate(&files[1]).unwrap();
         assert_eq!(read.common_name, "drone@drone");
         assert!((read.expires_in_s - 7 * 86_400).abs() < 120, "{} s", read.expires_in_s);
-        for file in files.iter().chain([&drone.join(AUTHORITY), &drone.join(HOLDERS)]) {
+        for file in files.iter().chain([&drone.join(AUTHORITY)]) {
             let mode = fs::metadata(file).unwrap().permissions().mode();
             assert_eq!(mode & 0o777, 0o600, "{file:?}");
         }
@@ -556,7 +570,7 @@ mod tests {
         refused(issue_for(Role::Relay, None, here, here), "--address HOST");
         refused(issue_for(Role::Operator, None, here, &here.join("none")), "alight keys init");
         let key = here.join(AUTHORITY_KEY);
-        fs::set_permissions(&key, fs::Permissions::from_mode(0o644)).unwrap();
+        fs::set_permissions(&key, Permissions::from_mode(0o644)).unwrap();
         refused(issue_for(Role::Observer, None, here, here), "chmod 600");
     }
 
@@ -603,6 +617,29 @@ mod tests {
         for address in ["foo bar", "", "10.0.0.1:7448", "http://drone", "dr\u{f6}hne"] {
             refused(parameters("drone", &[address.to_owned()], 30), "invalid address");
         }
+    }
+
+    #[test]
+    fn a_list_of_holders_keeps_its_mode_and_owner() {
+        use std::os::unix::fs::chown;
+        let home = tempfile::tempdir().unwrap();
+        let here = home.path();
+        init(here, 30).unwrap();
+        issue_for(Role::Operator, Some("bob"), here, here).unwrap();
+        let path = here.join(HOLDERS);
+        let mode = || fs::metadata(&path).unwrap().permissions().mode() & 0o777;
+        assert_eq!(mode(), 0o644, "it holds no secret");
+        fs::set_permissions(&path, Permissions::from_mode(0o664)).unwrap();
+        // Only some users may give a file away.
+        let is_given = chown(&path, Some(12_345), Some(12_346)).is_ok();
+        issue_for(Role::Observer, None, here, here).unwrap();
+        assert_eq!(mode(), 0o664);
+        if is_given {
+            let written = fs::metadata(&path).unwrap();
+            assert_eq!((written.uid(), written.gid()), (12_345, 12_346));
+        }
+        revoke(&"operator.bob@drone".parse().unwrap(), here).unwrap();
+        assert_eq!(mode(), 0o664);
     }
 
     #[test]

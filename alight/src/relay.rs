@@ -3,6 +3,7 @@
 //! Zenoh forwards the messages; this process keeps the session open, and reports its health and what it
 //! denies. When the list of holders among its keys changes, it starts anew with the rights of the new one.
 
+use std::io::ErrorKind;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
@@ -10,7 +11,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, ensure};
 use clap::Args;
 use node::access::{HOLDERS, Holders};
-use node::{Identity, Network, Node, Shutdown, denied};
+use node::{HealthCounters, Identity, Network, Node, Shutdown, denied};
 use tokio::time::MissedTickBehavior;
 
 use crate::args::{NetworkArgs, ParentArgs};
@@ -28,6 +29,10 @@ const HOLDERS_PERIOD: Duration = Duration::from_millis(500);
 const PORTS_PATIENCE: Duration = Duration::from_secs(2);
 /// Pause before it starts anew after a panic, so that one at every start does not use all of a core.
 const RELAUNCH_PAUSE: Duration = Duration::from_millis(200);
+
+/// What the health says of a list of holders that cannot be read.
+const NOT_TAKEN_UP: &str =
+    "the list of holders is not taken up, so who was revoked since is not shut out";
 
 /// The arguments of the relay.
 #[derive(Args, Clone)]
@@ -105,7 +110,7 @@ async fn relay(node: Node, shutdown: Shutdown, holders: HoldersFile) -> anyhow::
             _ = beat.tick() => {}
             _ = reads.tick() => {
                 // Zenoh reads its rights once.
-                if holders.has_changed() {
+                if holders.has_changed(node.health()) {
                     tracing::info!("The list of holders has changed; joining the network anew");
                     return Err(node::relaunch(&[])).context("starting this process anew");
                 }
@@ -132,18 +137,35 @@ impl HoldersFile {
     fn new(network: &Network) -> Self {
         let path = network.keys.as_ref().map(|keys| keys.join(HOLDERS));
         let file = Self { path, holders: None };
-        Self { holders: file.read(), ..file }
+        Self { holders: file.read().ok().flatten(), ..file }
     }
 
-    /// The list; `None` while there is none that can be read, as when it is being replaced.
-    fn read(&self) -> Option<Holders> {
-        std::fs::read_to_string(self.path.as_ref()?).ok()?.parse().ok()
+    /// The list; `None` while there is none, as when it is being replaced.
+    fn read(&self) -> anyhow::Result<Option<Holders>> {
+        let Some(path) = &self.path else { return Ok(None) };
+        let text = match std::fs::read_to_string(path) {
+            Ok(text) => text,
+            Err(cause) if cause.kind() == ErrorKind::NotFound => return Ok(None),
+            Err(cause) => return Err(cause).with_context(|| format!("reading {path:?}")),
+        };
+        text.parse().map(Some).with_context(|| format!("{path:?}"))
     }
 
-    /// True when it is another list now. One that cannot be read changes nothing: with it the relay would not start.
-    fn has_changed(&self) -> bool {
-        let read = self.read();
-        read.is_some() && read != self.holders
+    /// True when it is another list now. One that cannot be read is told and changes nothing: with it the relay would not start.
+    fn has_changed(&self, health: &HealthCounters) -> bool {
+        match self.read() {
+            Ok(read) => read.is_some() && read != self.holders,
+            Err(problem) => {
+                let reason = format!("{NOT_TAKEN_UP}: {problem:#}");
+                if health.failed(&reason) {
+                    tracing::warn!(
+                        %reason,
+                        "Copy the list of holders from the authority's folder again, readable for the user of this process"
+                    );
+                }
+                false
+            }
+        }
     }
 }
 
@@ -153,5 +175,41 @@ fn report(node: &Node) {
         if node.health().failed_times(&reason, times) {
             tracing::warn!(%reason, "Access denied (further denials are only counted)");
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_list_of_holders_that_cannot_be_taken_up_is_an_error_in_the_health() {
+        let keys = tempfile::tempdir().unwrap();
+        let list = keys.path().join(HOLDERS);
+        let write = |text: &str| std::fs::write(&list, text).unwrap();
+        write("drone@drone\noperator@drone\n");
+        let network = Network { keys: Some(keys.path().to_owned()), ..Network::default() };
+        let (holders, health) = (HoldersFile::new(&network), HealthCounters::default());
+        let identity = Identity { service: RELAY, instance: "drone".into() };
+        let errors = || health.report(&identity, 0).errors;
+        assert!(!holders.has_changed(&health));
+        write("drone@drone\nrevoked operator@drone\n");
+        assert!(holders.has_changed(&health));
+        std::fs::remove_file(&list).unwrap();
+        assert!(!holders.has_changed(&health), "it is being replaced");
+        assert_eq!(errors(), []);
+        write("drone@drone\nrevoked operator\n");
+        for times in 1..3 {
+            assert!(!holders.has_changed(&health));
+            let told = errors();
+            assert!(told[0].reason.contains("`operator` is not ROLE@VEHICLE"), "{told:?}");
+            assert!(told[0].reason.contains("who was revoked since is not shut out"), "{told:?}");
+            assert_eq!((told.len(), told[0].count), (1, times));
+        }
+        // Whoever runs the tests may be allowed to read any file, but a directory is none.
+        std::fs::remove_file(&list).unwrap();
+        std::fs::create_dir(&list).unwrap();
+        assert!(!holders.has_changed(&health));
+        assert!(errors().iter().any(|error| error.reason.contains("reading")), "{:?}", errors());
     }
 }

@@ -232,7 +232,20 @@ fn check_key(findings: &mut Findings, keys: &Path, name: &str, vehicle: &str) {
 /// Checks that a list of holders among the keys names the drone: processes beside an older one refuse its relay.
 fn check_holders(findings: &mut Findings, keys: &Path, vehicle: &str) {
     let path = keys.join(HOLDERS);
-    let Ok(text) = std::fs::read_to_string(&path) else { return };
+    let text = match std::fs::read_to_string(&path) {
+        Ok(text) => text,
+        // Where one is needed, that is told where the network is joined.
+        Err(cause) if cause.kind() == ErrorKind::NotFound => return,
+        Err(cause) => {
+            let told = path.display();
+            findings.wrong(
+                "keys",
+                format!("{told} cannot be read ({cause}), so what changes in it, as who is revoked, has no effect"),
+                &format!("it holds no secret: `sudo chmod 644 {told}`, or {COPY_HOLDERS}"),
+            );
+            return;
+        }
+    };
     match text.parse::<Holders>() {
         Err(problem) => {
             findings.wrong("keys", format!("{}: {problem:#}", path.display()), COPY_HOLDERS);
@@ -335,6 +348,22 @@ mod tests {
             assert!(text.contains(part) && text.contains("WRONG"), "{name}: {text}");
             std::fs::remove_dir_all(&here).unwrap();
             make_for_tests(&here, &[]).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_list_of_holders_that_cannot_be_read_is_told() {
+        let folder = tempfile::tempdir().unwrap();
+        make_for_tests(folder.path(), &[]).unwrap();
+        let list = folder.path().join(HOLDERS);
+        // Whoever runs the tests may be allowed to read any file, but a directory is none.
+        std::fs::remove_file(&list).unwrap();
+        let without = told(folder.path());
+        assert!(without.ends_with("Nothing is wrong."), "{without}");
+        std::fs::create_dir(&list).unwrap();
+        let text = told(folder.path());
+        for part in ["WRONG", "holders.txt cannot be read", "has no effect", "chmod 644"] {
+            assert!(text.contains(part), "`{part}` is not in: {text}");
         }
     }
 
