@@ -46,8 +46,8 @@ pub(crate) struct NetworkArgs {
     /// Address of the drone, or of the relay to it: HOST or HOST:PORT.
     #[arg(long, value_name = "ADDRESS", env = variable::CONNECT)]
     connect: Option<String>,
-    /// Address at which the relay listens: HOST or HOST:PORT [default: port 7448 of all interfaces, with 7449
-    /// and 7450 for frames].
+    /// Address at which the relay listens: HOST or HOST:PORT, and for IPv6 as well `[::]` [default: port 7448 of all IPv4
+    /// addresses, with 7449 and 7450 for frames].
     #[arg(long, value_name = "ADDRESS", env = variable::LISTEN)]
     listen: Option<String>,
     /// Rendezvous port of the processes of this machine, with `local` and `drone` [default: 7447].

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 use clap::ValueEnum;
 use node::access::key_name;
-use node::network::Address;
+use node::network::{Address, NO_KEYS_OVER_IPV6};
 use node::{ConfigError, Layers, Network};
 use serde::Deserialize;
 
@@ -218,15 +218,19 @@ impl Site {
             Role::Relay => (Role::Relay, "relay_address", &self.relay_address),
             Role::Ground | Role::Local => return Ok(None),
         };
-        // It listens at the port to which others connect.
+        // It listens at the port to which others connect, and for IPv6 where that is what they use: by itself it does not.
         let address = reached_at.as_deref().map(Address::parse).transpose();
         let address = address.with_context(|| format!("`{key}` of the site"))?;
-        let port = address.and_then(|address| address.port);
-        let network = Network {
-            config: Some(config.name().into()),
-            listen: port.map(|port| format!("0.0.0.0:{port}")),
-            ..self.network(role)
-        };
+        let is_ipv6 = address.as_ref().is_some_and(|address| address.host.starts_with('['));
+        ensure!(!is_ipv6 || self.keys.is_none(), "`{key}` of the site: {NO_KEYS_OVER_IPV6}");
+        let listen = address.and_then(|Address { port, .. }| {
+            let port = port.map(|port| format!(":{port}"));
+            match is_ipv6 {
+                true => Some(format!("[::]{}", port.unwrap_or_default())),
+                false => port.map(|port| format!("0.0.0.0{port}")),
+            }
+        });
+        let network = Network { config: Some(config.name().into()), listen, ..self.network(role) };
         Ok(Some(Job {
             name: RELAY.to_owned(),
             service: None,
@@ -345,6 +349,28 @@ mod tests {
         between.relay_address = Some("base.local".to_owned());
         let jobs = between.jobs(Role::Ground).unwrap();
         assert!(jobs[0].network.environment().contains(&("ALIGHT_CONNECT", "base.local".into())));
+    }
+
+    #[test]
+    fn a_relay_listens_at_ipv6_addresses_when_others_connect_to_one() {
+        for (address, listen) in [
+            ("fd00::1", Some("[::]")),
+            ("[fd00::1]", Some("[::]")),
+            ("[fd00::1]:8000", Some("[::]:8000")),
+            ("10.0.0.1:8000", Some("0.0.0.0:8000")),
+            ("10.0.0.1", None),
+            ("kestrel.local", None),
+        ] {
+            let of_drone = format!("insecure = true\naddress = '{address}'");
+            let of_base =
+                format!("insecure = true\naddress = '10.0.0.1'\nrelay_address = '{address}'");
+            for (text, role) in [(of_drone, Role::Drone), (of_base, Role::Relay)] {
+                let jobs = site(&text).jobs(role).unwrap();
+                assert_eq!(jobs[0].network.listen.as_deref(), listen, "{text}");
+            }
+        }
+        let told = problem("keys = 'keys'\naddress = 'fd00::1'", Role::Drone);
+        assert!(told.contains("`address` of the site: with keys, nothing"), "{told}");
     }
 
     /// The example beside the keys that `docs/deploy.md` has made for it.

@@ -38,6 +38,10 @@ pub const OPEN: &str =
 /// The file name of the authority's certificate in a directory of keys.
 pub const AUTHORITY: &str = "authority.pem";
 
+/// Why an IPv6 address is refused where there are keys, and what to do.
+pub const NO_KEYS_OVER_IPV6: &str = "with keys, nothing can be reached at an IPv6 address: give the IPv4 address of that machine, which its key has to name as well \
+     (`alight keys issue --address`)";
+
 /// Maximum port of an address: the next two are used as well.
 const MAX_PORT: u16 = u16::MAX - 2;
 /// The placeholder in a configuration for the address of the other side.
@@ -153,6 +157,9 @@ impl Network {
             !is_missing,
             "{name} needs the address of the drone: `--connect ADDRESS`, or ALIGHT_CONNECT in the environment"
         );
+        if let Some(endpoint) = endpoints(&config, "connect").find(|e| is_refused_by_tls(e)) {
+            bail!("{name} connects to {endpoint}: {NO_KEYS_OVER_IPV6}");
+        }
         if let Some(endpoint) = open_endpoint(&config).filter(|_| !self.insecure) {
             bail!(
                 "{name} listens beyond this machine ({endpoint}) without keys, so anyone in reach could command the \
@@ -360,6 +367,11 @@ fn open_endpoint(config: &Value) -> Option<String> {
     endpoints(config, "listen").find(|endpoint| is_open(endpoint)).map(str::to_owned)
 }
 
+/// Whether an endpoint is an IPv6 address over TLS: Zenoh takes the brackets for a part of its name, and never connects.
+fn is_refused_by_tls(endpoint: &str) -> bool {
+    Endpoint::parse(endpoint).is_some_and(|it| it.protocol == "tls" && it.host.starts_with('['))
+}
+
 fn merge(below: &mut Value, above: Value) {
     match (below, above) {
         (Value::Object(below), Value::Object(above)) => {
@@ -529,6 +541,12 @@ mod tests {
             refused(network, "HOST:PORT");
         }
         refused(Network { vehicle: Some("a/b".into()), ..Network::default() }, "letters, digits");
+        let folder = tempfile::tempdir().unwrap();
+        write_keys(folder.path(), "detector");
+        let keys = Some(folder.path().to_owned());
+        let connect = Some("fd00::1".into());
+        let part = "connects to tls/[fd00::1]:7448?prio=1-4#dscp=0xb8: with keys, nothing";
+        refused(Network { keys, connect, ..built_in("ground") }, part);
         let keys = Some("no/keys".into());
         let connect = Some("10.0.0.1".into());
         refused(

@@ -103,6 +103,29 @@ async fn the_ground_takes_part_through_the_drones_relay() -> anyhow::Result<()> 
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn the_ground_reaches_a_relay_at_either_kind_of_address() -> anyhow::Result<()> {
+    if std::net::TcpListener::bind("[::1]:0").is_err() {
+        // This machine has no IPv6.
+        return Ok(());
+    }
+    let site = Site::new()?;
+    let camera = site.open("local", "camera-pub", "down").await?;
+    let listen = Some(site.air.replace("127.0.0.1", "[::]"));
+    let relay = Network { connect: None, listen, insecure: true, ..site.network("drone") };
+    let identity = Identity { service: "relay", instance: "drone".into() };
+    let _relay = Node::open(identity, &relay.source("relay")?).await?;
+    for host in ["[::1]", "127.0.0.1"] {
+        let connect = Some(site.air.replace("127.0.0.1", host));
+        let ground = Network { connect, listen: None, ..site.network("ground") };
+        let identity = Identity { service: "detector", instance: "ground".into() };
+        let detector = Node::open(identity, &ground.source("detector")?).await?;
+        is_received(&camera, &detector).await?;
+        detector.close().await;
+    }
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn processes_on_the_ground_are_connected_without_the_drone() -> anyhow::Result<()> {
     let site = Site::new()?;
     let relay = site.open("drone", "relay", "drone").await?;
