@@ -12,6 +12,10 @@ use node::{Network, ZenohSource};
 /// The role whose key the tools at the command line use.
 pub(crate) const OPERATOR: &str = "operator";
 
+/// What a port at which the processes of a machine meet must be.
+pub(crate) const MEET_RULE: &str =
+    "all processes of a machine meet at the same port: write a number from 1 to 65535";
+
 /// The arguments of every service.
 #[derive(Args, Clone, Default)]
 pub(crate) struct ServiceArgs {
@@ -51,7 +55,7 @@ pub(crate) struct NetworkArgs {
     #[arg(long, value_name = "ADDRESS", env = variable::LISTEN)]
     listen: Option<String>,
     /// Rendezvous port of the processes of this machine, with `local` and `drone` [default: 7447].
-    #[arg(long, value_name = "PORT", env = variable::MEET)]
+    #[arg(long, value_name = "PORT", env = variable::MEET, value_parser = meet_port)]
     meet: Option<u16>,
     /// The vehicle's name, the first part of all keys [default: drone].
     #[arg(long, value_name = "NAME", env = variable::VEHICLE)]
@@ -86,6 +90,14 @@ impl NetworkArgs {
     }
 }
 
+/// The port at which the processes of a machine meet; at port 0, any that is free, none would find another.
+pub(crate) fn meet_port(text: &str) -> Result<u16, String> {
+    match text.parse() {
+        Ok(port @ 1..) => Ok(port),
+        Ok(0) | Err(_) => Err(MEET_RULE.to_owned()),
+    }
+}
+
 /// An address at which a service is to listen.
 pub(crate) fn address(text: &str) -> Result<SocketAddr, String> {
     text.parse().map_err(|_| {
@@ -116,7 +128,24 @@ pub(crate) enum Format {
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser;
+
     use super::*;
+
+    #[derive(Parser)]
+    struct Tool {
+        #[command(flatten)]
+        network: NetworkArgs,
+    }
+
+    #[test]
+    fn processes_that_would_meet_at_any_port_are_refused() {
+        let given = |port: &str| Tool::try_parse_from(["tool", "--meet", port]);
+        let told = given("0").err().map(|problem| problem.to_string()).unwrap();
+        assert!(told.contains("--meet") && told.contains("1 to 65535"), "{told}");
+        assert!(given("x").is_err() && given("65536").is_err());
+        assert_eq!(given("9000").map(|tool| tool.network.meet).ok(), Some(Some(9000)));
+    }
 
     #[test]
     fn a_port_alone_is_answered_with_the_address_that_was_meant() {

@@ -16,7 +16,7 @@ use node::{Layers, Network, Node, Shutdown, read_text};
 use tempfile::TempDir;
 use tokio::time::Instant;
 
-use crate::args::{Format, OPERATOR, address};
+use crate::args::{Format, OPERATOR, address, meet_port};
 use crate::children::{ChildEvent, Children, options_for_shell};
 use crate::ending::recording;
 use crate::outcome::{LandingSummary, OurRecorder};
@@ -62,7 +62,7 @@ pub(crate) struct LandArgs {
     #[arg(long, value_name = "FILE")]
     zenoh: Option<PathBuf>,
     /// Port at which the processes of this landing meet, if it is free; otherwise another one is chosen, and told [default: 7447].
-    #[arg(long, value_name = "PORT", env = variable::MEET, value_parser = clap::value_parser!(u16).range(1..))]
+    #[arg(long, value_name = "PORT", env = variable::MEET, value_parser = meet_port)]
     meet: Option<u16>,
     /// The vehicle's name, the first part of all keys [default: drone, or that of `--zenoh`].
     #[arg(long, value_name = "NAME", env = variable::VEHICLE)]

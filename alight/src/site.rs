@@ -10,6 +10,7 @@ use node::network::{Address, NO_KEYS_OVER_IPV6};
 use node::{ConfigError, Layers, Network};
 use serde::Deserialize;
 
+use crate::args::MEET_RULE;
 use crate::services::{RELAY, Service};
 
 /// The role of a machine.
@@ -116,6 +117,14 @@ impl Site {
             source_name: path.display().to_string(),
             cause: cause.to_string().trim_end().to_owned(),
         })?;
+        if site.meet == Some(0) {
+            return Err(ConfigError::Refused {
+                source_name: path.display().to_string(),
+                key: "meet".to_owned(),
+                value: "0".to_owned(),
+                limit: MEET_RULE.to_owned(),
+            });
+        }
         let folder = path.parent().filter(|folder| *folder != Path::new(""));
         let folder = folder.unwrap_or(Path::new("."));
         site.folder = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
@@ -439,6 +448,17 @@ mod tests {
         let told = Site::read(&path).unwrap_err().to_string();
         assert!(told.contains("site.toml") && told.contains("line 2"), "{told}");
         assert!(told.contains("save it as UTF-8"), "{told}");
+    }
+
+    #[test]
+    fn a_site_whose_processes_would_meet_at_any_port_is_refused() {
+        let home = tempfile::tempdir().unwrap();
+        let path = home.path().join("site.toml");
+        std::fs::write(&path, "meet = 0").unwrap();
+        let told = Site::read(&path).unwrap_err().to_string();
+        assert!(told.contains("`meet` = 0 is invalid") && told.contains("1 to 65535"), "{told}");
+        std::fs::write(&path, "meet = 9000").unwrap();
+        assert_eq!(Site::read(&path).unwrap().meet, Some(9000));
     }
 
     #[test]
