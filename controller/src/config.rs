@@ -1,5 +1,7 @@
 //! The controller's configuration.
 
+use std::time::Duration;
+
 use autopilot::{Address, KeyFileError, Permission, SigningConfig, Takeoff};
 use landing::{
     EnvelopeConfig, EstimatorConfig, GuidanceConfig, MetricConfig, PhaseConfig, TargetConfig,
@@ -8,9 +10,10 @@ use landing::{
 use node::{Check, Settings, clock_name, state_directory};
 use serde::{Deserialize, Serialize};
 
-use crate::service::TICK;
 use crate::wind::Drag;
 
+/// Period of the flight's ticks.
+pub(crate) const TICK: Duration = Duration::from_millis(25);
 /// Periods of the setpoints that the autopilot's setpoint timeout must last: with 2 of them one lost setpoint is survived.
 const MIN_TIMEOUT_PERIODS: f64 = 2.5;
 

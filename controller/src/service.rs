@@ -15,13 +15,11 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
-use crate::config::Config;
+use crate::config::{Config, TICK};
 use crate::flight::Flight;
 use crate::note_file::{NoteFile, PadFile, remove_useless_pads};
 use crate::tape::TapedFlight;
 
-/// Period of the flight's ticks.
-pub(crate) const TICK: Duration = Duration::from_millis(25);
 /// Longest wait at shutdown for the autopilot to confirm that its parameter is put back, and for the heartbeats, one a second, after
 /// which a PX4 is asked to hold its place, and which shows that it does.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
