@@ -241,9 +241,9 @@ impl Takeoff {
         if !state.connected {
             return if waiting { Ok(()) } else { Err(TakeoffError::Lost) };
         }
-        // PX4 passes through modes of its own during the climb.
-        let rises =
-            !waiting && [FlightMode::AUTO_TAKEOFF, FlightMode::AUTO_HOLD].contains(&state.mode);
+        // PX4 passes through modes of its own from the command to rise on; before it, while it is armed, they are the pilot's.
+        let rises = !matches!(self.part, Part::Ready | Part::Arm(_))
+            && [FlightMode::AUTO_TAKEOFF, FlightMode::AUTO_HOLD].contains(&state.mode);
         let guided = state.mode.is_guided() || rises;
         self.guided |= guided;
         let taken = match &self.part {

@@ -759,8 +759,11 @@ fn the_pilots_mode_change_ends_the_takeoff() {
 #[test]
 fn a_pilot_who_arms_or_changes_the_mode_while_arming_is_refused_ends_the_takeoff() {
     let (position, manual) = (FlightMode::Px4(3 << 16), FlightMode::Px4(1 << 16));
-    for is_armed in [true, false] {
-        let mut world = World::with(|px4| px4.mode = position);
+    // The mode in which it stands, whether the pilot arms it there, and else the mode that the pilot chooses.
+    let hold = FlightMode::AUTO_HOLD;
+    let cases = [(position, None), (hold, None), (position, Some(manual)), (position, Some(hold))];
+    for (mode, chosen) in cases {
+        let mut world = World::with(|px4| px4.mode = mode);
         world.px4.refuses = true;
         let mut takeoff = Takeoff::new(10.0);
         let mut step = |world: &mut World| {
@@ -773,14 +776,14 @@ fn a_pilot_who_arms_or_changes_the_mode_while_arming_is_refused_ends_the_takeoff
             assert!(world.now < 120 * SECOND, "it is not refused");
         }
         world.px4.refuses = false;
-        match is_armed {
-            true => world.px4.armed = true,
-            false => world.px4.mode = manual,
+        match chosen {
+            None => world.px4.armed = true,
+            Some(mode) => world.px4.mode = mode,
         }
         let steps = (0..10 * SECOND / STEP).map(|_| step(&mut world)).last();
-        let Some(TakeoffProgress::Failed(problem)) = steps else { panic!("{steps:?}") };
-        let name = if is_armed { "PX4 POSITION" } else { "PX4 MANUAL" };
-        assert!(problem.to_string().contains(name), "{problem}");
+        let Some(TakeoffProgress::Failed(problem)) = steps else { panic!("{mode}: {steps:?}") };
+        let name = chosen.unwrap_or(mode).to_string();
+        assert!(problem.to_string().contains(&name), "{problem}");
         assert_eq!(world.px4.climbs_to_m, None);
     }
 }
