@@ -260,30 +260,30 @@ impl<D: Device> Capture<D> {
         Ok(())
     }
 
-    /// Takes the newest frame, if it is whole; `None` when there is none within `timeout`, or a damaged one.
+    /// Takes the newest whole frame; `None` when there is none within `timeout`, or only damaged ones.
     ///
     /// # Errors
     /// The device is gone, or what it gives is not what was agreed on.
     pub(crate) fn take(&mut self, timeout: Duration) -> Result<Option<Taken>, Lost> {
-        let Some(mut buffer) = self.dequeue(timeout)? else { return Ok(None) };
+        let mut newest: Option<Buffer> = None;
         // Whoever takes longer than a period for a frame would else be given the oldest, which wait until all buffers are full.
-        for _ in 1..self.buffers.len() {
-            let Some(newer) = self.dequeue(Duration::ZERO)? else { break };
-            self.counts.queued += 1;
-            self.queue(buffer.index)?;
-            buffer = newer;
-        }
-        let arrival_ns = self.device.now_ns();
-        match self.check(&buffer, arrival_ns) {
-            Ok(Some(exposure)) => {
-                let bytes = buffer.bytesused as usize;
-                Ok(Some(Taken { index: buffer.index, bytes, exposure }))
-            }
-            refused => {
-                self.queue(buffer.index)?;
-                refused.map(|_none| None)
+        for taken in 0..self.buffers.len() {
+            let timeout = if taken == 0 { timeout } else { Duration::ZERO };
+            let Some(buffer) = self.dequeue(timeout)? else { break };
+            let refused = if self.is_whole(&buffer)? {
+                let older = newest.replace(buffer);
+                self.counts.queued += u64::from(older.is_some());
+                older
+            } else {
+                Some(buffer)
+            };
+            if let Some(refused) = refused {
+                self.queue(refused.index)?;
             }
         }
+        let Some(buffer) = newest else { return Ok(None) };
+        let exposure = self.exposure(&buffer, self.device.now_ns())?;
+        Ok(Some(Taken { index: buffer.index, bytes: buffer.bytesused as usize, exposure }))
     }
 
     /// A buffer that the driver has filled; `None` when there is none within `timeout`.
@@ -310,11 +310,11 @@ impl<D: Device> Capture<D> {
         Ok(Some(buffer))
     }
 
-    /// When a buffer's frame was exposed; `None` when it is damaged.
-    fn check(&mut self, buffer: &Buffer, arrival_ns: i64) -> Result<Option<Exposure>, Lost> {
+    /// Whether a buffer has all of a frame.
+    fn is_whole(&mut self, buffer: &Buffer) -> Result<bool, Lost> {
         if buffer.flags & BUF_FLAG_ERROR != 0 {
             self.counts.damaged += 1;
-            return Ok(None);
+            return Ok(false);
         }
         let mapped = self.buffers.get(buffer.index as usize).map_or(0, Mapping::len);
         let bytes = buffer.bytesused as usize;
@@ -322,19 +322,17 @@ impl<D: Device> Capture<D> {
             Pixels::Mjpeg => (1..=mapped).contains(&bytes),
             _ => (self.rows.min_bytes()..=mapped).contains(&bytes),
         };
-        if !is_whole {
-            self.counts.cut += 1;
-            self.cut_in_a_row += 1;
-            if self.cut_in_a_row < IN_A_ROW {
-                return Ok(None);
-            }
-            let needed = self.rows.min_bytes();
-            return Err(Lost::FormatChanged(format!(
-                "its frames have {bytes} bytes, {needed} are needed"
-            )));
+        if is_whole {
+            self.cut_in_a_row = 0;
+            return Ok(true);
         }
-        self.cut_in_a_row = 0;
-        self.exposure(buffer, arrival_ns).map(Some)
+        self.counts.cut += 1;
+        self.cut_in_a_row += 1;
+        if self.cut_in_a_row < IN_A_ROW {
+            return Ok(false);
+        }
+        let needed = self.rows.min_bytes();
+        Err(Lost::FormatChanged(format!("its frames have {bytes} bytes, {needed} are needed")))
     }
 
     fn exposure(&mut self, buffer: &Buffer, arrival_ns: i64) -> Result<Exposure, Lost> {

@@ -355,6 +355,23 @@ mod tests {
     }
 
     #[test]
+    fn a_slow_reader_gets_the_newest_frame_that_is_whole() {
+        let fake = Fake::of("GREY", Stamps::ExposureStart, 0);
+        (1..2000).step_by(2).for_each(|number| fake.script(number, Happening::Damaged));
+        let mut video = Video::start(Rc::clone(&fake), wanted(&fake)).unwrap();
+        let mut frames = 0;
+        while fake.now_ns() < 10_000 * MS {
+            let Next::Frame(taken) = video.next().unwrap() else { continue };
+            assert_eq!(fake.number_at(taken.exposure.mid_ns + MS) % 2, 0);
+            fake.pass(Duration::from_millis(25));
+            video.capture().unwrap().give_back(taken).unwrap();
+            frames += 1;
+        }
+        // Each of 25 ms, in which two or three come, one of them at least whole.
+        assert!(frames > 390, "{frames}");
+    }
+
+    #[test]
     fn a_clock_that_was_good_once_ends_no_service_when_the_camera_is_back_with_another() {
         let fake = Fake::of("GREY", Stamps::ExposureStart, 0);
         fake.script(100, Happening::Unplugged(300 * MS));
