@@ -134,13 +134,24 @@ impl Frame {
 
     /// MCUs of a scan of all components. That of a single component is not interleaved: its MCU is one block, whatever its sampling.
     fn mcus(&self) -> u64 {
-        let edge = |axis: usize| {
-            let of = |it: &Component| it.sampling.get(axis).copied();
-            let most = self.components().filter_map(of).max().unwrap_or(1);
-            if self.components().count() == 1 { BLOCK_EDGE } else { BLOCK_EDGE * most }
-        };
-        let [width, height] = self.size;
-        width.div_ceil(edge(0)) * height.div_ceil(edge(1))
+        let [across, down] = self.mcus_by_axis();
+        across * down
+    }
+
+    fn mcus_by_axis(&self) -> [u64; 2] {
+        std::array::from_fn(|axis| self.size[axis].div_ceil(self.mcu_edge(axis)))
+    }
+
+    fn mcu_edge(&self, axis: usize) -> u64 {
+        let of = |it: &Component| it.sampling.get(axis).copied();
+        let max = self.components().filter_map(of).max().unwrap_or(1);
+        if self.components().count() == 1 { BLOCK_EDGE } else { BLOCK_EDGE * max }
+    }
+
+    /// MCUs of a further row of 8 lines, where the picture's rows are odd: encoders in hardware may fill up 1080 lines to 1088.
+    fn padding(&self) -> u64 {
+        let [across, down] = self.mcus_by_axis();
+        if self.mcu_edge(1) == BLOCK_EDGE && down % 2 == 1 { across } else { 0 }
     }
 
     /// Blocks of a component in an MCU of a scan of all components.
@@ -309,6 +320,8 @@ struct Scan<'a> {
     ac: Tables,
     parts: [Option<Part>; MAX_COMPONENTS],
     mcus: u64,
+    /// MCUs of the row that an encoder adds which fills up the picture to 16 lines; 0 where there is none to be filled up.
+    padding: u64,
     /// MCUs between restart markers; 0 without them.
     restart_interval: u64,
     coded: &'a [u8],
@@ -331,8 +344,8 @@ impl<'a> Scan<'a> {
                     let frame: Frame = frame?;
                     let parts = parts(&frame, segment.parameters)?;
                     let coded = jpeg.get(segment.at + 4 + segment.parameters.len()..)?;
-                    let mcus = frame.mcus();
-                    let scan = Self { dc, ac, parts, mcus, restart_interval, coded };
+                    let (mcus, padding) = (frame.mcus(), frame.padding());
+                    let scan = Self { dc, ac, parts, mcus, padding, restart_interval, coded };
                     let has_tables = |part: &Part| scan.tables(*part).is_some();
                     return scan.parts.iter().flatten().all(has_tables).then_some(scan);
                 }
@@ -377,14 +390,17 @@ impl<'a> Scan<'a> {
         Ok(())
     }
 
-    /// True when what follows the last block are blocks, too: they end with an MCU where the data do.
+    /// True when what follows the last block are blocks, too, and not those that fill up the picture: they end with an MCU where the data
+    /// do.
     fn goes_on(&self, mut bits: Bits<'_>) -> bool {
         if bits.is_at_marker() {
             return false;
         }
+        let mut surplus = 0;
         while self.skip_mcu(&mut bits, &mut 0).is_ok() {
+            surplus += 1;
             if bits.is_at_marker() {
-                return bits.is_filled();
+                return bits.is_filled() && surplus != self.padding;
             }
         }
         false
@@ -606,6 +622,15 @@ mod tests {
             assert_eq!(check(&[six, surplus, EOI]), Ok(()), "{surplus:x?}");
         }
         assert_eq!(check(&[six, EOI, seven, EOI]), Ok(()));
+        // 16 x 24 pixels are filled up to 16 x 32: a row of two blocks.
+        let frame = [8, 0, 24, 0, 16, 1, 7, 0x11, 0];
+        let headers = [segment(SOF_BASELINE, &frame), tables(), segment(SOS, GREY_SCAN)];
+        let check_odd = |blocks: usize| {
+            check_scan(&file(&headers, &[&coded(&vec![FULL; blocks])[..], EOI].concat()))
+        };
+        assert_eq!([6, 8].map(check_odd), [Ok(()), Ok(())]);
+        let beyond = || Err(ScanFault::Beyond { blocks: 6 });
+        assert_eq!([7, 9].map(check_odd), [beyond(), beyond()]);
         assert_eq!(check(&[seven, EOI]), Err(ScanFault::Beyond { blocks: BLOCKS }));
         // Blocks of whole bytes leave no rest of one to be filled up.
         let even = ["10 101 10 01 10 01 10 10 110 110 10 01 111000000000 1 0 "; 7];
