@@ -34,6 +34,8 @@ use crate::status::{Used, View};
 use crate::wind::WindEstimate;
 use crate::wire;
 
+/// Time in which an autopilot whose motors show as off shows that it has restarted, if that is why, in nanoseconds.
+const RESTART_SHOWS_NS: i64 = 3_000_000_000;
 /// Change of the link's delay that the lander is told of, in seconds.
 const LINK_DELAY_STEP_S: f64 = 0.01;
 
@@ -570,8 +572,8 @@ impl Flight {
             if command == OperatorCommand::Resume {
                 return Err("the autopilot steers; there is nothing to resume".to_owned());
             }
-            let height_m = self.decision.and_then(|d| d.target).map(|target| target.height_m);
-            return landing_target.abort(now_ns, height_m, no_return_m, &mut self.autopilot);
+            let may_recall = self.lander.may_recall();
+            return landing_target.abort(now_ns, may_recall, no_return_m, &mut self.autopilot);
         }
         let before = self.lander.phase();
         self.decide(now_ns, LanderEvent::Operator(command));
@@ -600,7 +602,7 @@ impl Flight {
 
     fn advance_mission(&mut self, now_ns: i64) {
         if let Some(landing_target) = &mut self.landing_target
-            && landing_target.step(now_ns, &mut self.autopilot)
+            && landing_target.step(now_ns, self.lander.may_recall(), &mut self.autopilot)
             && !self.mission.is_sending_landing_target()
         {
             // Somebody else began it; it is followed like our own.
@@ -695,7 +697,9 @@ impl Flight {
                     let by_motors = matches!(why, Some(Reason::TouchedDown | Reason::Disarmed));
                     self.mission.armed_changed(now_ns, armed, is_finished, by_motors);
                 }
-                Event::Restarted if self.mission.started_ns().is_some() && !self.is_over() => {
+                Event::Restarted
+                    if self.mission.started_ns().is_some() && !self.is_over_since(now_ns) =>
+                {
                     let why = "the autopilot restarted in flight".to_owned();
                     self.mission.fail(&mut self.autopilot, why);
                 }
@@ -704,9 +708,12 @@ impl Flight {
         }
     }
 
-    /// True after a landing, once the motors are off.
-    fn is_over(&self) -> bool {
-        self.view().is_finished() && self.autopilot.state().is_some_and(|state| !state.armed)
+    /// True after a landing whose motors have been off for some time. What says so of an autopilot that restarts in flight comes just
+    /// before what shows the restart.
+    fn is_over_since(&self, now_ns: i64) -> bool {
+        let is_off = self.autopilot.state().is_some_and(|state| !state.armed);
+        let off_ns = self.mission.disarmed_ns().map(|at_ns| now_ns.saturating_sub(at_ns));
+        self.view().is_finished() && is_off && off_ns.is_none_or(|off_ns| off_ns > RESTART_SHOWS_NS)
     }
 
     /// The pilot has taken over: what was requested before is not repeated against the pilot. A take-off passes

@@ -106,8 +106,9 @@ impl LandingTargetMode {
         self.state = State::Stabilising(now_ns);
     }
 
-    /// Follows what the autopilot does; true when it has just begun to land, whoever requested it.
-    pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
+    /// Follows what the autopilot does; true when it has just begun to land, whoever requested it. Only while it `may_recall` is the
+    /// vehicle so high that it is taken back from landing.
+    pub fn step(&mut self, now_ns: i64, may_recall: bool, autopilot: &mut Autopilot) -> bool {
         let Some(state) = autopilot.state().copied() else { return false };
         let lands = state.armed && state.mode.is_landing();
         match self.state.clone() {
@@ -116,6 +117,10 @@ impl LandingTargetMode {
                 self.state = State::Ended(format!("the flight mode was changed to {}", state.mode));
             }
             State::Landing => {}
+            State::Recalling(..) if lands && !may_recall => {
+                autopilot.withdraw();
+                self.state = State::Landing;
+            }
             State::Recalling(request, why) => match autopilot.status(request) {
                 CommandStatus::Pending => {}
                 CommandStatus::Failed(problem) if lands => {
@@ -124,7 +129,7 @@ impl LandingTargetMode {
                 }
                 _ => self.state = State::Ended(why),
             },
-            State::AbortedEarly(until_ns) if lands && now_ns <= until_ns => {
+            State::AbortedEarly(until_ns) if lands && may_recall && now_ns <= until_ns => {
                 self.recall(now_ns, autopilot);
             }
             // By the pilot or a mission, or as requested.
@@ -182,30 +187,29 @@ impl LandingTargetMode {
     }
 
     /// Aborts a landing: one that the autopilot flies already is taken back to the mode in which it hovers,
-    /// unless it is lower than `no_return_m`.
+    /// unless it is lower than `no_return_m`, as it is where it may not be recalled.
     ///
     /// # Errors
     /// Says why not.
     pub fn abort(
         &mut self,
         now_ns: i64,
-        height_m: Option<f64>,
+        may_recall: bool,
         no_return_m: f64,
         autopilot: &mut Autopilot,
     ) -> Result<String, String> {
-        let is_low = height_m.is_some_and(|height_m| height_m <= no_return_m);
         match self.state {
             State::Stabilising(_) | State::Commanding(_) => {
                 autopilot.withdraw();
                 self.state = match self.state {
-                    State::Commanding(_) if !is_low => {
+                    State::Commanding(_) if may_recall => {
                         State::AbortedEarly(now_ns.saturating_add(MAX_LATE_LAND_NS))
                     }
                     _ => State::Ended(ABORTED.to_owned()),
                 };
                 Ok(ABORTED.to_owned())
             }
-            State::Landing if is_low => {
+            State::Landing if !may_recall => {
                 Err(format!("below {no_return_m} m the autopilot's landing is not interrupted"))
             }
             State::Landing => Ok(self.recall(now_ns, autopilot)),

@@ -359,20 +359,79 @@ fn an_abort_while_land_is_asked_for_takes_the_autopilot_back_from_it() {
     }
 }
 
+/// In this mode, without a marker, from one height to another: the modes that are asked for.
+fn asked_at(
+    flight: &mut Flight,
+    mode: u32,
+    (from_ms, to_ms): (i64, i64),
+    (from_m, to_m): (f32, f32),
+) -> Vec<f32> {
+    let mut sent = Sent::default();
+    for ms in (from_ms..to_ms).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(flight, ms * MS, &heartbeat(mode, true));
+        }
+        let share = (ms - from_ms) as f32 / (to_ms - from_ms) as f32;
+        pose_at(flight, ms * MS, from_m + share * (to_m - from_m));
+        flight.tick(ms * MS + 3);
+        sent.take(flight);
+    }
+    sent.modes
+}
+
+#[test]
+fn low_over_the_ground_the_autopilot_is_not_taken_back_from_its_precision_landing() {
+    let landing = || {
+        let mut flight = landing_target("airborne");
+        parameter(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
+        parameter(&mut flight, 2 * MS, "PLND_TYPE", 1.0);
+        assert_eq!(hover(&mut flight, 1000, 6000, 4).modes.first(), Some(&9.0));
+        flight
+    };
+    let abort = |flight: &mut Flight, ms: i64| {
+        let reply = flight.command(ms * MS, &ControllerCommand::Abort);
+        assert!(reply.accepted, "{reply:?}");
+    };
+    // LAND, asked for before the abort, shows when the vehicle is low already.
+    let mut flight = landing();
+    abort(&mut flight, 6000);
+    assert!(asked_at(&mut flight, 4, (6020, 8000), (5.0, 0.9)).is_empty());
+    assert!(asked_at(&mut flight, 9, (8000, 12_000), (0.9, 0.2)).is_empty());
+    assert_eq!(flight.status(12_000 * MS).phase, Phase::Final);
+    // What takes it back is lost, and it becomes low.
+    let mut flight = landing();
+    asked_at(&mut flight, 9, (6020, 8000), (5.0, 3.0));
+    abort(&mut flight, 8000);
+    assert!(asked_at(&mut flight, 9, (8000, 9500), (3.0, 1.1)).contains(&4.0));
+    asked_at(&mut flight, 9, (9500, 9700), (1.1, 0.9));
+    assert!(asked_at(&mut flight, 9, (9700, 14_000), (0.9, 0.8)).is_empty());
+    assert_eq!(flight.status(14_000 * MS).phase, Phase::Final);
+}
+
+#[test]
+fn a_vehicle_that_takes_what_called_it_back_climbs_also_where_it_has_become_low() {
+    let mut flight = in_flight("airborne");
+    hover(&mut flight, 20, 1000, 4);
+    assert!(flight.command(1000 * MS, &ControllerCommand::LandHere).accepted);
+    asked_at(&mut flight, 9, (1000, 3000), (5.0, 1.2));
+    assert!(flight.command(3000 * MS, &ControllerCommand::Abort).accepted);
+    assert_eq!(asked_at(&mut flight, 9, (3000, 3400), (1.2, 0.9)), [4.0]);
+    receive(&mut flight, 3400 * MS, &heartbeat(4, true));
+    let mut sent = Sent::default();
+    for ms in (3420..3980).step_by(20) {
+        pose_at(&mut flight, ms * MS, 0.9);
+        flight.tick(ms * MS + 3);
+        sent.take(&mut flight);
+    }
+    assert!(sent.setpoints > 10, "{}", sent.setpoints);
+    assert_eq!(flight.status(3980 * MS).phase, Phase::Aborted);
+}
+
 #[test]
 fn a_vehicle_that_is_called_back_from_land_is_left_to_it_low_over_the_ground() {
     let mut flight = in_flight("airborne");
     let land = |flight: &mut Flight, from_ms: i64, to_ms: i64, height_m: f32| {
-        let mut sent = Sent::default();
-        for ms in (from_ms..to_ms).step_by(20) {
-            if ms % 1000 == 0 {
-                receive(flight, ms * MS, &heartbeat(9, true));
-            }
-            pose_at(flight, ms * MS, height_m);
-            flight.tick(ms * MS + 3);
-            sent.take(flight);
-        }
-        sent.modes
+        asked_at(flight, 9, (from_ms, to_ms), (height_m, height_m))
     };
     hover(&mut flight, 20, 1000, 4);
     assert!(flight.command(1000 * MS, &ControllerCommand::LandHere).accepted);
@@ -928,6 +987,31 @@ fn an_autopilot_that_is_restarted_after_a_landing_is_no_failure() {
     receive(&mut flight, 30_000 * MS, &heartbeat(4, true));
     receive(&mut flight, 30_001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
     assert_eq!(poses(&mut flight, 30_020, 31_000, 10_000), Phase::Search);
+}
+
+#[test]
+fn an_autopilot_that_restarts_in_flight_has_not_landed() {
+    for mode in [9, 4] {
+        let mut flight = in_flight("airborne");
+        let poses = |flight: &mut Flight, (from_ms, to_ms): (i64, i64), booted_ms: i64| {
+            for ms in (from_ms..to_ms).step_by(20) {
+                receive(flight, ms * MS, &attitude((ms - booted_ms) * MS));
+                receive(flight, ms * MS + 1, &position((ms - booted_ms) * MS, 3.0));
+                flight.tick(ms * MS + 3);
+            }
+        };
+        hover(&mut flight, 20, 8000, 4);
+        assert!(flight.command(8000 * MS, &ControllerCommand::LandHere).accepted);
+        receive(&mut flight, 8010 * MS, &heartbeat(mode, true));
+        poses(&mut flight, (8020, 9000), 0);
+        assert_eq!(flight.status(9000 * MS).phase, Phase::Final);
+        // It falls silent, and its first heartbeat comes before what shows the time since its start.
+        receive(&mut flight, 11_000 * MS, &heartbeat(0, false));
+        poses(&mut flight, (11_600, 12_400), 10_900);
+        let status = flight.status(12_400 * MS);
+        assert_eq!(status.phase, Phase::Failed, "{}", status.why);
+        assert!(status.why.contains("restarted in flight"), "{}", status.why);
+    }
 }
 
 #[test]

@@ -259,6 +259,12 @@ impl Lander {
         self.state_machine.is_recalling()
     }
 
+    /// True while the vehicle is so high that it can be called back from LAND, and not left hovering low over the ground.
+    pub fn may_recall(&self) -> bool {
+        let vehicle = self.now.and_then(|now| self.vehicle_inputs(now));
+        vehicle.is_some_and(|vehicle| self.state_machine.is_high(vehicle))
+    }
+
     /// The alarm or the operator's command for which the vehicle lands, or has landed, away from the marker.
     pub fn cause(&self) -> Option<Reason> {
         self.state_machine.cause()

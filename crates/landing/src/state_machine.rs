@@ -70,9 +70,9 @@ const MIN_LOOK_S: f64 = 1.0;
 /// late, and the next one follows in a second. Nothing is sent meanwhile, so a pilot who takes over waits for nothing.
 const MAX_OVERTAKEN_S: f64 = 1.2;
 
-/// Time after an abort in which LAND, asked for before it, may still show, in seconds: heartbeats come each second, and one
-/// may be lost.
-const MAX_LATE_LAND_S: f64 = 2.5;
+/// Time in which a mode that was asked for until then may still show, in seconds: LAND after an abort, our own mode after a recall from
+/// LAND. Heartbeats come each second, and one may be lost.
+const MAX_LATE_MODE_S: f64 = 2.5;
 
 /// Longest time by which LAND may exceed what its speed and the known height take while the vehicle still sinks, in seconds:
 /// the ground may lie far below the place where the vehicle took off.
@@ -151,6 +151,8 @@ pub struct StateMachine {
     released: bool,
     /// The aborted vehicle is being commanded from LAND back to GUIDED.
     is_recalling: bool,
+    /// When that ended for a vehicle that had become too low, until it shows another mode than LAND.
+    became_low: Option<Timestamp>,
     /// LAND was asked for before the abort and the vehicle may still show it: then it is recalled.
     expects_land: bool,
     /// Retries of this landing so far.
@@ -185,6 +187,7 @@ impl StateMachine {
             touchdown_limit_s: config.touchdown_timeout_s,
             released: false,
             is_recalling: false,
+            became_low: None,
             expects_land: false,
             retries: 0,
             disarmed: None,
@@ -336,6 +339,7 @@ impl StateMachine {
     fn enter(&mut self, phase: Phase, reason: Reason, now: Timestamp) {
         self.is_recalling =
             phase == Phase::Aborted && self.landing && reason == Reason::OperatorAbort;
+        self.became_low = None;
         self.cause = match (phase, reason) {
             (
                 Phase::Final,
@@ -357,16 +361,25 @@ impl StateMachine {
     /// After an abort, the first foreign mode releases the vehicle.
     fn release_on_takeover(&mut self, inputs: &Inputs) {
         let Some(vehicle) = inputs.vehicle else { return };
-        self.expects_land &= !self.timed_out(inputs, MAX_LATE_LAND_S);
+        self.expects_land &= !self.timed_out(inputs, MAX_LATE_MODE_S);
         if self.expects_land && vehicle.mode == Mode::Land {
             self.expects_land = false;
             self.is_recalling = true;
         }
         let in_time = !self.timed_out(inputs, self.config.land_timeout_s);
-        // One that would stop low over the ground, or on it with its motors running, is landed instead.
-        self.is_recalling &= vehicle.mode == Mode::Land && in_time && self.is_high(vehicle);
+        // One that would stop low over the ground, or on it with its motors running, is landed instead. Where it has taken what was asked
+        // of it before, it follows again.
+        let is_low = !self.is_high(vehicle);
+        if vehicle.mode != Mode::Land {
+            self.became_low = None;
+        } else if self.is_recalling && is_low {
+            self.became_low = Some(inputs.now);
+        }
+        self.is_recalling &= vehicle.mode == Mode::Land && in_time && !is_low;
+        let may_follow =
+            self.became_low.is_some_and(|since| inputs.now.seconds_since(since) <= MAX_LATE_MODE_S);
         let is_foreign = matches!(vehicle.mode, Mode::Land | Mode::Other);
-        self.released |= is_foreign && !self.is_recalling;
+        self.released |= is_foreign && !self.is_recalling && !may_follow;
     }
 
     /// The transitions that any phase can take.
@@ -451,7 +464,7 @@ impl StateMachine {
     }
 
     /// Whether the vehicle is so high that it can still be called back from LAND.
-    fn is_high(&self, vehicle: VehicleInputs) -> bool {
+    pub(crate) fn is_high(&self, vehicle: VehicleInputs) -> bool {
         // Below the place where it took off nothing is known of the ground; what sinks flies, and what is not in LAND yet.
         let flies = vehicle.landed != Landed::OnGround && (vehicle.sinks || !self.landing);
         let is_in_valley = !vehicle.is_over_target && vehicle.height_m < 0.0 && flies;

@@ -213,8 +213,19 @@ fn an_abort_ends_land_only_while_the_vehicle_is_high() {
     assert_eq!(after(&[land(9.4, 3.0)]), (true, false));
     assert_eq!(after(&[land(9.4, 3.0), at(9.6)]), (false, false), "it follows again");
     assert_eq!(after(&[land(15.0, 3.0)]), (false, true), "it did not come back");
-    assert_eq!(after(&[land(10.0, 0.9)]), (false, true), "it is as good as down");
-    assert_eq!(after(&[land(10.0, 0.9), land(10.2, 1.1)]), (false, true), "it stays released");
+    let low = land(10.0, 0.9);
+    assert_eq!(after(&[low]), (false, false), "it may have taken what was asked of it");
+    assert_eq!(after(&[low, land(10.2, 1.1)]), (false, false), "it is asked no more");
+    assert_eq!(
+        after(&[low, land(10.2, 0.8), at(10.4), at(14.0)]),
+        (false, false),
+        "it follows again"
+    );
+    assert_eq!(after(&[low, land(12.6, 0.1)]), (false, true), "it is as good as down");
+    assert_eq!(after(&[low, land(12.6, 0.1), at(13.0)]), (false, true), "it stays released");
+    assert_eq!(after(&[low, at(10.2), land(10.4, 0.9)]), (false, true), "LAND is the pilot's");
+    let other = flown(10.2, |v| v.mode = Mode::Other);
+    assert_eq!(after(&[low, other]), (false, true), "the pilot flies");
     assert_eq!(after(&[flown(9.4, |v| v.mode = Mode::Other)]), (false, true));
     let landing = PhaseConfig { on_abort: OnAbort::Land, ..PhaseConfig::default() };
     let mut machine = StateMachine::new(landing);

@@ -53,6 +53,7 @@ fn aged(machine: &StateMachine, seconds: f64) -> StateMachine {
         entered: earlier(machine.entered),
         started: earlier(machine.started),
         disarmed: machine.disarmed.map(earlier),
+        became_low: machine.became_low.map(earlier),
         ..machine.clone()
     }
 }
