@@ -419,13 +419,14 @@ impl Lander {
         if marker.confidence < self.config.target.min_confidence {
             return Err(Rejection::LowConfidence);
         }
-        if let (Some(pose), Some(motion)) = (marker.body_from_marker, self.history.at(frame.stamp))
-        {
+        if let Some(motion) = self.history.at(frame.stamp) {
             // Nothing was seen: neither the marker, nor that it is elsewhere.
-            if self.repeated_picture.is_repeated(frame.stamp, &motion, pose.origin()) {
+            if self.repeated_picture.is_repeated(frame, marker, &motion) {
                 return Err(Rejection::RepeatedPicture);
             }
-            self.axis_check.add(frame.stamp, &motion, pose.origin());
+            if let Some(pose) = marker.body_from_marker {
+                self.axis_check.add(frame.stamp, &motion, pose.origin());
+            }
         }
         self.mount_check.observe(&self.config.estimator, frame, marker, &self.history);
         self.first_seen.get_or_insert(frame.stamp);
