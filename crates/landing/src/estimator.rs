@@ -93,6 +93,13 @@ impl Estimator {
         Ok(())
     }
 
+    /// Forgets the detections of later frames than this, but for the oldest that is kept.
+    pub fn forget_since(&mut self, stamp: Timestamp) {
+        while self.past.len() > 1 && self.newest_stamp().is_some_and(|newest| newest > stamp) {
+            self.past.pop_back();
+        }
+    }
+
     /// The estimate relative to a vehicle at `vehicle`, at `now`, with the odometry frame's present place.
     pub fn estimate(
         &self,

@@ -420,8 +420,13 @@ impl Lander {
             return Err(Rejection::LowConfidence);
         }
         if let Some(motion) = self.history.at(frame.stamp) {
-            // Nothing was seen: neither the marker, nor that it is elsewhere.
-            if self.repeated_picture.is_repeated(frame, marker, &motion) {
+            // Nothing was seen: neither the marker, nor that it is elsewhere; nor was it in the frames that told of this one.
+            let config = &self.config.estimator;
+            if let Some(since) =
+                self.repeated_picture.repeated_since(frame, marker, &motion, config)
+            {
+                self.target_filter.forget_since(since);
+                self.sightings.forget_since(since);
                 return Err(Rejection::RepeatedPicture);
             }
             if let Some(pose) = marker.body_from_marker {

@@ -3,11 +3,14 @@
 //!
 //! The marker then stays where it is relative to the vehicle, however that moves: the pad seems to move along, and to sink before a
 //! vehicle that goes down. No two pictures of a camera are alike, as its noise differs, and no vehicle holds its place over a marker
-//! to a fraction of a millimetre. So a marker that stays, while the autopilot's position and attitude change, is an old one.
+//! to a fraction of a millimetre. So a marker that stays, while the autopilot's position and attitude change, is an old one. Where a link
+//! codes the picture anew for each frame it stays less exactly, and must seem to move further.
 
 use geometry::{Body, Camera, Pixel, Point, Rotation, Vector};
+use libm::hypot;
 use nalgebra::Vector3;
 
+use crate::config::EstimatorConfig;
 use crate::event::{FrameObservation, MarkerInFrame};
 use crate::history::Motion;
 use crate::time::Timestamp;
@@ -22,6 +25,14 @@ const MIN_ALIKE: u32 = 2;
 const MIN_MOVED_M: f64 = 0.05;
 const MIN_MOVED_SHARE: f64 = 0.01;
 
+/// The same where the link codes a repeated picture anew, in which the marker is found again less well (measured: 7e-4 at most from one
+/// quality of JPEG to the next). So much a marker may stay that moves along with the vehicle, or whose vehicle stays while the
+/// autopilot's position drifts: it must seem to move for longer, and faster than that (in m/s, beside the configured pad's speed).
+const MAX_CODED_CHANGE: f64 = 1e-3;
+const MIN_CODED_MOVED_M: f64 = 0.1;
+const MIN_CODED_MOVED_SHARE: f64 = 0.02;
+const MIN_CODED_M_S: f64 = 0.2;
+
 /// How far the direction to a marker whose distance is not known must seem to have turned over the ground meanwhile, in radians.
 const MIN_TURNED_RAD: f64 = 0.02;
 
@@ -29,11 +40,20 @@ const MIN_TURNED_RAD: f64 = 0.02;
 #[derive(Clone, Debug, Default)]
 pub(crate) struct RepeatedPicture {
     newest: Option<Sight>,
-    /// Where the marker was over the ground in the first of those that are alike, in the odometry frame, in metres; of one whose
-    /// distance is not known the direction.
-    first: Vector3<f64>,
+    /// The first of those that are alike, and how many came after it.
+    first: Option<First>,
     alike: u32,
-    /// The newest one is an old picture, and so are all that are like it.
+    /// The first of those in which the marker stays as it does in pictures that were coded anew.
+    coded: Option<First>,
+}
+
+/// The first of frames in which the marker stays.
+#[derive(Copy, Clone, Debug)]
+struct First {
+    sight: Sight,
+    /// Where the marker was over the ground, in the odometry frame, in metres; of one whose distance is not known the direction.
+    place: Vector3<f64>,
+    /// Those after it are old pictures.
     is_old: bool,
 }
 
@@ -47,14 +67,15 @@ struct Sight {
 }
 
 impl RepeatedPicture {
-    /// Adds a marker, and tells whether its picture is an old one. Where its distance is not known the direction decides: then a
-    /// vehicle that moves and does not tilt may see it where it was.
-    pub(crate) fn is_repeated(
+    /// Adds a marker, and tells since when its picture is an old one; `None` when it is of now. Where its distance is not known the
+    /// direction decides: then a vehicle that moves and does not tilt may see it where it was.
+    pub(crate) fn repeated_since(
         &mut self,
         frame: &FrameObservation,
         marker: &MarkerInFrame,
         motion: &Motion,
-    ) -> bool {
+        config: &EstimatorConfig,
+    ) -> Option<Timestamp> {
         let stamp = frame.stamp;
         let Some(pose) = marker.body_from_marker else {
             let in_body = direction(frame, marker.centre);
@@ -64,23 +85,47 @@ impl RepeatedPicture {
         let in_body = pose.origin() - Point::origin();
         let sight = Sight { stamp, in_body, has_distance: true };
         let place = motion.odometry.coords.coords + (motion.ned_from_body * in_body).coords;
-        self.add(sight, place, MIN_MOVED_M + MIN_MOVED_SHARE * in_body.norm())
+        let same = self.add(sight, place, MIN_MOVED_M + MIN_MOVED_SHARE * in_body.norm());
+        let pad_m_s = hypot(config.pad_speed_m_s, config.pad_heave_m_s);
+        let coded = self.add_coded(sight, place, MIN_CODED_M_S + pad_m_s);
+        coded.map_or(same, |coded| same.map_or(Some(coded), |same| Some(same.min(coded))))
     }
 
-    fn add(&mut self, sight: Sight, place: Vector3<f64>, min_moved: f64) -> bool {
-        let is_alike = self.newest.is_some_and(|newest| newest.is_like(&sight));
+    fn add(&mut self, sight: Sight, place: Vector3<f64>, min_moved: f64) -> Option<Timestamp> {
+        let is_alike = self.newest.is_some_and(|newest| newest.is_like(&sight, MAX_CHANGE));
+        let first = self.first.filter(|_| is_alike);
         // A frame that comes late says nothing of what has come since.
         if self.newest.is_some_and(|newest| sight.stamp <= newest.stamp) {
-            return is_alike && self.is_old;
+            return first.and_then(First::old_since);
         }
         self.newest = Some(sight);
-        if !is_alike {
-            (self.first, self.alike, self.is_old) = (place, 0, false);
-            return false;
+        self.alike = if is_alike { self.alike.saturating_add(1) } else { 0 };
+        let mut first = first.unwrap_or(First { sight, place, is_old: false });
+        first.is_old |= self.alike >= MIN_ALIKE && (place - first.place).norm() > min_moved;
+        self.first = Some(first);
+        first.old_since()
+    }
+
+    /// The same for a picture that may have been coded anew.
+    fn add_coded(&mut self, sight: Sight, place: Vector3<f64>, min_m_s: f64) -> Option<Timestamp> {
+        let first = self.coded.filter(|first| first.sight.is_like(&sight, MAX_CODED_CHANGE));
+        let after_s = self.coded.map_or(0.0, |it| sight.stamp.seconds_since(it.sight.stamp));
+        if after_s < 0.0 {
+            return None;
         }
-        self.alike = self.alike.saturating_add(1);
-        self.is_old |= self.alike >= MIN_ALIKE && (place - self.first).norm() > min_moved;
-        self.is_old
+        let mut first = first.unwrap_or(First { sight, place, is_old: false });
+        let min_m = MIN_CODED_MOVED_M
+            + MIN_CODED_MOVED_SHARE * sight.in_body.norm()
+            + min_m_s * sight.stamp.seconds_since(first.sight.stamp);
+        first.is_old |= (place - first.place).norm() > min_m;
+        self.coded = Some(first);
+        first.old_since()
+    }
+}
+
+impl First {
+    fn old_since(self) -> Option<Timestamp> {
+        self.is_old.then_some(self.sight.stamp)
     }
 }
 
@@ -95,9 +140,9 @@ fn direction(frame: &FrameObservation, pixel: Pixel) -> Vector<Body> {
 }
 
 impl Sight {
-    fn is_like(&self, other: &Self) -> bool {
+    fn is_like(&self, other: &Self, max_change: f64) -> bool {
         let change = (other.in_body - self.in_body).norm();
-        self.has_distance == other.has_distance && change <= MAX_CHANGE * other.in_body.norm()
+        self.has_distance == other.has_distance && change <= max_change * other.in_body.norm()
     }
 }
 
@@ -141,7 +186,7 @@ mod tests {
             body_from_camera: None,
             marker: Some(marker),
         };
-        check.is_repeated(&frame, &marker, motion)
+        check.repeated_since(&frame, &marker, motion, &EstimatorConfig::default()).is_some()
     }
 
     /// In which of the frames the picture is an old one, of a vehicle at these heights over a marker that is seen so deep, in metres.
@@ -175,7 +220,11 @@ mod tests {
         assert_eq!(repeated(24, height_m, stays), (7..24).collect::<Vec<_>>());
         // As a camera's noise has it, the vehicle may stay over a pad while the autopilot's height drifts.
         let noise = |number: u32| 5.0 * (1.0 + 3e-5 * f64::from(number % 2));
-        assert_eq!(repeated(20, true_m, noise), Vec::<u32>::new());
+        let drifts_m = |number: u32| 5.0 - 0.01 * f64::from(number);
+        assert_eq!(repeated(100, drifts_m, noise), Vec::<u32>::new());
+        // It is coded anew for each frame: it moves further than errors and a drift of the position explain.
+        let coded = |number: u32| true_m(number.min(5)) * (1.0 + 5e-4 * f64::from(number % 2));
+        assert_eq!(repeated(20, true_m, coded), (8..20).collect::<Vec<_>>());
     }
 
     #[test]

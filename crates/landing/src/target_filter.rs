@@ -65,6 +65,13 @@ impl TargetFilter {
         }
     }
 
+    /// Forgets the markers of later frames than this, as far as they are kept.
+    pub(crate) fn forget_since(&mut self, stamp: Timestamp) {
+        if let Self::Kalman(estimator) = self {
+            estimator.forget_since(stamp);
+        }
+    }
+
     /// The landing point at a time, seen from the vehicle.
     pub(crate) fn estimate(
         &self,
@@ -90,6 +97,11 @@ impl Sightings {
         self.in_a_row = if gap_s > max_gap_s { 1 } else { self.in_a_row.saturating_add(1) };
         self.newest = Some(stamp);
         self.out_of_view_s = 0.0;
+    }
+
+    /// Forgets that markers of later frames than this were seen.
+    pub(crate) fn forget_since(&mut self, stamp: Timestamp) {
+        self.newest = self.newest.map(|newest| newest.min(stamp));
     }
 
     /// Notes a marker that was refused; frames may come late and twice.

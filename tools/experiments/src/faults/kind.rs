@@ -54,6 +54,8 @@ pub enum Kind {
     ClockStep,
     /// The camera repeats its last picture, with new stamps.
     PictureRepeated,
+    /// It does, and the link codes it anew for each frame.
+    PictureRecoded,
     /// A preferred detector says that the marker is 1 m beside its place.
     LiarJumps,
     /// A preferred detector lets the marker drift by 5 cm/s.
@@ -105,7 +107,7 @@ pub enum Kind {
 /// A kind, its name and its description.
 type Row = (Kind, &'static str, &'static str);
 
-const TABLE: [Row; 46] = [
+const TABLE: [Row; 47] = [
     (
         Kind::ControllerKilled,
         "controller-killed",
@@ -137,6 +139,7 @@ const TABLE: [Row; 46] = [
         "picture-repeated",
         "the camera repeats its last picture, with new stamps",
     ),
+    (Kind::PictureRecoded, "picture-recoded", "it does, and the link codes it anew each time"),
     (Kind::LiarJumps, "liar-jumps", "a preferred detector is 1 m off, from one frame to the next"),
     (Kind::LiarDrifts, "liar-drifts", "a preferred detector drifts by 5 cm/s"),
     (Kind::PreferredIsBlind, "preferred-is-blind", "a preferred detector finds nothing"),
@@ -270,7 +273,7 @@ mod tests {
 
     #[test]
     fn every_kind_has_a_unique_name() {
-        assert_eq!((Kind::all().count(), Kind::in_lockstep().count()), (46, 40));
+        assert_eq!((Kind::all().count(), Kind::in_lockstep().count()), (47, 41));
         for kind in Kind::all() {
             assert_eq!(kind.name().parse(), Ok(kind));
             assert!(!kind.words().is_empty());
