@@ -181,6 +181,8 @@ struct Listed {
     file: Option<String>,
     /// Days until the certificate expires; negative when it has.
     expires_in_days: Option<i64>,
+    /// By this machine's clock the certificate is of the future.
+    is_not_valid_yet: bool,
 }
 
 /// What the list of holders says of one.
@@ -193,6 +195,12 @@ enum Standing {
     Unlisted,
 }
 
+impl Listed {
+    fn without_key(holder: String, standing: Standing) -> Self {
+        Self { holder, standing, file: None, expires_in_days: None, is_not_valid_yet: false }
+    }
+}
+
 impl HolderList {
     fn table(&self) -> String {
         let mut rows = vec![["HOLDER", "MAY CONNECT", "KEY HERE"].map(str::to_owned)];
@@ -203,6 +211,9 @@ impl HolderList {
                 Standing::Unlisted => "no, not in holders.txt",
             };
             let key = match (&listed.file, listed.expires_in_days) {
+                (Some(file), Some(_)) if listed.is_not_valid_yet => {
+                    format!("{file}, not valid yet: is this machine's clock right?")
+                }
                 (Some(file), Some(..0)) => format!("{file}, expired"),
                 (Some(file), Some(days)) => format!("{file}, expires in {days} days"),
                 _ => "-".to_owned(),
@@ -374,8 +385,7 @@ fn list(directory: &Path) -> anyhow::Result<HolderList> {
         .chain(holders.revoked().map(|holder| (holder, Standing::Revoked)))
     {
         let holder = listed.to_string();
-        let listed = Listed { holder: holder.clone(), standing, file: None, expires_in_days: None };
-        by_name.insert(holder, listed);
+        by_name.insert(holder.clone(), Listed::without_key(holder, standing));
     }
     let files = fs::read_dir(directory).with_context(|| format!("reading {directory:?}"))?;
     let mut paths: Vec<PathBuf> = files.map(|file| Ok(file?.path())).collect::<io::Result<_>>()?;
@@ -385,20 +395,18 @@ fn list(directory: &Path) -> anyhow::Result<HolderList> {
     paths.sort();
     for path in paths {
         // Certificates of pages and others may be there as well.
-        let Ok(Certificate { common_name, expires_in_s, .. }) = certificate(&path) else {
+        let Ok(Certificate { common_name, begins_in_s, expires_in_s }) = certificate(&path) else {
             continue;
         };
         if common_name.parse::<Holder>().is_err() {
             continue;
         }
-        let listed = by_name.entry(common_name.clone()).or_insert_with(|| Listed {
-            holder: common_name,
-            standing: Standing::Unlisted,
-            file: None,
-            expires_in_days: None,
-        });
+        let listed = by_name
+            .entry(common_name.clone())
+            .or_insert_with(|| Listed::without_key(common_name, Standing::Unlisted));
         listed.file = path.file_name().map(|name| name.to_string_lossy().into_owned());
         listed.expires_in_days = Some(expires_in_s.div_euclid(DAY.as_secs().cast_signed()));
+        listed.is_not_valid_yet = begins_in_s > 0;
     }
     Ok(HolderList { holders: by_name.into_values().collect() })
 }
@@ -659,6 +667,11 @@ mod tests {
         // The laptop's list is of the time before.
         let lines: Vec<_> = of_laptop.lines().collect();
         assert!(lines[1].starts_with("operator.bob@drone  yes          operator.pem, expires in "));
+        let mut early = list(&laptop).unwrap();
+        assert!(!early.holders[0].is_not_valid_yet);
+        early.holders[0].is_not_valid_yet = true;
+        let told = "operator.bob@drone  yes          operator.pem, not valid yet: is this machine's clock right?";
+        assert_eq!(early.table().lines().nth(1), Some(told));
         let of_home = list(here).unwrap().table();
         let lines: Vec<_> = of_home.lines().collect();
         assert!(lines[1].starts_with("observer@drone      yes          observer.pem, expires in "));

@@ -259,10 +259,11 @@ impl Lander {
         self.state_machine.is_recalling()
     }
 
-    /// True while the vehicle is so high that it can be called back from LAND, and not left hovering low over the ground.
+    /// True while the vehicle is so high that it can be called back from LAND, and not left hovering low over the ground, or at a height
+    /// that is not known.
     pub fn may_recall(&self) -> bool {
         let vehicle = self.now.and_then(|now| self.vehicle_inputs(now));
-        vehicle.is_some_and(|vehicle| self.state_machine.is_high(vehicle))
+        vehicle.is_none_or(|vehicle| self.state_machine.is_high(vehicle))
     }
 
     /// The alarm or the operator's command for which the vehicle lands, or has landed, away from the marker.

@@ -88,6 +88,11 @@ const MIN_DEVIATIONS: f64 = 3.0;
 const MIN_RATIO_DEVIATIONS: f64 = 3.5;
 const MIN_ANGLE_RAD: f64 = 1.5 * std::f64::consts::PI / 180.0;
 const MIN_RATIO: f64 = 0.03;
+/// Standard deviation of the scale of the autopilot's motion over a few metres, and the smallest error of the marker's size that is told:
+/// both look the same, in each flight again. The estimate of ArduPilot 4.5 in SITL lags behind an approach of 2 m by 2 to 2.5 % and catches
+/// up in ten seconds: ten landings made it a marker that is 3.2 +- 0.6 % smaller.
+const MOTION_SCALE: f64 = 0.015;
+const MIN_SIZE_RATIO: f64 = 0.05;
 const MAX_DEVIATION: f64 = 0.5;
 const MIN_IN_A_ROW: u32 = 15;
 /// Length of a part of the flight whose estimate is compared with those of the others, in seconds, the smallest share of what
@@ -304,20 +309,28 @@ impl MountCheck {
 
     /// The errors that are certain.
     pub fn findings(&self) -> MountFindings {
-        let of = |suspicion: Suspicion, index: usize, scatter: f64| {
-            suspicion.is_told.then(|| Measured {
-                // The configured value is what the filter's errors are relative to.
-                value: -self.mean[index],
-                deviation: self.deviation(index) * scatter,
-            })
+        let of = |suspicion: Suspicion, error: Measured| {
+            // The configured value is what the filter's errors are relative to.
+            suspicion.is_told.then_some(Measured { value: -error.value, ..error })
         };
-        let [roll, pitch, focal, size] = self.parts.map(|parts| parts.scatter());
+        let [roll, pitch, focal, size] = self.errors();
         MountFindings {
-            roll_rad: of(self.roll, TILT, roll),
-            pitch_rad: of(self.pitch, TILT + 1, pitch),
-            focal_ratio: of(self.focal, FOCAL, focal),
-            size_ratio: of(self.size, SIZE, size),
+            roll_rad: of(self.roll, roll),
+            pitch_rad: of(self.pitch, pitch),
+            focal_ratio: of(self.focal, focal),
+            size_ratio: of(self.size, size),
         }
+    }
+
+    /// The estimates of roll, pitch, focal length and size, with what their parts' scatter and the motion's scale add to the deviations.
+    fn errors(&self) -> [Measured; 4] {
+        let indices = [TILT, TILT + 1, FOCAL, SIZE];
+        std::array::from_fn(|which| {
+            let index = indices[which];
+            let known = self.deviation(index) * self.parts[which].scatter();
+            let unknown = if index == SIZE { MOTION_SCALE } else { 0.0 };
+            Measured { value: self.mean[index], deviation: hypot(known, unknown) }
+        })
     }
 
     fn deviation(&self, index: usize) -> f64 {
@@ -402,20 +415,19 @@ impl MountCheck {
     }
 
     fn suspect(&mut self, stamp: Timestamp) {
-        let mut errors = [TILT, TILT + 1, FOCAL, SIZE]
+        let estimates = [TILT, TILT + 1, FOCAL, SIZE]
             .map(|index| Measured { value: self.mean[index], deviation: self.deviation(index) });
-        for (error, parts) in errors.iter_mut().zip(&mut self.parts) {
-            parts.add(stamp, *error);
-            error.deviation *= parts.scatter();
+        for (estimate, parts) in estimates.into_iter().zip(&mut self.parts) {
+            parts.add(stamp, estimate);
         }
-        let [roll, pitch, focal, size] = errors;
+        let [roll, pitch, focal, size] = self.errors();
         let is_calm = |max_scale: f64| self.log_noise_scale < log(max_scale);
         let is_calm_for_ratios = is_calm(MAX_TOLD_RATIO_NOISE_SCALE);
         let is_calm = is_calm(MAX_TOLD_NOISE_SCALE);
         self.roll.follow(roll, MIN_DEVIATIONS, MIN_ANGLE_RAD, is_calm);
         self.pitch.follow(pitch, MIN_DEVIATIONS, MIN_ANGLE_RAD, is_calm);
         self.focal.follow(focal, MIN_RATIO_DEVIATIONS, MIN_RATIO, is_calm_for_ratios);
-        self.size.follow(size, MIN_RATIO_DEVIATIONS, MIN_RATIO, is_calm_for_ratios);
+        self.size.follow(size, MIN_RATIO_DEVIATIONS, MIN_SIZE_RATIO, is_calm_for_ratios);
     }
 }
 
@@ -477,6 +489,23 @@ mod tests {
         }
     }
 
+    /// Sees a pad's marker there, relative to the vehicle.
+    fn see(check: &mut MountCheck, frame: &FrameObservation, motion: &Motion, seen: Vector<Body>) {
+        let pose = Transform::new(Rotation::identity(), Point::origin() + seen);
+        let marker = MarkerInFrame {
+            centre: Pixel::new(0.0, 0.0),
+            body_from_marker: Some(pose),
+            alternative: None,
+            covariance_m2: None,
+            size_px: Some(40.0),
+            confidence: 1.0,
+        };
+        let pose = MarkerPose::resolve(motion, pose, None);
+        if let Ok(seen) = pose.measurement(&EstimatorConfig::default(), frame, &marker, motion) {
+            check.add(frame, motion, &seen);
+        }
+    }
+
     /// Moves down and up again over a pad whose marker is seen by a camera that is pitched by this much more than
     /// configured.
     fn descend(check: &mut MountCheck, from_s: f64, mount: Rotation<Body, Camera>, pitch: f64) {
@@ -488,21 +517,48 @@ mod tests {
             let attitude = Rotation::<Ned, Body>::from_euler(0.05 * t.sin(), 0.05 * t.cos(), 0.3);
             let in_body = off.inverse() * (attitude.inverse() * (Point::origin() - position));
             let motion = Motion::still(attitude, position);
-            let pose = Transform::new(Rotation::identity(), Point::origin() + in_body);
-            let marker = MarkerInFrame {
-                centre: Pixel::new(0.0, 0.0),
-                body_from_marker: Some(pose),
-                alternative: None,
-                covariance_m2: None,
-                size_px: Some(40.0),
-                confidence: 1.0,
-            };
-            let frame = frame(from_s + t, mount);
-            let pose = MarkerPose::resolve(&motion, pose, None);
-            let config = EstimatorConfig::default();
-            if let Ok(seen) = pose.measurement(&config, &frame, &marker, &motion) {
-                check.add(&frame, &motion, &seen);
+            see(check, &frame(from_s + t, mount), &motion, in_body);
+        }
+    }
+
+    /// Approaches a pad 2 m aside at 6 m, sinks and stops, in each of so many flights; the marker is larger than configured by this
+    /// share, and the autopilot's position moves by this share of the way.
+    fn size_found(flights: u32, larger: f64, moved: f64) -> Option<Measured> {
+        let mut check = MountCheck::default();
+        for number in 0..flights {
+            for i in 0..180 {
+                let t = f64::from(i) / 15.0;
+                let way = |from_s: f64, for_s: f64| {
+                    let share = ((t - from_s) / for_s).clamp(0.0, 1.0);
+                    (share * share * (3.0 - 2.0 * share), 6.0 * share * (1.0 - share) / for_s)
+                };
+                let ((aside, speed), (down, sinks)) = (way(2.0, 3.0), way(5.0, 6.0));
+                let position = Point::new(2.0 * (aside - 1.0), 0.0, 5.0 * down - 6.0);
+                let seen = (Point::<Ned>::origin() - position) * (1.0 / (1.0 + larger));
+                let told = Point::new(2.0 * moved * (aside - 1.0), 0.0, position.z());
+                let motion = Motion {
+                    velocity: Vector::new(2.0 * moved * speed, 0.0, 5.0 * sinks),
+                    ..Motion::still(Rotation::identity(), told)
+                };
+                let frame = frame(60.0 * f64::from(number) + t, Rotation::identity());
+                see(&mut check, &frame, &motion, Rotation::identity() * seen);
             }
+        }
+        check.findings().size_ratio
+    }
+
+    #[test]
+    fn a_motion_that_the_autopilot_underestimates_in_each_flight_is_no_marker_of_another_size() {
+        for flights in [1, 4, 16] {
+            assert_eq!(size_found(flights, 0.0, 0.965), None, "{flights} flights");
+            assert_eq!(size_found(flights, 0.0, 1.035), None, "{flights} flights");
+        }
+        for (larger, moved) in [(0.1, 1.0), (-0.1, 1.0), (0.1, 0.965), (-0.1, 0.965)] {
+            let found = size_found(4, larger, moved);
+            assert!(
+                found.is_some_and(|it| (it.value - larger).abs() < 0.05),
+                "{larger}: {found:?}"
+            );
         }
     }
 

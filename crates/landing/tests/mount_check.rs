@@ -145,7 +145,7 @@ fn in_wind_a_wandering_estimate_is_seldom_taken_for_a_wrong_camera() {
     for (name, change) in [
         ("focal length 5 % larger", (|s: &mut Scene| s.focal_ratio = 1.05) as fn(&mut Scene)),
         ("focal length 5 % smaller", |s| s.focal_ratio = 0.95),
-        ("marker 5 % larger", |s| s.vision.size_error = -0.05),
+        ("marker 10 % larger", |s| s.vision.size_error = -0.1),
         ("mount 3 degrees off", |s| s.mount_off_rad = [OFF_RAD, 0.0]),
     ] {
         if flights.is_some() {
