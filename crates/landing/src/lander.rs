@@ -62,9 +62,6 @@ const MAX_DESCEND_AGE_S: f64 = 0.2;
 /// Vertical speed of a vehicle that hovers, in m/s.
 const MAX_HOVER_M_S: f64 = 0.3;
 
-/// Shortest time without a state of the vehicle, in seconds, after which it may have touched down meanwhile.
-const MIN_SILENCE_S: f64 = 0.6;
-
 /// Minimum time of a search by a lander that takes over before it climbs, in seconds: the vehicle may stand.
 const MIN_RESUMED_LOOK_S: f64 = 1.5;
 
@@ -259,13 +256,6 @@ impl Lander {
         self.state_machine.is_recalling()
     }
 
-    /// True while the vehicle is so high that it can be called back from LAND, and not left hovering low over the ground, or at a height
-    /// that is not known.
-    pub fn may_recall(&self) -> bool {
-        let vehicle = self.now.and_then(|now| self.vehicle_inputs(now));
-        vehicle.is_none_or(|vehicle| self.state_machine.is_high(vehicle))
-    }
-
     /// The alarm or the operator's command for which the vehicle lands, or has landed, away from the marker.
     pub fn cause(&self) -> Option<Reason> {
         self.state_machine.cause()
@@ -310,14 +300,6 @@ impl Lander {
             self.standing_height.observe(is_of_landing.then(|| self.target(now)).flatten());
         }
         Ok(())
-    }
-
-    /// The pad's place before a silence that ends with a state of this time: what the estimate is after it, is less certain.
-    fn pad_before_silence(&self, stamp: Timestamp) -> Option<RememberedPad> {
-        let last = self.history.newest()?.stamp;
-        let is_silence = stamp.seconds_since(last) > MIN_SILENCE_S;
-        let is_active = is_silence && !self.phase().is_terminal() && !self.pad_moves();
-        to_remember(last, &self.target(last).filter(|_| is_active)?)
     }
 
     /// Where the vehicle is, apart from the jumps of the autopilot's position.

@@ -39,6 +39,13 @@ pub(super) enum AbortClimb {
 }
 
 impl Lander {
+    /// True while the vehicle is so high that it can be called back from LAND, and not left hovering low over the ground, or at a height
+    /// that is not known.
+    pub fn may_recall(&self) -> bool {
+        let vehicle = self.now.and_then(|now| self.vehicle_inputs(now));
+        vehicle.is_none_or(|vehicle| self.state_machine.is_high(vehicle))
+    }
+
     pub(super) fn aborted(&mut self, now: Timestamp) -> Action {
         let phases = self.config.phases;
         if self.state_machine.is_recalling() {

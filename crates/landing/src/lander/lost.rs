@@ -1,4 +1,4 @@
-//! A marker that is out of view, lost, or seen where it is not expected.
+//! A marker that is out of view, lost, or seen where it is not expected, and a pad that is to be remembered over a silence.
 
 use geometry::Vector;
 
@@ -6,6 +6,7 @@ use super::Lander;
 use crate::decision::{Action, Reason};
 use crate::envelope;
 use crate::event::FrameObservation;
+use crate::standing::{RememberedPad, to_remember};
 use crate::time::Timestamp;
 use crate::view::View;
 
@@ -14,7 +15,18 @@ use crate::view::View;
 const MIN_WAIT_HEIGHT_M: f64 = 1.5;
 const MAX_WAIT_DEVIATION_M: f64 = 0.2;
 
+/// Shortest time without a state of the vehicle, in seconds, after which it may have touched down meanwhile.
+const MIN_SILENCE_S: f64 = 0.6;
+
 impl Lander {
+    /// The pad's place before a silence that ends with a state of this time: what the estimate is after it, is less certain.
+    pub(super) fn pad_before_silence(&self, stamp: Timestamp) -> Option<RememberedPad> {
+        let last = self.history.newest()?.stamp;
+        let is_silence = stamp.seconds_since(last) > MIN_SILENCE_S;
+        let is_active = is_silence && !self.phase().is_terminal() && !self.pad_moves();
+        to_remember(last, &self.target(last).filter(|_| is_active)?)
+    }
+
     /// True when the place of a pad that does not move is well known, and the camera of a vehicle that is not low over it did not
     /// show it: low down, one that waits to see it is moved by a gust meanwhile.
     pub(super) fn is_out_of_view(&self, frame: &FrameObservation) -> bool {
