@@ -34,8 +34,6 @@ use crate::status::{Used, View};
 use crate::wind::WindEstimate;
 use crate::wire;
 
-/// Time in which an autopilot whose motors show as off shows that it has restarted, if that is why, in nanoseconds.
-const RESTART_SHOWS_NS: i64 = 3_000_000_000;
 /// Change of the link's delay that the lander is told of, in seconds.
 const LINK_DELAY_STEP_S: f64 = 0.01;
 
@@ -697,8 +695,9 @@ impl Flight {
                     let by_motors = matches!(why, Some(Reason::TouchedDown | Reason::Disarmed));
                     self.mission.armed_changed(now_ns, armed, is_finished, by_motors);
                 }
-                Event::Restarted
-                    if self.mission.started_ns().is_some() && !self.is_over_since(now_ns) =>
+                Event::Restarted { running }
+                    if self.mission.started_ns().is_some()
+                        && !self.was_over_before(now_ns, running) =>
                 {
                     let why = "the autopilot restarted in flight".to_owned();
                     self.mission.fail(&mut self.autopilot, why);
@@ -708,12 +707,14 @@ impl Flight {
         }
     }
 
-    /// True after a landing whose motors have been off for some time. What says so of an autopilot that restarts in flight comes just
-    /// before what shows the restart.
-    fn is_over_since(&self, now_ns: i64) -> bool {
+    /// True after a landing whose motors were off before the autopilot started, which has run for so long. One that restarts in flight
+    /// says that they are off, but only then.
+    fn was_over_before(&self, now_ns: i64, running: Duration) -> bool {
         let is_off = self.autopilot.state().is_some_and(|state| !state.armed);
-        let off_ns = self.mission.disarmed_ns().map(|at_ns| now_ns.saturating_sub(at_ns));
-        self.view().is_finished() && is_off && off_ns.is_none_or(|off_ns| off_ns > RESTART_SHOWS_NS)
+        let off_for_ns = self.mission.disarmed_ns().map(|at_ns| now_ns.saturating_sub(at_ns));
+        let was_off =
+            off_for_ns.is_none_or(|off_ns| i128::from(off_ns) > running.as_nanos() as i128);
+        self.view().is_finished() && is_off && was_off
     }
 
     /// The pilot has taken over: what was requested before is not repeated against the pilot. A take-off passes

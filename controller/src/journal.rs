@@ -151,7 +151,7 @@ impl Journal {
                 tracing::error!(%silence, "Autopilot heartbeat lost");
             }
             Event::Returned => tracing::info!("Autopilot heartbeat regained"),
-            Event::Restarted => tracing::error!("Autopilot restarted"),
+            Event::Restarted { .. } => tracing::error!("Autopilot restarted"),
             Event::ArmedChanged(armed) => tracing::info!(armed, "Motors"),
             // The first one is no change.
             Event::ModeChanged { from: None, to } => tracing::info!(mode = %to, "Flight mode"),

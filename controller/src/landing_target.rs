@@ -20,9 +20,9 @@ const MAVLINK: f64 = 1.0;
 /// Maximum gap between two landing targets, in nanoseconds; after a longer one ArduPilot starts a new
 /// estimate.
 const MAX_GAP_NS: i64 = 500_000_000;
-/// Time after an abort in which LAND, asked for before it, may still show, in nanoseconds: heartbeats come each second, and one
-/// may be lost.
-const MAX_LATE_LAND_NS: i64 = 2_500_000_000;
+/// Time in which a mode that was asked for until then may still show, in nanoseconds: LAND after an abort, the mode in which it hovers
+/// after that was withdrawn. Heartbeats come each second, and one may be lost.
+const MAX_LATE_MODE_NS: i64 = 2_500_000_000;
 
 /// Why an aborted landing ended that the autopilot had not begun.
 const ABORTED: &str = "aborted by the operator; hovering";
@@ -60,6 +60,8 @@ enum State {
     AbortedEarly(i64),
     /// The autopilot is taken back from landing, for this reason.
     Recalling(CommandId, String),
+    /// The autopilot, which has become low, is left to its landing; what takes it back may have reached it, until this time.
+    LeftToLand(i64, String),
     /// On the ground, disarmed.
     Landed,
     /// Aborted, or somebody took over.
@@ -117,10 +119,14 @@ impl LandingTargetMode {
                 self.state = State::Ended(format!("the flight mode was changed to {}", state.mode));
             }
             State::Landing => {}
-            State::Recalling(..) if lands && !may_recall => {
+            State::Recalling(_, why) if lands && !may_recall => {
+                tracing::warn!("Not taken back from landing: it is too low by now");
                 autopilot.withdraw();
-                self.state = State::Landing;
+                self.state = State::LeftToLand(now_ns.saturating_add(MAX_LATE_MODE_NS), why);
             }
+            State::LeftToLand(_, why) if !lands && state.armed => self.state = State::Ended(why),
+            State::LeftToLand(until_ns, _) if lands && now_ns <= until_ns => {}
+            State::LeftToLand(..) => self.state = State::Landing,
             State::Recalling(request, why) => match autopilot.status(request) {
                 CommandStatus::Pending => {}
                 CommandStatus::Failed(problem) if lands => {
@@ -203,7 +209,7 @@ impl LandingTargetMode {
                 autopilot.withdraw();
                 self.state = match self.state {
                     State::Commanding(_) if may_recall => {
-                        State::AbortedEarly(now_ns.saturating_add(MAX_LATE_LAND_NS))
+                        State::AbortedEarly(now_ns.saturating_add(MAX_LATE_MODE_NS))
                     }
                     _ => State::Ended(ABORTED.to_owned()),
                 };
@@ -216,6 +222,7 @@ impl LandingTargetMode {
             State::Idle
             | State::AbortedEarly(_)
             | State::Recalling(..)
+            | State::LeftToLand(..)
             | State::Landed
             | State::Ended(_) => {
                 Err(format!("no landing is active (phase `{}`)", self.phase(now_ns, None).0))
@@ -243,7 +250,9 @@ impl LandingTargetMode {
                 }),
             ),
             State::Commanding(_) => (Phase::Final, "requesting LAND".to_owned()),
-            State::Landing => (Phase::Final, format!("the autopilot lands; {target}")),
+            State::Landing | State::LeftToLand(..) => {
+                (Phase::Final, format!("the autopilot lands; {target}"))
+            }
             State::Landed => (Phase::Landed, landing::Reason::TouchedDown.to_string()),
             State::AbortedEarly(_) => (Phase::Aborted, ABORTED.to_owned()),
             State::Recalling(_, why) | State::Ended(why) => (Phase::Aborted, why.clone()),
@@ -252,7 +261,10 @@ impl LandingTargetMode {
 
     /// True from the beginning of a landing to its end.
     pub fn is_active(&self) -> bool {
-        matches!(self.state, State::Stabilising(_) | State::Commanding(_) | State::Landing)
+        matches!(
+            self.state,
+            State::Stabilising(_) | State::Commanding(_) | State::Landing | State::LeftToLand(..)
+        )
     }
 
     /// True once a landing has ended.

@@ -406,6 +406,15 @@ fn low_over_the_ground_the_autopilot_is_not_taken_back_from_its_precision_landin
     asked_at(&mut flight, 9, (9500, 9700), (1.1, 0.9));
     assert!(asked_at(&mut flight, 9, (9700, 14_000), (0.9, 0.8)).is_empty());
     assert_eq!(flight.status(14_000 * MS).phase, Phase::Final);
+    // It has reached the autopilot all the same.
+    let mut flight = landing();
+    asked_at(&mut flight, 9, (6020, 8000), (5.0, 1.3));
+    abort(&mut flight, 8000);
+    asked_at(&mut flight, 9, (8000, 8600), (1.3, 0.9));
+    asked_at(&mut flight, 4, (8600, 9500), (0.9, 0.9));
+    let status = flight.status(9500 * MS);
+    assert_eq!(status.phase, Phase::Aborted);
+    assert!(status.why.contains("aborted by the operator"), "{}", status.why);
 }
 
 #[test]
@@ -991,7 +1000,7 @@ fn an_autopilot_that_is_restarted_after_a_landing_is_no_failure() {
 
 #[test]
 fn an_autopilot_that_restarts_in_flight_has_not_landed() {
-    for mode in [9, 4] {
+    for (mode, told_ms) in [(9, 11_600), (4, 11_600), (9, 17_000)] {
         let mut flight = in_flight("airborne");
         let poses = |flight: &mut Flight, (from_ms, to_ms): (i64, i64), booted_ms: i64| {
             for ms in (from_ms..to_ms).step_by(20) {
@@ -1007,8 +1016,8 @@ fn an_autopilot_that_restarts_in_flight_has_not_landed() {
         assert_eq!(flight.status(9000 * MS).phase, Phase::Final);
         // It falls silent, and its first heartbeat comes before what shows the time since its start.
         receive(&mut flight, 11_000 * MS, &heartbeat(0, false));
-        poses(&mut flight, (11_600, 12_400), 10_900);
-        let status = flight.status(12_400 * MS);
+        poses(&mut flight, (told_ms, told_ms + 800), 10_900);
+        let status = flight.status((told_ms + 800) * MS);
         assert_eq!(status.phase, Phase::Failed, "{}", status.why);
         assert!(status.why.contains("restarted in flight"), "{}", status.why);
     }

@@ -687,7 +687,7 @@ impl Autopilot {
             BootTime::Present => self.clock.is_newest(now_ns, boot_ms, newest),
             BootTime::Contradicts => false,
             BootTime::Restarted => {
-                self.restarted();
+                self.restarted(Duration::from_millis(boot_ms.into()));
                 true
             }
         };
@@ -695,7 +695,7 @@ impl Autopilot {
         is_present
     }
 
-    fn restarted(&mut self) {
+    fn restarted(&mut self, running: Duration) {
         let Some(vehicle) = &mut self.vehicle else { return };
         vehicle.readiness = Readiness::default();
         vehicle.listener = Listener::default();
@@ -709,7 +709,7 @@ impl Autopilot {
         self.clock.restart();
         self.parameters.restart();
         self.streams.restart();
-        self.push(Event::Restarted);
+        self.push(Event::Restarted { running });
         self.report_contact(before);
         self.fail_requests(|command| CommandError::Restarted { command });
     }

@@ -38,7 +38,10 @@ pub enum Event {
     /// The heartbeat is back.
     Returned,
     /// The autopilot restarted: requests are lost, and its origin may have changed.
-    Restarted,
+    Restarted {
+        /// How long it has run.
+        running: Duration,
+    },
     /// A new attitude.
     Attitude(Attitude),
     /// A new position.

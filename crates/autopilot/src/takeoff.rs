@@ -250,7 +250,11 @@ impl Takeoff {
             Part::Ready => state.armed,
             // PX4 is armed in the pilot's own mode.
             Part::Arm(arming) => {
-                let is_changed = arming.mode.is_some_and(|mode| mode != state.mode);
+                // It leaves LAND by itself once it stands.
+                let is_changed = arming.mode.is_some_and(|mode| {
+                    let leaves_land = mode.is_landing() && state.mode == FlightMode::AUTO_HOLD;
+                    mode != state.mode && !leaves_land
+                });
                 self.guided || is_changed || state.armed && arming.request.is_none()
             }
             _ => self.guided,

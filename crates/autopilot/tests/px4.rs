@@ -424,7 +424,7 @@ fn after_it_started_again_its_events_count_from_the_first_and_old_checks_are_for
     world.px4.queue.push(status_of_failing_checks());
     world.step();
     let events: Vec<Event> = std::iter::from_fn(|| world.client.poll_event()).collect();
-    let restarts = events.iter().filter(|event| matches!(event, Event::Restarted));
+    let restarts = events.iter().filter(|event| matches!(event, Event::Restarted { .. }));
     assert_eq!(restarts.count(), 1);
     assert_eq!(texts_of(&events), ["No manual control input"]);
     let also = "prearm: checks not passed yet; PX4 also says: No manual control input";

@@ -119,7 +119,7 @@ fn changes_of_client(log: &[u8]) -> (Vec<(f64, Change)>, Autopilot) {
                 Event::LandedChanged { to, .. } => Change::Landed(to),
                 // The simulator pauses for 3 s while it starts.
                 Event::Lost { .. } if !client.state().unwrap().armed => continue,
-                Event::Lost { .. } | Event::Restarted | Event::OtherVehicle { .. } => {
+                Event::Lost { .. } | Event::Restarted { .. } | Event::OtherVehicle { .. } => {
                     panic!("{event:?} in a log without losses")
                 }
                 _ => continue,

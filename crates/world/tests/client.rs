@@ -108,7 +108,9 @@ fn the_client_takes_off_flies_and_lands() {
     assert!(!state.armed && !state.landed.is_flying() && pair.world.truth().on_ground);
     assert_eq!(pair.client.refused_numbers(), 0);
     assert!(
-        pair.events.iter().all(|event| !matches!(event, Event::Lost { .. } | Event::Restarted))
+        pair.events
+            .iter()
+            .all(|event| !matches!(event, Event::Lost { .. } | Event::Restarted { .. }))
     );
 }
 
