@@ -45,6 +45,16 @@ pub struct Estimator {
     heading: Option<[f64; 2]>,
     hypotheses: Hypotheses,
     nis: Option<f64>,
+    kept: Option<Kept>,
+}
+
+/// The estimate of an earlier time.
+#[derive(Clone, Debug)]
+struct Kept {
+    newest: FusedMeasurement,
+    detections: u32,
+    heading: Option<[f64; 2]>,
+    hypotheses: Hypotheses,
 }
 
 /// A detection and the state after it.
@@ -64,6 +74,7 @@ impl Estimator {
             heading: None,
             hypotheses: Hypotheses::default(),
             nis: None,
+            kept: None,
         }
     }
 
@@ -93,11 +104,23 @@ impl Estimator {
         Ok(())
     }
 
-    /// Forgets the detections of later frames than this, but for the oldest that is kept.
-    pub fn forget_since(&mut self, stamp: Timestamp) {
-        while self.past.len() > 1 && self.newest_stamp().is_some_and(|newest| newest > stamp) {
-            self.past.pop_back();
-        }
+    /// Keeps the estimate, for the case that what comes now is to be forgotten.
+    pub fn keep(&mut self) {
+        self.kept = self.past.back().map(|newest| Kept {
+            newest: newest.clone(),
+            detections: self.detections,
+            heading: self.heading,
+            hypotheses: self.hypotheses.clone(),
+        });
+    }
+
+    /// Goes back to the estimate that was kept, if any; late frames of before are not inserted any more.
+    pub fn go_back(&mut self) {
+        self.past.clear();
+        let Some(kept) = self.kept.clone() else { return };
+        self.past.push_back(kept.newest);
+        (self.detections, self.heading, self.hypotheses) =
+            (kept.detections, kept.heading, kept.hypotheses);
     }
 
     /// The estimate relative to a vehicle at `vehicle`, at `now`, with the odometry frame's present place.

@@ -2,6 +2,7 @@
 
 mod aborted;
 mod lost;
+mod marker;
 
 use aborted::AbortClimb;
 use geometry::{Ned, Odometry, Point, Vector};
@@ -11,8 +12,8 @@ use crate::config::{AlarmAction, Config, GuidanceConfig};
 use crate::decision::{Action, Decision, Phase, Reason, Rejection, TargetEstimate};
 use crate::envelope;
 use crate::event::{
-    AutopilotLimits, Event, FrameObservation, Landed, MarkerInFrame, Mode, OperatorCommand,
-    VehicleState, VehicleStatus,
+    AutopilotLimits, Event, FrameObservation, Landed, Mode, OperatorCommand, VehicleState,
+    VehicleStatus,
 };
 use crate::guidance::ActiveGuidance;
 use crate::guidance::situation::{Progress, Situation};
@@ -391,46 +392,6 @@ impl Lander {
         let result = frame.marker.map_or(Ok(()), |marker| self.marker(frame, &marker));
         self.inform_guidance(frame, result.is_ok());
         result
-    }
-
-    /// Fuses a marker; one without a pose is used only by a guidance that needs none.
-    fn marker(
-        &mut self,
-        frame: &FrameObservation,
-        marker: &MarkerInFrame,
-    ) -> Result<(), Rejection> {
-        if marker.confidence < self.config.target.min_confidence {
-            return Err(Rejection::LowConfidence);
-        }
-        if let Some(motion) = self.history.at(frame.stamp) {
-            // Nothing was seen: neither the marker, nor that it is elsewhere; nor was it in the frames that told of this one.
-            let config = &self.config.estimator;
-            if let Some(since) =
-                self.repeated_picture.repeated_since(frame, marker, &motion, config)
-            {
-                self.target_filter.forget_since(since);
-                self.sightings.forget_since(since);
-                return Err(Rejection::RepeatedPicture);
-            }
-            if let Some(pose) = marker.body_from_marker {
-                self.axis_check.add(frame.stamp, &motion, pose.origin());
-            }
-        }
-        self.mount_check.observe(&self.config.estimator, frame, marker, &self.history);
-        self.first_seen.get_or_insert(frame.stamp);
-        match self.target_filter.observe(frame, marker, &self.history) {
-            Err(Rejection::NoPose) if !self.guidance.needs_pose() => {}
-            Err(rejection) => {
-                self.sightings.refuse(frame.stamp, rejection);
-                return Err(rejection);
-            }
-            Ok(()) => {}
-        }
-        self.sightings.add(frame.stamp, self.config.phases.lost_target_s);
-        if self.sightings.in_a_row >= self.config.target.confirm_after {
-            self.resumed = None;
-        }
-        Ok(())
     }
 
     /// The thesis' controller runs once per frame, and only while the vehicle is guided.

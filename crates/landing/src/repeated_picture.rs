@@ -25,13 +25,16 @@ const MIN_ALIKE: u32 = 2;
 const MIN_MOVED_M: f64 = 0.05;
 const MIN_MOVED_SHARE: f64 = 0.01;
 
-/// The same where the link codes a repeated picture anew, in which the marker is found again less well (measured: 7e-4 at most from one
-/// quality of JPEG to the next). So much a marker may stay that moves along with the vehicle, or whose vehicle stays while the
-/// autopilot's position drifts: it must seem to move for longer, and faster than that (in m/s, beside the configured pad's speed).
-const MAX_CODED_CHANGE: f64 = 1e-3;
+/// The same where the link codes a repeated picture anew, in which the marker is found again less well: measured from one quality of
+/// JPEG to the next, 7e-4 at most. So much a marker may stay that moves along with the vehicle, or whose vehicle stays while the
+/// autopilot's position drifts: it must seem to move further and faster than that, to the side or up and down, within a time (in s and
+/// m/s, beside the speed and the heave of the configured pad). What has been found to be old is not of now by a larger change alone.
+const MAX_CODED_CHANGE: f64 = 2e-3;
+const MAX_OLD_CHANGE: f64 = 5e-3;
 const MIN_CODED_MOVED_M: f64 = 0.1;
 const MIN_CODED_MOVED_SHARE: f64 = 0.02;
 const MIN_CODED_M_S: f64 = 0.2;
+const CODED_S: f64 = 2.0;
 
 /// How far the direction to a marker whose distance is not known must seem to have turned over the ground meanwhile, in radians.
 const MIN_TURNED_RAD: f64 = 0.02;
@@ -47,12 +50,25 @@ pub(crate) struct RepeatedPicture {
     coded: Option<First>,
 }
 
+/// What the picture of a frame is.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Picture {
+    /// Another one than before.
+    Other,
+    /// It may be one of before.
+    Alike,
+    /// The one of this time.
+    Old(Timestamp),
+}
+
 /// The first of frames in which the marker stays.
 #[derive(Copy, Clone, Debug)]
 struct First {
     sight: Sight,
-    /// Where the marker was over the ground, in the odometry frame, in metres; of one whose distance is not known the direction.
+    /// Where the marker was over the ground, in the odometry frame, in metres, and when; of one whose distance is not known the
+    /// direction.
     place: Vector3<f64>,
+    placed: Timestamp,
     /// Those after it are old pictures.
     is_old: bool,
 }
@@ -67,65 +83,92 @@ struct Sight {
 }
 
 impl RepeatedPicture {
-    /// Adds a marker, and tells since when its picture is an old one; `None` when it is of now. Where its distance is not known the
-    /// direction decides: then a vehicle that moves and does not tilt may see it where it was.
-    pub(crate) fn repeated_since(
+    /// Adds a marker, and tells whether its picture is an old one. Where its distance is not known the direction decides: then a
+    /// vehicle that moves and does not tilt may see it where it was. What a vehicle that `stands` sees stays.
+    pub(crate) fn add(
         &mut self,
         frame: &FrameObservation,
         marker: &MarkerInFrame,
         motion: &Motion,
         config: &EstimatorConfig,
-    ) -> Option<Timestamp> {
+        stands: bool,
+    ) -> Picture {
         let stamp = frame.stamp;
-        let Some(pose) = marker.body_from_marker else {
+        let (sight, place, min_moved) = if let Some(pose) = marker.body_from_marker {
+            let in_body = pose.origin() - Point::origin();
+            let place = motion.odometry.coords.coords + (motion.ned_from_body * in_body).coords;
+            let sight = Sight { stamp, in_body, has_distance: true };
+            (sight, place, MIN_MOVED_M + MIN_MOVED_SHARE * in_body.norm())
+        } else {
             let in_body = direction(frame, marker.centre);
             let sight = Sight { stamp, in_body, has_distance: false };
-            return self.add(sight, (motion.ned_from_body * in_body).coords, MIN_TURNED_RAD);
+            (sight, (motion.ned_from_body * in_body).coords, MIN_TURNED_RAD)
         };
-        let in_body = pose.origin() - Point::origin();
-        let sight = Sight { stamp, in_body, has_distance: true };
-        let place = motion.odometry.coords.coords + (motion.ned_from_body * in_body).coords;
-        let same = self.add(sight, place, MIN_MOVED_M + MIN_MOVED_SHARE * in_body.norm());
-        let pad_m_s = hypot(config.pad_speed_m_s, config.pad_heave_m_s);
-        let coded = self.add_coded(sight, place, MIN_CODED_M_S + pad_m_s);
-        coded.map_or(same, |coded| same.map_or(Some(coded), |same| Some(same.min(coded))))
+        // A frame that comes late says nothing of what has come since.
+        if self.newest.is_some_and(|newest| stamp <= newest.stamp) {
+            let old = [(self.first, MAX_CHANGE), (self.coded, MAX_OLD_CHANGE)];
+            let old = old.into_iter().find_map(|(first, max_change)| {
+                first.filter(|it| it.is_old && it.sight.is_like(&sight, max_change))
+            });
+            return old.map_or(Picture::Alike, |first| Picture::Old(first.sight.stamp));
+        }
+        let same = self.add_same(sight, place, min_moved);
+        if !sight.has_distance || stands {
+            self.coded = None;
+            return same;
+        }
+        let slack_m_s = [config.pad_speed_m_s, config.pad_heave_m_s];
+        match (self.add_coded(sight, place, slack_m_s), same) {
+            (Picture::Old(coded), Picture::Old(same)) => Picture::Old(same.min(coded)),
+            (_, Picture::Old(since)) | (Picture::Old(since), _) => Picture::Old(since),
+            (coded, _) => coded,
+        }
     }
 
-    fn add(&mut self, sight: Sight, place: Vector3<f64>, min_moved: f64) -> Option<Timestamp> {
+    fn add_same(&mut self, sight: Sight, place: Vector3<f64>, min_moved: f64) -> Picture {
         let is_alike = self.newest.is_some_and(|newest| newest.is_like(&sight, MAX_CHANGE));
-        let first = self.first.filter(|_| is_alike);
-        // A frame that comes late says nothing of what has come since.
-        if self.newest.is_some_and(|newest| sight.stamp <= newest.stamp) {
-            return first.and_then(First::old_since);
-        }
         self.newest = Some(sight);
-        self.alike = if is_alike { self.alike.saturating_add(1) } else { 0 };
-        let mut first = first.unwrap_or(First { sight, place, is_old: false });
+        let Some(mut first) = self.first.filter(|_| is_alike) else {
+            (self.first, self.alike) = (Some(First::new(sight, place)), 0);
+            return Picture::Other;
+        };
+        self.alike = self.alike.saturating_add(1);
         first.is_old |= self.alike >= MIN_ALIKE && (place - first.place).norm() > min_moved;
         self.first = Some(first);
-        first.old_since()
+        first.picture()
     }
 
-    /// The same for a picture that may have been coded anew.
-    fn add_coded(&mut self, sight: Sight, place: Vector3<f64>, min_m_s: f64) -> Option<Timestamp> {
-        let first = self.coded.filter(|first| first.sight.is_like(&sight, MAX_CODED_CHANGE));
-        let after_s = self.coded.map_or(0.0, |it| sight.stamp.seconds_since(it.sight.stamp));
-        if after_s < 0.0 {
-            return None;
+    /// The same for a picture that may have been coded anew; a pad may move by so much to the side, and up and down.
+    fn add_coded(&mut self, sight: Sight, place: Vector3<f64>, pad_m_s: [f64; 2]) -> Picture {
+        let max_change =
+            |first: &First| if first.is_old { MAX_OLD_CHANGE } else { MAX_CODED_CHANGE };
+        let first = self.coded.filter(|first| first.sight.is_like(&sight, max_change(first)));
+        let Some(mut first) = first else {
+            self.coded = Some(First::new(sight, place));
+            return Picture::Other;
+        };
+        let moved = place - first.place;
+        let after_s = sight.stamp.seconds_since(first.placed);
+        let [aside, down] = pad_m_s.map(|pad_m_s| {
+            let error_m = MIN_CODED_MOVED_M + MIN_CODED_MOVED_SHARE * sight.in_body.norm();
+            error_m + (MIN_CODED_M_S + pad_m_s) * after_s
+        });
+        first.is_old |= hypot(moved.x, moved.y) > aside || moved.z.abs() > down;
+        if after_s > CODED_S {
+            (first.place, first.placed) = (place, sight.stamp);
         }
-        let mut first = first.unwrap_or(First { sight, place, is_old: false });
-        let min_m = MIN_CODED_MOVED_M
-            + MIN_CODED_MOVED_SHARE * sight.in_body.norm()
-            + min_m_s * sight.stamp.seconds_since(first.sight.stamp);
-        first.is_old |= (place - first.place).norm() > min_m;
         self.coded = Some(first);
-        first.old_since()
+        first.picture()
     }
 }
 
 impl First {
-    fn old_since(self) -> Option<Timestamp> {
-        self.is_old.then_some(self.sight.stamp)
+    fn new(sight: Sight, place: Vector3<f64>) -> Self {
+        Self { sight, place, placed: sight.stamp, is_old: false }
+    }
+
+    fn picture(&self) -> Picture {
+        if self.is_old { Picture::Old(self.sight.stamp) } else { Picture::Alike }
     }
 }
 
@@ -164,13 +207,11 @@ mod tests {
 
     /// A marker in one of 15 frames in a second, `late_s` earlier: at this place relative to the vehicle, or where only the pixel is
     /// known.
-    fn is_repeated(
-        check: &mut RepeatedPicture,
+    fn frame(
         (number, late_s): (u32, f64),
-        motion: &Motion,
         place: Option<Point<Body>>,
         centre: Pixel,
-    ) -> bool {
+    ) -> (FrameObservation, MarkerInFrame) {
         let marker = MarkerInFrame {
             centre,
             body_from_marker: place.map(|place| Transform::new(Rotation::identity(), place)),
@@ -186,7 +227,19 @@ mod tests {
             body_from_camera: None,
             marker: Some(marker),
         };
-        check.repeated_since(&frame, &marker, motion, &EstimatorConfig::default()).is_some()
+        (frame, marker)
+    }
+
+    fn is_repeated(
+        check: &mut RepeatedPicture,
+        at: (u32, f64),
+        motion: &Motion,
+        place: Option<Point<Body>>,
+        centre: Pixel,
+    ) -> bool {
+        let (frame, marker) = frame(at, place, centre);
+        let picture = check.add(&frame, &marker, motion, &EstimatorConfig::default(), false);
+        matches!(picture, Picture::Old(_))
     }
 
     /// In which of the frames the picture is an old one, of a vehicle at these heights over a marker that is seen so deep, in metres.
@@ -231,6 +284,55 @@ mod tests {
     fn a_picture_that_stays_while_the_vehicle_does_is_none() {
         let drifts_m = |number: u32| 5.0 + 0.0005 * f64::from(number);
         assert_eq!(repeated(100, drifts_m, |_| 5.0), Vec::<u32>::new());
+    }
+
+    /// In which of the frames a picture that is coded anew for each is an old one, of a vehicle at these heights over a marker that it saw
+    /// 5 m below; with a pad that may move to the side.
+    fn recoded(
+        frames: u32,
+        height_m: impl Fn(u32) -> f64,
+        change: impl Fn(u32) -> f64,
+    ) -> Vec<u32> {
+        let mut check = RepeatedPicture::default();
+        let config = EstimatorConfig { pad_speed_m_s: 3.0, ..EstimatorConfig::default() };
+        (0..frames)
+            .filter(|&number| {
+                let seen = Point::new(0.0, 0.0, 5.0 * (1.0 + change(number)));
+                let (frame, marker) = frame((number, 0.0), Some(seen), Pixel::new(0.0, 0.0));
+                let stands = height_m(number) == 0.0;
+                let picture =
+                    check.add(&frame, &marker, &motion(height_m(number)), &config, stands);
+                matches!(picture, Picture::Old(_))
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_picture_that_is_coded_anew_is_noticed_after_a_hover_and_after_the_start() {
+        let alternates = |number: u32| 7e-4 * f64::from(number % 2);
+        let first = |old: &[u32]| old.first().copied().unwrap_or(u32::MAX);
+        let goes_on_from = |old: &[u32], to: u32| (first(old)..to).eq(old.iter().copied());
+        // A minute, then down by 1 m/s: within 0.8 s.
+        let hovers = |number: u32| 5.0 - f64::from(number.saturating_sub(900)) / 15.0;
+        let old = recoded(975, hovers, alternates);
+        assert!((901..=912).contains(&first(&old)) && goes_on_from(&old, 975), "{old:?}");
+        // Two minutes on the ground, then up.
+        let climbs = |number: u32| f64::from(number.saturating_sub(1800)) / 15.0;
+        let old = recoded(1900, climbs, alternates);
+        assert!((1801..=1808).contains(&first(&old)) && goes_on_from(&old, 1900), "{old:?}");
+        // The quality changes by more once it is known to be an old one.
+        let hops = |number: u32| alternates(number) + if number > 930 { 3e-3 } else { 0.0 };
+        let old = recoded(975, hovers, hops);
+        assert!(goes_on_from(&old, 975), "{old:?}");
+        // The camera goes on.
+        let is_back = |number: u32| number > 930;
+        let back =
+            |number| if is_back(number) { hovers(number) / 5.0 - 1.0 } else { alternates(number) };
+        let old = recoded(975, hovers, back);
+        assert!(goes_on_from(&old, 931), "{old:?}");
+        // A slow drift of the autopilot's height over a vehicle that stays is none.
+        let drifts = |number: u32| 5.0 + 0.1 * f64::from(number) / 15.0;
+        assert_eq!(recoded(3000, drifts, alternates), Vec::<u32>::new());
     }
 
     #[test]

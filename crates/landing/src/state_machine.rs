@@ -370,7 +370,7 @@ impl StateMachine {
         // One that would stop low over the ground, or on it with its motors running, is landed instead. Where it has taken what was asked
         // of it before, it follows again.
         let is_low = !self.is_high(vehicle);
-        if vehicle.mode != Mode::Land {
+        if matches!(vehicle.mode, Mode::Guided | Mode::Other) {
             self.became_low = None;
         } else if self.is_recalling && is_low {
             self.became_low = Some(inputs.now);

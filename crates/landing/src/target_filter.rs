@@ -65,10 +65,17 @@ impl TargetFilter {
         }
     }
 
-    /// Forgets the markers of later frames than this, as far as they are kept.
-    pub(crate) fn forget_since(&mut self, stamp: Timestamp) {
+    /// Keeps the estimate, for the case that what comes now is to be forgotten.
+    pub(crate) fn keep(&mut self) {
         if let Self::Kalman(estimator) = self {
-            estimator.forget_since(stamp);
+            estimator.keep();
+        }
+    }
+
+    /// Goes back to the estimate that was kept.
+    pub(crate) fn go_back(&mut self) {
+        if let Self::Kalman(estimator) = self {
+            estimator.go_back();
         }
     }
 

@@ -39,11 +39,11 @@ pub(super) enum AbortClimb {
 }
 
 impl Lander {
-    /// True while the vehicle is so high that it can be called back from LAND, and not left hovering low over the ground, or at a height
-    /// that is not known.
+    /// True while the vehicle is so high over the pad that it can be called back from LAND, and not left hovering low over it, or
+    /// nothing is known of the pad.
     pub fn may_recall(&self) -> bool {
         let vehicle = self.now.and_then(|now| self.vehicle_inputs(now));
-        vehicle.is_none_or(|vehicle| self.state_machine.is_high(vehicle))
+        vehicle.is_none_or(|it| !it.is_over_target || self.state_machine.is_high(it))
     }
 
     pub(super) fn aborted(&mut self, now: Timestamp) -> Action {

@@ -1,0 +1,57 @@
+//! A marker in a frame: whether it is one of now, and used.
+
+use super::Lander;
+use crate::decision::Rejection;
+use crate::event::{FrameObservation, Landed, MarkerInFrame};
+use crate::repeated_picture::Picture;
+
+impl Lander {
+    /// Fuses a marker; one without a pose is used only by a guidance that needs none.
+    pub(super) fn marker(
+        &mut self,
+        frame: &FrameObservation,
+        marker: &MarkerInFrame,
+    ) -> Result<(), Rejection> {
+        if marker.confidence < self.config.target.min_confidence {
+            return Err(Rejection::LowConfidence);
+        }
+        let mut picture = Picture::Alike;
+        if let Some(motion) = self.history.at(frame.stamp) {
+            let config = &self.config.estimator;
+            let stands = self.now.is_some_and(|now| self.landed(now) == Landed::OnGround);
+            picture = self.repeated_picture.add(frame, marker, &motion, config, stands);
+            // Nothing was seen: neither the marker, nor that it is elsewhere; nor was it in the frames that told of this one.
+            if let Picture::Old(since) = picture {
+                self.target_filter.go_back();
+                self.sightings.forget_since(since);
+                return Err(Rejection::RepeatedPicture);
+            }
+            if let Some(pose) = marker.body_from_marker {
+                self.axis_check.add(frame.stamp, &motion, pose.origin());
+            }
+        }
+        let result = self.fuse(frame, marker);
+        if picture == Picture::Other {
+            self.target_filter.keep();
+        }
+        result
+    }
+
+    fn fuse(&mut self, frame: &FrameObservation, marker: &MarkerInFrame) -> Result<(), Rejection> {
+        self.mount_check.observe(&self.config.estimator, frame, marker, &self.history);
+        self.first_seen.get_or_insert(frame.stamp);
+        match self.target_filter.observe(frame, marker, &self.history) {
+            Err(Rejection::NoPose) if !self.guidance.needs_pose() => {}
+            Err(rejection) => {
+                self.sightings.refuse(frame.stamp, rejection);
+                return Err(rejection);
+            }
+            Ok(()) => {}
+        }
+        self.sightings.add(frame.stamp, self.config.phases.lost_target_s);
+        if self.sightings.in_a_row >= self.config.target.confirm_after {
+            self.resumed = None;
+        }
+        Ok(())
+    }
+}
