@@ -124,7 +124,9 @@ impl LandingTargetMode {
                 autopilot.withdraw();
                 self.state = State::LeftToLand(now_ns.saturating_add(MAX_LATE_MODE_NS), why);
             }
-            State::LeftToLand(_, why) if !lands && state.armed => self.state = State::Ended(why),
+            State::LeftToLand(_, why) if state.armed && state.mode == hover_mode(autopilot) => {
+                self.state = State::Ended(why);
+            }
             State::LeftToLand(until_ns, _) if lands && now_ns <= until_ns => {}
             State::LeftToLand(..) => self.state = State::Landing,
             State::Recalling(request, why) => match autopilot.status(request) {
@@ -167,10 +169,7 @@ impl LandingTargetMode {
 
     /// Takes the autopilot back from landing to the mode in which it hovers; returns why.
     fn recall(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> String {
-        let hover = match autopilot.firmware() {
-            Some(Firmware::Px4) => FlightMode::AUTO_HOLD,
-            _ => FlightMode::Guided,
-        };
+        let hover = hover_mode(autopilot);
         let request = autopilot.request(now_ns, Command::SetMode(hover));
         let why = format!("aborted by the operator; hovering in {hover}");
         self.state = State::Recalling(request, why.clone());
@@ -215,14 +214,13 @@ impl LandingTargetMode {
                 };
                 Ok(ABORTED.to_owned())
             }
-            State::Landing if !may_recall => {
+            State::Landing | State::LeftToLand(..) if !may_recall => {
                 Err(format!("below {no_return_m} m the autopilot's landing is not interrupted"))
             }
-            State::Landing => Ok(self.recall(now_ns, autopilot)),
+            State::Landing | State::LeftToLand(..) => Ok(self.recall(now_ns, autopilot)),
             State::Idle
             | State::AbortedEarly(_)
             | State::Recalling(..)
-            | State::LeftToLand(..)
             | State::Landed
             | State::Ended(_) => {
                 Err(format!("no landing is active (phase `{}`)", self.phase(now_ns, None).0))
@@ -284,6 +282,14 @@ impl LandingTargetMode {
     fn is_steady(&self, now_ns: i64) -> bool {
         let steady_ns = (self.settings.steady_s * 1e9) as i64;
         self.active_stream(now_ns).is_some_and(|s| s.last_ns - s.first_ns >= steady_ns)
+    }
+}
+
+/// The mode in which the autopilot hovers once it is taken back from landing.
+fn hover_mode(autopilot: &Autopilot) -> FlightMode {
+    match autopilot.firmware() {
+        Some(Firmware::Px4) => FlightMode::AUTO_HOLD,
+        _ => FlightMode::Guided,
     }
 }
 

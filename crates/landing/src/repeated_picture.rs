@@ -113,8 +113,10 @@ impl RepeatedPicture {
             return old.map_or(Picture::Alike, |first| Picture::Old(first.sight.stamp));
         }
         let same = self.add_same(sight, place, min_moved);
-        if !sight.has_distance || stands {
+        if stands {
             self.coded = None;
+        }
+        if !sight.has_distance || stands {
             return same;
         }
         let slack_m_s = [config.pad_speed_m_s, config.pad_heave_m_s];

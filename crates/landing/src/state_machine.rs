@@ -375,7 +375,9 @@ impl StateMachine {
         } else if self.is_recalling && is_low {
             self.became_low = Some(inputs.now);
         }
-        self.is_recalling &= vehicle.mode == Mode::Land && in_time && !is_low;
+        // While the mode is not known nothing is asked for, and it may be LAND still.
+        let may_land = matches!(vehicle.mode, Mode::Land | Mode::Unknown);
+        self.is_recalling &= may_land && in_time && !is_low;
         let may_follow =
             self.became_low.is_some_and(|since| inputs.now.seconds_since(since) <= MAX_LATE_MODE_S);
         let is_foreign = matches!(vehicle.mode, Mode::Land | Mode::Other);

@@ -39,11 +39,13 @@ pub(super) enum AbortClimb {
 }
 
 impl Lander {
-    /// True while the vehicle is so high over the pad that it can be called back from LAND, and not left hovering low over it, or
-    /// nothing is known of the pad.
+    /// True while the vehicle is so high that it can be called back from LAND, and not left hovering low over the ground, or neither pad
+    /// nor ground is known.
     pub fn may_recall(&self) -> bool {
-        let vehicle = self.now.and_then(|now| self.vehicle_inputs(now));
-        vehicle.is_none_or(|it| !it.is_over_target || self.state_machine.is_high(it))
+        let Some(now) = self.now else { return true };
+        let Some(vehicle) = self.vehicle_inputs(now) else { return true };
+        let is_known = self.known_height_m(now).is_some() || vehicle.landed == Landed::OnGround;
+        !is_known || self.state_machine.is_high(vehicle)
     }
 
     pub(super) fn aborted(&mut self, now: Timestamp) -> Action {

@@ -227,6 +227,8 @@ fn an_abort_ends_land_only_while_the_vehicle_is_high() {
     let other = flown(10.2, |v| v.mode = Mode::Other);
     assert_eq!(after(&[low, other]), (false, true), "the pilot flies");
     assert_eq!(after(&[flown(9.4, |v| v.mode = Mode::Other)]), (false, true));
+    let unknown = flown(9.6, |v| (v.mode, v.height_m) = (Mode::Unknown, 3.0));
+    assert_eq!(after(&[unknown, land(11.0, 3.0)]), (true, false), "a heartbeat was lost");
     let landing = PhaseConfig { on_abort: OnAbort::Land, ..PhaseConfig::default() };
     let mut machine = StateMachine::new(landing);
     for inputs in all.iter().chain([&abort(land(9.3, 3.0))]) {
