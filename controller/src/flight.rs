@@ -695,9 +695,8 @@ impl Flight {
                     let by_motors = matches!(why, Some(Reason::TouchedDown | Reason::Disarmed));
                     self.mission.armed_changed(now_ns, armed, is_finished, by_motors);
                 }
-                Event::Restarted { running }
-                    if self.mission.started_ns().is_some()
-                        && !self.was_over_before(now_ns, running) =>
+                Event::Restarted { started_ns }
+                    if self.mission.started_ns().is_some() && !self.was_over_at(started_ns) =>
                 {
                     let why = "the autopilot restarted in flight".to_owned();
                     self.mission.fail(&mut self.autopilot, why);
@@ -707,13 +706,10 @@ impl Flight {
         }
     }
 
-    /// True after a landing whose motors were off before the autopilot started, which has run for so long. One that restarts in flight
-    /// says that they are off, but only then.
-    fn was_over_before(&self, now_ns: i64, running: Duration) -> bool {
+    /// True after a landing whose motors were off before this time. An autopilot that restarts in flight says so as well, but only then.
+    fn was_over_at(&self, time_ns: i64) -> bool {
         let is_off = self.autopilot.state().is_some_and(|state| !state.armed);
-        let off_for_ns = self.mission.disarmed_ns().map(|at_ns| now_ns.saturating_sub(at_ns));
-        let was_off =
-            off_for_ns.is_none_or(|off_ns| i128::from(off_ns) > running.as_nanos() as i128);
+        let was_off = self.mission.disarmed_ns().is_none_or(|off_ns| off_ns < time_ns);
         self.view().is_finished() && is_off && was_off
     }
 

@@ -124,11 +124,6 @@ impl LandingTargetMode {
                 autopilot.withdraw();
                 self.state = State::LeftToLand(now_ns.saturating_add(MAX_LATE_MODE_NS), why);
             }
-            State::LeftToLand(_, why) if state.armed && state.mode == hover_mode(autopilot) => {
-                self.state = State::Ended(why);
-            }
-            State::LeftToLand(until_ns, _) if lands && now_ns <= until_ns => {}
-            State::LeftToLand(..) => self.state = State::Landing,
             State::Recalling(request, why) => match autopilot.status(request) {
                 CommandStatus::Pending => {}
                 CommandStatus::Failed(problem) if lands => {
@@ -137,6 +132,11 @@ impl LandingTargetMode {
                 }
                 _ => self.state = State::Ended(why),
             },
+            State::LeftToLand(_, why) if state.armed && state.mode == hover_mode(autopilot) => {
+                self.state = State::Ended(why);
+            }
+            State::LeftToLand(until_ns, _) if lands && now_ns <= until_ns => {}
+            State::LeftToLand(..) => self.state = State::Landing,
             State::AbortedEarly(until_ns) if lands && may_recall && now_ns <= until_ns => {
                 self.recall(now_ns, autopilot);
             }
@@ -192,7 +192,7 @@ impl LandingTargetMode {
     }
 
     /// Aborts a landing: one that the autopilot flies already is taken back to the mode in which it hovers,
-    /// unless it is lower than `no_return_m`, as it is where it may not be recalled.
+    /// unless it may not be recalled: it is lower than `no_return_m`.
     ///
     /// # Errors
     /// Says why not.

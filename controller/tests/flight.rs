@@ -359,13 +359,13 @@ fn an_abort_while_land_is_asked_for_takes_the_autopilot_back_from_it() {
     }
 }
 
-/// In this mode, without a marker, from one height to another: the modes that are asked for.
-fn asked_at(
+/// What is sent in this mode, without a marker, from one height to another.
+fn sent_at(
     flight: &mut Flight,
     mode: u32,
     (from_ms, to_ms): (i64, i64),
     (from_m, to_m): (f32, f32),
-) -> Vec<f32> {
+) -> Sent {
     let mut sent = Sent::default();
     for ms in (from_ms..to_ms).step_by(20) {
         if ms % 1000 == 0 {
@@ -376,7 +376,7 @@ fn asked_at(
         flight.tick(ms * MS + 3);
         sent.take(flight);
     }
-    sent.modes
+    sent
 }
 
 #[test]
@@ -395,23 +395,23 @@ fn low_over_the_ground_the_autopilot_is_not_taken_back_from_its_precision_landin
     // LAND, asked for before the abort, shows when the vehicle is low already.
     let mut flight = landing();
     abort(&mut flight, 6000);
-    assert!(asked_at(&mut flight, 4, (6020, 8000), (5.0, 0.9)).is_empty());
-    assert!(asked_at(&mut flight, 9, (8000, 12_000), (0.9, 0.2)).is_empty());
+    assert!(sent_at(&mut flight, 4, (6020, 8000), (5.0, 0.9)).modes.is_empty());
+    assert!(sent_at(&mut flight, 9, (8000, 12_000), (0.9, 0.2)).modes.is_empty());
     assert_eq!(flight.status(12_000 * MS).phase, Phase::Final);
     // What takes it back is lost, and it becomes low.
     let mut flight = landing();
-    asked_at(&mut flight, 9, (6020, 8000), (5.0, 3.0));
+    sent_at(&mut flight, 9, (6020, 8000), (5.0, 3.0));
     abort(&mut flight, 8000);
-    assert!(asked_at(&mut flight, 9, (8000, 9500), (3.0, 1.1)).contains(&4.0));
-    asked_at(&mut flight, 9, (9500, 9700), (1.1, 0.9));
-    assert!(asked_at(&mut flight, 9, (9700, 14_000), (0.9, 0.8)).is_empty());
+    assert!(sent_at(&mut flight, 9, (8000, 9500), (3.0, 1.1)).modes.contains(&4.0));
+    sent_at(&mut flight, 9, (9500, 9700), (1.1, 0.9));
+    assert!(sent_at(&mut flight, 9, (9700, 14_000), (0.9, 0.8)).modes.is_empty());
     assert_eq!(flight.status(14_000 * MS).phase, Phase::Final);
     // It has reached the autopilot all the same.
     let mut flight = landing();
-    asked_at(&mut flight, 9, (6020, 8000), (5.0, 1.3));
+    sent_at(&mut flight, 9, (6020, 8000), (5.0, 1.3));
     abort(&mut flight, 8000);
-    asked_at(&mut flight, 9, (8000, 8600), (1.3, 0.9));
-    asked_at(&mut flight, 4, (8600, 9500), (0.9, 0.9));
+    sent_at(&mut flight, 9, (8000, 8600), (1.3, 0.9));
+    sent_at(&mut flight, 4, (8600, 9500), (0.9, 0.9));
     let status = flight.status(9500 * MS);
     assert_eq!(status.phase, Phase::Aborted);
     assert!(status.why.contains("aborted by the operator"), "{}", status.why);
@@ -422,17 +422,12 @@ fn a_vehicle_that_takes_what_called_it_back_climbs_also_where_it_has_become_low(
     let mut flight = in_flight("airborne");
     hover(&mut flight, 20, 1000, 4);
     assert!(flight.command(1000 * MS, &ControllerCommand::LandHere).accepted);
-    asked_at(&mut flight, 9, (1000, 3000), (5.0, 1.2));
+    sent_at(&mut flight, 9, (1000, 3000), (5.0, 1.2));
     assert!(flight.command(3000 * MS, &ControllerCommand::Abort).accepted);
-    assert_eq!(asked_at(&mut flight, 9, (3000, 3400), (1.2, 0.9)), [4.0]);
+    assert_eq!(sent_at(&mut flight, 9, (3000, 3400), (1.2, 0.9)).modes, [4.0]);
     receive(&mut flight, 3400 * MS, &heartbeat(4, true));
-    let mut sent = Sent::default();
-    for ms in (3420..3980).step_by(20) {
-        pose_at(&mut flight, ms * MS, 0.9);
-        flight.tick(ms * MS + 3);
-        sent.take(&mut flight);
-    }
-    assert!(sent.setpoints > 10, "{}", sent.setpoints);
+    let setpoints = sent_at(&mut flight, 4, (3420, 3980), (0.9, 0.9)).setpoints;
+    assert!(setpoints > 10, "{setpoints}");
     assert_eq!(flight.status(3980 * MS).phase, Phase::Aborted);
 }
 
@@ -440,7 +435,7 @@ fn a_vehicle_that_takes_what_called_it_back_climbs_also_where_it_has_become_low(
 fn a_vehicle_that_is_called_back_from_land_is_left_to_it_low_over_the_ground() {
     let mut flight = in_flight("airborne");
     let land = |flight: &mut Flight, from_ms: i64, to_ms: i64, height_m: f32| {
-        asked_at(flight, 9, (from_ms, to_ms), (height_m, height_m))
+        sent_at(flight, 9, (from_ms, to_ms), (height_m, height_m)).modes
     };
     hover(&mut flight, 20, 1000, 4);
     assert!(flight.command(1000 * MS, &ControllerCommand::LandHere).accepted);

@@ -687,7 +687,7 @@ impl Autopilot {
             BootTime::Present => self.clock.is_newest(now_ns, boot_ms, newest),
             BootTime::Contradicts => false,
             BootTime::Restarted => {
-                self.restarted(Duration::from_millis(boot_ms.into()));
+                self.restarted(now_ns.saturating_sub(i64::from(boot_ms) * 1_000_000));
                 true
             }
         };
@@ -695,7 +695,7 @@ impl Autopilot {
         is_present
     }
 
-    fn restarted(&mut self, running: Duration) {
+    fn restarted(&mut self, started_ns: i64) {
         let Some(vehicle) = &mut self.vehicle else { return };
         vehicle.readiness = Readiness::default();
         vehicle.listener = Listener::default();
@@ -709,7 +709,7 @@ impl Autopilot {
         self.clock.restart();
         self.parameters.restart();
         self.streams.restart();
-        self.push(Event::Restarted { running });
+        self.push(Event::Restarted { started_ns });
         self.report_contact(before);
         self.fail_requests(|command| CommandError::Restarted { command });
     }

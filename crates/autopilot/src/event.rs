@@ -39,8 +39,8 @@ pub enum Event {
     Returned,
     /// The autopilot restarted: requests are lost, and its origin may have changed.
     Restarted {
-        /// How long it has run.
-        running: Duration,
+        /// When it started, by our clock.
+        started_ns: i64,
     },
     /// A new attitude.
     Attitude(Attitude),

@@ -41,6 +41,8 @@ const TILT: usize = 4;
 const FOCAL: usize = 7;
 const SIZE: usize = 8;
 const OFFSET: usize = 9;
+/// Those that are told: roll, pitch, focal length and size.
+const TOLD: [usize; 4] = [TILT, TILT + 1, FOCAL, SIZE];
 
 /// Initial standard deviations, in the units of the states.
 const UNKNOWN: [f64; STATES] = [100.0, 100.0, 0.08, 0.08, 0.1, 0.1, 0.05, 0.1, 0.05, 0.05];
@@ -324,13 +326,19 @@ impl MountCheck {
 
     /// The estimates of roll, pitch, focal length and size, with what their parts' scatter and the motion's scale add to the deviations.
     fn errors(&self) -> [Measured; 4] {
-        let indices = [TILT, TILT + 1, FOCAL, SIZE];
-        std::array::from_fn(|which| {
-            let index = indices[which];
-            let known = self.deviation(index) * self.parts[which].scatter();
-            let unknown = if index == SIZE { MOTION_SCALE } else { 0.0 };
-            Measured { value: self.mean[index], deviation: hypot(known, unknown) }
-        })
+        let [mut roll, mut pitch, mut focal, mut size] = self.estimates();
+        for (error, parts) in
+            [&mut roll, &mut pitch, &mut focal, &mut size].into_iter().zip(self.parts)
+        {
+            error.deviation *= parts.scatter();
+        }
+        size.deviation = hypot(size.deviation, MOTION_SCALE);
+        [roll, pitch, focal, size]
+    }
+
+    /// The same as the filter has them.
+    fn estimates(&self) -> [Measured; 4] {
+        TOLD.map(|index| Measured { value: self.mean[index], deviation: self.deviation(index) })
     }
 
     fn deviation(&self, index: usize) -> f64 {
@@ -415,9 +423,7 @@ impl MountCheck {
     }
 
     fn suspect(&mut self, stamp: Timestamp) {
-        let estimates = [TILT, TILT + 1, FOCAL, SIZE]
-            .map(|index| Measured { value: self.mean[index], deviation: self.deviation(index) });
-        for (estimate, parts) in estimates.into_iter().zip(&mut self.parts) {
+        for (estimate, parts) in self.estimates().into_iter().zip(&mut self.parts) {
             parts.add(stamp, estimate);
         }
         let [roll, pitch, focal, size] = self.errors();

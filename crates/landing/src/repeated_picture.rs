@@ -244,20 +244,34 @@ mod tests {
         matches!(picture, Picture::Old(_))
     }
 
-    /// In which of the frames the picture is an old one, of a vehicle at these heights over a marker that is seen so deep, in metres.
+    /// In which of the frames the picture is an old one, of a vehicle at these heights, 0 where it stands, over a marker that is seen so
+    /// deep, in metres, on a pad that may move by so much to the side.
+    fn old(
+        frames: u32,
+        pad_speed_m_s: f64,
+        height_m: impl Fn(u32) -> f64,
+        seen_m: impl Fn(u32) -> f64,
+    ) -> Vec<u32> {
+        let mut check = RepeatedPicture::default();
+        let config = EstimatorConfig { pad_speed_m_s, ..EstimatorConfig::default() };
+        (0..frames)
+            .filter(|&number| {
+                let seen = Point::new(0.3, -0.2, seen_m(number));
+                let (frame, marker) = frame((number, 0.0), Some(seen), Pixel::new(0.0, 0.0));
+                let stands = height_m(number) == 0.0;
+                let motion = motion(height_m(number));
+                let picture = check.add(&frame, &marker, &motion, &config, stands);
+                matches!(picture, Picture::Old(_))
+            })
+            .collect()
+    }
+
     fn repeated(
         frames: u32,
         height_m: impl Fn(u32) -> f64,
         seen_m: impl Fn(u32) -> f64,
     ) -> Vec<u32> {
-        let mut check = RepeatedPicture::default();
-        (0..frames)
-            .filter(|&number| {
-                let seen = Point::new(0.3, -0.2, seen_m(number));
-                let motion = motion(height_m(number));
-                is_repeated(&mut check, (number, 0.0), &motion, Some(seen), Pixel::new(0.0, 0.0))
-            })
-            .collect()
+        old(frames, 0.0, height_m, seen_m)
     }
 
     #[test]
@@ -288,53 +302,37 @@ mod tests {
         assert_eq!(repeated(100, drifts_m, |_| 5.0), Vec::<u32>::new());
     }
 
-    /// In which of the frames a picture that is coded anew for each is an old one, of a vehicle at these heights over a marker that it saw
-    /// 5 m below; with a pad that may move to the side.
-    fn recoded(
-        frames: u32,
-        height_m: impl Fn(u32) -> f64,
-        change: impl Fn(u32) -> f64,
-    ) -> Vec<u32> {
-        let mut check = RepeatedPicture::default();
-        let config = EstimatorConfig { pad_speed_m_s: 3.0, ..EstimatorConfig::default() };
-        (0..frames)
-            .filter(|&number| {
-                let seen = Point::new(0.0, 0.0, 5.0 * (1.0 + change(number)));
-                let (frame, marker) = frame((number, 0.0), Some(seen), Pixel::new(0.0, 0.0));
-                let stands = height_m(number) == 0.0;
-                let picture =
-                    check.add(&frame, &marker, &motion(height_m(number)), &config, stands);
-                matches!(picture, Picture::Old(_))
-            })
-            .collect()
-    }
-
     #[test]
     fn a_picture_that_is_coded_anew_is_noticed_after_a_hover_and_after_the_start() {
         let alternates = |number: u32| 7e-4 * f64::from(number % 2);
+        // A marker seen 5 m below, whose place changes by such a share.
+        let recoded = |frames, height_m: &dyn Fn(u32) -> f64, change: &dyn Fn(u32) -> f64| {
+            old(frames, 3.0, height_m, |number| 5.0 * (1.0 + change(number)))
+        };
         let first = |old: &[u32]| old.first().copied().unwrap_or(u32::MAX);
         let goes_on_from = |old: &[u32], to: u32| (first(old)..to).eq(old.iter().copied());
         // A minute, then down by 1 m/s: within 0.8 s.
         let hovers = |number: u32| 5.0 - f64::from(number.saturating_sub(900)) / 15.0;
-        let old = recoded(975, hovers, alternates);
+        let old = recoded(975, &hovers, &alternates);
         assert!((901..=912).contains(&first(&old)) && goes_on_from(&old, 975), "{old:?}");
         // Two minutes on the ground, then up.
         let climbs = |number: u32| f64::from(number.saturating_sub(1800)) / 15.0;
-        let old = recoded(1900, climbs, alternates);
+        let old = recoded(1900, &climbs, &alternates);
         assert!((1801..=1808).contains(&first(&old)) && goes_on_from(&old, 1900), "{old:?}");
         // The quality changes by more once it is known to be an old one.
         let hops = |number: u32| alternates(number) + if number > 930 { 3e-3 } else { 0.0 };
-        let old = recoded(975, hovers, hops);
+        let old = recoded(975, &hovers, &hops);
         assert!(goes_on_from(&old, 975), "{old:?}");
         // The camera goes on.
         let is_back = |number: u32| number > 930;
-        let back =
-            |number| if is_back(number) { hovers(number) / 5.0 - 1.0 } else { alternates(number) };
-        let old = recoded(975, hovers, back);
+        let back = |number: u32| {
+            if is_back(number) { hovers(number) / 5.0 - 1.0 } else { alternates(number) }
+        };
+        let old = recoded(975, &hovers, &back);
         assert!(goes_on_from(&old, 931), "{old:?}");
         // A slow drift of the autopilot's height over a vehicle that stays is none.
         let drifts = |number: u32| 5.0 + 0.1 * f64::from(number) / 15.0;
-        assert_eq!(recoded(3000, drifts, alternates), Vec::<u32>::new());
+        assert_eq!(recoded(3000, &drifts, &alternates), Vec::<u32>::new());
     }
 
     #[test]
@@ -356,7 +354,7 @@ mod tests {
 
     #[test]
     fn without_a_distance_a_direction_that_stays_while_the_vehicle_tilts_tells_it() {
-        let old = |follows: bool| {
+        let seen_old = |follows: bool| {
             let mut check = RepeatedPicture::default();
             (0..20)
                 .filter(|&number| {
@@ -371,7 +369,7 @@ mod tests {
                 })
                 .collect::<Vec<u32>>()
         };
-        assert_eq!(old(true), Vec::<u32>::new());
-        assert_eq!(old(false), (5..20).collect::<Vec<_>>());
+        assert_eq!(seen_old(true), Vec::<u32>::new());
+        assert_eq!(seen_old(false), (5..20).collect::<Vec<_>>());
     }
 }
