@@ -5,8 +5,8 @@
 //!
 //! Modules in reading order: [`config`] says what can be chosen, [`service`] publishes, `program` reads what
 //! a camera's program writes, `side_channel` what it tells of each frame beside: `metadata` splits that, `pairing`
-//! finds each frame's own, `exposure` says from its stamp when the frame was exposed. `rect` publishes frames without the lens'
-//! distortion for whoever wants them.
+//! finds each frame's own, `exposure` says from its stamp when the frame was exposed. `repeated` knows a picture that
+//! comes again. `rect` publishes frames without the lens' distortion for whoever wants them.
 //! `v4l2` reads cameras without a program, `genicam` (a feature) those of that standard, `rtsp` (a feature) those that stream over a network; `clock` is the host's time
 //! of a camera's own. `marker` says how cameras are exposed for the marker; [`devices`] lists those of this machine,
 //! [`announced`] those that are announced over MAVLink.
@@ -24,6 +24,7 @@ mod metadata;
 mod pairing;
 mod program;
 mod rect;
+mod repeated;
 #[cfg(feature = "rtsp")]
 mod rtsp;
 pub mod service;

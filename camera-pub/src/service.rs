@@ -26,6 +26,7 @@ use crate::genicam;
 use crate::marker::MarkerExposure;
 use crate::program::Program;
 use crate::rect::RectPublisher;
+use crate::repeated::{Picture, Pictures};
 #[cfg(feature = "rtsp")]
 use crate::rtsp::{self, feed::Image};
 use crate::v4l2::capture::{Lost, Taken};
@@ -206,6 +207,7 @@ struct Stream {
     rect: RectPublisher,
     health: Arc<HealthCounters>,
     marker: MarkerExposure,
+    pictures: Pictures,
     /// Samples of a frame before they are binned.
     raw: Vec<u8>,
     sequence: u64,
@@ -251,6 +253,7 @@ impl Stream {
                 .await?,
             health: node.shared_health(),
             marker,
+            pictures: Pictures::default(),
             raw: Vec::new(),
             sequence: 0,
         })
@@ -328,7 +331,7 @@ impl Stream {
             };
             self.health.latency("read", began.elapsed());
             if let Some(frame) = frame {
-                self.publish(frame, exposure).await;
+                self.publish_live(frame, exposure).await;
             }
         }
     }
@@ -350,7 +353,7 @@ impl Stream {
                     self.health.latency("read", began.elapsed());
                     unreadable = if frame.is_some() { 0 } else { unreadable + 1 };
                     if let Some(frame) = frame {
-                        self.publish(frame, exposure).await;
+                        self.publish_live(frame, exposure).await;
                     }
                     if unreadable == MAX_UNREADABLE {
                         unreadable = 0;
@@ -394,7 +397,7 @@ impl Stream {
                     };
                     self.health.latency("read", began.elapsed());
                     if let Some(frame) = frame {
-                        self.publish(frame, exposure).await;
+                        self.publish_live(frame, exposure).await;
                     }
                 }
                 genicam::feed::Next::Nothing => {}
@@ -427,7 +430,7 @@ impl Stream {
                     };
                     self.health.latency("read", began.elapsed());
                     if let Some(frame) = frame {
-                        self.publish(frame, exposure).await;
+                        self.publish_live(frame, exposure).await;
                     }
                 }
                 rtsp::feed::Next::Dropped(reason) => self.health.dropped(reason),
@@ -635,6 +638,21 @@ impl Stream {
     /// True when a frame of this format must be converted to grey, for the air link or to be rectified.
     fn needs_grey(&self, format: PixelFormat) -> bool {
         format != PixelFormat::Mono8 && (self.air.is_wanted() || self.rect.is_wanted())
+    }
+
+    /// Publishes the frame of a camera, but no picture a second time: it would not be of the time that its stamp says.
+    async fn publish_live(&mut self, frame: Prepared, exposure: Exposure) {
+        let picture = self.pictures.add(&frame.pixels, Instant::now());
+        if picture == Picture::New {
+            return self.publish(frame, exposure).await;
+        }
+        self.health.dropped("frames that repeat the picture before");
+        if picture == Picture::Stuck && self.health.failed("camera repeats one picture") {
+            tracing::warn!(
+                "The camera gives the same picture, to the last bit, since a second; it is not published again until another \
+                 comes. Is its signal gone, or does what plays it hang? Still pictures are published from `source.paths`"
+            );
+        }
     }
 
     async fn publish(&mut self, frame: Prepared, exposure: Exposure) {

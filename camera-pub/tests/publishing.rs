@@ -229,6 +229,48 @@ async fn frames_of_a_program_are_stamped_with_their_arrival() -> anyhow::Result<
     Ok(())
 }
 
+/// A still picture is published again and again, one that a camera repeats is not.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_picture_that_is_repeated_is_published_once() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("picture");
+    let show = |level: u8| {
+        let next = folder.path().join("next");
+        std::fs::write(&next, [level; 64 * 48])?;
+        std::fs::rename(next, &path)
+    };
+    show(1)?;
+    let forever = format!("while sleep 0.05; do cat '{}'; done", path.display());
+    let config = program(&["sh", "-c", &forever], &[])?;
+    let port = free_port()?;
+    let (camera, viewer) = (open("camera-pub", port).await?, open("gcs-bridge", port).await?);
+    let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await?;
+    let service = tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
+    let mut stamp_ns = 0;
+    for level in [1, 1, 1, 2, 3] {
+        show(level)?;
+        let frame = loop {
+            let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+            // Of the one before some may be on their way.
+            if level != 2 || frame.bytes()[0] != 1 {
+                break frame;
+            }
+        };
+        ensure!(frame.bytes().iter().all(|&sample| sample == level), "not {level}");
+        ensure!(frame.header.stamp_ns > stamp_ns, "its stamp is not newer");
+        stamp_ns = frame.header.stamp_ns;
+        if level > 1 {
+            let again = timeout(Duration::from_millis(1500), frames.next()).await;
+            ensure!(again.is_err(), "the repeated picture {level} is published again");
+        }
+    }
+    ensure!(camera.health().failures("camera repeats one picture") == 2);
+    service.abort();
+    camera.close().await;
+    viewer.close().await;
+    Ok(())
+}
+
 /// The first frame of a program whose pixels are all this sample of gray16, with these keys.
 async fn frame_of_samples(sample: u16, set: &[&str]) -> anyhow::Result<(PixelFormat, Vec<u8>)> {
     let file = tempfile::NamedTempFile::new()?;
