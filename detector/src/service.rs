@@ -1,7 +1,7 @@
 //! The service: newest frame in, detections out; parameters are changed between two frames.
 //!
 //! The image work runs on one thread of its own, named `detect`, so that no message ever waits for it. The thread
-//! takes a frame only when it is free, and its mailbox keeps only the newest.
+//! takes a frame only when it is free, and its inbox keeps only the newest.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -17,16 +17,14 @@ use imaging::{Converter, GrayView};
 use markers::Pad;
 use messages::{
     CameraInfo, CameraResponse, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo,
-    FrameAck, FrameHeader, PixelFormat, Refusals, topic,
+    FrameHeader, PixelFormat, Refusals, topic,
 };
-use node::{
-    BoxFuture, Frame, FramePublisher, FrameSubscriber, Loan, Node, Publisher, Shutdown, clock_name,
-    now_ns,
-};
+use node::{BoxFuture, Frame, FramePublisher, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 
 use crate::config::{Config, Input};
+use crate::inbox::{AirInbox, Inbox};
 use crate::search::{Search, StageClock};
 use crate::wire;
 
@@ -35,8 +33,6 @@ const DEBUG_IMAGES: [&str; 4] = ["ellipses", "rings", "squares", "target"];
 
 /// How often a detector tells about itself, for those whose link was cut.
 const INFO_PERIOD: Duration = Duration::from_secs(1);
-/// A frame that is older than the newest by more than this belongs to a camera that began anew, in nanoseconds.
-const OVERTAKEN_NS: i64 = 1_000_000_000;
 /// Silence after which a camera's calibration may be replaced: cameras repeat it every second.
 const CAMERA_SILENT: Duration = Duration::from_millis(3500);
 /// Time for the answer to a last command to leave.
@@ -250,17 +246,14 @@ impl Live {
 /// Everything the image thread needs.
 struct Work {
     node: Node,
-    frames: FrameSubscriber,
+    frames: Inbox,
     detections: Publisher<Detections>,
-    acks: Publisher<FrameAck>,
     refusals: Publisher<Refusals>,
     debug: Vec<(&'static str, FramePublisher)>,
     shared: Shared,
     config: Config,
     converter: Converter,
     unpacker: Unpacker,
-    /// Clock and stamp of the newest frame from the air.
-    newest: Option<(String, i64)>,
     search: Search,
     overlay: RgbImageBuf,
 }
@@ -269,8 +262,12 @@ impl Work {
     async fn new(node: &Node, config: &Config, shared: Shared) -> anyhow::Result<Self> {
         let search = Search::new(config).map_err(anyhow::Error::msg)?;
         let frames = match config.input {
-            Input::Raw => topic::FRAME,
-            Input::Jpeg => topic::JPEG,
+            Input::Raw => Inbox::Raw(node.frame_subscriber(topic::FRAME, &[&config.camera]).await?),
+            Input::Jpeg => Inbox::Air(AirInbox::start(
+                node.frame_subscriber(topic::JPEG, &[&config.camera]).await?,
+                node.publisher(topic::FRAME_ACK, &[&config.id]).await?,
+                node.shared_health(),
+            )),
         };
         let mut debug = Vec::new();
         for image in DEBUG_IMAGES {
@@ -281,16 +278,14 @@ impl Work {
         }
         Ok(Self {
             node: node.clone(),
-            frames: node.frame_subscriber(frames, &[&config.camera]).await?,
+            frames,
             detections: node.publisher(topic::DETECTIONS, &[&config.id]).await?,
-            acks: node.publisher(topic::FRAME_ACK, &[&config.id]).await?,
             refusals: node.publisher(topic::REFUSALS, &[&config.id]).await?,
             debug,
             shared,
             config: config.clone(),
             converter: Converter::default(),
             unpacker: Unpacker::default(),
-            newest: None,
             search,
             overlay: RgbImageBuf::default(),
         })
@@ -304,34 +299,12 @@ impl Work {
             .name("detect".to_owned())
             .spawn(move || {
                 while let Some(frame) = node::block_on(&runtime, self.frames.next()) {
-                    node::block_on(&runtime, self.search_newest(frame));
+                    node::block_on(&runtime, self.search(&frame));
                 }
                 drop(running);
             })
             .context("starting the detection thread")?;
         Ok((stopped, thread))
-    }
-
-    /// Searches a frame, or one that waits behind it if that is newer: over the air they may come in any order. Each of them
-    /// is acknowledged.
-    async fn search_newest(&mut self, first: Frame) {
-        let mut newest = None;
-        let mut next = Some(first);
-        while let Some(frame) = next {
-            let is_jpeg = frame.header.format == PixelFormat::Jpeg;
-            if is_jpeg {
-                self.acks.publish(&self.ack(&frame)).await;
-            }
-            let is_overtaken = is_jpeg && self.is_overtaken(&frame.header);
-            let left_out = if is_overtaken { Some(frame) } else { newest.replace(frame) };
-            if left_out.is_some() {
-                self.node.shared_health().dropped("frames that a newer one has overtaken");
-            }
-            next = if is_jpeg { self.frames.waiting() } else { None };
-        }
-        if let Some(frame) = newest {
-            self.search(&frame).await;
-        }
     }
 
     async fn search(&mut self, frame: &Frame) {
@@ -372,17 +345,6 @@ impl Work {
         self.converter = converter;
     }
 
-    /// True for a frame that was held up on its way over the air while a newer one was searched already.
-    fn is_overtaken(&mut self, header: &FrameHeader) -> bool {
-        let newest = self.newest.get_or_insert_with(|| (header.clock.clone(), header.stamp_ns));
-        let is_later = newest.1.saturating_sub(header.stamp_ns);
-        if newest.0 == header.clock && (1..OVERTAKEN_NS).contains(&is_later) {
-            return true;
-        }
-        *newest = (header.clock.clone(), header.stamp_ns);
-        false
-    }
-
     /// Searches a frame for the air link, part by part.
     async fn search_parts(&mut self, frame: &Frame) {
         let mut clock = StageClock::start();
@@ -406,17 +368,6 @@ impl Work {
             }
         }
         self.unpacker = unpacker;
-    }
-
-    fn ack(&self, frame: &Frame) -> FrameAck {
-        let FrameHeader { camera, sequence, stamp_ns, clock, .. } = &frame.header;
-        FrameAck {
-            camera: camera.clone(),
-            sequence: *sequence,
-            stamp_ns: *stamp_ns,
-            clock: clock.clone(),
-            bytes: u32::try_from(frame.bytes().len()).unwrap_or(u32::MAX),
-        }
     }
 
     fn take_change(&mut self) {

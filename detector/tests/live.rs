@@ -2,16 +2,18 @@
 
 use std::time::Duration;
 
+use airlink::{Packer, Plan};
 use anyhow::{Context, ensure};
 use detector::Config;
-use imaging::GrayImage;
+use imaging::{GrayImage, GrayView};
 use markers::{Drawing, Ink};
 use messages::{
     BayerPattern, CameraInfo, CommandReply, Configuration, Detections, DetectorCommand,
     FrameHeader, PixelFormat, topic,
 };
 use node::{
-    FramePublisher, Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, clock_name, now_ns,
+    FramePublisher, Identity, Layers, Loan, Node, Shutdown, Subscriber, ZenohSource, clock_name,
+    now_ns,
 };
 use testing::{ports, python, python_passes};
 use tokio::time::timeout;
@@ -259,6 +261,69 @@ async fn several_families_are_found_and_parameters_change_while_it_runs() -> any
         accept(&operator, "response", "\"auto\"").await?;
         filming.abort();
     }
+    service.abort();
+    Ok(())
+}
+
+/// A frame of the air link, of noise, in which a search takes its time.
+async fn send_noise(
+    jpegs: &FramePublisher,
+    sequence: u64,
+    width: usize,
+    height: usize,
+) -> anyhow::Result<()> {
+    let mut state = 1_u32;
+    let noise = (0..width * height).map(|_| {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (state >> 24) as u8
+    });
+    let noise: Vec<u8> = noise.collect();
+    let header = FrameHeader {
+        sequence,
+        stamp_ns: now_ns(),
+        clock: clock_name().into(),
+        width: width as u32,
+        height: height as u32,
+        ..FrameHeader::sample()
+    };
+    let plan = Plan { quality: 75, overview_quality: 75, parts: Vec::new() };
+    let view = GrayView::packed(&noise, width, height)?;
+    let (header, bytes) = Packer::default().pack(view, &header, &plan)?;
+    jpegs.publish(&header, Loan::Private(bytes)).await;
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_frame_of_the_air_link_is_acknowledged_while_another_is_searched() -> anyhow::Result<()> {
+    let ([port], _, _) = ports::free()?;
+    let (camera, node) =
+        (open("camera-pub", "down", port).await?, open("detector", "main", port).await?);
+    let operator = open("alight", "test", port).await?;
+    let set = vec!["input=jpeg".into(), format!("markers={ALL}")];
+    let config = Layers { file: None, set }.load::<Config>()?.settings;
+    let detections = operator.subscriber(topic::DETECTIONS, &["main"]).await?;
+    let acks = camera.subscriber(topic::FRAME_ACK, &["main"]).await?;
+    let jpegs = camera.frame_publisher(topic::JPEG, &["down"], 0).await?;
+    let service = tokio::spawn(detector::run(node, config, Shutdown::on_signals()?));
+    let watched = async {
+        while !jpegs.has_subscribers().await {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        send_noise(&jpegs, 1, 4000, 3000).await?;
+        let ack = acks.next().await.context("an acknowledgement")?;
+        ensure!(ack.sequence == 1, "{ack:?}");
+        send_noise(&jpegs, 2, 64, 48).await?;
+        tokio::select! {
+            ack = acks.next() => ensure!(ack.is_some_and(|ack| ack.sequence == 2)),
+            _ = detections.next() => anyhow::bail!("the second frame waited for the search of the first"),
+        }
+        for sequence in [1, 2] {
+            let found = detections.next().await.context("detections")?;
+            ensure!(found.header.sequence == sequence, "{found:?}");
+        }
+        Ok(())
+    };
+    timeout(PATIENCE, watched).await.context("waiting for acknowledgements and detections")??;
     service.abort();
     Ok(())
 }

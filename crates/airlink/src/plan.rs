@@ -32,6 +32,8 @@ const OVERLAP_PX: u32 = 96;
 const MAX_OVERVIEW_PX: u32 = 330;
 /// Edges of an ROI are multiples of this number of pixels, the size of a JPEG block.
 const BLOCK: u32 = 8;
+/// Bytes of a JPEG file before its pixels.
+const HEADER_BYTES: f64 = 330.0;
 /// Weight of a new file in the mean of bytes per pixel.
 const WEIGHT: f64 = 0.3;
 /// Size of JPEG files of rendered ground by quality, relative to quality 75, as measured by the example
@@ -164,7 +166,8 @@ impl Planner {
 
     fn learn_part(&mut self, quality: u8, part: &FramePart) {
         let pixels = f64::from(part.width) * f64::from(part.height);
-        let found = f64::from(part.bytes) / (pixels * relative_size(quality)).max(1.0);
+        let of_pixels = (f64::from(part.bytes) - HEADER_BYTES).max(0.0);
+        let found = of_pixels / (pixels * relative_size(quality)).max(1.0);
         let [fine, coarse] = &mut self.bytes_per_pixel;
         let mean = if part.scale == 1 { fine } else { coarse };
         *mean += WEIGHT * (found - *mean);
@@ -173,7 +176,8 @@ impl Planner {
     fn predicted_bytes(&self, quality: u8, part: &FramePart) -> f64 {
         let [fine, coarse] = self.bytes_per_pixel;
         let mean = if part.scale == 1 { fine } else { coarse };
-        f64::from(part.width) * f64::from(part.height) * mean * relative_size(quality)
+        let pixels = f64::from(part.width) * f64::from(part.height);
+        HEADER_BYTES + pixels * mean * relative_size(quality)
     }
 
     /// The allowed qualities, best first.
@@ -242,6 +246,9 @@ fn covering(size: FrameSize, scale: u32) -> Option<FramePart> {
 
 /// The part that covers an ROI as far as it lies in the frame.
 fn roi_part(roi: Roi, size: FrameSize, scale: u32) -> Option<FramePart> {
+    if roi.to.iter().any(|edge| *edge < 0.0) {
+        return None;
+    }
     let step = BLOCK * scale;
     let span = |from: f64, to: f64, edge: u32| {
         // Casts saturate.

@@ -123,7 +123,7 @@ struct Work {
     second_lane: FramePublisher,
     acks: Subscriber<FrameAck>,
     detections: Option<Subscriber<Detections>>,
-    /// Names the detector in use.
+    /// Names the detector in use, and the marker of the landing.
     status: Subscriber<ControllerStatus>,
     health: Arc<HealthCounters>,
     window: Window,
@@ -172,17 +172,25 @@ impl Work {
                 Event::Status(status) => {
                     let key = |detector: &String| topic::FRAME_ACK.key(&[detector]);
                     self.window.use_receiver(status.active_detector.as_ref().map(key));
+                    self.predictor.follow(&status);
                 }
                 Event::Frame => self.send().await,
                 Event::Tick => self.has_subscribers = self.jpegs.has_subscribers().await,
                 Event::Closed => return,
             }
-            let (is_open, lost) = self.window.is_open(now_ns());
-            for _ in 0..lost {
-                self.health.dropped("air link frames without an acknowledgement in time");
-            }
-            self.offers.is_wanted.store(is_open && self.has_subscribers, Ordering::Relaxed);
+            let is_wanted = self.is_open() && self.has_subscribers;
+            self.offers.is_wanted.store(is_wanted, Ordering::Relaxed);
         }
+    }
+
+    /// Whether the link has room for a frame.
+    fn is_open(&mut self) -> bool {
+        let (is_open, lost) = self.window.is_open(now_ns());
+        if lost > 0 {
+            let reason = "air link frames without an acknowledgement in time";
+            self.health.dropped_times(reason, lost as u64);
+        }
+        is_open
     }
 
     fn ack(&mut self, detector: &str, ack: &FrameAck) {
@@ -201,6 +209,10 @@ impl Work {
 
     async fn send(&mut self) {
         let Some(Offer { header, pixels }) = lock(&self.offers.newest).take() else { return };
+        // One that was offered while the last one was compressed would queue behind it.
+        if !self.is_open() {
+            return;
+        }
         let started = Instant::now();
         let Ok(view) = GrayView::packed(&pixels, header.width as usize, header.height as usize)
         else {
