@@ -150,19 +150,18 @@ impl Frames {
         let sight = marker.as_ref().map(|marker| Sight {
             position_m: marker.body_from_marker.map(|pose| pose.origin().coords.into()),
         });
-        let mut frame = FrameObservation {
+        let focal_px = camera.and_then(|info| {
+            let scale = f64::from(header.width) / f64::from(info.width.max(1));
+            info.focal_px.map(|[fx, fy]| 0.5 * (fx + fy) * scale)
+        });
+        let frame = FrameObservation {
             stamp: Timestamp::from_nanos(header.stamp_ns),
             image_size: (header.width, header.height),
-            focal_px: None,
-            body_from_camera: None,
+            focal_px,
+            body_from_camera: mount.map(|mount| mount.rotation()),
             marker,
         };
         if self.selection.received(now_ns, publisher, header.stamp_ns, sight) {
-            frame.focal_px = camera.and_then(|info| {
-                let scale = f64::from(header.width) / f64::from(info.width.max(1));
-                info.focal_px.map(|[fx, fy]| 0.5 * (fx + fy) * scale)
-            });
-            frame.body_from_camera = mount.map(|mount| mount.rotation());
             // A better name may have taken the place of one that was known.
             if self.newest.len() >= MAX_DETECTORS {
                 self.newest.retain(|name, _| self.selection.knows(name));
