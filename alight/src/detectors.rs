@@ -5,11 +5,10 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
-use controller::wire::marker_name;
 use markers::{Marker, Pad};
 use messages::{
     Candidate, Configuration, ControllerCommand, ControllerStatus, DetectorInfo, DetectorState,
-    Place, topic,
+    Place, marker_name, topic,
 };
 use node::Node;
 use serde::Serialize;

@@ -228,7 +228,7 @@ impl Settings for Config {
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
         check.range("takeoff_height_m", self.takeoff_height_m, 1.0..=100.0);
-        check.parses("marker", crate::wire::marker_name(&self.marker));
+        check.parses("marker", messages::marker_name(&self.marker));
         check.parses("autopilot.address", self.autopilot.address.parse::<Address>());
         check.parses("autopilot.ground_may", self.autopilot.ground_may.parse::<Permission>());
         check.range("autopilot.component_id", self.autopilot.component_id, 1..=255);
@@ -304,7 +304,7 @@ impl Config {
     /// is the image's, and turns with the vehicle.
     fn turn(&self) -> Result<(), String> {
         let is_round =
-            crate::wire::marker_name(&self.marker).is_ok_and(|(family, _)| family == "rings");
+            messages::marker_name(&self.marker).is_ok_and(|(family, _)| family == "rings");
         if self.metric.turn_rad_s > 0.0 && is_round {
             let marker = &self.marker;
             return Err(format!(

@@ -85,6 +85,7 @@ impl View<'_> {
                 Mode::Guided => self.config.guidance.name().to_owned(),
                 Mode::LandingTarget => self.config.mode.name().to_owned(),
             },
+            marker: self.config.marker.clone(),
             autopilot: self.link(),
             active_detector: selection.active().map(str::to_owned),
             detector_why: selection.why().to_owned(),

@@ -14,26 +14,9 @@ pub fn body_from_camera(info: &CameraInfo) -> Option<Transform<Body, Camera>> {
     info.body_from_camera.transform()
 }
 
-/// Splits a marker's name, `family` or `family:id`.
-///
-/// # Errors
-/// Says which form a name has.
-pub fn marker_name(name: &str) -> Result<(&str, Option<u32>), String> {
-    let (family, id) = match name.split_once(':') {
-        Some((family, id)) => (family, Some(id)),
-        None => (name, None),
-    };
-    let id = id.map(str::parse).transpose();
-    id.ok()
-        .filter(|_| !family.is_empty())
-        .map(|id| (family, id))
-        .ok_or_else(|| "it must be FAMILY or FAMILY:ID, with a whole number as ID".to_owned())
-}
-
 /// The first detection of the marker `family` or `family:id` in a frame; none for an invalid name.
 pub fn wanted<'a>(message: &'a Detections, marker: &str) -> Option<&'a Detection> {
-    let (family, id) = marker_name(marker).ok()?;
-    message.detections.iter().find(|d| d.family == family && (id.is_none() || d.id == id))
+    message.detections.iter().find(|detection| detection.is_of(marker))
 }
 
 /// Converts a detection for the lander.

@@ -367,8 +367,7 @@ impl Bridge {
 
     /// Takes what a detector found in a frame.
     fn detections(&mut self, now_ns: i64, detector: &str, found: &Detections) {
-        let in_use = self.status.as_ref().and_then(|status| status.active_detector.as_deref());
-        self.camera.sees(now_ns, detector, in_use, found);
+        self.camera.sees(now_ns, detector, self.status.as_ref(), found);
         self.track(now_ns);
     }
 

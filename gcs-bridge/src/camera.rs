@@ -11,7 +11,7 @@ use autopilot::dialect::{
     STORAGE_INFORMATION_DATA, StorageStatus, VIDEO_STREAM_INFORMATION_DATA,
     VIDEO_STREAM_STATUS_DATA, VideoStreamEncoding, VideoStreamStatusFlags, VideoStreamType,
 };
-use messages::{Detection, Detections};
+use messages::{ControllerStatus, Detection, Detections, marker_name};
 
 use crate::video::Video;
 
@@ -87,14 +87,17 @@ impl Camera {
         Self { video, started_ns: now_ns, seen: None, period_ns: None, due_ns: i64::MIN }
     }
 
-    /// Takes what a detector found in a frame, when it is the one in use; without one, the one that was heard first.
+    /// Takes what a detector found in a frame, when it is the one that the controller uses; without one, the one that was heard
+    /// first. Of its markers it is the landing's, as far as that is known.
     pub(crate) fn sees(
         &mut self,
         now_ns: i64,
         detector: &str,
-        in_use: Option<&str>,
+        status: Option<&ControllerStatus>,
         found: &Detections,
     ) {
+        let in_use = status.and_then(|status| status.active_detector.as_deref());
+        let wanted = status.map(|status| &status.marker).filter(|name| marker_name(name).is_ok());
         let followed = self.frame(now_ns).map(|frame| frame.detector.as_str());
         let is_followed = in_use.or(followed).is_none_or(|name| name == detector);
         let header = &found.header;
@@ -102,7 +105,10 @@ impl Camera {
             return;
         }
         let (width, height) = (header.width, header.height);
-        let best = found.detections.first();
+        let best = match wanted {
+            Some(name) => found.detections.iter().find(|detection| detection.is_of(name)),
+            None => found.detections.first(),
+        };
         self.seen = Some(Frame {
             at_ns: now_ns,
             detector: detector.to_owned(),
@@ -361,15 +367,27 @@ mod tests {
     #[test]
     fn the_detector_in_use_is_followed_and_without_one_the_first() {
         let nothing = Detections { detections: Vec::new(), ..found(None) };
+        let uses = |detector: &str, marker: &str| ControllerStatus {
+            active_detector: Some(detector.into()),
+            marker: marker.into(),
+            ..ControllerStatus::default()
+        };
+        let in_use = uses("other", "");
         let mut camera = camera_with(&found(None));
         camera.sees(1, "other", None, &nothing);
         assert!(camera.marker(1).is_some());
-        camera.sees(2, "other", Some("other"), &nothing);
+        camera.sees(2, "other", Some(&in_use), &nothing);
         assert_eq!(camera.marker(2), None);
-        camera.sees(3, "onboard", Some("other"), &found(None));
+        camera.sees(3, "onboard", Some(&in_use), &found(None));
         assert_eq!(camera.marker(3), None);
         // The one that was followed is gone.
         camera.sees(4 * SECOND_NS, "onboard", None, &found(None));
         assert!(camera.marker(4 * SECOND_NS).is_some());
+        // Of its markers the landing's.
+        for (marker, is_tracked) in [("rings", true), ("stag-hd23", false)] {
+            let status = uses("onboard", marker);
+            camera.sees(5 * SECOND_NS, "onboard", Some(&status), &found(None));
+            assert_eq!(camera.marker(5 * SECOND_NS).is_some(), is_tracked, "{marker}");
+        }
     }
 }

@@ -154,7 +154,7 @@ fn configured(info: &CameraInfo) -> anyhow::Result<ConfiguredCamera> {
 /// The wanted marker, or the one that the controller landed on, where it is the name of one.
 fn named(flight: &Flight, wanted: &Wanted<'_>) -> Option<String> {
     let name = wanted.marker.map(str::to_owned).or_else(|| flight.marker())?;
-    controller::wire::marker_name(&name).is_ok().then_some(name)
+    messages::marker_name(&name).is_ok().then_some(name)
 }
 
 /// The wanted marker, or the one that the controller landed on, or, without a controller, the one that was seen most.
@@ -169,7 +169,7 @@ fn marker(flight: &Flight, wanted: &Wanted<'_>, found: &[&Detections]) -> anyhow
     }
     let named = named(flight, wanted);
     let is_seen = |name: &String| {
-        controller::wire::marker_name(name).is_ok()
+        messages::marker_name(name).is_ok()
             && found.iter().any(|message| controller::wire::wanted(message, name).is_some())
     };
     if let Some(name) = &wanted.marker {

@@ -9,6 +9,8 @@ use super::describe::{ControlDescription, control_value};
 
 /// The unit of the exposure's control, in seconds.
 const UNIT_S: f64 = 1e-4;
+/// How much longer or shorter than wanted an exposure may be for white to stay good (`metering::control`).
+const CLOSE: std::ops::RangeInclusive<f64> = 0.9..=1.13;
 /// `V4L2_EXPOSURE_APERTURE_PRIORITY`, with which UVC cameras meter, and `V4L2_EXPOSURE_AUTO` of others.
 const METERING: [i32; 2] = [3, 0];
 
@@ -192,33 +194,52 @@ impl Exposer {
 
     fn set(&mut self, device: &impl Device, setting: Setting) -> std::io::Result<u32> {
         let Limits { min_exposure_s, max_exposure_s, max_gain } = self.limits();
-        let exposure_s = setting.exposure_s.clamp(min_exposure_s, max_exposure_s);
-        let units = (exposure_s / UNIT_S).round() as i32;
-        set(device, CID_EXPOSURE_ABSOLUTE, units)?;
+        let wanted_s = setting.exposure_s.clamp(min_exposure_s, max_exposure_s);
+        let units = whole_units(wanted_s / UNIT_S, self.gain.is_some());
+        let exposure_s = units * UNIT_S;
+        // A few units are a rough measure: gain has the rest.
+        let rest = wanted_s / exposure_s;
+        let gain_wanted = if CLOSE.contains(&rest) { setting.gain } else { setting.gain * rest };
         let mut gain = 1.0;
-        if let Some(control) = self.gain {
+        let control = self.gain.map(|control| {
             let Range { min, max } = control.range;
-            let part = (setting.gain.clamp(1.0, max_gain) - 1.0) / (max_gain - 1.0).max(1e-9);
+            let part = (gain_wanted.clamp(1.0, max_gain) - 1.0) / (max_gain - 1.0).max(1e-9);
             let value = min + (part * f64::from(max - min)).round() as i32;
-            set(device, control.id, value)?;
             gain = self.factor(control, value);
+            (control.id, value)
+        });
+        let next = Setting { exposure_s, gain };
+        if self.setting == Some(next) {
+            return Ok((exposure_s * 1e9).round() as u32);
         }
-        let exposure_s = f64::from(units) * UNIT_S;
+        set(device, CID_EXPOSURE_ABSOLUTE, units as i32)?;
+        if let Some((id, value)) = control {
+            set(device, id, value)?;
+        }
         // What the camera had chosen before is not known.
         let change = |before: Setting| ((exposure_s - before.exposure_s).abs() * 1e9) as u32;
         self.changed_ns = self.setting.map_or(u32::MAX, change);
-        self.setting = Some(Setting { exposure_s, gain });
+        self.setting = Some(next);
         self.frames = 0;
         Ok((exposure_s * 1e9).round() as u32)
     }
 
     /// How much brighter a value of the gain's control is than its smallest. Between the ends it is taken to be linear;
-    /// where it is not, the loop needs more steps.
+    /// where it is not, the loop needs more steps, and smaller ones.
     fn factor(&self, gain: Gain, value: i32) -> f64 {
         let Range { min, max } = gain.range;
         let part = f64::from(value - min) / f64::from((max - min).max(1));
         1.0 + part.clamp(0.0, 1.0) * (self.wanted.max_gain - 1.0)
     }
+}
+
+/// Whole units of exposure for so many: the nearest, or, where that is far off and gain can make up for it, those below.
+fn whole_units(units: f64, has_gain: bool) -> f64 {
+    let nearest = units.round().max(1.0);
+    if has_gain && !CLOSE.contains(&(units / nearest)) {
+        return units.floor().max(1.0);
+    }
+    nearest
 }
 
 fn set(device: &impl Device, id: u32, value: i32) -> std::io::Result<()> {

@@ -3,8 +3,10 @@
 //! Each marker's centre moves at constant velocity, from its last two detections; its size stays. Uncertainty
 //! of the motion widens the ROI. A track ends after two frames in which the detector that saw its marker last does not
 //! see it: one may have been cut off by its ROI. Other detectors may look for other markers, or see less.
+//!
+//! While a controller looks for its marker, others are no reason to send a region instead of the whole frame.
 
-use messages::{Detection, Detections};
+use messages::{ControllerStatus, Detection, Detections, marker_name};
 
 /// Maximum number of tracks; further markers are found in the overview.
 const MAX_TRACKS: usize = 8;
@@ -20,11 +22,15 @@ const MARGIN_PX: f64 = 24.0;
 const DISPLACEMENT_UNCERTAINTY: f64 = 0.5;
 /// Uncertainty of the prediction, in pixels per second.
 const UNCERTAINTY_PX_S: f64 = 150.0;
+/// A marker that is this many of its sizes from where it was predicted is another one of its name, whose motion is not known.
+const MAX_JUMP: f64 = 2.0;
 
 /// Tracks the detected markers.
 #[derive(Clone, Debug, Default)]
 pub struct RoiPredictor {
     tracks: Vec<Track>,
+    /// The marker of the landing; any one until it is known.
+    marker: Option<String>,
 }
 
 #[derive(Clone, Debug)]
@@ -33,6 +39,8 @@ struct Track {
     detector: String,
     family: String,
     id: Option<u32>,
+    /// Whether it may be of the landing's marker.
+    may_be_wanted: bool,
     stamp_ns: i64,
     centre_px: [f64; 2],
     size_px: f64,
@@ -52,29 +60,45 @@ pub struct Roi {
 }
 
 impl RoiPredictor {
+    /// Takes a controller's status: the marker that it lands on must be among those of an ROI.
+    pub fn follow(&mut self, status: &ControllerStatus) {
+        let marker = marker_name(&status.marker).is_ok().then(|| status.marker.clone());
+        if self.marker != marker {
+            self.marker = marker;
+            self.tracks.clear();
+        }
+    }
+
     /// Updates the tracks with a detector's message about a frame of this camera; any detector's will do.
     pub fn update(&mut self, message: &Detections) {
         let stamp_ns = message.header.stamp_ns;
-        for detection in &message.detections {
+        let is_sound = |detection: &&Detection| {
             let [x, y] = detection.centre_px;
-            let is_finite = [x, y, detection.size_px].iter().all(|n| n.is_finite());
-            if !is_finite || detection.size_px <= 0.0 {
-                continue;
+            [x, y, detection.size_px].iter().all(|n| n.is_finite()) && detection.size_px > 0.0
+        };
+        let sound = || message.detections.iter().filter(is_sound);
+        for track in &mut self.tracks {
+            // Of several of its name the nearest.
+            let of_its_name = sound().filter(|detection| track.is_of(detection));
+            let distance = |detection: &Detection| track.distance_px(stamp_ns, detection.centre_px);
+            if let Some(nearest) = of_its_name.min_by(|a, b| distance(a).total_cmp(&distance(b))) {
+                track.update(message, nearest);
             }
-            let has_room = self.tracks.len() < MAX_TRACKS;
-            match self.tracks.iter_mut().find(|track| track.is_of(detection)) {
-                Some(track) => track.update(message, detection),
-                None if has_room => self.tracks.push(Track {
+        }
+        for detection in sound() {
+            let is_known = self.tracks.iter().any(|track| track.is_of(detection));
+            if !is_known && self.tracks.len() < MAX_TRACKS {
+                self.tracks.push(Track {
                     detector: message.detector.clone(),
                     family: detection.family.clone(),
                     id: detection.id,
+                    may_be_wanted: self.marker.as_ref().is_none_or(|it| detection.may_be_of(it)),
                     stamp_ns,
                     centre_px: detection.centre_px,
                     size_px: detection.size_px,
                     velocity_px_s: [0.0; 2],
                     misses: 0,
-                }),
-                None => {}
+                });
             }
         }
         for track in &mut self.tracks {
@@ -87,9 +111,12 @@ impl RoiPredictor {
         self.tracks.retain(|track| track.misses < MAX_MISSES);
     }
 
-    /// The ROI of a frame with this stamp; `None` without a track.
+    /// The ROI of a frame with this stamp; `None` without a track of the landing's marker.
     pub fn roi(&mut self, stamp_ns: i64) -> Option<Roi> {
         self.tracks.retain(|track| track.age_s(stamp_ns).abs() < MAX_AGE_S);
+        if !self.tracks.iter().any(|track| track.may_be_wanted) {
+            return None;
+        }
         let mut tracks = self.tracks.iter();
         let first = tracks.next()?.roi(stamp_ns);
         Some(tracks.fold(first, |all, track| all.union(&track.roi(stamp_ns))))
@@ -111,15 +138,28 @@ impl Track {
         // Another detector may report the same frame, or an older one.
         if period_s > 1e-3 {
             let ([x, y], [new_x, new_y]) = (self.centre_px, detection.centre_px);
-            if period_s < MAX_AGE_S {
-                self.velocity_px_s = [(new_x - x) / period_s, (new_y - y) / period_s];
-            }
+            let jump_px = self.distance_px(stamp_ns, detection.centre_px);
+            let margin_px = MARGIN_PX + UNCERTAINTY_PX_S * period_s;
+            self.velocity_px_s = if period_s > MAX_AGE_S
+                || jump_px > MAX_JUMP * self.size_px.max(detection.size_px) + margin_px
+            {
+                [0.0; 2]
+            } else {
+                [(new_x - x) / period_s, (new_y - y) / period_s]
+            };
             self.detector.clone_from(&message.detector);
             self.stamp_ns = stamp_ns;
             self.centre_px = detection.centre_px;
             self.size_px = detection.size_px;
             self.misses = 0;
         }
+    }
+
+    /// How far a place is from where the marker is predicted, in pixels.
+    fn distance_px(&self, stamp_ns: i64, [x, y]: [f64; 2]) -> f64 {
+        let age_s = self.age_s(stamp_ns);
+        let [dx, dy] = [0, 1].map(|i| self.centre_px[i] + self.velocity_px_s[i] * age_s);
+        (x - dx).hypot(y - dy)
     }
 
     fn roi(&self, stamp_ns: i64) -> Roi {
@@ -224,6 +264,46 @@ mod tests {
             predictor.update(&of("tags", detections(stamp_ms, &[])));
         }
         assert!(predictor.roi(1452 * MS).is_none());
+    }
+
+    #[test]
+    fn a_marker_that_is_not_the_landings_makes_no_roi() {
+        let status =
+            |marker: &str| ControllerStatus { marker: marker.into(), ..Default::default() };
+        let of = |markers: &[(u32, [f64; 2], f64)]| detections(0, markers);
+        let (tag, both) = ((1, [100.0, 500.0], 40.0), (2, [900.0, 100.0], 80.0));
+        // The sample's family is `rings`.
+        for (marker, sees_tag, sees_both) in [
+            ("", true, true),
+            ("rings:2", false, true),
+            ("rings", true, true),
+            ("pad:2", true, true),
+        ] {
+            let mut predictor = RoiPredictor::default();
+            predictor.follow(&status(marker));
+            predictor.update(&of(&[tag]));
+            assert_eq!(predictor.roi(0).is_some(), sees_tag, "{marker}");
+            predictor.follow(&status(marker));
+            predictor.update(&of(&[tag, both]));
+            assert_eq!(predictor.roi(0).is_some(), sees_both, "{marker}");
+        }
+    }
+
+    #[test]
+    fn of_two_markers_of_one_name_the_nearest_is_followed() {
+        let mut predictor = RoiPredictor::default();
+        let near = |stamp_ms: i64| (1, [100.0 + 0.1 * stamp_ms as f64, 500.0], 40.0);
+        let far = (1, [900.0, 100.0], 40.0);
+        predictor.update(&detections(0, &[near(0)]));
+        for stamp_ms in (66..660).step_by(66) {
+            predictor.update(&detections(stamp_ms, &[far, near(stamp_ms)]));
+        }
+        let roi = predictor.roi(660 * MS).unwrap();
+        assert!(contains(roi, near(660).1) && roi.to[0] < 300.0, "{roi:?}");
+        // Only the other one is left.
+        predictor.update(&detections(660, &[far]));
+        let roi = predictor.roi(726 * MS).unwrap();
+        assert!(contains(roi, far.1) && roi.from[0] > 600.0 && roi.to[0] < 1200.0, "{roi:?}");
     }
 
     #[test]

@@ -9,7 +9,7 @@ use crate::detector::Place;
 
 wire! {
     TargetEstimate = 6 v 2;
-    ControllerStatus = 7 v 6;
+    ControllerStatus = 7 v 7;
     ControllerCommand = 8 v 3;
     CommandReply = 9 v 1;
 }
@@ -163,6 +163,8 @@ pub struct ControllerStatus {
     pub why: String,
     /// The guidance in use.
     pub guidance: String,
+    /// The marker it lands on, as `FAMILY` or `FAMILY:ID`.
+    pub marker: String,
     /// State of the link to the autopilot, as text.
     pub autopilot: String,
     /// The active detector.

@@ -26,6 +26,25 @@ pub struct Detections {
     pub stages: Vec<StageTime>,
 }
 
+/// Splits a marker's name, `FAMILY` or `FAMILY:ID`.
+///
+/// # Errors
+/// Says which form a name has.
+pub fn marker_name(name: &str) -> Result<(&str, Option<u32>), String> {
+    let (family, id) = match name.split_once(':') {
+        Some((family, id)) => (family, Some(id)),
+        None => (name, None),
+    };
+    let id = id.map(str::parse).transpose();
+    id.ok()
+        .filter(|_| !family.is_empty())
+        .map(|id| (family, id))
+        .ok_or_else(|| "it must be FAMILY or FAMILY:ID, with a whole number as ID".to_owned())
+}
+
+/// The family of pads of several markers.
+pub const PAD_FAMILY: &str = "pad";
+
 /// A marker found in a frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Detection {
@@ -197,5 +216,18 @@ impl Place {
             Self::Onboard => "onboard",
             Self::Ground => "ground",
         }
+    }
+}
+
+impl Detection {
+    /// Whether it is of the marker of this name, `FAMILY` or `FAMILY:ID`; of none for an invalid one.
+    pub fn is_of(&self, marker: &str) -> bool {
+        marker_name(marker)
+            .is_ok_and(|(family, id)| self.family == family && (id.is_none() || self.id == id))
+    }
+
+    /// The same, and every marker may be of a pad of several.
+    pub fn may_be_of(&self, marker: &str) -> bool {
+        self.is_of(marker) || marker_name(marker).is_ok_and(|(family, _)| family == PAD_FAMILY)
     }
 }

@@ -15,7 +15,7 @@ use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, Targe
 use crate::detector::{Detections, DetectorInfo};
 
 wire! {
-    Tape = 19 v 4;
+    Tape = 19 v 5;
 }
 
 /// Length of the hash at the end of each record, in bytes.

@@ -282,6 +282,7 @@ fn controller_status() {
         phase: Phase::Descend,
         why: "w".into(),
         guidance: "metric".into(),
+        marker: "rings".into(),
         autopilot: "ok".into(),
         active_detector: Some("main".into()),
         detector_why: "y".into(),
@@ -313,7 +314,7 @@ fn controller_status() {
     };
     check(
         &message,
-        "41070602040177066d6574726963026f6b01046d61696e01790667726f756e640201046d61696e000100000000000000f03f00000000000000400000000000002e4001000f0e0000000100000000000000000000000000000000000000000000000000000000000000000000000901000000000000f03f000000000000004001000000000000e03f010178",
+        "41070702040177066d65747269630572696e6773026f6b01046d61696e01790667726f756e640201046d61696e000100000000000000f03f00000000000000400000000000002e4001000f0e0000000100000000000000000000000000000000000000000000000000000000000000000000000901000000000000f03f000000000000004001000000000000e03f010178",
     );
 }
 
@@ -380,7 +381,7 @@ fn truth() {
 #[test]
 fn tape() {
     let message = Tape { begun_ns: 1, first: 300, count: 2, records: vec![7, 0] };
-    check(&message, "41130402ac0202020700");
+    check(&message, "41130502ac0202020700");
 }
 
 /// A record with one event: its bytes without the hash, which the bytes give.
@@ -485,7 +486,7 @@ fn records_of_a_tape() {
     let state = TapeState { status, target };
     assert_eq!(
         record(&TapeEvent::State(Box::new(state)), &nothing),
-        "020c00080000000000000000000000000000000000000002000001000000000000f03f000000000000000000000000"
+        "020c0008000000000000000000000000000000000000000002000001000000000000f03f000000000000000000000000"
     );
     let decision = TapeDecision {
         phase: "p",
@@ -653,6 +654,7 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
         phase: Phase::Descend,
         why: "w".into(),
         guidance: "metric".into(),
+        marker: "rings".into(),
         autopilot: "a".into(),
         active_detector: Some("main".into()),
         detector_why: "d".into(),

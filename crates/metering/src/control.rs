@@ -27,6 +27,9 @@ const LONGER: f64 = 1.1;
 const SHORTER: f64 = 0.6;
 /// Changes below this are none.
 const MIN_CHANGE: f64 = 0.03;
+/// Exponent on the next steps, relative to before, where one goes back: the last one went too far.
+const BACK_EXPONENT: f64 = 0.5;
+const MIN_EXPONENT: f64 = 0.125;
 
 /// An exposure time and a gain.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -66,30 +69,58 @@ impl Setting {
     }
 }
 
-/// The setting for the next frames; `None` when that of this frame is good, or the region shows no pad.
+/// The loop from a frame's levels to the next setting.
 ///
 /// The step follows from the frame's own setting, so that frames which were under way when a setting was ordered are not
-/// counted twice. It takes grey levels to be proportional to light. Tone curves rise more slowly, never faster, so that it
-/// is then too small and never too large: exact after one step for a linear camera, after a few for others. Of clipped
-/// white it is only known that it is too much; black tells how much.
-pub fn next_setting(seen: &Seen, limits: &Limits) -> Option<Setting> {
-    let Levels { white, black } = seen.levels;
-    let is_flat = white < MIN_CONTRAST * black && white < CLIPPED;
-    if black > MAX_FLAT && is_flat {
-        return None;
+/// counted twice. It takes grey levels to be proportional to light. Tone curves rise more slowly, so that it is then too small:
+/// exact after one step for a linear camera, after a few for others. Of clipped white it is only known that it is too much; black
+/// tells how much. A gain that is not what its control's value says, as one in decibels, may make a step too large: one that goes back
+/// takes the root of what it would be, and so do those after it, until white is good.
+#[derive(Clone, Debug)]
+pub struct ExposureControl {
+    /// The last step as it would be without an exponent; 1 for none.
+    last_step: f64,
+    exponent: f64,
+}
+
+impl Default for ExposureControl {
+    fn default() -> Self {
+        Self { last_step: 1.0, exponent: 1.0 }
     }
-    let step = if GOOD.contains(&white) { 1.0 } else { TARGET / brightness(seen.levels) };
-    let light = seen.setting.light() * step.clamp(1.0 / MAX_STEP, MAX_STEP);
-    let next = share(light, seen.motion_px_s, limits);
-    let is_sharp = seen.setting.exposure_s <= LONGER * next.exposure_s;
-    let is_long = seen.setting.exposure_s >= SHORTER * next.exposure_s;
-    if step == 1.0 && is_sharp && is_long {
-        return None;
+}
+
+impl ExposureControl {
+    /// The setting for the next frames; `None` when that of this frame is good, or the region shows no pad.
+    pub fn next(&mut self, seen: &Seen, limits: &Limits) -> Option<Setting> {
+        let Levels { white, black } = seen.levels;
+        let is_flat = white < MIN_CONTRAST * black && white < CLIPPED;
+        if black > MAX_FLAT && is_flat {
+            return None;
+        }
+        let step = if GOOD.contains(&white) { 1.0 } else { self.damped(brightness(seen.levels)) };
+        let light = seen.setting.light() * step.clamp(1.0 / MAX_STEP, MAX_STEP);
+        let next = share(light, seen.motion_px_s, limits);
+        let is_sharp = seen.setting.exposure_s <= LONGER * next.exposure_s;
+        let is_long = seen.setting.exposure_s >= SHORTER * next.exposure_s;
+        if step == 1.0 && is_sharp && is_long {
+            *self = Self::default();
+            return None;
+        }
+        let is_same = |now: f64, next: f64| (next / now - 1.0).abs() < MIN_CHANGE;
+        let same = is_same(seen.setting.exposure_s, next.exposure_s)
+            && is_same(seen.setting.gain, next.gain);
+        (!same && next.exposure_s.is_finite() && next.gain.is_finite()).then_some(next)
     }
-    let is_same = |now: f64, next: f64| (next / now - 1.0).abs() < MIN_CHANGE;
-    let same =
-        is_same(seen.setting.exposure_s, next.exposure_s) && is_same(seen.setting.gain, next.gain);
-    (!same && next.exposure_s.is_finite() && next.gain.is_finite()).then_some(next)
+
+    /// The step in light from white of this brightness.
+    fn damped(&mut self, brightness: f64) -> f64 {
+        let step = TARGET / brightness;
+        if (step - 1.0) * (self.last_step - 1.0) < 0.0 {
+            self.exponent = (self.exponent * BACK_EXPONENT).max(MIN_EXPONENT);
+        }
+        self.last_step = step;
+        step.powf(self.exponent)
+    }
 }
 
 /// How bright white is, of full scale; estimated where it is clipped, or too dark for a level of its own.
@@ -125,12 +156,17 @@ mod tests {
         /// White's level at an exposure of one second and gain 1.
         light: f64,
         gamma: f64,
+        /// Its gain is in decibels: the logarithm of what it truly is grows with the value that is set.
+        in_decibels: bool,
     }
 
     impl Camera {
         fn levels(&self, setting: Setting) -> Levels {
+            let Setting { exposure_s, gain } = setting;
+            let part = (gain - 1.0) / (LIMITS.max_gain - 1.0);
+            let gain = if self.in_decibels { LIMITS.max_gain.powf(part) } else { gain };
             let level = |reflectance: f64| {
-                let light: f64 = self.light * setting.light() * reflectance;
+                let light: f64 = self.light * exposure_s * gain * reflectance;
                 (light.min(1.0).powf(1.0 / self.gamma) * 255.0).round() / 255.0
             };
             Levels { white: level(1.0), black: level(BLACK) }
@@ -138,9 +174,10 @@ mod tests {
 
         /// Number of settings until nothing is changed any more, and the last one.
         fn settle(&self, mut setting: Setting, motion_px_s: f64) -> Settled {
-            for steps in 0..30 {
+            let mut control = ExposureControl::default();
+            for steps in 0..40 {
                 let seen = Seen { setting, levels: self.levels(setting), motion_px_s };
-                match next_setting(&seen, &LIMITS) {
+                match control.next(&seen, &LIMITS) {
                     Some(next) => setting = next,
                     None => return Settled { steps, setting, white: seen.levels.white },
                 }
@@ -159,10 +196,11 @@ mod tests {
     #[test]
     fn six_stops_of_light_are_made_up_for_in_a_few_steps() {
         for (gamma, max_steps) in [(1.0, 5), (2.2, 6)] {
-            let day = Camera { light: 200.0, gamma };
+            let day = Camera { light: 200.0, gamma, in_decibels: false };
             let before = day.settle(Setting { exposure_s: 1e-3, gain: 1.0 }, 0.0);
             for stops in -6..=6 {
-                let camera = Camera { light: 200.0 * f64::powi(2.0, stops), gamma };
+                let light = 200.0 * f64::powi(2.0, stops);
+                let camera = Camera { light, gamma, in_decibels: false };
                 let after = camera.settle(before.setting, 0.0);
                 assert!((0.6..=0.85).contains(&after.white), "{gamma} {stops}: {after:?}");
                 assert!(after.steps <= max_steps, "{gamma} {stops}: {after:?}");
@@ -172,7 +210,7 @@ mod tests {
 
     #[test]
     fn gain_comes_second_and_an_exposure_never_blurs_by_more_than_a_pixel() {
-        let camera = Camera { light: 200.0, gamma: 1.0 };
+        let camera = Camera { light: 200.0, gamma: 1.0, in_decibels: false };
         let still = camera.settle(Setting { exposure_s: 1e-3, gain: 16.0 }, 0.0);
         assert_eq!(still.setting.gain, 1.0, "{still:?}");
         let moving = camera.settle(still.setting, 1000.0);
@@ -184,7 +222,7 @@ mod tests {
 
     #[test]
     fn in_the_dark_it_stays_at_the_limits() {
-        let night = Camera { light: 0.3, gamma: 1.0 };
+        let night = Camera { light: 0.3, gamma: 1.0, in_decibels: false };
         let settled = night.settle(Setting { exposure_s: 1e-3, gain: 1.0 }, 500.0);
         assert_eq!(settled.setting, Setting { exposure_s: 2e-3, gain: 64.0 });
     }
@@ -194,11 +232,12 @@ mod tests {
         let setting = Setting { exposure_s: 1e-3, gain: 2.0 };
         let seen =
             |white, black| Seen { setting, levels: Levels { white, black }, motion_px_s: 0.0 };
-        assert_eq!(next_setting(&seen(0.5, 0.45), &LIMITS), None);
-        assert!(next_setting(&seen(0.5, 0.05), &LIMITS).is_some());
+        let next = |white, black| ExposureControl::default().next(&seen(white, black), &LIMITS);
+        assert_eq!(next(0.5, 0.45), None);
+        assert!(next(0.5, 0.05).is_some());
         // Far too light, and far too dark.
-        assert!(next_setting(&seen(1.0, 1.0), &LIMITS).is_some_and(|next| next.light() < 3e-4));
-        assert!(next_setting(&seen(0.0, 0.0), &LIMITS).is_some_and(|next| next.light() > 0.1));
+        assert!(next(1.0, 1.0).is_some_and(|next| next.light() < 3e-4));
+        assert!(next(0.0, 0.0).is_some_and(|next| next.light() > 0.1));
     }
 
     proptest! {
@@ -208,7 +247,7 @@ mod tests {
             stops in -7.0..7.0f64, gamma in 1.0..2.4f64,
             exposure_s in 20e-6..8e-3f64, gain in 1.0..64.0f64, motion_px_s in 0.0..1000.0f64,
         ) {
-            let camera = Camera { light: 200.0 * stops.exp2(), gamma };
+            let camera = Camera { light: 200.0 * stops.exp2(), gamma, in_decibels: false };
             let needed = 0.72f64.powf(gamma) / camera.light;
             let fastest = (1.0 / motion_px_s.max(1.0)).min(8e-3);
             prop_assume!((40e-6..0.8 * 64.0 * fastest).contains(&needed));
@@ -218,13 +257,26 @@ mod tests {
             prop_assert!(settled.steps <= 10, "{settled:?}");
         }
 
+        /// Also where the gain is not what its value says, though in more steps.
+        #[test]
+        fn white_settles_with_a_gain_in_decibels(
+            part in 0.02..0.98f64, gamma in 1.0..2.4f64, gain in 1.0..64.0f64,
+        ) {
+            // As much light as this part of the gain needs at the maximum exposure.
+            let light = 0.72f64.powf(gamma) / (8e-3 * 64.0f64.powf(part));
+            let camera = Camera { light, gamma, in_decibels: true };
+            let settled = camera.settle(Setting { exposure_s: 8e-3, gain }, 0.0);
+            prop_assert!((0.6..=0.85).contains(&settled.white), "{settled:?}");
+            prop_assert!(settled.steps <= 20, "{settled:?}");
+        }
+
         #[test]
         fn whatever_is_seen_a_setting_is_within_the_limits(
             exposure_s: f64, gain: f64, white: f64, black: f64, motion_px_s: f64,
         ) {
             let levels = Levels { white, black };
             let seen = Seen { setting: Setting { exposure_s, gain }, levels, motion_px_s };
-            if let Some(next) = next_setting(&seen, &LIMITS) {
+            if let Some(next) = ExposureControl::default().next(&seen, &LIMITS) {
                 prop_assert!((20e-6..=8e-3).contains(&next.exposure_s), "{next:?}");
                 prop_assert!((1.0..=64.0).contains(&next.gain), "{next:?}");
             }

@@ -13,7 +13,7 @@ pub mod handover;
 pub mod pad;
 pub mod region;
 
-pub use control::{Limits, Seen, Setting, next_setting};
+pub use control::{ExposureControl, Limits, Seen, Setting};
 pub use handover::Handover;
 pub use pad::{Pad, PadTrack};
 pub use region::{Levels, levels};

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use messages::{Detection, Detections};
+use messages::{ControllerStatus, Detection, Detections, marker_name};
 
 /// Maximum age of the last detection, in nanoseconds. After it the camera meters by itself: a landing goes on without the
 /// pad for longer, but not with a guess of where it is.
@@ -34,6 +34,8 @@ pub struct PadTrack {
     camera: String,
     /// The detector whose detections count; any one's until it is known.
     detector: Option<String>,
+    /// The marker of the landing; any one until it is known.
+    marker: Option<String>,
     last: Option<Sighting>,
     motions: VecDeque<Motion>,
 }
@@ -59,14 +61,19 @@ struct Motion {
 impl PadTrack {
     /// A track of what is detected in this camera's frames.
     pub fn new(camera: &str) -> Self {
-        Self { camera: camera.to_owned(), detector: None, last: None, motions: VecDeque::new() }
+        Self {
+            camera: camera.to_owned(),
+            detector: None,
+            marker: None,
+            last: None,
+            motions: VecDeque::new(),
+        }
     }
 
-    /// Only this detector counts from now on; with `None` every one does.
-    pub fn use_detector(&mut self, detector: Option<&str>) {
-        if self.detector.as_deref() != detector {
-            self.detector = detector.map(str::to_owned);
-        }
+    /// Only the detector that a controller uses counts from now on, while there is one, and only the marker that it lands on.
+    pub fn follow(&mut self, status: &ControllerStatus) {
+        self.detector.clone_from(&status.active_detector);
+        self.marker = marker_name(&status.marker).is_ok().then(|| status.marker.clone());
     }
 
     /// Takes a detector's message. One of another camera, of a detector that is not in use, or about an older frame is
@@ -82,14 +89,17 @@ impl PadTrack {
         let is_sound = |detection: &&Detection| {
             let [x, y] = detection.centre_px;
             let is_finite = [x, y, detection.size_px].iter().all(|n| n.is_finite());
-            is_finite && detection.size_px > 0.0
+            let is_wanted = self.marker.as_ref().is_none_or(|marker| detection.may_be_of(marker));
+            is_finite && detection.size_px > 0.0 && is_wanted
         };
         let sound = || message.detections.iter().filter(is_sound);
-        // The same marker while it is seen, else the best one.
-        let same = |detection: &&Detection| {
-            self.last.as_ref().is_some_and(|last| last.is_of(detection, stamp_ns))
-        };
-        let Some(found) = sound().find(same).or_else(|| sound().next()) else { return };
+        // The same marker while it is seen, of several of its name the nearest, else the best one.
+        let same = self.last.as_ref().and_then(|last| {
+            let of_its_name = sound().filter(|detection| last.is_of(detection, stamp_ns));
+            let distance = |detection: &Detection| last.distance_px(stamp_ns, detection.centre_px);
+            of_its_name.min_by(|a, b| distance(a).total_cmp(&distance(b)))
+        });
+        let Some(found) = same.or_else(|| sound().next()) else { return };
         let before = self.last.take().filter(|last| last.is_of(found, stamp_ns));
         let velocity_px_s = before.as_ref().map_or([0.0; 2], |before| {
             let step_s = before.age_ns(stamp_ns) as f64 * 1e-9;
@@ -121,7 +131,7 @@ impl PadTrack {
             |motion: &Motion| last.stamp_ns.saturating_sub(motion.stamp_ns) <= MOTION_NS;
         self.motions.retain(is_recent);
         let age_s = last.age_ns(stamp_ns) as f64 * 1e-9;
-        let centre_px = [0, 1].map(|axis| last.centre_px[axis] + age_s * last.velocity_px_s[axis]);
+        let centre_px = last.predicted_px(stamp_ns);
         let motion_px_s = self.motions.iter().map(|motion| motion.px_s).fold(0.0, f64::max);
         let drift_px = motion_px_s * age_s.abs();
         Some(Pad { centre_px, size_px: last.size_px, motion_px_s, drift_px })
@@ -131,6 +141,16 @@ impl PadTrack {
 impl Sighting {
     fn age_ns(&self, stamp_ns: i64) -> i64 {
         stamp_ns.saturating_sub(self.stamp_ns)
+    }
+
+    fn predicted_px(&self, stamp_ns: i64) -> [f64; 2] {
+        let age_s = self.age_ns(stamp_ns) as f64 * 1e-9;
+        [0, 1].map(|axis| self.centre_px[axis] + age_s * self.velocity_px_s[axis])
+    }
+
+    fn distance_px(&self, stamp_ns: i64, [x, y]: [f64; 2]) -> f64 {
+        let [predicted_x, predicted_y] = self.predicted_px(stamp_ns);
+        (x - predicted_x).hypot(y - predicted_y)
     }
 
     /// True for the same marker, seen soon after.
@@ -229,12 +249,34 @@ mod tests {
         track.update(&seen);
         assert_eq!(track.at(0), None);
         let mut track = PadTrack::new("down");
-        track.use_detector(Some("ground"));
+        let status = |detector: &str, marker: &str| ControllerStatus {
+            active_detector: Some(detector.into()),
+            marker: marker.into(),
+            ..ControllerStatus::default()
+        };
+        track.follow(&status("ground", ""));
         track.update(&seen);
         assert_eq!(track.at(0), None);
-        track.use_detector(Some("main"));
+        track.follow(&status("main", "stag"));
         track.update(&seen);
-        assert!(track.at(0).is_some());
+        assert_eq!(track.at(0), None);
+        for marker in ["", "rings", "pad:1"] {
+            let mut track = track.clone();
+            track.follow(&status("main", marker));
+            track.update(&seen);
+            assert!(track.at(0).is_some(), "{marker}");
+        }
+    }
+
+    #[test]
+    fn of_two_markers_of_one_name_the_one_that_was_seen_is_followed() {
+        let mut track = PadTrack::new("down");
+        track.update(&message(0, vec![detection("rings", [100.0, 50.0], 40.0)]));
+        let two =
+            [detection("rings", [500.0, 300.0], 80.0), detection("rings", [101.0, 50.0], 40.0)];
+        track.update(&message(50, two.to_vec()));
+        let pad = track.at(50 * MS).unwrap();
+        assert!(pad.centre_px == [101.0, 50.0] && pad.motion_px_s < 30.0, "{pad:?}");
     }
 
     proptest! {

@@ -4,7 +4,7 @@
 use anyhow::Context;
 use geometry::{Body, Camera, Marker, Ned, Pixel, Rotation, Transform, Vector};
 use imaging::GrayView;
-use messages::Detections;
+use messages::{ControllerStatus, Detections};
 use rendering::occluder::Line;
 use rendering::{CameraSettings, Occluder, RenderError, Renderer, Scene};
 use world::camera::{Passage, Shutter};
@@ -143,9 +143,9 @@ impl SimCamera {
         self.exposing.detected(message);
     }
 
-    /// The detector that the controller uses.
-    pub fn use_detector(&mut self, detector: Option<&str>) {
-        self.exposing.use_detector(detector);
+    /// Takes a controller's status: the detector that it uses, and the marker that it lands on.
+    pub fn follow(&mut self, status: &ControllerStatus) {
+        self.exposing.follow(status);
     }
 
     /// Renders a frame into `out`. `truth_at` gives the vehicle's state at a time, in seconds of the

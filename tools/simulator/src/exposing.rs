@@ -4,8 +4,8 @@
 use std::collections::VecDeque;
 
 use imaging::GrayView;
-use messages::Detections;
-use metering::{Handover, Limits, PadTrack, Seen, Setting, levels, next_setting};
+use messages::{ControllerStatus, Detections};
+use metering::{ExposureControl, Handover, Limits, PadTrack, Seen, Setting, levels};
 use rendering::{CameraSettings, Processing};
 
 use crate::config::{Config, ExposureKind};
@@ -32,6 +32,7 @@ pub(crate) struct Exposing {
     mean: f64,
     track: PadTrack,
     handover: Handover,
+    control: ExposureControl,
     setting: Setting,
     /// Those that later frames are taken with, in their order.
     ordered: VecDeque<Ordered>,
@@ -59,6 +60,7 @@ impl Exposing {
             mean: if is_linear { MEAN } else { MEAN_TONED },
             track: PadTrack::new(&camera.name),
             handover: Handover::default(),
+            control: ExposureControl::default(),
             setting: Setting { exposure_s: settings.exposure_s, gain: settings.gain },
             ordered: VecDeque::new(),
         }
@@ -77,9 +79,9 @@ impl Exposing {
         self.track.update(message);
     }
 
-    /// Only this detector counts from now on.
-    pub(crate) fn use_detector(&mut self, detector: Option<&str>) {
-        self.track.use_detector(detector);
+    /// Takes a controller's status.
+    pub(crate) fn follow(&mut self, status: &ControllerStatus) {
+        self.track.follow(status);
     }
 
     /// Orders the setting that follows from a frame.
@@ -101,7 +103,7 @@ impl Exposing {
         let Some(pad) = pad.filter(|_| is_metered) else { return Some(self.by_mean(frame)) };
         let (setting, motion_px_s) = (self.setting, pad.motion_px_s);
         let levels = levels(frame, &pad)?;
-        next_setting(&Seen { setting, levels, motion_px_s }, &self.limits)
+        self.control.next(&Seen { setting, levels, motion_px_s }, &self.limits)
     }
 
     /// What the camera's own metering makes of a frame.

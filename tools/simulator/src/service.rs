@@ -528,7 +528,7 @@ impl Camera {
     fn follow_pad(&mut self) {
         let Some(sightings) = &self.sightings else { return };
         while let Some(status) = sightings.status.waiting() {
-            self.sensor.use_detector(status.active_detector.as_deref());
+            self.sensor.follow(&status);
         }
         while let Some(message) = sightings.detections.waiting() {
             self.sensor.detected(&message);
