@@ -247,6 +247,16 @@ impl Settings for Config {
         if lost_s > 0.0 {
             check.at_least("alarms.autopilot_lost_s", lost_s, "phases.stale_vehicle_s", stale_s);
         }
+        // A marker that is lost and still counts as visible would end all retries at once.
+        let (lost_s, stale_s) = (self.phases.lost_target_s, self.phases.stale_target_s);
+        check.at_least("phases.lost_target_s", lost_s, "phases.stale_target_s", stale_s);
+        // The deviation of what is not seen grows for as long as that is extrapolated: a descent without the marker must see it grow.
+        if self.guidance == GuidanceName::Metric {
+            let blind_s = self.metric.stale_target_s + self.metric.blind_s;
+            let (key, other) =
+                ("estimator.forget_after_s", "metric.stale_target_s + metric.blind_s");
+            check.at_least(key, self.estimator.forget_after_s, other, blind_s);
+        }
         self.detectors.check(check);
         check.parses("metric.turn_rad_s", self.turn());
         // Both guidances are checked, so that a wrong number is found before it is used.
@@ -303,8 +313,8 @@ impl Config {
     /// Whether the vehicle can turn to the marker's heading: rings look the same from all sides, so the upper edge that their pose has
     /// is the image's, and turns with the vehicle.
     fn turn(&self) -> Result<(), String> {
-        let is_round =
-            messages::marker_name(&self.marker).is_ok_and(|(family, _)| family == "rings");
+        let is_round = messages::marker_name(&self.marker)
+            .is_ok_and(|(family, _)| family.starts_with("rings"));
         if self.metric.turn_rad_s > 0.0 && is_round {
             let marker = &self.marker;
             return Err(format!(
@@ -405,6 +415,7 @@ mod tests {
         {
             assert!(problem.contains(part), "`{part}` is not in: {problem}");
         }
+        assert!(load(&["metric.turn_rad_s=0.3", "marker=rings-thesis"]).is_err());
         for marker in ["marker=aruco-4x4-50:7", "marker=pad:1"] {
             assert!(load(&["metric.turn_rad_s=0.3", marker]).is_ok(), "{marker}");
         }
@@ -430,5 +441,7 @@ mod tests {
         check("alarms.autopilot_lost_s=0.3", &stale);
         check("phases.stale_vehicle_s=1.5", &["`alarms.autopilot_lost_s` = 1", "(1.5)"]);
         assert!(load(&["alarms.autopilot_lost_s=0"]).is_ok(), "the alarm is off");
+        check("phases.stale_target_s=1.5", &["`phases.lost_target_s` = 1", "(1.5)"]);
+        check("estimator.forget_after_s=5", &["`estimator.forget_after_s` = 5", "blind_s", "6.7"]);
     }
 }

@@ -9,8 +9,8 @@ use std::time::Duration;
 use autopilot::dialect::{MavMessage, MavType};
 use autopilot::{Autopilot, Event, FlightMode, LandedState, Packet};
 use landing::{
-    Action, AlarmAction, Decision, Event as LanderEvent, FrameObservation, Lander, OperatorCommand,
-    Phase, Reason, Timestamp,
+    Action, Alarm, AlarmAction, Decision, Event as LanderEvent, FrameObservation, Lander,
+    OperatorCommand, Phase, Reason, Timestamp,
 };
 use messages::{
     CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorInfo,
@@ -238,16 +238,35 @@ impl Flight {
         }
     }
 
-    /// Passes alarms to the lander while it lands.
+    /// Passes alarms to the lander while it lands, or while a landing after our take-off waits in the air.
     fn check_alarms(&mut self, now_ns: i64) {
-        if !self.is_landing() || self.mission.is_sending_landing_target() {
+        let waits_in_air = self.mission.waits_in_air() && self.landing_target.is_none();
+        let is_landing = self.is_landing() && !self.mission.is_sending_landing_target();
+        if !is_landing && !waits_in_air {
             return;
         }
         let battery = self.autopilot.state().map(|state| state.battery);
-        if let Some(alarm) = self.alarms.tick(now_ns, battery.as_ref()) {
-            self.journal.alarm(alarm);
-            self.decide(now_ns, LanderEvent::Alarm(alarm));
+        let Some(alarm) = self.alarms.tick(now_ns, battery.as_ref()) else { return };
+        self.journal.alarm(alarm);
+        if waits_in_air {
+            let phases = &self.config.phases;
+            let is_to_land = match alarm {
+                Alarm::BatteryCritical => phases.on_battery_critical == AlarmAction::Land,
+                Alarm::BatteryLow => phases.on_battery_low == AlarmAction::Land,
+                Alarm::AutopilotLost | Alarm::OperatorLost => false,
+            };
+            if !is_to_land {
+                return;
+            }
+            // It lands at once, whatever keeps it from being led to a marker.
+            let before = self.mission.clone();
+            self.begin(now_ns);
+            if self.lander.phase().is_terminal() {
+                self.mission = before;
+                return;
+            }
         }
+        self.decide(now_ns, LanderEvent::Alarm(alarm));
     }
 
     /// Handles the detections that were published on the key of the detector `publisher`. True when a frame
@@ -306,6 +325,9 @@ impl Flight {
 
     fn send_landing_target(&mut self, now_ns: i64, frame: &FrameObservation) {
         let target = self.decision.and_then(|decision| decision.target);
+        if landing_target::distrust(&self.lander, target.as_ref(), self.is_disputed).is_some() {
+            return;
+        }
         if let Some(landing_target) = &mut self.landing_target
             && landing_target.send(now_ns, frame, target, &mut self.autopilot)
         {
@@ -593,7 +615,10 @@ impl Flight {
         self.alarms.begin();
         self.mission.begin(now_ns, self.landing_target.is_some());
         match &mut self.landing_target {
-            Some(landing_target) => landing_target.begin(now_ns, is_holding_px4(&self.autopilot)),
+            Some(landing_target) => {
+                self.lander.repeat_axis_check();
+                landing_target.begin(now_ns, is_holding_px4(&self.autopilot));
+            }
             None => self.decide(now_ns, LanderEvent::Operator(OperatorCommand::Start)),
         }
     }
@@ -700,6 +725,8 @@ impl Flight {
                 {
                     let why = "the autopilot restarted in flight".to_owned();
                     self.mission.fail(&mut self.autopilot, why);
+                    // What it went on deciding would stand behind the next start.
+                    self.lander.stand_down();
                 }
                 _ => {}
             }

@@ -6,7 +6,7 @@
 
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, Parameter};
 use geometry::Point;
-use landing::{FrameObservation, TargetEstimate};
+use landing::{FrameObservation, Lander, Reason, TargetEstimate};
 use messages::Phase;
 
 use crate::config::{LandingTargetSettings, LandingTargetSource};
@@ -249,9 +249,10 @@ impl LandingTargetMode {
             ),
             State::Commanding(_) => (Phase::Final, "requesting LAND".to_owned()),
             State::Landing | State::LeftToLand(..) => {
-                (Phase::Final, format!("the autopilot lands; {target}"))
+                let why = problem.map_or_else(String::new, |problem| format!(": {problem}"));
+                (Phase::Final, format!("the autopilot lands; {target}{why}"))
             }
-            State::Landed => (Phase::Landed, landing::Reason::TouchedDown.to_string()),
+            State::Landed => (Phase::Landed, Reason::TouchedDown.to_string()),
             State::AbortedEarly(_) => (Phase::Aborted, ABORTED.to_owned()),
             State::Recalling(_, why) | State::Ended(why) => (Phase::Aborted, why.clone()),
         }
@@ -291,6 +292,22 @@ fn hover_mode(autopilot: &Autopilot) -> FlightMode {
         Some(Firmware::Px4) => FlightMode::AUTO_HOLD,
         _ => FlightMode::Guided,
     }
+}
+
+/// Why the target is not one that an autopilot may land on: what keeps our own guidance from descending, which the autopilot cannot know.
+pub fn distrust(
+    lander: &Lander,
+    target: Option<&TargetEstimate>,
+    is_disputed: bool,
+) -> Option<String> {
+    if let Some(mismatch) = lander.axis_mismatch() {
+        return Some(mismatch.to_string());
+    }
+    if is_disputed {
+        return Some(Reason::Disputed.to_string());
+    }
+    let is_ambiguous = target.is_some_and(|target| target.ambiguous);
+    is_ambiguous.then(|| Reason::Ambiguous.to_string())
 }
 
 /// What keeps this autopilot from using landing targets, and what to do about it.

@@ -35,6 +35,8 @@ pub enum State {
     TakingOff {
         /// The take-off.
         takeoff: Takeoff,
+        /// It has taken off, and something keeps the landing from beginning.
+        waits_in_air: bool,
         /// What it waits for.
         why: String,
     },
@@ -88,6 +90,7 @@ impl Mission {
             Start::Airborne | Start::Resume => State::AwaitingTakeoff,
             Start::Takeoff => State::TakingOff {
                 takeoff,
+                waits_in_air: false,
                 why: "waiting for the autopilot's heartbeat".to_owned(),
             },
         };
@@ -119,6 +122,11 @@ impl Mission {
     /// True while the vehicle takes off.
     pub fn is_taking_off(&self) -> bool {
         matches!(self.state, State::TakingOff { .. })
+    }
+
+    /// True while the vehicle has taken off, and something keeps the landing from beginning.
+    pub fn waits_in_air(&self) -> bool {
+        matches!(self.state, State::TakingOff { waits_in_air: true, .. })
     }
 
     /// True while a PX4 that holds its place is asked for OFFBOARD.
@@ -282,40 +290,43 @@ impl Mission {
                 }
                 None
             }
-            State::TakingOff { takeoff, why } => match takeoff.step(now_ns, autopilot) {
-                end @ (TakeoffProgress::Done
-                | TakeoffProgress::Failed(TakeoffError::PilotInCommand {
-                    mode: FlightMode::Land | FlightMode::AUTO_LAND,
-                    ..
-                })) => {
-                    if let Some(obstacle) = obstacle {
-                        obstacle.clone_into(why);
-                        hover_in_offboard(now_ns, autopilot);
-                        if let Some(end) = end_of_waiting(autopilot) {
-                            let why = format!("{end} while the landing waited: {obstacle}");
-                            tracing::error!("No landing after the take-off: {why}");
-                            self.fail(autopilot, why);
+            State::TakingOff { takeoff, waits_in_air, why } => {
+                match takeoff.step(now_ns, autopilot) {
+                    end @ (TakeoffProgress::Done
+                    | TakeoffProgress::Failed(TakeoffError::PilotInCommand {
+                        mode: FlightMode::Land | FlightMode::AUTO_LAND,
+                        ..
+                    })) => {
+                        if let Some(obstacle) = obstacle {
+                            *waits_in_air = true;
+                            obstacle.clone_into(why);
+                            hover_in_offboard(now_ns, autopilot);
+                            if let Some(end) = end_of_waiting(autopilot) {
+                                let why = format!("{end} while the landing waited: {obstacle}");
+                                tracing::error!("No landing after the take-off: {why}");
+                                self.fail(autopilot, why);
+                            }
+                            return None;
                         }
-                        return None;
+                        Some(match end {
+                            TakeoffProgress::Done => Trigger::TakenOff,
+                            _ => Trigger::LandInsteadOfTakeoff,
+                        })
                     }
-                    Some(match end {
-                        TakeoffProgress::Done => Trigger::TakenOff,
-                        _ => Trigger::LandInsteadOfTakeoff,
-                    })
+                    TakeoffProgress::Failed(problem) => {
+                        tracing::error!(%problem, "Take-off failed");
+                        self.fail(autopilot, problem.to_string());
+                        None
+                    }
+                    progress => {
+                        *why = match progress {
+                            TakeoffProgress::Waiting(reasons) => reasons.join("; "),
+                            progress => progress.to_string(),
+                        };
+                        None
+                    }
                 }
-                TakeoffProgress::Failed(problem) => {
-                    tracing::error!(%problem, "Take-off failed");
-                    self.fail(autopilot, problem.to_string());
-                    None
-                }
-                progress => {
-                    *why = match progress {
-                        TakeoffProgress::Waiting(reasons) => reasons.join("; "),
-                        progress => progress.to_string(),
-                    };
-                    None
-                }
-            },
+            }
             State::TakingControl { .. } => self.advance_control(now_ns, autopilot, is_fresh),
             State::LeavingOffboard { .. } => {
                 self.advance_exit(now_ns, autopilot);

@@ -123,7 +123,13 @@ impl View<'_> {
             (
                 State::Idle | State::AwaitingTakeoff | State::SendingLandingTarget,
                 Some(landing_target),
-            ) => landing_target.phase(now_ns, landing_target::problem(self.autopilot)),
+            ) => {
+                let target = self.decision.and_then(|decision| decision.target);
+                let is_disputed = self.frames.selection.dispute().is_some();
+                let distrust = landing_target::distrust(self.lander, target.as_ref(), is_disputed);
+                let problem = landing_target::problem(self.autopilot).or(distrust);
+                landing_target.phase(now_ns, problem)
+            }
             (State::SendingLandingTarget, None) => {
                 (Phase::Failed, "no landing target is sent in this mode".to_owned())
             }

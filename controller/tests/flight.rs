@@ -303,6 +303,36 @@ fn precision_landing_gets_the_target_and_no_setpoint() {
     assert_eq!(status.guidance, "landing-target");
 }
 
+/// The autopilot cannot know what keeps our own guidance from descending.
+#[test]
+fn no_landing_target_is_sent_while_two_detectors_see_the_marker_at_two_places() {
+    for lie_m in [0.0, 1.0] {
+        let mut flight = landing_target("airborne");
+        parameter(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
+        parameter(&mut flight, 2 * MS, "PLND_TYPE", 1.0);
+        let mut modes = Vec::new();
+        for ms in (20..9000).step_by(20) {
+            if ms % 1000 == 0 {
+                receive(&mut flight, ms * MS, &heartbeat(4, true));
+            }
+            pose_at(&mut flight, ms * MS, 5.0);
+            if ms % 60 == 0 {
+                for (name, lie_m) in [("main", 0.0), ("other", lie_m)] {
+                    let mut seen = Detections { detector: name.into(), ..seen(ms * MS - 40 * MS) };
+                    let pose = seen.detections[0].pose.as_mut().unwrap();
+                    pose.camera_from_marker.translation_m = [lie_m, 0.0, 5.0];
+                    flight.detections(ms * MS + 2, name, &seen);
+                }
+            }
+            flight.tick(ms * MS + 3);
+            modes.extend(sent(&mut flight).1);
+        }
+        let status = flight.status(9000 * MS);
+        assert_eq!(modes.is_empty(), lie_m > 0.0, "{lie_m} m: {status:?}");
+        assert_eq!(status.why.contains("at two places"), lie_m > 0.0, "{status:?}");
+    }
+}
+
 #[test]
 fn a_precision_landing_that_is_off_is_reported_with_what_to_set() {
     let mut flight = landing_target("command");
@@ -865,6 +895,43 @@ fn a_pilot_ends_the_wait_of_a_vehicle_that_took_off_for_its_landing() {
 }
 
 #[test]
+fn a_vehicle_that_waits_in_the_air_for_its_landing_lands_before_its_battery_is_empty() {
+    for (set, lands) in [("", true), ("phases.on_battery_critical=hold", false)] {
+        let set: Vec<&str> = [set].into_iter().filter(|it| !it.is_empty()).collect();
+        let mut flight = flight_with("takeoff", &set);
+        flight.presence(0, "main", true);
+        flight.camera(0, CameraInfo::sample());
+        receive(&mut flight, 0, &heartbeat(4, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        let foreign = |stamp_ns| Detections {
+            header: FrameHeader { clock: "monotonic/myhost".into(), ..header(stamp_ns) },
+            ..Detections::sample()
+        };
+        for ms in (20..10_000).step_by(20) {
+            flight.detections(ms * MS, "main", &foreign(ms * MS));
+            if ms > 1600 {
+                pose(&mut flight, ms * MS);
+            }
+            if ms % 1000 == 0 {
+                receive(&mut flight, ms * MS, &heartbeat(4, true));
+                let battery_remaining = if ms < 5000 { 50 } else { 8 };
+                let battery = SYS_STATUS_DATA { battery_remaining, ..Default::default() };
+                receive(&mut flight, ms * MS, &MavMessage::SYS_STATUS(battery));
+            }
+            flight.tick(ms * MS + 3);
+            if ms == 7000 {
+                let status = flight.status(ms * MS);
+                let waits = status.phase == Phase::Takeoff && status.why.contains("myhost");
+                assert!(waits, "{status:?}");
+            }
+        }
+        let status = flight.status(10_000 * MS);
+        assert_eq!(status.phase == Phase::Final, lands, "{status:?}");
+        assert_eq!(status.why.contains("battery"), lands, "{status:?}");
+    }
+}
+
+#[test]
 fn a_flight_that_follows_a_landing_within_seconds_is_not_landed_without_a_command() {
     let (on_ground, in_air) =
         (MavLandedState::MAV_LANDED_STATE_ON_GROUND, MavLandedState::MAV_LANDED_STATE_IN_AIR);
@@ -1015,6 +1082,14 @@ fn an_autopilot_that_restarts_in_flight_has_not_landed() {
         let status = flight.status((told_ms + 800) * MS);
         assert_eq!(status.phase, Phase::Failed, "{}", status.why);
         assert!(status.why.contains("restarted in flight"), "{}", status.why);
+        // What was going on does not go on behind a start.
+        let from_ms = told_ms + 800;
+        receive(&mut flight, from_ms * MS, &heartbeat(4, true));
+        receive(&mut flight, from_ms * MS + 1, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        poses(&mut flight, (from_ms + 20, from_ms + 200), 10_900);
+        let reply = flight.command((from_ms + 200) * MS, &ControllerCommand::Start);
+        let status = flight.status((from_ms + 200) * MS);
+        assert!(reply.accepted && status.phase == Phase::Search, "{reply:?} {status:?}");
     }
 }
 

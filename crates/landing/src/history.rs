@@ -17,6 +17,9 @@ const MAX_GAP_S: f64 = 0.5;
 /// metres, plus metres per second between the two states.
 const JUMP_M: f64 = 0.1;
 const JUMP_M_S: f64 = 0.5;
+/// Maximum gap over which a jump is told from a change of the velocity, in seconds: a vehicle that brakes by 2 m/s in a longer one has
+/// moved by metres less than the mean of its velocities says.
+const MAX_JUMP_GAP_S: f64 = 1.0;
 
 /// The vehicle's latest states, in the order of their stamps.
 #[derive(Clone, Debug)]
@@ -179,9 +182,12 @@ fn turn_rate(earlier: &VehicleState, later: &VehicleState) -> Vector<Body> {
 }
 
 /// The jump of the autopilot's position between two states: the part of the displacement that its velocity
-/// does not explain, when that is large.
+/// does not explain, when that is large. `None` over a long gap, in which the velocity may have been any.
 pub(crate) fn jump(earlier: &VehicleState, later: &VehicleState) -> Option<Vector<Ned>> {
     let gap_s = later.stamp.seconds_since(earlier.stamp);
+    if gap_s > MAX_JUMP_GAP_S {
+        return None;
+    }
     let expected = (earlier.velocity + later.velocity) * (0.5 * gap_s);
     let difference = later.position - earlier.position - expected;
     (difference.norm() > JUMP_M + JUMP_M_S * gap_s).then_some(difference)

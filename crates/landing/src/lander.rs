@@ -103,6 +103,8 @@ pub struct Lander {
     retry_to_m: Option<f64>,
     /// What an aborted landing does about its height.
     abort_climb: AbortClimb,
+    /// Since when an aborted vehicle follows what it is asked.
+    asked_since: Option<Timestamp>,
     /// Smallest angle from the image's centre to its edge, in radians.
     half_view_rad: Option<f64>,
     /// The expanding square that is being flown.
@@ -151,6 +153,7 @@ impl Lander {
             land_requested: None,
             retry_to_m: None,
             abort_climb: AbortClimb::default(),
+            asked_since: None,
             half_view_rad: None,
             square: None,
             limits: AutopilotLimits::default(),
@@ -245,6 +248,11 @@ impl Lander {
         let is_active = !self.phase().is_terminal() && !self.pad_moves();
         let pad = to_remember(self.now?, &target).filter(|_| is_active)?;
         Some(SeenPad { pad, height_m: target.height_m })
+    }
+
+    /// Ends the landing without another action; a new one may be started.
+    pub fn stand_down(&mut self) {
+        self.state_machine.stand_down(self.now.unwrap_or_default());
     }
 
     /// The present phase.
@@ -353,7 +361,11 @@ impl Lander {
             let is_recent = now.seconds_since(vehicle.stamp) <= self.config.phases.stale_vehicle_s;
             is_recent && vehicle.velocity.z().abs() > max_m_s
         });
-        let is_high = self.known_height_m(now).is_some_and(|height_m| height_m > MAX_CONTACT_M);
+        // The height over a ground of earlier flights may have drifted, and would never be corrected: beyond a landing, motors that are off
+        // say more.
+        let is_old = self.recent_target(now).is_none() && self.phase().is_terminal();
+        let is_high = (status.armed || !is_old)
+            && self.known_height_m(now).is_some_and(|height_m| height_m > MAX_CONTACT_M);
         if moves || is_high { Landed::InAir } else { Landed::OnGround }
     }
 
@@ -463,7 +475,7 @@ impl Lander {
     }
 
     /// How the axes of camera and autopilot differ, once that is certain.
-    fn axis_mismatch(&self) -> Option<Reason> {
+    pub fn axis_mismatch(&self) -> Option<Reason> {
         match self.axis_check.verdict() {
             Verdict::Mismatch(error) if self.checks_axes() => Some(match error {
                 AxisError::Turned(_) => Reason::CameraTurned,
@@ -475,7 +487,7 @@ impl Lander {
     }
 
     /// A vehicle that holds because of the axes and is told to go on looks at them again.
-    fn repeat_axis_check(&mut self) {
+    pub fn repeat_axis_check(&mut self) {
         if self.axis_mismatch().is_some() {
             self.axis_check = AxisConsistencyCheck::default();
             self.first_seen = None;
@@ -591,6 +603,7 @@ impl Lander {
         }
         if self.state_machine.phase() != Phase::Aborted {
             self.abort_climb = AbortClimb::default();
+            self.asked_since = None;
         }
         if !guided && !handing_over && !retrying {
             self.guidance.reset();

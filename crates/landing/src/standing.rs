@@ -28,10 +28,12 @@ const MAX_STANDING_M: f64 = 0.3;
 const MAX_STEERED_STANDING_M: f64 = 0.15;
 const MAX_STANDING_ASIDE_M: f64 = 0.3;
 const MAX_STANDING_DEVIATION_M: f64 = 0.2;
-/// How much more height per second since the newest detection: the autopilot's height drifts, in m/s.
+/// How much more or less height per second since the newest detection: the autopilot's height drifts, in m/s, for as long as an
+/// autopilot may take to say that it stands, in seconds.
 const STANDING_DRIFT_M_S: f64 = 0.02;
+const MAX_DRIFT_S: f64 = 15.0;
 
-/// Maximum age of a pad's place that an earlier lander has left, in seconds: the autopilot's position drifts.
+/// Maximum age of a pad's place, in seconds: the autopilot's position drifts.
 const MAX_REMEMBERED_S: f64 = 60.0;
 /// Maximum speed of a vehicle that stands where no pad is known, in m/s, its minimum duration, in seconds, and the maximum
 /// height over the local origin, in metres: a barometer drifts by so much in a flight.
@@ -170,7 +172,8 @@ pub(crate) fn may_stand(situation: &Situation<'_>, config: &Config, is_steered: 
         velocity: target.velocity,
     };
     let max_m = if is_steered { MAX_STEERED_STANDING_M } else { MAX_STANDING_M };
-    !target.ambiguous && is_right_over(situation, config, &below, max_m)
+    let is_sound = !target.ambiguous && target.age_s <= MAX_REMEMBERED_S;
+    is_sound && is_right_over(situation, config, &below, max_m)
 }
 
 /// The pad's place, for a lander that has to take over; `None` where it is not known well.
@@ -200,8 +203,9 @@ fn is_right_over(
 }
 
 fn is_low(config: &Config, below: &Below, max_height_m: f64) -> bool {
-    let max_m = max_height_m + STANDING_DRIFT_M_S * below.age_s;
-    below.height_m - standing_height_m(config) <= max_m
+    let drift_m = STANDING_DRIFT_M_S * libm::fmin(below.age_s, MAX_DRIFT_S);
+    let height_m = below.height_m - standing_height_m(config);
+    (-MAX_STILL_HEIGHT_M - drift_m..=max_height_m + drift_m).contains(&height_m)
 }
 
 fn is_recent(situation: &Situation<'_>, config: &Config) -> bool {
@@ -220,6 +224,25 @@ pub(crate) fn standing_height_m(config: &Config) -> f64 {
 mod tests {
     use super::*;
     use crate::guidance::metric::tests::{sinking, situation};
+
+    /// However old the estimate is: its height errs by decimetres.
+    #[test]
+    fn a_vehicle_high_over_an_old_estimate_or_below_it_does_not_stand() {
+        for (height_m, age_s, expected) in [
+            (0.5, 10.0, true),
+            (0.7, 50.0, false),
+            (0.1, 61.0, false),
+            (3.0, 135.0, false),
+            (-0.3, 0.0, true),
+            (-1.0, 8.0, false),
+        ] {
+            let vehicle = sinking(0.0, 0.0, height_m, 0.0);
+            let mut situation = situation(&vehicle);
+            situation.target = situation.target.map(|target| TargetEstimate { age_s, ..target });
+            let may_stand = may_stand(&situation, &Config::default(), false);
+            assert_eq!(may_stand, expected, "{height_m} m, {age_s} s");
+        }
+    }
 
     #[test]
     fn a_vehicle_that_is_steered_may_stand_only_where_it_is_lower() {

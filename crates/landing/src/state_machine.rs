@@ -336,6 +336,12 @@ impl StateMachine {
         self.retries = 0;
     }
 
+    /// Ends the landing; nothing is done until another one is started.
+    pub fn stand_down(&mut self, now: Timestamp) {
+        self.enter(Phase::Idle, Reason::WaitingForStart, now);
+        (self.expects_land, self.released) = (false, false);
+    }
+
     fn enter(&mut self, phase: Phase, reason: Reason, now: Timestamp) {
         self.is_recalling =
             phase == Phase::Aborted && self.landing && reason == Reason::OperatorAbort;

@@ -311,6 +311,69 @@ fn an_abort_climbs_over_the_pad() {
 }
 
 #[test]
+fn an_aborted_vehicle_that_cannot_be_asked_does_what_is_configured_once_it_can() {
+    let mut config = Config::default();
+    config.phases.on_abort = OnAbort::Land;
+    let mut told = Told::started(config, 9.0);
+    told.pad = Some(Point::origin());
+    told.run(2.0, true);
+    // The link is lost until long after the hold has ended in an abort.
+    told.pad = None;
+    for _ in 0..75 {
+        told.seconds += 1.0;
+        told.tell(Event::Tick);
+    }
+    assert_eq!(told.phase(), Phase::Aborted);
+    assert!(!told.has_asked_for_land());
+    told.run(0.5, true);
+    assert!(told.has_asked_for_land());
+}
+
+#[test]
+fn an_abort_that_climbs_does_not_lift_a_vehicle_that_may_stand() {
+    let mut config = Config::default();
+    config.phases.on_abort = OnAbort::Climb;
+    let mut told = Told::started(config, 2.0);
+    told.pad = Some(Point::origin());
+    while told.position.z() < -0.1 {
+        told.fly(STEP_S);
+    }
+    told.velocity = Vector::zero();
+    told.run(0.1, true);
+    told.tell(Event::Operator(OperatorCommand::Abort));
+    let from_s = told.seconds;
+    told.run(2.0, true);
+    let climbs = |decision: &Decision| matches!(decision.action, Action::Velocity { velocity, .. } if velocity.z() < 0.0);
+    assert_eq!(told.phase(), Phase::Aborted);
+    assert!(!told.decisions.iter().any(|(seconds, it)| *seconds > from_s && climbs(it)));
+    // It flies after all.
+    told.velocity = Vector::new(0.0, 0.0, -0.5);
+    told.run(0.1, true);
+    assert!(climbs(&told.decisions.last().unwrap().1));
+}
+
+/// The height over the ground drifts in a flight in which no marker is seen, by more than tells a vehicle that stands from one that flies.
+#[test]
+fn the_ground_is_where_the_vehicle_stands_with_its_motors_off() {
+    let on_ground = VehicleStatus { landed: Landed::OnGround, ..FLYING };
+    let mut told = Told::new(Config::default(), 0.0);
+    told.status = on_ground;
+    told.run(1.0, true);
+    told.status = FLYING;
+    told.rise(4.0);
+    // The pilot lands; the height reads 1.5 m.
+    told.position = Point::new(0.0, 0.0, -1.5);
+    told.status = VehicleStatus { armed: false, mode: Mode::Other, ..on_ground };
+    told.run(1.0, true);
+    told.status = FLYING;
+    told.rise(2.0);
+    told.tell(Event::Operator(OperatorCommand::Start));
+    told.fly(25.0);
+    let height_m = -1.5 - told.position.z();
+    assert!((height_m - 5.0).abs() < 0.2, "searched from {height_m} m over the ground");
+}
+
+#[test]
 fn a_landing_aborted_low_hovers_where_a_drift_does_not_touch_the_ground() {
     let hovers_m = |config, started_m, aborted_m: f64| {
         let mut told = Told::started(config, started_m);

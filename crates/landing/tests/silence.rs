@@ -54,6 +54,24 @@ fn silence_at_any_height_ends_in_a_soft_touchdown_or_in_none() {
     check(&[0.0, 5.0], &[f64::INFINITY, 0.5, 2.0, 5.0], |_| {});
 }
 
+/// A vehicle that brakes in a long silence has moved by less than its velocities before and after say. That is no jump of the
+/// autopilot's position, after which the pad would seem to be right below.
+#[test]
+fn after_a_long_silence_no_landing_is_asked_for_high_up() {
+    for (below_m, for_s) in [(6.0, 7.0), (7.0, 8.0), (8.0, 8.0), (9.0, 9.0), (9.0, 12.0)] {
+        for seed in 0..4 {
+            let silence = Silence { below_m, for_s, then: Then::GoesOn };
+            let flight = silent(seed, 0.0, silence).fly();
+            let lands = |it: &&Sample| it.decision.phase == landing::Phase::Final;
+            let from_m = flight.samples.iter().find(lands).map(height_m);
+            println!(
+                "silent below {below_m} m for {for_s} s, seed {seed}: lands from {from_m:?} m"
+            );
+            assert!(from_m.is_some_and(|from_m| from_m < 1.0), "{below_m} {for_s} {seed}");
+        }
+    }
+}
+
 #[test]
 fn an_autopilot_with_a_long_timeout_is_descended_with_slowly() {
     check(&[0.0], &[f64::INFINITY, 2.0], |scene| scene.setpoint_timeout_s = 3.0);

@@ -61,7 +61,9 @@ impl Lander {
         if self.state_machine.is_released() || !follows {
             return Action::None;
         }
-        let elapsed_s = self.state_machine.elapsed_s(now);
+        // A vehicle that could not be asked has its time from then on.
+        let since = *self.asked_since.get_or_insert(now);
+        let elapsed_s = now.seconds_since(since);
         match phases.on_abort {
             OnAbort::Hover => self.hover_aborted(now),
             OnAbort::Land if elapsed_s <= phases.land_timeout_s => self.request_land(now),
@@ -141,8 +143,12 @@ impl Lander {
         (missing_m > HOVER_TOLERANCE_M).then_some(missing_m)
     }
 
-    /// Climbs to `abort_height_m` and stays there.
-    fn climb_away(&self, now: Timestamp) -> Action {
+    /// Climbs to `abort_height_m` and stays there. One that may stand is not lifted, until it moves.
+    fn climb_away(&mut self, now: Timestamp) -> Action {
+        if self.abort_climb != AbortClimb::Climbs && self.may_stand_after_abort(now) {
+            return Action::hover();
+        }
+        self.abort_climb = AbortClimb::Climbs;
         let altitude_m = self.history.newest().map_or(f64::MAX, |state| -state.position.z());
         let to_m = self.altitude_m(now, self.config.phases.abort_height_m);
         self.climb((to_m - altitude_m).clamp(0.0, self.config.envelope.climb_m_s))
