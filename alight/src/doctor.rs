@@ -1,6 +1,7 @@
 //! `alight doctor`: checks this machine and its network, and says what to do about each problem.
 //!
-//! First the machine, the site, its keys and devices; then the network: services, `cameras`, clocks, links.
+//! First the machine, the site, its keys and devices; then the network: services, `cameras`, clocks, links; then the serial ports,
+//! which controllers hold that run.
 
 mod cameras;
 mod focus;
@@ -8,6 +9,7 @@ mod keys;
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
+use std::io::{Error, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
@@ -160,6 +162,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     }
     let is_key_wrong = findings.count(Verdict::Wrong) > before;
     let before = findings.findings.len();
+    let mut has_controller = false;
     match network.source(OPERATOR) {
         Ok(zenoh) => block_on(async {
             match timeout(OPEN_TIMEOUT, Node::open_tool(tool_identity("doctor"), &zenoh)).await {
@@ -169,7 +172,8 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
                         // They do not fit an air link.
                         has_raw_frames: network.connect.is_none(),
                     };
-                    check_network(&mut findings, node, watched, &expected).await;
+                    let seen = check_network(&mut findings, node, watched, &expected).await;
+                    has_controller = seen.has_controller();
                 }
                 Ok(Err(problem)) => findings.wrong("network", format!("{problem:#}"), "see above"),
                 Err(_) => findings.wrong(
@@ -190,6 +194,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
             "`alight doctor` uses the operator's key",
         ),
     }
+    check_serial_ports(&mut findings, &expected, has_controller);
     // The relay counts a connection to its ports as a denial, so they are tried only when no service was
     // found.
     if !findings.findings[before..]
@@ -284,18 +289,6 @@ fn problem_of_key(job: &Job, service: Service) -> Option<String> {
 /// Checks the files and devices that a service needs.
 fn check_devices(findings: &mut Findings, job: &Job, service: Service, folder: &Path) {
     let Ok(config) = service.effective_config(&job.layers) else { return };
-    if service == Service::Controller
-        && let Some(address) = config["autopilot"]["address"].as_str()
-        && let Some(device) =
-            address.strip_prefix("serial:").and_then(|rest| rest.split(':').next())
-        && let Err(cause) = std::fs::OpenOptions::new().read(true).write(true).open(device)
-    {
-        findings.wrong(
-            "autopilot",
-            format!("{device} cannot be opened: {cause}"),
-            "connect the autopilot, and add the user to the group that owns the device (often `dialout`)",
-        );
-    }
     if let Some(problem) = problem_of_key(job, service) {
         findings.wrong(
             "signing",
@@ -310,6 +303,43 @@ fn check_devices(findings: &mut Findings, job: &Job, service: Service, folder: &
                 findings.wrong("camera", format!("{path}: {cause}"), "correct `source.paths`");
             }
         }
+    }
+}
+
+/// Checks that the autopilots' serial ports can be opened. `has_controller` says whether one is ready, which holds its port for
+/// itself alone.
+fn check_serial_ports(findings: &mut Findings, jobs: &[Job], has_controller: bool) {
+    for job in jobs.iter().filter(|job| job.service == Some(Service::Controller)) {
+        let Ok(config) = Service::Controller.effective_config(&job.layers) else { continue };
+        let address = config["autopilot"]["address"].as_str();
+        let serial = address.and_then(|address| address.strip_prefix("serial:"));
+        if let Some(device) = serial.and_then(|rest| rest.split(':').next())
+            && let Err(cause) = std::fs::OpenOptions::new().read(true).write(true).open(device)
+        {
+            tell_unopened(findings, device, &cause, has_controller);
+        }
+    }
+}
+
+/// Tells what it means that a serial port cannot be opened.
+fn tell_unopened(findings: &mut Findings, device: &str, cause: &Error, has_controller: bool) {
+    match cause.kind() {
+        ErrorKind::ResourceBusy if has_controller => findings.good(
+            "autopilot",
+            format!("{device} is in use by another program, as it is while a controller runs"),
+        ),
+        ErrorKind::ResourceBusy => findings.doubtful(
+            "autopilot",
+            format!("{device} is in use by another program, and no controller is ready"),
+            &format!(
+                "`sudo fuser -v {device}` names the program: end it, or where it is a controller see the output of `alight up`"
+            ),
+        ),
+        _ => findings.wrong(
+            "autopilot",
+            format!("{device} cannot be opened: {cause}"),
+            "connect the autopilot, and add the user to the group that owns the device (often `dialout`)",
+        ),
     }
 }
 
@@ -381,6 +411,11 @@ impl Seen {
         }
     }
 
+    /// Whether a controller is ready.
+    fn has_controller(&self) -> bool {
+        self.peers.iter().any(|(service, _)| service == "controller")
+    }
+
     /// True while a landing is under way.
     fn lands(&self) -> bool {
         self.status.as_ref().is_some_and(|status| match status.phase {
@@ -415,7 +450,13 @@ struct ReceivedFrame {
     edge_width_px: Option<f64>,
 }
 
-async fn check_network(findings: &mut Findings, node: Node, watched: Watched, expected: &[Job]) {
+/// Checks what is heard on the network, and returns that.
+async fn check_network(
+    findings: &mut Findings,
+    node: Node,
+    watched: Watched,
+    expected: &[Job],
+) -> Seen {
     let mut seen = Seen::default();
     match watch(&node, &mut seen, watched).await {
         Ok(()) => {
@@ -429,6 +470,7 @@ async fn check_network(findings: &mut Findings, node: Node, watched: Watched, ex
         Err(problem) => findings.wrong("network", format!("{problem:#}"), "start it again"),
     }
     node.close().await;
+    seen
 }
 
 async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result<()> {
@@ -529,7 +571,7 @@ fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job], watche
             );
         }
     }
-    if !seen.peers.iter().any(|(service, _)| service == "controller") {
+    if !seen.has_controller() {
         findings.doubtful(
             "services",
             "no controller is running, so nothing can land".to_owned(),
@@ -750,6 +792,28 @@ mod tests {
         assert!(another.contains("no detector `ground` is ready"), "{another}");
         assert!(another.ends_with("0 wrong, 1 doubtful."), "{another}");
         assert!(told(&[]).ends_with("1 wrong, 0 doubtful."));
+    }
+
+    #[test]
+    fn a_serial_port_that_is_in_use_is_well_while_a_controller_runs() {
+        let told = |kind: ErrorKind, has_controller| {
+            let mut findings = Findings::default();
+            tell_unopened(&mut findings, "/dev/ttyAMA0", &kind.into(), has_controller);
+            findings.text()
+        };
+        let held = told(ErrorKind::ResourceBusy, true);
+        assert!(held.contains("/dev/ttyAMA0 is in use by another program"), "{held}");
+        assert!(held.ends_with("Nothing is wrong."), "{held}");
+        let taken = told(ErrorKind::ResourceBusy, false);
+        assert!(taken.contains("no controller is ready") && taken.contains("fuser"), "{taken}");
+        assert!(taken.ends_with("0 wrong, 1 doubtful."), "{taken}");
+        for kind in [ErrorKind::NotFound, ErrorKind::PermissionDenied] {
+            for has_controller in [true, false] {
+                let text = told(kind, has_controller);
+                assert!(text.contains("cannot be opened") && text.contains("dialout"), "{text}");
+                assert!(text.ends_with("1 wrong, 0 doubtful."), "{text}");
+            }
+        }
     }
 
     #[test]
