@@ -2,11 +2,12 @@
 //!
 //! A process whose files do not would start, listen nowhere, and say nothing of it.
 
+use std::io;
 use std::path::Path;
 
-use anyhow::Context;
+use anyhow::{Context, anyhow, ensure};
 use rustls::RootCertStore;
-use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::pem::{self, PemObject};
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::sign::CertifiedKey;
 
@@ -38,16 +39,35 @@ pub(crate) fn trusted(authority: &Path) -> anyhow::Result<RootCertStore> {
 
 /// The private key of a file.
 pub(crate) fn private_of(path: &Path) -> anyhow::Result<PrivateKeyDer<'static>> {
-    PrivateKeyDer::from_pem_file(path).with_context(|| {
-        format!("{path:?} is no private key; copy it again from where it was made")
-    })
+    PrivateKeyDer::from_pem_file(path).map_err(|cause| unusable(path, "private key", cause))
 }
 
 /// The first certificate of a file.
 pub(crate) fn certificate_of(path: &Path) -> anyhow::Result<CertificateDer<'static>> {
-    CertificateDer::from_pem_file(path).with_context(|| {
-        format!("{path:?} is no certificate; copy it again from where it was made")
-    })
+    CertificateDer::from_pem_file(path).map_err(|cause| unusable(path, "certificate", cause))
+}
+
+/// Why a file cannot be used for what it is to be.
+fn unusable(path: &Path, what: &str, cause: pem::Error) -> anyhow::Error {
+    if let pem::Error::Io(cause) = &cause
+        && let Err(denied) = check_permission(path, cause)
+    {
+        return denied;
+    }
+    anyhow!(cause).context(format!("{path:?} is no {what}; copy it again from where it was made"))
+}
+
+/// Checks that it is not for the rights of this user alone that a file of a key was not found or read: nothing is wrong with it then.
+///
+/// # Errors
+/// Says as whom to read it.
+pub(crate) fn check_permission(path: &Path, cause: &io::Error) -> anyhow::Result<()> {
+    ensure!(
+        cause.kind() != io::ErrorKind::PermissionDenied,
+        "this user may not read {path:?}: run this as the user of the services (`sudo -u alight alight ...`), to whom the keys are to \
+         belong (`sudo chown alight: FILE`), or with a key of your own (`--keys DIRECTORY`)"
+    );
+    Ok(())
 }
 
 #[cfg(test)]
@@ -82,5 +102,18 @@ mod tests {
             let told = problem(names).unwrap_err();
             assert!(told.contains(named), "{told}");
         }
+    }
+
+    #[test]
+    fn a_file_that_this_user_may_not_read_is_not_called_a_wrong_one() {
+        let path = Path::new("keys/operator.key");
+        let told = |kind: io::ErrorKind| {
+            format!("{:#}", unusable(path, "private key", pem::Error::Io(kind.into())))
+        };
+        let denied = told(io::ErrorKind::PermissionDenied);
+        assert!(denied.starts_with("this user may not read \"keys/operator.key\""), "{denied}");
+        assert!(denied.contains("`sudo -u alight alight ...`"), "{denied}");
+        let absent = told(io::ErrorKind::NotFound);
+        assert!(absent.starts_with("\"keys/operator.key\" is no private key"), "{absent}");
     }
 }

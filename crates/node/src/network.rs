@@ -4,6 +4,7 @@
 //! differ from site to site and are filled in here, so that no site needs files of its own.
 
 use std::ffi::OsString;
+use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
@@ -201,7 +202,7 @@ impl Network {
                 return false;
             }
             let bound = std::net::TcpListener::bind(format!("{host}:{port}"));
-            bound.is_err_and(|problem| problem.kind() == std::io::ErrorKind::AddrInUse)
+            bound.is_err_and(|problem| problem.kind() == io::ErrorKind::AddrInUse)
         };
         Ok(endpoints(&config, "listen").find(is_taken).map(str::to_owned))
     }
@@ -270,12 +271,7 @@ fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()>
     let key_file = format!("{key_name}.key");
     for file in [AUTHORITY, &format!("{key_name}.pem"), &key_file] {
         let path = keys.join(file);
-        ensure!(
-            path.is_file(),
-            "missing key file {path:?}; make it with `alight keys issue {} --authority DIR -o {}`, where DIR has the authority",
-            issue_arguments(key_name),
-            keys.display()
-        );
+        check_is_there(&path, std::fs::metadata(&path).map(|found| found.is_file()), key_name)?;
     }
     let key_file = keys.join(key_file);
     check_private(&key_file)?;
@@ -307,6 +303,20 @@ fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()>
         layer["access_control"] = access_control(&layer["access_control"], &holders, vehicle)?;
     }
     merge(config, layer);
+    Ok(())
+}
+
+/// Checks that a file of a key is there, by what the system says of it.
+fn check_is_there(path: &Path, is_file: io::Result<bool>, key_name: &str) -> anyhow::Result<()> {
+    if let Err(cause) = &is_file {
+        key_pair::check_permission(path, cause)?;
+    }
+    ensure!(
+        is_file.is_ok_and(|is_file| is_file),
+        "missing key file {path:?}; make it with `alight keys issue {} --authority DIR -o {}`, where DIR has the authority",
+        issue_arguments(key_name),
+        path.parent().unwrap_or(path).display()
+    );
     Ok(())
 }
 
@@ -644,6 +654,18 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn keys_that_this_user_may_not_read_are_not_called_missing() {
+        let told = |kind: io::ErrorKind| {
+            let result = check_is_there(Path::new("keys/x.pem"), Err(kind.into()), "operator");
+            result.unwrap_err().to_string()
+        };
+        let denied = told(io::ErrorKind::PermissionDenied);
+        assert!(denied.contains("may not read \"keys/x.pem\"") && denied.contains("sudo -u"));
+        let absent = told(io::ErrorKind::NotFound);
+        assert!(absent.contains("missing key file") && absent.contains("-o keys`"), "{absent}");
     }
 
     #[test]
