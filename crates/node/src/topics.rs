@@ -8,7 +8,7 @@
 
 use std::marker::PhantomData;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
 use messages::{Delivery, Message, Row, Topic, decode, encode};
@@ -267,7 +267,7 @@ impl Node {
     /// when it arrives after this requester has given up.
     ///
     /// # Errors
-    /// When there is no reply in time.
+    /// When there is no reply in time: says whether the command was sent.
     pub async fn command<M: Message>(
         &self,
         topic: Topic<M>,
@@ -299,15 +299,17 @@ impl Node {
                 None => return Err(self.unanswered(&key).await),
             };
             let named = format!("{key}?{SENDER}={}", self.sender());
+            let sent_at = Instant::now();
             match self.query(&named, &command, &sent, REPLY_TIMEOUT).await? {
                 Some(Reply::Command(reply)) => Ok(reply),
-                Some(Reply::Time(_)) | None => Err(self.unanswered(&key).await),
+                Some(Reply::Time(_)) | None => Err(unconfirmed(&key, sent_at.elapsed())),
             }
         })
     }
 
+    /// Why nobody answered who was asked for the time; no command was sent.
     async fn unanswered(&self, key: &str) -> anyhow::Error {
-        let who = key.rsplit_once('/').map_or(key, |(who, _command)| who);
+        let who = recipient(key);
         let (service, wanted) = match who.split_once('/') {
             Some((service, instance)) => (service, Some(instance)),
             None => (who, None),
@@ -338,6 +340,24 @@ impl Node {
         }
         Ok(None)
     }
+}
+
+/// The service, and its instance if one is meant, to which a command's key belongs.
+fn recipient(key: &str) -> &str {
+    key.rsplit_once('/').map_or(key, |(who, _command)| who)
+}
+
+/// What is known of a command that was sent so long ago and has no reply.
+fn unconfirmed(key: &str, waited: Duration) -> anyhow::Error {
+    let lack = match waited < REPLY_TIMEOUT {
+        true => "the connection to it ended before an answer came".to_owned(),
+        false => format!("no answer came within {} s", REPLY_TIMEOUT.as_secs()),
+    };
+    anyhow!(
+        "the command was sent to the {}, and {lack}: it may have been carried out; look at the status (`alight doctor` shows it) before you \
+         give it again",
+        recipient(key)
+    )
 }
 
 fn nanoseconds(ns: i64) -> Duration {

@@ -340,6 +340,29 @@ async fn a_recipient_that_does_not_answer_is_sent_no_command() -> anyhow::Result
     Ok(())
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_command_that_was_taken_and_not_answered_may_have_been_carried_out() -> anyhow::Result<()>
+{
+    // One session for both, which needs not wait until it is connected.
+    let node = open("controller", "main", free_port()?).await?;
+    let commands = node.commands(topic::COMMAND, &[]).await?;
+    let told = async || {
+        let reply = node.command(topic::COMMAND, &[], &ControllerCommand::Start).await;
+        reply.err().context("it is answered").map(|problem| problem.to_string())
+    };
+    // It takes the command and ends.
+    let (problem, taken) = tokio::join!(told(), async { commands.next().await.map(drop) });
+    let (problem, ()) = (problem?, taken.context("no command came")?);
+    let part = "sent to the controller, and the connection to it ended before an answer came: it may have been carried out";
+    assert!(problem.contains(part), "{problem}");
+    // It takes the command and stands still.
+    let (problem, taken) = tokio::join!(told(), commands.next());
+    let (problem, _taken) = (problem?, taken.context("no command came")?);
+    let part = "no answer came within 2 s: it may have been carried out";
+    assert!(problem.contains(part), "{problem}");
+    Ok(())
+}
+
 /// A Zenoh program without this crate.
 struct Foreign {
     session: zenoh::Session,
