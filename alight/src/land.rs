@@ -444,8 +444,22 @@ async fn watch(
                             }
                             _ => true,
                         };
-                    if service == Service::Simulator || is_needed {
+                    if is_needed {
                         bail!("{} exited before the landing: {exit}; see its stderr above", service.name());
+                    }
+                    if service == Service::Simulator {
+                        // No camera is left, and mostly no vehicle; what was told before has arrived.
+                        while let Some(truth) = truths.waiting() {
+                            landing.truth(truth);
+                        }
+                        let mut is_over = over.is_some();
+                        while let Some(status) = statuses.waiting() {
+                            is_over |= landing.status(status);
+                        }
+                        if !is_over || landing.comes_down() {
+                            landing.interrupted(&format!("the simulator exited: {exit}"));
+                        }
+                        return Ok(landing);
                     }
                 }
             },
@@ -556,8 +570,12 @@ pub(crate) fn free_port() -> anyhow::Result<(u16, UdpSocket)> {
 #[cfg(test)]
 mod tests {
     use clap::Parser;
+    use messages::{ControllerStatus, Phase, Touchdown, Truth};
+    use node::ZenohSource;
 
     use super::*;
+    use crate::children::Reach;
+    use crate::outcome::Outcome;
 
     #[derive(Parser)]
     struct Tool {
@@ -619,6 +637,88 @@ mod tests {
         let tool = Tool::command();
         let meet = tool.get_arguments().find(|argument| argument.get_id() == "meet").unwrap();
         assert_eq!(meet.get_env(), Some(std::ffi::OsStr::new("ALIGHT_MEET")));
+    }
+
+    /// The result of a landing whose simulator exits, where these are told before it does.
+    async fn without_its_simulator(
+        status: ControllerStatus,
+        truth: Option<Truth>,
+    ) -> anyhow::Result<Outcome> {
+        let (port, _lock) = free_port()?;
+        let zenoh = ZenohSource::Text(node::session::local_config(port));
+        let node = Node::open(tool_identity("land"), &zenoh).await?;
+        let statuses = node.publisher(topic::STATUS, &[]).await?;
+        let truths = node.publisher(topic::TRUTH, &[]).await?;
+        let telling = async {
+            loop {
+                statuses.publish(&status).await;
+                if let Some(truth) = &truth {
+                    truths.publish(truth).await;
+                }
+                tokio::time::sleep(Duration::from_millis(10)).await;
+            }
+        };
+        let settings = ServiceSettings::new(&Tool::try_parse_from(["land"])?.land)?;
+        let mut children = Children::new();
+        let mut simulator = tokio::process::Command::new("sh");
+        simulator.args(["-c", "sleep 0.2; exit 3"]);
+        children.spawn(Service::Simulator, simulator, "sh", Reach::Leader)?;
+        let mut progress = Progress::new(Format::Json);
+        let deadline = Instant::now() + Duration::from_secs(60);
+        let limits = Limits { shutdown: Shutdown::on_signals()?, deadline };
+        let landing = tokio::select! {
+            landing = watch(&node, &settings, &mut children, "", &mut progress, limits) => landing,
+            () = telling => bail!("nothing is told any more"),
+        };
+        node.close().await;
+        Ok(landing?.outcome())
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn what_is_known_of_a_landing_outlives_its_simulator() -> anyhow::Result<()> {
+        let status = |phase, started_ns| ControllerStatus {
+            phase,
+            why: "because".to_owned(),
+            started_ns,
+            ..ControllerStatus::default()
+        };
+        let before = without_its_simulator(status(Phase::Idle, None), None).await;
+        let problem = before.err().context("it never flew")?.to_string();
+        assert!(problem.contains("exited before the landing: exit status: 3"), "{problem}");
+
+        let outcome = without_its_simulator(status(Phase::Descend, Some(1)), None).await?;
+        let json = serde_json::to_string(&outcome)?;
+        let told = "the simulator exited: exit status: 3; it was in descend: because";
+        assert!(json.contains(told) && json.contains("\"landed\":false"), "{json}");
+        assert_eq!(outcome.exit_status(), 1);
+
+        let landed = ControllerStatus {
+            disarmed_ns: Some(3),
+            finished: true,
+            ..status(Phase::Landed, Some(1))
+        };
+        let touchdown = Touchdown {
+            stamp_ns: 2,
+            error_m: 0.02,
+            vertical_speed_m_s: 0.5,
+            lateral_speed_m_s: 0.0,
+        };
+        let truth = Truth {
+            stamp_ns: 3,
+            ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
+            position_ned_m: [0.0; 3],
+            velocity_ned_m_s: [0.0; 3],
+            pad_ned_m: [0.0; 3],
+            on_ground: true,
+            touchdown: Some(touchdown),
+            max_tilt_rad: 0.1,
+            frames: 300,
+        };
+        let outcome = without_its_simulator(landed, Some(truth)).await?;
+        let json = serde_json::to_string(&outcome)?;
+        assert!(json.contains("\"outcome\":\"landed\""), "{json}");
+        assert_eq!(outcome.exit_status(), 0);
+        Ok(())
     }
 
     #[test]
