@@ -62,7 +62,9 @@ impl Shutdown {
             tokio::select! {
                 _ = interrupt.recv() => {}
                 _ = terminate.recv() => {}
-                () = hung_up => {}
+                () = hung_up => tracing::warn!(
+                    "The terminal was closed (SIGHUP), so this process stops; in a systemd unit, in tmux or with `nohup` it goes on"
+                ),
             }
             // There is no receiver left when the service has ended by itself.
             sender.send_replace(true);
