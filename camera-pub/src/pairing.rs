@@ -3,8 +3,8 @@
 //! A program writes a frame and then, at once, its metadata, on two channels. Three things must agree before a record
 //! stamps a frame: the record arrived after the frame began and before the next one did; both have the same number,
 //! counted since the start; and the time from the record's stamp to the frame's arrival is that of the frames before.
-//! Once that time is known, a frame's record is found by it also where lines were lost or doubled. A frame whose record is
-//! in doubt is not stamped.
+//! Once that time is known, a frame's record is found by it also where lines were lost or doubled, and where it changes for good, as
+//! with a busy processor, it is learnt anew from records with their frames' numbers. A frame whose record is in doubt is not stamped.
 
 use crate::exposure::{Exposure, Shutter};
 use crate::metadata::{Metadata, Record};
@@ -45,6 +45,8 @@ pub(crate) struct Pairing {
 #[derive(Copy, Clone)]
 struct Numbered {
     number: i64,
+    /// The frame in which it was read.
+    read_in: i64,
     metadata: Metadata,
 }
 
@@ -59,6 +61,7 @@ struct Candidate {
 #[derive(Copy, Clone)]
 struct Placed {
     number: i64,
+    read_in: i64,
     metadata: Metadata,
     stamp_ns: i64,
     delay_ns: i64,
@@ -115,7 +118,8 @@ impl Pairing {
             if self.waiting.len() == MAX_WAITING {
                 self.waiting.remove(0);
             }
-            self.waiting.push(Numbered { number: self.records, metadata });
+            let (number, read_in) = (self.records, self.frames);
+            self.waiting.push(Numbered { number, read_in, metadata });
         }
         self.records += 1;
     }
@@ -178,7 +182,9 @@ impl Pairing {
             // The records of two frames are a period apart. A number that agrees settles what is nearly half of it off.
             let is_next = placed.number - self.frames == self.shift;
             let max_ns = if is_next { self.period_ns / 5 * 2 } else { self.period_ns / 4 };
-            (placed.delay_ns - known_ns).abs() <= max_ns
+            // One that was there before the frame is of an earlier one: programs write it after the frame.
+            let may_be_its = is_next || placed.read_in >= self.frames;
+            may_be_its && (placed.delay_ns - known_ns).abs() <= max_ns
         };
         let mut found = self.possible(arrival_ns).filter(of_frame);
         let first = found.next();
@@ -189,21 +195,22 @@ impl Pairing {
     fn possible(&self, arrival_ns: i64) -> impl Iterator<Item = Placed> {
         let offset_ns = self.clock_offsets_ns.first().copied().unwrap_or(0);
         self.waiting.iter().filter_map(move |record| {
-            let Numbered { number, metadata } = *record;
+            let Numbered { number, read_in, metadata } = *record;
             let stamp_ns = metadata.sensor_ns.checked_add(offset_ns)?;
             let delay_ns = arrival_ns.checked_sub(stamp_ns)?;
             let min_ns = self.shutter.until_read_ns(metadata.exposure_ns);
             let is_possible = (min_ns..=MAX_DELAY_NS).contains(&delay_ns);
-            is_possible.then_some(Placed { number, metadata, stamp_ns, delay_ns })
+            is_possible.then_some(Placed { number, read_in, metadata, stamp_ns, delay_ns })
         })
     }
 
-    /// Counts a frame towards a delay that several agree on.
+    /// Counts a frame towards a delay that several agree on. While none is known there must be no other record; a known one is
+    /// given up for another.
     fn learn(&mut self, arrival_ns: i64) {
-        let mut possible = self.possible(arrival_ns);
-        let only = possible.next().filter(|_| possible.next().is_none() && self.waiting.len() == 1);
-        drop(possible);
-        let Some(placed) = only.filter(|placed| placed.number - self.frames == self.shift) else {
+        let is_alone = self.waiting.len() == 1 || self.delay_ns.is_some();
+        let own = |placed: &Placed| placed.number - self.frames == self.shift;
+        let own = self.possible(arrival_ns).find(own).filter(|_| is_alone);
+        let Some(placed) = own else {
             self.candidate = None;
             return;
         };
@@ -351,6 +358,24 @@ mod tests {
                 errors_ns.push(exposure.map(|exposure| exposure.mid_ns - truth_ns));
             }
             Outcome { errors_ns }
+        }
+    }
+
+    /// The program takes longer or less long for a frame from the thirtieth on.
+    #[test]
+    fn a_delay_that_changes_for_good_is_learnt_again() {
+        for tenths in [-12, -10, -9, -8, -5, 5, 8, 10, 12_i64] {
+            let step_ns = tenths * PERIOD_NS / 10;
+            let late_ns = |n: i64| {
+                let before_ns = (-step_ns).max(0);
+                n * 7 % 3 * MS + if n < 30 { before_ns } else { before_ns + step_ns }
+            };
+            let outcome =
+                Stream { late_ns: (0..80).map(late_ns).collect(), lines: vec![Line::Good; 80] }
+                    .read();
+            assert_eq!(outcome.wrong(), 0, "{tenths}: {:?}", outcome.errors_ns);
+            let again = outcome.errors_ns.iter().skip(40).flatten().count();
+            assert!(again >= 38, "{tenths}: {:?}", outcome.errors_ns);
         }
     }
 
