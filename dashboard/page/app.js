@@ -151,7 +151,8 @@ function take(message) {
   } else if (message.kind === 'nonce') {
     nonceCame(link, message);
   } else if (message.kind === 'reply') {
-    link.tell(`${message.command}: ${message.accepted ? 'accepted' : 'refused'} by the ${message.who}: ${message.why}`, message.accepted ? 'good' : 'bad');
+    const verdict = `${message.accepted ? 'accepted' : 'refused'} by the ${message.who}`;
+    link.tell(`${message.command}: ${message.who === 'nobody' ? 'no answer' : verdict}: ${message.why}`, message.accepted ? 'good' : 'bad');
   }
 }
 

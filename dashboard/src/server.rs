@@ -581,21 +581,28 @@ impl Client {
         let (app, replies) = (Arc::clone(&self.visitor.app), self.replies.clone());
         tokio::spawn(async move {
             let reply = app.node.command(topic::COMMAND, &[], &command).await;
-            let (accepted, reason) = match reply {
-                Ok(reply) => (reply.accepted, reply.reason),
-                Err(problem) => (false, format!("{problem:#}")),
+            // One that is not answered may have been carried out.
+            let (verdict, who, reason) = match reply {
+                Ok(reply) if reply.accepted => {
+                    ("accepted by the controller", "controller", reply.reason)
+                }
+                Ok(reply) => ("refused by the controller", "controller", reply.reason),
+                Err(problem) => ("no answer", NOBODY, format!("{problem:#}")),
             };
+            let accepted = verdict.starts_with("accepted");
             app.node.health().count("commands");
-            let (verdict, level) =
-                if accepted { ("accepted", Level::Info) } else { ("refused", Level::Warn) };
+            let level = if accepted { Level::Info } else { Level::Warn };
             tracing::info!(command = whole, verdict, reason, "A browser's command");
-            app.log(level, &format!("operator: {whole}: {verdict} by the controller: {reason}"));
-            let text = reply_json(&whole, accepted, "controller", &reason);
+            app.log(level, &format!("operator: {whole}: {verdict}: {reason}"));
+            let text = reply_json(&whole, accepted, who, &reason);
             // The browser may have gone.
             drop(replies.send(text).await);
         });
     }
 }
+
+/// Who has answered where no answer came.
+const NOBODY: &str = "nobody";
 
 /// A command with its argument, as it is compared and shown.
 fn whole(command: &str, argument: Option<&str>) -> String {

@@ -265,6 +265,19 @@ async fn command(
     told(socket, |it| it["kind"] == "reply").await
 }
 
+/// It may have been carried out, and was not refused.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_command_that_nobody_answers_is_told_as_that() -> anyhow::Result<()> {
+    let page = Page::start(&["commands=here"]).await?;
+    let mut socket = page.socket("/ws").await?;
+    let nonce = nonce(&mut socket, "hold").await?;
+    sleep(HELD).await;
+    let reply = command(&mut socket, "hold", &nonce).await?;
+    ensure!(reply["accepted"] == false && reply["who"] == "nobody", "{reply}");
+    ensure!(reply["why"].as_str().is_some_and(|why| why.contains("no controller")), "{reply}");
+    Ok(())
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_command_is_held_for_a_second_and_given_once() -> anyhow::Result<()> {
     let page = Page::start(&["commands=here"]).await?;
