@@ -76,6 +76,7 @@ impl Up {
         let mut child = program
             .args(["up", role, "--config"])
             .arg(folder.join("site.toml"))
+            .env("RUNTIME_DIRECTORY", folder)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .spawn()?;
@@ -320,6 +321,42 @@ command = ["./own.sh"]
     ensure!(again != detector && test_kill_process(again).is_ok(), "{again:?}");
     let code = up.stop()?;
     ensure!(code == Some(0), "{code:?}: {:#?}", up.heard);
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn after_a_crash_of_the_supervisor_the_controller_does_not_take_off() -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
+    let folder = tempfile::tempdir()?;
+    let ([meet], _, autopilot) = ports::free()?;
+    let site = format!(
+        r#"
+meet = {meet}
+[[local]]
+run = "controller"
+set = ["autopilot.address=udpin:127.0.0.1:{autopilot}", "start=takeoff"]
+"#
+    );
+    std::fs::write(folder.path().join("site.toml"), site)?;
+    for (is_killed, mode) in [(true, None), (true, Some("command")), (false, Some("command"))] {
+        let mut up = Up::start(folder.path(), "local")?;
+        if mode.is_some() {
+            up.says("the `alight up` before this one was killed", "starts no motors").await?;
+        }
+        let started = up.says("controller:", "started as process").await?;
+        let told = started.split_once("start = ").map(|(_, mode)| mode.trim_matches('"'));
+        ensure!(told == mode, "{started}");
+        if is_killed {
+            up.child.kill()?;
+            up.child.wait()?;
+        } else {
+            ensure!(up.stop()? == Some(0));
+        }
+    }
+    let mut up = Up::start(folder.path(), "local")?;
+    let started = up.says("controller:", "started as process").await?;
+    ensure!(!started.contains("start ="), "{started}");
+    ensure!(up.stop()? == Some(0));
     Ok(())
 }
 

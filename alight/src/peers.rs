@@ -2,25 +2,23 @@
 //! running.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::os::unix::fs::MetadataExt;
-use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use messages::{ControllerStatus, DetectorInfo, Place, topic};
-use node::{Network, Node, clock_name, now_ns};
-use serde::{Deserialize, Serialize};
+use node::{Network, Node};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
+use crate::notes::Note;
 use crate::runtime::tool_identity;
 
 /// Maximum number of detectors that are followed; a network has far fewer.
 const MAX_DETECTORS: usize = 64;
-/// Interval at which the marker file of a landing is refreshed.
+/// Interval at which the note of a landing is written anew.
 const REFRESH: Duration = Duration::from_secs(1);
-/// A marker file older than this is stale: its landing is not resumed.
-const STALE_AFTER: Duration = Duration::from_secs(15);
+/// A note older than this is stale: its landing is not resumed.
+pub(crate) const STALE_AFTER: Duration = Duration::from_secs(15);
 
 /// The peers, as received so far.
 pub(crate) struct Peers {
@@ -48,19 +46,15 @@ impl Peers {
         Self { table: watch::channel(PeerTable::default()).1, session: None }
     }
 
-    /// Follows the peers from now on, and keeps the marker file.
-    pub(crate) async fn follow(
-        network: &Network,
-        key: &str,
-        marker_file: LandingMarkerFile,
-    ) -> anyhow::Result<Self> {
+    /// Follows the peers from now on, and keeps the note of a landing under way.
+    pub(crate) async fn follow(network: &Network, key: &str, note: Note) -> anyhow::Result<Self> {
         let node = Node::open(tool_identity("up"), &network.source(key)?).await?;
         let statuses = node.subscriber(topic::STATUS, &[]).await?;
         let infos = node.subscriber(topic::DETECTOR_INFO, &[]).await?;
         let presence = node.presence("detector").await?;
         let (sender, table) = watch::channel(PeerTable::default());
         let task = tokio::spawn(async move {
-            let mut monitor = LandingMonitor { marker_file, ..LandingMonitor::default() };
+            let mut monitor = LandingMonitor { note, ..LandingMonitor::default() };
             loop {
                 tokio::select! {
                     Some(status) = statuses.next() => {
@@ -85,7 +79,7 @@ impl Peers {
         Ok(Self { table, session: Some((node, task)) })
     }
 
-    /// Stops following; the marker file is not written after this.
+    /// Stops following; the note is not written after this.
     pub(crate) async fn close(&mut self) {
         if let Some((_node, task)) = self.session.take() {
             task.abort();
@@ -161,7 +155,7 @@ fn is_process(info: &DetectorInfo, host: &str, pid: i32) -> bool {
 /// Follows from the controller's status whether a landing is under way.
 #[derive(Default)]
 struct LandingMonitor {
-    marker_file: LandingMarkerFile,
+    note: Note,
     under_way: Option<Instant>,
     noted: Option<Instant>,
 }
@@ -178,82 +172,12 @@ impl LandingMonitor {
         }
         let is_due = self.noted.is_none_or(|noted| now - noted >= REFRESH);
         if is_under_way && is_due {
-            self.marker_file.note(true);
+            self.note.write();
             self.noted = Some(now);
         } else if self.under_way.is_none() && self.noted.take().is_some() {
-            self.marker_file.note(false);
+            self.note.remove();
         }
         self.under_way.is_some()
-    }
-}
-
-/// A file that marks a landing under way, for the supervisor that is started after one that was killed. It is
-/// in the directory for runtime files ($RUNTIME_DIRECTORY or $XDG_RUNTIME_DIR), which does not survive a
-/// reboot.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct LandingMarkerFile {
-    file: Option<PathBuf>,
-}
-
-/// Whether only this user (and root) can write to a directory: whoever can may have a landing resumed.
-fn is_ours_alone(directory: &Path) -> bool {
-    let Ok(found) = std::fs::metadata(directory) else { return true };
-    let user = rustix::process::geteuid();
-    (found.uid() == user.as_raw() || user.is_root()) && found.mode() & 0o022 == 0
-}
-
-/// The contents of the file.
-#[derive(Serialize, Deserialize)]
-struct LandingMarker {
-    clock: String,
-    stamp_ns: i64,
-}
-
-impl LandingMarkerFile {
-    /// The file of the supervisor with this name.
-    pub(crate) fn for_supervisor(name: &str) -> Self {
-        let directory = ["RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"].iter().find_map(std::env::var_os);
-        let directory = directory.map(PathBuf::from).filter(|directory| {
-            let is_ours = is_ours_alone(directory);
-            if !is_ours {
-                tracing::warn!(
-                    ?directory,
-                    "Other users can write there, so no landing is resumed after a crash"
-                );
-            }
-            is_ours
-        });
-        Self { file: directory.map(|it| it.join(format!("alight-{name}.landing"))) }
-    }
-
-    /// Notes whether a landing is under way.
-    pub(crate) fn note(&self, landing: bool) {
-        let Some(file) = &self.file else { return };
-        let marker = LandingMarker { clock: clock_name().to_owned(), stamp_ns: now_ns() };
-        let written = match (landing, serde_json::to_vec(&marker)) {
-            (true, Ok(text)) => {
-                // Renamed, so that a reader never sees half of it.
-                let new = file.with_extension("new");
-                std::fs::write(&new, text).and_then(|()| std::fs::rename(&new, file))
-            }
-            _ if !file.exists() => Ok(()),
-            _ => std::fs::remove_file(file),
-        };
-        if let Err(problem) = written {
-            tracing::warn!(%problem, ?file, "Marker file of the landing not written");
-        }
-    }
-
-    /// Whether a landing was under way a moment ago.
-    pub(crate) fn landing(&self) -> bool {
-        let text = self.file.as_ref().and_then(|file| std::fs::read(file).ok());
-        let marker: Option<LandingMarker> =
-            text.and_then(|text| serde_json::from_slice(&text).ok());
-        marker.is_some_and(|marker| {
-            let age_ns = now_ns().saturating_sub(marker.stamp_ns);
-            let limit_ns = i64::try_from(STALE_AFTER.as_nanos()).unwrap_or(i64::MAX);
-            marker.clock == clock_name() && (0..limit_ns).contains(&age_ns)
-        })
     }
 }
 
@@ -317,37 +241,5 @@ mod tests {
         assert!(monitor.update(&status(Some(1), false), now));
         assert!(!monitor.update(&status(Some(1), true), now));
         assert!(!monitor.update(&status(None, false), now));
-    }
-
-    #[test]
-    fn a_directory_in_which_others_write_has_no_marker_file() {
-        use std::os::unix::fs::PermissionsExt;
-        let folder = tempfile::tempdir().unwrap();
-        for (mode, is_ours) in [(0o700, true), (0o755, true), (0o775, false), (0o1777, false)] {
-            let permissions = std::fs::Permissions::from_mode(mode);
-            std::fs::set_permissions(folder.path(), permissions).unwrap();
-            assert_eq!(is_ours_alone(folder.path()), is_ours, "{mode:o}");
-        }
-    }
-
-    #[test]
-    fn a_marker_file_becomes_stale_and_is_removed_at_the_end() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("x.landing");
-        let marker_file = LandingMarkerFile { file: Some(file.clone()) };
-        assert!(!marker_file.landing() && !LandingMarkerFile::default().landing());
-        marker_file.note(false);
-        marker_file.note(true);
-        assert!(marker_file.landing());
-        let is_fresh = |clock: &str, age: Duration| {
-            let stamp_ns = now_ns() - i64::try_from(age.as_nanos()).unwrap();
-            let marker = LandingMarker { clock: clock.into(), stamp_ns };
-            std::fs::write(&file, serde_json::to_vec(&marker).unwrap()).unwrap();
-            marker_file.landing()
-        };
-        assert!(!is_fresh(clock_name(), STALE_AFTER * 2), "long ago");
-        assert!(!is_fresh("before the system started", Duration::ZERO));
-        marker_file.note(false);
-        assert!(!file.exists());
     }
 }

@@ -16,7 +16,8 @@ use tokio::process::Command;
 use tokio::time::Instant;
 
 use crate::children::{ChildEvent, Children, Exit, Reach, without_network};
-use crate::peers::{LandingMarkerFile, Peers, Slot};
+use crate::notes::{Note, Notes};
+use crate::peers::{Peers, STALE_AFTER, Slot};
 use crate::programs::{OWN_PROGRAM, missing, missing_of_service};
 use crate::runtime::block_on;
 use crate::services::Service;
@@ -182,18 +183,17 @@ impl Supervised {
 
 async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<ExitCode> {
     let shutdown = Shutdown::on_signals()?;
-    let marker_file = LandingMarkerFile::for_supervisor(&site.instance(role));
-    let mut peers = follow_peers(site, role, &jobs, &marker_file).await?;
+    let notes = Notes::of_supervisor(&site.instance(role));
+    let before = Before::noted_in(&notes);
+    let mut peers = follow_peers(site, role, &jobs, &notes.landing).await?;
     let mut children = Children::new();
-    let mut supervised: Vec<Supervised> = jobs.into_iter().map(Supervised::new).collect();
-    // A supervisor that was killed during a landing left its marker file.
-    let interrupted = marker_file.landing();
-    if interrupted {
-        say("a landing was interrupted a moment ago; resuming it");
+    for line in jobs.iter().filter_map(|job| before.told_of(job, &notes.running)) {
+        say(line);
     }
+    notes.running.write();
+    let mut supervised: Vec<Supervised> = jobs.into_iter().map(Supervised::new).collect();
     for (index, first) in supervised.iter_mut().enumerate() {
-        let is_controller = first.job.service == Some(Service::Controller);
-        let start_as = (interrupted && is_controller).then_some("resume");
+        let start_as = before.start_mode(&first.job);
         first.pid = start(&mut children, index, &first.job, start_as, site)?;
     }
     let all_given_up = watch(&mut children, &mut supervised, &mut peers, site, shutdown).await?;
@@ -205,11 +205,71 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
             say(&format!("{}: stopped", stopped.job.name));
         }
     }
-    // After a regular stop the landing is not resumed. The peers are closed first, as they write the marker
-    // file too.
+    // After an orderly stop the landing is not resumed. The peers are closed first, as they write its note too.
     peers.close().await;
-    marker_file.note(false);
+    notes.landing.remove();
+    // What starts this program again by itself does so after a failure, and then nothing may take off.
+    if !all_given_up {
+        notes.running.remove();
+    }
     Ok(ExitCode::from(u8::from(all_given_up)))
+}
+
+/// What was before this supervisor, by the notes of the one before it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Before {
+    /// Nothing, or an orderly stop.
+    Nothing,
+    /// It was killed, or failed.
+    Crash,
+    /// The same during a landing, a moment ago.
+    Landing,
+}
+
+impl Before {
+    fn noted_in(notes: &Notes) -> Self {
+        if notes.landing.age().is_some_and(|age| age < STALE_AFTER) {
+            Self::Landing
+        } else if notes.running.age().is_some() {
+            Self::Crash
+        } else {
+            Self::Nothing
+        }
+    }
+
+    /// The mode of a process's first start; `None` for what the site says. A crash restarts the controller like any other of its ends.
+    fn start_mode(self, job: &Job) -> Option<&'static str> {
+        match self {
+            Self::Nothing => None,
+            Self::Crash | Self::Landing => start_mode(job, self == Self::Landing),
+        }
+    }
+
+    /// What is to be said of it before a process is started.
+    fn told_of(self, job: &Job, running: &Note) -> Option<&'static str> {
+        if job.service != Some(Service::Controller) {
+            return None;
+        }
+        match self {
+            Self::Nothing if !running.is_kept() && starts_by_itself(job) => Some(
+                "a crash of this `alight up` cannot be noted, and after one its controller would begin anew as its `start` says: set \
+                 $RUNTIME_DIRECTORY to a directory to which only this user can write",
+            ),
+            Self::Nothing => None,
+            Self::Crash => Some(
+                "the `alight up` before this one was killed or failed: the controller waits for a command and starts no motors, whatever its \
+                 `start` says. It follows that after an orderly stop (Ctrl-C) and another start",
+            ),
+            Self::Landing => Some("a landing was interrupted a moment ago; resuming it"),
+        }
+    }
+}
+
+/// Whether a controller takes off or lands without a command.
+fn starts_by_itself(job: &Job) -> bool {
+    let config = job.service.and_then(|service| service.effective_config(&job.layers).ok());
+    let start = config.as_ref().and_then(|config| config.get("start")?.as_str());
+    matches!(start, Some("takeoff" | "airborne"))
 }
 
 /// Follows the peers on which restarts depend.
@@ -217,16 +277,16 @@ async fn follow_peers(
     site: &Site,
     role: Role,
     jobs: &[Job],
-    marker_file: &LandingMarkerFile,
+    landing: &Note,
 ) -> anyhow::Result<Peers> {
     let job_of = |service| jobs.iter().find(|job| job.service == Some(service));
-    // Only the supervisor of the controller keeps the marker file.
-    let (key, marker_file) = match (job_of(Service::Controller), job_of(Service::Detector)) {
-        (Some(controller), _) => (&controller.key, marker_file.clone()),
-        (None, Some(detector)) => (&detector.key, LandingMarkerFile::default()),
+    // Only the supervisor of the controller notes its landings.
+    let (key, note) = match (job_of(Service::Controller), job_of(Service::Detector)) {
+        (Some(controller), _) => (&controller.key, landing.clone()),
+        (None, Some(detector)) => (&detector.key, Note::default()),
         (None, None) => return Ok(Peers::none()),
     };
-    Peers::follow(&site.network(role), key, marker_file).await
+    Peers::follow(&site.network(role), key, note).await
 }
 
 /// Restarts processes that exit; returns false on a shutdown request, true when all processes are given up.

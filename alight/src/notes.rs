@@ -1,0 +1,137 @@
+//! What a supervisor notes for the one that is started after it, should it be killed: that it runs, and a landing under way.
+
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use node::{clock_name, now_ns};
+use serde::{Deserialize, Serialize};
+
+/// The notes of a supervisor, files in the directory for runtime files ($RUNTIME_DIRECTORY or $XDG_RUNTIME_DIR).
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Notes {
+    /// There from the start of its processes until an orderly stop.
+    pub(crate) running: Note,
+    /// There while a landing is under way, and written anew again and again.
+    pub(crate) landing: Note,
+}
+
+/// A file that is there while something holds. It counts until the machine is started anew, wherever it is.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Note {
+    file: Option<PathBuf>,
+}
+
+/// The contents of the file.
+#[derive(Serialize, Deserialize)]
+struct Content {
+    clock: String,
+    stamp_ns: i64,
+}
+
+impl Notes {
+    /// The notes of the supervisor with this name.
+    pub(crate) fn of_supervisor(name: &str) -> Self {
+        let directory = ["RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"].iter().find_map(std::env::var_os);
+        let directory = directory.map(PathBuf::from).filter(|directory| {
+            let is_ours = is_ours_alone(directory);
+            if !is_ours {
+                tracing::warn!(
+                    ?directory,
+                    "Other users can write there, so neither a landing nor a crash is noted there"
+                );
+            }
+            is_ours
+        });
+        let note = |what: &str| {
+            let file = directory.as_ref().map(|it| it.join(format!("alight-{name}.{what}")));
+            Note { file }
+        };
+        Self { running: note("running"), landing: note("landing") }
+    }
+}
+
+impl Note {
+    /// Whether there is a place for it.
+    pub(crate) fn is_kept(&self) -> bool {
+        self.file.is_some()
+    }
+
+    /// Writes it, with the time.
+    pub(crate) fn write(&self) {
+        let Some(file) = &self.file else { return };
+        let content = Content { clock: clock_name().to_owned(), stamp_ns: now_ns() };
+        // Renamed, so that a reader never sees half of it.
+        let new = file.with_added_extension("new");
+        let written = serde_json::to_vec(&content).map_err(std::io::Error::from);
+        let written = written
+            .and_then(|text| std::fs::write(&new, text))
+            .and_then(|()| std::fs::rename(&new, file));
+        if let Err(problem) = written {
+            tracing::warn!(%problem, ?file, "Note for the case of a crash not written");
+        }
+    }
+
+    /// Removes it.
+    pub(crate) fn remove(&self) {
+        let Some(file) = self.file.as_ref().filter(|file| file.exists()) else { return };
+        if let Err(problem) = std::fs::remove_file(file) {
+            tracing::warn!(%problem, ?file, "Note for the case of a crash not removed");
+        }
+    }
+
+    /// How long ago it was written, if it is there and the machine was not started anew since.
+    pub(crate) fn age(&self) -> Option<Duration> {
+        let text = std::fs::read(self.file.as_ref()?).ok()?;
+        let content: Content = serde_json::from_slice(&text).ok()?;
+        let age_ns = u64::try_from(now_ns().saturating_sub(content.stamp_ns)).ok()?;
+        (content.clock == clock_name()).then_some(Duration::from_nanos(age_ns))
+    }
+}
+
+/// Whether only this user (and root) can write to a directory: whoever can may have a landing resumed.
+fn is_ours_alone(directory: &Path) -> bool {
+    let Ok(found) = std::fs::metadata(directory) else { return true };
+    let user = rustix::process::geteuid();
+    (found.uid() == user.as_raw() || user.is_root()) && found.mode() & 0o022 == 0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_directory_in_which_others_write_has_no_notes() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().unwrap();
+        for (mode, is_ours) in [(0o700, true), (0o755, true), (0o775, false), (0o1777, false)] {
+            let permissions = std::fs::Permissions::from_mode(mode);
+            std::fs::set_permissions(folder.path(), permissions).unwrap();
+            assert_eq!(is_ours_alone(folder.path()), is_ours, "{mode:o}");
+        }
+    }
+
+    #[test]
+    fn a_note_counts_until_it_is_removed_or_the_machine_is_started_anew() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("x.landing");
+        let note = Note { file: Some(file.clone()) };
+        assert_eq!((note.age(), Note::default().age()), (None, None));
+        note.remove();
+        note.write();
+        assert!(note.age().unwrap() < Duration::from_secs(60));
+        let age_of = |clock: &str, age: Duration| {
+            let stamp_ns = now_ns() - i64::try_from(age.as_nanos()).unwrap();
+            let content = Content { clock: clock.into(), stamp_ns };
+            std::fs::write(&file, serde_json::to_vec(&content).unwrap()).unwrap();
+            note.age()
+        };
+        let long = Duration::from_secs(30);
+        assert!(age_of(clock_name(), long).unwrap() >= long);
+        assert_eq!(age_of("before the machine was started anew", Duration::ZERO), None);
+        std::fs::write(&file, "{").unwrap();
+        assert_eq!(note.age(), None);
+        note.remove();
+        assert!(!file.exists());
+    }
+}
