@@ -1,7 +1,7 @@
 //! The peers on which a supervisor's restarts depend: whether a landing is under way, and which detectors are
 //! running.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use messages::{ControllerStatus, DetectorInfo, Place, topic};
@@ -28,16 +28,34 @@ pub(crate) struct Peers {
 
 /// The place and camera of a detector: detectors in one slot can replace each other.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Slot {
+struct Slot {
     place: Place,
     camera: String,
+}
+
+/// A detector that runs in place of a supervised one.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Replacement {
+    pub(crate) name: String,
+    slot: Slot,
+    joined: Instant,
 }
 
 #[derive(Clone, Debug, Default)]
 struct PeerTable {
     landing: bool,
-    alive: BTreeSet<String>,
-    infos: BTreeMap<String, DetectorInfo>,
+    /// The controller's: a detector's name, a place, or nothing.
+    preference: String,
+    detectors: BTreeMap<String, KnownDetector>,
+}
+
+/// A detector that is there, or was a while ago.
+#[derive(Clone, Debug, Default)]
+struct KnownDetector {
+    alive: bool,
+    /// When it came, the last time.
+    joined: Option<Instant>,
+    info: Option<DetectorInfo>,
 }
 
 impl Peers {
@@ -62,15 +80,18 @@ impl Peers {
                         if sender.borrow().landing != landing {
                             sender.send_modify(|table| table.landing = landing);
                         }
+                        if sender.borrow().preference != status.preference {
+                            sender.send_modify(|table| table.preference = status.preference);
+                        }
                     }
                     Some((key, info)) = infos.next_with_key() => {
                         let name = topic::DETECTOR_INFO.first_name(&key).unwrap_or_default();
-                        if sender.borrow().infos.get(name) != Some(&info) {
+                        if sender.borrow().info(name) != Some(&info) {
                             sender.send_modify(|table| table.set_info(name, info));
                         }
                     }
                     Some((name, alive)) = presence.next() => {
-                        sender.send_modify(|table| table.set_alive(name, alive));
+                        sender.send_modify(|table| table.set_alive(&name, alive, Instant::now()));
                     }
                     else => return,
                 }
@@ -93,16 +114,15 @@ impl Peers {
         self.table.borrow().landing
     }
 
-    /// The slot of the detector with this process number on this host.
-    pub(crate) fn slot_of(&self, pid: i32) -> Option<Slot> {
-        let host = node::host_name();
-        let table = self.table.borrow();
-        table.infos.values().find(|info| is_process(info, &host, pid)).map(Slot::of)
+    /// The detector that replaces the one with this process number on this host, which has ended; `own` are the numbers of those that
+    /// are supervised.
+    pub(crate) fn replacement(&self, pid: i32, own: &[i32]) -> Option<Replacement> {
+        self.table.borrow().replacement(&node::host_name(), pid, own)
     }
 
-    /// A running detector in this slot other than the processes with these numbers on this host.
-    pub(crate) fn replacement(&self, slot: &Slot, own: &[i32]) -> Option<String> {
-        self.table.borrow().replacement(slot, &node::host_name(), own)
+    /// Whoever runs in place of a supervised detector now: the one that did, or once that is gone one that came after it.
+    pub(crate) fn successor(&self, of: &Replacement, own: &[i32]) -> Option<Replacement> {
+        self.table.borrow().successor(of, &node::host_name(), own)
     }
 
     /// Returns at the next change.
@@ -121,31 +141,68 @@ impl Slot {
 }
 
 impl PeerTable {
+    fn info(&self, name: &str) -> Option<&DetectorInfo> {
+        self.detectors.get(name)?.info.as_ref()
+    }
+
     fn set_info(&mut self, name: &str, info: DetectorInfo) {
-        if self.infos.len() < MAX_DETECTORS || self.infos.contains_key(name) {
-            self.infos.insert(name.to_owned(), info);
+        if let Some(detector) = self.detector(name) {
+            detector.info = Some(info);
         }
     }
 
-    fn set_alive(&mut self, name: String, alive: bool) {
-        if alive && self.alive.len() < MAX_DETECTORS {
-            self.alive.insert(name);
-        } else if !alive {
-            self.alive.remove(&name);
-            // The information on a detector that is gone is needed for a while, to find its slot.
-            let alive = &self.alive;
-            if self.infos.len() >= MAX_DETECTORS {
-                self.infos.retain(|name, _| alive.contains(name));
-            }
+    fn set_alive(&mut self, name: &str, alive: bool, now: Instant) {
+        let Some(detector) = self.detector(name) else { return };
+        if alive && !detector.alive {
+            detector.joined = Some(now);
         }
+        detector.alive = alive;
     }
 
-    fn replacement(&self, slot: &Slot, host: &str, own: &[i32]) -> Option<String> {
-        let is_own = |info: &DetectorInfo| own.iter().any(|pid| is_process(info, host, *pid));
-        let running = self.infos.iter().filter(|(name, _)| self.alive.contains(*name));
-        let mut others = running.filter(|(_, info)| Slot::of(info) == *slot && !is_own(info));
-        others.next().map(|(name, _)| name.clone())
+    /// What is known of a detector; `None` where there is no room for a further one.
+    fn detector(&mut self, name: &str) -> Option<&mut KnownDetector> {
+        let is_full = |table: &Self| {
+            table.detectors.len() >= MAX_DETECTORS && !table.detectors.contains_key(name)
+        };
+        if is_full(self) {
+            // One that is gone is needed for a while only, to find its slot.
+            self.detectors.retain(|_, detector| detector.alive);
+        }
+        (!is_full(self)).then(|| self.detectors.entry(name.to_owned()).or_default())
     }
+
+    /// One that the operator has named, or that came after it. Others in its slot were beside it all along, and that the controller uses one of
+    /// them says only that this one has gone.
+    fn replacement(&self, host: &str, pid: i32, own: &[i32]) -> Option<Replacement> {
+        let is_it =
+            |it: &&KnownDetector| it.info.as_ref().is_some_and(|info| is_process(info, host, pid));
+        let replaced = self.detectors.values().find(is_it)?;
+        let (slot, joined) = (Slot::of(replaced.info.as_ref()?), replaced.joined?);
+        let is_chosen = |it: &Replacement| it.name == self.preference;
+        let all = || self.others_in(&slot, host, own);
+        all().find(is_chosen).or_else(|| newest_after(joined, all()))
+    }
+
+    fn successor(&self, of: &Replacement, host: &str, own: &[i32]) -> Option<Replacement> {
+        let all = || self.others_in(&of.slot, host, own);
+        all().find(|it| it == of).or_else(|| newest_after(of.joined, all()))
+    }
+
+    /// The running detectors in a slot that are not supervised here.
+    fn others_in(&self, slot: &Slot, host: &str, own: &[i32]) -> impl Iterator<Item = Replacement> {
+        let running = self.detectors.iter().filter(|(_, detector)| detector.alive);
+        running.filter_map(move |(name, detector)| {
+            let (info, joined) = (detector.info.as_ref()?, detector.joined?);
+            let is_own = own.iter().any(|pid| is_process(info, host, *pid));
+            let found = Replacement { name: name.clone(), slot: Slot::of(info), joined };
+            (found.slot == *slot && !is_own).then_some(found)
+        })
+    }
+}
+
+/// The one that came last, if it came after a time.
+fn newest_after(time: Instant, all: impl Iterator<Item = Replacement>) -> Option<Replacement> {
+    all.filter(|it| it.joined > time).max_by_key(|it| it.joined)
 }
 
 fn is_process(info: &DetectorInfo, host: &str, pid: i32) -> bool {
@@ -197,33 +254,74 @@ mod tests {
         }
     }
 
-    #[test]
-    fn a_running_detector_of_the_same_place_and_camera_is_a_replacement() {
+    /// A table with detectors of the host `pi`, on board, that joined one second after the other; their numbers are 1, 2 ...
+    fn table(names: &[&str], start: Instant) -> PeerTable {
         let mut table = PeerTable::default();
-        for (name, place, host, pid) in [
-            ("main", Place::Onboard, "pi", 7),
-            ("second", Place::Onboard, "pi", 8),
-            ("new", Place::Onboard, "pi", 9),
-            ("ground", Place::Ground, "laptop", 7),
-        ] {
-            table.set_info(name, info(place, host, pid));
-            table.set_alive(name.into(), true);
+        for (pid, name) in (1..).zip(names) {
+            table.set_info(name, info(Place::Onboard, "pi", pid));
+            table.set_alive(name, true, start + Duration::from_secs(pid.into()));
         }
-        // It is the first by name.
-        let forward = DetectorInfo { camera: "forward".into(), ..info(Place::Onboard, "pi", 10) };
-        table.set_info("forward", forward);
-        table.set_alive("forward".into(), true);
-        let slot = |place: Place| Slot { place, camera: "down".into() };
-        let replacement =
-            |table: &PeerTable| table.replacement(&slot(Place::Onboard), "pi", &[7, 8]);
-        assert_eq!(replacement(&table).as_deref(), Some("new"));
-        assert_eq!(table.replacement(&slot(Place::Ground), "laptop", &[7]), None);
-        table.set_alive("new".into(), false);
+        table
+    }
+
+    fn name(replacement: Option<Replacement>) -> Option<String> {
+        replacement.map(|it| it.name)
+    }
+
+    #[test]
+    fn a_detector_is_replaced_by_one_of_its_place_and_camera_that_came_after_it() {
+        let start = Instant::now();
+        let mut table = table(&["spare", "main", "second", "new"], start);
+        let own = [2, 3];
+        let late = start + Duration::from_secs(60);
+        for (name, info) in [
+            ("ground", info(Place::Ground, "laptop", 2)),
+            ("forward", DetectorInfo { camera: "forward".into(), ..info(Place::Onboard, "pi", 9) }),
+        ] {
+            table.set_info(name, info);
+            table.set_alive(name, true, late);
+        }
+        table.set_alive("main", false, late);
+        assert_eq!(name(table.replacement("pi", 2, &own)).as_deref(), Some("new"));
+        table.set_alive("new", false, late);
         assert_eq!(
-            replacement(&table),
+            table.replacement("pi", 2, &own),
             None,
-            "not its own processes, nor a detector on the ground, nor one of another camera"
+            "neither one that was beside it, nor an own one, nor one of another place or camera"
         );
+        table.preference = "spare".into();
+        assert_eq!(name(table.replacement("pi", 2, &own)).as_deref(), Some("spare"));
+        assert_eq!(table.replacement("pi", 77, &own), None, "it never told its slot");
+    }
+
+    #[test]
+    fn a_replacement_that_is_gone_is_followed_only_by_one_that_came_after_it() {
+        let start = Instant::now();
+        let mut table = table(&["spare", "main", "new"], start);
+        let late = |s: u64| start + Duration::from_secs(60 + s);
+        table.set_alive("main", false, late(0));
+        let first = table.replacement("pi", 2, &[2]).unwrap();
+        assert_eq!(table.successor(&first, "pi", &[2]).as_ref(), Some(&first));
+        table.set_info("newer", info(Place::Onboard, "pi", 4));
+        table.set_alive("newer", true, late(1));
+        assert_eq!(table.successor(&first, "pi", &[2]).as_ref(), Some(&first));
+        table.set_alive("new", false, late(2));
+        let second = table.successor(&first, "pi", &[2]).unwrap();
+        assert_eq!(second.name, "newer");
+        table.set_alive("newer", false, late(3));
+        assert_eq!(table.successor(&second, "pi", &[2]), None);
+    }
+
+    #[test]
+    fn a_full_table_forgets_those_that_are_gone() {
+        let names: Vec<_> = (0..MAX_DETECTORS).map(|i| format!("{i:02}")).collect();
+        let names: Vec<_> = names.iter().map(String::as_str).collect();
+        let mut table = table(&names, Instant::now());
+        table.set_alive("more", true, Instant::now());
+        assert!(!table.detectors.contains_key("more"));
+        table.set_alive("07", false, Instant::now());
+        table.set_alive("more", true, Instant::now());
+        assert!(table.detectors["more"].alive && !table.detectors.contains_key("07"));
     }
 
     #[test]

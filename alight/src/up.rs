@@ -17,7 +17,7 @@ use tokio::time::Instant;
 
 use crate::children::{ChildEvent, Children, Exit, Reach, without_network};
 use crate::notes::{Note, Notes};
-use crate::peers::{Peers, STALE_AFTER, Slot};
+use crate::peers::{Peers, Replacement, STALE_AFTER};
 use crate::programs::{OWN_PROGRAM, missing, missing_of_service};
 use crate::runtime::block_on;
 use crate::services::Service;
@@ -133,9 +133,9 @@ enum State {
     Running,
     /// To be restarted at this time.
     Waiting(Instant),
-    /// A detector that was stopped in favour of another one in its slot, and is restarted when that one is
-    /// gone.
-    Replaced(Slot),
+    /// A detector that was stopped in favour of this one, and is restarted when that is gone and no later one has
+    /// its place.
+    Replaced(Replacement),
     GivenUp,
 }
 
@@ -147,13 +147,14 @@ impl Supervised {
     /// Handles the regular exit of a detector for which another one was swapped in; returns the message to
     /// show, `None` for any other process and any other exit.
     fn on_replaced(&mut self, exit: &Exit, peers: &Peers, own: &[i32]) -> Option<String> {
-        let slot = peers.slot_of(self.pid).filter(|_| exit.status == Some(0))?;
-        let other = peers.replacement(&slot, own)?;
-        self.state = State::Replaced(slot);
+        let by = peers.replacement(self.pid, own).filter(|_| exit.status == Some(0))?;
         let name = &self.job.name;
-        Some(format!(
-            "{name}: stopped and replaced by the detector `{other}`; restarted when that one is gone"
-        ))
+        let message = format!(
+            "{name}: stopped and replaced by the detector `{}`; restarted when that one is gone",
+            by.name
+        );
+        self.state = State::Replaced(by);
+        Some(message)
     }
 
     /// Handles the exit of a process; returns the message to show.
@@ -342,16 +343,26 @@ fn pids(supervised: &[Supervised]) -> Vec<i32> {
     supervised.iter().map(|s| s.pid).collect()
 }
 
-/// Restarts the replaced detectors whose replacement is gone.
+/// Restarts the replaced detectors whose replacement is gone, unless a later one has taken its place.
 fn restart_unreplaced(supervised: &mut [Supervised], peers: &Peers) {
     let own = pids(supervised);
     for replaced in supervised {
-        if let State::Replaced(slot) = &replaced.state
-            && peers.replacement(slot, &own).is_none()
-        {
-            say(&format!("{}: its replacement is gone; restarting", replaced.job.name));
-            replaced.state = State::Waiting(Instant::now());
-        }
+        let State::Replaced(by) = &replaced.state else { continue };
+        let name = &replaced.job.name;
+        replaced.state = match peers.successor(by, &own) {
+            Some(same) if same == *by => continue,
+            Some(next) => {
+                say(&format!(
+                    "{name}: the detector `{}` has taken the place of its replacement",
+                    next.name
+                ));
+                State::Replaced(next)
+            }
+            None => {
+                say(&format!("{name}: its replacement is gone; restarting"));
+                State::Waiting(Instant::now())
+            }
+        };
     }
 }
 
