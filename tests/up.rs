@@ -325,6 +325,37 @@ command = ["./own.sh"]
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_program_that_cannot_be_started_is_tried_again_beside_the_others() -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
+    let folder = tempfile::tempdir()?;
+    let script = folder.path().join("own.sh");
+    // It may be run, but what is to read it is not there.
+    std::fs::write(&script, "#!/no/such/shell\n")?;
+    std::fs::set_permissions(&script, std::fs::Permissions::from_mode(0o755))?;
+    let ([meet], ..) = ports::free()?;
+    let site = format!(
+        r#"
+meet = {meet}
+[[local]]
+name = "other"
+command = ["sleep", "600"]
+[[local]]
+name = "own"
+command = ["./own.sh"]
+"#
+    );
+    std::fs::write(folder.path().join("site.toml"), site)?;
+    let mut up = Up::start(folder.path(), "local")?;
+    let other = up.process("other:").await?;
+    up.says("own: exited with an error at its start", "./own.sh").await?;
+    std::fs::write(&script, "#!/bin/sh\nexec sleep 600\n")?;
+    up.process("own:").await?;
+    ensure!(test_kill_process(other).is_ok(), "the other one has ended");
+    ensure!(up.stop()? == Some(0));
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn after_a_crash_of_the_supervisor_the_controller_does_not_take_off() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     let folder = tempfile::tempdir()?;

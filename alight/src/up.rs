@@ -195,7 +195,7 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
     let mut supervised: Vec<Supervised> = jobs.into_iter().map(Supervised::new).collect();
     for (index, first) in supervised.iter_mut().enumerate() {
         let start_as = before.start_mode(&first.job);
-        first.pid = start(&mut children, index, &first.job, start_as, site)?;
+        start_or_retry(&mut children, index, first, start_as, site);
     }
     let all_given_up = watch(&mut children, &mut supervised, &mut peers, site, shutdown).await?;
     say("stopping");
@@ -326,14 +326,7 @@ async fn watch(
                 let Some((_, index)) = next else { continue };
                 let Some(again) = supervised.get_mut(index) else { continue };
                 let start_as = start_mode(&again.job, peers.landing());
-                match start(children, index, &again.job, start_as, site) {
-                    Ok(pid) => (again.pid, again.state) = (pid, State::Running),
-                    // The others go on, and so do the attempts.
-                    Err(problem) => {
-                        let exit = Exit { words: format!("{problem:#}"), status: None };
-                        say(&again.on_exit(&exit, Instant::now()));
-                    }
-                }
+                start_or_retry(children, index, again, start_as, site);
             }
         }
     }
@@ -383,6 +376,23 @@ fn show(supervised: &[Supervised], event: &ChildEvent<usize>) {
         && let Some(child) = supervised.get(*index)
     {
         say(&format!("{}: {line}", child.job.name));
+    }
+}
+
+/// Starts a process. A failure counts as one of its ends: the others go on, and so do the attempts.
+fn start_or_retry(
+    children: &mut Children<usize>,
+    index: usize,
+    process: &mut Supervised,
+    start_as: Option<&str>,
+    site: &Site,
+) {
+    match start(children, index, &process.job, start_as, site) {
+        Ok(pid) => (process.pid, process.state) = (pid, State::Running),
+        Err(problem) => {
+            let exit = Exit { words: format!("an error at its start: {problem:#}"), status: None };
+            say(&process.on_exit(&exit, Instant::now()));
+        }
     }
 }
 
