@@ -2,7 +2,8 @@
 //!
 //! The new detector is started as a process that outlives this one. It runs in shadow until it agrees with
 //! the active one, becomes the active one, and only then the old one is stopped. On any failure before that,
-//! the old one stays in use and the new one is stopped.
+//! the old one stays in use, the operator's preference is what it was, and the new one is stopped, unless the old
+//! one has gone meanwhile and no other is left.
 
 mod comparison;
 
@@ -16,7 +17,7 @@ use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use messages::{
     Candidate, Configuration, ControllerCommand, ControllerStatus, Detections, DetectorCommand,
-    DetectorState, topic,
+    DetectorState, Place, topic,
 };
 use node::{Layers, Node, Presence, Shutdown, Subscriber};
 use rustix::process::{Pid, Signal, kill_process_group};
@@ -32,6 +33,8 @@ use crate::terminal::{print, write_error};
 
 /// Timeout for the controller's first status.
 const CONTROLLER_TIMEOUT: Duration = Duration::from_secs(5);
+/// Timeout for a further status.
+const STATUS_TIMEOUT: Duration = Duration::from_secs(1);
 /// Timeout until the controller uses the new detector.
 const ACTIVE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Time that the new detector must stay active before the old one is stopped.
@@ -99,6 +102,7 @@ struct Report {
     agreed_s: Option<f64>,
     active_s: Option<f64>,
     old_stopped: bool,
+    new_kept: bool,
 }
 
 /// Swaps; the exit status is 0 when the new detector is in use.
@@ -141,6 +145,8 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
         detections,
         configurations,
         comparison: Comparison::default(),
+        preference: first.preference.clone(),
+        latest: first,
         presence,
         existing,
         child,
@@ -167,13 +173,15 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
             }
         }
         Err(problem) => {
-            swap.roll_back(&report).await;
-            let old = report.from.as_deref().unwrap_or("none");
-            report.why = format!("not swapped, {old} stays in use: {problem:#}");
+            swap.roll_back(&mut report).await;
+            report.why = format!("not swapped, {}: {problem:#}", left(&report, &swap.latest));
             if let Some(last) = report.log.as_deref().and_then(last_lines)
                 && swap.is_verbose
             {
                 write_error(&format!("End of the new detector's log:\n{last}"));
+            }
+            if args.wait && report.new_kept {
+                swap.wait().await;
             }
         }
     }
@@ -266,6 +274,9 @@ struct Swap<'a> {
     detections: Subscriber<Detections>,
     configurations: Subscriber<Configuration>,
     comparison: Comparison,
+    /// What the operator preferred before: a detector's name, a place or nothing.
+    preference: String,
+    latest: ControllerStatus,
     presence: Presence,
     existing: BTreeSet<String>,
     child: Child,
@@ -293,7 +304,9 @@ impl Swap<'_> {
         self.until_active(&new).await?;
         report.active_s = Some(self.elapsed_s());
         self.show(&format!("{new} is used"));
-        if let Some(old) = report.from.clone().filter(|old| *old != new && !self.args.keep_old) {
+        let is_to_stop =
+            |old: &String| *old != new && !self.args.keep_old && is_alive(&self.latest, old);
+        if let Some(old) = report.from.clone().filter(is_to_stop) {
             match self.stop_old(&old).await {
                 Ok(()) => report.old_stopped = true,
                 Err(problem) => {
@@ -318,7 +331,10 @@ impl Swap<'_> {
     async fn next_event(&mut self, deadline: Instant, waiting_for: &str) -> anyhow::Result<Event> {
         loop {
             return tokio::select! {
-                Some(status) = self.statuses.next() => Ok(Event::Status(Box::new(status))),
+                Some(status) = self.statuses.next() => {
+                    self.latest = status.clone();
+                    Ok(Event::Status(Box::new(status)))
+                }
                 Some((name, alive)) = self.presence.next() => {
                     Ok(if alive { Event::Joined(name) } else { Event::Left(name) })
                 }
@@ -422,11 +438,14 @@ impl Swap<'_> {
     }
 
     async fn use_detector(&self, name: &str) -> anyhow::Result<()> {
-        let command = ControllerCommand::UseDetector(name.to_owned());
-        let reply = self.node.command(topic::COMMAND, &[], &command).await?;
+        self.command(&ControllerCommand::UseDetector(name.to_owned())).await
+    }
+
+    async fn command(&self, command: &ControllerCommand) -> anyhow::Result<()> {
+        let reply = self.node.command(topic::COMMAND, &[], command).await?;
         match reply.accepted {
             true => Ok(()),
-            false => Err(anyhow!("the controller refused {name}: {}", reply.reason)),
+            false => Err(anyhow!("the controller refused: {}", reply.reason)),
         }
     }
 
@@ -467,14 +486,41 @@ impl Swap<'_> {
         }
     }
 
-    /// Switches back to the old detector and stops the new one.
-    async fn roll_back(&mut self, report: &Report) {
-        if let (Some(old), Some(_)) = (&report.from, report.agreed_s)
+    /// Switches back to the old detector and to what was preferred, and stops the new one, unless it is the last.
+    async fn roll_back(&mut self, report: &mut Report) {
+        if let Ok(Some(status)) = timeout(STATUS_TIMEOUT, self.statuses.next()).await {
+            self.latest = status;
+        }
+        // The controller may have been asked for the new one. That is undone before it ends, so that no frame is missed.
+        let was_asked = report.agreed_s.is_some();
+        let old = report.from.as_deref().filter(|old| is_alive(&self.latest, old));
+        if let Some(old) = old.filter(|_| was_asked)
             && let Err(problem) = self.use_detector(old).await
         {
-            write_error(&format!("{old} could not be preferred again: {problem:#}"));
+            write_error(&format!("going back to {old}: {problem:#}"));
         }
-        self.end_child().await;
+        let is_running = matches!(self.child.try_wait(), Ok(None));
+        report.new_kept = is_running && report.ready_s.is_some() && is_last(report, &self.latest);
+        if !report.new_kept {
+            self.end_child().await;
+        }
+        if was_asked {
+            self.prefer_again().await;
+        }
+    }
+
+    /// Has the controller prefer what the operator preferred before.
+    async fn prefer_again(&self) {
+        let Some(command) = preferring(&self.preference) else {
+            write_error(
+                "Before the swap no detector was preferred, and no command says so again: the one that the controller was last asked for is \
+                 preferred now (`alight detectors prefer onboard` and `ground` name a place instead)",
+            );
+            return;
+        };
+        if let Err(problem) = self.command(&command).await {
+            write_error(&format!("preferring {} again, as before: {problem:#}", self.preference));
+        }
     }
 
     async fn end_child(&mut self) {
@@ -507,6 +553,47 @@ impl Swap<'_> {
 
 fn find<'a>(status: &'a ControllerStatus, name: &str) -> Option<&'a Candidate> {
     status.candidates.iter().find(|candidate| candidate.detector == name)
+}
+
+fn is_alive(status: &ControllerStatus, name: &str) -> bool {
+    find(status, name).is_some_and(|candidate| candidate.alive)
+}
+
+/// The detector that is used beside the new one.
+fn other_in_use<'a>(report: &Report, status: &'a ControllerStatus) -> Option<&'a str> {
+    let used = status.active_detector.as_deref();
+    used.filter(|used| report.to.as_deref() != Some(used) && is_alive(status, used))
+}
+
+/// Whether the new detector is the last one: the old one has gone, and none is used in its place.
+fn is_last(report: &Report, status: &ControllerStatus) -> bool {
+    let old_is_gone = report.from.as_deref().is_some_and(|old| !is_alive(status, old));
+    old_is_gone && other_in_use(report, status).is_none()
+}
+
+/// What is left after a swap that failed, in words.
+fn left(report: &Report, status: &ControllerStatus) -> String {
+    let Some(old) = &report.from else { return "none stays in use".to_owned() };
+    let new = report.to.as_deref().unwrap_or_default();
+    match (report.new_kept, report.pid, other_in_use(report, status)) {
+        (true, Some(pid), _) => format!(
+            "but {old} has gone, and {new} is kept as the last one (process {pid}, `kill {pid}` ends it)"
+        ),
+        _ if is_alive(status, old) => format!("{old} stays in use"),
+        (_, _, Some(other)) => format!("{other} is used, as {old} has gone"),
+        _ => format!("but {old} has gone, and no other is left"),
+    }
+}
+
+/// The command after which this is preferred; `None` for nothing. The word for a place is taken for it, also where a detector has that
+/// name: the controller's status does not tell them apart.
+fn preferring(preference: &str) -> Option<ControllerCommand> {
+    let place = [Place::Onboard, Place::Ground].into_iter().find(|it| it.name() == preference);
+    match (place, preference) {
+        (Some(place), _) => Some(ControllerCommand::PreferDetectors(place)),
+        (None, "") => None,
+        (None, name) => Some(ControllerCommand::UseDetector(name.to_owned())),
+    }
 }
 
 /// Whether a detector agrees.
@@ -592,6 +679,54 @@ mod tests {
         assert_eq!(verdict(&shadow(15, 3), 15), Some(refused));
         let stale = Candidate { state: DetectorState::Stale, ..shadow(15, 15) };
         assert!(verdict(&stale, 15).is_none());
+    }
+
+    #[test]
+    fn the_new_detector_is_kept_only_as_the_last_one() {
+        let known = |name: &str, alive: bool| Candidate {
+            detector: name.into(),
+            alive,
+            ..Candidate::sample()
+        };
+        let status = |candidates: &[Candidate], active: Option<&str>| ControllerStatus {
+            candidates: candidates.to_vec(),
+            active_detector: active.map(Into::into),
+            ..ControllerStatus::default()
+        };
+        let report = |new_kept: bool| Report {
+            from: Some("old".into()),
+            to: Some("new".into()),
+            pid: Some(7),
+            new_kept,
+            ..Report::default()
+        };
+        let (old, new) = (known("old", true), known("new", true));
+        let (gone, spare) = (known("old", false), known("spare", true));
+        for (status, is_kept, told) in [
+            (status(&[old.clone(), new.clone()], Some("old")), false, "old stays in use"),
+            // It is silent for a while.
+            (status(&[old, new.clone()], None), false, "old stays in use"),
+            (status(&[gone.clone(), new.clone()], Some("old")), true, "`kill 7` ends it"),
+            (status(std::slice::from_ref(&new), Some("new")), true, "new is kept as the last one"),
+            (status(&[gone.clone(), new, spare], Some("spare")), false, "spare is used, as old"),
+        ] {
+            assert_eq!(is_last(&report(false), &status), is_kept, "{status:?}");
+            let left = left(&report(is_kept), &status);
+            assert!(left.contains(told), "{left}");
+        }
+        // The new one has ended as well.
+        let left = left(&report(false), &status(&[gone], None));
+        assert!(left.contains("no other is left"), "{left}");
+        assert!(!is_last(&Report::default(), &status(&[], None)), "there was none before");
+    }
+
+    #[test]
+    fn what_was_preferred_is_preferred_again() {
+        let place = ControllerCommand::PreferDetectors;
+        assert_eq!(preferring("ground"), Some(place(Place::Ground)));
+        assert_eq!(preferring("onboard"), Some(place(Place::Onboard)));
+        assert_eq!(preferring("spare"), Some(ControllerCommand::UseDetector("spare".into())));
+        assert_eq!(preferring(""), None);
     }
 
     #[test]
