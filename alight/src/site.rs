@@ -131,16 +131,24 @@ impl Site {
         Ok(site)
     }
 
-    /// The network of the processes of a role.
+    /// The network of the processes of a role, but of its relay.
     pub(crate) fn network(&self, role: Role) -> Network {
-        let connect = match role {
-            Role::Ground => self.relay_address.clone().or_else(|| self.address.clone()),
-            Role::Relay => self.address.clone(),
-            Role::Drone | Role::Local => None,
+        // The services on the drone are local; only its relay connects to others. Those of a base station are on the ground, and reach
+        // the drone through their own relay, at the port where it listens.
+        let (config, connect) = match role {
+            Role::Drone | Role::Local => (Role::Local, None),
+            Role::Ground => {
+                (Role::Ground, self.relay_address.clone().or_else(|| self.address.clone()))
+            }
+            Role::Relay => {
+                let address = self.relay_address.as_deref().map(Address::parse);
+                let port = address.and_then(Result::ok).and_then(|address| address.port);
+                let port = port.map_or_else(String::new, |port| format!(":{port}"));
+                (Role::Ground, Some(format!("127.0.0.1{port}")))
+            }
         };
         Network {
-            // The services on the drone are local; only its relay connects to others.
-            config: Some(if role == Role::Drone { Role::Local } else { role }.name().into()),
+            config: Some(config.name().into()),
             vehicle: self.vehicle.clone(),
             connect,
             listen: None,
@@ -239,7 +247,9 @@ impl Site {
                 false => port.map(|port| format!("0.0.0.0{port}")),
             }
         });
-        let network = Network { config: Some(config.name().into()), listen, ..self.network(role) };
+        let connect = self.address.clone().filter(|_| role == Role::Relay);
+        let network =
+            Network { config: Some(config.name().into()), connect, listen, ..self.network(role) };
         Ok(Some(Job {
             name: RELAY.to_owned(),
             service: None,
@@ -284,7 +294,7 @@ impl Site {
             file: entry.config.as_ref().map(|file| self.folder.join(file)),
             set: entry.set.clone(),
         };
-        if service == Some(Service::Detector) && role == Role::Ground {
+        if service == Some(Service::Detector) && matches!(role, Role::Ground | Role::Relay) {
             // The controller can prefer detectors by their place.
             layers.set.insert(0, "place=ground".to_owned());
         }
@@ -358,6 +368,33 @@ mod tests {
         between.relay_address = Some("base.local".to_owned());
         let jobs = between.jobs(Role::Ground).unwrap();
         assert!(jobs[0].network.environment().contains(&("ALIGHT_CONNECT", "base.local".into())));
+    }
+
+    #[test]
+    fn processes_on_a_base_station_connect_to_its_relay() {
+        let with = |relay_address: &str| {
+            let own = "relay = [{ run = 'detector' }, { command = ['python3', 'x.py'] }]";
+            site(&format!("address = '10.0.0.1'\ninsecure = true\n{relay_address}\n{own}"))
+        };
+        for (relay_address, connect) in [
+            ("", "127.0.0.1"),
+            ("relay_address = '192.168.1.20'", "127.0.0.1"),
+            ("relay_address = '192.168.1.20:8000'", "127.0.0.1:8000"),
+            ("relay_address = '[fd00::1]:8000'", "127.0.0.1:8000"),
+        ] {
+            let with = with(relay_address);
+            let jobs = with.jobs(Role::Relay).unwrap();
+            let relay = jobs[0].network.environment();
+            assert!(relay.contains(&("ALIGHT_ZENOH", "relay".into())), "{relay:?}");
+            assert!(relay.contains(&("ALIGHT_CONNECT", "10.0.0.1".into())), "{relay:?}");
+            for network in [&jobs[1].network, &jobs[2].network, &with.network(Role::Relay)] {
+                // Only the relay listens at its ports.
+                let other = network.environment();
+                assert!(other.contains(&("ALIGHT_ZENOH", "ground".into())), "{other:?}");
+                assert!(other.contains(&("ALIGHT_CONNECT", connect.into())), "{other:?}");
+            }
+            assert!(jobs[1].layers.set.contains(&"place=ground".to_owned()));
+        }
     }
 
     #[test]
