@@ -41,13 +41,15 @@ pub(crate) struct UpArgs {
 /// Pause before a process is restarted; doubled with each further exit within [`PERIOD`].
 const MIN_PAUSE: Duration = Duration::from_millis(500);
 const MAX_PAUSE: Duration = Duration::from_secs(8);
-/// A process that exits this many times within [`PERIOD`] is given up.
+/// A process that exits this many times within [`PERIOD`] keeps failing, until it has run for that long.
 const MAX_EXITS: usize = 6;
 const PERIOD: Duration = Duration::from_secs(60);
+/// Pause before one is restarted that keeps failing: what it lacks, as a camera, may come back.
+const LONG_PAUSE: Duration = Duration::from_secs(30);
 /// The exit status for an invalid configuration, with which a restart is useless.
 const WRONG_USE: i32 = 2;
 
-/// Runs a role until it is asked to stop, or until all processes have been given up.
+/// Runs a role until it is asked to stop, or until no process runs and each has been given up or keeps failing.
 pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
     let site = Site::read(&args.config)?;
     let jobs = site.jobs(args.role)?;
@@ -124,7 +126,10 @@ struct Supervised {
     job: Job,
     /// Its process number, once started.
     pid: i32,
+    /// When it was started the last time.
+    started: Instant,
     exits: VecDeque<Instant>,
+    keeps_failing: bool,
     state: State,
 }
 
@@ -141,7 +146,23 @@ enum State {
 
 impl Supervised {
     fn new(job: Job) -> Self {
-        Self { job, pid: 0, exits: VecDeque::new(), state: State::Running }
+        Self {
+            job,
+            pid: 0,
+            started: Instant::now(),
+            exits: VecDeque::new(),
+            keeps_failing: false,
+            state: State::Running,
+        }
+    }
+
+    /// Whether it does not run, and is not likely to.
+    fn is_out(&self) -> bool {
+        match self.state {
+            State::GivenUp => true,
+            State::Waiting(_) => self.keeps_failing,
+            State::Running | State::Replaced(_) => false,
+        }
     }
 
     /// Handles the regular exit of a detector for which another one was swapped in; returns the message to
@@ -168,12 +189,19 @@ impl Supervised {
                 "{name}: cannot run with its configuration ({exit}); given up. See its stderr above, then restart `alight up`"
             );
         }
-        if self.exits.len() >= MAX_EXITS {
-            self.state = State::GivenUp;
-            return format!(
-                "{name}: exited {MAX_EXITS} times within {} s, last with {exit}; given up. See its stderr above; the others continue without it",
-                PERIOD.as_secs()
-            );
+        let kept_failing = self.keeps_failing && now.duration_since(self.started) < PERIOD;
+        self.keeps_failing = kept_failing || self.exits.len() >= MAX_EXITS;
+        if self.keeps_failing {
+            self.state = State::Waiting(now + LONG_PAUSE);
+            let pause_s = LONG_PAUSE.as_secs();
+            return match kept_failing {
+                true => format!("{name}: exited with {exit}; restarting in {pause_s} s"),
+                false => format!(
+                    "{name}: exited {MAX_EXITS} times within {} s, last with {exit}; restarting every {pause_s} s from now on. See its stderr above; \
+                     the others continue without it",
+                    PERIOD.as_secs()
+                ),
+            };
         }
         let doublings = u32::try_from(self.exits.len()).unwrap_or(u32::MAX).saturating_sub(1);
         let pause = (MIN_PAUSE * 2_u32.saturating_pow(doublings)).min(MAX_PAUSE);
@@ -197,7 +225,7 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
         let start_as = before.start_mode(&first.job);
         start_or_retry(&mut children, index, first, start_as, site);
     }
-    let all_given_up = watch(&mut children, &mut supervised, &mut peers, site, shutdown).await?;
+    let all_are_out = watch(&mut children, &mut supervised, &mut peers, site, shutdown).await?;
     say("stopping");
     // In reverse order: the controller stops while its peers can still receive its last messages.
     for (index, stopped) in supervised.iter().enumerate().rev() {
@@ -210,10 +238,10 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
     peers.close().await;
     notes.landing.remove();
     // What starts this program again by itself does so after a failure, and then nothing may take off.
-    if !all_given_up {
+    if !all_are_out {
         notes.running.remove();
     }
-    Ok(ExitCode::from(u8::from(all_given_up)))
+    Ok(ExitCode::from(u8::from(all_are_out)))
 }
 
 /// What was before this supervisor, by the notes of the one before it.
@@ -290,7 +318,7 @@ async fn follow_peers(
     Peers::follow(&site.network(role), key, note).await
 }
 
-/// Restarts processes that exit; returns false on a shutdown request, true when all processes are given up.
+/// Restarts processes that exit; returns false on a shutdown request, true when none runs, and each has been given up or keeps failing.
 async fn watch(
     children: &mut Children<usize>,
     supervised: &mut [Supervised],
@@ -299,7 +327,8 @@ async fn watch(
     shutdown: Shutdown,
 ) -> anyhow::Result<bool> {
     loop {
-        if supervised.iter().all(|s| s.state == State::GivenUp) {
+        if supervised.iter().all(Supervised::is_out) {
+            say("no process runs, and none is likely to: ending with an error");
             return Ok(true);
         }
         let due = supervised.iter().enumerate().filter_map(|(index, s)| match s.state {
@@ -387,6 +416,7 @@ fn start_or_retry(
     start_as: Option<&str>,
     site: &Site,
 ) {
+    process.started = Instant::now();
     match start(children, index, &process.job, start_as, site) {
         Ok(pid) => (process.pid, process.state) = (pid, State::Running),
         Err(problem) => {
@@ -460,21 +490,29 @@ mod tests {
     }
 
     #[test]
-    fn repeated_exits_delay_the_restart_and_then_give_up() {
+    fn repeated_exits_delay_the_restart_up_to_half_a_minute() {
         let mut process = supervised();
         let mut now = Instant::now();
-        let mut pauses = Vec::new();
-        while process.state != State::GivenUp {
-            let message = process.on_exit(&failure(1), now);
-            if let State::Waiting(at) = process.state {
-                pauses.push(at - now);
-                now = at;
-            } else {
-                assert!(message.contains("given up"), "{message}");
-            }
+        let (mut pauses, mut told) = (Vec::new(), Vec::new());
+        for _ in 0..9 {
+            process.started = now;
+            now += Duration::from_millis(100);
+            told.push(process.on_exit(&failure(1), now));
+            let State::Waiting(at) = process.state else { panic!("{:?}", process.state) };
+            pauses.push(at - now);
+            now = at;
         }
         let half_seconds: Vec<_> = pauses.iter().map(|p| p.as_millis() / 500).collect();
-        assert_eq!(half_seconds, [1, 2, 4, 8, 16]);
+        assert_eq!(half_seconds, [1, 2, 4, 8, 16, 60, 60, 60, 60]);
+        assert!(process.is_out());
+        let news: Vec<_> = (0..).zip(&told).filter(|(_, it)| it.contains("from now on")).collect();
+        assert!(news.len() == 1 && news[0].0 == 5, "{told:#?}");
+        // It has run again for a while.
+        process.started = now;
+        now += PERIOD;
+        process.on_exit(&failure(1), now);
+        assert_eq!(process.state, State::Waiting(now + MIN_PAUSE));
+        assert!(!process.is_out());
     }
 
     #[test]
@@ -493,6 +531,7 @@ mod tests {
         let mut process = supervised();
         let message = process.on_exit(&failure(WRONG_USE), Instant::now());
         assert_eq!(process.state, State::GivenUp);
+        assert!(process.is_out());
         assert!(message.contains("cannot run"), "{message}");
     }
 }
