@@ -402,6 +402,13 @@ fn a_dry_run_says_what_would_be_run_and_a_mistake_is_named() -> anyhow::Result<(
     ensure!(commands == ["relay", "simulator", "detector", "controller"], "{text}");
     let output = alight(folder.path(), &["up", "relay", "--dry-run"])?;
     ensure!(output.status.success(), "{output:?}");
+    // A command is taken by a shell as it is, anywhere.
+    let own = r#"local = [{ command = ["sh", "-c", "echo it\\'s > said"] }]"#;
+    std::fs::write(folder.path().join("site.toml"), own)?;
+    let output = alight(folder.path(), &["up", "local", "--dry-run"])?;
+    let pasted = output_of(Command::new("sh").arg("-c").arg(String::from_utf8(output.stdout)?))?;
+    ensure!(pasted.status.success(), "{pasted:?}");
+    ensure!(std::fs::read_to_string(folder.path().join("said"))? == "it's\n");
     let set = "\"source.command=['no-such-camera']\", \"source.size_px=[64, 48]\"";
     let camera = format!("[[local]]\nrun = 'camera-pub'\nset = [{set}]\n");
     std::fs::write(folder.path().join("site.toml"), camera)?;

@@ -170,7 +170,7 @@ pub(crate) fn this_command() -> String {
 }
 
 /// A text as a shell takes it for one word.
-fn word(text: &str) -> String {
+pub(crate) fn word(text: &str) -> String {
     // Only a zero byte cannot be quoted, and no argument has one.
     shlex::try_quote(text).map_or_else(|_| text.to_owned(), Cow::into_owned)
 }

@@ -15,7 +15,7 @@ use node::Shutdown;
 use tokio::process::Command;
 use tokio::time::Instant;
 
-use crate::children::{ChildEvent, Children, Exit, Reach, without_network};
+use crate::children::{ChildEvent, Children, Exit, Reach, for_shell, without_network, word};
 use crate::notes::{Note, Notes};
 use crate::peers::{Peers, Replacement, STALE_AFTER};
 use crate::programs::{OWN_PROGRAM, missing, missing_of_service};
@@ -54,8 +54,14 @@ pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
     let site = Site::read(&args.config)?;
     let jobs = site.jobs(args.role)?;
     if args.dry_run {
+        // What a site names is relative to its folder.
+        let is_here = std::env::current_dir().is_ok_and(|here| here == site.folder);
+        let go_there = match is_here {
+            true => String::new(),
+            false => format!("cd {} && ", for_shell(&site.folder)),
+        };
         for job in &jobs {
-            say(&by_hand(job));
+            say(&format!("{go_there}{}", by_hand(job)));
         }
     }
     let search = std::env::var_os("PATH").unwrap_or_default();
@@ -94,19 +100,15 @@ fn say(line: &str) {
     drop(print(line));
 }
 
-/// The equivalent command line.
+/// The equivalent command line for a shell in the site's folder.
 fn by_hand(job: &Job) -> String {
     let environment = job.network.environment();
-    let environment: Vec<_> = environment
+    let environment = environment
         .iter()
-        .map(|(name, value)| format!("{name}={}", value.to_string_lossy()))
-        .collect();
-    let arguments = arguments(job).into_iter().map(|argument| {
-        let plain = |c: char| c.is_ascii_alphanumeric() || "-_./:,".contains(c);
-        if argument.chars().all(plain) { argument } else { format!("'{argument}'") }
-    });
-    let command: Vec<_> = arguments.collect();
-    format!("{} {}", environment.join(" "), command.join(" "))
+        .map(|(name, value)| format!("{name}={}", word(&value.to_string_lossy())));
+    let arguments = arguments(job).into_iter().map(|argument| word(&argument));
+    let words: Vec<_> = environment.chain(arguments).collect();
+    words.join(" ")
 }
 
 /// The program and its arguments.
@@ -472,6 +474,27 @@ mod tests {
             layers: node::Layers::default(),
         };
         Supervised::new(job)
+    }
+
+    #[test]
+    fn the_command_by_hand_is_for_a_shell() {
+        let mut job = supervised().job;
+        job.network.keys = Some("/etc/alight/my keys".into());
+        job.layers.file = Some("/etc/alight/it's.toml".into());
+        job.layers.set = vec!["markers=[\"rings:0.15\"]".to_owned()];
+        let expected = [
+            "ALIGHT_KEYS=/etc/alight/my keys",
+            "alight",
+            "detector",
+            "--config",
+            "/etc/alight/it's.toml",
+            "--set",
+            "markers=[\"rings:0.15\"]",
+        ];
+        let line = by_hand(&job);
+        assert_eq!(shlex::split(&line).unwrap(), expected);
+        // The variable's name is outside of the quotes, or it would be a command.
+        assert!(line.starts_with("ALIGHT_KEYS='/etc"), "{line}");
     }
 
     fn failure(status: i32) -> Exit {
