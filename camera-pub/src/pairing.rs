@@ -38,6 +38,8 @@ pub(crate) struct Pairing {
     /// Time from a frame's stamp to its arrival; `None` until frames and records agree.
     delay_ns: Option<i64>,
     candidate: Option<Candidate>,
+    /// For so many frames only a record with the frame's own number is its: one did not have the known delay of late.
+    doubtful: u32,
     impossible: u32,
 }
 
@@ -45,7 +47,7 @@ pub(crate) struct Pairing {
 #[derive(Copy, Clone)]
 struct Numbered {
     number: i64,
-    /// The frame in which it was read.
+    /// The frame in which, or just before which, it was read.
     read_in: i64,
     metadata: Metadata,
 }
@@ -95,15 +97,19 @@ impl Pairing {
             waiting: Vec::new(),
             delay_ns: None,
             candidate: None,
+            doubtful: 0,
             impossible: 0,
         }
     }
 
-    /// No frame has begun to arrive since the last one ended: until it is known which record is whose, those that are
-    /// there are not of the next one.
+    /// No frame has begun to arrive since the last one ended: the records that are there are not of the next one, as programs write
+    /// them after their frames.
     pub(crate) fn forget_unmatched(&mut self) {
         if self.delay_ns.is_none() {
             self.waiting.clear();
+        }
+        for record in &mut self.waiting {
+            record.read_in = record.read_in.min(self.frames - 1);
         }
     }
 
@@ -150,8 +156,12 @@ impl Pairing {
                 self.delay_ns = Some(known_ns + (placed.delay_ns - known_ns) / DELAY_WEIGHT);
                 self.shift = placed.number - self.frames;
                 self.candidate = None;
+                self.doubtful = 0;
             }
-            None => self.learn(arrival_ns),
+            None => {
+                self.doubtful = self.doubtful.saturating_sub(1);
+                self.learn(arrival_ns);
+            }
         }
         match matching {
             Some(placed) => {
@@ -173,6 +183,7 @@ impl Pairing {
     pub(crate) fn skip_frame(&mut self) {
         self.frames += 1;
         self.candidate = None;
+        self.doubtful = AGREEING_FRAMES;
     }
 
     /// The record that belongs to the frame, if there is no doubt.
@@ -182,8 +193,7 @@ impl Pairing {
             // The records of two frames are a period apart. A number that agrees settles what is nearly half of it off.
             let is_next = placed.number - self.frames == self.shift;
             let max_ns = if is_next { self.period_ns / 5 * 2 } else { self.period_ns / 4 };
-            // One that was there before the frame is of an earlier one: programs write it after the frame.
-            let may_be_its = is_next || placed.read_in >= self.frames;
+            let may_be_its = placed.read_in >= self.frames && (is_next || self.doubtful == 0);
             may_be_its && (placed.delay_ns - known_ns).abs() <= max_ns
         };
         let mut found = self.possible(arrival_ns).filter(of_frame);
@@ -208,12 +218,15 @@ impl Pairing {
     /// given up for another.
     fn learn(&mut self, arrival_ns: i64) {
         let is_alone = self.waiting.len() == 1 || self.delay_ns.is_some();
-        let own = |placed: &Placed| placed.number - self.frames == self.shift;
+        let own = |placed: &Placed| {
+            placed.number - self.frames == self.shift && placed.read_in >= self.frames
+        };
         let own = self.possible(arrival_ns).find(own).filter(|_| is_alone);
         let Some(placed) = own else {
             self.candidate = None;
             return;
         };
+        self.doubtful = AGREEING_FRAMES;
         let agreeing = self
             .candidate
             .filter(|candidate| (placed.delay_ns - candidate.delay_ns).abs() <= self.period_ns / 4);
@@ -475,6 +488,24 @@ mod tests {
             late_ns in prop::collection::vec(
                 prop_oneof![8 => 0..4 * MS, 1 => 0..25 * MS], 80..81),
         ) {
+            let outcome = Stream { late_ns, lines }.read();
+            prop_assert_eq!(outcome.wrong(), 0, "{:?}", outcome.errors_ns);
+        }
+
+        /// From a frame on all are later, or sooner, but not so that it comes with the one before; and a line is damaged.
+        #[test]
+        fn no_frame_has_the_stamp_of_another_while_the_delay_changes(
+            fault in (0_usize..80, any_line()),
+            mut late_ns in prop::collection::vec(0..4 * MS, 80..81),
+            step in (10_usize..60, -28..60_i64),
+        ) {
+            let (from, step_ms) = step;
+            for (n, late_ns) in late_ns.iter_mut().enumerate() {
+                *late_ns += (step_ms * MS).max(0) * i64::from(n >= from);
+                *late_ns += (-step_ms * MS).max(0) * i64::from(n < from);
+            }
+            let mut lines = vec![Line::Good; 80];
+            lines[fault.0] = fault.1;
             let outcome = Stream { late_ns, lines }.read();
             prop_assert_eq!(outcome.wrong(), 0, "{:?}", outcome.errors_ns);
         }
