@@ -67,7 +67,10 @@ impl MarkerExposure {
         }
         let pad = self.track.at(stamp_ns);
         let is_metered = self.handover.meters_pad(stamp_ns, pad.is_some());
-        let Some(pad) = pad.filter(|_| is_metered) else { return Order::OwnMetering };
+        let Some(pad) = pad.filter(|_| is_metered) else {
+            self.control = ExposureControl::default();
+            return Order::OwnMetering;
+        };
         if !exposed.is_taken_over {
             return Order::TakeOver;
         }

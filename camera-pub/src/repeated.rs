@@ -1,8 +1,9 @@
 //! A source that repeats its last picture as a new frame: a frame grabber without a signal, a player at a constant rate, a stream whose
 //! camera hangs. Such a frame is not of the time that it says.
 //!
-//! No two pictures of a camera are alike to the last bit, as its noise differs. A source that has only ever given one picture shows a
-//! still one, as on a bench.
+//! No two pictures of a sensor are alike to the last bit, as its noise differs; but those without any structure may be, in the dark or in
+//! the sun, and a coded video of a scene that does not move. A source that has only ever given one picture shows a still one, as on a
+//! bench.
 
 use std::time::{Duration, Instant};
 
@@ -42,7 +43,7 @@ impl Pictures {
             self.is_stuck = false;
             return Picture::New;
         };
-        if !self.has_changed {
+        if !self.has_changed || is_plain(samples) {
             return Picture::New;
         }
         if self.is_stuck || now.saturating_duration_since(since) < MIN_STUCK {
@@ -51,6 +52,11 @@ impl Pictures {
         self.is_stuck = true;
         Picture::Stuck
     }
+}
+
+/// Whether all samples are alike.
+fn is_plain(samples: &[u8]) -> bool {
+    samples.first().is_none_or(|first| samples.iter().all(|sample| sample == first))
 }
 
 #[cfg(test)]
@@ -62,7 +68,9 @@ mod tests {
         let start = Instant::now();
         let mut pictures = Pictures::default();
         let mut add = |grey: u8, at_ms: u64| {
-            pictures.add(&[grey; 3072], start + Duration::from_millis(at_ms))
+            let mut samples = [grey; 3072];
+            samples[0] = 200;
+            pictures.add(&samples, start + Duration::from_millis(at_ms))
         };
         // A still picture, which a camera gives as well before it runs.
         assert_eq!([0, 500, 5000].map(|ms| add(1, ms)), [Picture::New; 3]);
@@ -73,7 +81,12 @@ mod tests {
         assert_eq!((add(3, 9100), add(3, 10_100)), (Picture::New, Picture::Stuck));
         // One sample of them differs.
         let mut samples = [3; 3072];
-        samples[3071] = 4;
+        (samples[0], samples[3071]) = (200, 4);
         assert_eq!(pictures.add(&samples, start), Picture::New);
+        assert_eq!(pictures.add(&samples, start), Picture::Repeated);
+        // In the dark.
+        for _ in 0..3 {
+            assert_eq!(pictures.add(&[0; 3072], start), Picture::New);
+        }
     }
 }

@@ -650,7 +650,8 @@ impl Stream {
         if picture == Picture::Stuck && self.health.failed("camera repeats one picture") {
             tracing::warn!(
                 "The camera gives the same picture, to the last bit, since a second; it is not published again until another \
-                 comes. Is its signal gone, or does what plays it hang? Still pictures are published from `source.paths`"
+                 comes. Its signal is gone, or what plays it hangs; a coded video of a scene that does not move may do so as well. \
+                 Still pictures are published from `source.paths`"
             );
         }
     }

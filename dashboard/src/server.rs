@@ -582,14 +582,13 @@ impl Client {
         tokio::spawn(async move {
             let reply = app.node.command(topic::COMMAND, &[], &command).await;
             // One that is not answered may have been carried out.
-            let (verdict, who, reason) = match reply {
+            let (accepted, verdict, who, reason) = match reply {
                 Ok(reply) if reply.accepted => {
-                    ("accepted by the controller", "controller", reply.reason)
+                    (true, "accepted by the controller", "controller", reply.reason)
                 }
-                Ok(reply) => ("refused by the controller", "controller", reply.reason),
-                Err(problem) => ("no answer", NOBODY, format!("{problem:#}")),
+                Ok(reply) => (false, "refused by the controller", "controller", reply.reason),
+                Err(problem) => (false, "no answer", NOBODY, format!("{problem:#}")),
             };
-            let accepted = verdict.starts_with("accepted");
             app.node.health().count("commands");
             let level = if accepted { Level::Info } else { Level::Warn };
             tracing::info!(command = whole, verdict, reason, "A browser's command");
