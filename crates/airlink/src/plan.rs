@@ -261,9 +261,11 @@ fn roi_part(roi: Roi, size: FrameSize, scale: u32) -> Option<FramePart> {
     (width > 0 && height > 0).then_some(FramePart { x, y, width, height, scale, bytes: 0 })
 }
 
-/// The tile of a grid whose turn it is, with its overlap.
+/// The tile of a grid whose turn it is, with its overlap: by multiples of the golden ratio, of which every second or third comes to
+/// all of them as well, where a detector searches no more (Knuth, The Art of Computer Programming 3, 6.4).
 fn tile(size: FrameSize, Grid { columns, rows }: Grid, count: u32) -> Option<FramePart> {
-    let number = count % (columns * rows);
+    let share = u64::from(count.wrapping_mul(2_654_435_769));
+    let number = ((share * u64::from(columns * rows)) >> 32) as u32;
     let (column, row) = (number % columns, number / columns);
     let span = |edge: u32, number: u32, at: u32| {
         let from = (edge * at / number).saturating_sub(OVERLAP_PX / 2) / BLOCK * BLOCK;
@@ -333,7 +335,7 @@ mod tests {
     fn without_a_marker_the_frame_is_sent_tile_by_tile() {
         let mut planner = planner(Mode::Roi);
         let mut is_sent = vec![false; (SIZE.width * SIZE.height) as usize];
-        for _ in 0..16 {
+        for _ in 0..32 {
             let plan = planner.plan(SIZE, None, 50_000);
             let part = plan.parts[0];
             assert!((plan.quality, part.scale, plan.parts.len()) == (75, 1, 2), "{plan:?}");
@@ -344,6 +346,25 @@ mod tests {
         }
         assert!(is_sent.iter().all(|is_sent| *is_sent));
         assert!(planner.plan(SIZE, None, 300_000).parts.is_empty());
+    }
+
+    #[test]
+    fn a_detector_that_searches_every_few_frames_comes_to_all_tiles() {
+        for grid in GRIDS {
+            let all = grid.columns * grid.rows;
+            for every in 1..=6 {
+                let searched = (0..4 * all * every).step_by(every as usize);
+                let tiles = searched.filter_map(|count| tile(SIZE, grid, count));
+                let places: std::collections::BTreeSet<_> = tiles.map(|t| (t.x, t.y)).collect();
+                assert_eq!(
+                    places.len(),
+                    all as usize,
+                    "{} x {}, every {every}",
+                    grid.columns,
+                    grid.rows
+                );
+            }
+        }
     }
 
     #[test]

@@ -86,13 +86,19 @@ impl RoiPredictor {
             }
         }
         for detection in sound() {
+            let may_be_wanted = self.marker.as_ref().is_none_or(|it| detection.may_be_of(it));
             let is_known = self.tracks.iter().any(|track| track.is_of(detection));
+            if !is_known && may_be_wanted && self.tracks.len() == MAX_TRACKS {
+                // The landing's marker takes the place of another.
+                let other = self.tracks.iter().position(|track| !track.may_be_wanted);
+                other.map(|at| self.tracks.swap_remove(at));
+            }
             if !is_known && self.tracks.len() < MAX_TRACKS {
                 self.tracks.push(Track {
                     detector: message.detector.clone(),
                     family: detection.family.clone(),
                     id: detection.id,
-                    may_be_wanted: self.marker.as_ref().is_none_or(|it| detection.may_be_of(it)),
+                    may_be_wanted,
                     stamp_ns,
                     centre_px: detection.centre_px,
                     size_px: detection.size_px,
@@ -287,6 +293,20 @@ mod tests {
             predictor.update(&of(&[tag, both]));
             assert_eq!(predictor.roi(0).is_some(), sees_both, "{marker}");
         }
+    }
+
+    #[test]
+    fn the_landings_marker_has_a_track_beside_any_number_of_others() {
+        let mut predictor = RoiPredictor::default();
+        predictor.follow(&ControllerStatus { marker: "rings:20".into(), ..Default::default() });
+        let of = |ids: std::ops::RangeInclusive<u32>| {
+            let at = |id: u32| (id, [50.0 * f64::from(id), 500.0], 40.0);
+            detections(0, &ids.map(at).collect::<Vec<_>>())
+        };
+        predictor.update(&of(1..=12));
+        assert!(predictor.roi(0).is_none());
+        predictor.update(&of(1..=20));
+        assert!(contains(predictor.roi(0).unwrap(), [1000.0, 500.0]));
     }
 
     #[test]
