@@ -97,13 +97,17 @@ impl ExposureControl {
         if black > MAX_FLAT && is_flat {
             return None;
         }
-        let step = if GOOD.contains(&white) { 1.0 } else { self.damped(brightness(seen.levels)) };
+        let step = if GOOD.contains(&white) {
+            *self = Self::default();
+            1.0
+        } else {
+            self.damped(brightness(seen.levels))
+        };
         let light = seen.setting.light() * step.clamp(1.0 / MAX_STEP, MAX_STEP);
         let next = share(light, seen.motion_px_s, limits);
         let is_sharp = seen.setting.exposure_s <= LONGER * next.exposure_s;
         let is_long = seen.setting.exposure_s >= SHORTER * next.exposure_s;
         if step == 1.0 && is_sharp && is_long {
-            *self = Self::default();
             return None;
         }
         let is_same = |now: f64, next: f64| (next / now - 1.0).abs() < MIN_CHANGE;

@@ -100,7 +100,10 @@ impl Exposing {
     fn for_pad(&mut self, stamp_ns: i64, frame: GrayView<'_>) -> Option<Setting> {
         let pad = self.track.at(stamp_ns);
         let is_metered = self.handover.meters_pad(stamp_ns, pad.is_some());
-        let Some(pad) = pad.filter(|_| is_metered) else { return Some(self.by_mean(frame)) };
+        let Some(pad) = pad.filter(|_| is_metered) else {
+            self.control = ExposureControl::default();
+            return Some(self.by_mean(frame));
+        };
         let (setting, motion_px_s) = (self.setting, pad.motion_px_s);
         let levels = levels(frame, &pad)?;
         self.control.next(&Seen { setting, levels, motion_px_s }, &self.limits)
