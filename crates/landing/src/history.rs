@@ -18,8 +18,10 @@ const MAX_GAP_S: f64 = 0.5;
 const JUMP_M: f64 = 0.1;
 const JUMP_M_S: f64 = 0.5;
 /// Maximum gap over which a jump is told from a change of the velocity, in seconds: a vehicle that brakes by 2 m/s in a longer one has
-/// moved by metres less than the mean of its velocities says.
+/// moved by metres less than the mean of its velocities says. Over a longer one only what no velocity explains is a jump: the
+/// larger of the two, and so much more, in m/s.
 const MAX_JUMP_GAP_S: f64 = 1.0;
+const MARGIN_M_S: f64 = 1.0;
 
 /// The vehicle's latest states, in the order of their stamps.
 #[derive(Clone, Debug)]
@@ -182,14 +184,16 @@ fn turn_rate(earlier: &VehicleState, later: &VehicleState) -> Vector<Body> {
 }
 
 /// The jump of the autopilot's position between two states: the part of the displacement that its velocity
-/// does not explain, when that is large. `None` over a long gap, in which the velocity may have been any.
+/// does not explain, when that is large.
 pub(crate) fn jump(earlier: &VehicleState, later: &VehicleState) -> Option<Vector<Ned>> {
     let gap_s = later.stamp.seconds_since(earlier.stamp);
-    if gap_s > MAX_JUMP_GAP_S {
-        return None;
-    }
     let expected = (earlier.velocity + later.velocity) * (0.5 * gap_s);
-    let difference = later.position - earlier.position - expected;
+    let moved = later.position - earlier.position;
+    let difference = moved - expected;
+    if gap_s > MAX_JUMP_GAP_S {
+        let max_m_s = libm::fmax(earlier.velocity.norm(), later.velocity.norm()) + MARGIN_M_S;
+        return (moved.norm() > JUMP_M + max_m_s * gap_s).then_some(difference);
+    }
     (difference.norm() > JUMP_M + JUMP_M_S * gap_s).then_some(difference)
 }
 
@@ -235,6 +239,23 @@ mod tests {
         assert!(at(&history, 1.5).is_none(), "a gap of a second");
         assert!((at(&history, 2.05).unwrap().position.x() - 1.05).abs() < 1e-9);
         assert!(at(&history, 2.2).is_none());
+    }
+
+    /// Over a long gap a vehicle may have braked; a new origin is further than it flies.
+    #[test]
+    fn over_a_long_gap_only_what_no_velocity_explains_is_a_jump() {
+        let at = |seconds: f64, down_m: f64, down_m_s: f64| VehicleState {
+            position: Point::new(0.0, 0.0, down_m),
+            velocity: Vector::new(0.0, 0.0, down_m_s),
+            ..state(seconds, 0.0, 0.0)
+        };
+        let jump_m = |earlier: (f64, f64), gap_s: f64, later: (f64, f64)| {
+            let (earlier, later) = (at(0.0, earlier.0, earlier.1), at(gap_s, later.0, later.1));
+            jump(&earlier, &later).map(|jump| jump.z())
+        };
+        assert_eq!(jump_m((-8.0, 2.0), 8.0, (-5.0, 0.0)), None);
+        assert_eq!(jump_m((-10.0, 0.0), 3.0, (0.0, 0.0)), Some(10.0));
+        assert_eq!(jump_m((-8.0, 0.0), 0.5, (-7.0, 0.0)), Some(1.0));
     }
 
     #[test]

@@ -103,8 +103,8 @@ pub struct Lander {
     retry_to_m: Option<f64>,
     /// What an aborted landing does about its height.
     abort_climb: AbortClimb,
-    /// Since when an aborted vehicle follows what it is asked.
-    asked_since: Option<Timestamp>,
+    /// Since when an aborted vehicle is heard.
+    heard_since: Option<Timestamp>,
     /// Smallest angle from the image's centre to its edge, in radians.
     half_view_rad: Option<f64>,
     /// The expanding square that is being flown.
@@ -153,7 +153,7 @@ impl Lander {
             land_requested: None,
             retry_to_m: None,
             abort_climb: AbortClimb::default(),
-            asked_since: None,
+            heard_since: None,
             half_view_rad: None,
             square: None,
             limits: AutopilotLimits::default(),
@@ -250,9 +250,12 @@ impl Lander {
         Some(SeenPad { pad, height_m: target.height_m })
     }
 
-    /// Ends the landing without another action; a new one may be started.
+    /// Ends the landing without another action, as the autopilot began anew: what is known in its old frame is forgotten. A new one
+    /// may be started.
     pub fn stand_down(&mut self) {
         self.state_machine.stand_down(self.now.unwrap_or_default());
+        self.target_filter = TargetFilter::new(&self.config);
+        (self.resumed, self.ground) = (None, None);
     }
 
     /// The present phase.
@@ -361,8 +364,7 @@ impl Lander {
             let is_recent = now.seconds_since(vehicle.stamp) <= self.config.phases.stale_vehicle_s;
             is_recent && vehicle.velocity.z().abs() > max_m_s
         });
-        // The height over a ground of earlier flights may have drifted, and would never be corrected: beyond a landing, motors that are off
-        // say more.
+        // The height over the ground of an earlier flight may have drifted. Outside of a landing motors that are off correct it.
         let is_old = self.recent_target(now).is_none() && self.phase().is_terminal();
         let is_high = (status.armed || !is_old)
             && self.known_height_m(now).is_some_and(|height_m| height_m > MAX_CONTACT_M);
@@ -603,7 +605,7 @@ impl Lander {
         }
         if self.state_machine.phase() != Phase::Aborted {
             self.abort_climb = AbortClimb::default();
-            self.asked_since = None;
+            self.heard_since = None;
         }
         if !guided && !handing_over && !retrying {
             self.guidance.reset();

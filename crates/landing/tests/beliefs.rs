@@ -327,6 +327,26 @@ fn an_aborted_vehicle_that_cannot_be_asked_does_what_is_configured_once_it_can()
     assert!(!told.has_asked_for_land());
     told.run(0.5, true);
     assert!(told.has_asked_for_land());
+    // By default it climbs, where it is low.
+    let mut told = Told::new(Config::default(), 0.0);
+    told.status.landed = Landed::OnGround;
+    told.run(0.5, true);
+    told.status = FLYING;
+    told.rise(6.0);
+    told.tell(Event::Operator(OperatorCommand::Start));
+    told.pad = Some(Point::origin());
+    while told.position.z() < -1.0 {
+        told.fly(STEP_S);
+    }
+    told.pad = None;
+    told.velocity = Vector::zero();
+    for _ in 0..75 {
+        told.seconds += 1.0;
+        told.tell(Event::Tick);
+    }
+    assert_eq!(told.phase(), Phase::Aborted);
+    told.fly(5.0);
+    assert!((told.position.z() + 2.5).abs() < 0.2, "{:?}", told.position);
 }
 
 #[test]

@@ -53,23 +53,29 @@ impl Lander {
         if self.state_machine.is_recalling() {
             return self.recall(now);
         }
-        let follows = self
+        let is_recent = self
             .history
             .newest()
-            .is_some_and(|state| now.seconds_since(state.stamp) <= phases.stale_vehicle_s)
-            && self.status.is_some_and(|status| status.armed && status.mode == Mode::Guided);
-        if self.state_machine.is_released() || !follows {
+            .is_some_and(|state| now.seconds_since(state.stamp) <= phases.stale_vehicle_s);
+        let status = self.status.filter(|status| is_recent && status.mode != Mode::Unknown);
+        let Some(status) = status else { return Action::None };
+        // One that could not be asked has its time from when it is heard again.
+        self.heard_since.get_or_insert(now);
+        if self.state_machine.is_released() || !status.armed || status.mode != Mode::Guided {
             return Action::None;
         }
-        // A vehicle that could not be asked has its time from then on.
-        let since = *self.asked_since.get_or_insert(now);
-        let elapsed_s = now.seconds_since(since);
+        let elapsed_s = self.heard_s(now);
         match phases.on_abort {
             OnAbort::Hover => self.hover_aborted(now),
             OnAbort::Land if elapsed_s <= phases.land_timeout_s => self.request_land(now),
             OnAbort::Climb if elapsed_s <= CLIMB_AWAY_S => self.climb_away(now),
             OnAbort::Land | OnAbort::Climb => Action::None,
         }
+    }
+
+    /// For how long the aborted vehicle has been heard, in seconds.
+    fn heard_s(&self, now: Timestamp) -> f64 {
+        self.heard_since.map_or(0.0, |since| now.seconds_since(since))
     }
 
     /// Requests the mode that follows setpoints, at once and at intervals.
@@ -85,7 +91,7 @@ impl Lander {
     /// drifts onto the ground. One that may stand is not lifted, until it moves.
     fn hover_aborted(&mut self, now: Timestamp) -> Action {
         let missing_m = self.missing_after_abort(now);
-        let is_late = self.state_machine.elapsed_s(now) > CLIMB_AWAY_S;
+        let is_late = self.heard_s(now) > CLIMB_AWAY_S;
         self.abort_climb = match self.abort_climb {
             AbortClimb::Hovers { since, .. }
                 if now.seconds_since(since) > self.config.phases.release_after_s =>
