@@ -24,7 +24,7 @@ use crate::config::{Config, Mode, Start};
 use crate::control::{is_holding_px4, pilots_px4_mode};
 use crate::frames::{Arrival, Frames};
 use crate::journal::Journal;
-use crate::landing_target::{self, LandingTargetMode};
+use crate::landing_target::{self, Distrust, LandingTargetMode};
 use crate::limits::{Limits, Note};
 use crate::mission::{Mission, Trigger, is_flying_guided};
 use crate::offboard_watch::OffboardWatch;
@@ -255,7 +255,7 @@ impl Flight {
                 Alarm::BatteryLow => phases.on_battery_low == AlarmAction::Land,
                 Alarm::AutopilotLost | Alarm::OperatorLost => false,
             };
-            if !is_to_land {
+            if !is_to_land || !is_flying_guided(&self.autopilot) {
                 return;
             }
             // It lands at once, whatever keeps it from being led to a marker.
@@ -323,13 +323,16 @@ impl Flight {
         }
     }
 
+    /// Why the autopilot's own landing gets no target.
+    fn distrust(&self) -> Option<Distrust> {
+        self.landing_target.as_ref().and_then(|_| self.view().distrust())
+    }
+
     fn send_landing_target(&mut self, now_ns: i64, frame: &FrameObservation) {
         let target = self.decision.and_then(|decision| decision.target);
-        if landing_target::distrust(&self.lander, target.as_ref(), self.is_disputed).is_some() {
-            return;
-        }
+        let distrust = self.distrust();
         if let Some(landing_target) = &mut self.landing_target
-            && landing_target.send(now_ns, frame, target, &mut self.autopilot)
+            && landing_target.send(now_ns, frame, target, distrust.as_ref(), &mut self.autopilot)
         {
             self.journal.count("landing targets");
             self.journal.used_frame(now_ns, frame.stamp.nanos());
@@ -341,7 +344,11 @@ impl Flight {
         let camera = info.camera.clone();
         match self.frames.add_camera(now_ns, info, self.is_landing()) {
             Reception::Known => {}
-            Reception::Replaced(difference) => self.journal.camera_replaced(&camera, &difference),
+            Reception::Replaced(difference) => {
+                self.journal.camera_replaced(&camera, &difference);
+                // It may be mounted rightly now.
+                self.lander.repeat_axis_check();
+            }
             Reception::Refused(reason, _) => self.journal.reject_camera(reason),
         }
     }
@@ -524,6 +531,11 @@ impl Flight {
                     .into(),
             );
         }
+        if let Some(mismatch) = self.lander.axis_mismatch() {
+            // As after a hold for it, the operator who goes on has it looked at again.
+            self.lander.repeat_axis_check();
+            return Err(format!("no landing was started: {mismatch}; a second start begins it"));
+        }
         self.begin(now_ns);
         let (phase, why) = self.view().phase(now_ns);
         Ok(format!("in phase `{phase}`: {why}"))
@@ -615,17 +627,15 @@ impl Flight {
         self.alarms.begin();
         self.mission.begin(now_ns, self.landing_target.is_some());
         match &mut self.landing_target {
-            Some(landing_target) => {
-                self.lander.repeat_axis_check();
-                landing_target.begin(now_ns, is_holding_px4(&self.autopilot));
-            }
+            Some(landing_target) => landing_target.begin(now_ns, is_holding_px4(&self.autopilot)),
             None => self.decide(now_ns, LanderEvent::Operator(OperatorCommand::Start)),
         }
     }
 
     fn advance_mission(&mut self, now_ns: i64) {
+        let (may_recall, distrust) = (self.lander.may_recall(), self.distrust());
         if let Some(landing_target) = &mut self.landing_target
-            && landing_target.step(now_ns, self.lander.may_recall(), &mut self.autopilot)
+            && landing_target.step(now_ns, may_recall, distrust.as_ref(), &mut self.autopilot)
             && !self.mission.is_sending_landing_target()
         {
             // Somebody else began it; it is followed like our own.

@@ -74,14 +74,21 @@ impl LandingTargetMode {
         Self { settings, timeout_s, stream: None, state: State::Idle, from_hold: false }
     }
 
-    /// Sends the landing target of a frame that was used; false when there is nothing to send.
+    /// Sends the landing target of a frame that was used; false when there is nothing to send. One that there is `distrust` in is not
+    /// sent, but low in the autopilot's landing, which without it goes on to the ground all the same.
     pub fn send(
         &mut self,
         now_ns: i64,
         frame: &FrameObservation,
         target: Option<TargetEstimate>,
+        distrust: Option<&Distrust>,
         autopilot: &mut Autopilot,
     ) -> bool {
+        let lands_low =
+            self.state == State::Landing && distrust.is_some_and(|distrust| !distrust.may_recall);
+        if distrust.is_some() && !lands_low {
+            return false;
+        }
         let vehicle = autopilot.state().and_then(wire::vehicle);
         let (Some(target), Some(vehicle)) = (target, vehicle) else { return false };
         let detected = frame.marker.and_then(|marker| marker.body_from_marker);
@@ -109,8 +116,14 @@ impl LandingTargetMode {
     }
 
     /// Follows what the autopilot does; true when it has just begun to land, whoever requested it. Only while it `may_recall` is the
-    /// vehicle so high that it is taken back from landing.
-    pub fn step(&mut self, now_ns: i64, may_recall: bool, autopilot: &mut Autopilot) -> bool {
+    /// vehicle so high that it is taken back from landing; `distrust` is why no target is sent.
+    pub fn step(
+        &mut self,
+        now_ns: i64,
+        may_recall: bool,
+        distrust: Option<&Distrust>,
+        autopilot: &mut Autopilot,
+    ) -> bool {
         let Some(state) = autopilot.state().copied() else { return false };
         let lands = state.armed && state.mode.is_landing();
         match self.state.clone() {
@@ -154,7 +167,7 @@ impl LandingTargetMode {
             }
             State::Stabilising(since_ns) => {
                 hover_in_offboard(now_ns, autopilot);
-                self.command_when_steady(now_ns, since_ns, autopilot);
+                self.command_when_steady(now_ns, since_ns, distrust, autopilot);
             }
             State::Commanding(request) => {
                 hover_in_offboard(now_ns, autopilot);
@@ -176,7 +189,13 @@ impl LandingTargetMode {
         why
     }
 
-    fn command_when_steady(&mut self, now_ns: i64, since_ns: i64, autopilot: &mut Autopilot) {
+    fn command_when_steady(
+        &mut self,
+        now_ns: i64,
+        since_ns: i64,
+        distrust: Option<&Distrust>,
+        autopilot: &mut Autopilot,
+    ) {
         let mode = autopilot.firmware().and_then(Firmware::precision_land);
         let waited_s = now_ns.saturating_sub(since_ns) as f64 * 1e-9;
         if self.is_steady(now_ns)
@@ -185,7 +204,8 @@ impl LandingTargetMode {
         {
             self.state = State::Commanding(autopilot.request(now_ns, Command::SetMode(mode)));
         } else if waited_s > self.timeout_s {
-            self.state = State::Ended(problem(autopilot).unwrap_or_else(|| {
+            let distrusted = distrust.map(|distrust| distrust.why.clone());
+            self.state = State::Ended(problem(autopilot).or(distrusted).unwrap_or_else(|| {
                 format!("no marker without gaps for {waited_s:.0} s; hovering")
             }));
         }
@@ -294,20 +314,26 @@ fn hover_mode(autopilot: &Autopilot) -> FlightMode {
     }
 }
 
-/// Why the target is not one that an autopilot may land on: what keeps our own guidance from descending, which the autopilot cannot know.
+/// Why the autopilot gets no target: what keeps our own guidance from descending, which the autopilot cannot know.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Distrust {
+    /// The reason.
+    pub why: String,
+    /// The vehicle is so high that it could be taken back from landing.
+    pub may_recall: bool,
+}
+
+/// Whether a target is one that the autopilot may land on; `is_disputed` says that detectors see the marker at two places.
 pub fn distrust(
     lander: &Lander,
     target: Option<&TargetEstimate>,
     is_disputed: bool,
-) -> Option<String> {
-    if let Some(mismatch) = lander.axis_mismatch() {
-        return Some(mismatch.to_string());
-    }
-    if is_disputed {
-        return Some(Reason::Disputed.to_string());
-    }
+) -> Option<Distrust> {
     let is_ambiguous = target.is_some_and(|target| target.ambiguous);
-    is_ambiguous.then(|| Reason::Ambiguous.to_string())
+    let mismatch = lander.axis_mismatch();
+    let dispute = is_disputed.then_some(Reason::Disputed);
+    let why = mismatch.or(dispute).or(is_ambiguous.then_some(Reason::Ambiguous))?;
+    Some(Distrust { why: why.to_string(), may_recall: lander.may_recall() })
 }
 
 /// What keeps this autopilot from using landing targets, and what to do about it.

@@ -7,7 +7,7 @@ use messages::{ControllerStatus, Phase, Setpoint, TargetEstimate};
 use crate::config::{Config, GuidanceName, Mode, Start};
 use crate::frames::Frames;
 use crate::journal::Journal;
-use crate::landing_target::{self, LandingTargetMode};
+use crate::landing_target::{self, Distrust, LandingTargetMode};
 use crate::limits;
 use crate::mission::{Mission, State};
 use crate::mount;
@@ -124,9 +124,7 @@ impl View<'_> {
                 State::Idle | State::AwaitingTakeoff | State::SendingLandingTarget,
                 Some(landing_target),
             ) => {
-                let target = self.decision.and_then(|decision| decision.target);
-                let is_disputed = self.frames.selection.dispute().is_some();
-                let distrust = landing_target::distrust(self.lander, target.as_ref(), is_disputed);
+                let distrust = self.distrust().map(|distrust| distrust.why);
                 let problem = landing_target::problem(self.autopilot).or(distrust);
                 landing_target.phase(now_ns, problem)
             }
@@ -154,6 +152,14 @@ impl View<'_> {
             (State::Failed { why }, _) => (Phase::Failed, why.clone()),
             (State::Landing, _) => (wire::phase(self.lander.phase()), self.reason(now_ns)),
         }
+    }
+
+    /// Why the autopilot's own landing gets no target.
+    pub fn distrust(&self) -> Option<Distrust> {
+        let is_off = self.config.phases.dispute_height_m == 0.0;
+        let is_disputed = !is_off && self.frames.selection.dispute().is_some();
+        let target = self.decision.and_then(|decision| decision.target);
+        landing_target::distrust(self.lander, target.as_ref(), is_disputed)
     }
 
     /// Whether a landing was to be resumed, and the motors of a vehicle run that is said to stand.
