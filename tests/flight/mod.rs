@@ -40,7 +40,7 @@ pub(crate) const LONG: [&str; 6] = [
 ];
 pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 
-/// Landings with the small camera that keep their time on two processors: they need half of theirs.
+/// Landings with the small camera that keep their time on two processors: they need half of the processors.
 const MAX_AT_ONCE: u32 = 6;
 static FLIGHTS: Semaphore = Semaphore::const_new(MAX_AT_ONCE as usize);
 
