@@ -43,8 +43,13 @@ impl Notes {
             }
             is_ours
         });
+        Self::kept_in(directory.as_deref(), name)
+    }
+
+    /// The same in this directory; none are kept without one.
+    pub(crate) fn kept_in(directory: Option<&Path>, name: &str) -> Self {
         let note = |what: &str| {
-            let file = directory.as_ref().map(|it| it.join(format!("alight-{name}.{what}")));
+            let file = directory.map(|it| it.join(format!("alight-{name}.{what}")));
             Note { file }
         };
         Self { running: note("running"), landing: note("landing") }
@@ -70,6 +75,14 @@ impl Note {
         if let Err(problem) = written {
             tracing::warn!(%problem, ?file, "Note for the case of a crash not written");
         }
+    }
+
+    /// Writes it as if that was a while ago.
+    #[cfg(test)]
+    pub(crate) fn write_aged(&self, clock: &str, age: Duration) {
+        let stamp_ns = now_ns() - i64::try_from(age.as_nanos()).unwrap();
+        let content = Content { clock: clock.into(), stamp_ns };
+        std::fs::write(self.file.as_ref().unwrap(), serde_json::to_vec(&content).unwrap()).unwrap();
     }
 
     /// Removes it.
@@ -121,9 +134,7 @@ mod tests {
         note.write();
         assert!(note.age().unwrap() < Duration::from_secs(60));
         let age_of = |clock: &str, age: Duration| {
-            let stamp_ns = now_ns() - i64::try_from(age.as_nanos()).unwrap();
-            let content = Content { clock: clock.into(), stamp_ns };
-            std::fs::write(&file, serde_json::to_vec(&content).unwrap()).unwrap();
+            note.write_aged(clock, age);
             note.age()
         };
         let long = Duration::from_secs(30);

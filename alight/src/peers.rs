@@ -43,7 +43,8 @@ pub(crate) struct Replacement {
 
 #[derive(Clone, Debug, Default)]
 struct PeerTable {
-    landing: bool,
+    /// When a landing was under way the last time, unless it is over.
+    under_way: Option<Instant>,
     /// The controller's: a detector's name, a place, or nothing.
     preference: String,
     detectors: BTreeMap<String, KnownDetector>,
@@ -64,22 +65,30 @@ impl Peers {
         Self { table: watch::channel(PeerTable::default()).1, session: None }
     }
 
-    /// Follows the peers from now on, and keeps the note of a landing under way.
-    pub(crate) async fn follow(network: &Network, key: &str, note: Note) -> anyhow::Result<Self> {
+    /// Follows the peers from now on, and keeps the note of a landing under way; `under_way` is when one was, by the note before.
+    pub(crate) async fn follow(
+        network: &Network,
+        key: &str,
+        note: Note,
+        under_way: Option<Instant>,
+    ) -> anyhow::Result<Self> {
         let node = Node::open(tool_identity("up"), &network.source(key)?).await?;
         let statuses = node.subscriber(topic::STATUS, &[]).await?;
         let infos = node.subscriber(topic::DETECTOR_INFO, &[]).await?;
         let presence = node.presence("detector").await?;
-        let (sender, table) = watch::channel(PeerTable::default());
+        let (sender, table) = watch::channel(PeerTable { under_way, ..PeerTable::default() });
         let task = tokio::spawn(async move {
-            let mut monitor = LandingMonitor { note, ..LandingMonitor::default() };
+            // The note of before is removed once its landing is over.
+            let mut monitor = LandingMonitor { note, under_way, noted: under_way };
             loop {
                 tokio::select! {
                     Some(status) = statuses.next() => {
-                        let landing = monitor.update(&status, Instant::now());
-                        if sender.borrow().landing != landing {
-                            sender.send_modify(|table| table.landing = landing);
-                        }
+                        let under_way = monitor.update(&status, Instant::now());
+                        // Nobody waits for this: it is looked up when a controller is started.
+                        sender.send_if_modified(|table| {
+                            table.under_way = under_way;
+                            false
+                        });
                         if sender.borrow().preference != status.preference {
                             sender.send_modify(|table| table.preference = status.preference);
                         }
@@ -109,9 +118,9 @@ impl Peers {
         }
     }
 
-    /// Whether a landing is under way.
+    /// Whether a landing is under way, or was a moment ago.
     pub(crate) fn landing(&self) -> bool {
-        self.table.borrow().landing
+        self.table.borrow().landing(Instant::now())
     }
 
     /// The detector that replaces the one with this process number on this host, which has ended; `own` are the numbers of those that
@@ -141,6 +150,11 @@ impl Slot {
 }
 
 impl PeerTable {
+    /// A controller that is dead tells nothing more, so without a status a landing is under way for a while only.
+    fn landing(&self, now: Instant) -> bool {
+        self.under_way.is_some_and(|last| now - last < STALE_AFTER)
+    }
+
     fn info(&self, name: &str) -> Option<&DetectorInfo> {
         self.detectors.get(name)?.info.as_ref()
     }
@@ -218,7 +232,8 @@ struct LandingMonitor {
 }
 
 impl LandingMonitor {
-    fn update(&mut self, status: &ControllerStatus, now: Instant) -> bool {
+    /// When a landing was under way the last time; `None` when none is to be resumed.
+    fn update(&mut self, status: &ControllerStatus, now: Instant) -> Option<Instant> {
         let is_under_way = status.started_ns.is_some() && !status.finished;
         // A restarted controller waits for a moment before it resumes a landing.
         let waits = status.started_ns.is_none() && !status.finished;
@@ -234,7 +249,7 @@ impl LandingMonitor {
         } else if self.under_way.is_none() && self.noted.take().is_some() {
             self.note.remove();
         }
-        self.under_way.is_some()
+        self.under_way
     }
 }
 
@@ -332,12 +347,30 @@ mod tests {
             ..ControllerStatus::default()
         };
         let (mut monitor, now) = (LandingMonitor::default(), Instant::now());
-        assert!(!monitor.update(&status(None, false), now));
-        assert!(monitor.update(&status(Some(1), false), now));
-        assert!(monitor.update(&status(None, false), now + STALE_AFTER / 2));
-        assert!(!monitor.update(&status(None, false), now + STALE_AFTER));
-        assert!(monitor.update(&status(Some(1), false), now));
-        assert!(!monitor.update(&status(Some(1), true), now));
-        assert!(!monitor.update(&status(None, false), now));
+        let mut lands = |status, now| monitor.update(&status, now).is_some();
+        assert!(!lands(status(None, false), now));
+        assert!(lands(status(Some(1), false), now));
+        assert!(lands(status(None, false), now + STALE_AFTER / 2));
+        assert!(!lands(status(None, false), now + STALE_AFTER));
+        assert!(lands(status(Some(1), false), now));
+        assert!(!lands(status(Some(1), true), now));
+        assert!(!lands(status(None, false), now));
+    }
+
+    #[test]
+    fn a_landing_of_which_nothing_more_is_told_is_soon_over() {
+        let (mut monitor, now) = (LandingMonitor::default(), Instant::now());
+        let landing = ControllerStatus { started_ns: Some(1), ..ControllerStatus::default() };
+        let waiting = ControllerStatus::default();
+        let lands_after = |under_way, silence| {
+            PeerTable { under_way, ..PeerTable::default() }.landing(now + silence)
+        };
+        let told = monitor.update(&landing, now);
+        assert!(lands_after(told, STALE_AFTER / 2));
+        assert!(!lands_after(told, STALE_AFTER));
+        // A controller that waits does not make the landing any younger.
+        let told = monitor.update(&waiting, now + STALE_AFTER / 2);
+        assert!(lands_after(told, STALE_AFTER / 2));
+        assert!(!lands_after(told, STALE_AFTER));
     }
 }

@@ -216,7 +216,9 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
     let shutdown = Shutdown::on_signals()?;
     let notes = Notes::of_supervisor(&site.instance(role));
     let before = Before::noted_in(&notes);
-    let mut peers = follow_peers(site, role, &jobs, &notes.landing).await?;
+    let mut peers = follow_peers(site, role, &jobs, &notes.landing, before).await?;
+    // Joining the network may have taken long.
+    let before = before.by_now(peers.landing());
     let mut children = Children::new();
     for line in jobs.iter().filter_map(|job| before.told_of(job, &notes.running)) {
         say(line);
@@ -253,18 +255,33 @@ enum Before {
     Nothing,
     /// It was killed, or failed.
     Crash,
-    /// The same during a landing, a moment ago.
-    Landing,
+    /// The same during a landing, which was under way a moment ago.
+    Landing { last: Instant },
 }
 
 impl Before {
     fn noted_in(notes: &Notes) -> Self {
-        if notes.landing.age().is_some_and(|age| age < STALE_AFTER) {
-            Self::Landing
-        } else if notes.running.age().is_some() {
-            Self::Crash
-        } else {
-            Self::Nothing
+        let age = notes.landing.age().filter(|age| *age < STALE_AFTER);
+        match age.and_then(|age| Instant::now().checked_sub(age)) {
+            Some(last) => Self::Landing { last },
+            None if notes.running.age().is_some() => Self::Crash,
+            None => Self::Nothing,
+        }
+    }
+
+    /// What that is once it is known whether the landing can still be resumed.
+    fn by_now(self, landing: bool) -> Self {
+        match self {
+            Self::Landing { .. } if !landing => Self::Crash,
+            _ => self,
+        }
+    }
+
+    /// When the landing was under way the last time.
+    fn under_way(self) -> Option<Instant> {
+        match self {
+            Self::Landing { last } => Some(last),
+            Self::Nothing | Self::Crash => None,
         }
     }
 
@@ -272,7 +289,8 @@ impl Before {
     fn start_mode(self, job: &Job) -> Option<&'static str> {
         match self {
             Self::Nothing => None,
-            Self::Crash | Self::Landing => start_mode(job, self == Self::Landing),
+            Self::Crash => start_mode(job, false),
+            Self::Landing { .. } => start_mode(job, true),
         }
     }
 
@@ -291,7 +309,7 @@ impl Before {
                 "the `alight up` before this one was killed or failed: the controller waits for a command and starts no motors, whatever its \
                  `start` says. It follows that after an orderly stop (Ctrl-C) and another start",
             ),
-            Self::Landing => Some("a landing was interrupted a moment ago; resuming it"),
+            Self::Landing { .. } => Some("a landing was interrupted a moment ago; resuming it"),
         }
     }
 }
@@ -309,6 +327,7 @@ async fn follow_peers(
     role: Role,
     jobs: &[Job],
     landing: &Note,
+    before: Before,
 ) -> anyhow::Result<Peers> {
     let job_of = |service| jobs.iter().find(|job| job.service == Some(service));
     // Only the supervisor of the controller notes its landings.
@@ -317,7 +336,7 @@ async fn follow_peers(
         (None, Some(detector)) => (&detector.key, Note::default()),
         (None, None) => return Ok(Peers::none()),
     };
-    Peers::follow(&site.network(role), key, note).await
+    Peers::follow(&site.network(role), key, note, before.under_way()).await
 }
 
 /// Restarts processes that exit; returns false on a shutdown request, true when none runs, and each has been given up or keeps failing.
@@ -510,6 +529,38 @@ mod tests {
         only_supervisor(&format!("{name}-other")).unwrap();
         drop(first);
         only_supervisor(&name).unwrap();
+    }
+
+    #[test]
+    fn what_was_before_is_told_by_its_notes() {
+        let folder = tempfile::tempdir().unwrap();
+        let notes = Notes::kept_in(Some(folder.path()), "x");
+        let before = || Before::noted_in(&notes);
+        assert_eq!(before(), Before::Nothing);
+        notes.running.write();
+        assert_eq!(before(), Before::Crash);
+        let is_landing = || matches!(before(), Before::Landing { .. });
+        notes.landing.write_aged(node::clock_name(), STALE_AFTER / 2);
+        assert!(is_landing() && before().by_now(true).under_way().is_some());
+        assert_eq!(before().by_now(false), Before::Crash);
+        notes.landing.write_aged(node::clock_name(), STALE_AFTER);
+        assert_eq!(before(), Before::Crash, "a note of so long ago");
+        notes.landing.write_aged("before the machine was started anew", Duration::ZERO);
+        assert_eq!(before(), Before::Crash);
+        notes.running.write_aged("before the machine was started anew", Duration::ZERO);
+        assert_eq!(before(), Before::Nothing);
+    }
+
+    #[test]
+    fn a_controller_starts_no_motors_after_a_crash() {
+        let mut job = supervised().job;
+        let (now, crash) = (Instant::now(), Before::Crash);
+        let landing = Before::Landing { last: now };
+        assert_eq!([crash, landing].map(|it| it.start_mode(&job)), [None, None], "a detector");
+        job.service = Some(Service::Controller);
+        assert_eq!(Before::Nothing.start_mode(&job), None);
+        assert_eq!(crash.start_mode(&job), Some("command"));
+        assert_eq!(landing.start_mode(&job), Some("resume"));
     }
 
     #[test]
