@@ -574,6 +574,8 @@ fn the_units_are_as_systemd_wants_them() -> anyhow::Result<()> {
         let name = format!("alight-{role}.service");
         let unit = std::fs::read_to_string(deploy.join(&name))?;
         ensure!(unit.contains(&format!("/usr/local/bin/alight up {role} ")), "{unit}");
+        // The end of one process is no end of the others.
+        ensure!(unit.lines().any(|line| line == "OOMPolicy=continue"), "{unit}");
         // It also looks whether the program is there.
         std::fs::write(folder.path().join(&name), unit.replace("/usr/local/bin/alight", ALIGHT))?;
         command.arg(folder.path().join(&name));
