@@ -1,5 +1,6 @@
 //! What a supervisor notes for the one that is started after it, should it be killed: that it runs, and a landing under way.
 
+use std::io::{Error, ErrorKind};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -32,16 +33,18 @@ struct Content {
 impl Notes {
     /// The notes of the supervisor with this name.
     pub(crate) fn of_supervisor(name: &str) -> Self {
-        let directory = ["RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"].iter().find_map(std::env::var_os);
-        let directory = directory.map(PathBuf::from).filter(|directory| {
-            let is_ours = is_ours_alone(directory);
-            if !is_ours {
+        let named = ["RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"];
+        let named = named.iter().filter_map(std::env::var_os).find(|named| !named.is_empty());
+        let directory = named.map(PathBuf::from);
+        let directory = directory.filter(|directory| {
+            let unfit = unfit_because(directory);
+            if let Some(why) = &unfit {
                 tracing::warn!(
                     ?directory,
-                    "Other users can write there, so neither a landing nor a crash is noted there"
+                    "Neither a landing nor a crash is noted there, as {why}"
                 );
             }
-            is_ours
+            unfit.is_none()
         });
         Self::kept_in(directory.as_deref(), name)
     }
@@ -57,24 +60,20 @@ impl Notes {
 }
 
 impl Note {
-    /// Whether there is a place for it.
-    pub(crate) fn is_kept(&self) -> bool {
-        self.file.is_some()
-    }
-
-    /// Writes it, with the time.
-    pub(crate) fn write(&self) {
-        let Some(file) = &self.file else { return };
+    /// Writes it, with the time; returns whether it is there now.
+    pub(crate) fn write(&self) -> bool {
+        let Some(file) = &self.file else { return false };
         let content = Content { clock: clock_name().to_owned(), stamp_ns: now_ns() };
         // Renamed, so that a reader never sees half of it.
         let new = file.with_added_extension("new");
-        let written = serde_json::to_vec(&content).map_err(std::io::Error::from);
+        let written = serde_json::to_vec(&content).map_err(Error::from);
         let written = written
             .and_then(|text| std::fs::write(&new, text))
             .and_then(|()| std::fs::rename(&new, file));
-        if let Err(problem) = written {
+        if let Err(problem) = &written {
             tracing::warn!(%problem, ?file, "Note for the case of a crash not written");
         }
+        written.is_ok()
     }
 
     /// Writes it as if that was a while ago.
@@ -93,20 +92,36 @@ impl Note {
         }
     }
 
+    /// Whether it is there, and the machine was not started anew since. What is there and cannot be read, as after a full disk, counts.
+    pub(crate) fn is_there(&self) -> bool {
+        match self.read() {
+            Ok(content) => content.clock == clock_name(),
+            Err(problem) => problem.kind() != ErrorKind::NotFound,
+        }
+    }
+
     /// How long ago it was written, if it is there and the machine was not started anew since.
     pub(crate) fn age(&self) -> Option<Duration> {
-        let text = std::fs::read(self.file.as_ref()?).ok()?;
-        let content: Content = serde_json::from_slice(&text).ok()?;
+        let content = self.read().ok().filter(|content| content.clock == clock_name())?;
         let age_ns = u64::try_from(now_ns().saturating_sub(content.stamp_ns)).ok()?;
-        (content.clock == clock_name()).then_some(Duration::from_nanos(age_ns))
+        Some(Duration::from_nanos(age_ns))
+    }
+
+    fn read(&self) -> Result<Content, Error> {
+        let file = self.file.as_ref().ok_or(ErrorKind::NotFound)?;
+        Ok(serde_json::from_slice(&std::fs::read(file)?)?)
     }
 }
 
-/// Whether only this user (and root) can write to a directory: whoever can may have a landing resumed.
-fn is_ours_alone(directory: &Path) -> bool {
-    let Ok(found) = std::fs::metadata(directory) else { return true };
+/// Why notes cannot be kept in a directory: only this user (and root) may write there, as whoever can may have a landing resumed.
+fn unfit_because(directory: &Path) -> Option<String> {
+    let found = match std::fs::metadata(directory) {
+        Ok(found) => found,
+        Err(problem) => return Some(format!("it cannot be looked at: {problem}")),
+    };
     let user = rustix::process::geteuid();
-    (found.uid() == user.as_raw() || user.is_root()) && found.mode() & 0o022 == 0
+    let is_ours = (found.uid() == user.as_raw() || user.is_root()) && found.mode() & 0o022 == 0;
+    (!is_ours).then(|| "other users can write there".to_owned())
 }
 
 #[cfg(test)]
@@ -120,8 +135,20 @@ mod tests {
         for (mode, is_ours) in [(0o700, true), (0o755, true), (0o775, false), (0o1777, false)] {
             let permissions = std::fs::Permissions::from_mode(mode);
             std::fs::set_permissions(folder.path(), permissions).unwrap();
-            assert_eq!(is_ours_alone(folder.path()), is_ours, "{mode:o}");
+            assert_eq!(unfit_because(folder.path()).is_none(), is_ours, "{mode:o}");
         }
+        let missing = unfit_because(&folder.path().join("missing")).unwrap();
+        assert!(missing.contains("No such file"), "{missing}");
+    }
+
+    #[test]
+    fn a_note_tells_whether_it_was_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let note = Note { file: Some(folder.path().join("x.running")) };
+        assert!(note.write() && note.is_there());
+        let nowhere = Note { file: Some(folder.path().join("missing/x.running")) };
+        assert!(!nowhere.write() && !nowhere.is_there());
+        assert!(!Note::default().write() && !Note::default().is_there());
     }
 
     #[test]
@@ -139,9 +166,17 @@ mod tests {
         };
         let long = Duration::from_secs(30);
         assert!(age_of(clock_name(), long).unwrap() >= long);
+        assert!(note.is_there());
         assert_eq!(age_of("before the machine was started anew", Duration::ZERO), None);
+        assert!(!note.is_there());
+        // Half of it, and a thing that is no file: it is there, of whatever age.
         std::fs::write(&file, "{").unwrap();
-        assert_eq!(note.age(), None);
+        assert!(note.age().is_none() && note.is_there());
+        std::fs::remove_file(&file).unwrap();
+        std::fs::create_dir(&file).unwrap();
+        assert!(note.age().is_none() && note.is_there());
+        std::fs::remove_dir(&file).unwrap();
+        note.write();
         note.remove();
         assert!(!file.exists());
     }

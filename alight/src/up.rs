@@ -46,6 +46,8 @@ const MAX_EXITS: usize = 6;
 const PERIOD: Duration = Duration::from_secs(60);
 /// Pause before one is restarted that keeps failing: what it lacks, as a camera, may come back.
 const LONG_PAUSE: Duration = Duration::from_secs(30);
+/// Interval at which the note is written anew that this program runs.
+const RENEWAL: Duration = Duration::from_secs(60);
 /// The exit status for an invalid configuration, with which a restart is useless.
 const WRONG_USE: i32 = 2;
 
@@ -220,16 +222,17 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
     // Joining the network may have taken long.
     let before = before.by_now(peers.landing());
     let mut children = Children::new();
-    for line in jobs.iter().filter_map(|job| before.told_of(job, &notes.running)) {
+    let is_noted = notes.running.write();
+    for line in jobs.iter().filter_map(|job| before.told_of(job, is_noted)) {
         say(line);
     }
-    notes.running.write();
     let mut supervised: Vec<Supervised> = jobs.into_iter().map(Supervised::new).collect();
     for (index, first) in supervised.iter_mut().enumerate() {
         let start_as = before.start_mode(&first.job);
         start_or_retry(&mut children, index, first, start_as, site);
     }
-    let all_are_out = watch(&mut children, &mut supervised, &mut peers, site, shutdown).await?;
+    let all_are_out =
+        watch(&mut children, &mut supervised, &mut peers, &notes.running, site, shutdown).await?;
     say("stopping");
     // In reverse order: the controller stops while its peers can still receive its last messages.
     for (index, stopped) in supervised.iter().enumerate().rev() {
@@ -264,7 +267,7 @@ impl Before {
         let age = notes.landing.age().filter(|age| *age < STALE_AFTER);
         match age.and_then(|age| Instant::now().checked_sub(age)) {
             Some(last) => Self::Landing { last },
-            None if notes.running.age().is_some() => Self::Crash,
+            None if notes.running.is_there() => Self::Crash,
             None => Self::Nothing,
         }
     }
@@ -295,14 +298,14 @@ impl Before {
     }
 
     /// What is to be said of it before a process is started.
-    fn told_of(self, job: &Job, running: &Note) -> Option<&'static str> {
+    fn told_of(self, job: &Job, is_noted: bool) -> Option<&'static str> {
         if job.service != Some(Service::Controller) {
             return None;
         }
         match self {
-            Self::Nothing if !running.is_kept() && starts_by_itself(job) => Some(
+            Self::Nothing if !is_noted && starts_by_itself(job) => Some(
                 "a crash of this `alight up` cannot be noted, and after one its controller would begin anew as its `start` says: set \
-                 $RUNTIME_DIRECTORY to a directory to which only this user can write",
+                 $RUNTIME_DIRECTORY to a directory that exists, has room, and to which only this user can write",
             ),
             Self::Nothing => None,
             Self::Crash => Some(
@@ -344,9 +347,11 @@ async fn watch(
     children: &mut Children<usize>,
     supervised: &mut [Supervised],
     peers: &mut Peers,
+    running: &Note,
     site: &Site,
     shutdown: Shutdown,
 ) -> anyhow::Result<bool> {
+    let mut renewal = tokio::time::interval_at(Instant::now() + RENEWAL, RENEWAL);
     loop {
         if supervised.iter().all(Supervised::is_out) {
             say("no process runs, and none is likely to: ending with an error");
@@ -372,6 +377,8 @@ async fn watch(
                 }
             }
             () = peers.changed() => restart_unreplaced(supervised, peers),
+            // The first one may have found no room, or was removed; a failure is in the log.
+            _ = renewal.tick() => { running.write(); }
             () = next_start => {
                 let Some((_, index)) = next else { continue };
                 let Some(again) = supervised.get_mut(index) else { continue };
@@ -549,6 +556,8 @@ mod tests {
         assert_eq!(before(), Before::Crash);
         notes.running.write_aged("before the machine was started anew", Duration::ZERO);
         assert_eq!(before(), Before::Nothing);
+        std::fs::write(folder.path().join("alight-x.running"), "half of").unwrap();
+        assert_eq!(before(), Before::Crash, "it is there, whatever is in it");
     }
 
     #[test]
