@@ -576,6 +576,9 @@ fn the_units_are_as_systemd_wants_them() -> anyhow::Result<()> {
         ensure!(unit.contains(&format!("/usr/local/bin/alight up {role} ")), "{unit}");
         // The end of one process is no end of the others.
         ensure!(unit.lines().any(|line| line == "OOMPolicy=continue"), "{unit}");
+        // What was noted for the case of a crash is kept where systemd starts the unit no more.
+        let notes = unit.lines().find(|line| line.starts_with("RuntimeDirectoryPreserve="));
+        ensure!(notes.is_none_or(|line| line.ends_with("=yes")), "{unit}");
         // It also looks whether the program is there.
         std::fs::write(folder.path().join(&name), unit.replace("/usr/local/bin/alight", ALIGHT))?;
         command.arg(folder.path().join(&name));
