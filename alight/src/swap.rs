@@ -2,8 +2,8 @@
 //!
 //! The new detector is started as a process that outlives this one. It runs in shadow until it agrees with
 //! the active one, becomes the active one, and only then the old one is stopped. On any failure before that,
-//! the old one stays in use, the operator's preference is what it was, and the new one is stopped, unless the old
-//! one has gone meanwhile and no other is left.
+//! the old one stays in use, the operator's preference is what it was if there was one, and the new one is
+//! stopped, unless the old one has gone meanwhile and no other is left.
 
 mod comparison;
 
@@ -13,11 +13,11 @@ use std::path::{Path, PathBuf};
 use std::process::{ExitCode, Stdio};
 use std::time::Duration;
 
-use anyhow::{Context, anyhow, bail};
+use anyhow::{Context, bail, ensure};
 use clap::Args;
 use messages::{
-    Candidate, Configuration, ControllerCommand, ControllerStatus, Detections, DetectorCommand,
-    DetectorState, Place, topic,
+    Candidate, CommandReply, Configuration, ControllerCommand, ControllerStatus, Detections,
+    DetectorCommand, DetectorState, Place, topic,
 };
 use node::{Layers, Node, Presence, Shutdown, Subscriber};
 use rustix::process::{Pid, Signal, kill_process_group};
@@ -103,6 +103,8 @@ struct Report {
     active_s: Option<f64>,
     old_stopped: bool,
     new_kept: bool,
+    /// What is preferred after a swap that failed although nothing was before.
+    now_preferred: Option<String>,
 }
 
 /// Swaps; the exit status is 0 when the new detector is in use.
@@ -129,6 +131,10 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
     };
     let mut existing: BTreeSet<String> = node.alive("detector", "*").await?.into_iter().collect();
     existing.extend(first.candidates.iter().map(|candidate| candidate.detector.clone()));
+    // What has the preferred name is used soon, whether it agrees or not.
+    if let Some(ControllerCommand::UseDetector(preferred)) = preferring(&first.preference, &first) {
+        existing.insert(preferred);
+    }
     let new_detector = NewDetector::new(args, &existing)?;
     let mut report = Report {
         from: first.active_detector.clone(),
@@ -150,6 +156,7 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
         presence,
         existing,
         child,
+        is_asked: false,
         began: Instant::now(),
         is_verbose: args.format == Format::Text,
     };
@@ -174,14 +181,22 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
         }
         Err(problem) => {
             swap.roll_back(&mut report).await;
-            report.why = format!("not swapped, {}: {problem:#}", left(&report, &swap.latest));
+            let why = |report: &Report, latest: &ControllerStatus| {
+                let preferred = preferred_now(report);
+                format!("not swapped, {}{preferred}: {problem:#}", left(report, latest))
+            };
+            report.why = why(&report, &swap.latest);
             if let Some(last) = report.log.as_deref().and_then(last_lines)
                 && swap.is_verbose
             {
                 write_error(&format!("End of the new detector's log:\n{last}"));
             }
             if args.wait && report.new_kept {
+                swap.show(&report.why);
                 swap.wait().await;
+                report.new_kept = false;
+                swap.learn_status().await;
+                report.why = why(&report, &swap.latest);
             }
         }
     }
@@ -280,6 +295,8 @@ struct Swap<'a> {
     presence: Presence,
     existing: BTreeSet<String>,
     child: Child,
+    /// Whether the controller was asked for the new one, and did not refuse it.
+    is_asked: bool,
     began: Instant,
     is_verbose: bool,
 }
@@ -300,7 +317,10 @@ impl Swap<'_> {
         self.until_agreed(&new, report).await?;
         report.agreed_s = Some(self.elapsed_s());
         self.show(&format!("it agrees in {} of {} frames", report.agreed, report.compared));
-        self.use_detector(&new).await?;
+        let reply = self.ask(&ControllerCommand::UseDetector(new.clone())).await;
+        // Without an answer it may have been carried out.
+        self.is_asked = reply.as_ref().map_or(true, |reply| reply.accepted);
+        taken(&reply?)?;
         self.until_active(&new).await?;
         report.active_s = Some(self.elapsed_s());
         self.show(&format!("{new} is used"));
@@ -437,16 +457,12 @@ impl Swap<'_> {
         }
     }
 
-    async fn use_detector(&self, name: &str) -> anyhow::Result<()> {
-        self.command(&ControllerCommand::UseDetector(name.to_owned())).await
+    async fn tell(&self, command: &ControllerCommand) -> anyhow::Result<()> {
+        taken(&self.ask(command).await?)
     }
 
-    async fn command(&self, command: &ControllerCommand) -> anyhow::Result<()> {
-        let reply = self.node.command(topic::COMMAND, &[], command).await?;
-        match reply.accepted {
-            true => Ok(()),
-            false => Err(anyhow!("the controller refused: {}", reply.reason)),
-        }
+    async fn ask(&self, command: &ControllerCommand) -> anyhow::Result<CommandReply> {
+        self.node.command(topic::COMMAND, &[], command).await
     }
 
     async fn until_active(&mut self, new: &str) -> anyhow::Result<()> {
@@ -486,39 +502,44 @@ impl Swap<'_> {
         }
     }
 
-    /// Switches back to the old detector and to what was preferred, and stops the new one, unless it is the last.
-    async fn roll_back(&mut self, report: &mut Report) {
+    /// Waits for the controller's newest status.
+    async fn learn_status(&mut self) {
+        while let Some(status) = self.statuses.waiting() {
+            self.latest = status;
+        }
         if let Ok(Some(status)) = timeout(STATUS_TIMEOUT, self.statuses.next()).await {
             self.latest = status;
         }
-        // The controller may have been asked for the new one. That is undone before it ends, so that no frame is missed.
-        let was_asked = report.agreed_s.is_some();
-        let old = report.from.as_deref().filter(|old| is_alive(&self.latest, old));
-        if let Some(old) = old.filter(|_| was_asked)
-            && let Err(problem) = self.use_detector(old).await
-        {
-            write_error(&format!("going back to {old}: {problem:#}"));
+    }
+
+    /// Switches back to the old detector and to what was preferred, and stops the new one, unless it is the last.
+    async fn roll_back(&mut self, report: &mut Report) {
+        self.learn_status().await;
+        let new = report.to.as_deref();
+        let is_new_used = new.is_some() && self.latest.active_detector.as_deref() == new;
+        // That the controller was asked for the new one is undone before that ends, so that no frame is missed. Where nothing was preferred,
+        // to name the old one would be a preference of its own, and is done only for that.
+        let is_undone = self.is_asked && (is_new_used || !self.preference.is_empty());
+        let old = report.from.as_deref().filter(|old| is_undone && is_alive(&self.latest, old));
+        let mut preferred = new;
+        if let Some(old) = old {
+            match self.tell(&ControllerCommand::UseDetector(old.to_owned())).await {
+                Ok(()) => preferred = Some(old),
+                Err(problem) => write_error(&format!("going back to {old}: {problem:#}")),
+            }
+        }
+        if self.is_asked && self.preference.is_empty() {
+            report.now_preferred = preferred.map(ToOwned::to_owned);
         }
         let is_running = matches!(self.child.try_wait(), Ok(None));
         report.new_kept = is_running && report.ready_s.is_some() && is_last(report, &self.latest);
         if !report.new_kept {
             self.end_child().await;
         }
-        if was_asked {
-            self.prefer_again().await;
-        }
-    }
-
-    /// Has the controller prefer what the operator preferred before.
-    async fn prefer_again(&self) {
-        let Some(command) = preferring(&self.preference) else {
-            write_error(
-                "Before the swap no detector was preferred, and no command says so again: the one that the controller was last asked for is \
-                 preferred now (`alight detectors prefer onboard` and `ground` name a place instead)",
-            );
-            return;
-        };
-        if let Err(problem) = self.command(&command).await {
+        if self.is_asked
+            && let Some(command) = preferring(&self.preference, &self.latest)
+            && let Err(problem) = self.tell(&command).await
+        {
             write_error(&format!("preferring {} again, as before: {problem:#}", self.preference));
         }
     }
@@ -559,40 +580,65 @@ fn is_alive(status: &ControllerStatus, name: &str) -> bool {
     find(status, name).is_some_and(|candidate| candidate.alive)
 }
 
-/// The detector that is used beside the new one.
-fn other_in_use<'a>(report: &Report, status: &'a ControllerStatus) -> Option<&'a str> {
-    let used = status.active_detector.as_deref();
-    used.filter(|used| report.to.as_deref() != Some(used) && is_alive(status, used))
+/// A detector that is there beside the new one, best the one that is used.
+fn other_there<'a>(report: &Report, status: &'a ControllerStatus) -> Option<&'a str> {
+    let new = report.to.as_deref();
+    let is_other = |it: &&Candidate| it.alive && new != Some(it.detector.as_str());
+    let others = status.candidates.iter().filter(is_other).map(|it| it.detector.as_str());
+    others.max_by_key(|other| is_used(other, status))
 }
 
-/// Whether the new detector is the last one: the old one has gone, and none is used in its place.
+fn is_used(name: &str, status: &ControllerStatus) -> bool {
+    status.active_detector.as_deref() == Some(name)
+}
+
+/// Whether the new detector is the last one: the old one has gone, and no other is there.
 fn is_last(report: &Report, status: &ControllerStatus) -> bool {
-    let old_is_gone = report.from.as_deref().is_some_and(|old| !is_alive(status, old));
-    old_is_gone && other_in_use(report, status).is_none()
+    report.from.is_some() && other_there(report, status).is_none()
 }
 
 /// What is left after a swap that failed, in words.
 fn left(report: &Report, status: &ControllerStatus) -> String {
     let Some(old) = &report.from else { return "none stays in use".to_owned() };
     let new = report.to.as_deref().unwrap_or_default();
-    match (report.new_kept, report.pid, other_in_use(report, status)) {
+    match (report.new_kept, report.pid, other_there(report, status)) {
         (true, Some(pid), _) => format!(
             "but {old} has gone, and {new} is kept as the last one (process {pid}, `kill {pid}` ends it)"
         ),
         _ if is_alive(status, old) => format!("{old} stays in use"),
-        (_, _, Some(other)) => format!("{other} is used, as {old} has gone"),
+        (_, _, Some(other)) if is_used(other, status) => {
+            format!("{other} is used, as {old} has gone")
+        }
+        (_, _, Some(other)) => format!("but {old} has gone, and {other} is there, not used yet"),
         _ => format!("but {old} has gone, and no other is left"),
     }
 }
 
-/// The command after which this is preferred; `None` for nothing. The word for a place is taken for it, also where a detector has that
-/// name: the controller's status does not tell them apart.
-fn preferring(preference: &str) -> Option<ControllerCommand> {
+/// What is preferred after a swap that failed although nothing was before, in words.
+fn preferred_now(report: &Report) -> String {
+    let told = |name: &String| {
+        format!(
+            " (before the swap no detector was preferred; now `{name}` is, as no command takes a preference back: `alight detectors prefer onboard` \
+             or `ground` names a place instead)"
+        )
+    };
+    report.now_preferred.as_ref().map_or_else(String::new, told)
+}
+
+/// An error unless the controller has taken a command.
+fn taken(reply: &CommandReply) -> anyhow::Result<()> {
+    ensure!(reply.accepted, "the controller refused: {}", reply.reason);
+    Ok(())
+}
+
+/// The command after which this is preferred; `None` for nothing. The controller's status does not tell a place from a detector of
+/// that name: it is taken for the detector while that is there.
+fn preferring(preference: &str, status: &ControllerStatus) -> Option<ControllerCommand> {
     let place = [Place::Onboard, Place::Ground].into_iter().find(|it| it.name() == preference);
-    match (place, preference) {
-        (Some(place), _) => Some(ControllerCommand::PreferDetectors(place)),
-        (None, "") => None,
-        (None, name) => Some(ControllerCommand::UseDetector(name.to_owned())),
+    match place.filter(|_| !is_alive(status, preference)) {
+        Some(place) => Some(ControllerCommand::PreferDetectors(place)),
+        None if preference.is_empty() => None,
+        None => Some(ControllerCommand::UseDetector(preference.to_owned())),
     }
 }
 
@@ -708,7 +754,14 @@ mod tests {
             (status(&[old, new.clone()], None), false, "old stays in use"),
             (status(&[gone.clone(), new.clone()], Some("old")), true, "`kill 7` ends it"),
             (status(std::slice::from_ref(&new), Some("new")), true, "new is kept as the last one"),
-            (status(&[gone.clone(), new, spare], Some("spare")), false, "spare is used, as old"),
+            (
+                status(&[gone.clone(), new.clone(), spare.clone()], Some("spare")),
+                false,
+                "spare is used, as old",
+            ),
+            // None is used for a moment, or the new one still is.
+            (status(&[gone.clone(), new.clone(), spare.clone()], None), false, "spare is there"),
+            (status(&[gone.clone(), new, spare], Some("new")), false, "spare is there"),
         ] {
             assert_eq!(is_last(&report(false), &status), is_kept, "{status:?}");
             let left = left(&report(is_kept), &status);
@@ -723,10 +776,26 @@ mod tests {
     #[test]
     fn what_was_preferred_is_preferred_again() {
         let place = ControllerCommand::PreferDetectors;
-        assert_eq!(preferring("ground"), Some(place(Place::Ground)));
-        assert_eq!(preferring("onboard"), Some(place(Place::Onboard)));
-        assert_eq!(preferring("spare"), Some(ControllerCommand::UseDetector("spare".into())));
-        assert_eq!(preferring(""), None);
+        let named = |name: &str| Some(ControllerCommand::UseDetector(name.into()));
+        let with = |alive: bool| ControllerStatus {
+            candidates: vec![Candidate { detector: "ground".into(), alive, ..Candidate::sample() }],
+            ..ControllerStatus::default()
+        };
+        let none = ControllerStatus::default();
+        assert_eq!(preferring("ground", &none), Some(place(Place::Ground)));
+        assert_eq!(preferring("onboard", &with(true)), Some(place(Place::Onboard)));
+        assert_eq!(preferring("ground", &with(true)), named("ground"), "a detector of that name");
+        assert_eq!(preferring("ground", &with(false)), Some(place(Place::Ground)));
+        assert_eq!(preferring("spare", &none), named("spare"));
+        assert_eq!(preferring("", &none), None);
+    }
+
+    #[test]
+    fn a_preference_that_a_failed_swap_leaves_is_told() {
+        assert_eq!(preferred_now(&Report::default()), "");
+        let left = Report { now_preferred: Some("old".into()), ..Report::default() };
+        assert!(preferred_now(&left).contains("no detector was preferred; now `old` is"));
+        assert!(serde_json::to_string(&left).unwrap().contains(r#""now_preferred":"old""#));
     }
 
     #[test]
