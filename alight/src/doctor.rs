@@ -6,6 +6,7 @@
 mod cameras;
 mod focus;
 mod keys;
+mod ports;
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -16,9 +17,8 @@ use std::time::Duration;
 
 use clap::Args;
 use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, Phase, topic};
-use node::network::{AIR_PORT, Address};
 use node::version::release;
-use node::{INSECURE, Network, Node, clock_name, stats};
+use node::{INSECURE, Node, clock_name, stats};
 use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
 use tokio::time::timeout;
@@ -28,7 +28,7 @@ use self::keys::Checked;
 use crate::args::{Format, NetworkArgs, OPERATOR};
 use crate::programs::{missing, missing_of_service};
 use crate::runtime::{block_on, tool_identity};
-use crate::services::Service;
+use crate::services::{RELAY, Service};
 use crate::site::{Job, Role, Site};
 use crate::terminal::print;
 
@@ -57,7 +57,6 @@ const MIN_MEMLOCK: u64 = 64 << 20;
 /// Number of round trips to each process.
 const ROUND_TRIPS: u32 = 10;
 const REPLY_TIMEOUT: Duration = Duration::from_millis(300);
-const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
 /// What to do about a network that is open to all.
 const MAKE_KEYS: &str = "make keys (`alight keys`, docs/deploy.md), and remove `insecure`";
 const OPEN_TIMEOUT: Duration = Duration::from_secs(5);
@@ -140,8 +139,8 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     let mut checked = Checked::default();
     // On the drone what is asked stays on the machine, and needs no key.
     let mut needs_key = true;
-    if let (Some(role), Some(file)) = (args.role, &args.config) {
-        let site = Site::read(file)?;
+    let site = args.config.as_ref().map(|file| Site::read(file)).transpose()?;
+    if let (Some(role), Some(file), Some(site)) = (args.role, &args.config, &site) {
         network = site.network(role);
         needs_key = matches!(role, Role::Ground | Role::Relay);
         match site.jobs(role) {
@@ -162,7 +161,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     }
     let is_key_wrong = findings.count(Verdict::Wrong) > before;
     let before = findings.findings.len();
-    let mut has_controller = false;
+    let mut seen = Seen::default();
     match network.source(OPERATOR) {
         Ok(zenoh) => block_on(async {
             match timeout(OPEN_TIMEOUT, Node::open_tool(tool_identity("doctor"), &zenoh)).await {
@@ -172,8 +171,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
                         // They do not fit an air link.
                         has_raw_frames: network.connect.is_none(),
                     };
-                    let seen = check_network(&mut findings, node, watched, &expected).await;
-                    has_controller = seen.has_controller();
+                    seen = check_network(&mut findings, node, watched, &expected).await;
                 }
                 Ok(Err(problem)) => findings.wrong("network", format!("{problem:#}"), "see above"),
                 Err(_) => findings.wrong(
@@ -194,14 +192,12 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
             "`alight doctor` uses the operator's key",
         ),
     }
-    check_serial_ports(&mut findings, &expected, has_controller);
-    // The relay counts a connection to its ports as a denial, so they are tried only when no service was
-    // found.
-    if !findings.findings[before..]
-        .iter()
-        .any(|f| f.about == "services" && f.verdict == Verdict::Good)
-    {
-        check_ports(&mut findings, &network);
+    check_serial_ports(&mut findings, &expected, seen.has_controller());
+    let is_service = |f: &Finding| f.about == "services" && f.verdict == Verdict::Good;
+    let sees_any = findings.findings[before..].iter().any(is_service);
+    let sees_drone = seen.has_relay_of_drone();
+    for target in ports::targets(args.role, site.as_ref(), &network, sees_any, sees_drone) {
+        ports::check(&mut findings, &target, network.keys.is_some());
     }
     print(&match args.format {
         Format::Text => findings.text(),
@@ -343,37 +339,6 @@ fn tell_unopened(findings: &mut Findings, device: &str, cause: &Error, has_contr
     }
 }
 
-/// Checks whether the ports of the other side accept connections.
-fn check_ports(findings: &mut Findings, network: &Network) {
-    use std::net::{TcpStream, ToSocketAddrs};
-    let Some(address) = &network.connect else { return };
-    // An invalid address is reported with the network's configuration.
-    let Ok(Address { host, port }) = Address::parse(address) else { return };
-    let first_port = port.unwrap_or(AIR_PORT);
-    let bare_host = host.trim_matches(['[', ']']);
-    let over = if network.keys.is_some() { "TLS over TCP" } else { "TCP" };
-    for (offset, what) in (0_u16..).zip(["control", "frames", "frames, second connection"]) {
-        let port = first_port.saturating_add(offset);
-        let found = (bare_host, port).to_socket_addrs().ok().and_then(|mut all| all.next());
-        let Some(found) = found else {
-            findings.wrong(
-                "ports",
-                format!("address {host} cannot be resolved"),
-                "use an IP address, or a name that this machine can resolve",
-            );
-            return;
-        };
-        match TcpStream::connect_timeout(&found, CONNECT_TIMEOUT) {
-            Ok(_) => findings.good("ports", format!("{found} answers ({what}; {over})")),
-            Err(cause) => findings.wrong(
-                "ports",
-                format!("{found} ({what}) does not answer: {cause}"),
-                "check that `alight up drone` runs there, the address, and firewalls",
-            ),
-        }
-    }
-}
-
 /// What to watch of the network.
 #[derive(Clone, Copy)]
 struct Watched {
@@ -414,6 +379,11 @@ impl Seen {
     /// Whether a controller is ready.
     fn has_controller(&self) -> bool {
         self.peers.iter().any(|(service, _)| service == "controller")
+    }
+
+    /// Whether the drone is there, by its relay.
+    fn has_relay_of_drone(&self) -> bool {
+        self.peers.iter().any(|(service, instance)| service == RELAY && instance == "drone")
     }
 
     /// True while a landing is under way.

@@ -158,6 +158,16 @@ impl Site {
         }
     }
 
+    /// The drone's address for the ground: HOST or HOST:PORT.
+    pub(crate) fn drone_address(&self) -> Option<&str> {
+        self.address.as_deref()
+    }
+
+    /// The address of a relay between both, if there is one.
+    pub(crate) fn relay_address(&self) -> Option<&str> {
+        self.relay_address.as_deref()
+    }
+
     /// A name for the supervisor of a role, unique on its machine.
     pub(crate) fn instance(&self, role: Role) -> String {
         let vehicle = self.vehicle.as_deref().unwrap_or("drone");
