@@ -113,8 +113,13 @@ impl Up {
 
     /// Asks it to end; the answer is its exit status.
     fn stop(&mut self) -> anyhow::Result<Option<i32>> {
+        self.stop_by(Signal::INT)
+    }
+
+    /// Sends it a signal, and waits for its end; the answer is its exit status, if it has one.
+    fn stop_by(&mut self, signal: Signal) -> anyhow::Result<Option<i32>> {
         let pid = Pid::from_raw(i32::try_from(self.child.id())?).context("a process id")?;
-        kill_process(pid, Signal::INT)?;
+        kill_process(pid, signal)?;
         let began = Instant::now();
         while began.elapsed() < PATIENCE {
             if let Some(status) = self.child.try_wait()? {
@@ -369,7 +374,14 @@ set = ["autopilot.address=udpin:127.0.0.1:{autopilot}", "start=takeoff"]
 "#
     );
     std::fs::write(folder.path().join("site.toml"), site)?;
-    for (is_killed, mode) in [(true, None), (true, Some("command")), (false, Some("command"))] {
+    // The end of a terminal, unless that is ignored here, is no order to forget the crash.
+    let hangup = if node::ignores_hangups() { Signal::KILL } else { Signal::HUP };
+    for (signal, mode) in [
+        (Signal::KILL, None),
+        (hangup, Some("command")),
+        (Signal::KILL, Some("command")),
+        (Signal::INT, Some("command")),
+    ] {
         let mut up = Up::start(folder.path(), "local")?;
         if mode.is_some() {
             up.says("the `alight up` before this one was killed", "starts no motors").await?;
@@ -377,12 +389,8 @@ set = ["autopilot.address=udpin:127.0.0.1:{autopilot}", "start=takeoff"]
         let started = up.says("controller:", "started as process").await?;
         let told = started.split_once("start = ").map(|(_, mode)| mode.trim_matches('"'));
         ensure!(told == mode, "{started}");
-        if is_killed {
-            up.child.kill()?;
-            up.child.wait()?;
-        } else {
-            ensure!(up.stop()? == Some(0));
-        }
+        let code = up.stop_by(signal)?;
+        ensure!(code == (signal != Signal::KILL).then_some(0), "{code:?}");
     }
     let mut up = Up::start(folder.path(), "local")?;
     let started = up.says("controller:", "started as process").await?;

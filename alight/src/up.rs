@@ -232,7 +232,7 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
         start_or_retry(&mut children, index, first, start_as, site);
     }
     let all_are_out =
-        watch(&mut children, &mut supervised, &mut peers, &notes.running, site, shutdown).await?;
+        watch(&mut children, &mut supervised, &mut peers, &notes.running, site, &shutdown).await?;
     say("stopping");
     // In reverse order: the controller stops while its peers can still receive its last messages.
     for (index, stopped) in supervised.iter().enumerate().rev() {
@@ -241,12 +241,14 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
             say(&format!("{}: stopped", stopped.job.name));
         }
     }
-    // After an orderly stop the landing is not resumed. The peers are closed first, as they write its note too.
+    // The peers are closed first, as they write the note of a landing too. A terminal that breaks off is no order to forget anything.
     peers.close().await;
-    notes.landing.remove();
-    // What starts this program again by itself does so after a failure, and then nothing may take off.
-    if !all_are_out {
-        notes.running.remove();
+    if !shutdown.is_by_hangup() {
+        notes.landing.remove();
+        // What starts this program again by itself does so after a failure, and then nothing may take off.
+        if !all_are_out {
+            notes.running.remove();
+        }
     }
     Ok(ExitCode::from(u8::from(all_are_out)))
 }
@@ -256,7 +258,7 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
 enum Before {
     /// Nothing, or an orderly stop.
     Nothing,
-    /// It was killed, or failed.
+    /// It was killed, it failed, or its terminal was closed.
     Crash,
     /// The same during a landing, which was under way a moment ago.
     Landing { last: Instant },
@@ -309,7 +311,7 @@ impl Before {
             ),
             Self::Nothing => None,
             Self::Crash => Some(
-                "the `alight up` before this one was killed or failed: the controller waits for a command and starts no motors, whatever its \
+                "the `alight up` before this one was killed or failed, or its terminal was closed: the controller waits for a command and starts no motors, whatever its \
                  `start` says. It follows that after an orderly stop (Ctrl-C) and another start",
             ),
             Self::Landing { .. } => Some("a landing was interrupted a moment ago; resuming it"),
@@ -349,7 +351,7 @@ async fn watch(
     peers: &mut Peers,
     running: &Note,
     site: &Site,
-    shutdown: Shutdown,
+    shutdown: &Shutdown,
 ) -> anyhow::Result<bool> {
     let mut renewal = tokio::time::interval_at(Instant::now() + RENEWAL, RENEWAL);
     loop {

@@ -35,7 +35,16 @@ pub struct Options {
 /// A request to shut down; clones share it.
 #[derive(Clone, Debug)]
 pub struct Shutdown {
-    requested: watch::Receiver<bool>,
+    requested: watch::Receiver<Option<Cause>>,
+}
+
+/// What requests a shutdown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Cause {
+    /// Whoever runs the process, by SIGINT or SIGTERM.
+    Operator,
+    /// SIGHUP.
+    Hangup,
 }
 
 impl Shutdown {
@@ -51,7 +60,7 @@ impl Shutdown {
             true => None,
             false => Some(signal(SignalKind::hangup()).context("listening to SIGHUP")?),
         };
-        let (sender, requested) = watch::channel(false);
+        let (sender, requested) = watch::channel(None);
         tokio::spawn(async move {
             let hung_up = async {
                 match &mut hangup {
@@ -59,15 +68,19 @@ impl Shutdown {
                     None => std::future::pending().await,
                 }
             };
-            tokio::select! {
-                _ = interrupt.recv() => {}
-                _ = terminate.recv() => {}
-                () = hung_up => tracing::warn!(
-                    "The terminal was closed (SIGHUP), so this process stops; in a systemd unit, in tmux or with `nohup` it goes on"
-                ),
+            let cause = tokio::select! {
+                _ = interrupt.recv() => Cause::Operator,
+                _ = terminate.recv() => Cause::Operator,
+                () = hung_up => Cause::Hangup,
+            };
+            if cause == Cause::Hangup {
+                tracing::warn!(
+                    "SIGHUP came, as when a terminal is closed, so this process stops; one that is started as a systemd unit or in tmux has no \
+                     terminal that is closed, and one that is started with `nohup` ignores it"
+                );
             }
             // There is no receiver left when the service has ended by itself.
-            sender.send_replace(true);
+            sender.send_replace(Some(cause));
             // Keeps the sender: without it receivers would see a closed channel.
             std::future::pending::<()>().await;
         });
@@ -78,7 +91,12 @@ impl Shutdown {
     pub async fn requested(&self) {
         let mut requested = self.requested.clone();
         // The channel closes when the runtime shuts down, which is a request too.
-        drop(requested.wait_for(|requested| *requested).await);
+        drop(requested.wait_for(Option::is_some).await);
+    }
+
+    /// Whether it was requested by SIGHUP, so perhaps by nobody.
+    pub fn is_by_hangup(&self) -> bool {
+        *self.requested.borrow() == Some(Cause::Hangup)
     }
 }
 
