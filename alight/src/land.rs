@@ -423,6 +423,15 @@ async fn watch(
                         landing.interrupted("interrupted");
                         return Ok(landing);
                     }
+                    // What was told before it ended has arrived.
+                    while let Some(truth) = truths.waiting() {
+                        landing.truth(truth);
+                    }
+                    while let Some(status) = statuses.waiting() {
+                        if landing.status(status) && over.is_none() {
+                            over = Some(Instant::now() + AFTER_LANDING);
+                        }
+                    }
                     progress.say(&format!("{} exited: {exit}{}", service.name(), consequence(service)));
                     if service == Service::Recorder {
                         landing.recording_ended_early(&exit);
@@ -448,15 +457,8 @@ async fn watch(
                         bail!("{} exited before the landing: {exit}; see its stderr above", service.name());
                     }
                     if service == Service::Simulator {
-                        // No camera is left, and mostly no vehicle; what was told before has arrived.
-                        while let Some(truth) = truths.waiting() {
-                            landing.truth(truth);
-                        }
-                        let mut is_over = over.is_some();
-                        while let Some(status) = statuses.waiting() {
-                            is_over |= landing.status(status);
-                        }
-                        if !is_over || landing.comes_down() {
+                        // No camera is left, and mostly no vehicle.
+                        if over.is_none() || landing.comes_down() {
                             landing.interrupted(&format!("the simulator exited: {exit}"));
                         }
                         return Ok(landing);
@@ -649,26 +651,30 @@ mod tests {
         let node = Node::open(tool_identity("land"), &zenoh).await?;
         let statuses = node.publisher(topic::STATUS, &[]).await?;
         let truths = node.publisher(topic::TRUTH, &[]).await?;
+        let folder = tempfile::tempdir()?;
+        let told = folder.path().join("told");
         let telling = async {
-            loop {
-                statuses.publish(&status).await;
-                if let Some(truth) = &truth {
-                    truths.publish(truth).await;
-                }
-                tokio::time::sleep(Duration::from_millis(10)).await;
+            while !(statuses.has_subscribers().await && truths.has_subscribers().await) {
+                tokio::time::sleep(Duration::from_millis(5)).await;
             }
+            statuses.publish(&status).await;
+            if let Some(truth) = &truth {
+                truths.publish(truth).await;
+            }
+            std::fs::write(&told, "")?;
+            std::future::pending::<anyhow::Result<()>>().await
         };
         let settings = ServiceSettings::new(&Tool::try_parse_from(["land"])?.land)?;
         let mut children = Children::new();
         let mut simulator = tokio::process::Command::new("sh");
-        simulator.args(["-c", "sleep 0.2; exit 3"]);
+        simulator.args(["-c", "while [ ! -e \"$0\" ]; do sleep 0.02; done; exit 3"]).arg(&told);
         children.spawn(Service::Simulator, simulator, "sh", Reach::Leader)?;
         let mut progress = Progress::new(Format::Json);
         let deadline = Instant::now() + Duration::from_secs(60);
         let limits = Limits { shutdown: Shutdown::on_signals()?, deadline };
         let landing = tokio::select! {
             landing = watch(&node, &settings, &mut children, "", &mut progress, limits) => landing,
-            () = telling => bail!("nothing is told any more"),
+            end = telling => bail!("telling: {end:?}"),
         };
         node.close().await;
         Ok(landing?.outcome())
