@@ -602,11 +602,11 @@ fn the_units_are_as_systemd_wants_them() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_keeps_ending_is_given_up() -> anyhow::Result<()> {
-    with_second_try(a_process_keeps_ending).await
+async fn what_is_refused_its_configuration_is_given_up_at_once() -> anyhow::Result<()> {
+    with_second_try(a_process_refuses_its_configuration).await
 }
 
-async fn a_process_keeps_ending() -> anyhow::Result<()> {
+async fn a_process_refuses_its_configuration() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let site =
         "[[local]]\ncommand = ['sh', '-c', 'echo out of order >&2; exit 2']\nname = 'broken'\n";

@@ -133,6 +133,8 @@ struct Supervised {
     /// When it was started the last time.
     started: Instant,
     exits: VecDeque<Instant>,
+    /// How often in a row it exited with status 0.
+    completions: usize,
     keeps_failing: bool,
     state: State,
 }
@@ -155,9 +157,15 @@ impl Supervised {
             pid: 0,
             started: Instant::now(),
             exits: VecDeque::new(),
+            completions: 0,
             keeps_failing: false,
             state: State::Running,
         }
+    }
+
+    /// Whether it is a program that is none of ours: one may do its work once.
+    fn is_foreign(&self) -> bool {
+        self.job.service.is_none() && self.job.command.first().is_none_or(|it| it != OWN_PROGRAM)
     }
 
     /// Whether it does not run, and is not likely to.
@@ -186,6 +194,7 @@ impl Supervised {
     fn on_exit(&mut self, exit: &Exit, now: Instant) -> String {
         self.exits.push_back(now);
         self.exits.retain(|exit| now.duration_since(*exit) <= PERIOD);
+        self.completions = if exit.status == Some(0) { self.completions + 1 } else { 0 };
         let name = &self.job.name;
         if exit.status == Some(WRONG_USE) {
             self.state = State::GivenUp;
@@ -195,14 +204,20 @@ impl Supervised {
         }
         let kept_failing = self.keeps_failing && now.duration_since(self.started) < PERIOD;
         self.keeps_failing = kept_failing || self.exits.len() >= MAX_EXITS;
+        if self.keeps_failing && self.is_foreign() && self.completions >= MAX_EXITS {
+            self.state = State::GivenUp;
+            return format!(
+                "{name}: exited {MAX_EXITS} times in a row with status 0, so it seems to be done; given up. Restart `alight up` to run it again"
+            );
+        }
         if self.keeps_failing {
             self.state = State::Waiting(now + LONG_PAUSE);
             let pause_s = LONG_PAUSE.as_secs();
             return match kept_failing {
                 true => format!("{name}: exited with {exit}; restarting in {pause_s} s"),
                 false => format!(
-                    "{name}: exited {MAX_EXITS} times within {} s, last with {exit}; restarting every {pause_s} s from now on. See its stderr above; \
-                     the others continue without it",
+                    "{name}: exited {MAX_EXITS} times within {} s, last with {exit}; restarting every {pause_s} s from now on, while another process \
+                     runs. See its stderr above",
                     PERIOD.as_secs()
                 ),
             };
@@ -355,7 +370,7 @@ async fn watch(
 ) -> anyhow::Result<bool> {
     let mut renewal = tokio::time::interval_at(Instant::now() + RENEWAL, RENEWAL);
     loop {
-        if supervised.iter().all(Supervised::is_out) {
+        if all_are_out(supervised) {
             say("no process runs, and none is likely to: ending with an error");
             return Ok(true);
         }
@@ -389,6 +404,10 @@ async fn watch(
             }
         }
     }
+}
+
+fn all_are_out(supervised: &[Supervised]) -> bool {
+    supervised.iter().all(Supervised::is_out)
 }
 
 fn pids(supervised: &[Supervised]) -> Vec<i32> {
@@ -598,6 +617,50 @@ mod tests {
         process.on_exit(&failure(1), now);
         assert_eq!(process.state, State::Waiting(now + MIN_PAUSE));
         assert!(!process.is_out());
+    }
+
+    #[test]
+    fn it_goes_on_while_one_runs_and_ends_when_all_keep_failing() {
+        let mut all = [supervised(), supervised(), supervised()];
+        let now = Instant::now();
+        let fail = |process: &mut Supervised, status: i32| {
+            (0..MAX_EXITS).for_each(|_| drop(process.on_exit(&failure(status), now)));
+        };
+        fail(&mut all[0], 1);
+        fail(&mut all[1], WRONG_USE);
+        assert!(!all_are_out(&all), "one runs");
+        all[2].on_exit(&failure(1), now);
+        assert!(!all_are_out(&all), "it is soon started again");
+        fail(&mut all[2], 1);
+        assert!(all_are_out(&all));
+        all[0].state = State::Running;
+        assert!(!all_are_out(&all), "one has come back");
+    }
+
+    #[test]
+    fn a_program_of_others_that_is_done_is_given_up() {
+        let ended = |command: &[&str], service: Option<Service>, status: i32| {
+            let mut process = supervised();
+            process.job.service = service;
+            process.job.command = command.iter().map(|&word| word.to_owned()).collect();
+            let now = Instant::now();
+            let said = (0..MAX_EXITS).map(|_| process.on_exit(&failure(status), now)).last();
+            (process.state == State::GivenUp, said.unwrap())
+        };
+        let (is_given_up, said) = ended(&["./setup.sh"], None, 0);
+        assert!(is_given_up && said.contains("seems to be done"), "{said}");
+        assert!(!ended(&["./setup.sh"], None, 1).0);
+        assert!(!ended(&["alight", "relay"], None, 0).0);
+        assert!(!ended(&["alight", "detector"], Some(Service::Detector), 0).0);
+        // A failure between is another matter.
+        let mut process = supervised();
+        (process.job.service, process.job.command) = (None, vec!["./setup.sh".to_owned()]);
+        for status in [0, 0, 0, 1, 0, 0, 0, 0, 0] {
+            process.on_exit(&failure(status), Instant::now());
+            assert_ne!(process.state, State::GivenUp);
+        }
+        process.on_exit(&failure(0), Instant::now());
+        assert_eq!(process.state, State::GivenUp);
     }
 
     #[test]
