@@ -24,7 +24,7 @@ use crate::config::{Config, Mode, Start};
 use crate::control::{is_holding_px4, pilots_px4_mode};
 use crate::frames::{Arrival, Frames};
 use crate::journal::Journal;
-use crate::landing_target::{self, Distrust, LandingTargetMode};
+use crate::landing_target::{self, LandingTargetMode};
 use crate::limits::{Limits, Note};
 use crate::mission::{Mission, Trigger, is_flying_guided};
 use crate::offboard_watch::OffboardWatch;
@@ -323,16 +323,14 @@ impl Flight {
         }
     }
 
-    /// Why the autopilot's own landing gets no target.
-    fn distrust(&self) -> Option<Distrust> {
-        self.landing_target.as_ref().and_then(|_| self.view().distrust())
-    }
-
     fn send_landing_target(&mut self, now_ns: i64, frame: &FrameObservation) {
         let target = self.decision.and_then(|decision| decision.target);
-        let distrust = self.distrust();
+        let is_trusted = self.view().distrust().is_none();
+        let is_low = !self.lander.may_recall();
+        // Low in the autopilot's landing it goes on to the ground all the same.
         if let Some(landing_target) = &mut self.landing_target
-            && landing_target.send(now_ns, frame, target, distrust.as_ref(), &mut self.autopilot)
+            && (is_trusted || is_low && landing_target.is_landing())
+            && landing_target.send(now_ns, frame, target, &mut self.autopilot)
         {
             self.journal.count("landing targets");
             self.journal.used_frame(now_ns, frame.stamp.nanos());
@@ -633,9 +631,9 @@ impl Flight {
     }
 
     fn advance_mission(&mut self, now_ns: i64) {
-        let (may_recall, distrust) = (self.lander.may_recall(), self.distrust());
+        let (may_recall, distrust) = (self.lander.may_recall(), self.view().distrust());
         if let Some(landing_target) = &mut self.landing_target
-            && landing_target.step(now_ns, may_recall, distrust.as_ref(), &mut self.autopilot)
+            && landing_target.step(now_ns, may_recall, distrust, &mut self.autopilot)
             && !self.mission.is_sending_landing_target()
         {
             // Somebody else began it; it is followed like our own.

@@ -145,8 +145,8 @@ impl Frames {
         } else {
             self.kept_ns = now_ns;
         }
-        let marker = wire::wanted(message, &self.marker)
-            .map(|detection| wire::marker_in_frame(detection, mount));
+        let marker =
+            message.first_of(&self.marker).map(|detection| wire::marker_in_frame(detection, mount));
         let sight = marker.as_ref().map(|marker| Sight {
             position_m: marker.body_from_marker.map(|pose| pose.origin().coords.into()),
         });

@@ -6,7 +6,7 @@
 
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, Parameter};
 use geometry::Point;
-use landing::{FrameObservation, Lander, Reason, TargetEstimate};
+use landing::{FrameObservation, Reason, TargetEstimate};
 use messages::Phase;
 
 use crate::config::{LandingTargetSettings, LandingTargetSource};
@@ -74,21 +74,14 @@ impl LandingTargetMode {
         Self { settings, timeout_s, stream: None, state: State::Idle, from_hold: false }
     }
 
-    /// Sends the landing target of a frame that was used; false when there is nothing to send. One that there is `distrust` in is not
-    /// sent, but low in the autopilot's landing, which without it goes on to the ground all the same.
+    /// Sends the landing target of a frame that was used; false when there is nothing to send.
     pub fn send(
         &mut self,
         now_ns: i64,
         frame: &FrameObservation,
         target: Option<TargetEstimate>,
-        distrust: Option<&Distrust>,
         autopilot: &mut Autopilot,
     ) -> bool {
-        let lands_low =
-            self.state == State::Landing && distrust.is_some_and(|distrust| !distrust.may_recall);
-        if distrust.is_some() && !lands_low {
-            return false;
-        }
         let vehicle = autopilot.state().and_then(wire::vehicle);
         let (Some(target), Some(vehicle)) = (target, vehicle) else { return false };
         let detected = frame.marker.and_then(|marker| marker.body_from_marker);
@@ -121,7 +114,7 @@ impl LandingTargetMode {
         &mut self,
         now_ns: i64,
         may_recall: bool,
-        distrust: Option<&Distrust>,
+        distrust: Option<Reason>,
         autopilot: &mut Autopilot,
     ) -> bool {
         let Some(state) = autopilot.state().copied() else { return false };
@@ -193,7 +186,7 @@ impl LandingTargetMode {
         &mut self,
         now_ns: i64,
         since_ns: i64,
-        distrust: Option<&Distrust>,
+        distrust: Option<Reason>,
         autopilot: &mut Autopilot,
     ) {
         let mode = autopilot.firmware().and_then(Firmware::precision_land);
@@ -204,7 +197,7 @@ impl LandingTargetMode {
         {
             self.state = State::Commanding(autopilot.request(now_ns, Command::SetMode(mode)));
         } else if waited_s > self.timeout_s {
-            let distrusted = distrust.map(|distrust| distrust.why.clone());
+            let distrusted = distrust.map(|why| why.to_string());
             self.state = State::Ended(problem(autopilot).or(distrusted).unwrap_or_else(|| {
                 format!("no marker without gaps for {waited_s:.0} s; hovering")
             }));
@@ -286,6 +279,11 @@ impl LandingTargetMode {
         )
     }
 
+    /// True while the autopilot lands.
+    pub fn is_landing(&self) -> bool {
+        self.state == State::Landing
+    }
+
     /// True once a landing has ended.
     pub fn is_finished(&self) -> bool {
         matches!(self.state, State::AbortedEarly(_) | State::Landed | State::Ended(_))
@@ -312,28 +310,6 @@ fn hover_mode(autopilot: &Autopilot) -> FlightMode {
         Some(Firmware::Px4) => FlightMode::AUTO_HOLD,
         _ => FlightMode::Guided,
     }
-}
-
-/// Why the autopilot gets no target: what keeps our own guidance from descending, which the autopilot cannot know.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Distrust {
-    /// The reason.
-    pub why: String,
-    /// The vehicle is so high that it could be taken back from landing.
-    pub may_recall: bool,
-}
-
-/// Whether a target is one that the autopilot may land on; `is_disputed` says that detectors see the marker at two places.
-pub fn distrust(
-    lander: &Lander,
-    target: Option<&TargetEstimate>,
-    is_disputed: bool,
-) -> Option<Distrust> {
-    let is_ambiguous = target.is_some_and(|target| target.ambiguous);
-    let mismatch = lander.axis_mismatch();
-    let dispute = is_disputed.then_some(Reason::Disputed);
-    let why = mismatch.or(dispute).or(is_ambiguous.then_some(Reason::Ambiguous))?;
-    Some(Distrust { why: why.to_string(), may_recall: lander.may_recall() })
 }
 
 /// What keeps this autopilot from using landing targets, and what to do about it.

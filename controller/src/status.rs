@@ -7,7 +7,7 @@ use messages::{ControllerStatus, Phase, Setpoint, TargetEstimate};
 use crate::config::{Config, GuidanceName, Mode, Start};
 use crate::frames::Frames;
 use crate::journal::Journal;
-use crate::landing_target::{self, Distrust, LandingTargetMode};
+use crate::landing_target::{self, LandingTargetMode};
 use crate::limits;
 use crate::mission::{Mission, State};
 use crate::mount;
@@ -124,7 +124,7 @@ impl View<'_> {
                 State::Idle | State::AwaitingTakeoff | State::SendingLandingTarget,
                 Some(landing_target),
             ) => {
-                let distrust = self.distrust().map(|distrust| distrust.why);
+                let distrust = self.distrust().map(|why| why.to_string());
                 let problem = landing_target::problem(self.autopilot).or(distrust);
                 landing_target.phase(now_ns, problem)
             }
@@ -154,12 +154,15 @@ impl View<'_> {
         }
     }
 
-    /// Why the autopilot's own landing gets no target.
-    pub fn distrust(&self) -> Option<Distrust> {
-        let is_off = self.config.phases.dispute_height_m == 0.0;
-        let is_disputed = !is_off && self.frames.selection.dispute().is_some();
+    /// Why the autopilot's own landing gets no target: what keeps our own guidance from descending, which the autopilot cannot know.
+    pub fn distrust(&self) -> Option<Reason> {
+        self.landing_target?;
+        let checks_disputes = self.config.phases.dispute_height_m > 0.0;
+        let is_disputed = checks_disputes && self.frames.selection.dispute().is_some();
         let target = self.decision.and_then(|decision| decision.target);
-        landing_target::distrust(self.lander, target.as_ref(), is_disputed)
+        let is_ambiguous = target.is_some_and(|target| target.ambiguous);
+        let dispute = is_disputed.then_some(Reason::Disputed);
+        self.lander.axis_mismatch().or(dispute).or(is_ambiguous.then_some(Reason::Ambiguous))
     }
 
     /// Whether a landing was to be resumed, and the motors of a vehicle run that is said to stand.

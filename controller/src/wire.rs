@@ -3,7 +3,7 @@
 use autopilot::VehicleState;
 use geometry::{Body, Camera, Marker, Pixel, Rotation, Transform, Vector};
 use landing::{Landed, MarkerInFrame, Mode, Timestamp, VehicleStatus};
-use messages::{CameraInfo, Detection, Detections, MarkerPose, Phase, Transform3};
+use messages::{CameraInfo, Detection, MarkerPose, Phase, Transform3};
 use nalgebra::Matrix3;
 
 /// Maximum time between attitude and position, in nanoseconds: beyond it one of the two has stopped.
@@ -12,11 +12,6 @@ const MAX_SKEW_NS: i64 = 300_000_000;
 /// Where a camera is mounted.
 pub fn body_from_camera(info: &CameraInfo) -> Option<Transform<Body, Camera>> {
     info.body_from_camera.transform()
-}
-
-/// The first detection of the marker `family` or `family:id` in a frame; none for an invalid name.
-pub fn wanted<'a>(message: &'a Detections, marker: &str) -> Option<&'a Detection> {
-    message.detections.iter().find(|detection| detection.is_of(marker))
 }
 
 /// Converts a detection for the lander.
@@ -133,24 +128,6 @@ pub fn vehicle_message(state: &VehicleState) -> Option<messages::VehicleState> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn the_wanted_marker_is_found_by_family_and_id() {
-        let detection =
-            |family: &str, id| Detection { family: family.into(), id, ..Detection::sample() };
-        let detections = vec![
-            detection("aruco-4x4-50", Some(3)),
-            detection("aruco-4x4-50", Some(7)),
-            detection("rings", None),
-        ];
-        let message = Detections { detections, ..Detections::sample() };
-        let id = |marker: &str| wanted(&message, marker).map(|d| d.id);
-        assert_eq!(id("rings"), Some(None));
-        assert_eq!(id("aruco-4x4-50:7"), Some(Some(7)));
-        assert_eq!(id("aruco-4x4-50"), Some(Some(3)));
-        assert_eq!(id("stag-hd23:0"), None);
-        assert_eq!(id("aruco-4x4-50:x7"), None, "an id that is not a number is refused");
-    }
 
     #[test]
     fn a_position_that_has_stopped_is_not_flown_on() {

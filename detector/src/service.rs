@@ -3,7 +3,7 @@
 //! The image work runs on one thread of its own, named `detect`, so that no message ever waits for it. The thread
 //! takes a frame only when it is free, and its inbox keeps only the newest.
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use airlink::Unpacker;
@@ -24,7 +24,7 @@ use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 
 use crate::config::{Config, Input};
-use crate::inbox::{AirInbox, Inbox};
+use crate::inbox::{AirInbox, Inbox, lock};
 use crate::search::{Search, StageClock};
 use crate::wire;
 
@@ -115,11 +115,6 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     }
     drop(thread);
     Ok(())
-}
-
-// What a thread that panicked has left is still one whole value.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Whether a camera's information is used: not what no camera can have, and not another calibration while the

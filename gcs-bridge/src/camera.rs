@@ -11,7 +11,7 @@ use autopilot::dialect::{
     STORAGE_INFORMATION_DATA, StorageStatus, VIDEO_STREAM_INFORMATION_DATA,
     VIDEO_STREAM_STATUS_DATA, VideoStreamEncoding, VideoStreamStatusFlags, VideoStreamType,
 };
-use messages::{ControllerStatus, Detection, Detections, marker_name};
+use messages::{ControllerStatus, Detection, Detections};
 
 use crate::video::Video;
 
@@ -97,7 +97,7 @@ impl Camera {
         found: &Detections,
     ) {
         let in_use = status.and_then(|status| status.active_detector.as_deref());
-        let wanted = status.map(|status| &status.marker).filter(|name| marker_name(name).is_ok());
+        let wanted = status.and_then(ControllerStatus::landing_marker);
         let followed = self.frame(now_ns).map(|frame| frame.detector.as_str());
         let is_followed = in_use.or(followed).is_none_or(|name| name == detector);
         let header = &found.header;
@@ -106,7 +106,7 @@ impl Camera {
         }
         let (width, height) = (header.width, header.height);
         let best = match wanted {
-            Some(name) => found.detections.iter().find(|detection| detection.is_of(name)),
+            Some(name) => found.first_of(name),
             None => found.detections.first(),
         };
         self.seen = Some(Frame {

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use anyhow::{Context, ensure};
 use calibration::{ConfiguredCamera, MarkerSample, VehicleSample};
-use controller::wire::{body_from_camera, wanted};
+use controller::wire::body_from_camera;
 use geometry::{Point, Rotation, Vector};
 use messages::{CameraInfo, Detections};
 use report::{Flight, FlightReader, replay_tapes};
@@ -91,7 +91,7 @@ pub(super) fn read(file: &Path, wanted: &Wanted<'_>) -> anyhow::Result<RecordedF
 }
 
 fn messages_pose<'a>(message: &'a Detections, marker: &str) -> Option<&'a messages::MarkerPose> {
-    wanted(message, marker)?.pose.as_ref()
+    message.first_of(marker)?.pose.as_ref()
 }
 
 /// The detections of the detector with the most, or of the wanted one, of one camera.
@@ -116,9 +116,7 @@ fn detections<'a>(flight: &'a Flight, wanted: &Wanted<'_>) -> anyhow::Result<Vec
     // Other detectors may have found other markers, also more of them.
     let named = named(flight, wanted);
     let seen_named = |messages: &[&Detections]| {
-        let sees = |name: &String| {
-            messages.iter().filter(|it| controller::wire::wanted(it, name).is_some()).count()
-        };
+        let sees = |name: &String| messages.iter().filter(|it| it.first_of(name).is_some()).count();
         named.as_ref().map_or(0, sees)
     };
     let most = chosen.max_by_key(|(_, messages)| (seen_named(messages), seen(messages)));
@@ -170,7 +168,7 @@ fn marker(flight: &Flight, wanted: &Wanted<'_>, found: &[&Detections]) -> anyhow
     let named = named(flight, wanted);
     let is_seen = |name: &String| {
         messages::marker_name(name).is_ok()
-            && found.iter().any(|message| controller::wire::wanted(message, name).is_some())
+            && found.iter().any(|message| message.first_of(name).is_some())
     };
     if let Some(name) = &wanted.marker {
         ensure!(

@@ -4,7 +4,6 @@
 use std::collections::VecDeque;
 
 use controller::agreement::distance;
-use controller::wire::wanted;
 use messages::{Configuration, Detections};
 
 /// Latest frames of each of the two that are kept: the later one may be half a second behind.
@@ -68,7 +67,7 @@ impl Comparison {
             _ => return,
         };
         let detection = match &self.controller {
-            Some(controller) => wanted(message, &controller.marker),
+            Some(controller) => message.first_of(&controller.marker),
             None => message.detections.first(),
         };
         let Some(pose) = detection.and_then(|detection| detection.pose.as_ref()) else { return };

@@ -6,7 +6,7 @@
 //!
 //! While a controller looks for its marker, others are no reason to send a region instead of the whole frame.
 
-use messages::{ControllerStatus, Detection, Detections, marker_name};
+use messages::{ControllerStatus, Detection, Detections};
 
 /// Maximum number of tracks; further markers are found in the overview.
 const MAX_TRACKS: usize = 8;
@@ -62,7 +62,7 @@ pub struct Roi {
 impl RoiPredictor {
     /// Takes a controller's status: the marker that it lands on must be among those of an ROI.
     pub fn follow(&mut self, status: &ControllerStatus) {
-        let marker = marker_name(&status.marker).is_ok().then(|| status.marker.clone());
+        let marker = status.landing_marker().map(str::to_owned);
         if self.marker != marker {
             self.marker = marker;
             self.tracks.clear();

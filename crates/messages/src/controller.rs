@@ -5,7 +5,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use crate::codec::wire;
-use crate::detector::Place;
+use crate::detector::{Place, marker_name};
 
 wire! {
     TargetEstimate = 6 v 2;
@@ -202,6 +202,11 @@ pub struct ControllerStatus {
 }
 
 impl ControllerStatus {
+    /// The marker it lands on, unless that is no marker's name, as in a status that tells none.
+    pub fn landing_marker(&self) -> Option<&str> {
+        marker_name(&self.marker).is_ok().then_some(self.marker.as_str())
+    }
+
     /// The phase and its reason in words. A reason that begins with the phase's name stands alone, as "aborted: held too long" and
     /// "aborted by the operator" do.
     pub fn sentence(&self) -> String {

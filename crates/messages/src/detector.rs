@@ -43,7 +43,7 @@ pub fn marker_name(name: &str) -> Result<(&str, Option<u32>), String> {
 }
 
 /// The family of pads of several markers.
-pub const PAD_FAMILY: &str = "pad";
+const PAD_FAMILY: &str = "pad";
 
 /// A marker found in a frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -229,5 +229,35 @@ impl Detection {
     /// The same, and every marker may be of a pad of several.
     pub fn may_be_of(&self, marker: &str) -> bool {
         self.is_of(marker) || marker_name(marker).is_ok_and(|(family, _)| family == PAD_FAMILY)
+    }
+}
+
+impl Detections {
+    /// The first detection of the marker of this name, `FAMILY` or `FAMILY:ID`; none for an invalid one.
+    pub fn first_of(&self, marker: &str) -> Option<&Detection> {
+        self.detections.iter().find(|detection| detection.is_of(marker))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_wanted_marker_is_found_by_family_and_id() {
+        let detection =
+            |family: &str, id| Detection { family: family.into(), id, ..Detection::sample() };
+        let detections = vec![
+            detection("aruco-4x4-50", Some(3)),
+            detection("aruco-4x4-50", Some(7)),
+            detection("rings", None),
+        ];
+        let message = Detections { detections, ..Detections::sample() };
+        let id = |marker: &str| message.first_of(marker).map(|d| d.id);
+        assert_eq!(id("rings"), Some(None));
+        assert_eq!(id("aruco-4x4-50:7"), Some(Some(7)));
+        assert_eq!(id("aruco-4x4-50"), Some(Some(3)));
+        assert_eq!(id("stag-hd23:0"), None);
+        assert_eq!(id("aruco-4x4-50:x7"), None, "an id that is not a number is refused");
     }
 }

@@ -33,8 +33,7 @@ pub use controller::{
 };
 pub use detector::{
     AlternativePose, CameraResponse, Detection, Detections, DetectorCommand, DetectorInfo,
-    EllipsePx, MarkerPose, PAD_FAMILY, Place, Refusal, Refusals, RefusedShape, StageTime,
-    marker_name,
+    EllipsePx, MarkerPose, Place, Refusal, Refusals, RefusedShape, StageTime, marker_name,
 };
 pub use health::{Configuration, Count, Health, Latency, Rate};
 pub use recorder::{NEVER_CAME, RecorderLoss, RecorderStatus, has_never_come};

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use messages::{ControllerStatus, Detection, Detections, marker_name};
+use messages::{ControllerStatus, Detection, Detections};
 
 /// Maximum age of the last detection, in nanoseconds. After it the camera meters by itself: a landing goes on without the
 /// pad for longer, but not with a guess of where it is.
@@ -73,7 +73,7 @@ impl PadTrack {
     /// Only the detector that a controller uses counts from now on, while there is one, and only the marker that it lands on.
     pub fn follow(&mut self, status: &ControllerStatus) {
         self.detector.clone_from(&status.active_detector);
-        self.marker = marker_name(&status.marker).is_ok().then(|| status.marker.clone());
+        self.marker = status.landing_marker().map(str::to_owned);
     }
 
     /// Takes a detector's message. One of another camera, of a detector that is not in use, or about an older frame is

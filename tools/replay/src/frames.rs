@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 
 use airlink::Unpacker;
 use anyhow::{Context, bail, ensure};
-use controller::wire::wanted;
 use detector::{Search, StageClock};
 use flightlog::{Entry, RecordedTape};
 use geometry::Point;
@@ -313,7 +312,7 @@ impl Frames {
         let sides = [(&mut searched.then, then, then_ms), (&mut searched.now, now, took_ms)];
         for ((side, message, ms), place) in sides.into_iter().zip(&mut places) {
             side.times_ms.push(ms);
-            let Some(seen) = wanted(message, &side.marker) else { continue };
+            let Some(seen) = message.first_of(&side.marker) else { continue };
             side.frames += 1;
             side.visible += usize::from(is_visible);
             let [x, y, z] = match &seen.pose {
