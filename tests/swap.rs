@@ -12,7 +12,7 @@ use node::{Identity, Node, Subscriber, ZenohSource};
 use testing::{python, python_passes, with_second_try};
 use tokio::time::{sleep, timeout};
 
-use crate::flight::{ALIGHT, Landing, PATIENCE, alone, beside_another, output_of};
+use crate::flight::{ALIGHT, Landing, PATIENCE, beside_another, output_of, time_for};
 use crate::swaps::{self, command};
 
 fn detectors(landing: &Landing, args: &[&str]) -> anyhow::Result<String> {
@@ -135,7 +135,7 @@ async fn failed_swaps_and_twenty_more_detectors_change_nothing() -> anyhow::Resu
 }
 
 async fn swaps_fail_and_many_speak() -> anyhow::Result<()> {
-    let _alone = alone().await?;
+    let _flight = time_for(4).await?;
     let landing = Landing::start(&["--seed", "22"]).await?;
     landing.descends_below(9.0).await?;
     command(&landing, ControllerCommand::Hold).await?;

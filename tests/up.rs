@@ -18,7 +18,7 @@ use testing::{ports, with_second_try};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
-use crate::flight::{alone, beside_another, output_of, small_camera};
+use crate::flight::{beside_another, output_of, small_camera, time_for};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
@@ -164,7 +164,7 @@ async fn two_roles_meet_what_dies_comes_back_and_the_end_is_orderly() -> anyhow:
 }
 
 async fn two_roles_meet() -> anyhow::Result<()> {
-    let _alone = alone().await?;
+    let _flight = time_for(4).await?;
     let folder = tempfile::tempdir()?;
     let meet = write_site(folder.path())?;
     let mut drone = Up::start(folder.path(), "drone")?;
