@@ -58,7 +58,7 @@ impl Permission {
         let name = match self {
             Self::Everything => None,
             Self::NoArming => {
-                (starts_or_stops_motors(message, command)).then_some("arming or stopping motors")
+                starts_or_stops_motors(message).then_some("arming or stopping motors")
             }
             Self::Monitor => (!changes_nothing(message, command)).then_some("only monitoring"),
         };
@@ -90,34 +90,64 @@ fn command(message: &MavMessage) -> Option<MavCmd> {
     }
 }
 
-/// SET_MODE counts as well: its flags can arm older autopilots. So do a script or a file that the autopilot would run, mavlink
-/// packets for another of its links, and what a pilot's sticks, switches and buttons would do: sticks arm, and a switch may
-/// stop the motors in the air (ArduPilot's auxiliary functions, `ARMING_RUDDER`).
-#[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
-fn starts_or_stops_motors(message: &MavMessage, command: Option<MavCmd>) -> bool {
-    let by_command = matches!(
-        command,
-        Some(
+/// A command to be carried out now, or by a mission.
+struct Order {
+    command: MavCmd,
+    /// The fifth, sixth and seventh parameters; a mission's place is none.
+    last_parameters: [f32; 3],
+}
+
+impl Order {
+    #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+    fn of(message: &MavMessage) -> Option<Self> {
+        let (command, last_parameters) = match message {
+            MavMessage::COMMAND_LONG(it) => (it.command, [it.param5, it.param6, it.param7]),
+            MavMessage::COMMAND_INT(it) => (it.command, [it.x as f32, it.y as f32, it.z]),
+            MavMessage::MISSION_ITEM(it) => (it.command, [0.0; 3]),
+            MavMessage::MISSION_ITEM_INT(it) => (it.command, [0.0; 3]),
+            _ => return None,
+        };
+        Some(Self { command, last_parameters })
+    }
+
+    /// Some do so by a parameter: a calibration of the compass against the motors or of the speed controllers turns motors,
+    /// and one of the compass may restart the autopilot at its end.
+    fn starts_or_stops_motors(&self) -> bool {
+        let [fifth, sixth, seventh] = self.last_parameters;
+        match self.command {
+            MavCmd::MAV_CMD_PREFLIGHT_CALIBRATION => sixth != 0.0 || seventh != 0.0,
+            MavCmd::MAV_CMD_DO_START_MAG_CAL => fifth != 0.0,
             MavCmd::MAV_CMD_COMPONENT_ARM_DISARM
-                | MavCmd::MAV_CMD_DO_FLIGHTTERMINATION
-                | MavCmd::MAV_CMD_DO_MOTOR_TEST
-                | MavCmd::MAV_CMD_DO_PARACHUTE
-                | MavCmd::MAV_CMD_DO_SET_ACTUATOR
-                | MavCmd::MAV_CMD_DO_SET_SERVO
-                | MavCmd::MAV_CMD_DO_REPEAT_SERVO
-                | MavCmd::MAV_CMD_DO_SET_RELAY
-                | MavCmd::MAV_CMD_DO_REPEAT_RELAY
-                | MavCmd::MAV_CMD_DO_AUX_FUNCTION
-                | MavCmd::MAV_CMD_DO_ENGINE_CONTROL
-                | MavCmd::MAV_CMD_MISSION_START
-                | MavCmd::MAV_CMD_SOLO_BTN_FLY_CLICK
-                | MavCmd::MAV_CMD_SOLO_BTN_FLY_HOLD
-                | MavCmd::MAV_CMD_SOLO_BTN_PAUSE_CLICK
-                | MavCmd::MAV_CMD_ACTUATOR_TEST
-                | MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
-        )
-    );
-    by_command
+            | MavCmd::MAV_CMD_DO_FLIGHTTERMINATION
+            | MavCmd::MAV_CMD_DO_MOTOR_TEST
+            | MavCmd::MAV_CMD_DO_PARACHUTE
+            | MavCmd::MAV_CMD_DO_SET_ACTUATOR
+            | MavCmd::MAV_CMD_DO_SET_SERVO
+            | MavCmd::MAV_CMD_DO_REPEAT_SERVO
+            | MavCmd::MAV_CMD_DO_SET_RELAY
+            | MavCmd::MAV_CMD_DO_REPEAT_RELAY
+            | MavCmd::MAV_CMD_DO_AUX_FUNCTION
+            | MavCmd::MAV_CMD_DO_ENGINE_CONTROL
+            | MavCmd::MAV_CMD_MISSION_START
+            | MavCmd::MAV_CMD_SOLO_BTN_FLY_CLICK
+            | MavCmd::MAV_CMD_SOLO_BTN_FLY_HOLD
+            | MavCmd::MAV_CMD_SOLO_BTN_PAUSE_CLICK
+            | MavCmd::MAV_CMD_ACTUATOR_TEST
+            | MavCmd::MAV_CMD_INJECT_FAILURE
+            | MavCmd::MAV_CMD_CAN_FORWARD
+            | MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN => true,
+            _ => false,
+        }
+    }
+}
+
+/// SET_MODE counts as well: its flags can arm older autopilots. So do a script or a file that the autopilot would run, MAVLink
+/// packets for another of its links, what goes to its buses past its checks, and what a pilot's sticks, switches and buttons
+/// would do: sticks arm, and a switch may stop the motors in the air (ArduPilot's auxiliary functions, `ARMING_RUDDER`). A
+/// mission's items count like commands, as AUTO carries them out in the air.
+#[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+fn starts_or_stops_motors(message: &MavMessage) -> bool {
+    Order::of(message).is_some_and(|order| order.starts_or_stops_motors())
         || matches!(
             message,
             MavMessage::SET_MODE(_)
@@ -127,6 +157,9 @@ fn starts_or_stops_motors(message: &MavMessage, command: Option<MavCmd>) -> bool
                 | MavMessage::SERIAL_CONTROL(_)
                 | MavMessage::FILE_TRANSFER_PROTOCOL(_)
                 | MavMessage::TUNNEL(_)
+                | MavMessage::DEVICE_OP_WRITE(_)
+                | MavMessage::CAN_FRAME(_)
+                | MavMessage::CANFD_FRAME(_)
         )
 }
 
@@ -163,8 +196,8 @@ fn changes_nothing(message: &MavMessage, command: Option<MavCmd>) -> bool {
 mod tests {
     use super::*;
     use crate::dialect::{
-        COMMAND_INT_DATA, COMMAND_LONG_DATA, HEARTBEAT_DATA, MANUAL_CONTROL_DATA,
-        PARAM_REQUEST_LIST_DATA, PARAM_SET_DATA, RC_CHANNELS_OVERRIDE_DATA,
+        CAN_FRAME_DATA, COMMAND_INT_DATA, COMMAND_LONG_DATA, HEARTBEAT_DATA, MANUAL_CONTROL_DATA,
+        MISSION_ITEM_INT_DATA, PARAM_REQUEST_LIST_DATA, PARAM_SET_DATA, RC_CHANNELS_OVERRIDE_DATA,
         REQUEST_DATA_STREAM_DATA, SET_MODE_DATA,
     };
     use crate::packet::{Parser, Sender, encode};
@@ -179,6 +212,18 @@ mod tests {
 
     fn int(command: MavCmd) -> MavMessage {
         MavMessage::COMMAND_INT(COMMAND_INT_DATA { command, ..Default::default() })
+    }
+
+    /// A calibration, with the compass against the motors or without.
+    fn calibration(param6: f32) -> MavMessage {
+        let command = MavCmd::MAV_CMD_PREFLIGHT_CALIBRATION;
+        MavMessage::COMMAND_LONG(COMMAND_LONG_DATA { command, param6, ..Default::default() })
+    }
+
+    /// Places of missions are not parameters.
+    fn item(command: MavCmd) -> MavMessage {
+        let place = MISSION_ITEM_INT_DATA { x: 470_000_000, y: 80_000_000, ..Default::default() };
+        MavMessage::MISSION_ITEM_INT(MISSION_ITEM_INT_DATA { command, ..place })
     }
 
     #[test]
@@ -202,6 +247,11 @@ mod tests {
             (long(MavCmd::MAV_CMD_DO_FLIGHTTERMINATION), false, false),
             (int(MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN), false, false),
             (MavMessage::SET_MODE(SET_MODE_DATA::default()), false, false),
+            (MavMessage::CAN_FRAME(CAN_FRAME_DATA::default()), false, false),
+            (calibration(0.0), true, false),
+            (calibration(1.0), false, false),
+            (item(MavCmd::MAV_CMD_NAV_WAYPOINT), true, false),
+            (item(MavCmd::MAV_CMD_DO_AUX_FUNCTION), false, false),
         ] {
             let packet = packet(&message);
             assert_eq!(Permission::Everything.refusal(&packet), None);
