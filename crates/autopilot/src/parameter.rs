@@ -1,4 +1,4 @@
-//! Reads parameters of the autopilot and sets them, one after the other, with a bounded number of requests.
+//! Reads parameters of the autopilot and sets them, one after the other, with a bounded rate of requests.
 
 use libm::fmax;
 
@@ -11,8 +11,10 @@ use crate::mode::Firmware;
 const REPLY_TIMEOUT_NS: i64 = 500_000_000;
 /// Maximum number of parameters that are read.
 const MAX_PARAMETERS: usize = 64;
-/// Maximum number of requests for each parameter.
+/// Number of requests after which a parameter counts as silent.
 const ATTEMPTS: u32 = 6;
+/// Time between the requests for silent ones, in nanoseconds: all the packets of the first seconds may have been lost.
+const SILENT_NS: i64 = 10_000_000_000;
 
 /// The state of a parameter.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -55,6 +57,10 @@ impl Wanted {
         self.attempts <= ATTEMPTS && (self.value.is_none() || self.set.is_some())
     }
 
+    fn is_silent(&self) -> bool {
+        self.attempts > ATTEMPTS && self.value.is_none()
+    }
+
     fn request(&self, system: u8, component: u8) -> MavMessage {
         match self.set {
             Some(value) => MavMessage::PARAM_SET(PARAM_SET_DATA {
@@ -85,6 +91,7 @@ impl Parameters {
             if self.list.len() < MAX_PARAMETERS && self.list.iter().all(|known| known.name != *name)
             {
                 self.list.push(Wanted::new(name));
+                self.due_ns = i64::MIN;
             }
         }
     }
@@ -98,7 +105,7 @@ impl Parameters {
     pub(crate) fn get(&self, name: &str) -> Parameter {
         match self.list.iter().find(|wanted| wanted.name == name) {
             Some(Wanted { value: Some(value), .. }) => Parameter::Value(*value),
-            Some(wanted) if wanted.attempts > ATTEMPTS => Parameter::Silent,
+            Some(wanted) if wanted.is_silent() => Parameter::Silent,
             _ => Parameter::Unknown,
         }
     }
@@ -137,11 +144,15 @@ impl Parameters {
         }
         // A value to set comes first; then the one with the fewest requests, so that a silent one does not
         // delay the others.
-        let pending = self.list.iter_mut().filter(|wanted| wanted.is_pending());
-        let wanted = pending.min_by_key(|wanted| (wanted.set.is_none(), wanted.attempts))?;
-        wanted.attempts += 1;
-        self.due_ns = now_ns.saturating_add(REPLY_TIMEOUT_NS);
-        if wanted.attempts > ATTEMPTS {
+        let wanted =
+            self.list.iter_mut().filter(|wanted| wanted.is_pending() || wanted.is_silent());
+        let wanted = wanted
+            .min_by_key(|wanted| (wanted.is_silent(), wanted.set.is_none(), wanted.attempts))?;
+        let was_silent = wanted.is_silent();
+        wanted.attempts = wanted.attempts.saturating_add(1);
+        let pause_ns = if was_silent { SILENT_NS } else { REPLY_TIMEOUT_NS };
+        self.due_ns = now_ns.saturating_add(pause_ns);
+        if !was_silent && wanted.attempts > ATTEMPTS {
             wanted.is_unanswered = wanted.set.take().is_some();
             return None;
         }
@@ -187,10 +198,10 @@ mod tests {
     }
 
     #[test]
-    fn a_silent_parameter_is_requested_a_few_times_and_delays_no_other() {
+    fn a_silent_parameter_is_requested_a_few_times_and_then_rarely_and_delays_no_other() {
         let mut parameters = Parameters::new(&["A", "B"]);
         let mut requests = Vec::new();
-        for now_ns in (0..20_000_000_000).step_by(100_000_000) {
+        for now_ns in (0..10_000_000_000).step_by(100_000_000) {
             if let Some(MavMessage::PARAM_REQUEST_READ(request)) = parameters.request(now_ns, 1, 1)
             {
                 let name = request.param_id.to_str().unwrap().to_owned();
@@ -202,10 +213,18 @@ mod tests {
             }
         }
         assert_eq!(requests.iter().filter(|name| *name == "B").count(), 1);
-        assert_eq!(requests.len(), 1 + ATTEMPTS as usize);
+        // The first of the rare ones comes at once.
+        assert_eq!(requests.len(), 2 + ATTEMPTS as usize);
         assert_eq!(parameters.get("A"), Parameter::Silent);
         assert_eq!(parameters.get("B"), Parameter::Value(3.0));
         assert_eq!(parameters.get("C"), Parameter::Unknown);
+        // Packets that begin to arrive after a minute.
+        let late = (10..70).filter(|s| parameters.request(s * 1_000_000_000, 1, 1).is_some());
+        assert_eq!(late.count(), 6);
+        assert!(parameters.request(75_000_000_000, 1, 1).is_some());
+        parameters.take(Firmware::Copter, &value("A", 4.0, MavParamType::MAV_PARAM_TYPE_REAL32));
+        assert_eq!(parameters.get("A"), Parameter::Value(4.0));
+        assert!(parameters.request(90_000_000_000, 1, 1).is_none());
         parameters.restart();
         assert_eq!(parameters.get("B"), Parameter::Unknown);
     }
