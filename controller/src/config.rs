@@ -231,7 +231,7 @@ impl Settings for Config {
         check.parses("marker", messages::marker_name(&self.marker));
         check.parses("autopilot.address", self.autopilot.address.parse::<Address>());
         check.parses("autopilot.ground_may", self.autopilot.ground_may.parse::<Permission>());
-        check.range("autopilot.component_id", self.autopilot.component_id, 1..=255);
+        check.range("autopilot.component_id", self.autopilot.component_id, 2..=255);
         check.range("autopilot.state_rate_hz", self.autopilot.state_rate_hz, 10.0..=200.0);
         check.range("autopilot.setpoint_rate_hz", self.autopilot.setpoint_rate_hz, 5.0..=100.0);
         self.autopilot.check_setpoint_timeout(check);
