@@ -14,7 +14,7 @@ use std::time::Duration;
 use geometry::{Body, Ned, Point, Vector};
 
 use crate::boot::{BootClock, BootTime};
-use crate::clock::Clock;
+use crate::clock::{Clock, Measured};
 use crate::command::{
     Command, CommandError, CommandId, CommandStatus, MODE_OF_NOW_NS, MODE_SETTLES_NS, Request,
     SetpointError, Step, ns,
@@ -305,7 +305,7 @@ impl Autopilot {
         self.refused_numbers
     }
 
-    /// Number of measurements left out because they came after newer ones, because their time since the
+    /// Number of measurements left out because they came after newer ones or seconds late, because their time since the
     /// autopilot's start contradicted that of the others, or because a moving vehicle's position stayed the same.
     pub fn late_measurements(&self) -> u64 {
         self.late
@@ -638,8 +638,13 @@ impl Autopilot {
         if !self.is_present(now_ns, attitude.boot_ms, newest) {
             return;
         }
-        if let Some(stamp_ns) = self.clock.arrived(now_ns, attitude.boot_ms) {
-            attitude.stamp_ns = stamp_ns;
+        match self.clock.arrived(now_ns, attitude.boot_ms) {
+            Measured::At(stamp_ns) => attitude.stamp_ns = stamp_ns,
+            Measured::LongAgo => {
+                self.late += 1;
+                return;
+            }
+            Measured::Unknown => {}
         }
         if let Some(vehicle) = &mut self.vehicle {
             vehicle.state.attitude = Some(attitude);
@@ -665,8 +670,13 @@ impl Autopilot {
             return;
         }
         self.clock.position_arrived(now_ns);
-        if let Some(stamp_ns) = self.clock.arrived(now_ns, position.boot_ms) {
-            position.stamp_ns = stamp_ns;
+        match self.clock.arrived(now_ns, position.boot_ms) {
+            Measured::At(stamp_ns) => position.stamp_ns = stamp_ns,
+            Measured::LongAgo => {
+                self.late += 1;
+                return;
+            }
+            Measured::Unknown => {}
         }
         if let Some(vehicle) = &mut self.vehicle {
             vehicle.readiness.take_position();

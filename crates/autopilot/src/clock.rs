@@ -13,14 +13,14 @@ const MS: i64 = 1_000_000;
 const FIRST_NS: i64 = 100 * MS;
 /// Period of later requests, in nanoseconds.
 const LATER_NS: i64 = 1_000 * MS;
-/// Number of round trips at the first period.
+/// Number of round trips at the first period, also of those that are too long to be used.
 const FIRST: usize = 12;
 /// Maximum number of round trips kept.
 const MAX_TRIPS: usize = 64;
 /// Time for which a round trip is kept, in nanoseconds.
 const WINDOW_NS: i64 = 30_000 * MS;
-/// Maximum number of requests without a reply.
-const MAX_REQUESTS: usize = 16;
+/// Maximum number of requests without a reply: 12.8 s of them at the first period.
+const MAX_REQUESTS: usize = 128;
 /// Maximum length of a round trip that is used, in nanoseconds. Also a long one tells more than the time of the
 /// reception, which is wrong by the whole way here.
 const MAX_TRIP_NS: i64 = 1_500 * MS;
@@ -50,6 +50,9 @@ const CONTRADICTIONS: u32 = 3;
 /// Maximum age of a measurement on arrival over a live link, in nanoseconds: an old one must not pass for one of
 /// now.
 const MAX_AGE_NS: i64 = 3_000 * MS;
+/// Maximum age on arrival that a link's backlog explains, in nanoseconds. Beyond that the autopilot's time since its start
+/// and the one of its replies are not the same clock.
+const MAX_BACKLOG_NS: i64 = 60_000 * MS;
 
 /// The offset of the two clocks.
 #[derive(Clone, Debug, Default)]
@@ -66,6 +69,17 @@ pub struct Clock {
     /// What came farthest behind newer measurements.
     behind: Option<Length>,
     contradictions: u32,
+}
+
+/// When the autopilot measured what it sent.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Measured {
+    /// At this time, by our clock.
+    At(i64),
+    /// Too long ago for a live link: it says nothing of now.
+    LongAgo,
+    /// The offset of the clocks is unknown, or the time lies in the future.
+    Unknown,
 }
 
 /// When a reply or a measurement came, and after which time.
@@ -90,7 +104,8 @@ impl Clock {
         if now_ns < self.due_ns {
             return None;
         }
-        let pause_ns = if self.trips.len() < FIRST { FIRST_NS } else { LATER_NS };
+        let is_first = self.trips.len().max(self.lengths.len()) < FIRST;
+        let pause_ns = if is_first { FIRST_NS } else { LATER_NS };
         self.due_ns = now_ns.saturating_add(pause_ns);
         if self.requests.len() >= MAX_REQUESTS {
             self.requests.pop_front();
@@ -141,15 +156,17 @@ impl Clock {
         self.best(now_ns).map(|trip| trip.length_ns)
     }
 
-    /// As [`Clock::stamp_ns`], and notes how long the measurement was under way.
-    pub fn arrived(&mut self, now_ns: i64, boot_ms: u32) -> Option<i64> {
-        let stamp_ns = self.stamp_ns(now_ns, boot_ms)?;
-        if self.ages.len() >= AGES {
-            self.ages.pop_front();
+    /// As [`Clock::measured`], and notes how long the measurement was under way.
+    pub fn arrived(&mut self, now_ns: i64, boot_ms: u32) -> Measured {
+        let measured = self.measured(now_ns, boot_ms);
+        if let Measured::At(stamp_ns) = measured {
+            if self.ages.len() >= AGES {
+                self.ages.pop_front();
+            }
+            let length_ns = now_ns.saturating_sub(stamp_ns).max(0);
+            self.ages.push_back(Length { at_ns: now_ns, length_ns });
         }
-        let length_ns = now_ns.saturating_sub(stamp_ns).max(0);
-        self.ages.push_back(Length { at_ns: now_ns, length_ns });
-        Some(stamp_ns)
+        measured
     }
 
     /// A position came.
@@ -232,17 +249,27 @@ impl Clock {
     }
 
     /// The time by our clock at which the autopilot's showed `boot_ms` milliseconds, for a message received
-    /// at `now_ns`; `None` while the offset is unknown, and for a time that is too old for a live link.
-    pub fn stamp_ns(&self, now_ns: i64, boot_ms: u32) -> Option<i64> {
+    /// at `now_ns`.
+    pub fn measured(&self, now_ns: i64, boot_ms: u32) -> Measured {
+        let Some(stamp_ns) = self.stamp_ns(now_ns, boot_ms) else { return Measured::Unknown };
+        let age_ns = now_ns.saturating_sub(stamp_ns);
+        if !(-SLACK_NS..=MAX_BACKLOG_NS).contains(&age_ns) {
+            Measured::Unknown
+        } else if age_ns > MAX_AGE_NS {
+            Measured::LongAgo
+        } else {
+            Measured::At(stamp_ns.min(now_ns))
+        }
+    }
+
+    fn stamp_ns(&self, now_ns: i64, boot_ms: u32) -> Option<i64> {
         let offset_ns = self.best(now_ns)?.offset_ns;
         let theirs_ns = now_ns.checked_add(offset_ns)?;
         // The counter of milliseconds wraps after 49 days, so only the difference counts. It is truncated,
         // half a millisecond too early on average.
         let ahead_ms = boot_ms.wrapping_sub((theirs_ns / MS) as u32).cast_signed();
         let measured_ns = (theirs_ns / MS + i64::from(ahead_ms)) * MS + MS / 2;
-        let stamp_ns = measured_ns.checked_sub(offset_ns)?;
-        let is_live = stamp_ns >= now_ns - MAX_AGE_NS && stamp_ns <= now_ns + SLACK_NS;
-        is_live.then_some(stamp_ns.min(now_ns))
+        measured_ns.checked_sub(offset_ns)
     }
 
     fn best(&self, now_ns: i64) -> Option<Trip> {
@@ -305,7 +332,7 @@ mod tests {
             let shortest_ms = ways.iter().map(|(a, b)| a + b).min().unwrap();
             let measured_ns = now_ns - age_ms * MS;
             let boot_ms = ((measured_ns + ahead_ns) / MS) as u32;
-            let Some(stamp_ns) = clock.stamp_ns(now_ns, boot_ms) else {
+            let Measured::At(stamp_ns) = clock.measured(now_ns, boot_ms) else {
                 // Only times in the future, or too long ago, are unknown.
                 prop_assert!(age_ms * 2 <= shortest_ms || age_ms * 2 + shortest_ms > 5_990);
                 return Ok(());
@@ -325,7 +352,7 @@ mod tests {
                 clock.request(now_ns);
                 clock.answered(now_ns, theirs_ns, ts1_ns);
                 clock.answered(now_ns, theirs_ns, now_ns);
-                if let Some(stamp_ns) = clock.stamp_ns(1_000 * MS, boot_ms) {
+                if let Measured::At(stamp_ns) = clock.measured(1_000 * MS, boot_ms) {
                     prop_assert!((-2_000 * MS..=1_000 * MS).contains(&stamp_ns));
                 }
             }
@@ -399,9 +426,36 @@ mod tests {
         let (clock, now_ns) = synchronised(&[(1, 1), (40, 5)], 20, 77 * MS);
         for age_ms in [5, 50, 300] {
             let boot_ms = ((now_ns - age_ms * MS + 77 * MS) / MS) as u32;
-            let stamp_ns = clock.stamp_ns(now_ns, boot_ms).unwrap();
+            let Measured::At(stamp_ns) = clock.measured(now_ns, boot_ms) else { panic!() };
             assert!((now_ns - stamp_ns - age_ms * MS).abs() <= 2 * MS);
         }
+        for (age_ms, expected) in [
+            (3_500, Measured::LongAgo),
+            (59_000, Measured::LongAgo),
+            (61_000, Measured::Unknown),
+            (-500, Measured::Unknown),
+        ] {
+            let boot_ms = ((now_ns - age_ms * MS + 77 * MS) / MS) as u32;
+            assert_eq!(clock.measured(now_ns, boot_ms), expected, "{age_ms} ms");
+        }
+    }
+
+    #[test]
+    fn a_link_that_is_slow_from_the_start_is_known_to_be_and_not_asked_ten_times_a_second() {
+        let (mut clock, mut under_way) = (Clock::default(), VecDeque::new());
+        let mut requests = 0;
+        for now_ms in (1_000..31_000).step_by(20) {
+            if let Some(ts1_ns) = clock.request(now_ms * MS) {
+                requests += 1;
+                under_way.push_back(ts1_ns);
+            }
+            while let Some(ts1_ns) = under_way.pop_front_if(|ts1| *ts1 + 2_000 * MS <= now_ms * MS)
+            {
+                clock.answered(now_ms * MS, ts1_ns + 1_000 * MS, ts1_ns);
+            }
+        }
+        assert_eq!(clock.link_delay_ns(31_000 * MS), Some(2_000 * MS));
+        assert!(requests < 65, "{requests}");
     }
 
     #[test]
@@ -410,7 +464,8 @@ mod tests {
         let (clock, now_ns) = synchronised(&[(1, 1)], 20, ahead_ns);
         let boot_ms = ((now_ns + ahead_ns) / MS) as u32;
         assert!(boot_ms < 10_000, "it did");
-        assert!((clock.stamp_ns(now_ns, boot_ms).unwrap() - now_ns).abs() <= 2 * MS);
+        let Measured::At(stamp_ns) = clock.measured(now_ns, boot_ms) else { panic!() };
+        assert!((stamp_ns - now_ns).abs() <= 2 * MS);
     }
 
     #[test]
@@ -425,14 +480,14 @@ mod tests {
         };
         assert_eq!([0; 3].map(|_| trip(&mut clock, &mut now_ns)), [false, false, true]);
         let boot_ms = ((now_ns + 5_000 * MS) / MS) as u32;
-        assert!(clock.stamp_ns(now_ns, boot_ms).is_some());
+        assert!(matches!(clock.measured(now_ns, boot_ms), Measured::At(_)));
     }
 
     #[test]
     fn a_clock_that_is_not_known_or_was_long_ago_tells_nothing() {
-        assert_eq!(Clock::default().stamp_ns(1_000 * MS, 1_000), None);
+        assert_eq!(Clock::default().measured(1_000 * MS, 1_000), Measured::Unknown);
         let (clock, now_ns) = synchronised(&[(1, 1)], 20, 0);
-        assert!(clock.stamp_ns(now_ns + WINDOW_NS + MS, 0).is_none());
+        assert_eq!(clock.measured(now_ns + WINDOW_NS + MS, 0), Measured::Unknown);
         assert!(!Clock::default().answered(2 * MS, MS, MS), "without a request");
     }
 }

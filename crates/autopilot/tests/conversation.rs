@@ -773,6 +773,14 @@ fn measurements_carry_their_own_time_once_clocks_are_synchronised() {
     without.run(10);
     assert!(without.client.round_trip(without.now).is_none());
     assert!(age_ms(&without) <= 20, "that of its reception");
+    // What comes seconds late, as out of a link's backlog, is none of now.
+    let mut backlog =
+        World::with(Fake { boot_ns, late_steps: 200, ..Fake::new() }, Config::default());
+    backlog.run(10);
+    let old = backlog.client.late_measurements();
+    backlog.run(2);
+    assert!(backlog.client.late_measurements() > old + 100, "still left out");
+    assert_eq!(backlog.client.state().unwrap().attitude, None);
     // It requests our time as well, and gets it.
     let question = TIMESYNC_DATA { tc1: 0, ts1: 77, ..Default::default() };
     world.receive(AUTOPILOT, &MavMessage::TIMESYNC(question));
