@@ -45,9 +45,9 @@ enum Action {
         #[command(flatten)]
         network: NetworkArgs,
     },
-    /// Prefer detectors that run at this place, while they are healthy.
+    /// Prefer detectors that run at this place, while they are healthy, or none to another.
     Prefer {
-        /// The place.
+        /// The place; `any` takes back what was preferred.
         #[arg(value_enum)]
         place: Where,
         #[command(flatten)]
@@ -62,6 +62,8 @@ enum Where {
     Onboard,
     /// On the ground.
     Ground,
+    /// Anywhere.
+    Any,
 }
 
 /// Lists the detectors, or has the controller choose one.
@@ -70,11 +72,12 @@ pub(crate) fn run(args: DetectorsArgs) -> anyhow::Result<ExitCode> {
         None => return list(&args.network, args.format),
         Some(Action::Use { id, network }) => (network, ControllerCommand::UseDetector(id)),
         Some(Action::Prefer { place, network }) => {
-            let place = match place {
-                Where::Onboard => Place::Onboard,
-                Where::Ground => Place::Ground,
+            let command = match place {
+                Where::Onboard => ControllerCommand::PreferDetectors(Place::Onboard),
+                Where::Ground => ControllerCommand::PreferDetectors(Place::Ground),
+                Where::Any => ControllerCommand::PreferAnyDetector,
             };
-            (network, ControllerCommand::PreferDetectors(place))
+            (network, command)
         }
     };
     send_to_controller(&network, "detectors", &command)

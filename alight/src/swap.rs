@@ -2,7 +2,7 @@
 //!
 //! The new detector is started as a process that outlives this one. It runs in shadow until it agrees with
 //! the active one, becomes the active one, and only then the old one is stopped. On any failure before that,
-//! the old one stays in use, the operator's preference is what it was if there was one, and the new one is
+//! the old one stays in use, the operator's preference is what it was, and the new one is
 //! stopped, unless the old one has gone meanwhile and no other is left.
 
 mod comparison;
@@ -103,8 +103,6 @@ struct Report {
     active_s: Option<f64>,
     old_stopped: bool,
     new_kept: bool,
-    /// What is preferred after a swap that failed although nothing was before.
-    now_preferred: Option<String>,
 }
 
 /// Swaps; the exit status is 0 when the new detector is in use.
@@ -132,7 +130,7 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
     let mut existing: BTreeSet<String> = node.alive("detector", "*").await?.into_iter().collect();
     existing.extend(first.candidates.iter().map(|candidate| candidate.detector.clone()));
     // What has the preferred name is used soon, whether it agrees or not.
-    if let Some(ControllerCommand::UseDetector(preferred)) = preferring(&first.preference, &first) {
+    if let ControllerCommand::UseDetector(preferred) = preferring(&first.preference, &first) {
         existing.insert(preferred);
     }
     let new_detector = NewDetector::new(args, &existing)?;
@@ -182,8 +180,7 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
         Err(problem) => {
             swap.roll_back(&mut report).await;
             let why = |report: &Report, latest: &ControllerStatus| {
-                let preferred = preferred_now(report);
-                format!("not swapped, {}{preferred}: {problem:#}", left(report, latest))
+                format!("not swapped, {}: {problem:#}", left(report, latest))
             };
             report.why = why(&report, &swap.latest);
             if let Some(last) = report.log.as_deref().and_then(last_lines)
@@ -515,21 +512,12 @@ impl Swap<'_> {
     /// Switches back to the old detector and to what was preferred, and stops the new one, unless it is the last.
     async fn roll_back(&mut self, report: &mut Report) {
         self.learn_status().await;
-        let new = report.to.as_deref();
-        let is_new_used = new.is_some() && self.latest.active_detector.as_deref() == new;
-        // That the controller was asked for the new one is undone before that ends, so that no frame is missed. Where nothing was preferred,
-        // to name the old one would be a preference of its own, and is done only for that.
-        let is_undone = self.is_asked && (is_new_used || !self.preference.is_empty());
-        let old = report.from.as_deref().filter(|old| is_undone && is_alive(&self.latest, old));
-        let mut preferred = new;
-        if let Some(old) = old {
-            match self.tell(&ControllerCommand::UseDetector(old.to_owned())).await {
-                Ok(()) => preferred = Some(old),
-                Err(problem) => write_error(&format!("going back to {old}: {problem:#}")),
-            }
-        }
-        if self.is_asked && self.preference.is_empty() {
-            report.now_preferred = preferred.map(ToOwned::to_owned);
+        // That the controller was asked for the new one is undone before that ends, so that no frame is missed.
+        let old = report.from.as_deref().filter(|old| self.is_asked && is_alive(&self.latest, old));
+        if let Some(old) = old
+            && let Err(problem) = self.tell(&ControllerCommand::UseDetector(old.to_owned())).await
+        {
+            write_error(&format!("going back to {old}: {problem:#}"));
         }
         let is_running = matches!(self.child.try_wait(), Ok(None));
         report.new_kept = is_running && report.ready_s.is_some() && is_last(report, &self.latest);
@@ -537,10 +525,11 @@ impl Swap<'_> {
             self.end_child().await;
         }
         if self.is_asked
-            && let Some(command) = preferring(&self.preference, &self.latest)
-            && let Err(problem) = self.tell(&command).await
+            && let Err(problem) = self.tell(&preferring(&self.preference, &self.latest)).await
         {
-            write_error(&format!("preferring {} again, as before: {problem:#}", self.preference));
+            let before = Some(self.preference.as_str()).filter(|it| !it.is_empty());
+            let before = before.unwrap_or("any detector");
+            write_error(&format!("preferring {before} again, as before: {problem:#}"));
         }
     }
 
@@ -614,31 +603,20 @@ fn left(report: &Report, status: &ControllerStatus) -> String {
     }
 }
 
-/// What is preferred after a swap that failed although nothing was before, in words.
-fn preferred_now(report: &Report) -> String {
-    let told = |name: &String| {
-        format!(
-            " (before the swap no detector was preferred; now `{name}` is, as no command takes a preference back: `alight detectors prefer onboard` \
-             or `ground` names a place instead)"
-        )
-    };
-    report.now_preferred.as_ref().map_or_else(String::new, told)
-}
-
 /// An error unless the controller has taken a command.
 fn taken(reply: &CommandReply) -> anyhow::Result<()> {
     ensure!(reply.accepted, "the controller refused: {}", reply.reason);
     Ok(())
 }
 
-/// The command after which this is preferred; `None` for nothing. The controller's status does not tell a place from a detector of
+/// The command after which this is preferred; an empty name is none. The controller's status does not tell a place from a detector of
 /// that name: it is taken for the detector while that is there.
-fn preferring(preference: &str, status: &ControllerStatus) -> Option<ControllerCommand> {
+fn preferring(preference: &str, status: &ControllerStatus) -> ControllerCommand {
     let place = [Place::Onboard, Place::Ground].into_iter().find(|it| it.name() == preference);
     match place.filter(|_| !is_alive(status, preference)) {
-        Some(place) => Some(ControllerCommand::PreferDetectors(place)),
-        None if preference.is_empty() => None,
-        None => Some(ControllerCommand::UseDetector(preference.to_owned())),
+        Some(place) => ControllerCommand::PreferDetectors(place),
+        None if preference.is_empty() => ControllerCommand::PreferAnyDetector,
+        None => ControllerCommand::UseDetector(preference.to_owned()),
     }
 }
 
@@ -776,26 +754,18 @@ mod tests {
     #[test]
     fn what_was_preferred_is_preferred_again() {
         let place = ControllerCommand::PreferDetectors;
-        let named = |name: &str| Some(ControllerCommand::UseDetector(name.into()));
+        let named = |name: &str| ControllerCommand::UseDetector(name.into());
         let with = |alive: bool| ControllerStatus {
             candidates: vec![Candidate { detector: "ground".into(), alive, ..Candidate::sample() }],
             ..ControllerStatus::default()
         };
         let none = ControllerStatus::default();
-        assert_eq!(preferring("ground", &none), Some(place(Place::Ground)));
-        assert_eq!(preferring("onboard", &with(true)), Some(place(Place::Onboard)));
+        assert_eq!(preferring("ground", &none), place(Place::Ground));
+        assert_eq!(preferring("onboard", &with(true)), place(Place::Onboard));
         assert_eq!(preferring("ground", &with(true)), named("ground"), "a detector of that name");
-        assert_eq!(preferring("ground", &with(false)), Some(place(Place::Ground)));
+        assert_eq!(preferring("ground", &with(false)), place(Place::Ground));
         assert_eq!(preferring("spare", &none), named("spare"));
-        assert_eq!(preferring("", &none), None);
-    }
-
-    #[test]
-    fn a_preference_that_a_failed_swap_leaves_is_told() {
-        assert_eq!(preferred_now(&Report::default()), "");
-        let left = Report { now_preferred: Some("old".into()), ..Report::default() };
-        assert!(preferred_now(&left).contains("no detector was preferred; now `old` is"));
-        assert!(serde_json::to_string(&left).unwrap().contains(r#""now_preferred":"old""#));
+        assert_eq!(preferring("", &none), ControllerCommand::PreferAnyDetector);
     }
 
     #[test]

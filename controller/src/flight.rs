@@ -385,6 +385,7 @@ impl Flight {
             ControllerCommand::LandHere => self.land_here(now_ns),
             ControllerCommand::UseDetector(name) => selection.prefer(now_ns, name),
             ControllerCommand::PreferDetectors(place) => Ok(selection.prefer_place(now_ns, *place)),
+            ControllerCommand::PreferAnyDetector => Ok(selection.prefer_any(now_ns)),
         };
         self.use_newest(now_ns);
         match result {

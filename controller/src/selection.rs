@@ -253,6 +253,18 @@ impl Selection {
         }
     }
 
+    /// Prefers no detector to another; the answer says what that means now.
+    pub fn prefer_any(&mut self, now_ns: i64) -> String {
+        self.preference = Preference::default();
+        self.overruled.clear();
+        self.is_requested = false;
+        self.choose(now_ns);
+        self.active().map_or_else(
+            || "no detector is preferred".to_owned(),
+            |active| format!("no detector is preferred; `{active}` is used while it is healthy"),
+        )
+    }
+
     /// Lets time pass.
     pub fn tick(&mut self, now_ns: i64) {
         let is_there = self.known_active().is_some_and(|active| active.alive);
@@ -294,7 +306,7 @@ impl Selection {
         self.changes
     }
 
-    /// The preference: a detector's name or a place.
+    /// The preference: a detector's name or a place; empty for none.
     pub fn preference(&self) -> &str {
         let Preference { detector, place } = &self.preference;
         detector.as_deref().or(place.map(Place::name)).unwrap_or_default()

@@ -237,6 +237,15 @@ fn a_place_is_preferred_and_left_and_taken_again() {
     assert_eq!(bench.selection.active(), Some("ground"));
     assert!(bench.longest_gap_ms() <= 201, "{}", bench.longest_gap_ms());
     assert_eq!(bench.selection.preference(), "ground");
+    // Without the preference the one in use stays, until it fails, and is not taken again.
+    let any = bench.selection.prefer_any(bench.now_ns);
+    assert!(any.contains("no detector is preferred; `ground` is used"), "{any}");
+    assert_eq!(bench.selection.preference(), "");
+    bench.frames(110..120, &answers);
+    assert_eq!(bench.selection.active(), Some("ground"));
+    bench.frames(120..130, &answers[..1]);
+    bench.frames(130..190, &answers);
+    assert_eq!(bench.selection.active(), Some("air"));
 }
 
 #[test]

@@ -637,6 +637,7 @@ fn parse(command: &str, argument: Option<String>) -> Option<ControllerCommand> {
         ("prefer", Some(place)) if place == Place::Ground.name() => {
             ControllerCommand::PreferDetectors(Place::Ground)
         }
+        ("prefer", Some(place)) if place == "any" => ControllerCommand::PreferAnyDetector,
         _ => return None,
     })
 }

@@ -257,6 +257,8 @@ pub enum ControllerCommand {
     PreferDetectors(Place),
     /// Land straight down where the vehicle is, without the marker.
     LandHere,
+    /// Prefer no detector to another.
+    PreferAnyDetector,
 }
 
 /// The answer to a command.

@@ -346,6 +346,7 @@ fn controller_command() {
     check(&message, "41080304057370617265");
     check(&ControllerCommand::PreferDetectors(Place::Ground), "4108030501");
     check(&ControllerCommand::LandHere, "41080306");
+    check(&ControllerCommand::PreferAnyDetector, "41080307");
 }
 
 #[test]
