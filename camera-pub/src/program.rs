@@ -170,18 +170,14 @@ struct FrameReader<R> {
     input: R,
     format: FrameFormat,
     scanner: JpegScanner,
-    /// Nominal time between frames.
-    period_ns: i64,
-    /// Time of the previous frame's first byte.
-    previous_ns: Option<i64>,
+    queue: Queue,
     count: u64,
 }
 
 impl<R: AsyncBufRead + Unpin> FrameReader<R> {
     fn new(input: R, format: FrameFormat, period: Duration) -> Self {
-        let period_ns = period.as_nanos().try_into().unwrap_or(i64::MAX);
-        let scanner = JpegScanner::default();
-        Self { input, format, scanner, period_ns, previous_ns: None, count: 0 }
+        let queue = Queue::of(period);
+        Self { input, format, scanner: JpegScanner::default(), queue, count: 0 }
     }
 
     /// Waits for the first byte of a frame; `None` at the end of the input.
@@ -195,11 +191,7 @@ impl<R: AsyncBufRead + Unpin> FrameReader<R> {
             return Ok(None);
         }
         let stamp_ns = now_ns();
-        let previous_ns = self.previous_ns.replace(stamp_ns);
-        let was_queued = previous_ns.is_some_and(|previous_ns| {
-            let waited_ns = stamp_ns - read_ns;
-            was_queued(stamp_ns - previous_ns, waited_ns, self.period_ns)
-        });
+        let was_queued = self.queue.has_held(stamp_ns, stamp_ns - read_ns);
         Ok(Some(Arrival { stamp_ns, was_queued }))
     }
 
@@ -268,13 +260,42 @@ impl<R: AsyncBufRead + Unpin> FrameReader<R> {
     }
 }
 
-/// True for a frame that was queued on its way, told from the time since the previous frame and the time the
-/// read waited: one that follows sooner than a camera can deliver, and one that was late but already there,
-/// so that it may have arrived at any time since it was due.
-fn was_queued(since_previous_ns: i64, waited_ns: i64, period_ns: i64) -> bool {
-    let quarter_ns = period_ns / 4;
-    since_previous_ns < quarter_ns
-        || (waited_ns < IMMEDIATE_NS && since_previous_ns > period_ns.saturating_add(quarter_ns))
+/// Tells which frames were queued on their way.
+struct Queue {
+    /// Nominal time between frames.
+    period_ns: i64,
+    last: Option<Last>,
+}
+
+/// The frame before.
+#[derive(Copy, Clone)]
+struct Last {
+    /// When its first byte was read.
+    read_ns: i64,
+    /// When that was there, as far as it is known.
+    due_ns: i64,
+}
+
+impl Queue {
+    fn of(period: Duration) -> Self {
+        Self { period_ns: period.as_nanos().try_into().unwrap_or(i64::MAX), last: None }
+    }
+
+    /// Whether the frame whose first byte is read at `stamp_ns`, after the read waited so long for it, was queued: one that
+    /// follows sooner than a camera can deliver, and one that was there already and is later than it was due. What is due is
+    /// counted on from the last frame that was waited for, so that what a slow reader is behind adds up.
+    fn has_held(&mut self, stamp_ns: i64, waited_ns: i64) -> bool {
+        let quarter_ns = self.period_ns / 4;
+        let due_ns = match self.last {
+            Some(last) if waited_ns < IMMEDIATE_NS => {
+                last.due_ns.saturating_add(self.period_ns).min(stamp_ns)
+            }
+            _ => stamp_ns,
+        };
+        let last = self.last.replace(Last { read_ns: stamp_ns, due_ns });
+        last.is_some_and(|last| stamp_ns - last.read_ns < quarter_ns)
+            || stamp_ns - due_ns > quarter_ns
+    }
 }
 
 fn no_jpeg(event: &str, max_bytes: usize) -> std::io::Error {
@@ -336,7 +357,9 @@ mod tests {
     fn queued_frames_are_recognised() {
         const MS: i64 = 1_000_000;
         let was_queued = |since_previous_ms, waited_ms| {
-            was_queued(since_previous_ms * MS, waited_ms * MS, 40 * MS)
+            let mut queue = Queue::of(PERIOD);
+            assert!(!queue.has_held(0, 0), "the first one");
+            queue.has_held(since_previous_ms * MS, waited_ms * MS)
         };
         assert!(!was_queued(40, 35), "the read waited for it");
         assert!(!was_queued(200, 195), "the camera paused");
@@ -344,5 +367,38 @@ mod tests {
         assert!(!was_queued(45, 0), "due, and already there");
         assert!(was_queued(9, 6), "sooner than a camera can");
         assert!(was_queued(70, 0), "there since some time between 40 and 70 ms");
+    }
+    /// The largest age of the frames that were not queued, and their number, of 500 frames of a camera that are read by one
+    /// who needs so long for each that is not queued.
+    fn read_slowly(period: Duration, needed: Duration) -> (Duration, usize) {
+        let ns = |time: Duration| time.as_nanos() as i64;
+        let mut queue = Queue::of(PERIOD);
+        let (mut free_ns, mut oldest_ns, mut fresh) = (0, 0, 0);
+        for number in 0..500 {
+            let arrival_ns = number * ns(period);
+            let stamp_ns = arrival_ns.max(free_ns);
+            if queue.has_held(stamp_ns, stamp_ns - free_ns) {
+                free_ns = stamp_ns + ns(Duration::from_millis(2));
+                continue;
+            }
+            free_ns = stamp_ns + ns(needed);
+            oldest_ns = oldest_ns.max(stamp_ns - arrival_ns);
+            fresh += 1;
+        }
+        (Duration::from_nanos(oldest_ns as u64), fresh)
+    }
+
+    #[test]
+    fn frames_do_not_grow_old_before_a_reader_who_is_a_little_too_slow() {
+        for needed_ms in [39, 41, 45, 49, 55, 81, 130] {
+            let (oldest, fresh) = read_slowly(PERIOD, Duration::from_millis(needed_ms));
+            assert!(oldest <= PERIOD / 4, "{needed_ms} ms for a frame: {oldest:?} old");
+            // Of every two that a frame's time covers one is fresh.
+            let all = 500 * 40 / needed_ms.max(40) as usize;
+            assert!(fresh > all * 3 / 5, "{needed_ms} ms for a frame: {fresh} of {all}");
+        }
+        // Of a camera that is a little slower than it is said to be, for one who is quick enough.
+        let (oldest, fresh) = read_slowly(PERIOD + PERIOD / 50, PERIOD);
+        assert!(oldest.is_zero() && fresh == 500, "{oldest:?}, {fresh} frames");
     }
 }

@@ -306,8 +306,8 @@ impl Stream {
                 self.health.dropped("frames that were queued");
                 ensure!(
                     last_published.elapsed() < config.timeout,
-                    "frames from `source.command` arrive in bursts or faster than 4x `source.rate_hz` ({}), so that their \
-                     age is unknown; set `source.rate_hz` to the program's frame rate",
+                    "frames from `source.command` arrive in bursts, faster than 4x `source.rate_hz` ({}), or later than they \
+                     are due by it, so that their age is unknown; set `source.rate_hz` to the program's frame rate",
                     config.rate_hz
                 );
                 continue;
