@@ -400,7 +400,8 @@ impl SourceConfig {
                 stamped_at: self.stamped_at().unwrap_or(StampedAt::ReadoutStart),
                 readout_ns: self.readout_ns(),
             },
-            timeout: Duration::from_secs_f64(self.timeout_s),
+            timeout: Duration::try_from_secs_f64(self.timeout_s)
+                .context("`source.timeout_s` is no time")?,
         }))
     }
 
@@ -850,6 +851,9 @@ mod tests {
         camera(&["source.binning=5"], "multiples of the binning");
         camera(&["source.binning=2", "source.pixels=yuv420"], "raw frames are binned");
         camera(&["source.timeout_s=0"], "from 0.1 to 3600");
+        camera(&["source.timeout_s=-1"], "from 0.1 to 3600");
+        camera(&["source.timeout_s=nan"], "from 0.1 to 3600");
+        camera(&["source.timeout_s=1e30"], "from 0.1 to 3600");
         camera(&["source.stamp_at=middle"], "auto, exposure-start");
         camera(&["source.readout_ms=-1"], "from 0 to 1000");
         camera(&["source.device=/dev/video0"], "`source.command`");
