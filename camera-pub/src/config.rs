@@ -622,6 +622,11 @@ impl CalibrationConfig {
                 "it must be [left, top, width, height] in pixels of the sensor, or empty",
             ),
         );
+        let has_file = self.file != Path::new("");
+        let otherwise = "it needs `calibration.file`: `calibration.focal_px` and what follows are of the frames as they are published";
+        check.parses("calibration.binning", holds(has_file || self.binning == 0, otherwise));
+        let is_whole = self.region_px.is_empty();
+        check.parses("calibration.region_px", holds(has_file || is_whole, otherwise));
     }
 
     /// The mode that the frames are taken in, as far as it is said.
@@ -828,6 +833,11 @@ mod tests {
         check(&["calibration.focal_px=[900, 0]"], "or both 0");
         check(&["calibration.focal_px=[nan, 900]"], "above 0");
         check(&["calibration.principal_px=[1]"], "[cx, cy]");
+        check(
+            &["calibration.focal_px=[900, 900]", "calibration.binning=2"],
+            "needs `calibration.file`",
+        );
+        check(&["calibration.region_px=[0, 0, 640, 480]"], "needs `calibration.file`");
         check(&["calibration.lens=fish"], "kannala-brandt");
         check(&["calibration.distortion=[1]"], "`calibration.lens`");
         check(&["calibration.lens=kannala-brandt"], "4 coefficients");

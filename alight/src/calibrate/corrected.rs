@@ -96,6 +96,12 @@ pub(super) fn changes(flight: &RecordedFlight, result: &FlightCalibration) -> Ch
         };
         let numbers: Vec<String> = numbers.iter().map(|number| format!("{number:.9}")).collect();
         set("calibration", "file", "\"\"".to_owned());
+        // What converts a file's camera is refused without one.
+        for (key, nothing) in [("binning", "0"), ("region_px", "[]")] {
+            if matches!(before(flight, "calibration", key), Before::Was(_)) {
+                set("calibration", key, nothing.to_owned());
+            }
+        }
         set("calibration", "focal_px", format!("[{:.4}, {:.4}]", model.fx, model.fy));
         set("calibration", "principal_px", format!("[{:.4}, {:.4}]", model.cx, model.cy));
         set("calibration", "lens", format!("\"{lens}\""));
