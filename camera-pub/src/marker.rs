@@ -88,7 +88,7 @@ mod tests {
     use crate::v4l2::abi::CID_EXPOSURE_ABSOLUTE;
     use crate::v4l2::capture::Wanted;
     use crate::v4l2::exposer::ForMarker;
-    use crate::v4l2::fake::{Exposed as Truth, Fake, MS, Stamps};
+    use crate::v4l2::fake::{Exposed as Truth, Fake, GAIN, MS, Stamps};
     use crate::v4l2::video::{Next, Port, Video};
     use messages::{Detection, FrameHeader, PixelFormat};
     use std::rc::Rc;
@@ -277,6 +277,20 @@ mod tests {
         exposing.fake.refuse(None);
         exposing.run(2000 * MS, still);
         assert!((0.6..=0.85).contains(&exposing.last().white), "{}", exposing.last().white);
+    }
+
+    #[test]
+    fn the_cameras_own_gain_is_put_back_also_after_a_refusal() {
+        let mut exposing = Loop::new(Stamps::FirstPacket);
+        exposing.fake.light(0.05);
+        exposing.run(1500 * MS, still);
+        assert!(exposing.truth().gain > 1.5, "{:?}", exposing.truth());
+        exposing.fake.refuse(Some(GAIN));
+        exposing.run(2000 * MS, |_| None);
+        assert!(exposing.refused > 0 && exposing.truth().gain > 1.5, "{:?}", exposing.truth());
+        exposing.fake.refuse(None);
+        exposing.run(2000 * MS, |_| None);
+        assert!(exposing.truth().gain < 1.01, "{:?}", exposing.truth());
     }
 
     #[test]

@@ -230,6 +230,8 @@ impl<D: Device> Capture<D> {
         let set = failed("VIDIOC_S_EXT_CTRLS", exposer.follow(&self.device, order));
         if set.is_err() {
             self.expose_again_ns = now_ns.saturating_add(EXPOSE_PAUSE_NS);
+            // A part of it may have been set.
+            self.exposure_read_ns = i64::MIN;
         }
         if let Some(exposure_ns) = set? {
             (self.exposure_ns, self.exposure_read_ns) = (exposure_ns, now_ns);

@@ -165,17 +165,20 @@ impl Exposer {
                     return Ok(None);
                 };
                 set(device, CID_EXPOSURE_AUTO, value)?;
-                if let Some((gain, value)) = self.gain.zip(self.own_gain.take()) {
+                self.setting = None;
+                // What is refused is kept, and tried again with all of this.
+                if let Some((gain, value)) = self.gain.zip(self.own_gain) {
                     set(device, gain.id, value)?;
                 }
-                (self.is_metering, self.setting) = (true, None);
+                (self.is_metering, self.own_gain) = (true, None);
                 Ok(Some(0))
             }
             Order::TakeOver => {
                 let exposure = control_value(device, CID_EXPOSURE_ABSOLUTE).unwrap_or(1);
-                self.own_gain = self.gain.and_then(|gain| control_value(device, gain.id));
-                let gain =
-                    self.gain.zip(self.own_gain).map(|(gain, value)| self.factor(gain, value));
+                let value = self.gain.and_then(|gain| control_value(device, gain.id));
+                // One that could not be put back is still the camera's own.
+                self.own_gain = self.own_gain.or(value);
+                let gain = self.gain.zip(value).map(|(gain, value)| self.factor(gain, value));
                 if self.metering.is_some() {
                     set(device, CID_EXPOSURE_AUTO, EXPOSURE_MANUAL)?;
                     self.is_metering = false;

@@ -32,7 +32,7 @@ const CONTROL_FRAMES: u32 = 3;
 const MAX_GAIN: f64 = 16.0;
 /// From the last row's readout to the frame in the buffer.
 const DELIVERY_NS: i64 = 4 * MS;
-const GAIN: u32 = 0x0098_0913;
+pub(crate) const GAIN: u32 = 0x0098_0913;
 const SIZES: [(u32, u32); 3] = [(1280, 720), (640, 480), (320, 240)];
 
 /// What the driver's stamps are of.
