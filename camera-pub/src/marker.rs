@@ -280,6 +280,19 @@ mod tests {
     }
 
     #[test]
+    fn an_exposure_that_cannot_be_read_is_not_taken_over() {
+        let mut exposing = Loop::new(Stamps::FirstPacket);
+        exposing.fake.light(0.2);
+        exposing.fake.hide(Some(CID_EXPOSURE_ABSOLUTE));
+        exposing.run(1000 * MS, still);
+        assert!(exposing.refused > 0 && exposing.fake.is_metering());
+        exposing.fake.hide(None);
+        exposing.run(2500 * MS, still);
+        assert!(!exposing.fake.is_metering());
+        assert!((0.6..=0.85).contains(&exposing.last().white), "{}", exposing.last().white);
+    }
+
+    #[test]
     fn the_cameras_own_gain_is_put_back_also_after_a_refusal() {
         let mut exposing = Loop::new(Stamps::FirstPacket);
         exposing.fake.light(0.05);

@@ -376,12 +376,14 @@ impl<D: Device> Capture<D> {
         Ok(Exposure { mid_ns: shutter.mid_exposure_ns(stamp_ns, exposure_ns), exposure_ns })
     }
 
-    /// The exposure time; 0 while the camera meters by itself, as it does not say then what it chose for which frame.
+    /// The exposure time; 0 while the camera meters by itself, as it does not say then what it chose for which frame, and
+    /// where it does not say whether it meters.
     fn exposure_time_ns(&self) -> u32 {
-        let is_manual =
-            control_value(&self.device, CID_EXPOSURE_AUTO).is_none_or(|v| v == EXPOSURE_MANUAL);
-        let value = control_value(&self.device, CID_EXPOSURE_ABSOLUTE).filter(|_| is_manual);
-        value.and_then(|value| u32::try_from(value).ok()?.checked_mul(100_000)).unwrap_or(0)
+        let is_manual = control_value(&self.device, CID_EXPOSURE_AUTO)
+            .is_ok_and(|auto| auto.is_none_or(|auto| auto == EXPOSURE_MANUAL));
+        let value = control_value(&self.device, CID_EXPOSURE_ABSOLUTE).ok().flatten();
+        let units = value.filter(|_| is_manual).and_then(|value| u32::try_from(value).ok());
+        units.and_then(|units| units.checked_mul(100_000)).unwrap_or(0)
     }
 
     /// Reads the bytes of a frame where the driver wrote them.

@@ -218,8 +218,14 @@ fn control_name(name: &str) -> String {
 }
 
 /// The present value of a control; `None` where the device has it not.
-pub(crate) fn control_value(device: &impl Device, id: u32) -> Option<i32> {
+///
+/// # Errors
+/// It cannot be read now.
+pub(crate) fn control_value(device: &impl Device, id: u32) -> io::Result<Option<i32>> {
     let mut control = ExtControl { id, ..ExtControl::default() };
-    device.call(Call::GetControl(&mut control)).ok()?;
-    Some(control.value)
+    match device.call(Call::GetControl(&mut control)) {
+        Ok(()) => Ok(Some(control.value)),
+        Err(cause) if matches!(cause.raw_os_error(), Some(libc::EINVAL | libc::ENOTTY)) => Ok(None),
+        Err(cause) => Err(cause),
+    }
 }

@@ -174,8 +174,9 @@ impl Exposer {
                 Ok(Some(0))
             }
             Order::TakeOver => {
-                let exposure = control_value(device, CID_EXPOSURE_ABSOLUTE).unwrap_or(1);
-                let value = self.gain.and_then(|gain| control_value(device, gain.id));
+                let exposure = control_value(device, CID_EXPOSURE_ABSOLUTE)?.unwrap_or(1);
+                let value = self.gain.map(|gain| control_value(device, gain.id));
+                let value = value.transpose()?.flatten();
                 // One that could not be put back is still the camera's own.
                 self.own_gain = self.own_gain.or(value);
                 let gain = self.gain.zip(value).map(|(gain, value)| self.factor(gain, value));

@@ -89,6 +89,8 @@ pub(crate) struct Fake {
     is_foreign: Cell<bool>,
     /// The control that it does not set.
     refused: Cell<Option<u32>>,
+    /// The control that it does not tell.
+    hidden: Cell<Option<u32>>,
     open_devices: Cell<u32>,
     mappings: Cell<u32>,
     opened: Cell<u32>,
@@ -154,6 +156,7 @@ impl Fake {
             light: Cell::new(0.0),
             is_foreign: Cell::new(false),
             refused: Cell::new(None),
+            hidden: Cell::new(None),
             open_devices: Cell::new(0),
             mappings: Cell::new(0),
             opened: Cell::new(0),
@@ -187,6 +190,11 @@ impl Fake {
     /// Refuses to set this control from now on, or none.
     pub(crate) fn refuse(&self, control: Option<u32>) {
         self.refused.set(control);
+    }
+
+    /// Fails to tell this control from now on, or none.
+    pub(crate) fn hide(&self, control: Option<u32>) {
+        self.hidden.set(control);
     }
 
     pub(crate) fn is_metering(&self) -> bool {
@@ -383,6 +391,9 @@ impl Device for FakeDevice {
                 state.filled.clear();
             }
             Call::QueryExtCtrl(control) => next_control(control)?,
+            Call::GetControl(control) if self.fake.hidden.get() == Some(control.id) => {
+                return Err(errno(libc::EIO));
+            }
             Call::GetControl(control) if control.id == CID_EXPOSURE_AUTO => {
                 control.value = if self.fake.is_metering.get() { 3 } else { 1 };
             }

@@ -177,6 +177,7 @@ fn open<P: Port>(port: &P, wanted: &Wanted) -> Result<Capture<P::Device>, Lost> 
 mod tests {
     use super::*;
     use crate::exposure::StampedAt;
+    use crate::v4l2::abi::CID_EXPOSURE_AUTO;
     use crate::v4l2::capture::Counts;
     use crate::v4l2::fake::{Fake, Happening, MS, Stamps};
     use std::rc::Rc;
@@ -271,6 +272,11 @@ mod tests {
         let metering = Fake::of("GREY", Stamps::ExposureStart, 0);
         metering.meter();
         assert!(inexact(metering) > 80);
+        // One that does not say whether it does.
+        let silent = Fake::of("GREY", Stamps::ExposureStart, 0);
+        silent.meter();
+        silent.hide(Some(CID_EXPOSURE_AUTO));
+        assert!(inexact(silent) > 80);
         assert_eq!(inexact(Fake::of("GREY", Stamps::ExposureStart, 0)), 0);
     }
 
