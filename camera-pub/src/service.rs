@@ -406,6 +406,7 @@ impl Stream {
             }
             let counts = feed.take_counts();
             for (reason, count) in [
+                ("frames that were queued", counts.queued),
                 ("frames of which packets were lost", counts.torn),
                 ("frames of another size", counts.other),
             ] {
@@ -437,6 +438,9 @@ impl Stream {
                 rtsp::feed::Next::Lost(reason) => drop(self.health.failed(reason)),
                 rtsp::feed::Next::Nothing => {}
             }
+            let missed = feed.take_missed().min(MAX_COUNTED);
+            (0..missed)
+                .for_each(|_| self.health.dropped("pictures that came faster than they are read"));
         }
     }
 

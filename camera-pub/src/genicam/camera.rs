@@ -77,6 +77,8 @@ pub(crate) struct Counts {
     pub(crate) torn: u64,
     /// Of another size or format.
     pub(crate) other: u64,
+    /// That waited until a newer one was there.
+    pub(crate) queued: u64,
 }
 
 /// A frame.
@@ -171,24 +173,43 @@ impl OpenCamera {
         self.is_gone.load(Ordering::Relaxed)
     }
 
-    /// The next whole frame within this time.
+    /// The newest whole frame that is there within this time.
     pub(super) fn take(&mut self, patience: Duration) -> Option<Taken> {
-        let buffer = self.stream.timeout_pop_buffer(patience.as_micros() as u64)?;
-        let is_whole = buffer.status() == BufferStatus::Success;
+        let mut newest: Option<Buffer> = None;
+        // Whoever takes longer than a period for a frame would else be given the oldest, which wait until all buffers are full.
+        for taken in 0..BUFFERS {
+            let popped = match taken {
+                0 => self.stream.timeout_pop_buffer(patience.as_micros() as u64),
+                _ => self.stream.try_pop_buffer(),
+            };
+            let Some(buffer) = popped else { break };
+            let refused = if self.is_whole(&buffer) {
+                let older = newest.replace(buffer);
+                self.counts.queued += u64::from(older.is_some());
+                older
+            } else {
+                Some(buffer)
+            };
+            if let Some(refused) = refused {
+                self.stream.push_buffer(refused);
+            }
+        }
+        let buffer = newest?;
+        let exposure = self.exposure(&buffer);
+        Some(Taken { buffer, exposure })
+    }
+
+    /// Whether a buffer has all of a frame as it is wanted; another is counted.
+    fn is_whole(&mut self, buffer: &Buffer) -> bool {
+        if buffer.status() != BufferStatus::Success {
+            self.counts.torn += 1;
+            return false;
+        }
         let edges = [buffer.image_width(), buffer.image_height()].map(usize::try_from);
         let is_wanted = edges == [Ok(self.size.width), Ok(self.size.height)]
             && buffer.data().1 >= self.size.pixels();
-        if is_whole && is_wanted {
-            let exposure = self.exposure(&buffer);
-            return Some(Taken { buffer, exposure });
-        }
-        if is_whole {
-            self.counts.other += 1;
-        } else {
-            self.counts.torn += 1;
-        }
-        self.stream.push_buffer(buffer);
-        None
+        self.counts.other += u64::from(!is_wanted);
+        is_wanted
     }
 
     /// Gives a frame back, to be filled again.

@@ -73,6 +73,7 @@ impl Feed {
         let counts = camera.take_counts();
         self.counts.torn += counts.torn;
         self.counts.other += counts.other;
+        self.counts.queued += counts.queued;
         // To open a camera again whose packets are lost on the way brings none of them back.
         if counts.torn > 0 {
             self.last_frame_ns = now_ns();

@@ -32,6 +32,8 @@ pub(crate) struct Feed {
     outage: Option<(i64, String)>,
     /// Pictures in a row whose time is not known.
     unknown: u32,
+    /// Pictures that came faster than they were taken.
+    missed: u64,
 }
 
 /// What happened next.
@@ -70,6 +72,7 @@ impl Feed {
             newest_ns: i64::MIN,
             outage: None,
             unknown: 0,
+            missed: 0,
             config: config.clone(),
         })
     }
@@ -94,11 +97,17 @@ impl Feed {
         }
     }
 
+    /// How many pictures came faster than they were taken since the last call.
+    pub(crate) fn take_missed(&mut self) -> u64 {
+        std::mem::take(&mut self.missed)
+    }
+
     fn take(&mut self, picture: Picture, coding: Coding) -> anyhow::Result<Next> {
         if let Some((since_ns, _)) = self.outage.take() {
             let lost_s = (now_ns() - since_ns) as f64 * 1e-9;
             tracing::info!(lost_s, "The camera is back");
         }
+        self.missed += picture.missed;
         let stamp = self.stamps.stamp(&picture.times, utc_ahead_ns());
         // Also of a picture that is dropped: the next ones refer to it.
         let image = match coding {

@@ -15,8 +15,8 @@ use retina::client::{Credentials, Demuxed, PlayOptions, Session, SessionOptions,
 use retina::codec::{CodecItem, FrameFormat, VideoFrame};
 use retina::rtcp::ReceivedCompoundPacket;
 use retina::{NtpTimestamp, Timestamp, UNIX_EPOCH};
-use tokio::sync::mpsc;
-use tokio::sync::mpsc::error::TrySendError;
+use tokio::sync::broadcast;
+use tokio::sync::broadcast::error::RecvError;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
@@ -24,7 +24,8 @@ use crate::config::RtspConfig;
 
 /// Time for all that is said until a stream begins.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(5);
-/// Number of pictures that wait to be decoded; more of them mean that the decoder is slower than the camera.
+/// Number of pictures of H.264 that wait to be decoded, as each refers to others: more of them mean that the decoder is slower
+/// than the camera. Of JPEG only the newest waits.
 const MAX_WAITING: usize = 8;
 /// Maximum size of a file with credentials, in bytes.
 const MAX_CREDENTIALS: u64 = 1024;
@@ -37,11 +38,13 @@ pub(super) enum Coding {
 }
 
 /// A picture as it came.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Picture {
     pub(super) bytes: Vec<u8>,
     /// Whether something before it is missing.
     pub(super) is_after_loss: bool,
+    /// Number of those before it that came faster than they were taken.
+    pub(super) missed: u64,
     pub(super) times: Times,
 }
 
@@ -67,7 +70,9 @@ pub(super) struct SenderReport {
 /// A stream that is open.
 pub(super) struct OpenStream {
     pub(super) coding: Coding,
-    pictures: mpsc::Receiver<Result<Picture, String>>,
+    /// The newest ones: whoever is too slow for them misses the oldest.
+    pictures: broadcast::Receiver<Result<Picture, String>>,
+    missed: u64,
     reader: JoinHandle<()>,
 }
 
@@ -112,14 +117,26 @@ impl OpenStream {
         })?;
         session.setup(index, SetupOptions::default().frame_format(FrameFormat::SIMPLE)).await?;
         let session = session.play(PlayOptions::default()).await?.demuxed()?;
-        let (sender, pictures) = mpsc::channel(MAX_WAITING);
+        let waiting = if coding == Coding::H264 { MAX_WAITING } else { 1 };
+        let (sender, pictures) = broadcast::channel(waiting);
         let reader = tokio::spawn(receive(session, sender));
-        Ok(Self { coding, pictures, reader })
+        Ok(Self { coding, pictures, missed: 0, reader })
     }
 
     /// The next picture, or why there are no more.
     pub(super) async fn next(&mut self) -> Result<Picture, String> {
-        self.pictures.recv().await.unwrap_or_else(|| Err("the camera ended its stream".to_owned()))
+        loop {
+            match self.pictures.recv().await {
+                Ok(Ok(picture)) => {
+                    let missed = std::mem::take(&mut self.missed);
+                    let is_after_loss = picture.is_after_loss || missed > 0;
+                    return Ok(Picture { is_after_loss, missed, ..picture });
+                }
+                Ok(Err(problem)) => return Err(problem),
+                Err(RecvError::Lagged(pictures)) => self.missed += pictures,
+                Err(RecvError::Closed) => return Err("the camera ended its stream".to_owned()),
+            }
+        }
     }
 }
 
@@ -135,23 +152,19 @@ fn address<T: FromStr<Err: Display>>(text: &str) -> anyhow::Result<T> {
 }
 
 /// Passes pictures on, on a task of its own: while one is decoded the next gets the time at which it really arrives.
-async fn receive(mut session: Demuxed, pictures: mpsc::Sender<Result<Picture, String>>) {
-    let (mut report, mut is_after_loss) = (None, false);
+async fn receive(mut session: Demuxed, pictures: broadcast::Sender<Result<Picture, String>>) {
+    let mut report = None;
     while let Some(item) = session.next().await {
         match item {
             Ok(CodecItem::VideoFrame(frame)) => {
-                let mut picture = picture(frame, report);
-                picture.is_after_loss |= is_after_loss;
-                match pictures.try_send(Ok(picture)) {
-                    Ok(()) => is_after_loss = false,
-                    Err(TrySendError::Full(_)) => is_after_loss = true,
-                    Err(TrySendError::Closed(_)) => return,
+                if pictures.send(Ok(picture(frame, report))).is_err() {
+                    return;
                 }
             }
             Ok(CodecItem::Rtcp(packet)) => report = sender_report(&packet).or(report),
             Ok(_) => {}
             Err(problem) => {
-                drop(pictures.send(Err(problem.to_string())).await);
+                drop(pictures.send(Err(problem.to_string())));
                 return;
             }
         }
@@ -162,7 +175,7 @@ fn picture(frame: VideoFrame, report: Option<SenderReport>) -> Picture {
     let waited_ns = frame.start_ctx().received().elapsed().as_nanos();
     let arrival_ns = now_ns().saturating_sub(waited_ns.try_into().unwrap_or(i64::MAX));
     let times = Times { stream_ns: nanoseconds(frame.timestamp()), arrival_ns, report };
-    Picture { is_after_loss: frame.loss() > 0, times, bytes: frame.into_data() }
+    Picture { is_after_loss: frame.loss() > 0, missed: 0, times, bytes: frame.into_data() }
 }
 
 fn sender_report(packet: &ReceivedCompoundPacket) -> Option<SenderReport> {
