@@ -39,8 +39,9 @@ use crate::v4l2::video::{Next, Port, Video};
 const MAX_MEASURED_IMAGES: usize = 1000;
 /// Maximum number of lost frames that are counted at once.
 const MAX_COUNTED: u64 = 1000;
-/// Number of JPEG files in a row that cannot be read after which a device is opened again.
-const MAX_UNREADABLE: u32 = 10;
+/// Time without a frame that can be read after which a device is opened again, in nanoseconds, beside three periods: to open it
+/// costs half a second.
+const UNREADABLE_NS: i64 = 1_000_000_000;
 /// Interval at which a service that waits for a subscriber looks for one.
 const SUBSCRIBER_POLL: Duration = Duration::from_millis(20);
 
@@ -226,6 +227,15 @@ impl Pace {
     }
 }
 
+/// Why a picture is no frame.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum NoFrame {
+    /// It cannot be read.
+    Damaged,
+    /// It has another size.
+    OtherSize(FrameSize),
+}
+
 /// A frame ready to be published.
 struct Prepared {
     width: usize,
@@ -327,7 +337,7 @@ impl Stream {
                 FrameFormat::Samples { .. } => {
                     Some(self.prepare_samples(pixels, config.size, config.bits, bayer))
                 }
-                FrameFormat::Jpeg { .. } => self.prepare_jpeg(&jpeg),
+                FrameFormat::Jpeg { .. } => self.prepare_jpeg(&jpeg).ok(),
             };
             self.health.latency("read", began.elapsed());
             if let Some(frame) = frame {
@@ -343,7 +353,8 @@ impl Stream {
         config: &DeviceConfig,
     ) -> anyhow::Result<()> {
         let mut video = Video::start(port, config.wanted.clone())?;
-        let mut unreadable = 0;
+        let patience_ns = UNREADABLE_NS.max((3e9 / config.wanted.rate_hz) as i64);
+        let mut unreadable_since_ns = None;
         loop {
             match video.next()? {
                 Next::Frame(taken) => {
@@ -351,18 +362,21 @@ impl Stream {
                     let began = Instant::now();
                     let frame = self.prepare_taken(&mut video, taken, config);
                     self.health.latency("read", began.elapsed());
-                    unreadable = if frame.is_some() { 0 } else { unreadable + 1 };
-                    if let Some(frame) = frame {
-                        self.publish_live(frame, exposure).await;
-                    }
-                    if unreadable == MAX_UNREADABLE {
-                        unreadable = 0;
-                        let FrameSize { width, height } = config.size;
-                        let lost = Lost::FormatChanged(format!(
-                            "its frames are no JPEG files of {width} x {height} pixels"
-                        ));
-                        video.lose(&lost);
-                        self.health.failed(lost.reason());
+                    match frame {
+                        Ok(frame) => {
+                            unreadable_since_ns = None;
+                            self.publish_live(frame, exposure).await;
+                        }
+                        Err(why) => {
+                            let now_ns = video.now_ns();
+                            let unreadable_ns = now_ns - *unreadable_since_ns.get_or_insert(now_ns);
+                            if unreadable_ns >= patience_ns {
+                                unreadable_since_ns = None;
+                                let lost = why.as_loss(config.size, unreadable_ns);
+                                video.lose(&lost);
+                                self.health.failed(lost.reason());
+                            }
+                        }
                     }
                 }
                 Next::Nothing => {}
@@ -426,8 +440,8 @@ impl Stream {
                 rtsp::feed::Next::Frame(image, exposure) => {
                     let began = Instant::now();
                     let frame = match image {
-                        Image::Jpeg(jpeg) => self.prepare_jpeg(&jpeg),
-                        Image::Grey(image) => self.prepare_grey(&image),
+                        Image::Jpeg(jpeg) => self.prepare_jpeg(&jpeg).ok(),
+                        Image::Grey(image) => self.prepare_grey(&image).ok(),
                     };
                     self.health.latency("read", began.elapsed());
                     if let Some(frame) = frame {
@@ -444,25 +458,26 @@ impl Stream {
         }
     }
 
-    /// A frame from a picture that was decoded; `None` when it has the wrong size.
+    /// A frame from a picture that was decoded.
     #[cfg(feature = "rtsp")]
-    fn prepare_grey(&self, image: &GrayImage) -> Option<Prepared> {
+    fn prepare_grey(&self, image: &GrayImage) -> Result<Prepared, NoFrame> {
         let (width, height) = (image.width(), image.height());
-        if !self.is_expected(width, height) {
-            return None;
-        }
+        self.expect(width, height)?;
         let mut pixels = self.frames.loan(width * height);
         pixels.copy_from_slice(image.pixels());
-        Some(Prepared { width, height, format: PixelFormat::Mono8, pixels, grey: None })
+        Ok(Prepared { width, height, format: PixelFormat::Mono8, pixels, grey: None })
     }
 
-    /// Whether a frame has the size that is configured; another is told.
-    fn is_expected(&self, width: usize, height: usize) -> bool {
-        let is_expected = (FrameSize { width, height }) == self.size;
-        if !is_expected && self.health.failed("image of another size") {
+    /// Refuses a frame whose size is not the one that is configured, which is told.
+    fn expect(&self, width: usize, height: usize) -> Result<(), NoFrame> {
+        let size = FrameSize { width, height };
+        if size == self.size {
+            return Ok(());
+        }
+        if self.health.failed("image of another size") {
             tracing::warn!(width, height, "Dropped a frame whose size is not `source.size_px`");
         }
-        is_expected
+        Err(NoFrame::OtherSize(size))
     }
 
     /// Takes a frame out of the driver's buffer, gives that back, and sets the exposure of later frames.
@@ -471,28 +486,26 @@ impl Stream {
         video: &mut Video<P>,
         taken: Taken,
         config: &DeviceConfig,
-    ) -> Option<Prepared> {
+    ) -> Result<Prepared, NoFrame> {
         let FrameSize { width, height } = config.size;
-        let capture = video.capture()?;
+        let capture = video.capture().ok_or(NoFrame::Damaged)?;
         let frame = if Pixels::of(&config.wanted.fourcc) == Some(Pixels::Mjpeg) {
             capture.read(&taken, |jpeg| self.prepare_jpeg(jpeg))
         } else {
             let mut pixels = self.frames.loan(width * height);
             let copied = capture.copy_grey(&taken, &mut pixels);
             let format = PixelFormat::Mono8;
-            (copied == width * height).then_some(Prepared {
-                width,
-                height,
-                format,
-                pixels,
-                grey: None,
-            })
+            match copied == width * height {
+                true => Ok(Prepared { width, height, format, pixels, grey: None }),
+                false => Err(NoFrame::Damaged),
+            }
         };
         let counts = capture.take_counts();
         let stamp_ns = taken.exposure.mid_ns;
         let mut lost = capture.give_back(taken).err();
         let view = frame
             .as_ref()
+            .ok()
             .and_then(|frame| GrayView::packed(&frame.pixels, frame.width, frame.height).ok());
         if let Some((exposed, view)) = capture.exposed().zip(view).filter(|_| lost.is_none()) {
             match capture.expose(self.marker.after(stamp_ns, view, &exposed)) {
@@ -552,8 +565,8 @@ impl Stream {
         Some(Prepared { width, height, format: PixelFormat::Mono8, pixels, grey: None })
     }
 
-    /// A frame from a JPEG file of the program; `None` when it cannot be decoded or has the wrong size.
-    fn prepare_jpeg(&self, jpeg: &[u8]) -> Option<Prepared> {
+    /// A frame from a camera's JPEG file.
+    fn prepare_jpeg(&self, jpeg: &[u8]) -> Result<Prepared, NoFrame> {
         let max_pixels = self.config.max_pixels();
         let image = match DecodedImage::decode(Path::new("a JPEG frame"), jpeg, max_pixels) {
             Ok(image) => image,
@@ -561,16 +574,14 @@ impl Stream {
                 if self.health.failed("unreadable image") {
                     tracing::warn!(%problem, "Dropped a frame that is no whole JPEG file");
                 }
-                return None;
+                return Err(NoFrame::Damaged);
             }
         };
         let (width, height) = (image.width(), image.height());
-        if !self.is_expected(width, height) {
-            return None;
-        }
+        self.expect(width, height)?;
         let mut pixels = self.frames.loan(width * height);
         image.write_grey(&mut pixels);
-        Some(Prepared { width, height, format: PixelFormat::Mono8, pixels, grey: None })
+        Ok(Prepared { width, height, format: PixelFormat::Mono8, pixels, grey: None })
     }
 
     /// Publishes image files at the configured rate.
@@ -688,6 +699,19 @@ impl Stream {
     }
 }
 
+impl NoFrame {
+    /// Why a camera is given up that has sent nothing else for so long, where frames of this size are wanted.
+    fn as_loss(self, wanted: FrameSize, for_ns: i64) -> Lost {
+        match self {
+            Self::Damaged => Lost::Unreadable(Duration::from_nanos(for_ns.unsigned_abs())),
+            Self::OtherSize(FrameSize { width, height }) => Lost::FormatChanged(format!(
+                "its frames have {width} x {height} pixels, {} x {} are wanted (`source.size_px`)",
+                wanted.width, wanted.height
+            )),
+        }
+    }
+}
+
 /// Moves samples of so many bits up to 16 where no format has as many; returns how many they have then.
 fn with_bits_of_a_format(samples: &mut [u8], bits: u32) -> u32 {
     if matches!(bits, 0..=8 | 10 | 12 | 16..) {
@@ -728,10 +752,15 @@ mod tests {
         Node::open(Identity { service, instance: "down".into() }, &local).await.unwrap()
     }
 
-    /// Publishes the frames of a played device that is unplugged at its twentieth, until `see` has seen enough of them.
-    async fn publish(fourcc: &'static str, mut see: impl FnMut(&Fake, &Frame) -> bool) {
+    /// Publishes the frames of a played device to which this happens, until `see` has seen enough of them; returns what was
+    /// counted.
+    async fn publish(
+        fourcc: &'static str,
+        script: &[(u32, Happening)],
+        mut see: impl FnMut(&Fake, &Frame) -> bool,
+    ) -> Arc<HealthCounters> {
         let fake = Fake::of(fourcc, Stamps::ExposureStart, 0);
-        fake.script(20, Happening::Unplugged(300 * MS));
+        script.iter().for_each(|(frame, happening)| fake.script(*frame, *happening));
         let set = ["source.device=/dev/video0", "source.size_px=[640, 480]", "source.rate_hz=100"];
         let mut set: Vec<_> = set.map(str::to_owned).into();
         set.push(format!("source.fourcc={fourcc}"));
@@ -757,18 +786,20 @@ mod tests {
             result = stream.publish_device(Rc::clone(&fake), &device) => result.unwrap(),
             () = seeing => {}
         }
-        assert_eq!(camera.health().failures("camera unplugged"), 1);
+        let health = camera.shared_health();
         // A session that is dropped instead of closed may wait ten seconds for the others of its process.
         drop((stream, frames));
         camera.close().await;
         viewer.close().await;
+        health
     }
 
     #[tokio::test(flavor = "multi_thread")]
     async fn a_devices_frames_carry_their_own_stamps_before_and_after_it_was_unplugged() {
         for fourcc in ["YUYV", "MJPG"] {
             let (mut before, mut after) = (0, 0);
-            publish(fourcc, |fake, frame| {
+            let script = [(20, Happening::Unplugged(300 * MS))];
+            let health = publish(fourcc, &script, |fake, frame| {
                 let (header, bytes) = (&frame.header, frame.bytes());
                 assert_eq!((header.width, header.height, bytes.len()), (640, 480, 640 * 480));
                 assert_eq!((header.exposure_ns, header.format), (5_000_000, PixelFormat::Mono8));
@@ -784,6 +815,25 @@ mod tests {
                 before > 0 && after > 4
             })
             .await;
+            assert_eq!(health.failures("camera unplugged"), 1);
+        }
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_camera_is_given_up_for_a_second_of_damaged_frames_and_for_no_short_disturbance() {
+        for (damaged, losses) in [(12, 0), (150, 1)] {
+            let script: Vec<_> = (20..20 + damaged).map(|at| (at, Happening::Cut)).collect();
+            let (mut opened, mut after) = (0, 0);
+            let health = publish("MJPG", &script, |fake, frame| {
+                opened = fake.opened();
+                after += u32::from(fake.number_at(frame.header.stamp_ns + 1000) >= 20);
+                after > 4
+            })
+            .await;
+            assert_eq!(u64::from(opened), 1 + losses, "{damaged} damaged");
+            assert_eq!(health.failures("camera's frames unreadable"), losses);
+            assert_eq!(health.failures("camera's format changed"), 0);
+            assert!(health.failures("unreadable image") >= u64::from(damaged));
         }
     }
 

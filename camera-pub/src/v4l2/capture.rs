@@ -70,6 +70,9 @@ pub(crate) enum Lost {
     /// It gives no frames.
     #[error("it gave no frame for {0:.1?}")]
     Stalled(Duration),
+    /// Nothing of what it gave could be read.
+    #[error("its frames could not be read for {0:.1?}: they are damaged, or no JPEG files")]
+    Unreadable(Duration),
     /// Its frames are others than those that were agreed on.
     #[error("its format changed: {0}")]
     FormatChanged(String),
@@ -419,6 +422,7 @@ impl Lost {
         match self {
             Self::Unplugged => "camera unplugged",
             Self::Stalled(_) => "camera stalled",
+            Self::Unreadable(_) => "camera's frames unreadable",
             Self::FormatChanged(_) => "camera's format changed",
             Self::ForeignClock { .. } => "camera's stamps of another clock",
             Self::Refused(_) => "camera refused what is configured",
