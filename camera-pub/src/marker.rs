@@ -92,6 +92,7 @@ mod tests {
     use crate::v4l2::video::{Next, Port, Video};
     use messages::{Detection, FrameHeader, PixelFormat};
     use std::rc::Rc;
+    use std::time::Duration;
 
     /// A detector's message of the pad that the played camera shows in its middle.
     fn message(stamp_ns: i64, centre_px: Option<[f64; 2]>) -> Detections {
@@ -130,6 +131,8 @@ mod tests {
         frames: Vec<Frame>,
         /// How often a control was refused.
         refused: u32,
+        /// How long each frame takes.
+        needed: Duration,
     }
 
     #[derive(Copy, Clone, Debug)]
@@ -169,7 +172,7 @@ mod tests {
             };
             let video = Video::start(Rc::clone(&fake), wanted).unwrap();
             let marker = MarkerExposure::new("down");
-            Self { fake, video, marker, frames: Vec::new(), refused: 0 }
+            Self { fake, video, marker, frames: Vec::new(), refused: 0, needed: Duration::ZERO }
         }
 
         /// Reads frames for so long; a detector finds the pad where it says.
@@ -182,6 +185,7 @@ mod tests {
                 capture.copy_grey(&taken, &mut grey);
                 let number = u32::from_le_bytes(grey[..4].try_into().unwrap());
                 let exposure = taken.exposure;
+                self.fake.pass(self.needed);
                 capture.give_back(taken).unwrap();
                 let exposed = capture.exposed().unwrap();
                 let frame = GrayView::packed(&grey, 640, 480).unwrap();
@@ -308,8 +312,11 @@ mod tests {
 
     #[test]
     fn a_stamp_is_exact_to_a_millisecond_or_marked_also_while_the_exposure_changes() {
-        for stamps in [Stamps::ExposureStart, Stamps::FirstPacket, Stamps::FrameEnd] {
+        let all = [Stamps::ExposureStart, Stamps::FirstPacket, Stamps::FrameEnd];
+        // Whoever needs several periods for a frame finds frames that waited in all buffers.
+        for (stamps, needed_ms) in all.into_iter().flat_map(|it| [(it, 0), (it, 35), (it, 80)]) {
             let mut exposing = Loop::new(stamps);
+            exposing.needed = Duration::from_millis(needed_ms);
             for light in [0.2, 3.0, 0.4, 0.05] {
                 exposing.fake.light(light);
                 exposing.run(1000 * MS, still);
@@ -317,8 +324,9 @@ mod tests {
             let exact = exposing.frames.iter().filter(|frame| frame.is_exact);
             let worst_ns = exact.clone().map(|frame| frame.error_ns.abs()).max().unwrap();
             let (exact, all) = (exact.count(), exposing.frames.len());
-            println!("{stamps:?}: {exact} of {all} exact, worst {worst_ns} ns");
-            assert!(worst_ns <= MS && exact > all * 3 / 4 && exact < all, "{worst_ns} {exact}");
+            println!("{stamps:?}, {needed_ms} ms: {exact} of {all} exact, worst {worst_ns} ns");
+            assert!(worst_ns <= MS && exact < all, "{worst_ns} {exact}");
+            assert!(needed_ms > 0 || exact > all * 3 / 4, "{exact}");
         }
     }
 }

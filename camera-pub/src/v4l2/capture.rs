@@ -306,8 +306,9 @@ impl<D: Device> Capture<D> {
             }
             Err(cause) => return failed("VIDIOC_DQBUF", Err(cause)),
         }
+        let read_ns = self.read_ns(&buffer);
         if let Some(exposer) = &mut self.exposer {
-            exposer.frame();
+            exposer.frame(read_ns);
         }
         if let Some(last) = self.last_sequence.replace(buffer.sequence) {
             self.counts.missed += u64::from(buffer.sequence.wrapping_sub(last).saturating_sub(1));
@@ -342,19 +343,7 @@ impl<D: Device> Capture<D> {
 
     fn exposure(&mut self, buffer: &Buffer, arrival_ns: i64) -> Result<Exposure, Lost> {
         let by_arrival = Exposure::estimated(arrival_ns - self.delay_ns);
-        if buffer.flags & BUF_FLAG_TIMESTAMP_MASK != BUF_FLAG_TIMESTAMP_MONOTONIC {
-            return Ok(by_arrival);
-        }
-        let of_driver = match buffer.flags & BUF_FLAG_TSTAMP_SRC_MASK {
-            BUF_FLAG_TSTAMP_SRC_SOE => self.start,
-            _ => StampedAt::FrameEnd,
-        };
-        let stamped_at = self.stamped_at.unwrap_or(of_driver);
-        let shutter = Shutter { stamped_at, readout_ns: self.readout_ns };
-        let stamp_ns = buffer
-            .seconds
-            .saturating_mul(1_000_000_000)
-            .saturating_add(buffer.microseconds.saturating_mul(1000));
+        let Some((stamp_ns, shutter)) = self.stamp(buffer) else { return Ok(by_arrival) };
         if arrival_ns.saturating_sub(self.exposure_read_ns) > EXPOSURE_READ_NS {
             (self.exposure_ns, self.exposure_read_ns) = (self.exposure_time_ns(), arrival_ns);
         }
@@ -377,6 +366,31 @@ impl<D: Device> Capture<D> {
             return Ok(by_arrival);
         }
         Ok(Exposure { mid_ns: shutter.mid_exposure_ns(stamp_ns, exposure_ns), exposure_ns })
+    }
+
+    /// The driver's stamp and what it is of; `None` where it does not say that it is of the host's clock.
+    fn stamp(&self, buffer: &Buffer) -> Option<(i64, Shutter)> {
+        if buffer.flags & BUF_FLAG_TIMESTAMP_MASK != BUF_FLAG_TIMESTAMP_MONOTONIC {
+            return None;
+        }
+        let of_driver = match buffer.flags & BUF_FLAG_TSTAMP_SRC_MASK {
+            BUF_FLAG_TSTAMP_SRC_SOE => self.start,
+            _ => StampedAt::FrameEnd,
+        };
+        let stamped_at = self.stamped_at.unwrap_or(of_driver);
+        let stamp_ns = buffer
+            .seconds
+            .saturating_mul(1_000_000_000)
+            .saturating_add(buffer.microseconds.saturating_mul(1000));
+        Some((stamp_ns, Shutter { stamped_at, readout_ns: self.readout_ns }))
+    }
+
+    /// When a frame had been read from the sensor; `None` where its stamp does not tell.
+    fn read_ns(&self, buffer: &Buffer) -> Option<i64> {
+        let (stamp_ns, shutter) = self.stamp(buffer)?;
+        let delay_ns = self.device.now_ns().saturating_sub(stamp_ns);
+        let is_possible = (0..=MAX_DELAY_NS).contains(&delay_ns);
+        is_possible.then(|| stamp_ns.saturating_add(shutter.until_read_ns(self.exposure_ns)))
     }
 
     /// The exposure time; 0 while the camera meters by itself, as it does not say then what it chose for which frame, and

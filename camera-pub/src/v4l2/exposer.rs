@@ -49,8 +49,9 @@ pub(crate) struct Exposer {
     /// The gain's value before it was set here.
     own_gain: Option<i32>,
     setting: Option<Setting>,
-    /// Frames since the last change.
+    /// Frames since the last change, and when that was ordered.
     frames: u32,
+    ordered_ns: i64,
     /// By how much the exposure changed then.
     changed_ns: u32,
 }
@@ -110,6 +111,7 @@ impl Exposer {
             own_gain: None,
             setting: None,
             frames: 0,
+            ordered_ns: i64::MIN,
             changed_ns: 0,
         })
     }
@@ -125,9 +127,12 @@ impl Exposer {
         }
     }
 
-    /// Counts a frame.
-    pub(crate) fn frame(&mut self) {
-        self.frames = self.frames.saturating_add(1);
+    /// Counts a frame, which had been read from the sensor then: one that was ready before the last change was ordered, and
+    /// waited in the driver's buffers, says nothing of it.
+    pub(crate) fn frame(&mut self, read_ns: Option<i64>) {
+        if read_ns.is_none_or(|read_ns| read_ns >= self.ordered_ns) {
+            self.frames = self.frames.saturating_add(1);
+        }
     }
 
     /// The setting with which the newest frame was taken; `None` while the camera meters, or a change may be under way.
@@ -224,7 +229,7 @@ impl Exposer {
         let change = |before: Setting| ((exposure_s - before.exposure_s).abs() * 1e9) as u32;
         self.changed_ns = self.setting.map_or(u32::MAX, change);
         self.setting = Some(next);
-        self.frames = 0;
+        (self.frames, self.ordered_ns) = (0, device.now_ns());
         Ok((exposure_s * 1e9).round() as u32)
     }
 
