@@ -14,11 +14,12 @@ use autopilot::dialect::{
 };
 use autopilot::packet::encode;
 use autopilot::{Address, Link, LinkEvent, Packet, Parser, Sender, compose};
+use node::without_credentials;
 use serde::Serialize;
 use tokio::net::UdpSocket;
 use tokio::time::{Instant, interval, sleep_until};
 
-use crate::config::{RATES_HZ, without_credentials};
+use crate::config::RATES_HZ;
 use crate::v4l2::abi::text;
 
 /// Period of the questions, until they are answered.

@@ -8,7 +8,7 @@ use anyhow::{Context, bail, ensure};
 use geometry::{Body, Camera, CameraModel, Distortion, Point, Rotation, Transform};
 use imaging::{BayerPattern, GrayView};
 use media::{CalibrationFile, SensorRegion, WantedMode};
-use node::{Check, Settings};
+use node::{Check, Settings, without_credentials};
 use serde::Deserialize;
 
 use crate::exposure::{Shutter, StampedAt};
@@ -455,17 +455,15 @@ impl SourceConfig {
                 && self.device == Path::new(""),
             "with a stream of RTSP, `source.paths`, `source.command`, `source.device` and `source.genicam` must be empty"
         );
-        let host = self.rtsp.strip_prefix("rtsp://").and_then(|rest| rest.split('/').next());
-        let host = host.filter(|host| !host.is_empty()).with_context(|| {
-            format!(
-                "`{}` is no address of the form rtsp://HOST:PORT/STREAM",
-                without_credentials(&self.rtsp)
-            )
-        })?;
         ensure!(
-            !host.contains('@'),
-            "`source.rtsp` has a name or password in it: write user:password into a file that only you can read, and name \
-             that in `source.rtsp_credentials`"
+            without_credentials(&self.rtsp) == self.rtsp,
+            "it has a name or password in it: write user:password into a file that only you can read, and name that in \
+             `source.rtsp_credentials`"
+        );
+        let host = self.rtsp.strip_prefix("rtsp://").and_then(|rest| rest.split('/').next());
+        ensure!(
+            host.is_some_and(|host| !host.is_empty()),
+            "it is no address of the form rtsp://HOST:PORT/STREAM"
         );
         let credentials = &self.rtsp_credentials;
         Ok(Some(RtspConfig {
@@ -699,25 +697,6 @@ impl MountConfig {
     }
 }
 
-/// An address without a name and a password: without what stands between its scheme and the last `@` before the path, or, where
-/// a password has a slash in it, before the end.
-pub(crate) fn without_credentials(address: &str) -> String {
-    let (scheme, rest) = match address.split_once("://") {
-        Some((scheme, rest)) => (format!("{scheme}://"), rest),
-        None => (String::new(), address),
-    };
-    let end = rest.find(['/', '?', '#']).unwrap_or(rest.len());
-    let authority = &rest[..end];
-    let is_port = |text: &str| text.chars().all(|it| it.is_ascii_digit());
-    let has_odd_port = authority.rsplit_once(':').is_some_and(|(_, port)| !is_port(port));
-    let at = match authority.rfind('@') {
-        None if has_odd_port => rest.rfind('@'),
-        at => at,
-    };
-    let shown = at.map_or(rest, |at| &rest[at + 1..]);
-    format!("{scheme}{shown}")
-}
-
 fn holds(holds: bool, otherwise: &'static str) -> Result<(), &'static str> {
     if holds { Ok(()) } else { Err(otherwise) }
 }
@@ -870,6 +849,14 @@ mod tests {
         check(&["source.device=/dev/video0"], "`alight cameras` lists them");
         check(&["source.fourcc=H264"], "GREY, NV12");
         check(&["source.rtsp_stamps=ntp"], "unknown variant");
+        for url in ["rtsp://admin:s3cret@host/x", "rtsp://admin:s3/cret@host/x"] {
+            let problem = load(&[&format!("source.rtsp={url}")]).unwrap_err();
+            assert!(!problem.contains("s3"), "{problem}");
+            assert!(
+                !cfg!(feature = "rtsp") || problem.contains("`source.rtsp_credentials`"),
+                "{problem}"
+            );
+        }
         check(&["source.controls=['gain']"], "`name=value`");
         check(&["source.controls=['gain=much']"], "no number");
     }

@@ -70,7 +70,7 @@ pub enum ConfigError {
         cause: String,
     },
     /// A setting without `=`.
-    #[error("the setting `{text}` is not of the form key=value; write `{text}=VALUE`")]
+    #[error("the setting `{0}` is not of the form key=value; write `{0}=VALUE`", shown(text))]
     Form {
         /// The setting.
         text: String,
@@ -86,7 +86,7 @@ pub enum ConfigError {
         hint: String,
     },
     /// A value of the wrong type.
-    #[error("{source_name}: `{key}` = {value} is {found}, where {wanted} is needed")]
+    #[error("{source_name}: `{key}` = {} is {found}, where {wanted} is needed", shown(value))]
     WrongType {
         /// The file or setting.
         source_name: String,
@@ -100,7 +100,7 @@ pub enum ConfigError {
         wanted: &'static str,
     },
     /// A value that the service rejects.
-    #[error("{source_name}: `{key}` = {value} is invalid: {limit}")]
+    #[error("{source_name}: `{key}` = {} is invalid: {limit}", shown(value))]
     Refused {
         /// The file or setting.
         source_name: String,
@@ -316,7 +316,7 @@ fn file_layer(path: &Path) -> Result<Layer, ConfigError> {
 }
 
 fn setting_layer(text: &str, defaults: &Table) -> Result<Layer, ConfigError> {
-    let name = format!("--set {text}");
+    let name = format!("--set {}", shown(text));
     let (key, value) =
         text.split_once('=').ok_or_else(|| ConfigError::Form { text: text.to_owned() })?;
     let (key, value) = (key.trim(), value.trim());
@@ -420,6 +420,30 @@ fn similar<'a>(keys: impl Iterator<Item = &'a String>, wanted: &str) -> Option<&
 pub fn named<T: DeserializeOwned>(text: &str) -> Result<T, String> {
     let text: StrDeserializer<'_, ValueError> = text.into_deserializer();
     T::deserialize(text).map_err(|cause| cause.to_string())
+}
+
+/// An address without a name and a password: without what stands between its scheme and the last `@` before the path, or, where
+/// a password has a slash in it, before the end.
+pub fn without_credentials(address: &str) -> String {
+    let (scheme, rest) = match address.split_once("://") {
+        Some((scheme, rest)) => (format!("{scheme}://"), rest),
+        None => (String::new(), address),
+    };
+    let end = rest.find(['/', '?', '#']).unwrap_or(rest.len());
+    let authority = &rest[..end];
+    let is_port = |text: &str| text.chars().all(|it| it.is_ascii_digit());
+    let has_odd_port = authority.rsplit_once(':').is_some_and(|(_, port)| !is_port(port));
+    let at = match authority.rfind('@') {
+        None if has_odd_port => rest.rfind('@'),
+        at => at,
+    };
+    let shown = at.map_or(rest, |at| &rest[at + 1..]);
+    format!("{scheme}{shown}")
+}
+
+/// A setting or its value as it is told: it may be an address with a password in it.
+fn shown(text: &str) -> String {
+    if text.contains("://") { without_credentials(text) } else { text.to_owned() }
 }
 
 /// The rule of [`is_name`].
@@ -541,6 +565,19 @@ mod tests {
             set: set.iter().map(|s| (*s).to_owned()).collect(),
         };
         layers.load::<Camera>().map(|c| c.settings).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn a_password_in_an_address_is_not_told_with_what_is_refused() {
+        let address = "rtsp://me:s3cret@host:554/main";
+        let set = |key: &str| load(None, &[&format!("{key}={address}")]).unwrap_err();
+        let file = load(Some(&format!("name = \"{address}\"")), &[]).unwrap_err();
+        for problem in [file, set("name"), set("rate_hz"), set("nam")] {
+            assert!(!problem.contains("s3cret"), "{problem}");
+            assert!(problem.contains("//host:554/main") || problem.contains("nam`"), "{problem}");
+        }
+        let form = load(None, &[address]).unwrap_err();
+        assert!(form.contains("`rtsp://host:554/main`") && !form.contains("s3cret"), "{form}");
     }
 
     #[test]

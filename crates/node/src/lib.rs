@@ -43,6 +43,7 @@ pub use boxed::BoxFuture;
 pub use clock::{boot_ahead_ns, clock_name, host_name, now_ns};
 pub use config::{
     Check, ConfigError, Effective, Layers, Settings, changed, from_toml, named, read_text, to_toml,
+    without_credentials,
 };
 pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
 pub use health::HealthCounters;
