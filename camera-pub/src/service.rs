@@ -879,12 +879,18 @@ mod tests {
                 assert_eq!((header.format, header.camera.as_str()), (PixelFormat::Mono8, "down"));
                 assert!(frame.bytes()[..] == straight[..]);
             }
+            let identity = Identity { service: "camera-pub", instance: "down".into() };
+            let rates = camera.health().report(&identity, now_ns()).rates;
+            let count = |name: &str| rates.iter().find(|rate| rate.name == name).map(|it| it.count);
+            (count("frames").unwrap(), count("rectified frames").unwrap())
         };
         let seen = tokio::time::timeout(Duration::from_secs(20), seeing);
-        tokio::select! {
-            result = stream.publish_images(&images) => result.unwrap(),
+        let (frames, rectified) = tokio::select! {
+            result = stream.publish_images(&images) => panic!("it ended: {result:?}"),
             seen = seen => seen.expect("rectified frames in time"),
-        }
+        };
+        // One may be counted and not numbered yet.
+        assert!(frames <= stream.sequence + 1 && rectified >= 3, "{frames}, {rectified}");
         drop(stream);
         camera.close().await;
         viewer.close().await;

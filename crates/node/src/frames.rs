@@ -49,6 +49,8 @@ const FRAME_CONNECTIONS: usize = 2;
 pub struct FramePublisher {
     publisher: zenoh::pubsub::Publisher<'static>,
     pool: Option<Mutex<Pool>>,
+    /// What its frames are counted as, but for JPEG.
+    counted: &'static str,
     health: Arc<HealthCounters>,
 }
 
@@ -98,13 +100,16 @@ impl Node {
         Box::pin(async move {
             let key = topic.key(names);
             debug_assert_eq!(topic.delivery(), Delivery::Latest);
+            let is_rectified = key == topic::RECT.key(names);
+            let counted = if is_rectified { "rectified frames" } else { "frames" };
             let publisher = self.declare_frames(key, FIRST_PRIORITY).await?;
+            let health = self.shared_health();
             if max_frame_bytes == 0 || !self.has_shared_memory {
-                return Ok(FramePublisher { publisher, pool: None, health: self.shared_health() });
+                return Ok(FramePublisher { publisher, pool: None, counted, health });
             }
             let pool_bytes = FRAMES_IN_POOL * max_frame_bytes.next_multiple_of(4096) + 4096;
             let pool = Pool::new(pool_bytes).map(Mutex::new);
-            Ok(FramePublisher { publisher, pool, health: self.shared_health() })
+            Ok(FramePublisher { publisher, pool, counted, health })
         })
     }
 
@@ -221,7 +226,7 @@ impl FramePublisher {
             match self.publisher.put(payload).attachment(encode(header)).await {
                 Ok(()) => self.health.count(match header.format {
                     PixelFormat::Jpeg => "JPEG images",
-                    _ => "frames",
+                    _ => self.counted,
                 }),
                 Err(cause) => {
                     if self.health.failed("publish frame") {
@@ -241,7 +246,8 @@ impl FramePublisher {
         Box::pin(async move {
             let key = self.publisher.key_expr().as_str().to_owned();
             let publisher = node.declare_frames(key, SECOND_PRIORITY).await?;
-            Ok(Self { publisher, pool: None, health: Arc::clone(&self.health) })
+            let (counted, health) = (self.counted, Arc::clone(&self.health));
+            Ok(Self { publisher, pool: None, counted, health })
         })
     }
 
