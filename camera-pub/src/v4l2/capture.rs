@@ -113,10 +113,20 @@ pub(crate) struct Counts {
     pub(crate) early: u64,
 }
 
+/// Which camera a device is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Identity {
+    /// Its name, by which others of its kind are called as well.
+    pub(crate) card: String,
+    /// Where it is plugged in.
+    pub(crate) bus: String,
+}
+
 /// A device that gives frames.
 pub(crate) struct Capture<D: Device> {
     buffers: Vec<D::Mapping>,
     device: D,
+    identity: Identity,
     rows: Rows,
     rate_hz: f64,
     stamped_at: Option<StampedAt>,
@@ -147,13 +157,20 @@ pub(crate) struct Taken {
 }
 
 impl<D: Device> Capture<D> {
-    /// Opens the device for frames as wanted, and starts them.
+    /// Opens the device for frames as wanted, and starts them, where it is a camera that is accepted.
     ///
     /// # Errors
-    /// It is no camera, cannot do what is wanted, or fails.
-    pub(crate) fn start(device: D, wanted: &Wanted) -> Result<Self, Lost> {
+    /// It is no camera or none that is accepted, cannot do what is wanted, or fails.
+    pub(crate) fn start(
+        device: D,
+        wanted: &Wanted,
+        accept: impl FnOnce(&Identity) -> Result<(), Lost>,
+    ) -> Result<Self, Lost> {
         let mut capability = Capability::default();
         failed("VIDIOC_QUERYCAP", device.call(Call::QueryCap(&mut capability)))?;
+        let identity = Identity { card: text(&capability.card), bus: text(&capability.bus_info) };
+        // Before anything is set: it may be another service's.
+        accept(&identity)?;
         if !is_camera(&capability) {
             let card = text(&capability.card);
             return Err(Lost::Refused(format!(
@@ -170,6 +187,7 @@ impl<D: Device> Capture<D> {
         let mut capture = Self {
             buffers: Vec::new(),
             device,
+            identity,
             rows,
             rate_hz,
             stamped_at: wanted.stamped_at,
@@ -194,6 +212,11 @@ impl<D: Device> Capture<D> {
         capture.request_buffers()?;
         failed("VIDIOC_STREAMON", capture.device.call(Call::StreamOn))?;
         Ok(capture)
+    }
+
+    /// Which camera it is.
+    pub(crate) fn identity(&self) -> &Identity {
+        &self.identity
     }
 
     /// The rate at which the device gives frames.

@@ -87,6 +87,9 @@ pub(crate) struct Fake {
     /// The level of white at 1 ms and gain 1, of full scale: it shows a pad in its middle; 0 for none.
     light: Cell<f64>,
     is_foreign: Cell<bool>,
+    /// Where it is plugged in, and whether its path is a link.
+    bus: Cell<[u8; 20]>,
+    is_linked: Cell<bool>,
     /// The control that it does not set.
     refused: Cell<Option<u32>>,
     /// The control that it does not tell.
@@ -155,6 +158,8 @@ impl Fake {
             changes: RefCell::default(),
             light: Cell::new(0.0),
             is_foreign: Cell::new(false),
+            bus: Cell::new(*b"usb-0000:0e:00.0-2.4"),
+            is_linked: Cell::new(false),
             refused: Cell::new(None),
             hidden: Cell::new(None),
             open_devices: Cell::new(0),
@@ -227,6 +232,15 @@ impl Fake {
         self.now_ns.set(self.now_ns.get() + time.as_nanos() as i64);
     }
 
+    pub(crate) fn plug_in_at(&self, bus: &[u8; 20]) {
+        self.bus.set(*bus);
+    }
+
+    /// Gives it a path that is a link.
+    pub(crate) fn link(&self) {
+        self.is_linked.set(true);
+    }
+
     pub(crate) fn unplug(&self, away_ns: i64) {
         self.away_until_ns.set(self.now_ns.get() + away_ns);
     }
@@ -285,6 +299,10 @@ impl Port for Rc<Fake> {
         Ok(FakeDevice { fake: Self::clone(self), generation, state: RefCell::default() })
     }
 
+    fn is_by_number(&self) -> bool {
+        !self.is_linked.get()
+    }
+
     fn now_ns(&self) -> i64 {
         // Waiting for a frame passes the time; where there is no device, asking for it does.
         if self.open_devices.get() == 0 {
@@ -335,7 +353,7 @@ impl Device for FakeDevice {
                 let driver = if is_usb { b"uvcvideo" } else { b"unicam\0\0" };
                 capability.driver[..8].copy_from_slice(driver);
                 capability.card[..14].copy_from_slice(b"PTZ Pro Camera");
-                capability.bus_info[..20].copy_from_slice(b"usb-0000:0e:00.0-2.4");
+                capability.bus_info[..20].copy_from_slice(&self.fake.bus.get());
                 capability.capabilities = 0x04a0_0001 | CAP_DEVICE_CAPS;
                 capability.device_caps = 0x0420_0001;
             }

@@ -47,6 +47,11 @@ impl Port for DevicePath {
         KernelDevice::open(&self.0)
     }
 
+    fn is_by_number(&self) -> bool {
+        let number = self.0.file_name().and_then(|name| name.to_str()?.strip_prefix("video"));
+        number.is_some_and(|number| number.bytes().all(|byte| byte.is_ascii_digit()))
+    }
+
     fn now_ns(&self) -> i64 {
         node::now_ns()
     }

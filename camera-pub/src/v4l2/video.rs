@@ -4,7 +4,7 @@ use std::io;
 use std::time::Duration;
 
 use super::abi::Device;
-use super::capture::{Capture, Lost, Taken, Wanted};
+use super::capture::{Capture, Identity, Lost, Taken, Wanted};
 
 /// Time between attempts to open the camera.
 const RETRY_NS: i64 = 500_000_000;
@@ -24,6 +24,9 @@ pub(crate) trait Port {
     /// It is not there, or may not be used.
     fn open(&self) -> io::Result<Self::Device>;
 
+    /// Whether the path is a device's number (`/dev/video0`), which another camera may have after a loss.
+    fn is_by_number(&self) -> bool;
+
     /// The host's clock.
     fn now_ns(&self) -> i64;
 }
@@ -33,6 +36,8 @@ pub(crate) struct Video<P: Port> {
     port: P,
     wanted: Wanted,
     capture: Option<Capture<P::Device>>,
+    /// Which camera it was first: another one has another mount and another calibration.
+    identity: Identity,
     /// Whether its stamps have been of the host's clock: then others end no service.
     has_clock: bool,
     started_ns: i64,
@@ -65,11 +70,12 @@ impl<P: Port> Video<P> {
     /// # Errors
     /// It is not there, or cannot do what is wanted.
     pub(crate) fn start(port: P, wanted: Wanted) -> Result<Self, Lost> {
-        let capture = open(&port, &wanted)?;
+        let capture = open(&port, &wanted, None)?;
         let now_ns = port.now_ns();
         Ok(Self {
             port,
             wanted,
+            identity: capture.identity().clone(),
             capture: Some(capture),
             has_clock: false,
             started_ns: now_ns,
@@ -145,7 +151,7 @@ impl<P: Port> Video<P> {
     }
 
     fn reopen(&mut self) -> Next {
-        match open(&self.port, &self.wanted) {
+        match open(&self.port, &self.wanted, Some(&self.identity)) {
             Ok(mut capture) => {
                 if self.has_clock {
                     capture.believe_clock();
@@ -162,7 +168,12 @@ impl<P: Port> Video<P> {
     }
 }
 
-fn open<P: Port>(port: &P, wanted: &Wanted) -> Result<Capture<P::Device>, Lost> {
+/// Opens the camera; after a loss only the same one.
+fn open<P: Port>(
+    port: &P,
+    wanted: &Wanted,
+    before: Option<&Identity>,
+) -> Result<Capture<P::Device>, Lost> {
     let device = port.open().map_err(|cause| match cause.raw_os_error() {
         Some(libc::ENODEV | libc::ENXIO | libc::ENOENT) => Lost::Unplugged,
         Some(libc::EACCES | libc::EPERM) => Lost::Refused(
@@ -170,7 +181,17 @@ fn open<P: Port>(port: &P, wanted: &Wanted) -> Result<Capture<P::Device>, Lost> 
         ),
         _ => Lost::Failed { call: "open", cause },
     })?;
-    Capture::start(device, wanted)
+    Capture::start(device, wanted, |now| match before {
+        // A link is of a camera or of a place, but a camera of the same name may be plugged in elsewhere.
+        Some(before) if now.card != before.card || port.is_by_number() && now != before => {
+            Err(Lost::Refused(format!(
+                "another camera is there now, `{}` at {}; `{}` at {} is waited for. A path in /dev/v4l/by-id or by-path stays \
+                 with its camera; start the service again if this is the one to take",
+                now.card, now.bus, before.card, before.bus
+            )))
+        }
+        _ => Ok(()),
+    })
 }
 
 #[cfg(test)]
@@ -333,6 +354,25 @@ mod tests {
             assert!((0..=max_ms).contains(&back_ms), "{reason}: {back_ms} ms");
             assert!(seen.frames > 300 && seen.worst_ns <= 1000);
         }
+    }
+
+    #[test]
+    fn another_camera_of_the_same_kind_is_not_taken_after_a_loss() {
+        let fake = Fake::of("GREY", Stamps::ExposureStart, 0);
+        let mut video = Video::start(Rc::clone(&fake), wanted(&fake)).unwrap();
+        assert!(run(&fake, &mut video, 200 * MS).frames > 10);
+        // Their numbers have changed.
+        fake.unplug(200 * MS);
+        fake.plug_in_at(b"usb-0000:0e:00.0-2.1");
+        let seen = run(&fake, &mut video, 3000 * MS);
+        assert_eq!((seen.frames, &seen.lost[..]), (0, &["camera unplugged"][..]));
+        fake.plug_in_at(b"usb-0000:0e:00.0-2.4");
+        assert!(run(&fake, &mut video, 4000 * MS).frames > 10);
+        // By its link it is the same one wherever it is.
+        fake.link();
+        fake.unplug(200 * MS);
+        fake.plug_in_at(b"usb-0000:0e:00.0-2.1");
+        assert!(run(&fake, &mut video, 6000 * MS).frames > 10);
     }
 
     #[test]
