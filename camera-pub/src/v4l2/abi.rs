@@ -10,8 +10,9 @@ use std::time::Duration;
 pub(crate) const VIDEO_CAPTURE: u32 = 1;
 /// Buffers of the driver that are mapped, `V4L2_MEMORY_MMAP`.
 pub(crate) const MEMORY_MMAP: u32 = 1;
-/// `V4L2_FIELD_NONE`: whole frames.
+/// `V4L2_FIELD_NONE`: whole frames. Drivers that know nothing else may leave `V4L2_FIELD_ANY`.
 pub(crate) const FIELD_NONE: u32 = 1;
+pub(crate) const FIELD_ANY: u32 = 0;
 
 pub(crate) const CAP_VIDEO_CAPTURE: u32 = 0x0000_0001;
 pub(crate) const CAP_STREAMING: u32 = 0x0400_0000;
@@ -489,6 +490,7 @@ mod tests {
             ("V4L2_BUF_TYPE_VIDEO_CAPTURE", VIDEO_CAPTURE),
             ("V4L2_MEMORY_MMAP", MEMORY_MMAP),
             ("V4L2_FIELD_NONE", FIELD_NONE),
+            ("V4L2_FIELD_ANY", FIELD_ANY),
             ("V4L2_CAP_VIDEO_CAPTURE", CAP_VIDEO_CAPTURE),
             ("V4L2_CAP_STREAMING", CAP_STREAMING),
             ("V4L2_CAP_DEVICE_CAPS", CAP_DEVICE_CAPS),

@@ -6,8 +6,8 @@ use std::time::Duration;
 use super::abi::{
     BUF_FLAG_ERROR, BUF_FLAG_TIMESTAMP_MASK, BUF_FLAG_TIMESTAMP_MONOTONIC,
     BUF_FLAG_TSTAMP_SRC_MASK, BUF_FLAG_TSTAMP_SRC_SOE, Buffer, CID_EXPOSURE_ABSOLUTE,
-    CID_EXPOSURE_AUTO, Call, Capability, Device, EXPOSURE_MANUAL, ExtControl, FIELD_NONE, Format,
-    Mapping, PixFormat, RequestBuffers, StreamParm, text,
+    CID_EXPOSURE_AUTO, Call, Capability, Device, EXPOSURE_MANUAL, ExtControl, FIELD_ANY,
+    FIELD_NONE, Format, Mapping, PixFormat, RequestBuffers, StreamParm, text,
 };
 use super::describe::{ControlDescription, control_value, controls, describe, is_camera};
 use super::exposer::{Exposer, ForMarker, Order};
@@ -513,6 +513,13 @@ fn set_format(device: &impl Device, wanted: &Wanted) -> Result<Rows, Lost> {
         return Err(Lost::Refused(format!(
             "it has no `{fourcc}` of {width} x {height} pixels, the nearest is `{nearest}` of {} x {}; it has {offered}",
             pix.width, pix.height
+        )));
+    }
+    if ![FIELD_NONE, FIELD_ANY].contains(&pix.field) {
+        let field = pix.field;
+        return Err(Lost::Refused(format!(
+            "its frames are interlaced (field {field} of VIDIOC_S_FMT), which tears what moves: read it by `source.command` with \
+             ffmpeg, deinterlaced (`-vf yadif`)"
         )));
     }
     let [width, height, stride] = [pix.width, pix.height, pix.bytesperline].map(|n| n as usize);

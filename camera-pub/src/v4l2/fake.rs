@@ -46,6 +46,13 @@ pub(crate) enum Stamps {
     Unknown,
 }
 
+/// What is odd about a camera.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Oddity {
+    /// Its frames are of two fields.
+    Interlaced,
+}
+
 /// How a frame was exposed.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) struct Exposed {
@@ -87,6 +94,7 @@ pub(crate) struct Fake {
     /// The level of white at 1 ms and gain 1, of full scale: it shows a pad in its middle; 0 for none.
     light: Cell<f64>,
     is_foreign: Cell<bool>,
+    oddity: Cell<Option<Oddity>>,
     /// Where it is plugged in, and whether its path is a link.
     bus: Cell<[u8; 20]>,
     is_linked: Cell<bool>,
@@ -158,6 +166,7 @@ impl Fake {
             changes: RefCell::default(),
             light: Cell::new(0.0),
             is_foreign: Cell::new(false),
+            oddity: Cell::new(None),
             bus: Cell::new(*b"usb-0000:0e:00.0-2.4"),
             is_linked: Cell::new(false),
             refused: Cell::new(None),
@@ -180,6 +189,15 @@ impl Fake {
     /// Something will happen at this frame, or the next one that is read.
     pub(crate) fn script(&self, frame: u32, happening: Happening) {
         self.script.borrow_mut().push((frame, happening));
+    }
+
+    /// Makes it odd.
+    pub(crate) fn make(&self, oddity: Oddity) {
+        self.oddity.set(Some(oddity));
+    }
+
+    fn is(&self, oddity: Oddity) -> bool {
+        self.oddity.get() == Some(oddity)
     }
 
     /// Lets the camera choose its exposure by itself.
@@ -382,6 +400,9 @@ impl Device for FakeDevice {
                 let pix = &mut format.pix;
                 (pix.width, pix.height, pix.pixelformat) = (width, height, pixelformat);
                 (pix.bytesperline, pix.sizeimage) = (stride, bytes as u32);
+                if self.fake.is(Oddity::Interlaced) {
+                    pix.field = 4;
+                }
                 state.bytes = bytes;
             }
             Call::SetParm(parm) => (parm.numerator, parm.denominator) = (1, 100),

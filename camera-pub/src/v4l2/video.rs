@@ -200,7 +200,7 @@ mod tests {
     use crate::exposure::StampedAt;
     use crate::v4l2::abi::CID_EXPOSURE_AUTO;
     use crate::v4l2::capture::Counts;
-    use crate::v4l2::fake::{Fake, Happening, MS, Stamps};
+    use crate::v4l2::fake::{Fake, Happening, MS, Oddity, Stamps};
     use std::rc::Rc;
 
     fn wanted(fake: &Fake) -> Wanted {
@@ -476,6 +476,13 @@ mod tests {
         );
         let range = control("exposure_time_absolute", 9999);
         assert!(range.contains("to 9999, but it can be from 1 to 2500"), "{range}");
+        let odd = |oddity| {
+            let fake = Fake::of("MJPG", Stamps::ExposureStart, 0);
+            fake.make(oddity);
+            Video::start(fake, fine.clone()).err().unwrap().to_string()
+        };
+        let interlaced = odd(Oddity::Interlaced);
+        assert!(interlaced.contains("interlaced") && interlaced.contains("yadif"), "{interlaced}");
         let fake = Fake::of("MJPG", Stamps::ExposureStart, 0);
         fake.script(0, Happening::OtherClock);
         let mut video = Video::start(Rc::clone(&fake), fine).unwrap();
