@@ -138,6 +138,12 @@ fn text(listing: &Listing) -> String {
                     None => text += "  camera-pub reads none of these formats\n\n",
                 }
             }
+            (Some(description), _) if description.is_multi_planar => {
+                text += &format!(
+                    "{path}: {}, multi-planar, which camera-pub does not read: take GStreamer (docs/camera.md)\n\n",
+                    description.card
+                );
+            }
             (Some(description), _) => {
                 text += &format!("{path}: {}, gives no frames\n\n", description.card);
             }
@@ -286,6 +292,7 @@ mod tests {
             card: "PTZ Pro Camera".into(),
             bus: "usb-0000:0e:00.0-2.4".into(),
             is_camera,
+            is_multi_planar: false,
             formats,
             controls: Vec::<ControlDescription>::new(),
         };

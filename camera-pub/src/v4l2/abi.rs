@@ -15,6 +15,7 @@ pub(crate) const FIELD_NONE: u32 = 1;
 pub(crate) const FIELD_ANY: u32 = 0;
 
 pub(crate) const CAP_VIDEO_CAPTURE: u32 = 0x0000_0001;
+pub(crate) const CAP_VIDEO_CAPTURE_MPLANE: u32 = 0x0000_1000;
 pub(crate) const CAP_STREAMING: u32 = 0x0400_0000;
 pub(crate) const CAP_DEVICE_CAPS: u32 = 0x8000_0000;
 
@@ -492,6 +493,7 @@ mod tests {
             ("V4L2_FIELD_NONE", FIELD_NONE),
             ("V4L2_FIELD_ANY", FIELD_ANY),
             ("V4L2_CAP_VIDEO_CAPTURE", CAP_VIDEO_CAPTURE),
+            ("V4L2_CAP_VIDEO_CAPTURE_MPLANE", CAP_VIDEO_CAPTURE_MPLANE),
             ("V4L2_CAP_STREAMING", CAP_STREAMING),
             ("V4L2_CAP_DEVICE_CAPS", CAP_DEVICE_CAPS),
             ("V4L2_BUF_FLAG_ERROR", BUF_FLAG_ERROR),

@@ -9,7 +9,9 @@ use super::abi::{
     CID_EXPOSURE_AUTO, Call, Capability, Device, EXPOSURE_MANUAL, ExtControl, FIELD_ANY,
     FIELD_NONE, Format, Mapping, PixFormat, RequestBuffers, StreamParm, text,
 };
-use super::describe::{ControlDescription, control_value, controls, describe, is_camera};
+use super::describe::{
+    ControlDescription, control_value, controls, describe, is_camera, is_multi_planar,
+};
 use super::exposer::{Exposer, ForMarker, Order};
 use super::pixels::{Pixels, Rows};
 use crate::exposure::{Exposure, Shutter, StampedAt};
@@ -173,6 +175,12 @@ impl<D: Device> Capture<D> {
         accept(&identity)?;
         if !is_camera(&capability) {
             let card = text(&capability.card);
+            if is_multi_planar(&capability) {
+                return Err(Lost::Refused(format!(
+                    "`{card}` is multi-planar, which is not read: read it by `source.command` with GStreamer (v4l2src or the \
+                     maker's source; docs/camera.md)"
+                )));
+            }
             return Err(Lost::Refused(format!(
                 "`{card}` gives no frames; a camera has several devices, `alight cameras` says which to take"
             )));

@@ -5,9 +5,10 @@ use std::io;
 use serde::Serialize;
 
 use super::abi::{
-    CAP_DEVICE_CAPS, CAP_STREAMING, CAP_VIDEO_CAPTURE, CTRL_FLAG_DISABLED, CTRL_FLAG_NEXT_CTRL,
-    CTRL_FLAG_READ_ONLY, Call, Capability, Device, ExtControl, FmtDesc, FrmIvalEnum, FrmSizeEnum,
-    QueryExtCtrl, TYPE_DISCRETE, VIDEO_CAPTURE, text,
+    CAP_DEVICE_CAPS, CAP_STREAMING, CAP_VIDEO_CAPTURE, CAP_VIDEO_CAPTURE_MPLANE,
+    CTRL_FLAG_DISABLED, CTRL_FLAG_NEXT_CTRL, CTRL_FLAG_READ_ONLY, Call, Capability, Device,
+    ExtControl, FmtDesc, FrmIvalEnum, FrmSizeEnum, QueryExtCtrl, TYPE_DISCRETE, VIDEO_CAPTURE,
+    text,
 };
 use super::pixels::Pixels;
 
@@ -25,6 +26,8 @@ pub struct DeviceDescription {
     pub bus: String,
     /// True for a device that gives frames. A camera has others beside, for its metadata.
     pub is_camera: bool,
+    /// True for a device that gives frames in several planes, each in memory of its own, which camera-pub does not read.
+    pub is_multi_planar: bool,
     /// Its pixel formats.
     pub formats: Vec<FormatDescription>,
     /// Its controls.
@@ -87,6 +90,7 @@ pub(crate) fn describe(device: &impl Device) -> io::Result<DeviceDescription> {
         card: text(&capability.card),
         bus: text(&capability.bus_info),
         is_camera,
+        is_multi_planar: is_multi_planar(&capability),
         formats: if is_camera { formats(device)? } else { Vec::new() },
         controls: if is_camera { controls(device)? } else { Vec::new() },
     })
@@ -94,10 +98,19 @@ pub(crate) fn describe(device: &impl Device) -> io::Result<DeviceDescription> {
 
 /// True for a device that gives frames in buffers that can be mapped.
 pub(crate) fn is_camera(capability: &Capability) -> bool {
-    // Those of this node, where the driver tells them; else those of all nodes of the device.
-    let has_own = capability.capabilities & CAP_DEVICE_CAPS != 0;
-    let caps = if has_own { capability.device_caps } else { capability.capabilities };
+    let caps = caps(capability);
     caps & CAP_VIDEO_CAPTURE != 0 && caps & CAP_STREAMING != 0
+}
+
+/// True for a device that gives frames in several planes, and in no other way.
+pub(crate) fn is_multi_planar(capability: &Capability) -> bool {
+    caps(capability) & CAP_VIDEO_CAPTURE_MPLANE != 0 && !is_camera(capability)
+}
+
+/// What a node can do, where the driver tells that; else what all nodes of its device can.
+fn caps(capability: &Capability) -> u32 {
+    let has_own = capability.capabilities & CAP_DEVICE_CAPS != 0;
+    if has_own { capability.device_caps } else { capability.capabilities }
 }
 
 /// The entries of a list that `EINVAL` ends.

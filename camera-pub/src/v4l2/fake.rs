@@ -51,6 +51,7 @@ pub(crate) enum Stamps {
 pub(crate) enum Oddity {
     /// Its frames are of two fields.
     Interlaced,
+    MultiPlanar,
 }
 
 /// How a frame was exposed.
@@ -373,7 +374,8 @@ impl Device for FakeDevice {
                 capability.card[..14].copy_from_slice(b"PTZ Pro Camera");
                 capability.bus_info[..20].copy_from_slice(&self.fake.bus.get());
                 capability.capabilities = 0x04a0_0001 | CAP_DEVICE_CAPS;
-                capability.device_caps = 0x0420_0001;
+                let is_multi_planar = self.fake.is(Oddity::MultiPlanar);
+                capability.device_caps = if is_multi_planar { 0x0420_1000 } else { 0x0420_0001 };
             }
             Call::EnumFmt(format) if format.index == 0 => {
                 format.pixelformat = fourcc(self.fake.name.as_bytes().try_into().unwrap());

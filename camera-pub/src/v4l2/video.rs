@@ -483,6 +483,8 @@ mod tests {
         };
         let interlaced = odd(Oddity::Interlaced);
         assert!(interlaced.contains("interlaced") && interlaced.contains("yadif"), "{interlaced}");
+        let planes = odd(Oddity::MultiPlanar);
+        assert!(planes.contains("multi-planar") && planes.contains("GStreamer"), "{planes}");
         let fake = Fake::of("MJPG", Stamps::ExposureStart, 0);
         fake.script(0, Happening::OtherClock);
         let mut video = Video::start(Rc::clone(&fake), fine).unwrap();
