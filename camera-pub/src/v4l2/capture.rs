@@ -218,7 +218,15 @@ impl<D: Device> Capture<D> {
         };
         // From here on `drop` gives back what there is.
         capture.request_buffers()?;
-        failed("VIDIOC_STREAMON", capture.device.call(Call::StreamOn))?;
+        match capture.device.call(Call::StreamOn) {
+            Err(cause) if cause.raw_os_error() == Some(libc::ENOSPC) => {
+                return Err(Lost::Refused(format!(
+                    "its USB bus has no room left for it (VIDIOC_STREAMON: {cause}): set a lower rate or a smaller size, `MJPG`, or \
+                     plug it in at another bus"
+                )));
+            }
+            started => failed("VIDIOC_STREAMON", started)?,
+        }
         Ok(capture)
     }
 

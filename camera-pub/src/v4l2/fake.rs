@@ -52,6 +52,8 @@ pub(crate) enum Oddity {
     /// Its frames are of two fields.
     Interlaced,
     MultiPlanar,
+    /// The bus has no room for it.
+    Crowded,
 }
 
 /// How a frame was exposed.
@@ -420,6 +422,7 @@ impl Device for FakeDevice {
                 state.queued.push_back(buffer.index);
             }
             Call::DqBuf(buffer) => return self.dequeue(&mut state, buffer),
+            Call::StreamOn if self.fake.is(Oddity::Crowded) => return Err(errno(libc::ENOSPC)),
             Call::StreamOn => {
                 assert!(!state.queued.is_empty(), "no buffers are queued");
                 state.is_streaming = true;

@@ -485,6 +485,8 @@ mod tests {
         assert!(interlaced.contains("interlaced") && interlaced.contains("yadif"), "{interlaced}");
         let planes = odd(Oddity::MultiPlanar);
         assert!(planes.contains("multi-planar") && planes.contains("GStreamer"), "{planes}");
+        let crowded = odd(Oddity::Crowded);
+        assert!(crowded.contains("no room") && crowded.contains("lower rate"), "{crowded}");
         let fake = Fake::of("MJPG", Stamps::ExposureStart, 0);
         fake.script(0, Happening::OtherClock);
         let mut video = Video::start(Rc::clone(&fake), fine).unwrap();
