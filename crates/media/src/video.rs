@@ -1,7 +1,8 @@
 //! Videos, frame by frame: Motion JPEG (AVI, or a bare stream of JPEG files) and H.264 (MP4, or a bare
 //! stream).
 
-use std::collections::VecDeque;
+use std::cmp::Reverse;
+use std::collections::{BinaryHeap, VecDeque};
 use std::fs::File;
 use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -161,25 +162,32 @@ impl Video {
     pub fn next_frame(&mut self) -> Option<Result<VideoFrame, VideoError>> {
         let problems = Problems { path: &self.path };
         let stream = &mut self.stream;
+        let (index, period_s) = (self.next, self.period_s);
+        self.next += 1;
         let decode = || {
-            let image = match stream {
-                Stream::Avi(reader) => reader.next(&problems),
+            let frame = match stream {
+                Stream::Avi(reader) => {
+                    let image = reader.next(&problems);
+                    let time_s = reader.dropped.saturating_add(index) as f64 * period_s;
+                    image.map(|image| image.map(|image| (image, Some(time_s))))
+                }
                 Stream::Jpegs { bytes, at } => {
-                    next_jpeg(bytes, at).map(|jpeg| Ok(VideoImage::Jpeg(jpeg.to_vec())))
+                    next_jpeg(bytes, at).map(|jpeg| Ok((VideoImage::Jpeg(jpeg.to_vec()), None)))
                 }
                 Stream::H264(decoder) => decoder.next(&problems),
                 Stream::Ended => None,
             };
-            image.transpose()
+            frame.transpose()
         };
-        let image = contained(decode, |cause| problems.damaged(cause)).transpose();
-        if !matches!(image, Some(Ok(_))) {
+        let frame = contained(decode, |cause| problems.damaged(cause)).transpose();
+        if !matches!(frame, Some(Ok(_))) {
             self.stream = Stream::Ended;
         }
-        let index = self.next;
-        self.next += 1;
-        let time_s = index as f64 * self.period_s;
-        image.map(|image| Ok(VideoFrame { index, time_s, image: image? }))
+        let timed = |(image, time_s): (VideoImage, Option<f64>)| {
+            let time_s = time_s.unwrap_or(index as f64 * period_s);
+            VideoFrame { index, time_s, image }
+        };
+        frame.map(|frame| frame.map(timed))
     }
 }
 
@@ -221,6 +229,8 @@ struct AviReader {
     ids: [[u8; 4]; 2],
     /// Width and height of raw grey frames; `None` for frames that are JPEG files.
     grey: Option<[usize; 2]>,
+    /// Frames that were left out so far.
+    dropped: u64,
 }
 
 /// A chunk among the frames.
@@ -294,7 +304,7 @@ impl AviReader {
             0 => 1.0 / DEFAULT_RATE_HZ,
             micros => f64::from(micros) * 1e-6,
         };
-        Ok((Self { file, ids, grey }, period_s))
+        Ok((Self { file, ids, grey, dropped: 0 }, period_s))
     }
 
     fn next(&mut self, problems: &Problems<'_>) -> Option<Result<VideoImage, VideoError>> {
@@ -322,7 +332,10 @@ impl AviReader {
             }
             return Ok(AviChunk::Other);
         }
-        // A dropped frame is an empty chunk.
+        // A dropped frame is an empty chunk, which has its time.
+        if self.ids.contains(&id) && len == 0 {
+            self.dropped += 1;
+        }
         if !self.ids.contains(&id) || len == 0 || u64::from(len) > MAX_FRAME_BYTES {
             skip(&mut self.file, u64::from(len), len)?;
             return Ok(AviChunk::Other);
@@ -396,7 +409,32 @@ struct H264 {
     source: Source,
     /// Decoded images, in order of presentation.
     ready: VecDeque<GrayImage>,
+    times: Times,
     is_over: bool,
+}
+
+/// When the pictures of an MP4 file are shown.
+#[derive(Default)]
+struct Times {
+    /// Of those that are not out yet, in ticks.
+    waiting: BinaryHeap<Reverse<i64>>,
+    first: Option<i64>,
+    ticks_per_s: f64,
+}
+
+impl Times {
+    /// Notes the time of a picture that is decoded, in any order.
+    fn add(&mut self, sample: &mp4::Mp4Sample) {
+        let start = i64::try_from(sample.start_time).unwrap_or(i64::MAX);
+        self.waiting.push(Reverse(start.saturating_add(i64::from(sample.rendering_offset))));
+    }
+
+    /// The time of the next picture in order of presentation, since that of the first.
+    fn next_s(&mut self) -> Option<f64> {
+        let Reverse(shown) = self.waiting.pop()?;
+        let first = *self.first.get_or_insert(shown);
+        Some(shown.saturating_sub(first) as f64 / self.ticks_per_s)
+    }
 }
 
 enum Source {
@@ -444,28 +482,37 @@ impl H264 {
                 decoder.decode_nal(&unit).map_err(|e| problems.damaged(e))?;
             }
         }
+        let ticks_per_s = f64::from(track.timescale().max(1));
+        let times = Times { ticks_per_s, ..Times::default() };
         let seconds = track.duration().as_secs_f64() / f64::from(track.sample_count().max(1));
         let period_s = if seconds > 0.0 { seconds } else { 1.0 / DEFAULT_RATE_HZ };
         let length_bytes = usize::from(avc1.avcc.length_size_minus_one & 3) + 1;
         let track = track.track_id();
         let source = Source::Mp4 { reader: Box::new(reader), track, next: 1, length_bytes };
-        Ok((Self { decoder, limits, source, ready: VecDeque::new(), is_over: false }, period_s))
+        let ready = VecDeque::new();
+        Ok((Self { decoder, limits, source, ready, times, is_over: false }, period_s))
     }
 
     fn from_stream(bytes: Vec<u8>, max_pixels: u64) -> Self {
         let source = Source::Stream { bytes, at: 0 };
         let (decoder, limits) = (OrderedDecoder::new(), Limits::new(max_pixels));
-        Self { decoder, limits, source, ready: VecDeque::new(), is_over: false }
+        let (ready, times) = (VecDeque::new(), Times::default());
+        Self { decoder, limits, source, ready, times, is_over: false }
     }
 
-    fn next(&mut self, problems: &Problems<'_>) -> Option<Result<VideoImage, VideoError>> {
+    /// The next picture, and its time where the file tells it.
+    fn next(
+        &mut self,
+        problems: &Problems<'_>,
+    ) -> Option<Result<(VideoImage, Option<f64>), VideoError>> {
         while self.ready.is_empty() && !self.is_over {
             if let Err(problem) = self.decode_more(problems) {
                 self.is_over = true;
                 return Some(Err(problem));
             }
         }
-        self.ready.pop_front().map(|image| Ok(VideoImage::Grey(image)))
+        let image = self.ready.pop_front()?;
+        Some(Ok((VideoImage::Grey(image), self.times.next_s())))
     }
 
     fn decode_more(&mut self, problems: &Problems<'_>) -> Result<(), VideoError> {
@@ -481,6 +528,7 @@ impl H264 {
                 *next += 1;
                 match sample {
                     Some(sample) => {
+                        self.times.add(&sample);
                         parse_avcc(&sample.bytes, *length_bytes)
                             .iter()
                             .try_for_each(&mut decode)?;
@@ -601,13 +649,39 @@ mod tests {
                     level.abs_diff(wanted) < 3 && (time_s - period_s * f64::from(i)).abs() < 1e-9
                 })
         };
+        // Each frame and the dropped one behind it have 50 ms.
         let found = levels("a.avi", &avi(b"MJPG", &frames)).unwrap();
-        assert!(close(&found, 0.05), "{found:?}");
+        assert!(close(&found, 0.1), "{found:?}");
         let found = levels("a.mjpeg", &frames.concat()).unwrap();
         assert!(close(&found, 0.04), "{found:?}");
         let grey = [50_u8, 100, 150].map(|level| vec![level; 16 * 8]);
         let found = levels("a.avi", &avi(b"Y800", &grey)).unwrap();
-        assert!(close(&found, 0.05), "{found:?}");
+        assert!(close(&found, 0.1), "{found:?}");
+    }
+
+    #[test]
+    fn frames_of_mp4_have_the_times_at_which_they_are_shown() {
+        if !testing::has_x264() {
+            return;
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.mp4");
+        // Of 20 frames at 25 Hz every third and the ten in the middle are missing; B-frames are coded in another order.
+        let kept = |n: &u32| !n.is_multiple_of(3) && !(5..15).contains(n);
+        let made = std::process::Command::new("ffmpeg")
+            .args(["-v", "error", "-f", "lavfi", "-i", "testsrc=size=64x48:rate=25:duration=0.8"])
+            .args(["-vf", "select='mod(n,3)*not(between(n,5,14))'", "-fps_mode", "vfr"])
+            .args(["-c:v", "libx264", "-pix_fmt", "yuv420p", "-bf", "2"])
+            .arg(&path)
+            .status();
+        assert!(made.unwrap().success());
+        let mut video = Video::open(&path, MAX_PIXELS).unwrap();
+        let mut times = Vec::new();
+        while let Some(frame) = video.next_frame() {
+            times.push((frame.unwrap().time_s * 25.0).round() as u32);
+        }
+        let expected: Vec<u32> = (0..20).filter(kept).map(|n| n - 1).collect();
+        assert_eq!(times, expected);
     }
 
     #[test]
