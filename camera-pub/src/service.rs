@@ -439,11 +439,12 @@ impl Stream {
             match feed.next().await? {
                 rtsp::feed::Next::Frame(image, exposure) => {
                     let began = Instant::now();
+                    let decoding = feed.decoding();
                     let frame = match image {
                         Image::Jpeg(jpeg) => self.prepare_jpeg(&jpeg).ok(),
                         Image::Grey(image) => self.prepare_grey(&image).ok(),
                     };
-                    self.health.latency("read", began.elapsed());
+                    self.health.latency("read", decoding + began.elapsed());
                     if let Some(frame) = frame {
                         self.publish_live(frame, exposure).await;
                     }

@@ -1,6 +1,6 @@
 //! The pictures of a camera that may be lost: its stream is opened again until it is back.
 
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, bail, ensure};
 use imaging::GrayImage;
@@ -17,6 +17,8 @@ use crate::exposure::Exposure;
 const RETRY: Duration = Duration::from_millis(500);
 /// Time without a picture after which the camera has stalled, beside three periods.
 const STALL_S: f64 = 1.0;
+/// Time of pictures that give no frame after which the reason is told, in nanoseconds.
+const FRAMELESS_NS: i64 = 5_000_000_000;
 /// Time in which a camera must tell its clock, where that is wanted, in seconds: most tell it every five.
 const CLOCK_S: f64 = 20.0;
 
@@ -34,6 +36,31 @@ pub(crate) struct Feed {
     unknown: u32,
     /// Pictures that came faster than they were taken.
     missed: u64,
+    /// How long the last picture took to decode.
+    decoding: Duration,
+    frameless: Frameless,
+}
+
+/// Pictures that come and give no frame.
+#[derive(Default)]
+struct Frameless {
+    since_ns: Option<i64>,
+    is_told: bool,
+}
+
+impl Frameless {
+    /// Notes a picture without a frame; true where the reason is to be told, which is once.
+    fn add(&mut self, now_ns: i64) -> bool {
+        let since_ns = *self.since_ns.get_or_insert(now_ns);
+        let is_due = now_ns - since_ns >= FRAMELESS_NS && !self.is_told;
+        self.is_told |= is_due;
+        is_due
+    }
+
+    /// A frame has come.
+    fn end(&mut self) {
+        self.since_ns = None;
+    }
 }
 
 /// What happened next.
@@ -73,6 +100,8 @@ impl Feed {
             outage: None,
             unknown: 0,
             missed: 0,
+            decoding: Duration::ZERO,
+            frameless: Frameless::default(),
             config: config.clone(),
         })
     }
@@ -102,6 +131,11 @@ impl Feed {
         std::mem::take(&mut self.missed)
     }
 
+    /// How long the last picture took to decode here.
+    pub(crate) fn decoding(&self) -> Duration {
+        self.decoding
+    }
+
     fn take(&mut self, picture: Picture, coding: Coding) -> anyhow::Result<Next> {
         if let Some((since_ns, _)) = self.outage.take() {
             let lost_s = (now_ns() - since_ns) as f64 * 1e-9;
@@ -116,10 +150,33 @@ impl Feed {
                 if picture.is_after_loss {
                     self.decoder.restart();
                 }
-                match self.decoder.decode(&picture.bytes) {
-                    Ok(image) => image.map(Image::Grey),
+                let began = Instant::now();
+                let decoded = self.decoder.decode(&picture.bytes);
+                self.decoding = began.elapsed();
+                match decoded {
+                    Ok(Some(image)) => {
+                        self.frameless.end();
+                        Some(Image::Grey(image))
+                    }
+                    Ok(None) => {
+                        if self.frameless.add(now_ns()) {
+                            tracing::warn!(
+                                "The camera's pictures give no frame since {} s, as none of them is a key frame (IDR): set the \
+                                 camera to one each second or more often",
+                                FRAMELESS_NS / 1_000_000_000
+                            );
+                        }
+                        None
+                    }
                     Err(problem) => {
                         tracing::debug!(%problem, "Waiting for the next key frame");
+                        if self.frameless.add(now_ns()) {
+                            tracing::warn!(
+                                %problem,
+                                "The camera's pictures give no frame since {} s",
+                                FRAMELESS_NS / 1_000_000_000
+                            );
+                        }
                         return Ok(Next::Dropped("pictures that cannot be decoded"));
                     }
                 }
@@ -155,6 +212,7 @@ impl Feed {
     fn lose(&mut self, reason: &'static str, problem: String) -> Next {
         self.stream = None;
         self.decoder.restart();
+        self.frameless.end();
         self.note(problem);
         Next::Lost(reason)
     }
@@ -189,4 +247,23 @@ fn utc_ahead_ns() -> i64 {
     let utc = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     let utc_ns: i64 = utc.as_nanos().try_into().unwrap_or(i64::MAX);
     utc_ns.saturating_sub(now_ns())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_without_a_frame_are_told_once_after_five_seconds() {
+        const SECOND: i64 = 1_000_000_000;
+        let mut frameless = Frameless::default();
+        let told = |frameless: &mut Frameless, from_s: i64| {
+            (from_s..from_s + 10).filter(|at_s| frameless.add(at_s * SECOND)).collect::<Vec<_>>()
+        };
+        assert!((0..4).all(|at_s| !frameless.add(at_s * SECOND)));
+        // A frame in between, as after a loss.
+        frameless.end();
+        assert_eq!(told(&mut frameless, 4), [9]);
+        assert!(told(&mut frameless, 14).is_empty());
+    }
 }

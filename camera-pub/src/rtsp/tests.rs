@@ -95,6 +95,7 @@ async fn pictures_are_those_that_were_sent_and_stamped_when_they_were_taken() {
     // The quickest tells them all; a loaded machine may be late with each.
     assert!(errors[errors.len() / 2].abs() <= MS, "{errors:?}");
     assert!(seen.lost.is_empty(), "{:?}", seen.lost);
+    assert!(feed.decoding() > Duration::ZERO);
 }
 
 #[tokio::test(flavor = "multi_thread")]
