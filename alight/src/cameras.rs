@@ -105,7 +105,8 @@ fn listing(folder: &Path, only: Option<&Path>) -> Listing {
     found.retain(|device| only.as_ref().is_none_or(|only| device.path == *only));
     let entry = |device: ConnectedDevice| {
         let description = device.description.as_ref();
-        let source = description.and_then(|description| source_table(&device.path, description));
+        let path = device.link.as_ref().unwrap_or(&device.path);
+        let source = description.and_then(|description| source_table(path, description));
         Entry { device, source }
     };
     let devices = found.into_iter().map(entry).collect();
@@ -298,7 +299,8 @@ mod tests {
         };
         let path = PathBuf::from("/dev/video0");
         let source = source_table(&path, &description);
-        let device = ConnectedDevice { path, description: Some(description), problem: None };
+        let device =
+            ConnectedDevice { path, link: None, description: Some(description), problem: None };
         Entry { device, source }
     }
 

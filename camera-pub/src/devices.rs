@@ -21,6 +21,8 @@ use crate::v4l2::video::{Next, Port, Video};
 pub struct ConnectedDevice {
     /// Its path, as `/dev/video0`.
     pub path: PathBuf,
+    /// A link to it, where there is one: its number may be another camera's when it is plugged in again.
+    pub link: Option<PathBuf>,
     /// What it offers; `None` when it cannot be asked.
     pub description: Option<DeviceDescription>,
     /// Why it cannot be asked.
@@ -48,13 +50,40 @@ pub fn connected_devices(folder: &Path) -> Vec<ConnectedDevice> {
     let mut found: Vec<(u32, PathBuf)> =
         entries.map(|entry| entry.path()).filter_map(|path| Some((number(&path)?, path))).collect();
     found.sort();
-    found.into_iter().map(|(_number, path)| ask(path)).collect()
+    let mut devices: Vec<_> = found.into_iter().map(|(_number, path)| ask(path)).collect();
+    let name = |device: &ConnectedDevice| {
+        device.description.as_ref().filter(|it| it.is_camera).map(|it| it.card.clone())
+    };
+    let names: Vec<_> = devices.iter().filter_map(name).collect();
+    for device in &mut devices {
+        let of_its_name = |own: String| names.iter().filter(|name| **name == own).count();
+        let has_twin = name(device).is_some_and(|own| of_its_name(own) > 1);
+        device.link = lasting_link(folder, &device.path, has_twin);
+    }
+    devices
+}
+
+/// The link to a device in `v4l/by-id`, which stays with it wherever it is plugged in, or that in `v4l/by-path`, which is of its
+/// place: cameras of one name may have the same id.
+fn lasting_link(folder: &Path, path: &Path, has_twin: bool) -> Option<PathBuf> {
+    let device = path.canonicalize().ok()?;
+    let kinds = if has_twin { &["by-path"][..] } else { &["by-id", "by-path"] };
+    kinds.iter().find_map(|kind| {
+        let links = std::fs::read_dir(folder.join("v4l").join(kind)).ok()?.flatten();
+        let is_its = |link: &PathBuf| link.canonicalize().is_ok_and(|target| target == device);
+        links.map(|link| link.path()).filter(is_its).min()
+    })
 }
 
 fn ask(path: PathBuf) -> ConnectedDevice {
     match KernelDevice::open(&path).and_then(|device| describe(&device)) {
-        Ok(description) => ConnectedDevice { path, description: Some(description), problem: None },
-        Err(cause) => ConnectedDevice { path, description: None, problem: Some(cause.to_string()) },
+        Ok(description) => {
+            ConnectedDevice { path, link: None, description: Some(description), problem: None }
+        }
+        Err(cause) => {
+            let problem = Some(cause.to_string());
+            ConnectedDevice { path, link: None, description: None, problem }
+        }
     }
 }
 
@@ -241,6 +270,27 @@ mod tests {
         let number = u32::from_le_bytes(picture.pixels()[..4].try_into().unwrap());
         assert!((15..30).contains(&number), "frame {number}");
         assert_eq!((fake.open_devices(), fake.mappings()), (0, 0));
+    }
+
+    #[test]
+    fn a_device_is_named_by_a_link_that_stays_with_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::create_dir_all(at("v4l/by-id")).unwrap();
+        std::fs::create_dir_all(at("v4l/by-path")).unwrap();
+        for name in ["video0", "video2", "video4"] {
+            std::fs::write(at(name), "").unwrap();
+        }
+        for (link, device) in
+            [("by-id/usb-a", "video0"), ("by-path/usb-1", "video0"), ("by-path/usb-2", "video2")]
+        {
+            std::os::unix::fs::symlink(at(device), at("v4l").join(link)).unwrap();
+        }
+        let link = |name, has_twin| lasting_link(folder.path(), &at(name), has_twin);
+        assert_eq!(link("video0", false).unwrap(), at("v4l/by-id/usb-a"));
+        assert_eq!(link("video0", true).unwrap(), at("v4l/by-path/usb-1"));
+        assert_eq!(link("video2", false).unwrap(), at("v4l/by-path/usb-2"));
+        assert_eq!(link("video4", false), None);
     }
 
     #[test]
