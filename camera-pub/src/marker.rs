@@ -30,6 +30,8 @@ pub(crate) struct Exposed {
     /// `None` while it is not known.
     pub(crate) setting: Option<Setting>,
     pub(crate) limits: Limits,
+    /// Whether its luma is from 16 to 235.
+    pub(crate) is_limited: bool,
 }
 
 impl MarkerExposure {
@@ -74,7 +76,11 @@ impl MarkerExposure {
         if !exposed.is_taken_over {
             return Order::TakeOver;
         }
-        let next = exposed.setting.zip(levels(frame, &pad)).and_then(|(setting, levels)| {
+        let levels = levels(frame, &pad).map(|levels| match exposed.is_limited {
+            true => levels.of_limited_range(),
+            false => levels,
+        });
+        let next = exposed.setting.zip(levels).and_then(|(setting, levels)| {
             let seen = Seen { setting, levels, motion_px_s: pad.motion_px_s };
             self.control.next(&seen, &exposed.limits)
         });
@@ -145,14 +151,18 @@ mod tests {
 
     impl Loop {
         fn new(stamps: Stamps) -> Self {
-            let exposing = Self::left(stamps);
+            Self::with("GREY", stamps)
+        }
+
+        fn with(fourcc: &'static str, stamps: Stamps) -> Self {
+            let exposing = Self::left(fourcc, stamps);
             exposing.fake.meter();
             exposing
         }
 
         /// With a camera that does not meter.
-        fn left(stamps: Stamps) -> Self {
-            let fake = Fake::of("GREY", stamps, 0);
+        fn left(fourcc: &'static str, stamps: Stamps) -> Self {
+            let fake = Fake::of(fourcc, stamps, 0);
             let for_marker = ForMarker {
                 max_exposure_s: 5e-3,
                 gain: "gain".into(),
@@ -160,7 +170,7 @@ mod tests {
                 settle_frames: 4,
             };
             let wanted = Wanted {
-                fourcc: "GREY".into(),
+                fourcc: fourcc.into(),
                 width: 640,
                 height: 480,
                 rate_hz: 100.0,
@@ -228,6 +238,19 @@ mod tests {
     }
 
     #[test]
+    fn white_of_a_limited_range_that_is_clipped_is_told_as_such() {
+        let mut exposing = Loop::with("YUYV", Stamps::ExposureStart);
+        exposing.fake.light(0.2);
+        exposing.run(1000 * MS, still);
+        // White is at 235 then, and black is clipped as well.
+        exposing.fake.light(4.0);
+        exposing.run(400 * MS, still);
+        // Of 16 to 235.
+        let white = (exposing.last().white * 255.0 - 16.0) / 219.0;
+        assert!((0.6..=0.85).contains(&white), "{white} {:?}", exposing.truth());
+    }
+
+    #[test]
     fn a_marker_that_moves_is_exposed_for_a_shorter_time_and_with_more_gain() {
         let mut exposing = Loop::new(Stamps::ExposureStart);
         exposing.fake.light(0.2);
@@ -257,7 +280,7 @@ mod tests {
     #[test]
     fn a_camera_that_was_left_without_metering_meters_again() {
         // As an earlier start or `source.controls` have left it.
-        let mut exposing = Loop::left(Stamps::FirstPacket);
+        let mut exposing = Loop::left("GREY", Stamps::FirstPacket);
         assert!(!exposing.fake.is_metering());
         exposing.run(100 * MS, |_| None);
         assert!(exposing.fake.is_metering());

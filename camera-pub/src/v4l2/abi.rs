@@ -13,6 +13,10 @@ pub(crate) const MEMORY_MMAP: u32 = 1;
 /// `V4L2_FIELD_NONE`: whole frames. Drivers that know nothing else may leave `V4L2_FIELD_ANY`.
 pub(crate) const FIELD_NONE: u32 = 1;
 pub(crate) const FIELD_ANY: u32 = 0;
+/// `V4L2_QUANTIZATION_FULL_RANGE`: luma from 0 to 255. The default is that for `V4L2_COLORSPACE_JPEG`, else limited range.
+pub(crate) const QUANTIZATION_FULL_RANGE: u32 = 1;
+pub(crate) const QUANTIZATION_DEFAULT: u32 = 0;
+pub(crate) const COLORSPACE_JPEG: u32 = 7;
 
 pub(crate) const CAP_VIDEO_CAPTURE: u32 = 0x0000_0001;
 pub(crate) const CAP_VIDEO_CAPTURE_MPLANE: u32 = 0x0000_1000;
@@ -492,6 +496,9 @@ mod tests {
             ("V4L2_MEMORY_MMAP", MEMORY_MMAP),
             ("V4L2_FIELD_NONE", FIELD_NONE),
             ("V4L2_FIELD_ANY", FIELD_ANY),
+            ("V4L2_QUANTIZATION_FULL_RANGE", QUANTIZATION_FULL_RANGE),
+            ("V4L2_QUANTIZATION_DEFAULT", QUANTIZATION_DEFAULT),
+            ("V4L2_COLORSPACE_JPEG", COLORSPACE_JPEG),
             ("V4L2_CAP_VIDEO_CAPTURE", CAP_VIDEO_CAPTURE),
             ("V4L2_CAP_VIDEO_CAPTURE_MPLANE", CAP_VIDEO_CAPTURE_MPLANE),
             ("V4L2_CAP_STREAMING", CAP_STREAMING),

@@ -6,8 +6,9 @@ use std::time::Duration;
 use super::abi::{
     BUF_FLAG_ERROR, BUF_FLAG_TIMESTAMP_MASK, BUF_FLAG_TIMESTAMP_MONOTONIC,
     BUF_FLAG_TSTAMP_SRC_MASK, BUF_FLAG_TSTAMP_SRC_SOE, Buffer, CID_EXPOSURE_ABSOLUTE,
-    CID_EXPOSURE_AUTO, Call, Capability, Device, EXPOSURE_MANUAL, ExtControl, FIELD_ANY,
-    FIELD_NONE, Format, Mapping, PixFormat, RequestBuffers, StreamParm, text,
+    CID_EXPOSURE_AUTO, COLORSPACE_JPEG, Call, Capability, Device, EXPOSURE_MANUAL, ExtControl,
+    FIELD_ANY, FIELD_NONE, Format, Mapping, PixFormat, QUANTIZATION_DEFAULT,
+    QUANTIZATION_FULL_RANGE, RequestBuffers, StreamParm, text,
 };
 use super::describe::{
     ControlDescription, control_value, controls, describe, is_camera, is_multi_planar,
@@ -257,6 +258,7 @@ impl<D: Device> Capture<D> {
             is_taken_over: exposer.is_taken_over(),
             setting: exposer.setting(),
             limits: exposer.limits(),
+            is_limited: self.rows.is_limited,
         })
     }
 
@@ -539,7 +541,11 @@ fn set_format(device: &impl Device, wanted: &Wanted) -> Result<Rows, Lost> {
         )));
     }
     let [width, height, stride] = [pix.width, pix.height, pix.bytesperline].map(|n| n as usize);
-    let rows = Rows { pixels, width, height, stride };
+    let is_full = pix.quantization == QUANTIZATION_FULL_RANGE
+        || (pix.quantization == QUANTIZATION_DEFAULT && pix.colorspace == COLORSPACE_JPEG);
+    // Grey cameras and JPEG files have no other.
+    let is_limited = matches!(pixels, Pixels::Yuyv | Pixels::LumaFirst) && !is_full;
+    let rows = Rows { pixels, width, height, stride, is_limited };
     // Drivers leave it at 0 for JPEG, and some for samples without padding.
     let stride = if stride == 0 { rows.row_bytes() } else { stride };
     if pixels != Pixels::Mjpeg && stride < rows.row_bytes() {

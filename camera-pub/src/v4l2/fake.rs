@@ -585,7 +585,10 @@ impl FakeDevice {
     fn paint_pad(&self, number: u32, at: impl Fn(usize, usize) -> usize, memory: &mut [u8]) {
         let Exposed { exposure_ns, gain } = self.fake.exposed(number);
         let light = self.fake.light.get() * exposure_ns as f64 / MS as f64 * gain;
-        let level = |reflectance: f64| (255.0 * (light * reflectance).min(1.0)).round() as u8;
+        let (black, white) = if self.fake.name == "GREY" { (0.0, 255.0) } else { (16.0, 235.0) };
+        let level = |reflectance: f64| {
+            (black + (white - black) * (light * reflectance).min(1.0)).round() as u8
+        };
         let stripes = [level(1.0), level(1.0 / 16.0)];
         for (x, y) in (280..360).flat_map(|x| (200..280).map(move |y| (x, y))) {
             memory[at(x, y)] = stripes[x / 4 % 2];

@@ -23,6 +23,8 @@ pub(crate) struct Rows {
     pub(crate) height: usize,
     /// Bytes from row to row.
     pub(crate) stride: usize,
+    /// Whether luma is from 16 to 235 instead of from 0 to 255.
+    pub(crate) is_limited: bool,
 }
 
 impl Pixels {
@@ -88,7 +90,7 @@ mod tests {
 
     #[test]
     fn luma_is_taken_without_padding_and_chroma() {
-        let rows = |pixels, stride| Rows { pixels, width: 3, height: 2, stride };
+        let rows = |pixels, stride| Rows { pixels, width: 3, height: 2, stride, is_limited: false };
         let mut grey = [0; 6];
         let grey_rows = rows(Pixels::Grey, 4);
         assert_eq!(grey_rows.copy_grey(&[1, 2, 3, 99, 4, 5, 6], &mut grey), 6);

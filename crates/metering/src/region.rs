@@ -23,6 +23,22 @@ pub struct Levels {
     pub black: f64,
 }
 
+/// Luma of black and of white where its range is limited (ITU-R BT.601).
+const LIMITED_BLACK: f64 = 16.0;
+const LIMITED_WHITE: f64 = 235.0;
+
+impl Levels {
+    /// The same of luma whose range is limited: full scale is at 235 of 255 there, and black at 16.
+    #[must_use]
+    pub fn of_limited_range(self) -> Self {
+        let full = |level: f64| {
+            let part = (level * 255.0 - LIMITED_BLACK) / (LIMITED_WHITE - LIMITED_BLACK);
+            part.clamp(0.0, 1.0)
+        };
+        Self { white: full(self.white), black: full(self.black) }
+    }
+}
+
 /// The levels of the pad in this frame; `None` when it does not show enough of it, or when the pad may be elsewhere, having
 /// moved by more than its size since it was seen: what is there instead may be in another light.
 ///
@@ -133,6 +149,15 @@ mod tests {
             };
             assert_eq!(seen(paint), [180, 12], "ground {ground}");
         }
+    }
+
+    #[test]
+    fn white_of_a_limited_range_is_clipped_at_235() {
+        let levels = |white: f64, black: f64| Levels { white: white / 255.0, black: black / 255.0 };
+        assert_eq!(levels(235.0, 16.0).of_limited_range(), levels(255.0, 0.0));
+        assert_eq!(levels(250.0, 4.0).of_limited_range(), levels(255.0, 0.0), "beyond it");
+        let middle = levels(125.5, 125.5).of_limited_range();
+        assert!((middle.white - 0.5).abs() < 1e-9, "{middle:?}");
     }
 
     #[test]
