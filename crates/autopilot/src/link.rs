@@ -40,6 +40,8 @@ const LAST_RETRY: Duration = Duration::from_secs(2);
 const CONNECT_LIMIT: Duration = Duration::from_secs(3);
 /// Timeout of writing one packet.
 const WRITE_LIMIT: Duration = Duration::from_secs(2);
+/// Time without a datagram that could be sent, after which a UDP connection is made anew.
+const SEND_LIMIT: Duration = Duration::from_secs(2);
 /// Silence after which a TCP connection counts as dead.
 const TCP_SILENCE: Duration = Duration::from_secs(10);
 
@@ -651,6 +653,7 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
         port.connected(peer.to_string());
     }
     let mut bytes = vec![0; 65_536];
+    let mut unsent_since = None;
     loop {
         tokio::select! {
             read = socket.recv_from(&mut bytes) => match read {
@@ -679,9 +682,18 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
                     (None, Some(peer)) => socket.send_to(&packet, peer).await,
                     (None, None) => continue,
                 };
-                // A network may be away for a moment; the packet counts as lost.
-                if let Err(error) = sent {
-                    tracing::debug!(%error, "datagram not sent");
+                match sent {
+                    // A network may be away for a moment; the packet counts as lost.
+                    Err(error) if !is_refusal(&error) => {
+                        tracing::debug!(%error, "datagram not sent");
+                        let since = *unsent_since.get_or_insert_with(Instant::now);
+                        // A connection keeps the address that this machine had when it was made.
+                        if fixed.is_some() && since.elapsed() > SEND_LIMIT {
+                            let seconds = SEND_LIMIT.as_secs();
+                            return format!("nothing could be sent for {seconds} s: {error}");
+                        }
+                    }
+                    _ => unsent_since = None,
                 }
             }
         }

@@ -191,6 +191,56 @@ async fn udpout_sends_first_and_outlives_a_peer_that_is_away() {
     assert_eq!(packet(&mut link).await, time());
 }
 
+/// Set where the test below runs in a network of its own.
+const OWN_NETWORK: &str = "ALIGHT_TEST_OWN_NETWORK";
+
+#[cfg(target_os = "linux")]
+#[test]
+fn udpout_goes_on_with_a_new_address_of_this_machine() {
+    use std::process::Command;
+    let shell = |script: &str| Command::new("sh").args(["-ec", script]).output().unwrap();
+    if std::env::var_os(OWN_NETWORK).is_some() {
+        let sending = async {
+            let mut link = open("udpout:10.77.0.1:14550".into()).await;
+            peer(&mut link).await;
+            assert!(shell("ip address delete 10.77.0.2/24 dev air").status.success());
+            assert!(shell("ip address add 10.77.0.3/24 dev air").status.success());
+            let reason = loop {
+                link.send(&heartbeat(false)).unwrap();
+                sleep(Duration::from_millis(50)).await;
+                if let Some(LinkEvent::Disconnected { reason }) = link.try_recv() {
+                    break reason;
+                }
+            };
+            assert!(reason.contains("nothing could be sent for 2 s"), "{reason}");
+            peer(&mut link).await;
+        };
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(async { timeout(PATIENCE, sending).await }).unwrap();
+        return;
+    }
+    const NETWORK: &str = "ip link set lo up
+        ip link add air type veth peer name far
+        ip link set air up
+        ip link set far up
+        ip address add 10.77.0.2/24 dev air";
+    let tried = shell(&format!("unshare -rn sh -ec '{NETWORK}'"));
+    if !tried.status.success() {
+        testing::skip("namespaces", String::from_utf8_lossy(&tried.stderr).trim());
+        return;
+    }
+    let test = "udpout_goes_on_with_a_new_address_of_this_machine";
+    let run = Command::new("unshare")
+        .args(["-rn", "sh", "-ec", &format!("{NETWORK}\nexec \"$@\"",), "sh"])
+        .arg(std::env::current_exe().unwrap())
+        .args(["--exact", test, "--nocapture"])
+        .env(OWN_NETWORK, "1")
+        .output()
+        .unwrap();
+    let told = String::from_utf8_lossy(&run.stdout) + String::from_utf8_lossy(&run.stderr);
+    assert!(run.status.success() && told.contains("1 passed"), "{told}");
+}
+
 #[tokio::test]
 async fn tcp_connects_again_and_sends_nothing_old() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
