@@ -6,7 +6,7 @@ use std::time::Duration;
 use anyhow::Context;
 use autopilot::packet::MAX_PACKET;
 use autopilot::signing::Refusals;
-use autopilot::{Address, Link, LinkEvent, Parser, Peering, Permission};
+use autopilot::{Address, GivenCommand, Link, LinkEvent, Packet, Parser, Peering, Permission};
 use messages::{
     CommandReply, ControllerCommand, ControllerStatus, MavlinkBytes, Tape, VehicleState, topic,
 };
@@ -155,7 +155,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                 // An arming or a mode that waited while this process was frozen is not wanted any more.
                 if standstill.step(now_ns()).is_some() {
                     node.health().dropped("packets of the ground station: too late");
-                } else if pass_up(&node, &mut flight, permission, &message.packet)
+                } else if pass_up(&node, &mut flight, &reports, permission, &message.packet)
                     && link.send_spare(&message.packet).is_err()
                 {
                     node.health().dropped("packets of the ground station");
@@ -197,7 +197,13 @@ fn late_because(
 }
 
 /// Whether a packet of a ground station goes to the autopilot; the flight hears it before.
-fn pass_up(node: &Node, flight: &mut TapedFlight, permission: Permission, bytes: &[u8]) -> bool {
+fn pass_up(
+    node: &Node,
+    flight: &mut TapedFlight,
+    reports: &Reports,
+    permission: Permission,
+    bytes: &[u8],
+) -> bool {
     if !(1..=MAX_PACKET).contains(&bytes.len()) {
         node.health().dropped("packets of the ground station");
         return false;
@@ -208,20 +214,29 @@ fn pass_up(node: &Node, flight: &mut TapedFlight, permission: Permission, bytes:
     for packet in &packets {
         flight.ground_packet(now_ns(), packet);
     }
-    // Bytes in which no packet is recognised could be any message.
-    let parsed: usize = packets.iter().map(|packet| packet.raw.len()).sum();
-    let is_read = parsed == bytes.len() || permission == Permission::Everything;
-    let refusal = packets.iter().find_map(|packet| permission.refusal(packet));
-    let Some(name) = refusal.map(|r| r.name).or((!is_read).then_some("unknown message")) else {
-        return true;
-    };
+    let Some(name) = refused(permission, &packets, bytes.len()) else { return true };
     if node.health().failed(&format!("packets of the ground station refused: {name}")) {
         tracing::warn!(
             %permission,
             "Packet of a ground station refused: {name} (`autopilot.ground_may`; further ones are only counted)"
         );
     }
+    denials(&packets).for_each(|answer| reports.pass_on(node, answer));
     false
+}
+
+/// What is refused of the packets in so many bytes, if anything is.
+fn refused(permission: Permission, packets: &[Packet], bytes: usize) -> Option<&'static str> {
+    // Bytes in which no packet is recognised could be any message.
+    let parsed: usize = packets.iter().map(|packet| packet.raw.len()).sum();
+    let is_read = parsed == bytes || permission == Permission::Everything;
+    let refusal = packets.iter().find_map(|packet| permission.refusal(packet));
+    refusal.map(|it| it.name).or((!is_read).then_some("unknown message"))
+}
+
+/// The answers to the commands in refused packets, as of whom they were for: they would be given again until one comes.
+fn denials(packets: &[Packet]) -> impl Iterator<Item = Vec<u8>> {
+    packets.iter().filter_map(|it| Some(GivenCommand::of(it)?.denied(0, it.sender)))
 }
 
 /// Sends the flight's packets.
@@ -368,5 +383,35 @@ impl Reports {
             self.status.publish(&status).await;
             self.last = Some(status);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use autopilot::Sender;
+    use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage, MavResult};
+    use autopilot::packet::encode;
+
+    #[test]
+    fn a_refused_command_is_answered_as_by_the_autopilot() {
+        let ground = Sender { system: 255, component: 190 };
+        let arm = COMMAND_LONG_DATA {
+            command: MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
+            target_system: 7,
+            target_component: 1,
+            ..COMMAND_LONG_DATA::default()
+        };
+        let bytes = encode(ground, 0, &MavMessage::COMMAND_LONG(arm));
+        let packets = Parser::new().push(&bytes);
+        assert_eq!(refused(Permission::Everything, &packets, bytes.len()), None);
+        let name = refused(Permission::NoArming, &packets, bytes.len());
+        assert_eq!(name, Some("arming or stopping motors"));
+        let answer = Parser::new().push(&denials(&packets).next().unwrap()).remove(0);
+        assert_eq!(answer.sender, Sender { system: 7, component: 1 });
+        let Some(MavMessage::COMMAND_ACK(answer)) = answer.message else { panic!("no answer") };
+        assert_eq!(answer.command, MavCmd::MAV_CMD_COMPONENT_ARM_DISARM);
+        assert_eq!(answer.result, MavResult::MAV_RESULT_DENIED);
+        assert_eq!((answer.target_system, answer.target_component), (255, 190));
     }
 }

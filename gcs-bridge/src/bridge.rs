@@ -11,7 +11,9 @@ use autopilot::link::SendError;
 use autopilot::packet::{Counters, encode};
 use autopilot::permission::Refusal;
 use autopilot::signing::Refusals;
-use autopilot::{Address, Link, LinkEvent, LinkSender, Packet, Parser, Permission, Sender};
+use autopilot::{
+    Address, GivenCommand, Link, LinkEvent, LinkSender, Packet, Parser, Permission, Sender,
+};
 use messages::{
     Configuration, ControllerStatus, Detections, Health, MavlinkBytes, Phase, RecorderStatus,
     TargetEstimate, topic,
@@ -317,7 +319,7 @@ impl Bridge {
                     self.health.count("to autopilot");
                     return Some(packet.raw);
                 };
-                self.refuse(now_ns, packet.sender, refusal);
+                self.refuse(now_ns, &packet, refusal);
             }
         }
         None
@@ -380,7 +382,8 @@ impl Bridge {
     }
 
     /// Counts a packet that the ground station may not send, and tells it.
-    fn refuse(&mut self, now_ns: i64, to: Sender, refusal: Refusal) {
+    fn refuse(&mut self, now_ns: i64, packet: &Packet, refusal: Refusal) {
+        let to = packet.sender;
         if self.health.failed(&format!("from ground: refused: {}", refusal.name)) {
             let Sender { system, component } = to;
             tracing::warn!(
@@ -391,8 +394,8 @@ impl Bridge {
                 refusal.name
             );
         }
-        if let Some(command) = refusal.command {
-            self.send_own(now_ns, &route::denied(command, to));
+        if let Some(command) = GivenCommand::of(packet) {
+            self.send(&command.denied(self.sequence, to));
         }
         let is_due =
             self.refusal_ns.is_none_or(|last| now_ns.saturating_sub(last) > REFUSAL_PAUSE_NS);

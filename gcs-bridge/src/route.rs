@@ -6,7 +6,7 @@
 use autopilot::dialect::{
     COMMAND_ACK_DATA, MavCmd, MavMessage, MavResult, Message, MessageData, SETUP_SIGNING_DATA,
 };
-use autopilot::{Packet, Sender, UnknownCommand};
+use autopilot::{GivenCommand, Packet, Sender};
 
 use crate::params::Ask;
 use crate::request::Command;
@@ -33,7 +33,7 @@ pub(crate) enum Route {
     /// About the companion's parameters, answered already.
     Parameters,
     /// A command that nobody here knows.
-    Unknown(UnknownCommand),
+    Unknown(GivenCommand),
     /// A key for signed packets, which must not travel further.
     Key,
     /// Dropped, for this reason.
@@ -51,7 +51,7 @@ pub(crate) fn from_ground(packet: &Packet, own: Option<Own>, vehicle: &Vehicle) 
         return Route::Key;
     }
     let Some(own) = own else { return Route::Pass };
-    if let Some(unknown) = UnknownCommand::of(packet).filter(|it| own.is(it.target)) {
+    if let Some(unknown) = GivenCommand::unknown(packet).filter(|it| own.is(it.target)) {
         return Route::Unknown(unknown);
     }
     if is_for(packet, own.companion) {
@@ -118,11 +118,6 @@ fn answer(packet: &Packet) -> Option<MavMessage> {
 
 fn unsupported(command: MavCmd, to: Sender) -> MavMessage {
     acknowledgement(command, MavResult::MAV_RESULT_UNSUPPORTED, to)
-}
-
-/// The acknowledgement of a command that the sender may not give.
-pub(crate) fn denied(command: MavCmd, to: Sender) -> MavMessage {
-    acknowledgement(command, MavResult::MAV_RESULT_DENIED, to)
 }
 
 /// The acknowledgement of a command.

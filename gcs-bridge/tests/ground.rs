@@ -9,8 +9,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use autopilot::dialect::{
-    COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavBool, MavCmd, MavFrame, MavMessage,
-    MavResult, MavState, MavType, PARAM_REQUEST_READ_DATA, PARAM_VALUE_DATA, calculate_crc,
+    COMMAND_ACK_DATA, COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavBool, MavCmd, MavFrame,
+    MavMessage, MavResult, MavState, MavType, Message, MessageData, PARAM_REQUEST_READ_DATA,
+    PARAM_VALUE_DATA, calculate_crc,
 };
 use autopilot::packet::encode;
 use autopilot::{Packet, Parser, Sender};
@@ -230,9 +231,17 @@ async fn a_ground_station_that_may_not_arm_is_told_so() -> anyhow::Result<()> {
     ground.expect_text("Alight: refused (no-arming): arming or stopping motors").await?;
     until_error(&health, "refused: arming", 1).await?;
     ground.send(&arm).await?;
-    let answer = ground.expect(|f| matches!(f.message, Some(MavMessage::COMMAND_ACK(_)))).await?;
+    // Ground stations take the acknowledgement of the component that the command was for, and no other.
+    let answer = ground.expect(|f| f.message_id == COMMAND_ACK_DATA::ID).await?;
+    assert_eq!(answer.sender, AUTOPILOT);
     let Some(MavMessage::COMMAND_ACK(answer)) = answer.message else { bail!("no answer") };
+    assert_eq!(answer.command, MavCmd::MAV_CMD_COMPONENT_ARM_DISARM);
     assert_eq!(answer.result, MavResult::MAV_RESULT_DENIED);
+    ground.send(&unknown_command()).await?;
+    let is_its_answer = |f: &Packet| {
+        f.message_id == COMMAND_ACK_DATA::ID && f.payload().starts_with(&UNKNOWN_COMMAND)
+    };
+    assert_eq!(ground.expect(is_its_answer).await?.sender, AUTOPILOT);
     let allowed = encode(GROUND, 2, &param_request(2));
     let passed = async {
         loop {
@@ -715,6 +724,19 @@ fn command_to(target: Sender) -> MavMessage {
         target_component: target.component,
         ..COMMAND_LONG_DATA::default()
     })
+}
+
+/// A number that no dialect gives to a command.
+const UNKNOWN_COMMAND: [u8; 2] = 60_123_u16.to_le_bytes();
+
+fn unknown_command() -> Vec<u8> {
+    let mut packet = encode(GROUND, 1, &command_to(AUTOPILOT));
+    packet[38..40].copy_from_slice(&UNKNOWN_COMMAND);
+    let end = packet.len() - 2;
+    let extra = MavMessage::extra_crc(COMMAND_LONG_DATA::ID);
+    let checksum = calculate_crc(&packet[1..end], extra);
+    packet[end..].copy_from_slice(&checksum.to_le_bytes());
+    packet
 }
 
 /// A number that no dialect gives to a message.

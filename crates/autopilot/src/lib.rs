@@ -16,7 +16,7 @@
 //! `contact` say which of its reports are believed, `simulation` asks whether it is simulated, [`client`] is the
 //! conversation with it with the settings of [`config`], [`event`] its events, [`command`] is what can be requested
 //! and why it may fail, [`takeoff`] arms the vehicle and takes off, [`offboard_exit`] ends PX4's OFFBOARD, which needs the `setpoint_stream`, [`permission`] is what a ground station may send,
-//! [`compose`] makes the messages that a companion sends, and `unknown` its answer to commands that no one knows.
+//! [`compose`] makes the messages that a companion sends, and `given` the answer to a command that is not carried out.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
 
@@ -30,6 +30,7 @@ pub mod config;
 mod contact;
 pub mod event;
 mod gate;
+mod given;
 pub mod key_file;
 pub mod link;
 pub mod mode;
@@ -47,7 +48,6 @@ pub mod state;
 mod stream;
 pub mod takeoff;
 mod text;
-mod unknown;
 
 /// The MAVLink messages, enumerations and bit fields of ArduPilot's dialect.
 pub mod dialect {
@@ -61,6 +61,7 @@ pub use client::Autopilot;
 pub use command::{Command, CommandError, CommandId, CommandStatus};
 pub use config::Config;
 pub use event::Event;
+pub use given::GivenCommand;
 pub use key_file::{KeyFileError, SigningConfig};
 pub use link::{Link, LinkEvent, LinkSender};
 pub use mode::{Firmware, FlightMode};
@@ -71,4 +72,3 @@ pub use peers::Peering;
 pub use permission::Permission;
 pub use state::{Attitude, Battery, LandedState, Position, Range, VehicleState};
 pub use takeoff::{Takeoff, TakeoffError, TakeoffProgress};
-pub use unknown::UnknownCommand;

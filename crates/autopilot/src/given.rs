@@ -1,9 +1,11 @@
-//! Commands whose number the dialect does not know: who they are for, and the answer that nobody here supports them.
+//! Commands as they stand in a packet: their number, who they are for, and the answer that they are not carried out.
 //!
-//! A ground station repeats a command until it is acknowledged, whatever its number is.
+//! A ground station repeats a command until it is acknowledged, whatever its number is, and takes no acknowledgement but of the
+//! component that the command was for.
 
 use mavlink::{Message, MessageData, calculate_crc};
 
+use crate::client::AUTOPILOT;
 use crate::dialect::{
     COMMAND_ACK_DATA, COMMAND_INT_DATA, COMMAND_LONG_DATA, MavMessage, MavResult,
 };
@@ -17,20 +19,19 @@ const COMPONENT: usize = 31;
 const HEADER: usize = 10;
 const CHECKSUM: usize = 2;
 
-/// A command that the dialect does not know.
+/// A command in a packet, whether the dialect knows it or not.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct UnknownCommand {
+pub struct GivenCommand {
     /// Its number.
     pub number: u16,
     /// Whom it is for.
     pub target: Sender,
 }
 
-impl UnknownCommand {
-    /// The command in a packet, when its number is why the packet could not be decoded.
+impl GivenCommand {
+    /// The command in a packet.
     pub fn of(packet: &Packet) -> Option<Self> {
-        let is_command = [COMMAND_INT_DATA::ID, COMMAND_LONG_DATA::ID].contains(&packet.message_id);
-        if !is_command || packet.message.is_some() {
+        if ![COMMAND_INT_DATA::ID, COMMAND_LONG_DATA::ID].contains(&packet.message_id) {
             return None;
         }
         let payload = packet.payload();
@@ -42,15 +43,31 @@ impl UnknownCommand {
         })
     }
 
+    /// The command in a packet, when its number is why the packet could not be decoded.
+    pub fn unknown(packet: &Packet) -> Option<Self> {
+        Self::of(packet).filter(|_| packet.message.is_none())
+    }
+
     /// The packet that says to its sender that the command is not supported.
     pub fn unsupported(&self, sequence: u8, to: Sender) -> Vec<u8> {
+        self.refused(MavResult::MAV_RESULT_UNSUPPORTED, sequence, to)
+    }
+
+    /// The packet that says to its sender that the command may not be given.
+    pub fn denied(&self, sequence: u8, to: Sender) -> Vec<u8> {
+        self.refused(MavResult::MAV_RESULT_DENIED, sequence, to)
+    }
+
+    /// The acknowledgement with a result that is not zero; for a command to all components that of the autopilot.
+    fn refused(&self, result: MavResult, sequence: u8, to: Sender) -> Vec<u8> {
         let answer = MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
-            result: MavResult::MAV_RESULT_UNSUPPORTED,
+            result,
             target_system: to.system,
             target_component: to.component,
             ..COMMAND_ACK_DATA::default()
         });
-        let mut packet = encode(self.target, sequence, &answer);
+        let component = if self.target.component == 0 { AUTOPILOT } else { self.target.component };
+        let mut packet = encode(Sender { component, ..self.target }, sequence, &answer);
         // The number is the first field of the acknowledgement, and the result behind it is never zero.
         packet.iter_mut().skip(HEADER).zip(self.number.to_le_bytes()).for_each(|(to, of)| *to = of);
         let end = packet.len().saturating_sub(CHECKSUM);
@@ -92,8 +109,8 @@ mod tests {
     fn a_command_of_an_unknown_number_is_answered_with_that_number() {
         let packet = asked(60_123);
         assert_eq!(packet.message, None);
-        let unknown = UnknownCommand::of(&packet).unwrap();
-        assert_eq!(unknown, UnknownCommand { number: 60_123, target: CAMERA });
+        let unknown = GivenCommand::unknown(&packet).unwrap();
+        assert_eq!(unknown, GivenCommand { number: 60_123, target: CAMERA });
         let answer = Parser::new().push(&unknown.unsupported(9, GROUND)).remove(0);
         assert_eq!((answer.sender, answer.sequence, answer.message_id), (CAMERA, 9, 77));
         // Number, result, and after progress and the second result the recipient.
@@ -104,7 +121,7 @@ mod tests {
     #[test]
     fn the_answer_has_the_bytes_of_one_to_a_known_command() {
         let number = MavCmd::MAV_CMD_REQUEST_MESSAGE as u16;
-        let unknown = UnknownCommand { number, target: CAMERA };
+        let given = GivenCommand { number, target: CAMERA };
         let known = MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
             command: MavCmd::MAV_CMD_REQUEST_MESSAGE,
             result: MavResult::MAV_RESULT_UNSUPPORTED,
@@ -112,7 +129,18 @@ mod tests {
             target_component: GROUND.component,
             ..COMMAND_ACK_DATA::default()
         });
-        assert_eq!(unknown.unsupported(3, GROUND), encode(CAMERA, 3, &known));
-        assert_eq!(UnknownCommand::of(&asked(number)), None);
+        assert_eq!(given.unsupported(3, GROUND), encode(CAMERA, 3, &known));
+        assert_eq!(GivenCommand::of(&asked(number)), Some(given));
+        assert_eq!(GivenCommand::unknown(&asked(number)), None);
+    }
+
+    #[test]
+    fn the_answer_to_a_command_to_all_components_is_the_autopilots() {
+        let to_all = GivenCommand { number: 400, target: Sender { component: 0, ..CAMERA } };
+        let answer = Parser::new().push(&to_all.denied(0, GROUND)).remove(0);
+        assert_eq!(answer.sender, Sender { component: AUTOPILOT, ..CAMERA });
+        let Some(MavMessage::COMMAND_ACK(answer)) = answer.message else { panic!("no answer") };
+        assert_eq!(answer.command, MavCmd::MAV_CMD_COMPONENT_ARM_DISARM);
+        assert_eq!(answer.result, MavResult::MAV_RESULT_DENIED);
     }
 }
