@@ -292,6 +292,11 @@ impl DetectorSettings {
 }
 
 impl Config {
+    /// The vehicle's system id, if it is pinned.
+    pub(crate) fn system_id(&self) -> Option<u8> {
+        Some(self.autopilot.system_id).filter(|id| *id != 0)
+    }
+
     /// The clock whose frames are used.
     pub(crate) fn clock(&self) -> &str {
         if self.clock.is_empty() { clock_name() } else { &self.clock }

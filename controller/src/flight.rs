@@ -80,7 +80,7 @@ impl Flight {
         let parameters =
             if is_autopilots { landing_target::PARAMETERS.to_vec() } else { Vec::new() };
         let autopilot = Autopilot::new(autopilot::Config {
-            system_id: Some(settings.system_id).filter(|id| *id != 0),
+            system_id: config.system_id(),
             our_component: settings.component_id,
             streams: autopilot::config::default_streams(settings.state_rate_hz),
             parameters,

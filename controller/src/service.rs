@@ -62,8 +62,9 @@ pub fn run(
 async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name("*").await?;
     let address: Address = config.autopilot.address.parse()?;
+    let peering = Peering::Autopilot { system: config.system_id() };
     let permission: Permission = config.autopilot.ground_may.parse()?;
-    let mut link = Link::open_for(address, Peering::Autopilot, config.signing()?)
+    let mut link = Link::open_for(address, peering, config.signing()?)
         .await
         .context("opening the link to the autopilot")?;
     drop(tokio::task::spawn_blocking(remove_useless_pads));

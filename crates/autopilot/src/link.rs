@@ -133,7 +133,7 @@ pub enum SendError {
 impl Link {
     /// Opens the link; needs a tokio runtime with network and time, and ends when it is dropped.
     pub async fn open(address: Address) -> Result<Self, LinkError> {
-        Self::open_for(address, Peering::Autopilot, None).await
+        Self::open_for(address, Peering::default(), None).await
     }
 
     /// The same, for the peers of a kind where it listens, and with a key for signed packets only; all others are dropped

@@ -3,6 +3,7 @@
 use std::net::{IpAddr, SocketAddr};
 use std::time::{Duration, Instant};
 
+use crate::client::AUTOPILOT;
 use crate::dialect::{MavAutopilot, MavMessage};
 use crate::gate::Gate;
 use crate::packet::{Counters, Packet, Parser};
@@ -15,11 +16,13 @@ const PEER_SILENCE: Duration = Duration::from_secs(3);
 const MAX_PEERS: usize = 8;
 
 /// Whom a listening link talks to.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Peering {
     /// An autopilot: the sender of its heartbeat, until that is silent for 3 s.
-    #[default]
-    Autopilot,
+    Autopilot {
+        /// Its system id; `None` takes any.
+        system: Option<u8>,
+    },
     /// A ground station: the first one heard, until that is silent.
     GroundStation {
         /// The addresses of the ground stations; any address if there are none.
@@ -29,11 +32,17 @@ pub enum Peering {
     },
 }
 
+impl Default for Peering {
+    fn default() -> Self {
+        Self::Autopilot { system: None }
+    }
+}
+
 impl Peering {
     /// Whether packets from this address are taken at all.
     pub(crate) fn admits(&self, from: IpAddr) -> bool {
         match self {
-            Self::Autopilot => true,
+            Self::Autopilot { .. } => true,
             Self::GroundStation { known, .. } => {
                 known.is_empty() || known.iter().any(|k| k.to_canonical() == from.to_canonical())
             }
@@ -43,8 +52,21 @@ impl Peering {
     /// Silence after which a peer is replaced.
     pub(crate) fn silence(&self) -> Duration {
         match self {
-            Self::Autopilot => PEER_SILENCE,
+            Self::Autopilot { .. } => PEER_SILENCE,
             Self::GroundStation { silence, .. } => *silence,
+        }
+    }
+
+    /// True for the heartbeat of the autopilot, as opposed to another vehicle's, a ground station, camera or companion.
+    fn is_heartbeat(&self, packet: &Packet) -> bool {
+        let Self::Autopilot { system } = self else { return false };
+        match &packet.message {
+            Some(MavMessage::HEARTBEAT(heartbeat)) => {
+                heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
+                    && packet.sender.component == AUTOPILOT
+                    && system.is_none_or(|system| system == packet.sender.system)
+            }
+            _ => false,
         }
     }
 }
@@ -107,9 +129,9 @@ impl Peers {
             peer.active = Some(now);
         }
         let counted = peer.parser.take_counters();
-        let is_autopilot = packets.iter().any(is_autopilot_heartbeat);
+        let is_autopilot = packets.iter().any(|packet| self.peering.is_heartbeat(packet));
         if is_autopilot {
-            peer.autopilot = Some(now);
+            self.peer(from, now).autopilot = Some(now);
         }
         if admitted.is_peer && self.chosen != Some(from) && self.is_replaced(is_autopilot, now) {
             self.chosen = Some(from);
@@ -139,8 +161,8 @@ impl Peers {
             return true;
         };
         match (&self.peering, chosen.autopilot) {
-            (Peering::Autopilot, Some(at)) => to_autopilot && !recent(at),
-            (Peering::Autopilot, None) => to_autopilot || self.is_silent(now),
+            (Peering::Autopilot { .. }, Some(at)) => to_autopilot && !recent(at),
+            (Peering::Autopilot { .. }, None) => to_autopilot || self.is_silent(now),
             (Peering::GroundStation { .. }, _) => self.is_silent(now),
         }
     }
@@ -172,17 +194,6 @@ impl Peers {
         if let Some((oldest, _)) = others.min_by_key(|(_, peer)| peer.heard) {
             self.known.swap_remove(oldest);
         }
-    }
-}
-
-/// True for the heartbeat of an autopilot, as opposed to a ground station, camera or companion.
-fn is_autopilot_heartbeat(packet: &Packet) -> bool {
-    match &packet.message {
-        Some(MavMessage::HEARTBEAT(heartbeat)) => {
-            heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
-                && packet.sender.component == 1
-        }
-        _ => false,
     }
 }
 
@@ -260,6 +271,25 @@ mod tests {
         assert_eq!(peers.chosen, Some(at(3)), "an old packet holds nobody's place");
         peers.take(at(2), &behind, later, &mut gate, NOW);
         assert_eq!(peers.chosen, Some(at(3)));
+    }
+
+    #[test]
+    fn of_several_vehicles_at_one_port_the_pinned_one_is_heard() {
+        let mut peers = Peers::new(None, Peering::Autopilot { system: Some(2) });
+        let began = Instant::now();
+        let of = |system| {
+            let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
+            heartbeat(autopilot, Sender { system, component: AUTOPILOT })
+        };
+        for second in 0..20 {
+            let now = began + Duration::from_secs(second);
+            peers.take_any(at(1), &of(1), now);
+            assert_eq!(peers.take_any(at(2), &of(2), now).packets.len(), 1, "after {second} s");
+            assert_eq!(peers.chosen, Some(at(2)));
+        }
+        // Also while it is silent.
+        peers.take_any(at(1), &of(1), began + Duration::from_secs(60));
+        assert_eq!(peers.chosen, Some(at(2)));
     }
 
     #[test]

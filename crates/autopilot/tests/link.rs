@@ -354,7 +354,7 @@ fn signing(passphrase: &str, link_id: u8) -> SigningConfig {
 }
 
 async fn open_signed(address: String, signing: SigningConfig) -> Link {
-    Link::open_for(address.parse().unwrap(), Peering::Autopilot, Some(signing)).await.unwrap()
+    Link::open_for(address.parse().unwrap(), Peering::default(), Some(signing)).await.unwrap()
 }
 
 #[tokio::test]

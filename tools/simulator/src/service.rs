@@ -311,7 +311,7 @@ impl AutopilotSide {
                     // No other program listens to the simulated autopilot, so it keeps no stamps.
                     path => Some(SigningConfig::read(path.as_ref(), 0, None, "simulator")?),
                 };
-                let link = Link::open_for(address, Peering::Autopilot, signing).await;
+                let link = Link::open_for(address, Peering::default(), signing).await;
                 Self::Link(link.context("opening the link of the simulated autopilot")?)
             }
             VehicleKind::Reported => Self::Topics {
