@@ -142,6 +142,9 @@ const MAX_TO_TELL: usize = 16;
 /// A relay that has not said for this time that it is insecure is so no more, in nanoseconds.
 const INSECURE_NS: i64 = 10_000_000_000;
 
+/// What is said when the last controller has gone.
+const ABANDONED: &str = "Alight: the controller is gone";
+
 const CLOSED: &str = "the network session was closed";
 
 /// The bridge between two packets.
@@ -269,6 +272,8 @@ impl Bridge {
         match event {
             LinkEvent::Connected { peer } => {
                 tracing::info!(peer, "Link to the ground station is up");
+                // It may be another one, and what was said meanwhile is lost.
+                self.ground_ns = None;
                 None
             }
             LinkEvent::Disconnected { reason } => {
@@ -452,6 +457,10 @@ impl Bridge {
             tracing::info!(system, component, "Ground station found");
             self.texts.reset();
             self.insecure_told = false;
+            self.not_recording.clear();
+            if self.is_abandoned {
+                self.tell(now_ns, MavSeverity::MAV_SEVERITY_WARNING, ABANDONED);
+            }
             self.send_texts(now_ns);
             self.tell_insecure(now_ns);
         }
@@ -505,7 +514,7 @@ impl Bridge {
             // The next controller's phase is sent even when it is the same.
             self.status = None;
             self.texts.reset();
-            (MavSeverity::MAV_SEVERITY_WARNING, "Alight: the controller is gone")
+            (MavSeverity::MAV_SEVERITY_WARNING, ABANDONED)
         } else {
             (MavSeverity::MAV_SEVERITY_NOTICE, "Alight: the controller is back")
         };

@@ -16,7 +16,10 @@ use autopilot::dialect::{
 use autopilot::packet::encode;
 use autopilot::{Packet, Parser, Sender};
 use gcs_bridge::Config;
-use messages::{ControllerStatus, Detections, Health, MavlinkBytes, Phase, TargetEstimate, topic};
+use messages::{
+    ControllerStatus, Detections, Health, MavlinkBytes, Phase, RecorderStatus, TargetEstimate,
+    topic,
+};
 use node::{INSECURE, Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, now_ns};
 use testing::ports;
 use tokio::net::{TcpStream, UdpSocket};
@@ -332,6 +335,30 @@ async fn the_bridge_outlives_the_ground_station() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_ground_station_that_joins_later_is_told_what_was_said_once() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let ([], _, listening) = ports::free()?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let recorder = open("recorder", "main", port).await?;
+    let recording = tokio::spawn(record_nothing(recorder));
+    let setting = format!("ground=udpin:127.0.0.1:{listening}");
+    let settings = [setting.as_str(), "ground_silence_s=1"];
+    let bridge = start_bridge(port, &Ground::open().await?, &settings).await?;
+    let to = SocketAddr::from(([127, 0, 0, 1], listening));
+    let not_recording = "Alight: not recording: the disk is full";
+    let mut first = Ground { bridge: Some(to), ..Ground::open().await? };
+    first.call_until_told(not_recording).await?;
+    vehicle.stop().await;
+    first.call_until_told("Alight: the controller is gone").await?;
+    let mut second = Ground { bridge: Some(to), ..Ground::open().await? };
+    second.call_until_told("Alight: the controller is gone").await?;
+    second.call_until_told(not_recording).await?;
+    recording.abort();
+    bridge.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_port_in_use_is_an_error() -> anyhow::Result<()> {
     let taken = Ground::open().await?;
     let setting = format!("ground=udpin:{}", taken.socket.local_addr()?);
@@ -502,6 +529,21 @@ async fn see(node: Node) -> anyhow::Result<()> {
     }
 }
 
+/// Publishes that nothing is recorded.
+async fn record_nothing(node: Node) -> anyhow::Result<()> {
+    let statuses = node.publisher(topic::RECORDER_STATUS, &[]).await?;
+    let status = RecorderStatus {
+        recorder: "main".into(),
+        problem: Some("the disk is full".into()),
+        ..RecorderStatus::default()
+    };
+    let mut tick = interval(Duration::from_millis(100));
+    loop {
+        tick.tick().await;
+        statuses.publish(&status).await;
+    }
+}
+
 fn free_port() -> anyhow::Result<u16> {
     let ([port], _, _) = ports::free()?;
     Ok(port)
@@ -578,6 +620,22 @@ impl Ground {
         let seen = async {
             while !self.texts.iter().any(|text| text == wanted) {
                 self.next().await?;
+            }
+            anyhow::Ok(())
+        };
+        let outcome = timeout(PATIENCE, seen).await;
+        outcome.with_context(|| format!("`{wanted}` is not in {:?}", self.texts))?
+    }
+
+    /// Sends heartbeats until a text of the companion has come.
+    async fn call_until_told(&mut self, wanted: &str) -> anyhow::Result<()> {
+        let heartbeat = encode(GROUND, 0, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()));
+        let seen = async {
+            while !self.texts.iter().any(|text| text == wanted) {
+                self.send(&heartbeat).await?;
+                if let Ok(packet) = timeout(Duration::from_millis(200), self.next()).await {
+                    packet?;
+                }
             }
             anyhow::Ok(())
         };
