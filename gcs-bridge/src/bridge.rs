@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use autopilot::compose::heartbeat;
-use autopilot::dialect::{MavMessage, MavSeverity, MavState};
+use autopilot::dialect::{HEARTBEAT_DATA, MavMessage, MavSeverity, MavState, MessageData};
 use autopilot::link::SendError;
 use autopilot::packet::{Counters, encode};
 use autopilot::permission::Refusal;
@@ -136,6 +136,9 @@ const MAX_PROBLEM_CHARS: usize = 120;
 /// Minimum pause between two texts about refused packets, in nanoseconds.
 const REFUSAL_PAUSE_NS: i64 = 5_000_000_000;
 
+/// Maximum number of the camera's heartbeats that are known when they come back; longer than for three seconds none is on its way.
+const MAX_CAMERA_HEARTBEATS: usize = 3;
+
 /// Maximum number of texts that wait for their sending.
 const MAX_TO_TELL: usize = 16;
 
@@ -188,6 +191,8 @@ struct Bridge {
     /// Sequence numbers of our next packets: the companion's and the camera's.
     sequence: u8,
     camera_sequence: u8,
+    /// The camera's last heartbeats with their sequence numbers, the newest first.
+    camera_heartbeats: VecDeque<(u8, MavMessage)>,
 }
 
 impl Bridge {
@@ -227,6 +232,7 @@ impl Bridge {
             to_tell: VecDeque::new(),
             sequence: 0,
             camera_sequence: 0,
+            camera_heartbeats: VecDeque::new(),
         })
     }
 
@@ -256,7 +262,9 @@ impl Bridge {
             self.health.dropped("from autopilot: not a MAVLink packet");
         }
         for packet in packets {
-            self.vehicle.received(now_ns, &packet);
+            if !self.is_echo_of_camera(&packet) {
+                self.vehicle.received(now_ns, &packet);
+            }
             match route::from_autopilot(&packet, self.own(now_ns)) {
                 Route::Drop(reason) => self.health.dropped(reason),
                 _ => {
@@ -265,6 +273,16 @@ impl Bridge {
                 }
             }
         }
+    }
+
+    /// Whether a packet may be the camera's own, which the autopilot sends back to all its links. Another camera with that id is
+    /// known by heartbeats that the bridge has not sent.
+    fn is_echo_of_camera(&self, packet: &Packet) -> bool {
+        let is_heartbeat = packet.message_id == HEARTBEAT_DATA::ID;
+        let is_sent = self.camera_heartbeats.iter().any(|(sequence, message)| {
+            *sequence == packet.sequence && packet.message.as_ref() == Some(message)
+        });
+        packet.sender.component == self.camera_component && (is_sent || !is_heartbeat)
     }
 
     /// The packet for the autopilot in an event of the ground station's link, if there is one.
@@ -608,6 +626,8 @@ impl Bridge {
         self.send_own(now_ns, &self.heartbeat());
         if let Some(heartbeat) = self.camera.heartbeat(now_ns) {
             self.tell_taken(now_ns);
+            self.camera_heartbeats.truncate(MAX_CAMERA_HEARTBEATS - 1);
+            self.camera_heartbeats.push_front((self.camera_sequence, heartbeat.clone()));
             self.send_from_camera(now_ns, &heartbeat);
         }
         self.tell_more(now_ns);

@@ -30,6 +30,7 @@ use tokio::time::{interval, sleep, timeout};
 const PATIENCE: Duration = Duration::from_secs(30);
 const AUTOPILOT: Sender = Sender { system: 7, component: 1 };
 const COMPANION: Sender = Sender { system: 7, component: 191 };
+const CAMERA: Sender = Sender { system: 7, component: 100 };
 const GROUND: Sender = Sender { system: 255, component: 190 };
 
 #[tokio::test(flavor = "multi_thread")]
@@ -429,6 +430,40 @@ async fn a_ground_station_finds_the_camera_its_video_and_the_marker() -> anyhow:
             ensure!(told.contains(part), "{part} is not in {told}");
         }
     }
+    seeing.abort();
+    bridge.abort();
+    Ok(())
+}
+
+/// The camera's packets may come back to the bridge, as an autopilot sends what it hears on one link to all others.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_camera_gives_way_to_another_one_and_not_to_its_own_echo() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let mut ground = Ground::open().await?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let seeing = tokio::spawn(see(vehicle.node.clone()));
+    let back = vehicle.node.publisher(topic::FROM_AUTOPILOT, &[]).await?;
+    let bridge = start_bridge(port, &ground, &[]).await?;
+    let mut last = None;
+    for _ in 0..4 {
+        let is_new = |f: &Packet| f.sender == CAMERA && Some(f.sequence) > last;
+        let packet = ground.expect(is_new).await?;
+        last = Some(packet.sequence);
+        back.publish(&MavlinkBytes { packet: packet.raw }).await;
+    }
+    let other = HEARTBEAT_DATA { mavtype: MavType::MAV_TYPE_CAMERA, ..HEARTBEAT_DATA::default() };
+    let other = encode(CAMERA, 200, &MavMessage::HEARTBEAT(other));
+    let is_other = |f: &Packet| f.raw == other;
+    let came = async {
+        loop {
+            back.publish(&MavlinkBytes { packet: other.clone() }).await;
+            let next = timeout(Duration::from_millis(100), ground.expect(is_other)).await;
+            if let Ok(packet) = next {
+                return packet;
+            }
+        }
+    };
+    timeout(PATIENCE, came).await??;
     seeing.abort();
     bridge.abort();
     Ok(())
