@@ -6,18 +6,21 @@
 //! late command is a wrong one.
 
 use std::collections::VecDeque;
+use std::future::poll_fn;
 use std::io;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll};
 use std::time::{Duration, Instant, SystemTime};
 
-use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream, UdpSocket};
 use tokio::sync::{Notify, mpsc};
 use tokio::task::JoinHandle;
 use tokio::time::{sleep, sleep_until, timeout};
-use tokio_serial::{SerialPortBuilderExt, SerialStream};
+use tokio_serial::{SerialPort, SerialPortBuilderExt, SerialStream};
 
 use crate::address::{Address, Endpoint};
 use crate::gate::{Admitted, Gate};
@@ -30,8 +33,12 @@ use crate::signing::{Refusals, Signing, stamp};
 const INCOMING: usize = 1024;
 /// Maximum number of packets waiting to be sent.
 const OUTGOING: usize = 256;
-/// Maximum number of waiting packets for another one of low priority.
-const SPARE: usize = 8;
+/// Maximum number of waiting packets of low priority, about a second of a slow line.
+const SPARE: usize = 16;
+/// Maximum time that a line needs for what it has still to send, when one of them is sent.
+const SPARE_BACKLOG: Duration = Duration::from_millis(50);
+/// Pause before it is looked again how much a line has still to send.
+const BACKLOG_PAUSE: Duration = Duration::from_millis(10);
 /// Pause before the first retry; it doubles up to the last.
 const FIRST_RETRY: Duration = Duration::from_millis(200);
 /// Maximum pause between two retries.
@@ -59,6 +66,7 @@ pub struct Link {
 pub struct LinkSender {
     shared: Arc<Shared>,
     queue: mpsc::Sender<Vec<u8>>,
+    spare: mpsc::Sender<Vec<u8>>,
 }
 
 /// An event of a link.
@@ -150,11 +158,13 @@ impl Link {
             Listener::None => None,
         };
         let (queue, outgoing) = mpsc::channel(OUTGOING);
+        let (spare, outgoing_spare) = mpsc::channel(SPARE);
         let shared = Arc::new(Shared::new());
         let (gate, keeping) = signing.map_or((Gate::new(None), None), keyed);
-        let port = Port { shared: Arc::clone(&shared), outgoing, peering, gate, keeping };
+        let port =
+            Port { shared: Arc::clone(&shared), outgoing, outgoing_spare, peering, gate, keeping };
         let task = tokio::spawn(run(address, listener, port));
-        let sender = LinkSender { shared: Arc::clone(&shared), queue };
+        let sender = LinkSender { shared: Arc::clone(&shared), queue, spare };
         Ok(Self { shared, sender, task, local })
     }
 
@@ -229,22 +239,23 @@ impl LinkSender {
     /// Sends a packet without waiting. It is refused without a connection or when the line is too slow;
     /// packets that wait when a connection breaks are not sent on the next one.
     pub fn send(&self, packet: &[u8]) -> Result<(), SendError> {
+        self.put(&self.queue, packet)
+    }
+
+    /// Sends a packet when no other one waits and a serial line has little left to send, so that heavy traffic (a ground
+    /// station that sends corrections or files over a slow line) hardly delays the setpoints. Few such packets wait.
+    pub fn send_spare(&self, packet: &[u8]) -> Result<(), SendError> {
+        self.put(&self.spare, packet)
+    }
+
+    fn put(&self, queue: &mpsc::Sender<Vec<u8>>, packet: &[u8]) -> Result<(), SendError> {
         if !self.shared.connected.load(Ordering::Acquire) {
             return Err(SendError::NotConnected);
         }
-        self.queue.try_send(packet.to_vec()).map_err(|refused| match refused {
+        queue.try_send(packet.to_vec()).map_err(|refused| match refused {
             mpsc::error::TrySendError::Full(_) => SendError::Full,
             mpsc::error::TrySendError::Closed(_) => SendError::NotConnected,
         })
-    }
-
-    /// Sends a packet only while few others wait, so that heavy traffic (a ground station that reads all
-    /// parameters over a slow line) never delays the setpoints.
-    pub fn send_spare(&self, packet: &[u8]) -> Result<(), SendError> {
-        if self.queue.capacity() + SPARE < OUTGOING {
-            return Err(SendError::Full);
-        }
-        self.send(packet)
     }
 }
 
@@ -316,6 +327,8 @@ impl Shared {
 struct Port {
     shared: Arc<Shared>,
     outgoing: mpsc::Receiver<Vec<u8>>,
+    /// Packets of low priority.
+    outgoing_spare: mpsc::Receiver<Vec<u8>>,
     peering: Peering,
     gate: Gate,
     keeping: Option<Keeping>,
@@ -338,10 +351,20 @@ fn keyed(config: SigningConfig) -> (Gate, Option<Keeping>) {
 impl Port {
     fn connected(&mut self, peer: String) {
         while self.outgoing.try_recv().is_ok() {}
+        while self.outgoing_spare.try_recv().is_ok() {}
         self.shared.mark_active();
         tracing::info!(%peer, "Link connected");
         self.shared.connected.store(true, Ordering::Release);
         self.shared.push(LinkEvent::Connected { peer });
+    }
+
+    /// The next packet to send, one of low priority only when it may be; may be cancelled without losing one.
+    async fn next(&mut self, may_be_spare: bool) -> Option<Vec<u8>> {
+        tokio::select! {
+            biased;
+            packet = self.outgoing.recv() => packet,
+            packet = self.outgoing_spare.recv(), if may_be_spare => packet,
+        }
     }
 
     fn disconnected(&mut self, reason: String) {
@@ -485,7 +508,7 @@ async fn serve(address: &Address, listener: &mut Listener, port: &mut Port) -> (
         Address::Tcp(to) => match call_tcp(to).await {
             Ok(stream) => {
                 port.connected(to.to_string());
-                (true, serve_stream(stream, port, Some(TCP_SILENCE)).await)
+                (true, serve_stream(stream, unknown_backlog, port, Some(TCP_SILENCE)).await)
             }
             Err(error) => (false, explain_socket(&error)),
         },
@@ -496,7 +519,7 @@ async fn serve(address: &Address, listener: &mut Listener, port: &mut Port) -> (
         Address::Serial { device, baud } => match open_serial(device, *baud) {
             Ok(stream) => {
                 port.connected(address.to_string());
-                (true, serve_stream(stream, port, None).await)
+                (true, serve_stream(stream, serial_backlog, port, None).await)
             }
             Err(error) => (false, explain_serial(device, &error)),
         },
@@ -525,6 +548,18 @@ async fn call_tcp(to: &Endpoint) -> io::Result<TcpStream> {
 
 fn open_serial(device: &str, baud: u32) -> tokio_serial::Result<SerialStream> {
     tokio_serial::new(device, baud).open_native_async()
+}
+
+/// What a serial line has still to send, as time: ten bits for a byte.
+fn serial_backlog(line: &SerialStream) -> Duration {
+    let (Ok(bytes), Ok(baud)) = (line.bytes_to_write(), line.baud_rate()) else {
+        return Duration::ZERO;
+    };
+    Duration::from_secs(u64::from(bytes) * 10) / baud.max(1)
+}
+
+fn unknown_backlog(_: &TcpStream) -> Duration {
+    Duration::ZERO
 }
 
 fn explain_socket(error: &io::Error) -> String {
@@ -566,7 +601,7 @@ async fn serve_tcp_in(listener: &TcpListener, port: &mut Port) -> (bool, String)
         let _ = stream.set_nodelay(true);
         port.connected(peer.to_string());
         tokio::select! {
-            reason = serve_stream(stream, port, None) => return (true, reason),
+            reason = serve_stream(stream, unknown_backlog, port, None) => return (true, reason),
             newcomer = accept_when_silent(listener, &shared, &peering) => next = newcomer,
         }
     }
@@ -599,21 +634,54 @@ fn refuse(shared: &Shared, peer: SocketAddr, reason: &str) {
     }
 }
 
-/// Moves bytes in both directions until the connection breaks; returns why.
-async fn serve_stream<S>(stream: S, port: &mut Port, silence: Option<Duration>) -> String
+/// What happened on a line: bytes were read, or written.
+enum Moved {
+    Read(io::Result<usize>),
+    Written(io::Result<usize>),
+}
+
+/// Writes what there is to write, or reads.
+fn poll_line<L: AsyncRead + AsyncWrite + Unpin>(
+    line: &mut L,
+    context: &mut Context<'_>,
+    bytes: &mut [u8],
+    rest: &[u8],
+) -> Poll<Moved> {
+    if !rest.is_empty()
+        && let Poll::Ready(written) = Pin::new(&mut *line).poll_write(context, rest)
+    {
+        return Poll::Ready(Moved::Written(written));
+    }
+    let mut read = ReadBuf::new(bytes);
+    let done = Pin::new(line).poll_read(context, &mut read);
+    done.map(|done| Moved::Read(done.map(|()| read.filled().len())))
+}
+
+/// Moves bytes in both directions until the connection breaks; returns why. `backlog` is the time that the line needs for what
+/// it has still to send.
+async fn serve_stream<L>(
+    mut line: L,
+    backlog: impl Fn(&L) -> Duration,
+    port: &mut Port,
+    silence: Option<Duration>,
+) -> String
 where
-    S: AsyncRead + AsyncWrite,
+    L: AsyncRead + AsyncWrite + Unpin,
 {
-    let (mut reader, mut writer) = tokio::io::split(stream);
     let mut parser = Parser::new();
     let mut bytes = [0; 4096];
     let mut active = tokio::time::Instant::now();
+    // What is left of the packet that is being written, and since when it is.
+    let mut rest = Vec::new();
+    let mut writing = active;
     loop {
         let limit = silence.unwrap_or(Duration::from_secs(3600));
+        let is_writing = !rest.is_empty();
+        let is_free = !is_writing && backlog(&line) <= SPARE_BACKLOG;
         tokio::select! {
-            read = reader.read(&mut bytes) => match read {
-                Ok(0) => return "the other side closed the connection".into(),
-                Ok(count) => {
+            moved = poll_fn(|context| poll_line(&mut line, context, &mut bytes, &rest)) => match moved {
+                Moved::Read(Ok(0)) => return "the other side closed the connection".into(),
+                Moved::Read(Ok(count)) => {
                     active = tokio::time::Instant::now();
                     let packets = parser.push(bytes.get(..count).unwrap_or(&[]));
                     let admitted = port.admit(packets);
@@ -623,16 +691,19 @@ where
                     }
                     port.received(admitted.packets, parser.take_counters());
                 }
-                Err(error) => return format!("reading failed: {error}"),
+                Moved::Read(Err(error)) => return format!("reading failed: {error}"),
+                Moved::Written(Ok(0)) => return "the other side takes no more bytes".into(),
+                Moved::Written(Ok(count)) => drop(rest.drain(..count.min(rest.len()))),
+                Moved::Written(Err(error)) => return format!("writing failed: {error}"),
             },
-            packet = port.outgoing.recv() => {
+            packet = port.next(is_free), if !is_writing => {
                 let Some(packet) = packet else { return "closed".into() };
-                let Some(packet) = port.seal(packet) else { continue };
-                match timeout(WRITE_LIMIT, writer.write_all(&packet)).await {
-                    Ok(Ok(())) => {}
-                    Ok(Err(error)) => return format!("writing failed: {error}"),
-                    Err(_) => return "the other side takes no more bytes".into(),
-                }
+                rest = port.seal(packet).unwrap_or_default();
+                writing = tokio::time::Instant::now();
+            }
+            () = sleep(BACKLOG_PAUSE), if !is_writing && !is_free => {}
+            () = sleep_until(writing + WRITE_LIMIT), if is_writing => {
+                return "the other side takes no more bytes".into();
             }
             () = sleep_until(active + PACKET_GAP), if parser.is_waiting() => {
                 let packets = port.admit(parser.finish()).packets;
@@ -674,7 +745,7 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
                 Err(error) if is_refusal(&error) => {}
                 Err(error) => return format!("receiving failed: {error}"),
             },
-            packet = port.outgoing.recv() => {
+            packet = port.next(true) => {
                 let Some(packet) = packet else { return "closed".into() };
                 let Some(packet) = port.seal(packet) else { continue };
                 let sent = match (fixed, peers.chosen) {
@@ -707,18 +778,78 @@ fn is_refusal(error: &io::Error) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
-    #[test]
-    fn packets_of_low_priority_never_fill_the_queue() {
-        let (queue, mut line) = mpsc::channel(OUTGOING);
-        let sender = LinkSender { shared: Arc::new(Shared::new()), queue };
+    /// A link's two sides, connected.
+    fn pair() -> (LinkSender, Port) {
+        let (queue, outgoing) = mpsc::channel(OUTGOING);
+        let (spare, outgoing_spare) = mpsc::channel(SPARE);
+        let shared = Arc::new(Shared::new());
+        let sender = LinkSender { shared: Arc::clone(&shared), queue, spare };
+        let (peering, gate) = (Peering::default(), Gate::new(None));
+        let port = Port { shared, outgoing, outgoing_spare, peering, gate, keeping: None };
+        (sender, port)
+    }
+
+    #[tokio::test]
+    async fn packets_of_low_priority_never_fill_the_queue() {
+        let (sender, mut port) = pair();
         assert_eq!(sender.send_spare(b"packet"), Err(SendError::NotConnected));
-        sender.shared.connected.store(true, Ordering::Release);
+        port.connected("peer".into());
         let sent = (0..100).take_while(|_| sender.send_spare(b"packet").is_ok()).count();
-        assert_eq!(sent, SPARE + 1);
+        assert_eq!(sent, SPARE);
         assert_eq!(sender.send_spare(b"packet"), Err(SendError::Full));
         assert_eq!(sender.send(b"setpoint"), Ok(()), "our own still goes");
-        while line.try_recv().is_ok() {}
+        assert_eq!(port.next(true).await.unwrap(), b"setpoint", "and goes first");
+        assert_eq!(port.next(true).await.unwrap(), b"packet");
         assert_eq!(sender.send_spare(b"packet"), Ok(()));
+    }
+
+    #[tokio::test]
+    async fn packets_of_low_priority_wait_until_a_slow_line_has_sent_the_others() {
+        let is_slow = AtomicBool::new(true);
+        let backlog = |_: &_| match is_slow.load(Ordering::Relaxed) {
+            true => SPARE_BACKLOG * 2,
+            false => SPARE_BACKLOG,
+        };
+        let (sender, mut port) = pair();
+        port.connected("peer".into());
+        let (line, mut other_end) = tokio::io::duplex(4096);
+        let sending = async {
+            sender.send_spare(b"packet").unwrap();
+            let mut bytes = [0; 100];
+            for _ in 0..3 {
+                sender.send(b"setpoint").unwrap();
+                let count = other_end.read(&mut bytes).await.unwrap();
+                assert_eq!(&bytes[..count], b"setpoint");
+                sleep(BACKLOG_PAUSE).await;
+            }
+            is_slow.store(false, Ordering::Relaxed);
+            let count = other_end.read(&mut bytes).await.unwrap();
+            assert_eq!(&bytes[..count], b"packet");
+        };
+        tokio::select! {
+            () = sending => {}
+            reason = serve_stream(line, backlog, &mut port, None) => panic!("{reason}"),
+        }
+    }
+
+    #[tokio::test]
+    async fn what_comes_is_read_while_nothing_can_be_written() {
+        let (sender, mut port) = pair();
+        port.connected("peer".into());
+        let (line, mut other_end) = tokio::io::duplex(4);
+        sender.send(b"more than the line takes").unwrap();
+        let receiving = async {
+            sleep(Duration::from_millis(20)).await;
+            other_end.write_all(b"noise").await.unwrap();
+            while sender.shared.counters.lock().unwrap().bad_bytes < 5 {
+                sleep(Duration::from_millis(5)).await;
+            }
+        };
+        tokio::select! {
+            () = receiving => {}
+            reason = serve_stream(line, |_| Duration::ZERO, &mut port, None) => panic!("{reason}"),
+        }
     }
 }
