@@ -16,7 +16,7 @@ use std::task::{Context, Poll};
 use std::time::{Duration, Instant, SystemTime};
 
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::{TcpListener, TcpStream, UdpSocket};
+use tokio::net::{TcpListener, TcpStream, UdpSocket, lookup_host};
 use tokio::sync::{Notify, mpsc};
 use tokio::task::JoinHandle;
 use tokio::time::{sleep, sleep_until, timeout};
@@ -447,12 +447,8 @@ enum Listener {
 
 async fn listen(address: &Address) -> Result<Listener, LinkError> {
     let (bound, Endpoint { host, port }) = match address {
-        Address::UdpIn(at) => {
-            (UdpSocket::bind((at.host.as_str(), at.port)).await.map(Listener::Udp), at)
-        }
-        Address::TcpIn(at) => {
-            (TcpListener::bind((at.host.as_str(), at.port)).await.map(Listener::Tcp), at)
-        }
+        Address::UdpIn(at) => (listen_udp(at).await.map(Listener::Udp), at),
+        Address::TcpIn(at) => (listen_tcp(at).await.map(Listener::Tcp), at),
         Address::UdpOut(_) | Address::Tcp(_) | Address::Serial { .. } => return Ok(Listener::None),
     };
     bound.map_err(|source| {
@@ -463,6 +459,27 @@ async fn listen(address: &Address) -> Result<Listener, LinkError> {
             _ => LinkError::Listen { address, source },
         }
     })
+}
+
+async fn listen_udp(at: &Endpoint) -> io::Result<UdpSocket> {
+    UdpSocket::bind(local(at).await?).await
+}
+
+async fn listen_tcp(at: &Endpoint) -> io::Result<TcpListener> {
+    TcpListener::bind(local(at).await?).await
+}
+
+/// The address to listen on. Not each of the host's in turn, or a second program would get the next one where the port is in use.
+async fn local(at: &Endpoint) -> io::Result<SocketAddr> {
+    let found = lookup_host((at.host.as_str(), at.port)).await?;
+    in_order(found).first().copied().ok_or_else(|| io::ErrorKind::AddrNotAvailable.into())
+}
+
+/// The addresses of a host with those of IPv4 first, which autopilots and ground stations speak; a socket has either IPv4 or IPv6.
+fn in_order(found: impl Iterator<Item = SocketAddr>) -> Vec<SocketAddr> {
+    let mut found: Vec<_> = found.collect();
+    found.sort_by_key(SocketAddr::is_ipv6);
+    found
 }
 
 /// Serves one connection after the other, with a pause that grows while nothing works.
@@ -527,15 +544,24 @@ async fn serve(address: &Address, listener: &mut Listener, port: &mut Port) -> (
 }
 
 async fn call_udp(to: &Endpoint) -> io::Result<(UdpSocket, SocketAddr)> {
-    let mut found = tokio::net::lookup_host((to.host.as_str(), to.port)).await?;
-    let peer = found.next().ok_or(io::ErrorKind::HostUnreachable)?;
+    let mut result = Err(io::ErrorKind::HostUnreachable.into());
+    for peer in in_order(lookup_host((to.host.as_str(), to.port)).await?) {
+        result = connect_udp(peer).await.map(|socket| (socket, peer));
+        if result.is_ok() {
+            break;
+        }
+    }
+    result
+}
+
+async fn connect_udp(peer: SocketAddr) -> io::Result<UdpSocket> {
     let local: SocketAddr = match peer {
         SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
         SocketAddr::V6(_) => (Ipv6Addr::UNSPECIFIED, 0).into(),
     };
     let socket = UdpSocket::bind(local).await?;
     socket.connect(peer).await?;
-    Ok((socket, peer))
+    Ok(socket)
 }
 
 async fn call_tcp(to: &Endpoint) -> io::Result<TcpStream> {
@@ -779,6 +805,13 @@ fn is_refusal(error: &io::Error) -> bool {
 mod tests {
     use super::*;
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
+
+    #[test]
+    fn a_host_with_addresses_of_both_kinds_is_spoken_to_by_ipv4() {
+        let [v6, v4] = ["[::1]:14550", "127.0.0.1:14550"].map(|text| text.parse().unwrap());
+        assert_eq!(in_order([v6, v4].into_iter()), [v4, v6]);
+        assert_eq!(in_order([v6].into_iter()), [v6]);
+    }
 
     /// A link's two sides, connected.
     fn pair() -> (LinkSender, Port) {
