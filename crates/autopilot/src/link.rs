@@ -51,6 +51,8 @@ const WRITE_LIMIT: Duration = Duration::from_secs(2);
 const SEND_LIMIT: Duration = Duration::from_secs(2);
 /// Silence after which a TCP connection counts as dead.
 const TCP_SILENCE: Duration = Duration::from_secs(10);
+/// A time that nothing takes.
+const NO_LIMIT: Duration = Duration::from_secs(3600);
 
 /// A connection to an autopilot that reconnects by itself.
 #[derive(Debug)]
@@ -525,7 +527,7 @@ async fn serve(address: &Address, listener: &mut Listener, port: &mut Port) -> (
         Address::Tcp(to) => match call_tcp(to).await {
             Ok(stream) => {
                 port.connected(to.to_string());
-                (true, serve_stream(stream, unknown_backlog, port, Some(TCP_SILENCE)).await)
+                (true, serve_stream(stream, tcp(Some(TCP_SILENCE)), port).await)
             }
             Err(error) => (false, explain_socket(&error)),
         },
@@ -536,7 +538,7 @@ async fn serve(address: &Address, listener: &mut Listener, port: &mut Port) -> (
         Address::Serial { device, baud } => match open_serial(device, *baud) {
             Ok(stream) => {
                 port.connected(address.to_string());
-                (true, serve_stream(stream, serial_backlog, port, None).await)
+                (true, serve_stream(stream, serial(), port).await)
             }
             Err(error) => (false, explain_serial(device, &error)),
         },
@@ -574,18 +576,6 @@ async fn call_tcp(to: &Endpoint) -> io::Result<TcpStream> {
 
 fn open_serial(device: &str, baud: u32) -> tokio_serial::Result<SerialStream> {
     tokio_serial::new(device, baud).open_native_async()
-}
-
-/// What a serial line has still to send, as time: ten bits for a byte.
-fn serial_backlog(line: &SerialStream) -> Duration {
-    let (Ok(bytes), Ok(baud)) = (line.bytes_to_write(), line.baud_rate()) else {
-        return Duration::ZERO;
-    };
-    Duration::from_secs(u64::from(bytes) * 10) / baud.max(1)
-}
-
-fn unknown_backlog(_: &TcpStream) -> Duration {
-    Duration::ZERO
 }
 
 fn explain_socket(error: &io::Error) -> String {
@@ -627,7 +617,7 @@ async fn serve_tcp_in(listener: &TcpListener, port: &mut Port) -> (bool, String)
         let _ = stream.set_nodelay(true);
         port.connected(peer.to_string());
         tokio::select! {
-            reason = serve_stream(stream, unknown_backlog, port, None) => return (true, reason),
+            reason = serve_stream(stream, tcp(None), port) => return (true, reason),
             newcomer = accept_when_silent(listener, &shared, &peering) => next = newcomer,
         }
     }
@@ -660,6 +650,31 @@ fn refuse(shared: &Shared, peer: SocketAddr, reason: &str) {
     }
 }
 
+/// How a stream is served.
+struct Manner<B> {
+    /// The time that the line needs for what it has still to send.
+    backlog: B,
+    /// Silence after which an incomplete packet is noise; on a line that delivers every byte its rest is only late.
+    gap: Option<Duration>,
+    /// Silence after which the connection counts as dead.
+    silence: Option<Duration>,
+}
+
+fn serial() -> Manner<impl Fn(&SerialStream) -> Duration> {
+    let backlog = |line: &SerialStream| {
+        let (Ok(bytes), Ok(baud)) = (line.bytes_to_write(), line.baud_rate()) else {
+            return Duration::ZERO;
+        };
+        // A byte takes ten bits.
+        Duration::from_secs(u64::from(bytes) * 10) / baud.max(1)
+    };
+    Manner { backlog, gap: Some(PACKET_GAP), silence: None }
+}
+
+fn tcp(silence: Option<Duration>) -> Manner<impl Fn(&TcpStream) -> Duration> {
+    Manner { backlog: |_: &TcpStream| Duration::ZERO, gap: None, silence }
+}
+
 /// What happened on a line: bytes were read, or written.
 enum Moved {
     Read(io::Result<usize>),
@@ -683,13 +698,11 @@ fn poll_line<L: AsyncRead + AsyncWrite + Unpin>(
     done.map(|done| Moved::Read(done.map(|()| read.filled().len())))
 }
 
-/// Moves bytes in both directions until the connection breaks; returns why. `backlog` is the time that the line needs for what
-/// it has still to send.
+/// Moves bytes in both directions until the connection breaks; returns why.
 async fn serve_stream<L>(
     mut line: L,
-    backlog: impl Fn(&L) -> Duration,
+    manner: Manner<impl Fn(&L) -> Duration>,
     port: &mut Port,
-    silence: Option<Duration>,
 ) -> String
 where
     L: AsyncRead + AsyncWrite + Unpin,
@@ -701,9 +714,9 @@ where
     let mut rest = Vec::new();
     let mut writing = active;
     loop {
-        let limit = silence.unwrap_or(Duration::from_secs(3600));
+        let [gap, limit] = [manner.gap, manner.silence].map(|it| it.unwrap_or(NO_LIMIT));
         let is_writing = !rest.is_empty();
-        let is_free = !is_writing && backlog(&line) <= SPARE_BACKLOG;
+        let is_free = !is_writing && (manner.backlog)(&line) <= SPARE_BACKLOG;
         tokio::select! {
             moved = poll_fn(|context| poll_line(&mut line, context, &mut bytes, &rest)) => match moved {
                 Moved::Read(Ok(0)) => return "the other side closed the connection".into(),
@@ -731,11 +744,11 @@ where
             () = sleep_until(writing + WRITE_LIMIT), if is_writing => {
                 return "the other side takes no more bytes".into();
             }
-            () = sleep_until(active + PACKET_GAP), if parser.is_waiting() => {
+            () = sleep_until(active + gap), if manner.gap.is_some() && parser.is_waiting() => {
                 let packets = port.admit(parser.finish()).packets;
                 port.received(packets, parser.take_counters());
             }
-            () = sleep_until(active + limit), if silence.is_some() => {
+            () = sleep_until(active + limit), if manner.silence.is_some() => {
                 return format!("silent for {} s", limit.as_secs());
             }
         }
@@ -845,6 +858,7 @@ mod tests {
             true => SPARE_BACKLOG * 2,
             false => SPARE_BACKLOG,
         };
+        let manner = Manner { backlog, gap: None, silence: None };
         let (sender, mut port) = pair();
         port.connected("peer".into());
         let (line, mut other_end) = tokio::io::duplex(4096);
@@ -863,7 +877,7 @@ mod tests {
         };
         tokio::select! {
             () = sending => {}
-            reason = serve_stream(line, backlog, &mut port, None) => panic!("{reason}"),
+            reason = serve_stream(line, manner, &mut port) => panic!("{reason}"),
         }
     }
 
@@ -872,6 +886,7 @@ mod tests {
         let (sender, mut port) = pair();
         port.connected("peer".into());
         let (line, mut other_end) = tokio::io::duplex(4);
+        let manner = Manner { backlog: |_: &_| Duration::ZERO, gap: None, silence: None };
         sender.send(b"more than the line takes").unwrap();
         let receiving = async {
             sleep(Duration::from_millis(20)).await;
@@ -882,7 +897,7 @@ mod tests {
         };
         tokio::select! {
             () = receiving => {}
-            reason = serve_stream(line, |_| Duration::ZERO, &mut port, None) => panic!("{reason}"),
+            reason = serve_stream(line, manner, &mut port) => panic!("{reason}"),
         }
     }
 }

@@ -269,6 +269,19 @@ async fn tcp_connects_again_and_sends_nothing_old() {
 }
 
 #[tokio::test]
+async fn a_packet_that_comes_in_two_parts_over_tcp_is_none_less() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let mut link = open(format!("tcp:{}", listener.local_addr().unwrap())).await;
+    let (mut server, _) = listener.accept().await.unwrap();
+    let heartbeat = heartbeat(true);
+    server.write_all(&heartbeat[..9]).await.unwrap();
+    // Longer than the pause after which an incomplete packet on a serial line is noise.
+    sleep(Duration::from_millis(300)).await;
+    server.write_all(&heartbeat[9..]).await.unwrap();
+    assert_eq!(packet(&mut link).await, heartbeat);
+}
+
+#[tokio::test]
 async fn tcpin_takes_one_client_after_the_other() {
     let mut link = open("tcpin:127.0.0.1:0".into()).await;
     let at = link.local_address().unwrap();
