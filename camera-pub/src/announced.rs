@@ -481,7 +481,7 @@ mod tests {
         let closed = announced_cameras("tcp:127.0.0.1:1", soon).await.unwrap().problem.unwrap();
         assert!(closed.contains("127.0.0.1:1") && !closed.contains("no MAVLink"), "{closed}");
         let problem = announced_cameras("somewhere", soon).await.unwrap_err().to_string();
-        assert!(problem.contains("`somewhere` is not an autopilot address"), "{problem}");
+        assert!(problem.contains("`somewhere` is not an address of a MAVLink link"), "{problem}");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! The address of the autopilot's link.
+//! The address of a link to an autopilot or a ground station.
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,7 +6,7 @@ use std::str::FromStr;
 /// Default speed of a serial line, in baud: ArduPilot's default for a telemetry port.
 pub const DEFAULT_BAUD: u32 = 57_600;
 
-/// The address of the autopilot's link.
+/// The address of a link to an autopilot or a ground station.
 ///
 /// ```
 /// use autopilot::Address;
@@ -17,7 +17,7 @@ pub const DEFAULT_BAUD: u32 = 57_600;
 /// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Address {
-    /// Listen on this UDP port, and reply to the autopilot's address.
+    /// Listen on this UDP port, and reply to the other side's address.
     UdpIn(Endpoint),
     /// Send to this UDP port, and receive its replies.
     UdpOut(Endpoint),
@@ -45,7 +45,7 @@ pub struct Endpoint {
 
 /// Why an address is invalid.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("`{text}` is not an autopilot address: {problem}; {EXPECTED}")]
+#[error("`{text}` is not an address of a MAVLink link: {problem}; {EXPECTED}")]
 pub struct AddressError {
     text: String,
     problem: String,

@@ -100,7 +100,7 @@ pub enum LinkError {
     #[error(
         "{address}: port {port} is already in use by another program, often a ground station \
          (QGroundControl, MAVProxy) or a second controller; stop that program, or listen on another \
-         port and send the autopilot's packets there"
+         port and have the packets sent there"
     )]
     PortInUse {
         /// The address.
@@ -133,10 +133,10 @@ pub enum LinkError {
 #[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SendError {
     /// No connection.
-    #[error("not sent: the link to the autopilot is not connected")]
+    #[error("not sent: the link is not connected")]
     NotConnected,
     /// The line is too slow.
-    #[error("not sent: the queue is full, the line to the autopilot is too slow")]
+    #[error("not sent: the queue is full, the line is too slow")]
     Full,
 }
 
@@ -522,14 +522,14 @@ async fn serve(address: &Address, listener: &mut Listener, port: &mut Port) -> (
         }
         Address::UdpOut(to) => match call_udp(to).await {
             Ok((socket, peer)) => (true, serve_udp(&socket, port, Some(peer)).await),
-            Err(error) => (false, explain_socket(&error)),
+            Err(error) => (false, explain_socket(&error, port.peering.other_side())),
         },
         Address::Tcp(to) => match call_tcp(to).await {
             Ok(stream) => {
                 port.connected(to.to_string());
                 (true, serve_stream(stream, tcp(Some(TCP_SILENCE)), port).await)
             }
-            Err(error) => (false, explain_socket(&error)),
+            Err(error) => (false, explain_socket(&error, port.peering.other_side())),
         },
         Address::TcpIn(_) => {
             let Listener::Tcp(listener) = &*listener else { return (false, "no socket".into()) };
@@ -540,7 +540,7 @@ async fn serve(address: &Address, listener: &mut Listener, port: &mut Port) -> (
                 port.connected(address.to_string());
                 (true, serve_stream(stream, serial(), port).await)
             }
-            Err(error) => (false, explain_serial(device, &error)),
+            Err(error) => (false, explain_serial(device, &error, port.peering.other_side())),
         },
     }
 }
@@ -578,21 +578,23 @@ fn open_serial(device: &str, baud: u32) -> tokio_serial::Result<SerialStream> {
     tokio_serial::new(device, baud).open_native_async()
 }
 
-fn explain_socket(error: &io::Error) -> String {
+fn explain_socket(error: &io::Error, other_side: &str) -> String {
     match error.kind() {
         io::ErrorKind::ConnectionRefused => {
-            "connection refused; is the autopilot (or its simulator) running?".into()
+            format!("connection refused; is the {other_side} running?")
         }
-        io::ErrorKind::TimedOut => "no reply; is the autopilot switched on and in reach?".into(),
+        io::ErrorKind::TimedOut => {
+            format!("no reply; is the {other_side} switched on and in reach?")
+        }
         _ => format!("cannot reach it: {error}"),
     }
 }
 
-fn explain_serial(device: &str, error: &tokio_serial::Error) -> String {
+fn explain_serial(device: &str, error: &tokio_serial::Error, other_side: &str) -> String {
     use tokio_serial::ErrorKind;
     match error.kind() {
         ErrorKind::NoDevice | ErrorKind::Io(io::ErrorKind::NotFound) => {
-            format!("no device {device}; is the cable plugged in and the autopilot switched on?")
+            format!("no device {device}; is the cable plugged in and the {other_side} switched on?")
         }
         ErrorKind::Io(io::ErrorKind::PermissionDenied) => format!(
             "no permission to open {device}; on most systems the group `dialout` has it (then log in again)"

@@ -49,6 +49,14 @@ impl Peering {
         }
     }
 
+    /// Whom it talks to, for messages.
+    pub(crate) fn other_side(&self) -> &'static str {
+        match self {
+            Self::Autopilot { .. } => "autopilot (or its simulator)",
+            Self::GroundStation { .. } => "ground station",
+        }
+    }
+
     /// Silence after which a peer is replaced.
     pub(crate) fn silence(&self) -> Duration {
         match self {

@@ -257,7 +257,7 @@ async fn tcp_connects_again_and_sends_nothing_old() {
     assert!(reason.contains(&at.to_string()), "{reason}");
     assert_eq!(link.send(&time()), Err(SendError::NotConnected));
     let reason = lost(&mut link).await;
-    assert!(reason.contains("connection refused"), "{reason}");
+    assert!(reason.contains("connection refused; is the autopilot"), "{reason}");
 
     let listener = TcpListener::bind(at).await.unwrap();
     let (mut server, _) = timeout(PATIENCE, listener.accept()).await.unwrap().unwrap();
@@ -298,6 +298,18 @@ async fn tcpin_takes_one_client_after_the_other() {
         drop(client);
         lost(&mut link).await;
     }
+}
+
+#[tokio::test]
+async fn a_ground_station_that_is_away_is_called_one() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = format!("tcp:{}", listener.local_addr().unwrap());
+    drop(listener);
+    let silence = Duration::from_secs(10);
+    let station = Peering::GroundStation { known: Vec::new(), silence };
+    let mut link = Link::open_for(address.parse().unwrap(), station, None).await.unwrap();
+    let reason = lost(&mut link).await;
+    assert!(reason.contains("connection refused; is the ground station running?"), "{reason}");
 }
 
 #[tokio::test]
