@@ -298,6 +298,13 @@ impl Flight {
         firsts.into_iter().flatten().min().unwrap_or(0)
     }
 
+    /// The last status that tells of the landing, or of all where none tells of one: after a landing its controller may wait for the
+    /// next flight, or be started again.
+    pub fn last_status(&self) -> Option<&ControllerStatus> {
+        let of_landing = self.statuses.iter().rev().find(|it| it.started_ns.is_some());
+        of_landing.or(self.statuses.last())
+    }
+
     /// A stamp of the vehicle's clock in seconds since [`Flight::zero_ns`].
     pub fn at_s(&self, stamp_ns: i64) -> f64 {
         stamp_ns.saturating_sub(self.zero_ns) as f64 * 1e-9

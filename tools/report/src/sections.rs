@@ -282,7 +282,7 @@ fn lost(view: &View<'_>) -> Section {
 fn detectors(view: &View<'_>) -> Section {
     let flight = view.flight;
     let mut section = section("detectors", "Detectors", "");
-    let Some(last) = flight.statuses.last() else {
+    let Some(last) = flight.last_status() else {
         section.before.push(missing("the controller's status, which tells the detector in use"));
         return section;
     };

@@ -18,7 +18,7 @@ pub struct Summary {
     pub program: Option<String>,
     /// The guidance law.
     pub guidance: Option<String>,
-    /// The last phase.
+    /// The last phase of the landing.
     pub phase: Option<String>,
     /// Its reason.
     pub why: Option<String>,
@@ -88,7 +88,7 @@ pub struct Summary {
 /// A flight in numbers.
 pub fn of(flight: &Flight, frames: &Frames) -> Summary {
     let latency = budget(frames);
-    let last = flight.statuses.last();
+    let last = flight.last_status();
     let since_start_s = |stamp_ns: i64| {
         flight.statuses.iter().find_map(|status| status.started_ns).map(|_| flight.at_s(stamp_ns))
     };
@@ -259,4 +259,34 @@ impl Summary {
 /// A number of things: `1 change`, `2 changes`.
 pub fn counted(number: u64, one: &str, several: &str) -> String {
     format!("{number} {}", if number == 1 { one } else { several })
+}
+
+#[cfg(test)]
+mod tests {
+    use messages::ControllerStatus;
+
+    use super::*;
+
+    #[test]
+    fn what_a_controller_tells_after_a_landing_is_not_its_outcome() {
+        let status = |phase, started_ns, why: &str| ControllerStatus {
+            phase,
+            started_ns,
+            why: why.to_owned(),
+            ..ControllerStatus::default()
+        };
+        let descent = status(Phase::Descend, Some(1), "descending over the marker");
+        let landed = status(Phase::Landed, Some(1), "on the ground, disarmed");
+        let again = status(Phase::Idle, None, "waiting until the vehicle flies");
+        let outcome = |statuses: &[&ControllerStatus]| {
+            let mut flight = Flight::default();
+            flight.statuses = statuses.iter().map(|it| (*it).clone()).collect();
+            let found = of(&flight, &Frames::default());
+            (found.landed, found.outcome())
+        };
+        let whole = outcome(&[&again, &descent, &landed, &again, &again]);
+        assert_eq!(whole, (Some(true), "landed".to_owned()));
+        let none = outcome(&[&again]);
+        assert_eq!(none, (Some(false), "idle: waiting until the vehicle flies".to_owned()));
+    }
 }
