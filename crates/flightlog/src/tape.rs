@@ -33,18 +33,27 @@ impl TapeReader {
     pub fn read(&mut self, recording: &[u8]) -> Result<(), Problem> {
         let key = topic::TAPE.key(&[]);
         let reading = read(recording, |entry| match entry {
-            Entry::Message(message) if message.key == key => self.take(message.payload),
+            Entry::Message(message) if message.key == key => {
+                self.take(message.payload);
+            }
             _ => {}
         })?;
         self.damage.extend(reading.damage);
         Ok(())
     }
 
-    /// Adds a message of [`topic::TAPE`].
-    pub fn take(&mut self, payload: &[u8]) {
+    /// Adds a message of [`topic::TAPE`]; when its tape began, in nanoseconds of the controller's clock, unless it cannot be read.
+    pub fn take(&mut self, payload: &[u8]) -> Option<i64> {
         match decode::<Tape>(payload) {
-            Ok(tape) => self.push(tape),
-            Err(problem) => self.note(format!("a part of a tape {}", problem.in_recording())),
+            Ok(tape) => {
+                let begun_ns = tape.begun_ns;
+                self.push(tape);
+                Some(begun_ns)
+            }
+            Err(problem) => {
+                self.note(format!("a part of a tape {}", problem.in_recording()));
+                None
+            }
         }
     }
 

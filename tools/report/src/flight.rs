@@ -18,6 +18,9 @@ use crate::settings::{self, Difference};
 /// Longest gap over which a position is interpolated, in nanoseconds.
 const MAX_GAP_NS: i64 = 500_000_000;
 
+/// How much later after its stamp than the one before a message may come, in nanoseconds; beyond this the vehicle's clock began anew.
+const MAX_LATE_NS: i64 = 60_000_000_000;
+
 /// Time between pictures that are measured, in nanoseconds.
 const LIGHT_PERIOD_NS: u64 = 1_000_000_000;
 
@@ -92,6 +95,15 @@ pub struct Replayed {
     pub text: String,
 }
 
+/// A start of the vehicle's computer, with which its clock begins anew.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
+pub struct Boot {
+    /// Its number, from 1 on.
+    pub number: usize,
+    /// How many the recording has.
+    pub of: usize,
+}
+
 /// A landing of a recording that has several.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Landing {
@@ -105,7 +117,7 @@ pub struct Landing {
     pub detector_changes_before: u64,
 }
 
-/// A flight as its recording has it: what was not recorded is empty.
+/// A flight as its recording has it: what was not recorded is empty. All of it is of one start of the vehicle's computer.
 #[derive(Clone, Debug, Default)]
 pub struct Flight {
     /// The name of its file.
@@ -166,8 +178,14 @@ pub struct Flight {
     pub zero_ns: i64,
     /// Which of the landings in the recording this is; `None` where all of it is.
     pub landing: Option<Landing>,
+    /// Which start of the vehicle's computer it is of.
+    pub boot: Boot,
+    /// What the recording has of other starts of the vehicle's computer.
+    pub(crate) other_boots: Vec<Flight>,
     /// Minimum time from a stamp of the vehicle's clock to the reception of its message, in nanoseconds.
     min_apart_ns: Option<i64>,
+    /// The same of the last message.
+    last_apart_ns: i64,
 }
 
 /// Reads the recording of a flight, which may be several files.
@@ -175,6 +193,8 @@ pub struct Flight {
 pub struct FlightReader {
     flight: Flight,
     tapes: TapeReader,
+    /// Starts of the vehicle's computer that there had been when a part of a tape came last, by the tape's begin.
+    boot_of_tape: BTreeMap<i64, usize>,
     meter: Meter,
     /// Messages that a recorder lost since its start, by its run and their key.
     lost_by_run: BTreeMap<String, BTreeMap<String, u64>>,
@@ -187,12 +207,12 @@ impl FlightReader {
         Self { flight, ..Self::default() }
     }
 
-    /// Adds a file of the recording.
+    /// Adds a file of the recording, after those that were written before it.
     ///
     /// # Errors
     /// When it is no MCAP file at all.
     pub fn add(&mut self, recording: &[u8]) -> Result<(), flightlog::Problem> {
-        let Self { flight, tapes, meter, lost_by_run } = self;
+        let Self { flight, tapes, boot_of_tape, meter, lost_by_run } = self;
         let tape_key = topic::TAPE.key(&[]);
         let mut lost = BTreeMap::new();
         let mut run = String::new();
@@ -204,7 +224,11 @@ impl FlightReader {
                     flight.facts.extend(facts);
                 }
                 Entry::Dropped(counts) => lost = counts,
-                Entry::Message(message) if message.key == tape_key => tapes.take(message.payload),
+                Entry::Message(message) if message.key == tape_key => {
+                    if let Some(begun_ns) = tapes.take(message.payload) {
+                        boot_of_tape.insert(begun_ns, flight.other_boots.len());
+                    }
+                }
                 Entry::Message(message) => flight.take(message),
                 Entry::TimeSet(ahead_ns) => set_s.push(ahead_ns as f64 * 1e-9),
                 Entry::Picture { header, bytes, .. } => flight.see(meter, &header, bytes),
@@ -232,23 +256,30 @@ impl FlightReader {
         self.tapes.shares_tape_with(&other.tapes)
     }
 
-    /// The flight.
+    /// The flight; of several starts of the vehicle's computer that with the last landing, or the last.
     pub fn finish(self) -> Flight {
-        let Self { mut flight, tapes, lost_by_run, .. } = self;
+        let Self { mut flight, tapes, boot_of_tape, lost_by_run, .. } = self;
         for (key, count) in lost_by_run.into_values().flatten() {
             *flight.lost.entry(key).or_default() += count;
         }
         flight.damage.extend_from_slice(tapes.damage());
-        flight.tapes = tapes.tapes();
-        flight.set_shift();
-        flight.sort();
-        flight.set_zero();
-        let configuration = flight.tapes.iter().find_map(configuration_of);
-        if let Some(toml) = configuration
-            && !flight.configurations.keys().any(|name| name.starts_with("controller"))
-        {
-            flight.configurations.insert("controller (from its tape)".to_owned(), toml);
+        let mut boots = std::mem::take(&mut flight.other_boots);
+        boots.iter_mut().for_each(|boot| boot.take_over(&flight));
+        boots.push(flight);
+        for tape in tapes.tapes() {
+            let boot = boot_of_tape.get(&tape.begun_ns).and_then(|boot| boots.get_mut(*boot));
+            boot.into_iter().for_each(|boot| boot.tapes.push(tape.clone()));
         }
+        let of = boots.len();
+        for (number, boot) in (1..).zip(&mut boots) {
+            boot.boot = Boot { number, of };
+            boot.settle();
+        }
+        let has_landing =
+            |boot: &Flight| boot.statuses.iter().any(|status| status.started_ns.is_some());
+        let chosen = boots.iter().rposition(has_landing).unwrap_or(of - 1);
+        let mut flight = boots.remove(chosen);
+        flight.other_boots = boots;
         flight
     }
 }
@@ -348,7 +379,8 @@ impl Flight {
         match parts.as_slice() {
             ["controller", "status"] => {
                 if let Some(status) = self.decoded(topic::STATUS, key, payload) {
-                    self.note_apart(received_ns, status.stamp_ns);
+                    let last_ns = self.statuses.last().map(|it| it.stamp_ns);
+                    self.note_stamp(received_ns, status.stamp_ns, last_ns);
                     self.statuses.push(status);
                 }
             }
@@ -358,7 +390,8 @@ impl Flight {
             }
             ["vehicle", "state"] => {
                 if let Some(state) = self.decoded(topic::VEHICLE_STATE, key, payload) {
-                    self.note_apart(received_ns, state.stamp_ns);
+                    let last_ns = self.vehicle.last().map(|it| it.stamp_ns);
+                    self.note_stamp(received_ns, state.stamp_ns, last_ns);
                     self.vehicle.push(state);
                 }
             }
@@ -451,10 +484,52 @@ impl Flight {
         }
     }
 
-    /// Notes how much later than its stamp a message came.
-    fn note_apart(&mut self, received_ns: i64, stamp_ns: i64) {
+    /// Notes how much later than its stamp a message came, and whether the vehicle's clock began anew after the last of its kind.
+    fn note_stamp(&mut self, received_ns: i64, stamp_ns: i64, last_ns: Option<i64>) {
         let apart_ns = received_ns.saturating_sub(stamp_ns);
+        // What was only held up on the way has no earlier stamp.
+        let is_later = apart_ns > self.last_apart_ns.saturating_add(MAX_LATE_NS);
+        if last_ns.is_some_and(|last_ns| stamp_ns < last_ns) && is_later {
+            self.begin_boot();
+        }
+        self.last_apart_ns = apart_ns;
         self.min_apart_ns = Some(self.min_apart_ns.map_or(apart_ns, |it| it.min(apart_ns)));
+    }
+
+    /// What follows is of another start of the vehicle's computer. What is of the recording as a whole goes on, and what was told last.
+    fn begin_boot(&mut self) {
+        let mut before = std::mem::take(self);
+        self.take_over(&before);
+        self.name.clone_from(&before.name);
+        self.configurations.clone_from(&before.configurations);
+        self.detectors.clone_from(&before.detectors);
+        self.cameras.clone_from(&before.cameras);
+        self.other_boots = std::mem::take(&mut before.other_boots);
+        self.other_boots.push(before);
+    }
+
+    /// Takes over what another one knows of the recording as a whole.
+    fn take_over(&mut self, other: &Self) {
+        (self.is_ended, self.messages) = (other.is_ended, other.messages);
+        self.facts.clone_from(&other.facts);
+        self.time_set_s.clone_from(&other.time_set_s);
+        self.damage.clone_from(&other.damage);
+        self.unreadable.clone_from(&other.unreadable);
+        self.lost.clone_from(&other.lost);
+        self.recorder.clone_from(&other.recorder);
+    }
+
+    /// Puts all in order when it is there.
+    fn settle(&mut self) {
+        self.set_shift();
+        self.sort();
+        self.set_zero();
+        let configuration = self.tapes.iter().find_map(configuration_of);
+        if let Some(toml) = configuration
+            && !self.configurations.keys().any(|name| name.starts_with("controller"))
+        {
+            self.configurations.insert("controller (from its tape)".to_owned(), toml);
+        }
     }
 
     /// Notes what the recorder's clock is ahead of the vehicle's: nothing on one machine, and else what the quickest

@@ -1,5 +1,6 @@
 //! The landings in a recording, and one of them alone.
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 use crate::flight::{Flight, Landing};
@@ -7,7 +8,7 @@ use crate::flight::{Flight, Landing};
 /// What belongs to a landing before its begin, in nanoseconds.
 const BEFORE_NS: i64 = 2_000_000_000;
 
-/// When each landing of a recording began, in nanoseconds of the vehicle's clock.
+/// When each landing of a flight began, in nanoseconds of the vehicle's clock.
 pub fn begins(flight: &Flight) -> Vec<i64> {
     let mut begins: Vec<i64> = flight.statuses.iter().filter_map(|it| it.started_ns).collect();
     begins.sort_unstable();
@@ -16,26 +17,40 @@ pub fn begins(flight: &Flight) -> Vec<i64> {
 }
 
 impl Flight {
-    /// Keeps one of several landings, by its number from 1 on, or the last; of a recording with one everything stays.
+    /// Keeps one of several landings, by its number from 1 on, or the last; of a recording with one everything stays, but for other
+    /// starts of the vehicle's computer.
     ///
     /// # Errors
     /// How many landings there are, when there is none of this number.
     pub fn keep_landing(&mut self, number: Option<usize>) -> Result<(), usize> {
-        let begins = begins(self);
-        let of = begins.len();
+        let boots = self.other_boots.iter().chain([&*self]);
+        let counts: BTreeMap<usize, usize> =
+            boots.map(|boot| (boot.boot.number, begins(boot).len())).collect();
+        let of: usize = counts.values().sum();
         let number = number.unwrap_or(of.max(1));
         if number == 0 || number > of.max(1) {
             return Err(of);
         }
+        let mut before = 0;
+        for (boot, count) in counts {
+            if (before + 1..=before + count).contains(&number) {
+                self.turn_to(boot);
+                break;
+            }
+            before += count;
+        }
+        self.other_boots.clear();
         if of < 2 {
             return Ok(());
         }
-        let at = |number: usize| begins.get(number.wrapping_sub(1)).copied();
-        let begun_ns = at(number).unwrap_or(i64::MIN);
-        let from_ns = if number == 1 { i64::MIN } else { begun_ns.saturating_sub(BEFORE_NS) };
-        let to_ns = at(number + 1).map_or(i64::MAX, |next_ns| next_ns.saturating_sub(BEFORE_NS));
+        let begins = begins(self);
+        let at = |index: usize| begins.get(index).copied();
+        let index = number - 1 - before;
+        let begun_ns = at(index).unwrap_or(i64::MIN);
+        let from_ns = if index == 0 { i64::MIN } else { begun_ns.saturating_sub(BEFORE_NS) };
+        let to_ns = at(index + 1).map_or(i64::MAX, |next_ns| next_ns.saturating_sub(BEFORE_NS));
         self.keep(from_ns..to_ns);
-        let before = self.statuses.first().filter(|_| number > 1);
+        let before = self.statuses.first().filter(|_| index > 0);
         let detector_changes_before = before.map_or(0, |status| status.detector_changes);
         // A status before the begin still tells of the landing before.
         for status in &mut self.statuses {
@@ -50,6 +65,13 @@ impl Flight {
         self.landing = Some(Landing { number, of, time_ns, detector_changes_before });
         self.zero_ns = begun_ns;
         Ok(())
+    }
+
+    /// Becomes what the recording has of this start of the vehicle's computer.
+    fn turn_to(&mut self, number: usize) {
+        if let Some(boot) = self.other_boots.iter_mut().find(|it| it.boot.number == number) {
+            *self = std::mem::take(boot);
+        }
     }
 
     fn keep(&mut self, time_ns: Range<i64>) {

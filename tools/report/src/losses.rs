@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use messages::has_never_come;
 
-use crate::flight::Flight;
+use crate::flight::{Boot, Flight};
 
 /// Something of which a part was lost.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -146,6 +146,12 @@ pub fn recording(flight: &Flight) -> Vec<String> {
     let mut lines = flight.damage.clone();
     if !flight.is_ended {
         lines.push("the recording has no end: its recorder was killed, or the rest is cut off; `alight record --repair` writes a copy with an end".to_owned());
+    }
+    let Boot { number, of } = flight.boot;
+    if of > 1 {
+        lines.push(format!(
+            "the vehicle's clock began anew while the recording went on, as with a start of its computer: of {of} such parts this shows number {number} alone"
+        ));
     }
     for set_s in &flight.time_set_s {
         lines.push(format!(

@@ -15,6 +15,7 @@ const VEHICLE_PERIOD_NS: i64 = 18_000_000;
 /// Replays the tapes of a flight: whether they verify, and status, estimates and the vehicle's state where the recording
 /// has the tapes alone.
 pub fn replay_tapes(flight: &mut Flight) {
+    flight.other_boots.iter_mut().for_each(replay_tapes);
     let mut texts = Vec::new();
     let mut is_verified = true;
     let is_alone = flight.statuses.is_empty();
