@@ -14,6 +14,7 @@ use messages::{
 
 use crate::channel::{Received, Record, Schema, as_json, header_as_json, matches};
 use crate::foxglove::{self, Calibration, FrameTransform, Level, Outline, Pixels, Place, Pose};
+use crate::own_autopilot::OwnAutopilot;
 use crate::protobuf::MessageType;
 
 /// Name of the world's coordinate frame as viewers have it: x east, y north, z up.
@@ -63,6 +64,7 @@ pub struct Display {
     /// Added to stamps, so that they count from 1970.
     utc_offset_ns: i64,
     vehicle_clock: VehicleClock,
+    autopilot: OwnAutopilot,
     status: Option<(Phase, String)>,
     warnings: Vec<String>,
     said: BTreeSet<String>,
@@ -149,6 +151,9 @@ impl Display {
             decode(payload).ok().map(|health| self.health(received_ns, &health))
         } else if is(topic::FROM_AUTOPILOT.key(&[])) {
             decode(payload).ok().map(|bytes| self.packet(received_ns, &bytes))
+        } else if is(topic::CONFIGURATION.key(&[])) {
+            decode(payload).ok().iter().for_each(|it| self.autopilot.configure(it));
+            None
         } else {
             None
         };
@@ -367,9 +372,10 @@ impl Display {
         records
     }
 
-    /// The place that an autopilot reports.
-    fn packet(&self, stamp_ns: i64, bytes: &MavlinkBytes) -> Vec<Record> {
-        let packets = Parser::new().push(&bytes.packet);
+    /// The place that the vehicle's autopilot reports.
+    fn packet(&mut self, stamp_ns: i64, bytes: &MavlinkBytes) -> Vec<Record> {
+        let mut packets = Parser::new().push(&bytes.packet);
+        packets.retain(|packet| self.autopilot.has_sent(packet));
         let places = packets.iter().filter_map(|packet| match packet.message.as_ref()? {
             // Zero is what it says before it knows.
             MavMessage::GLOBAL_POSITION_INT(at) if at.lat != 0 || at.lon != 0 => Some(Place {
@@ -441,7 +447,7 @@ fn encoding(format: PixelFormat) -> &'static str {
 
 #[cfg(test)]
 mod tests {
-    use autopilot::dialect::GLOBAL_POSITION_INT_DATA;
+    use autopilot::dialect::{GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA};
     use autopilot::{Sender, packet};
     use messages::{Message, encode};
 
@@ -486,18 +492,27 @@ mod tests {
     }
 
     #[test]
-    fn a_place_comes_from_the_autopilots_own_position() {
-        let message = MavMessage::GLOBAL_POSITION_INT(GLOBAL_POSITION_INT_DATA {
-            lat: 473_977_418,
-            lon: 85_455_938,
-            alt: 488_000,
-            ..GLOBAL_POSITION_INT_DATA::default()
-        });
-        let packet = packet::encode(Sender { system: 1, component: 1 }, 0, &message);
-        let bytes = MavlinkBytes { packet };
-        let records = records(&mut Display::default(), "mavlink/from-autopilot", &bytes);
-        assert_eq!(records[0].channel, "vehicle/location");
-        assert!(has(&records[0], &(473_977_418.0 * 1e-7_f64).to_le_bytes()));
+    fn a_place_comes_from_the_own_autopilots_position() {
+        let mut display = Display::default();
+        let mut shown = |system, component, message: &MavMessage| {
+            let packet = packet::encode(Sender { system, component }, 0, message);
+            records(&mut display, "mavlink/from-autopilot", &MavlinkBytes { packet })
+        };
+        let at = |lat| {
+            MavMessage::GLOBAL_POSITION_INT(GLOBAL_POSITION_INT_DATA {
+                lat,
+                lon: 85_455_938,
+                alt: 488_000,
+                ..GLOBAL_POSITION_INT_DATA::default()
+            })
+        };
+        assert_eq!(shown(1, 1, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default())).len(), 0);
+        let own = shown(1, 1, &at(473_977_418));
+        assert_eq!(own[0].channel, "vehicle/location");
+        assert!(has(&own[0], &(473_977_418.0 * 1e-7_f64).to_le_bytes()));
+        for (system, component) in [(2, 1), (1, 154)] {
+            assert_eq!(shown(system, component, &at(1)).len(), 0, "{system} {component}");
+        }
     }
 
     #[test]

@@ -5,7 +5,8 @@
 //! whatever is given.
 //!
 //! Modules in reading order: [`protobuf`] describes and encodes messages, [`foxglove`] has those of Foxglove,
-//! [`channel`] says what a record is and keeps messages as they came and as JSON, [`display`] as Foxglove shows them;
+//! [`channel`] says what a record is and keeps messages as they came and as JSON, [`display`] as Foxglove shows them, with the packets of the
+//! vehicle's [`own_autopilot`] alone;
 //! [`live`] offers the latter to programs that follow a flight; [`writer`] puts both into a file; `records` goes through one,
 //! [`mod@repair`] ends a file properly whose writer was killed,
 //! [`reader`] reads one as far as it is whole, and [`tape`] the controllers' tapes.
@@ -14,6 +15,7 @@ pub mod channel;
 pub mod display;
 pub mod foxglove;
 pub mod live;
+pub mod own_autopilot;
 pub mod protobuf;
 pub mod reader;
 mod records;
@@ -24,6 +26,7 @@ pub mod writer;
 pub use channel::{Received, Record, Schema};
 pub use display::{Picture, VehicleClock};
 pub use live::Live;
+pub use own_autopilot::OwnAutopilot;
 pub use reader::{Entry, Reading, read};
 pub use repair::{Repaired, repair};
 pub use tape::{RecordedTape, TapeReader};

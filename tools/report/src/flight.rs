@@ -429,6 +429,7 @@ impl Flight {
             }
             ["config", ..] => {
                 if let Some(configuration) = self.decoded(topic::CONFIGURATION, key, payload) {
+                    self.packets.own.configure(&configuration);
                     let Configuration { service, instance, toml, .. } = configuration;
                     let service = format!("{service}/{instance}");
                     if let Some(before) = self.configurations.get(&service) {
@@ -504,6 +505,7 @@ impl Flight {
         self.configurations.clone_from(&before.configurations);
         self.detectors.clone_from(&before.detectors);
         self.cameras.clone_from(&before.cameras);
+        self.packets.own.clone_from(&before.packets.own);
         self.other_boots = std::mem::take(&mut before.other_boots);
         self.other_boots.push(before);
     }

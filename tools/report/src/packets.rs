@@ -4,9 +4,7 @@ use std::collections::BTreeMap;
 
 use autopilot::dialect::{MavAutopilot, MavMessage, MavParamType};
 use autopilot::{Battery, Packet, Parser};
-
-/// Maximum number of texts that are kept; further ones are left out.
-const MAX_TEXTS: usize = 2000;
+use flightlog::OwnAutopilot;
 
 /// The battery at a time.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -49,19 +47,21 @@ pub struct Packets {
     pub power: Vec<Power>,
     /// What it said.
     pub texts: Vec<Text>,
+    /// Tells its packets from others on its link.
+    pub(crate) own: OwnAutopilot,
     is_px4: bool,
 }
 
 impl Packets {
-    /// Adds a packet that came at `received_ns`.
+    /// Adds a packet that came at `received_ns`, if the vehicle's autopilot has sent it.
     pub fn take(&mut self, received_ns: i64, bytes: &[u8]) {
+        let parsed =
+            Packet::from_raw(bytes).or_else(|| Parser::new().push(bytes).into_iter().next());
+        let Some(packet) = parsed.filter(|packet| self.own.has_sent(packet)) else { return };
         self.count += 1;
         self.bytes += bytes.len() as u64;
         self.received_ns.push(received_ns);
-        let packet = Packet::from_raw(bytes)
-            .or_else(|| Parser::new().push(bytes).into_iter().next())
-            .and_then(|packet| packet.message);
-        match packet {
+        match packet.message {
             Some(MavMessage::HEARTBEAT(heartbeat)) => {
                 self.is_px4 |= heartbeat.autopilot == MavAutopilot::MAV_AUTOPILOT_PX4;
             }
@@ -89,14 +89,53 @@ impl Packets {
                 // From 0, the worst, to 7.
                 let is_warning = part.severity as u32 <= 4;
                 let id = part.id;
-                let is_full = self.texts.len() >= MAX_TEXTS;
                 match self.texts.last_mut() {
                     Some(last) if id != 0 && last.id == id => last.text.push_str(&text),
-                    _ if is_full => {}
                     _ => self.texts.push(Text { received_ns, is_warning, text, id }),
                 }
             }
             _ => {}
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use autopilot::dialect::{
+        CharArray, HEARTBEAT_DATA, PARAM_VALUE_DATA, STATUSTEXT_DATA, SYS_STATUS_DATA,
+    };
+    use autopilot::{Sender, packet};
+
+    use super::*;
+
+    #[test]
+    fn what_others_on_the_link_say_is_left_out() {
+        let mut packets = Packets::default();
+        for (system, component) in [(7, 1), (8, 1), (7, 154)] {
+            let text = MavMessage::STATUSTEXT(STATUSTEXT_DATA {
+                text: format!("of {system} {component}").as_str().into(),
+                ..STATUSTEXT_DATA::default()
+            });
+            let parameter = MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
+                param_id: CharArray::from("NAME"),
+                param_value: f32::from(system) + f32::from(component),
+                ..PARAM_VALUE_DATA::default()
+            });
+            let battery = MavMessage::SYS_STATUS(SYS_STATUS_DATA {
+                voltage_battery: 1000 * u16::from(system),
+                battery_remaining: 50,
+                ..SYS_STATUS_DATA::default()
+            });
+            let heartbeat = MavMessage::HEARTBEAT(HEARTBEAT_DATA::default());
+            for message in [heartbeat, text, parameter, battery] {
+                let sender = Sender { system, component };
+                packets.take(3, &packet::encode(sender, 0, &message));
+            }
+        }
+        assert_eq!((packets.count, packets.received_ns.len(), packets.power.len()), (4, 4, 1));
+        assert_eq!(packets.power[0].voltage_v, Some(7.0));
+        assert_eq!(packets.parameters.get("NAME"), Some(&8.0));
+        assert_eq!(packets.texts.len(), 1);
+        assert_eq!(packets.texts[0].text, "of 7 1");
     }
 }
