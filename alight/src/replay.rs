@@ -18,7 +18,7 @@ use crate::terminal::{aligned, print, write_error};
 
 #[derive(Args)]
 pub(crate) struct ReplayArgs {
-    /// The recording, an MCAP file; of a recording in several files all, from the first on.
+    /// The recording, an MCAP file; of a recording in several files all, in whatever order.
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Compare what comes out of each event with what came out then, to the bit. The first event that gives another

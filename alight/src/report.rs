@@ -14,8 +14,8 @@ use crate::terminal::{print, write_error};
 
 #[derive(Args)]
 pub(crate) struct ReportArgs {
-    /// The recording of a flight (MCAP), or those of two to compare. Files that share a controller's tape are one flight,
-    /// as a recorder begins a new file when one is large.
+    /// The recording of a flight (MCAP), or those of two to compare. Files that share a controller's tape and the recorder's clock are
+    /// one flight, in whatever order they are named, as a recorder begins a new file when one is large.
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Which landing of each recording, from 1 on, where it has several [default: the last].
@@ -150,11 +150,9 @@ impl ReportArgs {
     fn beside(&self, flights: &[Flight], extension: &str) -> PathBuf {
         let Some(first) = self.files.first() else { return PathBuf::new() };
         let stem =
-            |name: &Path| name.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        let mut name = stem(first);
-        for other in flights.iter().skip(1) {
-            name.push_str(&format!("-and-{}", stem(Path::new(&other.name))));
-        }
+            |flight: &Flight| Path::new(&flight.name).file_stem().unwrap_or_default().to_owned();
+        let stems = flights.iter().map(|it| stem(it).to_string_lossy().into_owned());
+        let mut name = stems.collect::<Vec<_>>().join("-and-");
         if let Some(number) = self.landing {
             name.push_str(&format!("-landing-{number}"));
         }
@@ -218,28 +216,49 @@ fn is_same_file(one: &Path, other: &Path) -> bool {
         || one.canonicalize().ok().zip(other.canonicalize().ok()).is_some_and(|(a, b)| a == b)
 }
 
-/// The flights in files; a file that shares a tape with one before it goes on with its flight.
+/// The flights in files, in the order in which they are named; files that are parts of one recording are of one flight, in whatever
+/// order.
 fn flights(files: &[PathBuf]) -> anyhow::Result<Vec<Flight>> {
-    let mut readers: Vec<FlightReader> = Vec::new();
-    for file in files {
-        let recording = std::fs::read(file).with_context(|| format!("reading {file:?}"))?;
-        let mut alone = FlightReader::new(&name(file));
-        alone.add(&recording).with_context(|| format!("{file:?} is no recording (MCAP file)"))?;
+    let mut parts = Vec::new();
+    for (place, file) in files.iter().enumerate() {
+        let mut reader = FlightReader::new(&name(file));
+        add(&mut reader, file)?;
         ensure!(
-            !alone.is_empty(),
+            !reader.is_empty(),
             "nothing of a flight is in {file:?}; `alight land --record` and `alight record` write recordings"
         );
-        match readers.iter_mut().find(|reader| reader.shares_tape_with(&alone)) {
-            Some(same) => same.add(&recording).with_context(|| format!("reading {file:?}"))?,
-            None => readers.push(alone),
+        parts.push(Part { place, file, reader });
+    }
+    parts.sort_by_key(|part| part.reader.first_ns());
+    let mut recordings: Vec<Part<'_>> = Vec::new();
+    for part in parts {
+        match recordings.iter_mut().find(|it| it.reader.goes_on_in(&part.reader)) {
+            Some(recording) => {
+                recording.place = recording.place.min(part.place);
+                add(&mut recording.reader, part.file)?;
+            }
+            None => recordings.push(part),
         }
     }
-    let flight = |reader: FlightReader| {
-        let mut flight = reader.finish();
+    recordings.sort_by_key(|recording| recording.place);
+    let flight = |recording: Part<'_>| {
+        let mut flight = recording.reader.finish();
         replay_tapes(&mut flight);
         flight
     };
-    Ok(readers.into_iter().map(flight).collect())
+    Ok(recordings.into_iter().map(flight).collect())
+}
+
+/// A file that is read, and which of the named ones it is.
+struct Part<'a> {
+    place: usize,
+    file: &'a Path,
+    reader: FlightReader,
+}
+
+fn add(reader: &mut FlightReader, file: &Path) -> anyhow::Result<()> {
+    let recording = std::fs::read(file).with_context(|| format!("reading {file:?}"))?;
+    reader.add(&recording).with_context(|| format!("{file:?} is no recording (MCAP file)"))
 }
 
 fn name(file: &Path) -> String {
@@ -296,7 +315,7 @@ mod tests {
     #[test]
     fn files_that_share_a_tape_are_one_flight_and_others_are_not() {
         let folder = tempfile::tempdir().unwrap();
-        let write = |name: &str, begun_ns: i64, records: &[u8]| {
+        let write = |name: &str, begun_ns: i64, records: &[u8], received_ns: i64| {
             let file = folder.path().join(name);
             let mut recording = Vec::new();
             let about = flightlog::About::default();
@@ -305,25 +324,28 @@ mod tests {
             let tape = messages::Tape { begun_ns, records, ..messages::Tape::default() };
             let payload = messages::encode(&tape);
             let key = messages::topic::TAPE.key(&[]);
-            let message = flightlog::Received {
-                key: &key,
-                payload: &payload,
-                attachment: b"",
-                received_ns: 9,
-            };
+            let message =
+                flightlog::Received { key: &key, payload: &payload, attachment: b"", received_ns };
             writer.receive(message).unwrap();
             writer.finish().unwrap();
             std::fs::write(&file, recording).unwrap();
             file
         };
         let files = [
-            write("one.mcap", 3, b"one"),
-            write("one-2.mcap", 3, b"one"),
-            write("two.mcap", 4, b"one"),
-            write("in-lock-step.mcap", 3, b"two"),
+            write("one.mcap", 3, b"one", 9),
+            write("one-2.mcap", 3, b"one", 12),
+            write("two.mcap", 4, b"one", 9),
+            write("in-lock-step.mcap", 3, b"two", 9),
         ];
-        let names: Vec<String> = flights(&files).unwrap().into_iter().map(|it| it.name).collect();
-        assert_eq!(names, ["one.mcap", "two.mcap", "in-lock-step.mcap"]);
+        let names = |files: &[PathBuf]| -> Vec<String> {
+            flights(files).unwrap().into_iter().map(|it| it.name).collect()
+        };
+        assert_eq!(names(&files), ["one.mcap", "two.mcap", "in-lock-step.mcap"]);
+        // As a shell has them, and the other way round.
+        let [one, second, two, other] = files;
+        let flights_of = names(&[second.clone(), one.clone(), two.clone(), other.clone()]);
+        assert_eq!(flights_of, ["one.mcap", "two.mcap", "in-lock-step.mcap"]);
+        assert_eq!(names(&[two, other, second, one])[2], "one.mcap");
     }
 
     /// A recorded landing of its own.

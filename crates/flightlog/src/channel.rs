@@ -1,9 +1,9 @@
 //! The records of a recording: messages as they came, and as JSON.
 
 use messages::{
-    CameraInfo, CameraResponse, Configuration, ControllerStatus, DecodeError, Detections,
-    DetectorInfo, FrameAck, FrameHeader, Health, Message, RecorderStatus, Refusals, TargetEstimate,
-    Truth, VehicleState, Wind, decode, topic,
+    CameraInfo, CameraResponse, Configuration, ControllerStatus, DecodeError, Delivery, Detections,
+    DetectorInfo, FrameAck, FrameHeader, Health, Message, RecorderStatus, Refusals, TOPICS,
+    TargetEstimate, Truth, VehicleState, Wind, decode, topic,
 };
 
 use crate::protobuf::{MessageType, descriptor_set};
@@ -137,11 +137,18 @@ static JSON_TOPICS: [JsonTopic; 14] = [
     json_topic::<Configuration>(|names| topic::CONFIGURATION.key(names)),
 ];
 
-/// True when a key matches a pattern, in which `*` stands for one part.
+/// True when a key matches a pattern, in which `*` or a name in braces stands for one part.
 pub(crate) fn matches(pattern: &str, key: &str) -> bool {
     let mut wanted = pattern.split('/');
-    let is_same = key.split('/').all(|part| wanted.next().is_some_and(|w| w == "*" || w == part));
+    let is_any = |wanted: &str| wanted == "*" || wanted.starts_with('{');
+    let is_same = key.split('/').all(|part| wanted.next().is_some_and(|w| is_any(w) || w == part));
     is_same && wanted.next().is_none()
+}
+
+/// Whether a message is the last value of a state: with those a file begins, though they are from before.
+pub fn is_state(key: &str) -> bool {
+    let mut states = TOPICS.iter().filter(|row| row.delivery == Delivery::LastValue);
+    states.any(|row| matches(row.key, key))
 }
 
 /// A message as it came.
@@ -218,15 +225,18 @@ mod tests {
         assert!(!matches("detector/*/info", "detector/info"));
         assert!(!matches("detector/*/info", "detector/main/info/more"));
         assert!(!matches("detector/*/info/more", "detector/main/info"));
+        for (key, state) in [("health/detector/main", true), ("truth", false), ("status", false)] {
+            assert_eq!(is_state(key), state, "{key}");
+        }
     }
 
     #[test]
     fn every_topic_with_a_message_of_its_own_is_kept_as_json() {
         let is_bytes = |row: &&messages::Row| {
-            row.delivery == messages::Delivery::Query
+            row.delivery == Delivery::Query
                 || ["FrameHeader", "MavlinkBytes", "Tape"].contains(&row.message)
         };
-        for row in messages::TOPICS.iter().filter(|row| !is_bytes(row)) {
+        for row in TOPICS.iter().filter(|row| !is_bytes(row)) {
             assert!(JSON_TOPICS.iter().any(|it| it.name == row.message), "{}", row.message);
         }
     }

@@ -23,11 +23,11 @@ pub mod repair;
 pub mod tape;
 pub mod writer;
 
-pub use channel::{Received, Record, Schema};
+pub use channel::{Received, Record, Schema, is_state};
 pub use display::{Picture, VehicleClock};
 pub use live::Live;
 pub use own_autopilot::OwnAutopilot;
-pub use reader::{Entry, Reading, read};
+pub use reader::{Entry, Reading, in_order, read};
 pub use repair::{Repaired, repair};
 pub use tape::{RecordedTape, TapeReader};
 pub use writer::{About, Problem, Writer};

@@ -7,7 +7,7 @@ use mcap::records::{MessageHeader, Record};
 use mcap::{Channel, Summary};
 use messages::{FrameHeader, PixelFormat, decode, topic};
 
-use crate::channel::{RAW_PREFIX, Received, split_raw};
+use crate::channel::{RAW_PREFIX, Received, is_state, split_raw};
 use crate::display::picture_channel;
 use crate::foxglove::{self, Image};
 use crate::records::{Records, check_begin, contained, records_of};
@@ -111,6 +111,25 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
         found.reading.damage.push(DIFFERS.to_owned());
     }
     Ok(found.reading)
+}
+
+/// The files of a recording in the order in which they were written.
+///
+/// # Errors
+/// When one is no MCAP file at all.
+pub fn in_order(files: &[Vec<u8>]) -> Result<Vec<&[u8]>, Problem> {
+    let mut parts = Vec::new();
+    for file in files {
+        let mut first_ns = None;
+        read(file, |entry| {
+            if let Entry::Message(Received { key, received_ns, .. }) = entry {
+                first_ns = first_ns.or_else(|| (!is_state(key)).then_some(received_ns));
+            }
+        })?;
+        parts.push((first_ns, file.as_slice()));
+    }
+    parts.sort_by_key(|(first_ns, _)| *first_ns);
+    Ok(parts.into_iter().map(|(_, file)| file).collect())
 }
 
 /// What was found so far.
@@ -257,6 +276,27 @@ mod tests {
         assert_eq!(times, (5..55).collect::<Vec<_>>());
         assert_eq!((others, reading.is_ended, reading.messages), (2, true, 50));
         assert!(reading.damage.is_empty(), "{:?}", reading.damage);
+    }
+
+    #[test]
+    fn files_are_in_the_order_of_what_is_no_state_from_before() {
+        let file = |keys: &[&str], from_ns: i64| {
+            let mut file = Vec::new();
+            let mut recording = Writer::new(&mut file, &About::default()).unwrap();
+            for (received_ns, key) in (from_ns..).zip(keys) {
+                let message = Received { key, payload: b"", attachment: b"", received_ns };
+                recording.receive(message).unwrap();
+            }
+            recording.finish().unwrap();
+            file
+        };
+        let [first, second] = [
+            file(&["wind", "wind"], 5),
+            file(&["controller/status", "camera/down/info", "wind"], 4),
+        ];
+        for files in [[second.clone(), first.clone()], [first.clone(), second.clone()]] {
+            assert_eq!(in_order(&files).unwrap(), [&first, &second]);
+        }
     }
 
     #[test]

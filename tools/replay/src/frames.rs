@@ -159,7 +159,7 @@ fn configuration(tape: &RecordedTape) -> Option<String> {
     }
 }
 
-/// Searches the frames of a recording, which may be several files, again: those that the detector searched then, one
+/// Searches the frames of a recording, which may be several files in any order, again: those that the detector searched then, one
 /// after the other. The tapes, of the same recording, are replayed with what is found.
 ///
 /// # Errors
@@ -169,8 +169,9 @@ pub fn search(
     tapes: &[RecordedTape],
     again: &Again,
 ) -> anyhow::Result<Searched> {
+    let files = flightlog::in_order(files)?;
     let mut facts = Facts::default();
-    for file in files {
+    for file in &files {
         flightlog::read(file, |entry| {
             if let Entry::Message(message) = entry {
                 facts.take(message.key, message.payload);
@@ -204,7 +205,7 @@ pub fn search(
     if !frames.truths.is_empty() && frames.info.is_some() {
         frames.searched.showing_the_pad = Some(0);
     }
-    for file in files {
+    for file in &files {
         flightlog::read(file, |entry| {
             if let Entry::Picture { header, bytes, .. } = entry {
                 frames.picture(&header, bytes);
