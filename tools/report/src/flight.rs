@@ -21,6 +21,9 @@ const MAX_GAP_NS: i64 = 500_000_000;
 /// How much later after its stamp than the one before a message may come, in nanoseconds; beyond this the vehicle's clock began anew.
 const MAX_LATE_NS: i64 = 60_000_000_000;
 
+/// What still belongs to a landing after its end, in seconds.
+const AFTER_END_S: f64 = 2.0;
+
 /// Time between pictures that are measured, in nanoseconds.
 const LIGHT_PERIOD_NS: u64 = 1_000_000_000;
 
@@ -344,6 +347,14 @@ impl Flight {
     pub fn last_status(&self) -> Option<&ControllerStatus> {
         let of_landing = self.statuses.iter().rev().find(|it| it.started_ns.is_some());
         of_landing.or(self.statuses.last())
+    }
+
+    /// When the landing ended, in seconds since [`Flight::zero_ns`], with the moment after it. Later nothing happens for as long as
+    /// somebody watches.
+    pub fn end_s(&self) -> Option<f64> {
+        let mut of_landing = self.statuses.iter().filter(|it| it.stamp_ns >= self.zero_ns);
+        let finished = of_landing.find(|status| status.finished)?;
+        Some(self.at_s(finished.stamp_ns) + AFTER_END_S)
     }
 
     /// A stamp of the vehicle's clock in seconds since [`Flight::zero_ns`].

@@ -8,7 +8,7 @@ use crate::flight::{Change, Flight};
 use crate::phases;
 use crate::settings::Difference;
 
-/// Maximum number of lines; further ones are counted.
+/// Maximum number of lines: the last until the landing's end, and what still has room of those after it; others are counted.
 const MAX_LINES: usize = 2000;
 
 /// A line of the log.
@@ -33,6 +33,9 @@ pub fn of(flight: &Flight) -> (Vec<Line>, usize) {
     lines.extend(changes(flight));
     lines.sort_by(|one, other| one.time_s.total_cmp(&other.time_s));
     let left_out = lines.len().saturating_sub(MAX_LINES);
+    let end_s = flight.end_s().unwrap_or(f64::INFINITY);
+    let until_its_end = lines.partition_point(|line| line.time_s <= end_s);
+    lines.drain(..until_its_end.saturating_sub(MAX_LINES));
     lines.truncate(MAX_LINES);
     (lines, left_out)
 }
@@ -175,4 +178,39 @@ fn changes(flight: &Flight) -> Vec<Line> {
         }
     };
     flight.changes.iter().map(line).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use messages::{ControllerStatus, Phase};
+
+    use super::*;
+
+    const S: i64 = 1_000_000_000;
+
+    #[test]
+    fn of_a_long_recording_the_lines_of_the_landing_are_kept() {
+        for landing_s in [10, 1_500, 2_990] {
+            let mut flight = Flight::default();
+            let change = |s: i64| Change {
+                service: "detector/main".to_owned(),
+                received_ns: s * S,
+                setting: Difference { name: "thorough".to_owned(), one: None, other: None },
+            };
+            flight.changes = (0..3_000).map(change).collect();
+            flight.statuses.push(ControllerStatus {
+                stamp_ns: landing_s * S,
+                phase: Phase::Landed,
+                started_ns: Some(landing_s * S),
+                finished: true,
+                ..ControllerStatus::default()
+            });
+            flight.set_zero();
+            let (lines, left_out) = of(&flight);
+            assert_eq!(lines.len(), MAX_LINES);
+            assert!(left_out > 1000, "{left_out}");
+            let told = lines.iter().any(|line| line.who == "controller" && line.text == "landed");
+            assert!(told, "a landing after {landing_s} s");
+        }
+    }
 }

@@ -409,7 +409,9 @@ fn log(view: &View<'_>) -> Section {
         .collect();
     section.after.push(table(&["at", "who", "said"], rows));
     if left_out > 0 {
-        section.after.push(paragraph(&format!("{left_out} further lines are left out.")));
+        section.after.push(paragraph(&format!(
+            "{left_out} lines that are farther from the landing are left out."
+        )));
     }
     section
 }

@@ -129,10 +129,7 @@ fn time(flight: &Flight, phases: &[phases::Phase]) -> Range<f64> {
     let end_s = lasts.into_iter().flatten().max().map_or(1.0, |last_ns| flight.at_s(last_ns));
     let begun = phases.iter().find(|phase| phase.name != Phase::Idle.name());
     let from_s = begun.map_or(0.0, |phase| phase.from_s - BEFORE_S);
-    // After the end nothing happens for as long as somebody watches.
-    let mut of_landing = flight.statuses.iter().filter(|it| it.stamp_ns >= flight.zero_ns);
-    let finished = of_landing.find(|status| status.finished);
-    let end_s = finished.map_or(end_s, |status| end_s.min(flight.at_s(status.stamp_ns) + 2.0));
+    let end_s = flight.end_s().map_or(end_s, |it| it.min(end_s));
     from_s..end_s.max(from_s + 1.0)
 }
 
