@@ -357,6 +357,11 @@ impl Flight {
         Some(self.at_s(finished.stamp_ns) + AFTER_END_S)
     }
 
+    /// Whether a time of the vehicle's clock belongs to the landing that is kept.
+    pub fn has(&self, stamp_ns: i64) -> bool {
+        self.landing.as_ref().is_none_or(|landing| landing.time_ns.contains(&stamp_ns))
+    }
+
     /// A stamp of the vehicle's clock in seconds since [`Flight::zero_ns`].
     pub fn at_s(&self, stamp_ns: i64) -> f64 {
         stamp_ns.saturating_sub(self.zero_ns) as f64 * 1e-9
@@ -579,7 +584,7 @@ impl Flight {
         order(&mut self.truth, |it| it.stamp_ns);
         order(&mut self.wind, |it| it.stamp_ns);
         self.found.sort_by_key(|it| it.received_ns);
-        self.packets.received_ns.sort_unstable();
+        self.packets.received.sort_by_key(|it| it.received_ns);
         self.packets.power.sort_by_key(|it| it.received_ns);
         self.packets.texts.sort_by_key(|it| it.received_ns);
         for frames in self.frames.values_mut() {

@@ -124,9 +124,7 @@ impl Frames {
         for tape in &flight.tapes {
             all.extend(of_tape(tape, marker.as_deref()));
         }
-        if let Some(landing) = &flight.landing {
-            all.retain(|it| landing.time_ns.contains(&it.handled_ns));
-        }
+        all.retain(|it| flight.has(it.handled_ns));
         let mut frames = match all.is_empty() {
             false => Self { is_from_tape: true, all },
             true => Self { is_from_tape: false, all: of_messages(flight, marker.as_deref()) },

@@ -95,7 +95,9 @@ fn controller(flight: &Flight) -> Vec<Line> {
 fn commands(flight: &Flight) -> Vec<Line> {
     let mut lines = Vec::new();
     for tape in &flight.tapes {
-        for record in tape.parts.iter().flat_map(messages::Tape::records).flatten() {
+        let mut has_ended = false;
+        let records = tape.parts.iter().flat_map(messages::Tape::records).flatten();
+        for record in records.filter(|record| flight.has(record.now_ns)) {
             let (who, is_warning, text) = match &record.event {
                 TapeEvent::Command(command) => {
                     let reply = record.reply.as_ref();
@@ -110,7 +112,10 @@ fn commands(flight: &Flight) -> Vec<Line> {
                 TapeEvent::Presence { detector, alive: false } => {
                     ("controller", true, format!("detector {detector} went"))
                 }
-                TapeEvent::Shutdown => ("controller", false, "the controller ends".to_owned()),
+                // It is told again until all that it takes is sent.
+                TapeEvent::Shutdown if !std::mem::replace(&mut has_ended, true) => {
+                    ("controller", false, "the controller ends".to_owned())
+                }
                 _ => continue,
             };
             let time_s = flight.at_s(record.now_ns);
@@ -182,9 +187,13 @@ fn changes(flight: &Flight) -> Vec<Line> {
 
 #[cfg(test)]
 mod tests {
-    use messages::{ControllerStatus, Phase};
+    use std::borrow::Cow;
+
+    use flightlog::RecordedTape;
+    use messages::{ControllerCommand, ControllerStatus, Phase, TapeOutput, TapeWriter};
 
     use super::*;
+    use crate::flight::Landing;
 
     const S: i64 = 1_000_000_000;
 
@@ -212,5 +221,33 @@ mod tests {
             let told = lines.iter().any(|line| line.who == "controller" && line.text == "landed");
             assert!(told, "a landing after {landing_s} s");
         }
+    }
+
+    #[test]
+    fn commands_and_the_end_are_those_of_the_landing_and_told_once() {
+        let mut tape = TapeWriter::new(0);
+        let mut write = |now_ns, event: &TapeEvent<'_>| {
+            tape.write(now_ns, event, &TapeOutput::default());
+        };
+        let command = |command| TapeEvent::Command(Cow::Owned(command));
+        write(S, &command(ControllerCommand::Start));
+        write(3 * S, &command(ControllerCommand::Hold));
+        (4..8).for_each(|s| write(s * S, &TapeEvent::Shutdown));
+        let parts = tape.take().into_iter().collect();
+        let mut flight = Flight::default();
+        flight.tapes = vec![RecordedTape { begun_ns: 0, parts }];
+        let told = |flight: &Flight| -> Vec<String> {
+            commands(flight).into_iter().map(|line| line.text).collect()
+        };
+        let ends = "the controller ends".to_owned();
+        let [start, hold] = ["Start", "Hold"].map(|it| format!("{it}: refused, "));
+        assert_eq!(told(&flight), [start.clone(), hold.clone(), ends.clone()]);
+        let mut of_landing = |time_ns| {
+            let (number, of, detector_changes_before) = (1, 2, 0);
+            flight.landing = Some(Landing { number, of, time_ns, detector_changes_before });
+            told(&flight)
+        };
+        assert_eq!(of_landing(i64::MIN..2 * S), [start]);
+        assert_eq!(of_landing(2 * S..i64::MAX), [hold, ends]);
     }
 }

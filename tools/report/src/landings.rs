@@ -90,7 +90,7 @@ impl Flight {
             pictures.retain(|it| time_ns.contains(&it.stamp_ns));
         }
         self.changes.retain(|it| is_received(it.received_ns));
-        self.packets.received_ns.retain(|it| is_received(*it));
+        self.packets.received.retain(|it| is_received(it.received_ns));
         self.packets.power.retain(|it| is_received(it.received_ns));
         self.packets.texts.retain(|it| is_received(it.received_ns));
     }

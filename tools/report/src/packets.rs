@@ -6,6 +6,15 @@ use autopilot::dialect::{MavAutopilot, MavMessage, MavParamType};
 use autopilot::{Battery, Packet, Parser};
 use flightlog::OwnAutopilot;
 
+/// That a packet came.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Arrival {
+    /// When, in nanoseconds of the recorder's clock.
+    pub received_ns: i64,
+    /// Its length in bytes.
+    pub bytes: usize,
+}
+
 /// The battery at a time.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Power {
@@ -35,12 +44,8 @@ pub struct Text {
 /// What the autopilot's packets say.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Packets {
-    /// How many there are.
-    pub count: u64,
-    /// Bytes of all.
-    pub bytes: u64,
-    /// When each came, in nanoseconds of the recorder's clock.
-    pub received_ns: Vec<i64>,
+    /// Each of them.
+    pub received: Vec<Arrival>,
     /// The last value of each parameter that was asked for.
     pub parameters: BTreeMap<String, f64>,
     /// The battery.
@@ -58,9 +63,7 @@ impl Packets {
         let parsed =
             Packet::from_raw(bytes).or_else(|| Parser::new().push(bytes).into_iter().next());
         let Some(packet) = parsed.filter(|packet| self.own.has_sent(packet)) else { return };
-        self.count += 1;
-        self.bytes += bytes.len() as u64;
-        self.received_ns.push(received_ns);
+        self.received.push(Arrival { received_ns, bytes: bytes.len() });
         match packet.message {
             Some(MavMessage::HEARTBEAT(heartbeat)) => {
                 self.is_px4 |= heartbeat.autopilot == MavAutopilot::MAV_AUTOPILOT_PX4;
@@ -132,7 +135,7 @@ mod tests {
                 packets.take(3, &packet::encode(sender, 0, &message));
             }
         }
-        assert_eq!((packets.count, packets.received_ns.len(), packets.power.len()), (4, 4, 1));
+        assert_eq!((packets.received.len(), packets.power.len()), (4, 1));
         assert_eq!(packets.power[0].voltage_v, Some(7.0));
         assert_eq!(packets.parameters.get("NAME"), Some(&8.0));
         assert_eq!(packets.texts.len(), 1);

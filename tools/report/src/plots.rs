@@ -356,8 +356,8 @@ pub fn battery(view: &View<'_>) -> Vec<Chart> {
     let voltage = view.curve(&flight.packets.power, |it| {
         Some(at(flight.at_s(flight.vehicle_ns(it.received_ns)), it.voltage_v?))
     });
-    let received = flight.packets.received_ns.iter();
-    let mut packets = per_second(received.map(|ns| flight.at_s(flight.vehicle_ns(*ns))));
+    let received = flight.packets.received.iter();
+    let mut packets = per_second(received.map(|it| flight.at_s(flight.vehicle_ns(it.received_ns))));
     packets.retain(|point| view.is_shown(point.x));
     let line = |name: &str, ink, points| vec![layer(name, ink, Shape::Line, points)];
     let mut voltage =

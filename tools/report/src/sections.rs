@@ -358,12 +358,14 @@ fn wind(view: &View<'_>) -> Section {
 fn battery(view: &View<'_>) -> Section {
     let flight = view.flight;
     let mut section = section("battery", "Battery and link", "");
-    if flight.packets.count == 0 {
+    let packets = &flight.packets.received;
+    if packets.is_empty() {
         section.before.push(missing("the autopilot's packets"));
     } else {
         section.before.push(paragraph(&format!(
             "{} packets of the autopilot, {} bytes.",
-            flight.packets.count, flight.packets.bytes
+            packets.len(),
+            packets.iter().map(|it| it.bytes).sum::<usize>()
         )));
     }
     let charts = plots::battery(view).into_iter();
