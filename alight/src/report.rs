@@ -312,40 +312,44 @@ mod tests {
         assert!(refusal(Some(&empty)).contains("nothing of a flight is in"));
     }
 
+    /// Writes a recording of a part of a tape.
+    fn write(file: &Path, clock: &str, received_ns: i64, begun_ns: i64, records: &[u8]) {
+        let mut recording = Vec::new();
+        let facts = [("clock".to_owned(), clock.to_owned())].into();
+        let about = flightlog::About { facts, ..flightlog::About::default() };
+        let mut writer = flightlog::Writer::new(&mut recording, &about).unwrap();
+        let tape =
+            messages::Tape { begun_ns, records: records.to_vec(), ..messages::Tape::default() };
+        let (key, payload) = (messages::topic::TAPE.key(&[]), messages::encode(&tape));
+        let message =
+            flightlog::Received { key: &key, payload: &payload, attachment: b"", received_ns };
+        writer.receive(message).unwrap();
+        writer.finish().unwrap();
+        std::fs::write(file, recording).unwrap();
+    }
+
     #[test]
-    fn files_that_share_a_tape_are_one_flight_and_others_are_not() {
+    fn files_that_share_tape_and_clock_are_one_flight_in_any_order() {
         let folder = tempfile::tempdir().unwrap();
-        let write = |name: &str, begun_ns: i64, records: &[u8], received_ns: i64| {
-            let file = folder.path().join(name);
-            let mut recording = Vec::new();
-            let about = flightlog::About::default();
-            let mut writer = flightlog::Writer::new(&mut recording, &about).unwrap();
-            let records = records.to_vec();
-            let tape = messages::Tape { begun_ns, records, ..messages::Tape::default() };
-            let payload = messages::encode(&tape);
-            let key = messages::topic::TAPE.key(&[]);
-            let message =
-                flightlog::Received { key: &key, payload: &payload, attachment: b"", received_ns };
-            writer.receive(message).unwrap();
-            writer.finish().unwrap();
-            std::fs::write(&file, recording).unwrap();
-            file
+        let path = |name: &str| folder.path().join(name);
+        let [one, second, two, other, ground] =
+            ["one.mcap", "one-2.mcap", "two.mcap", "in-lock-step.mcap", "ground.mcap"].map(path);
+        write(&one, "drone", 9, 3, b"one");
+        write(&second, "drone", 12, 3, b"one");
+        write(&two, "drone", 9, 4, b"one");
+        write(&other, "drone", 9, 3, b"two");
+        write(&ground, "ground", 5, 3, b"one");
+        let names = |files: &[&PathBuf]| -> Vec<String> {
+            let files: Vec<PathBuf> = files.iter().map(|it| (*it).clone()).collect();
+            flights(&files).unwrap().into_iter().map(|it| it.name).collect()
         };
-        let files = [
-            write("one.mcap", 3, b"one", 9),
-            write("one-2.mcap", 3, b"one", 12),
-            write("two.mcap", 4, b"one", 9),
-            write("in-lock-step.mcap", 3, b"two", 9),
-        ];
-        let names = |files: &[PathBuf]| -> Vec<String> {
-            flights(files).unwrap().into_iter().map(|it| it.name).collect()
-        };
-        assert_eq!(names(&files), ["one.mcap", "two.mcap", "in-lock-step.mcap"]);
-        // As a shell has them, and the other way round.
-        let [one, second, two, other] = files;
-        let flights_of = names(&[second.clone(), one.clone(), two.clone(), other.clone()]);
+        let flights_of = names(&[&one, &second, &two, &other]);
         assert_eq!(flights_of, ["one.mcap", "two.mcap", "in-lock-step.mcap"]);
-        assert_eq!(names(&[two, other, second, one])[2], "one.mcap");
+        // As a shell has them, and the other way round.
+        assert_eq!(names(&[&second, &one, &two, &other]), flights_of);
+        assert_eq!(names(&[&two, &other, &second, &one])[2], "one.mcap");
+        // Of the same flight, by another recorder.
+        assert_eq!(names(&[&second, &ground, &one]), ["one.mcap", "ground.mcap"]);
     }
 
     /// A recorded landing of its own.

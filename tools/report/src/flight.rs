@@ -264,9 +264,11 @@ impl FlightReader {
         self.first_ns
     }
 
-    /// True when another is of the same recording: a tape goes on in it.
+    /// True when another is of the same recording: a tape goes on in it, and its times are of the same clock. The ground's of the
+    /// same flight is another.
     pub fn goes_on_in(&self, other: &Self) -> bool {
-        self.tapes.shares_tape_with(&other.tapes)
+        let clock = |reader: &Self| reader.flight.facts.get("clock").cloned();
+        self.tapes.shares_tape_with(&other.tapes) && clock(self) == clock(other)
     }
 
     /// The flight; of several starts of the vehicle's computer that with the last landing, or the last.
