@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::Context;
 use flightlog::Record;
 use flightlog::writer::dropped;
-use node::{HealthCounters, Node, Tapped, now_ns};
+use node::{HealthCounters, Node, Tapped, clock_name, now_ns};
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 
@@ -72,7 +72,8 @@ impl Live {
                 tracing::error!(problem = format!("{problem:#}"), "No viewer is served any more");
             }
         });
-        Ok(Some(Self { hub, health, records: flightlog::Live::new(0), told_lost: None, task }))
+        let records = flightlog::Live::new(0, clock_name());
+        Ok(Some(Self { hub, health, records, told_lost: None, task }))
     }
 
     /// Whether somebody follows; the first one gets the last values of all states.
@@ -82,7 +83,7 @@ impl Live {
         states: impl IntoIterator<Item = &'a Tapped>,
     ) -> bool {
         if self.hub.take_begun() {
-            self.records = flightlog::Live::new(utc_offset_ns());
+            self.records = flightlog::Live::new(utc_offset_ns(), clock_name());
             self.told_lost = None;
             for state in states {
                 self.take(state, None);

@@ -69,6 +69,8 @@ struct Overview {
     /// When the first message came that is no state from before, in nanoseconds.
     first_ns: Option<i64>,
     last_ns: i64,
+    /// The name of the recorder's clock.
+    clock: Option<String>,
     /// When the last health report of each service and instance came.
     services: BTreeMap<Name, i64>,
 }
@@ -121,7 +123,8 @@ pub(crate) fn run(
         sleep(BEGIN).await;
         let length_s = overview.last_ns.saturating_sub(first_ns) as f64 * 1e-9;
         write_error(&format!("publishing {length_s:.0} s of flight; Ctrl-C ends it"));
-        let mut restamp = Restamp::new(first_ns, now_ns(), clock_name());
+        let mut restamp =
+            Restamp::new(first_ns, now_ns(), clock_name()).recorded_by(overview.clock.as_deref());
         let alive: BTreeMap<_, _> = overview
             .services
             .into_iter()
@@ -151,6 +154,7 @@ fn in_order(files: Vec<Vec<u8>>, without: &[String]) -> anyhow::Result<(Vec<Vec<
         let part = overview(&file, without)?;
         whole.first_ns = whole.first_ns.into_iter().chain(part.first_ns).min();
         whole.last_ns = whole.last_ns.max(part.last_ns);
+        whole.clock = whole.clock.or(part.clock);
         for (name, last_ns) in part.services {
             let newest_ns = whole.services.entry(name).or_insert(last_ns);
             *newest_ns = last_ns.max(*newest_ns);
@@ -164,7 +168,14 @@ fn in_order(files: Vec<Vec<u8>>, without: &[String]) -> anyhow::Result<(Vec<Vec<
 fn overview(file: &[u8], without: &[String]) -> anyhow::Result<Overview> {
     let mut overview = Overview::default();
     flightlog::read(file, |entry| {
-        let Entry::Message(Received { key, received_ns, .. }) = entry else { return };
+        let Received { key, received_ns, .. } = match entry {
+            Entry::Message(message) => message,
+            Entry::About(facts) => {
+                overview.clock = facts.get("clock").cloned();
+                return;
+            }
+            _ => return,
+        };
         let Some(row) = played(key, without) else { return };
         if row.delivery != Delivery::LastValue {
             overview.first_ns.get_or_insert(received_ns);

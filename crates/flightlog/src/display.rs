@@ -31,7 +31,7 @@ const MAP_FROM_NED: FrameTransform<'static> = FrameTransform {
     rotation_wxyz: [0.0, FRAC_1_SQRT_2, FRAC_1_SQRT_2, 0.0],
 };
 /// Maximum time between a stamp and the reception of its message by one clock, in nanoseconds: stamps farther away are
-/// another clock's.
+/// another clock's, where the clocks' names are not known.
 const MAX_AGE_NS: i64 = 60_000_000_000;
 /// Maximum number of lines and files that are remembered in order not to repeat them; further ones are left out.
 const MAX_REMEMBERED: usize = 4096;
@@ -74,15 +74,36 @@ pub struct Display {
 /// The vehicle's clock, as the one who receives its messages knows it.
 #[derive(Clone, Debug, Default)]
 pub struct VehicleClock {
-    /// Added to its stamps, where it is another clock, so that they are of ours.
+    /// The name of ours, where it is known.
+    own: Option<String>,
+    /// The name of the controller's, by which messages are stamped that do not name their clock.
+    controllers: Option<String>,
+    /// Added to stamps of another clock, so that they are of ours.
     offset_ns: Option<i64>,
 }
 
 impl VehicleClock {
-    /// A stamp by our clock: one of the vehicle's, where that is another one, by the age of its first message.
-    pub fn ours(&mut self, received_ns: i64, stamp_ns: i64) -> i64 {
+    /// For who receives by a clock of this name.
+    pub fn new(own: Option<&str>) -> Self {
+        Self { own: own.map(str::to_owned), ..Self::default() }
+    }
+
+    /// Takes the name of the controller's clock from its health.
+    pub fn take_health(&mut self, health: &Health) {
+        if health.service == "controller" {
+            self.controllers = Some(health.clock.clone());
+        }
+    }
+
+    /// A stamp by our clock: one of another, by the age of its first message. Clocks are told apart by their names; where one is not
+    /// known, a stamp that is far away is of another.
+    pub fn ours(&mut self, received_ns: i64, stamp_ns: i64, clock: Option<&str>) -> i64 {
         let apart_ns = received_ns.saturating_sub(stamp_ns);
-        if apart_ns.unsigned_abs() <= MAX_AGE_NS.unsigned_abs() {
+        let is_ours = match (self.own.as_deref(), clock.or(self.controllers.as_deref())) {
+            (Some(own), Some(clock)) => own == clock,
+            _ => apart_ns.unsigned_abs() <= MAX_AGE_NS.unsigned_abs(),
+        };
+        if is_ours {
             return stamp_ns;
         }
         let known = self.offset_ns.filter(|it| it.abs_diff(apart_ns) <= MAX_AGE_NS as u64);
@@ -91,9 +112,9 @@ impl VehicleClock {
 }
 
 impl Display {
-    /// Nothing was shown yet; `utc_offset_ns` is the time since 1970 less that of the clock of all stamps.
-    pub fn new(utc_offset_ns: i64) -> Self {
-        Self { utc_offset_ns, ..Self::default() }
+    /// Nothing was shown yet; `utc_offset_ns` is the time since 1970 less that of the clock of all stamps, which has this name.
+    pub fn new(utc_offset_ns: i64, clock: Option<&str>) -> Self {
+        Self { utc_offset_ns, vehicle_clock: VehicleClock::new(clock), ..Self::default() }
     }
 
     /// A message for programs that know nothing of Alight: as JSON, and as it is shown.
@@ -108,7 +129,8 @@ impl Display {
         header: &FrameHeader,
         picture: &Picture,
     ) -> Vec<Record> {
-        let stamp_ns = self.our_clock(message.received_ns, header.stamp_ns);
+        let clock = Some(header.clock.as_str());
+        let stamp_ns = self.vehicle_clock.ours(message.received_ns, header.stamp_ns, clock);
         let camera = topic::FRAME.first_name(message.key).unwrap_or(&header.camera);
         let shown = self.picture(camera, stamp_ns, header, message.payload, picture);
         [header_as_json(message, stamp_ns, header)].into_iter().chain(shown).collect()
@@ -120,7 +142,8 @@ impl Display {
         let is = |pattern: String| matches(&pattern, key);
         let records = if let Some(detector) = topic::DETECTIONS.first_name(key) {
             decode(payload).ok().map(|found: Detections| {
-                let at_ns = self.our_clock(received_ns, found.header.stamp_ns);
+                let FrameHeader { stamp_ns, clock, .. } = &found.header;
+                let at_ns = self.vehicle_clock.ours(received_ns, *stamp_ns, Some(clock));
                 self.detections(detector, at_ns, &found)
             })
         } else if is(topic::VEHICLE_STATE.key(&[])) {
@@ -148,7 +171,10 @@ impl Display {
         } else if is(topic::DETECTOR_INFO.key(&[])) {
             decode(payload).ok().map(|info| self.detector(received_ns, &info))
         } else if is(topic::HEALTH.key(&[])) {
-            decode(payload).ok().map(|health| self.health(received_ns, &health))
+            decode(payload).ok().map(|health| {
+                self.vehicle_clock.take_health(&health);
+                self.health(received_ns, &health)
+            })
         } else if is(topic::FROM_AUTOPILOT.key(&[])) {
             decode(payload).ok().map(|bytes| self.packet(received_ns, &bytes))
         } else if is(topic::CONFIGURATION.key(&[])) {
@@ -185,9 +211,9 @@ impl Display {
         Some(file)
     }
 
-    /// A stamp by our clock.
+    /// A stamp of the controller's clock, or of the simulator's, by ours.
     fn our_clock(&mut self, received_ns: i64, stamp_ns: i64) -> i64 {
-        self.vehicle_clock.ours(received_ns, stamp_ns)
+        self.vehicle_clock.ours(received_ns, stamp_ns, None)
     }
 
     /// A frame of a camera as a picture, taken at `stamp_ns` by our clock.
@@ -464,7 +490,7 @@ mod tests {
 
     #[test]
     fn picture_and_overlay_have_the_same_stamp() {
-        let mut display = Display::new(1_700_000_000_000_000_000);
+        let mut display = Display::new(1_700_000_000_000_000_000, None);
         let header = FrameHeader { stamp_ns: 123_456_789, ..FrameHeader::sample() };
         let jpeg = Picture::Jpeg(vec![1]);
         let picture = display.picture("down", 123_456_789, &header, b"", &jpeg).unwrap();
@@ -489,6 +515,35 @@ mod tests {
         // It was started again.
         assert_eq!(display.our_clock(days + 100 * S, 20 * S), days + 100 * S);
         assert_eq!(display.our_clock(i64::MAX, i64::MIN), -1, "saturates");
+    }
+
+    #[test]
+    fn clocks_are_told_apart_by_their_names() {
+        const S: i64 = 1_000_000_000;
+        let health = |service: &str, clock: &str| Health {
+            service: service.into(),
+            clock: clock.into(),
+            instance: "main".into(),
+            host: String::new(),
+            version: String::new(),
+            stamp_ns: 0,
+            pid: 0,
+            cpu_s: 0.0,
+            uptime_s: 0.0,
+            rates: Vec::new(),
+            latencies: Vec::new(),
+            drops: Vec::new(),
+            errors: Vec::new(),
+        };
+        let mut clock = VehicleClock::new(Some("ground"));
+        // The vehicle was started 20 s after the ground.
+        assert_eq!(clock.ours(50 * S, 30 * S, None), 30 * S, "its name is not known");
+        clock.take_health(&health("recorder", "ground"));
+        assert_eq!(clock.ours(50 * S, 30 * S, None), 30 * S, "its name is not known");
+        clock.take_health(&health("controller", "drone"));
+        assert_eq!(clock.ours(50 * S, 30 * S, None), 50 * S);
+        assert_eq!(clock.ours(53 * S, 32 * S, Some("drone")), 52 * S);
+        assert_eq!(clock.ours(200 * S, 100 * S, Some("ground")), 100 * S, "ours, and late");
     }
 
     #[test]

@@ -31,9 +31,9 @@ pub struct Live {
 }
 
 impl Live {
-    /// Nothing was sent yet; `utc_offset_ns` is the time since 1970 less that of the clock of all stamps.
-    pub fn new(utc_offset_ns: i64) -> Self {
-        Self { display: Display::new(utc_offset_ns), utc_offset_ns }
+    /// Nothing was sent yet; `utc_offset_ns` is the time since 1970 less that of the clock of all stamps, which has this name.
+    pub fn new(utc_offset_ns: i64, clock: &str) -> Self {
+        Self { display: Display::new(utc_offset_ns, Some(clock)), utc_offset_ns }
     }
 
     /// The messages that are made of one.
@@ -185,7 +185,7 @@ mod tests {
 
     #[test]
     fn a_message_is_made_of_what_came() {
-        let mut live = Live::new(1_000);
+        let mut live = Live::new(1_000, "clock");
         let payload = encode(&Wind { velocity_ned_m_s: [1.0, 0.0, 0.0], stamp_ns: 7 });
         let received = Received { key: "wind", payload: &payload, attachment: b"", received_ns: 9 };
         let records = live.message(received);

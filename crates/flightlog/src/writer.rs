@@ -46,7 +46,7 @@ pub enum Problem {
 pub struct About {
     /// The program and its version.
     pub program: String,
-    /// Facts by name: the host, the clock.
+    /// Facts by name: the host, the clock's name (`clock`).
     pub facts: BTreeMap<String, String>,
     /// Time since 1970 less that of the clock of all stamps, in nanoseconds: the file's own times count from 1970.
     pub utc_offset_ns: i64,
@@ -99,7 +99,7 @@ impl<W: Write> Writer<W> {
         Ok(Self {
             mcap,
             open: BTreeMap::new(),
-            display: Display::new(utc_offset_ns),
+            display: Display::new(utc_offset_ns, about.facts.get("clock").map(String::as_str)),
             utc_offset_ns,
         })
     }

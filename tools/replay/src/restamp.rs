@@ -28,6 +28,11 @@ impl Restamp {
         }
     }
 
+    /// The same of a recorder whose clock had this name, if that is known.
+    pub fn recorded_by(self, clock: Option<&str>) -> Self {
+        Self { vehicle_clock: VehicleClock::new(clock), ..self }
+    }
+
     /// A time of the recorder's clock by that of now, in nanoseconds.
     pub fn due_ns(&self, received_ns: i64) -> i64 {
         received_ns.saturating_add(self.shift_ns)
@@ -43,12 +48,13 @@ impl Restamp {
             self.stamped(message, |now, it: &mut Refusals| it.header = now.header(&it.header))
         } else if topic::FRAME_ACK.first_name(key).is_some() {
             self.stamped(message, |now, it: &mut FrameAck| {
-                it.stamp_ns = now.stamp_ns(it.stamp_ns);
+                it.stamp_ns = now.stamp_of(it.stamp_ns, Some(&it.clock));
                 now.clock.clone_into(&mut it.clock);
             })
         } else if topic::HEALTH.first_name(key).is_some() {
             self.stamped(message, |now, it: &mut Health| {
-                it.stamp_ns = now.stamp_ns(it.stamp_ns);
+                now.restamp.vehicle_clock.take_health(it);
+                it.stamp_ns = now.stamp_of(it.stamp_ns, Some(&it.clock));
                 now.clock.clone_into(&mut it.clock);
             })
         } else if is(topic::VEHICLE_STATE.key(&[])) {
@@ -127,13 +133,18 @@ impl std::ops::Deref for Now<'_> {
 }
 
 impl Now<'_> {
+    /// A stamp of the controller's clock, or of the simulator's.
     fn stamp_ns(&mut self, stamp_ns: i64) -> i64 {
-        let ours_ns = self.restamp.vehicle_clock.ours(self.received_ns, stamp_ns);
+        self.stamp_of(stamp_ns, None)
+    }
+
+    fn stamp_of(&mut self, stamp_ns: i64, clock: Option<&str>) -> i64 {
+        let ours_ns = self.restamp.vehicle_clock.ours(self.received_ns, stamp_ns, clock);
         self.restamp.due_ns(ours_ns)
     }
 
     fn header(&mut self, header: &FrameHeader) -> FrameHeader {
-        let stamp_ns = self.stamp_ns(header.stamp_ns);
+        let stamp_ns = self.stamp_of(header.stamp_ns, Some(&header.clock));
         FrameHeader { stamp_ns, clock: self.restamp.clock.clone(), ..header.clone() }
     }
 }
@@ -189,6 +200,21 @@ mod tests {
         assert_eq!(moved.header.stamp_ns, 5_000_000_000_000 - 40);
         assert_eq!(moved.header.clock, "here");
         assert_eq!(moved.detections, found.detections);
+    }
+
+    #[test]
+    fn stamps_of_a_vehicle_that_was_started_with_the_ground_are_moved_by_its_clocks_name() {
+        let header = |clock: &str| FrameHeader {
+            stamp_ns: RECEIVED_NS - 20_000_000_000,
+            clock: clock.into(),
+            ..FrameHeader::sample()
+        };
+        let mut restamp = restamp().recorded_by(Some("ground"));
+        for (clock, stamp_ns) in [("ground", 4_980_000_000_000), ("drone", 5_000_000_000_000)] {
+            let found = Detections { header: header(clock), ..Detections::sample() };
+            let moved = again(&mut restamp, "detector/main/detections", &found);
+            assert_eq!(moved.header.stamp_ns, stamp_ns, "{clock}");
+        }
     }
 
     #[test]
