@@ -222,6 +222,8 @@ async fn in_a_browser() -> anyhow::Result<()> {
         last = tokio::task::block_in_place(|| line)?;
         println!("{last}");
         match last.as_str() {
+            "STOP" => kill_process(landing.service("dashboard")?.pid, Signal::STOP)?,
+            "CONT" => kill_process(landing.service("dashboard")?.pid, Signal::CONT)?,
             "KILL" => drop(landing.kill("dashboard")?),
             "START" => {
                 landing.start_by_hand("dashboard", &[])?;

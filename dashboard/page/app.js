@@ -163,9 +163,10 @@ function showHello(hello) {
   enable();
 }
 
-/** Buttons that cannot be used say so. */
+/** Buttons that cannot be used say so, and are not held: one that is disabled does not hear that it is let go. */
 function enable() {
   const may = known.hello && !known.hello.no_commands && isConnected();
+  if (!may) connectionLost(link);
   for (const button of document.querySelectorAll('button.hold')) {
     /** @type {HTMLButtonElement} */ (button).disabled = !may;
   }

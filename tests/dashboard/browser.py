@@ -1,7 +1,7 @@
 """Looks at a landing in a real browser, and commands it: browser.py URL FOLDER
 
-Says `KILL` and `START` when the page's server is to be killed and started again, and waits for a line after each. Prints what
-was measured as JSON on its last line. Exit status 77: no browser, or no package to drive one.
+Says `STOP` and `CONT` when the page's server is to be stopped and to go on, `KILL` and `START` when it is to be killed and started
+again, and waits for a line after each. Prints what was measured as JSON on its last line. Exit status 77: no browser, or no package to drive one.
 """
 
 import json
@@ -31,6 +31,7 @@ SPREAD = """(selector) => {
 LINES = "(selector) => [...document.querySelectorAll(selector)].map((it) => getComputedStyle(it).textDecorationLine)"
 # What tells of the landing, each in its own way, and has something to tell throughout.
 TELLING = ["#height", "#why", "#mode", "#detector-why", "#detectors td", "#services td", "#recorders", "#checks span", "#strips span:last-child", "#video-text"]
+CONNECTED = "document.getElementById('connection').textContent === 'connected'"
 # A button that is pressed shortly and then held, before the server has answered the first press.
 TWICE = """(button) => {
   const key = (kind) => button.dispatchEvent(new KeyboardEvent(kind, { key: ' ', bubbles: true }));
@@ -115,6 +116,22 @@ def give(page, command, down, up):
     raise AssertionError(f"{command} is not accepted; the last reply: {text(page, '#reply')}")
 
 
+def lose_link_while_held(page):
+    """Holds a button while the link stalls: nothing may be sent once buttons cannot be used."""
+    # Without the focus, which some browsers give to no button: one that loses it hears of that.
+    page.evaluate("document.activeElement.blur()")
+    page.locator("button[data-command=hold]").dispatch_event("keydown", {"key": " "})
+    time.sleep(0.2)
+    asked("STOP")
+    wait(page, "document.querySelector('button[data-command=hold]').disabled", 5)
+    # The second is over meanwhile.
+    time.sleep(0.3)
+    asked("CONT")
+    wait(page, CONNECTED, 10)
+    time.sleep(0.5)
+    assert "nothing was sent" in text(page, "#reply"), text(page, "#reply")
+
+
 def replied(begin):
     """The condition that the last reply begins like this."""
     return f"document.getElementById('reply').textContent.startsWith('{begin}')"
@@ -165,7 +182,7 @@ def main():
         page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda problem: problems.append(str(problem)))
         page.goto(URL)
-        wait(page, "document.getElementById('connection').textContent === 'connected'")
+        wait(page, CONNECTED)
         wait(page, "document.getElementById('phase').textContent === 'Descending'")
         wait(page, "/found 1 in it/.test(document.getElementById('video-text').textContent)")
         wait(page, "document.getElementById('log').children.length > 2")
@@ -216,6 +233,8 @@ def main():
         page.locator("button[data-command=hold]").dispatch_event("keyup", {"key": " "})
         wait(page, "/by the controller/.test(document.getElementById('reply').textContent)", 10)
 
+        lose_link_while_held(page)
+
         page.set_viewport_size({"width": 360, "height": 740})
         time.sleep(0.5)
         width = page.evaluate("document.documentElement.scrollWidth")
@@ -244,7 +263,7 @@ def main():
             assert strip.startswith("- "), f"a number of long ago: {strip}"
         page.screenshot(path=FOLDER / "cut-off.png", full_page=True)
         asked("START")
-        measured["back_s"] = wait(page, "document.getElementById('connection').textContent === 'connected'", 10)
+        measured["back_s"] = wait(page, CONNECTED, 10)
         wait(page, "!document.getElementById('video-panel').classList.contains('stale')", 10)
         wait(page, "!document.querySelector('main').classList.contains('cut-off')", 2)
 
