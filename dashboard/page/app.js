@@ -1,6 +1,6 @@
 // @ts-check
 // The page: takes what the server tells, shows it, and greys what is no longer current.
-import { connectionLost, holdable, isHeld, nonceCame } from './hold.js';
+import { answered, connectionLost, holdable, isHeld, nonceCame, release } from './hold.js';
 import { Map2 } from './map.js';
 import { follow } from './picture.js';
 import { Strip } from './strips.js';
@@ -151,6 +151,7 @@ function take(message) {
   } else if (message.kind === 'nonce') {
     nonceCame(link, message);
   } else if (message.kind === 'reply') {
+    answered(message.command);
     const verdict = `${message.accepted ? 'accepted' : 'refused'} by the ${message.who}`;
     link.tell(`${message.command}: ${message.who === 'nobody' ? 'no answer' : verdict}: ${message.why}`, message.accepted ? 'good' : 'bad');
   }
@@ -166,7 +167,7 @@ function showHello(hello) {
 /** Buttons that cannot be used say so, and are not held: one that is disabled does not hear that it is let go. */
 function enable() {
   const may = known.hello && !known.hello.no_commands && isConnected();
-  if (!may) connectionLost(link);
+  if (!may) release(link);
   for (const button of document.querySelectorAll('button.hold')) {
     /** @type {HTMLButtonElement} */ (button).disabled = !may;
   }

@@ -14,6 +14,8 @@ const HOLD_MS = 1000;
 let press = null;
 /** Presses so far: the nonce of an earlier one is good for nothing once the next was asked for. */
 let presses = 0;
+/** The command that was sent last and has no answer yet. @type {string | null} */
+let unanswered = null;
 
 /** @param {HTMLButtonElement} button */
 function named(button) {
@@ -52,14 +54,29 @@ export function nonceCame(link, message) {
     const { button, nonce } = press;
     button.classList.remove('holding');
     press = null;
-    const sent = link.send({ kind: 'command', ...named(button), nonce });
+    const it = named(button);
+    const sent = link.send({ kind: 'command', ...it, nonce });
+    if (sent) unanswered = it.argument === null ? it.command : `${it.command} ${it.argument}`;
     link.tell(sent ? 'Sent, waiting for the answer ...' : 'No connection.', sent ? 'busy' : 'bad');
   }, HOLD_MS);
 }
 
-/** Lets go of whatever is held, as the connection is lost. @param {Link} link */
-export function connectionLost(link) {
+/** An answer has come. @param {string} command what it is for, with its argument */
+export function answered(command) {
+  if (unanswered === command) unanswered = null;
+}
+
+/** Lets go of whatever is held, as nothing can be sent. @param {Link} link */
+export function release(link) {
   cancel(link, 'The connection was lost: nothing was sent.');
+}
+
+/** No answer comes any more. @param {Link} link */
+export function connectionLost(link) {
+  release(link);
+  if (unanswered === null) return;
+  link.tell(`${unanswered}: the connection was lost before the answer: it may have been carried out; see "What happened".`, 'bad');
+  unanswered = null;
 }
 
 /** Whether this button is held. @param {HTMLButtonElement} button */

@@ -132,6 +132,21 @@ def lose_link_while_held(page):
     assert "nothing was sent" in text(page, "#reply"), text(page, "#reply")
 
 
+def lose_answer(page):
+    """Loses the connection between a command and its answer."""
+    tab_to(page, "hold")
+    page.keyboard.down("Space")
+    time.sleep(0.6)
+    asked("STOP")
+    wait(page, replied("Sent, waiting"), 2)
+    page.keyboard.up("Space")
+    wait(page, "!" + replied("Sent, waiting"), 10)
+    told = text(page, "#reply")
+    assert told.startswith("hold: ") and "may have been carried out" in told, told
+    asked("CONT")
+    wait(page, CONNECTED, 10)
+
+
 def replied(begin):
     """The condition that the last reply begins like this."""
     return f"document.getElementById('reply').textContent.startsWith('{begin}')"
@@ -234,6 +249,7 @@ def main():
         wait(page, "/by the controller/.test(document.getElementById('reply').textContent)", 10)
 
         lose_link_while_held(page)
+        lose_answer(page)
 
         page.set_viewport_size({"width": 360, "height": 740})
         time.sleep(0.5)
