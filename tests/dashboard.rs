@@ -200,7 +200,8 @@ async fn in_a_browser() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let pictures = std::env::var_os("ALIGHT_PICTURES").map_or(folder.path().into(), PathBuf::from);
     let page = free_page()?;
-    let args = [["--seed", "4"], ["--dashboard", &page], SLOWLY].concat();
+    let few = ["--set", "dashboard.max_clients=2"];
+    let args = [["--seed", "4"], ["--dashboard", &page], SLOWLY, few].concat();
     let mut landing = Landing::start(&args).await?;
     drop(socket(&page, "/ws").await?);
     let script = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("dashboard/browser.py");

@@ -44,6 +44,8 @@ let hasVideo = false;
 /** @type {WebSocket | null} */
 let socket = null;
 let pause = RECONNECT_MS;
+/** Why the server takes no connection of this page, and what to do. */
+let refusal = '';
 const map = new Map2();
 /** What makes the pictures. @type {import('./picture.js').Follower | null} */
 let video = null;
@@ -82,6 +84,7 @@ const address = (path) => `${location.protocol === 'https:' ? 'wss' : 'ws'}://${
 async function begin() {
   try {
     const answer = await fetch('/session');
+    refusal = '';
     if (answer.ok) {
       element('login').hidden = true;
       connect();
@@ -90,10 +93,10 @@ async function begin() {
     }
     const why = await answer.json();
     element('login').hidden = answer.status !== 401;
-    put('connection', why.reason ?? `refused (${answer.status})`);
+    refusal = why.why;
     if (answer.status === 401) return;
   } catch {
-    put('connection', 'no connection');
+    refusal = '';
   }
   setTimeout(begin, pause);
   pause = Math.min(2 * pause, MAX_RECONNECT_MS);
@@ -352,7 +355,7 @@ function lookAtAges() {
   // What comes late is no connection either.
   const silent = at - known.heardAt;
   const lost = silent < STALE_MS && socket?.readyState === WebSocket.OPEN ? `${age(since(at, known.heardAt, known.toldMs))} behind` : `no connection for ${age(silent)}`;
-  put('connection', connected ? 'connected' : lost);
+  put('connection', connected ? 'connected' : (!socket && refusal) || lost);
   element('connection').className = `badge ${connected ? 'good' : 'lost'}`;
   document.querySelector('main')?.classList.toggle('cut-off', !connected);
   if (socket && silent > SILENCE_MS) disconnect();

@@ -307,13 +307,16 @@ async fn protect(Shared(app): Shared<Arc<App>>, request: Request, next: Next) ->
     response
 }
 
-/// What this browser may do.
+/// What this browser may do, or why it gets no connection: a WebSocket that is refused tells its page nothing.
 async fn session(
     Shared(app): Shared<Arc<App>>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
     headers: HeaderMap,
 ) -> Response {
-    std::future::ready(match app.admit(peer, &headers) {
+    let has_room = app.clients.available_permits() > 0;
+    let admitted = app.admit(peer, &headers);
+    let admitted = admitted.and_then(|it| has_room.then_some(it).ok_or(Refusal::Full));
+    std::future::ready(match admitted {
         Ok(visitor) => {
             let text = json!({ "no_commands": visitor.access.no_commands }).to_string();
             answer(StatusCode::OK, JSON, text)

@@ -224,6 +224,8 @@ async fn what_is_not_of_the_page_is_refused_and_counted() -> anyhow::Result<()> 
     let _two = [page.socket("/ws").await?, page.socket("/ws").await?];
     let third = refusal(page.address, page.request(page.address, "/ws")?).await?;
     ensure!(third == 503 && page.refused("too many browsers") == 1, "{third}");
+    let answer = ask(page.address, &get("/session", &own, "")).await?;
+    ensure!(answer.starts_with("HTTP/1.1 503") && answer.contains("`max_clients`"), "{answer}");
     Ok(())
 }
 

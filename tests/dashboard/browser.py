@@ -147,6 +147,18 @@ def lose_answer(page):
     wait(page, CONNECTED, 10)
 
 
+def refuse_a_third(browser):
+    """Opens more pages than `max_clients` allows: the last one says so."""
+    second, third = browser.new_page(), browser.new_page()
+    second.goto(URL)
+    wait(second, CONNECTED)
+    third.goto(URL)
+    wait(third, "document.getElementById('connection').textContent.includes('max_clients')", 10)
+    second.close()
+    wait(third, CONNECTED, 10)
+    third.close()
+
+
 def replied(begin):
     """The condition that the last reply begins like this."""
     return f"document.getElementById('reply').textContent.startsWith('{begin}')"
@@ -250,6 +262,7 @@ def main():
 
         lose_link_while_held(page)
         lose_answer(page)
+        refuse_a_third(browser)
 
         page.set_viewport_size({"width": 360, "height": 740})
         time.sleep(0.5)
