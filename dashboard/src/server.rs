@@ -20,7 +20,7 @@ use axum::middleware::{Next, from_fn_with_state};
 use axum::response::Response;
 use axum::routing::{get, post};
 use messages::{ControllerCommand, Place, topic};
-use node::{Node, host_name, now_ns};
+use node::{Node, boot_ahead_ns, host_name, now_ns};
 use serde::Deserialize;
 use serde_json::json;
 use tokio::net::TcpListener;
@@ -172,8 +172,9 @@ impl App {
                 self.log(Level::Warn, "the tokens cannot be read: after a minute all sessions end");
             }
             let mut sessions = self.sessions();
-            sessions.keep(tokens.as_ref().ok(), now_ns());
-            sessions.kind(cookie, now_s())
+            let now_ns = session_ns();
+            sessions.keep(tokens.as_ref().ok(), now_ns);
+            sessions.kind(cookie, now_ns)
         });
         self.guard.access(peer, session)
     }
@@ -228,9 +229,14 @@ impl Visitor {
     }
 }
 
-/// Seconds since 1970, in which tokens and sessions end.
+/// Seconds since 1970, in which tokens end.
 fn now_s() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()
+}
+
+/// Nanoseconds of the clock of sessions, which nobody sets and which counts on while the host sleeps.
+fn session_ns() -> i64 {
+    now_ns().saturating_add(boot_ahead_ns())
 }
 
 fn answer(status: StatusCode, kind: &'static str, body: impl Into<Body>) -> Response {
@@ -338,7 +344,7 @@ async fn login(Shared(app): Shared<Arc<App>>, token: String) -> Response {
     let begun = token.and_then(|token| Some((token, secret().ok()?)));
     let Some((token, cookie)) = begun else { return app.refuse(Refusal::Token) };
     let kind = token.kind;
-    app.sessions().begin(&cookie, token, now_s());
+    app.sessions().begin(&cookie, token, now_s(), session_ns());
     app.log(Level::Info, &format!("a browser has shown a token of the kind `{kind}`"));
     let secure = if app.tls.is_some() { "; Secure" } else { "" };
     let cookie = format!(

@@ -220,36 +220,39 @@ pub struct Sessions {
 #[derive(Clone, Debug)]
 struct Session {
     token: Token,
-    expires_s: u64,
-    /// Since when its token is not in the file, in nanoseconds of the clock that only grows.
+    /// When it ends, in nanoseconds of the clock that only grows: a clock that is set meanwhile ends no control of a landing.
+    ends_ns: i64,
+    /// Since when its token is not in the file, in nanoseconds of that clock.
     missing_ns: Option<i64>,
     /// Since when nobody knows whether it is.
     unknown_ns: Option<i64>,
 }
 
 impl Sessions {
-    /// Begins a session with this cookie, no longer than its token lasts.
-    pub fn begin(&mut self, cookie: &str, token: Token, now_s: u64) {
-        self.by_hash.retain(|_, session| session.expires_s > now_s);
+    /// Begins a session with this cookie, no longer than its token lasts by the time in seconds since 1970. `now_ns` is, here and
+    /// below, of a clock that only grows.
+    pub fn begin(&mut self, cookie: &str, token: Token, now_s: u64, now_ns: i64) {
+        self.by_hash.retain(|_, session| session.ends_ns > now_ns);
         let of_token = self.by_hash.iter().filter(|(_, session)| session.token == token);
         if of_token.clone().count() >= MAX_SESSIONS {
-            let first = of_token.min_by_key(|(_, session)| session.expires_s);
+            let first = of_token.min_by_key(|(_, session)| session.ends_ns);
             let first = first.map(|(hash, _)| hash.clone());
             first.and_then(|hash| self.by_hash.remove(&hash));
         }
-        let expires_s = token.expires_s.min(now_s + SESSION_S);
-        let session = Session { token, expires_s, missing_ns: None, unknown_ns: None };
+        let lasts_s = token.expires_s.saturating_sub(now_s).min(SESSION_S);
+        let ends_ns = now_ns.saturating_add(lasts_s.cast_signed() * 1_000_000_000);
+        let session = Session { token, ends_ns, missing_ns: None, unknown_ns: None };
         self.by_hash.insert(hash(cookie), session);
     }
 
     /// The kind of the session of a cookie, while it lasts.
-    pub fn kind(&self, cookie: &str, now_s: u64) -> Option<Kind> {
+    pub fn kind(&self, cookie: &str, now_ns: i64) -> Option<Kind> {
         let session = self.by_hash.get(&hash(cookie))?;
-        (session.expires_s > now_s).then_some(session.token.kind)
+        (session.ends_ns > now_ns).then_some(session.token.kind)
     }
 
     /// Ends the sessions of tokens that are no longer in their file, and those of a file that cannot be read (`None`) for long; what
-    /// lasts for a moment ends none. `now_ns` is of a clock that only grows.
+    /// lasts for a moment ends none.
     pub fn keep(&mut self, tokens: Option<&Tokens>, now_ns: i64) {
         let lasts = |since_ns: Option<i64>, for_ns| {
             since_ns.is_some_and(|since_ns| now_ns.saturating_sub(since_ns) >= for_ns)
@@ -319,12 +322,15 @@ mod tests {
     fn sessions_end_with_their_time_and_their_token() {
         let token = |kind, expires_s: u64| Token { kind, hash: expires_s.to_string(), expires_s };
         let mut sessions = Sessions::default();
-        sessions.begin("short", token(Kind::Monitor, 60), 0);
-        assert_eq!(sessions.kind("short", 59), Some(Kind::Monitor));
-        assert_eq!(sessions.kind("short", 60), None, "as its token");
-        sessions.begin("a", token(Kind::Monitor, u64::MAX), 0);
-        assert_eq!(sessions.kind("a", SESSION_S - 1), Some(Kind::Monitor));
-        assert_eq!(sessions.kind("a", SESSION_S), None);
+        let second = 1_000_000_000;
+        // The time since 1970 counts at the log-in only: it may be set after it.
+        sessions.begin("short", token(Kind::Monitor, 1060), 1000, 5 * second);
+        assert_eq!(sessions.kind("short", 64 * second), Some(Kind::Monitor));
+        assert_eq!(sessions.kind("short", 65 * second), None, "as its token");
+        sessions.begin("a", token(Kind::Monitor, u64::MAX), 1000, 0);
+        let end = SESSION_S.cast_signed() * second;
+        assert_eq!(sessions.kind("a", end - 1), Some(Kind::Monitor));
+        assert_eq!(sessions.kind("a", end), None);
         assert_eq!(sessions.kind("b", 0), None);
         sessions.end("a");
         assert_eq!(sessions.kind("a", 1), None);
@@ -334,10 +340,10 @@ mod tests {
     fn log_ins_end_sessions_of_their_own_token_only() {
         let token = |kind, name: &str| Token { kind, hash: name.into(), expires_s: u64::MAX };
         let mut sessions = Sessions::default();
-        sessions.begin("pilot", token(Kind::Command, "pilot"), 0);
-        sessions.begin("guest", token(Kind::Monitor, "guest"), 0);
+        sessions.begin("pilot", token(Kind::Command, "pilot"), 0, 0);
+        sessions.begin("guest", token(Kind::Monitor, "guest"), 0, 0);
         for number in 0..1000 {
-            sessions.begin(&number.to_string(), token(Kind::Monitor, "crowd"), number);
+            sessions.begin(&number.to_string(), token(Kind::Monitor, "crowd"), 0, number);
         }
         assert_eq!(sessions.by_hash.len(), 2 + MAX_SESSIONS);
         assert_eq!(sessions.kind("pilot", 1000), Some(Kind::Command));
@@ -351,8 +357,8 @@ mod tests {
         let token =
             |name: &str| Token { kind: Kind::Command, hash: name.into(), expires_s: u64::MAX };
         let mut begun = Sessions::default();
-        begun.begin("one", token("one"), 0);
-        begun.begin("two", token("two"), 0);
+        begun.begin("one", token("one"), 0, 0);
+        begun.begin("two", token("two"), 0, 0);
         let open = |sessions: &Sessions| ["one", "two"].map(|it| sessions.kind(it, 0).is_some());
         let both = Tokens { tokens: vec![token("one"), token("two")] };
         let second = Tokens { tokens: vec![token("two")] };
