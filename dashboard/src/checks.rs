@@ -1,9 +1,9 @@
 //! The list before a flight: what must be well, and what to do where it is not. It turns green by itself.
 
-use messages::{CameraInfo, ControllerStatus, RecorderStatus, VehicleState};
+use messages::{CameraInfo, ControllerStatus, Detections, RecorderStatus, VehicleState};
 use serde::Serialize;
 
-use crate::found::Found;
+use crate::found::in_words;
 
 /// Numbers older than this are no longer current, in milliseconds.
 const MAX_AGE_MS: f64 = 1000.0;
@@ -53,7 +53,7 @@ pub struct Facts<'a> {
     /// Its age in milliseconds.
     pub vehicle_age_ms: Option<f64>,
     /// What the detector in use found in its newest frame.
-    pub found: Option<&'a Found>,
+    pub found: Option<&'a Detections>,
     /// Its age in milliseconds.
     pub found_age_ms: Option<f64>,
     /// Frames a second, as the camera's service counts them.
@@ -195,17 +195,20 @@ fn detector(facts: &Facts<'_>) -> Finding {
 }
 
 fn marker(facts: &Facts<'_>) -> Finding {
-    let todo = "Show the pad to the camera, and give the detector the marker's family and size.";
-    let found = facts.found.filter(|_| is_current(facts.found_age_ms));
-    match found {
-        Some(found) if found.poses > 0 => {
-            finding(Verdict::Good, found.best.clone().unwrap_or_default(), todo)
+    let todo = "Show the pad to the camera, give the detector the marker's family and size, and the controller its name (`marker`).";
+    let Some(found) = facts.found.filter(|_| is_current(facts.found_age_ms)) else {
+        return finding(Verdict::Bad, "nobody looks", todo);
+    };
+    let any = found.detections.first();
+    let wanted = facts.status.and_then(ControllerStatus::landing_marker);
+    match (wanted.map_or(any, |wanted| found.first_of(wanted)), any, wanted) {
+        (Some(it), ..) if it.pose.is_some() => finding(Verdict::Good, in_words(it), todo),
+        (Some(_), ..) => finding(Verdict::Bad, "seen, but its size is not configured", todo),
+        (None, Some(other), Some(wanted)) => {
+            let text = format!("sees {}, the landing wants {wanted}", in_words(other));
+            finding(Verdict::Bad, text, todo)
         }
-        Some(found) if found.markers > 0 => {
-            finding(Verdict::Bad, "seen, but its size is not configured", todo)
-        }
-        Some(_) => finding(Verdict::Open, "not in sight; it is looked for in flight", todo),
-        None => finding(Verdict::Bad, "nobody looks", todo),
+        (None, ..) => finding(Verdict::Open, "not in sight; it is looked for in flight", todo),
     }
 }
 
@@ -289,7 +292,7 @@ fn warnings(facts: &Facts<'_>) -> Finding {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::{Candidate, DetectorState, FrameHeader, LandedState};
+    use messages::{Candidate, Detection, DetectorState, LandedState};
 
     fn verdict(facts: &Facts<'_>, name: &str) -> Verdict {
         checks(facts).into_iter().find(|check| check.name == name).unwrap().verdict
@@ -308,6 +311,7 @@ mod tests {
     fn all_is_well_when_all_is_known_and_new() {
         let status = ControllerStatus {
             autopilot: "connected".into(),
+            marker: "rings".into(),
             active_detector: Some("main".into()),
             candidates: vec![Candidate { state: DetectorState::Active, ..Candidate::sample() }],
             started_ns: Some(1),
@@ -323,12 +327,7 @@ mod tests {
             landed: LandedState::OnGround,
             battery: Some(0.9),
         };
-        let found = Found {
-            header: FrameHeader::sample(),
-            markers: 1,
-            poses: 1,
-            best: Some("rings".into()),
-        };
+        let found = Detections::sample();
         let info = CameraInfo::sample();
         let recorder = RecorderStatus { file: "a.mcap".into(), ..RecorderStatus::default() };
         let facts = Facts {
@@ -355,6 +354,10 @@ mod tests {
         assert_eq!(verdict(&old, "marker"), Verdict::Bad);
         let foreign = Facts { controller_clock: Some("other"), ..facts.clone() };
         assert_eq!(verdict(&foreign, "clock"), Verdict::Bad);
+        let aruco = Detection { family: "aruco-4x4-50".into(), id: Some(7), ..Detection::sample() };
+        let other = Detections { detections: vec![aruco], ..found.clone() };
+        let other = Facts { found: Some(&other), ..facts.clone() };
+        assert_eq!(verdict(&other, "marker"), Verdict::Bad, "another marker is not the landing's");
         let open = Facts { is_insecure: Some(true), silent: vec!["detector main".into()], ..facts };
         assert_eq!(verdict(&open, "keys"), Verdict::Bad);
         assert_eq!(verdict(&open, "warnings"), Verdict::Bad);

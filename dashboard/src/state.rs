@@ -12,7 +12,7 @@ use messages::{
 use serde_json::{Value, json};
 
 use crate::checks::{Facts, checks, is_current};
-use crate::found::Found;
+use crate::found::in_words;
 use crate::funnel::Funnel;
 use crate::log::{Level, Log};
 use crate::words;
@@ -79,7 +79,7 @@ pub struct State {
     status: Option<Seen<ControllerStatus>>,
     target: Option<Seen<TargetEstimate>>,
     vehicle: Option<Seen<VehicleState>>,
-    found: BTreeMap<String, Seen<Found>>,
+    found: BTreeMap<String, Seen<Detections>>,
     detectors: BTreeMap<String, Seen<DetectorInfo>>,
     cameras: BTreeMap<String, Seen<CameraInfo>>,
     recorders: BTreeMap<String, Seen<RecorderStatus>>,
@@ -127,7 +127,7 @@ impl State {
             Input::Vehicle(vehicle) => {
                 self.vehicle = Some(Seen { value: *vehicle, received_ns: now_ns });
             }
-            Input::Detections(name, told) => put(&mut self.found, name, Found::new(*told), now_ns),
+            Input::Detections(name, told) => put(&mut self.found, name, *told, now_ns),
             Input::Detector(name, info) => put(&mut self.detectors, name, *info, now_ns),
             Input::Camera(name, info) => put(&mut self.cameras, name, *info, now_ns),
             Input::Health(service, instance, health) => {
@@ -371,7 +371,8 @@ impl State {
                 "frame_age_ms": candidate.map(|it| it.age_ms),
                 "compared": candidate.map(|it| it.compared), "agreed": candidate.map(|it| it.agreed),
                 "disagreement_m": candidate.and_then(|it| it.disagreement_m),
-                "sees": found.and_then(|it| it.value.best.as_ref()), "seen": found.map(|it| it.value.markers),
+                "sees": found.and_then(|it| it.value.detections.first()).map(in_words),
+                "seen": found.map(|it| it.value.detections.len()),
             })
         };
         names.into_iter().map(row).collect()
