@@ -142,6 +142,10 @@ function take(message) {
   } else if (message.kind === 'log') {
     showLog(message);
   } else if (message.kind === 'hello') {
+    if (known.hello && known.hello.vehicle !== message.vehicle) {
+      startAnew();
+      return;
+    }
     known.hello = message;
     showHello(message);
   } else if (message.kind === 'pong') {
@@ -160,8 +164,19 @@ function take(message) {
   }
 }
 
+/** The server is that of another vehicle by now: nothing of the one before is shown beside it, and no button that is held commands it. */
+function startAnew() {
+  const old = socket;
+  socket = null;
+  old?.close();
+  connectionLost(link);
+  location.reload();
+}
+
 /** @param {any} hello */
 function showHello(hello) {
+  document.title = `${hello.vehicle} - Alight`;
+  put('vehicle-name', hello.vehicle);
   put('host', `${hello.host}, version ${hello.version}`);
   put('commands-note', hello.no_commands ? `No commands: ${hello.no_commands}.` : 'Hold a button, or the space bar on it, for one second.');
   enable();

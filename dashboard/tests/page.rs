@@ -236,6 +236,7 @@ async fn the_state_is_told_with_its_age() -> anyhow::Result<()> {
     let mut socket = page.socket("/ws").await?;
     let hello = told(&mut socket, |it| it["kind"] == "hello").await?;
     ensure!(hello["no_commands"].as_str().is_some_and(|why| why.contains("only shows")), "{hello}");
+    ensure!(hello["vehicle"] == "drone", "{hello}");
     let is_young = |it: &Value| it["status"]["age_ms"].as_f64().is_some_and(|age| age < 700.0);
     let is_told = |it: &Value| it["status"]["phase"] == "descend" && is_young(it);
     let now = told(&mut socket, is_told).await?;

@@ -130,6 +130,7 @@ fn utc_offset_ns() -> i64 {
 
 fn about(node: &Node) -> About {
     let facts = [
+        ("vehicle".to_owned(), node.vehicle().to_owned()),
         ("recorder".to_owned(), node.identity().instance.clone()),
         ("host".to_owned(), node::host_name()),
         ("clock".to_owned(), node::clock_name().to_owned()),

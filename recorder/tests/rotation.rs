@@ -23,8 +23,11 @@ async fn open(service: &'static str, meet: u16) -> anyhow::Result<Node> {
 
 /// The winds in a file, which count; and whether it is whole.
 fn winds(file: &Path) -> anyhow::Result<(Vec<u32>, bool)> {
-    let mut winds = Vec::new();
+    let (mut winds, mut vehicle) = (Vec::new(), None);
     let reading = read(&std::fs::read(file)?, |entry| {
+        if let Entry::About(facts) = &entry {
+            vehicle = facts.get("vehicle").cloned();
+        }
         if let Entry::Message(message) = entry
             && message.key == topic::WIND.key(&[])
             && let Ok(wind) = decode::<Wind>(message.payload)
@@ -32,6 +35,7 @@ fn winds(file: &Path) -> anyhow::Result<(Vec<u32>, bool)> {
             winds.push(wind.velocity_ned_m_s[0] as u32);
         }
     })?;
+    ensure!(vehicle.as_deref() == Some("drone"), "a recording of the vehicle {vehicle:?}");
     Ok((winds, reading.is_ended && reading.damage.is_empty()))
 }
 

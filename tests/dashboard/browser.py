@@ -6,6 +6,7 @@ again, and waits for a line after each. Prints what was measured as JSON on its 
 
 import json
 import os
+import re
 import sys
 import time
 from pathlib import Path
@@ -159,6 +160,28 @@ def refuse_a_third(browser):
     third.close()
 
 
+def meet_another_vehicle(browser):
+    """A page whose server is replaced by that of another vehicle begins anew."""
+    page, connections = browser.new_page(), []
+
+    def connect(socket):
+        connections.append(socket)
+        server = socket.connect_to_server()
+        if len(connections) > 1:
+            server.on_message(lambda told: socket.send(re.sub('"vehicle":"[^"]+"', '"vehicle":"kestrel"', told)))
+
+    page.route_web_socket("**/ws", connect)
+    page.goto(URL)
+    wait(page, CONNECTED)
+    assert page.title() == f"{text(page, '#vehicle-name')} - Alight" != "kestrel - Alight", page.title()
+    connections[0].close()
+    wait(page, "document.getElementById('vehicle-name').textContent === 'kestrel'", 10)
+    begun = page.evaluate("performance.getEntriesByType('navigation')[0].type")
+    assert begun == "reload", f"the page of another vehicle goes on ({begun})"
+    page.screenshot(path=FOLDER / "another-vehicle.png")
+    page.close()
+
+
 def replied(begin):
     """The condition that the last reply begins like this."""
     return f"document.getElementById('reply').textContent.startsWith('{begin}')"
@@ -263,6 +286,7 @@ def main():
         lose_link_while_held(page)
         lose_answer(page)
         refuse_a_third(browser)
+        meet_another_vehicle(browser)
 
         page.set_viewport_size({"width": 360, "height": 740})
         time.sleep(0.5)

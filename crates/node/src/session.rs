@@ -151,6 +151,11 @@ impl Node {
         &self.identity
     }
 
+    /// The name of the vehicle whose processes it meets.
+    pub fn vehicle(&self) -> &str {
+        self.reach.vehicle()
+    }
+
     /// The service's counters.
     pub fn health(&self) -> &HealthCounters {
         &self.health
