@@ -4,7 +4,7 @@
 //! subscribes like anyone, so no other service knows of it or waits for it; it knows nothing of how a landing is decided.
 //!
 //! Modules in reading order: [`config`]; [`state`] is what is known, as JSON with the age of each number, with [`words`] for
-//! people, what was [`found`], the [`funnel`] of the descent, the [`checks`] before a flight and the [`log`]; [`rate`] says which frames are taken, [`pairing`] joins a picture with
+//! people, what was [`found`], the [`funnel`] of the descent, the [`checks`] before a flight and the [`log`]; [`pairing`] joins a picture with
 //! what was found in it, and [`window`] bounds what is on its way to a browser; [`guard`] decides who may read and command, with
 //! [`nonce`] for each command and [`tokens`] in a file. These are without network. `server` answers browsers, `video` makes pictures,
 //! `motion` gives them to viewers of Motion JPEG, `stream` (with the feature `h264`) sends them as H.264, both on a `canvas` where
@@ -20,7 +20,6 @@ pub mod log;
 mod motion;
 pub mod nonce;
 pub mod pairing;
-pub mod rate;
 mod server;
 pub mod service;
 pub mod state;

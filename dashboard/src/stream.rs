@@ -7,6 +7,7 @@ use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
+use airlink::Rate;
 use anyhow::Context;
 use messages::{FrameHeader, topic};
 use node::{Frame, Node, clock_name, now_ns};
@@ -14,7 +15,6 @@ use tokio::net::UdpSocket;
 
 use crate::canvas::Canvas;
 use crate::config::{Input, VideoConfig};
-use crate::rate::Rate;
 use crate::state::State;
 
 use encoder::Encoder;

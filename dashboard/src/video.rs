@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
+use airlink::Rate;
 use airlink::picture::jpeg;
 use anyhow::Context;
 use axum::body::Bytes;
@@ -16,7 +17,6 @@ use tokio::time::{Instant, interval, sleep, sleep_until, timeout};
 
 use crate::config::{Input, VideoConfig};
 use crate::pairing::{Pairing, Picture};
-use crate::rate::Rate;
 use crate::state::State;
 
 /// Period in which somebody who begins to look is noticed.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use airlink::Rate;
 use airlink::picture::jpeg;
 use flightlog::{Picture, Received};
 use messages::{FrameHeader, decode, topic};
@@ -28,25 +29,25 @@ pub(crate) struct Frame {
 pub(crate) struct Pictures {
     frames: Frames,
     jpeg_quality: u8,
-    period_ns: i64,
-    /// When the last picture of each camera was taken, in nanoseconds, by the key of its frames.
-    last: BTreeMap<String, i64>,
+    /// At most so many of each camera a second, by the stamps of its frames.
+    max_hz: f64,
+    /// Which frames of each camera are taken, by their key.
+    rates: BTreeMap<String, Rate>,
 }
 
 impl Pictures {
     /// As configured.
     pub(crate) fn new(config: &Config, frames: Frames) -> Self {
-        let period_ns = (1e9 / config.max_picture_hz) as i64;
-        Self { frames, jpeg_quality: config.jpeg_quality, period_ns, last: BTreeMap::new() }
+        let (jpeg_quality, max_hz) = (config.jpeg_quality, config.max_picture_hz);
+        Self { frames, jpeg_quality, max_hz, rates: BTreeMap::new() }
     }
 
     /// The frame that a message with this header is.
     pub(crate) fn frame(&mut self, message: &Tapped, header: FrameHeader) -> Frame {
-        // A camera that begins anew may have other stamps.
-        let last_ns = self.last.get(&message.key).copied();
-        let is_due = last_ns.is_none_or(|last_ns| {
-            header.stamp_ns.saturating_sub(last_ns).saturating_abs() >= self.period_ns
-        });
+        let known = self.rates.get(&message.key);
+        let is_remembered = known.is_some() || self.rates.len() < MAX_CAMERAS;
+        let mut rate = known.cloned().unwrap_or_else(|| Rate::new(self.max_hz));
+        let is_due = rate.is_due(header.stamp_ns);
         let picture = match self.frames {
             Frames::Jpeg if is_due => {
                 jpeg(&header, &message.payload, self.jpeg_quality).map(Picture::Jpeg)
@@ -56,8 +57,9 @@ impl Pictures {
         };
         let is_whole = picture.is_some();
         let picture = picture.unwrap_or(Picture::None);
-        if picture != Picture::None && (self.last.len() < MAX_CAMERAS || last_ns.is_some()) {
-            self.last.insert(message.key.clone(), header.stamp_ns);
+        if picture != Picture::None && is_remembered {
+            rate.take(header.stamp_ns);
+            self.rates.insert(message.key.clone(), rate);
         }
         Frame { header, picture, is_whole }
     }
@@ -82,8 +84,24 @@ pub(crate) fn received(message: &Tapped) -> Received<'_> {
 #[cfg(test)]
 mod tests {
     use messages::encode;
+    use node::Layers;
 
     use super::*;
+
+    #[test]
+    fn a_camera_of_the_maximum_rate_loses_no_pictures_though_its_frames_come_unevenly() {
+        let layers = Layers { file: None, set: vec!["max_picture_hz=15".into()] };
+        let config = layers.load::<Config>().unwrap().settings;
+        let mut pictures = Pictures::new(&config, Frames::Raw);
+        let message = Tapped { key: "camera/down/frame".into(), ..Tapped::default() };
+        let kept = (0..150).filter(|number| {
+            let stamp_ns = number * 1_000_000_000 / 15 + number % 2 * 50_000;
+            let header = FrameHeader { stamp_ns, ..FrameHeader::sample() };
+            pictures.frame(&message, header).picture == Picture::Pixels
+        });
+        let kept = kept.count();
+        assert!(kept >= 149, "{kept} of 150");
+    }
 
     #[test]
     fn only_a_frame_with_a_header_of_ours_is_a_frame() {

@@ -8,7 +8,7 @@
 //! Modules in reading order: [`config`] has the keys, [`window`] decides when the next frame may be sent and
 //! how large it may be, [`prediction`] where the markers should be in it, [`plan`] which parts are sent at
 //! which scale and quality, [`payload`] encodes and decodes the bytes; [`picture`] makes one of a
-//! whole frame for people. These are algorithms, without clock,
+//! whole frame for people, and [`rate`] says of which frames. These are algorithms, without clock,
 //! thread and network; [`sender`] is the camera's side, which has all three.
 
 pub mod config;
@@ -16,10 +16,12 @@ pub mod payload;
 pub mod picture;
 pub mod plan;
 pub mod prediction;
+pub mod rate;
 pub mod sender;
 pub mod window;
 
 pub use config::AirConfig;
 pub use payload::{Packer, PayloadError, Unpacker};
 pub use plan::{FrameSize, Plan, Planner};
+pub use rate::Rate;
 pub use sender::AirSender;

@@ -1,4 +1,4 @@
-//! Which frames are taken, so that there are no more than a rate allows.
+//! Which frames become pictures for people, so that there are no more than a rate allows.
 
 /// Share of the period by which a frame may be early, as frames come unevenly.
 const MAX_EARLY: f64 = 0.3;
@@ -20,15 +20,18 @@ impl Rate {
         Self { period_ns: period_ns as i64, early_ns, due_ns: i64::MIN }
     }
 
-    /// Whether a frame that comes now may be taken.
+    /// Whether a frame of this time may be taken. One of a time before the last, as of a camera that began anew, begins anew.
     pub fn is_due(&self, now_ns: i64) -> bool {
-        now_ns >= self.due_ns.saturating_sub(self.early_ns)
+        let first_ns = self.due_ns.saturating_sub(self.early_ns);
+        now_ns >= first_ns || now_ns < first_ns.saturating_sub(self.period_ns)
     }
 
     /// Notes that it is. The next one is due a period after this one was due: an early frame lets no further one in. After a
-    /// pause it is due a period after this one came.
+    /// pause, or where times begin anew, it is due a period after this one.
     pub fn take(&mut self, now_ns: i64) {
-        let is_in_turn = now_ns < self.due_ns.saturating_add(self.period_ns);
+        let turn_ns =
+            self.due_ns.saturating_sub(self.early_ns)..self.due_ns.saturating_add(self.period_ns);
+        let is_in_turn = turn_ns.contains(&now_ns);
         self.due_ns = if is_in_turn { self.due_ns } else { now_ns }.saturating_add(self.period_ns);
     }
 }
@@ -73,5 +76,15 @@ mod tests {
         assert!(rate.is_due(5_000_000_000));
         rate.take(5_000_000_000);
         assert!(!rate.is_due(5_050_000_000) && rate.is_due(5_075_000_000));
+    }
+
+    #[test]
+    fn times_that_step_back_begin_anew() {
+        let mut rate = Rate::new(10.0);
+        rate.take(5_000_000_000);
+        assert!(!rate.is_due(4_990_000_000), "a little uneven");
+        assert!(rate.is_due(1_000_000_000));
+        rate.take(1_000_000_000);
+        assert!(!rate.is_due(1_050_000_000) && rate.is_due(1_100_000_000));
     }
 }
