@@ -123,8 +123,10 @@ impl Shared {
         self.lock().status.path = Some(path.clone());
         let result = self.write(&path, &mut file);
         if result.is_err() && self.lock().status.bytes == 0 {
-            // A disk without room still takes empty files, one for each attempt.
-            drop(std::fs::remove_file(&path));
+            // A disk without room still takes empty files, one for each attempt. A file that others put there is theirs.
+            if is_still_there(&path, &file).is_ok() {
+                drop(std::fs::remove_file(&path));
+            }
             self.lock().status.path = None;
         }
         result
@@ -233,6 +235,22 @@ mod tests {
         disk.append(b"cd".to_vec());
         let problem = disk.wait(PATIENCE).problem.unwrap();
         assert!(problem.contains("removed"), "{problem}");
+    }
+
+    #[test]
+    fn a_file_that_others_put_in_its_place_stays() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("flight.mcap");
+        let disk = Disk::open(path.clone()).unwrap();
+        while disk.status().path.is_none() {
+            std::thread::yield_now();
+        }
+        std::fs::write(folder.path().join("other"), b"theirs").unwrap();
+        std::fs::rename(folder.path().join("other"), &path).unwrap();
+        disk.append(b"ab".to_vec());
+        let problem = disk.wait(PATIENCE).problem.unwrap();
+        assert!(problem.contains("another file"), "{problem}");
+        assert_eq!(std::fs::read(&path).unwrap(), b"theirs");
     }
 
     #[test]
