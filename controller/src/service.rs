@@ -232,7 +232,7 @@ fn refused(permission: Permission, packets: &[Packet], bytes: usize) -> Option<&
     let parsed: usize = packets.iter().map(|packet| packet.raw.len()).sum();
     let is_read = parsed == bytes || permission == Permission::Everything;
     let refusal = packets.iter().find_map(|packet| permission.refusal(packet));
-    refusal.map(|it| it.name).or((!is_read).then_some("unknown message"))
+    refusal.or((!is_read).then_some("unknown message"))
 }
 
 /// The answers to the commands in refused packets, as of whom they were for: they would be given again until one comes.

@@ -9,7 +9,6 @@ use autopilot::compose::heartbeat;
 use autopilot::dialect::{HEARTBEAT_DATA, MavMessage, MavSeverity, MavState, MessageData};
 use autopilot::link::SendError;
 use autopilot::packet::{Counters, encode};
-use autopilot::permission::Refusal;
 use autopilot::signing::Refusals;
 use autopilot::{
     Address, GivenCommand, Link, LinkEvent, LinkSender, Packet, Parser, Permission, Sender,
@@ -405,16 +404,15 @@ impl Bridge {
     }
 
     /// Counts a packet that the ground station may not send, and tells it.
-    fn refuse(&mut self, now_ns: i64, packet: &Packet, refusal: Refusal) {
+    fn refuse(&mut self, now_ns: i64, packet: &Packet, refusal: &str) {
         let to = packet.sender;
-        if self.health.failed(&format!("from ground: refused: {}", refusal.name)) {
+        if self.health.failed(&format!("from ground: refused: {refusal}")) {
             let Sender { system, component } = to;
             tracing::warn!(
                 system,
                 component,
                 permission = %self.permission,
-                "Packet refused: {} (`ground_may`; further ones are only counted)",
-                refusal.name
+                "Packet refused: {refusal} (`ground_may`; further ones are only counted)"
             );
         }
         if let Some(command) = GivenCommand::of(packet) {
@@ -424,7 +422,7 @@ impl Bridge {
             self.refusal_ns.is_none_or(|last| now_ns.saturating_sub(last) > REFUSAL_PAUSE_NS);
         if is_due {
             self.refusal_ns = Some(now_ns);
-            let text = format!("Alight: refused ({}): {}", self.permission, refusal.name);
+            let text = format!("Alight: refused ({}): {refusal}", self.permission);
             self.send_answer(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text);
         }
     }

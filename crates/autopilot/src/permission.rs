@@ -18,15 +18,6 @@ pub enum Permission {
     Monitor,
 }
 
-/// Why a packet was refused.
-#[derive(Copy, Clone, Debug, PartialEq)]
-pub struct Refusal {
-    /// A short name for counters.
-    pub name: &'static str,
-    /// The command in the packet, if it is one.
-    pub command: Option<MavCmd>,
-}
-
 /// A permission with an unknown name.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("unknown permission `{0}`: expected everything, no-arming or monitor")]
@@ -44,25 +35,23 @@ impl Permission {
         }
     }
 
-    /// Why a packet may not be sent; `None` when it may.
+    /// Why a packet may not be sent, as a short name for counters; `None` when it may.
     ///
     /// What the dialect does not know may only be sent with [`Permission::Everything`]: it could be anything.
-    pub fn refusal(self, packet: &Packet) -> Option<Refusal> {
+    pub fn refusal(self, packet: &Packet) -> Option<&'static str> {
         if self == Self::Everything {
             return None;
         }
         let Some(message) = &packet.message else {
-            return Some(Refusal { name: "unknown message", command: None });
+            return Some("unknown message");
         };
-        let command = command(message);
-        let name = match self {
+        match self {
             Self::Everything => None,
             Self::NoArming => {
                 starts_or_stops_motors(message).then_some("arming or stopping motors")
             }
-            Self::Monitor => (!changes_nothing(message, command)).then_some("only monitoring"),
-        };
-        name.map(|name| Refusal { name, command })
+            Self::Monitor => (!changes_nothing(message)).then_some("only monitoring"),
+        }
     }
 }
 
@@ -165,8 +154,8 @@ fn starts_or_stops_motors(message: &MavMessage) -> bool {
 
 /// Requests for streams are not among them: they would take the rates away that the controller has asked for.
 #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
-fn changes_nothing(message: &MavMessage, command: Option<MavCmd>) -> bool {
-    match command {
+fn changes_nothing(message: &MavMessage) -> bool {
+    match command(message) {
         Some(command) => matches!(
             command,
             MavCmd::MAV_CMD_REQUEST_MESSAGE
@@ -258,8 +247,6 @@ mod tests {
             assert_eq!(Permission::NoArming.refusal(&packet).is_none(), no_arming, "{message:?}");
             assert_eq!(Permission::Monitor.refusal(&packet).is_none(), monitor, "{message:?}");
         }
-        let refusal = Permission::NoArming.refusal(&packet(&long(arming))).map(|r| r.command);
-        assert_eq!(refusal, Some(Some(arming)), "the command is answered with a refusal");
     }
 
     #[test]
