@@ -187,7 +187,7 @@ pub struct Flight {
     pub(crate) other_boots: Vec<Flight>,
     /// Minimum time from a stamp of the vehicle's clock to the reception of its message, in nanoseconds.
     min_apart_ns: Option<i64>,
-    /// The same of the last message.
+    /// That time of the last message, in nanoseconds.
     last_apart_ns: i64,
 }
 
@@ -282,8 +282,10 @@ impl FlightReader {
         boots.iter_mut().for_each(|boot| boot.take_over(&flight));
         boots.push(flight);
         for tape in tapes.tapes() {
-            let boot = boot_of_tape.get(&tape.begun_ns).and_then(|boot| boots.get_mut(*boot));
-            boot.into_iter().for_each(|boot| boot.tapes.push(tape.clone()));
+            let place = boot_of_tape.get(&tape.begun_ns);
+            if let Some(boot) = place.and_then(|place| boots.get_mut(*place)) {
+                boot.tapes.push(tape);
+            }
         }
         let of = boots.len();
         for (number, boot) in (1..).zip(&mut boots) {
