@@ -44,6 +44,8 @@ const MAX_OUTCOMES: usize = 32;
 const HEARTBEAT_NS: i64 = 1_000_000_000;
 /// What an unsteady link counts as.
 const UNSTEADY: Duration = Duration::from_secs(1);
+/// Silence after which another companion with our ids counts as gone, in nanoseconds.
+const SAME_ADDRESS_NS: i64 = 10_000_000_000;
 /// Maximum age of a position whose vertical speed says whether the vehicle stands, in nanoseconds.
 const MAX_SPEED_AGE_NS: i64 = 500_000_000;
 
@@ -65,7 +67,8 @@ pub struct Autopilot {
     sequence: u8,
     heartbeat_due_ns: i64,
     other_vehicle: bool,
-    same_address: bool,
+    /// When a packet of another companion with our ids came last.
+    same_address_ns: Option<i64>,
     refused_numbers: u64,
     late: u64,
 }
@@ -115,7 +118,7 @@ impl Autopilot {
             sequence: 0,
             heartbeat_due_ns: i64::MIN,
             other_vehicle: false,
-            same_address: false,
+            same_address_ns: None,
             refused_numbers: 0,
             late: 0,
         }
@@ -124,8 +127,11 @@ impl Autopilot {
     /// Handles a packet received at `now_ns`.
     pub fn handle(&mut self, now_ns: i64, packet: &Packet) {
         let Some(message) = &packet.message else { return };
-        if packet.sender == self.our_address() && !std::mem::replace(&mut self.same_address, true) {
-            self.push(Event::SameAddress { sender: packet.sender });
+        if packet.sender == self.our_address() {
+            if !self.shares_our_address(now_ns) {
+                self.push(Event::SameAddress { sender: packet.sender });
+            }
+            self.same_address_ns = Some(now_ns);
         }
         if packet.sender.component != AUTOPILOT {
             return;
@@ -288,8 +294,8 @@ impl Autopilot {
     }
 
     /// Whether another companion on this link uses our ids: probably a second controller of the same vehicle.
-    pub fn shares_our_address(&self) -> bool {
-        self.same_address
+    pub fn shares_our_address(&self, now_ns: i64) -> bool {
+        self.same_address_ns.is_some_and(|last| now_ns.saturating_sub(last) < SAME_ADDRESS_NS)
     }
 
     /// Why the vehicle cannot be armed and flown yet, as texts; empty when it can.

@@ -25,7 +25,7 @@ pub enum Event {
         /// Its system id.
         system: u8,
     },
-    /// Another companion uses our ids, probably a second controller of the same vehicle. Reported once.
+    /// Another companion uses our ids, probably a second controller of the same vehicle. Reported once until it is gone.
     SameAddress {
         /// Our ids.
         sender: Sender,

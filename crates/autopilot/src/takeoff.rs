@@ -275,7 +275,7 @@ impl Takeoff {
         autopilot: &mut Autopilot,
         state: Option<&VehicleState>,
     ) -> Result<(), TakeoffError> {
-        if autopilot.shares_our_address() {
+        if autopilot.shares_our_address(now_ns) {
             return Err(TakeoffError::SameAddress { sender: autopilot.our_address() });
         }
         let connected = state.filter(|state| state.connected);

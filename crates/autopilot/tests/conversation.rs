@@ -865,6 +865,19 @@ fn a_vehicle_of_another_controller_with_our_ids_is_neither_lifted_nor_taken_over
 }
 
 #[test]
+fn once_the_other_controller_with_our_ids_has_ended_the_vehicle_takes_off() {
+    let mut world = World::standing();
+    let companion = Sender { system: 1, component: 191 };
+    world.receive(companion, &autopilot::compose::heartbeat());
+    world.run(11);
+    let (end, _) = world.take_off(&mut Takeoff::new(10.0), 60);
+    assert_eq!(end, TakeoffProgress::Done);
+    world.receive(companion, &autopilot::compose::heartbeat());
+    world.step();
+    assert_eq!(world.count(|event| *event == Event::SameAddress { sender: companion }), 2);
+}
+
+#[test]
 fn a_vehicle_that_the_pilot_flies_is_left_alone() {
     let mut world = World::flying();
     world.fake.mode = 5;
