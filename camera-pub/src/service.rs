@@ -890,8 +890,8 @@ mod tests {
             result = stream.publish_images(&images) => panic!("it ended: {result:?}"),
             seen = seen => seen.expect("rectified frames in time"),
         };
-        // One may be counted and not numbered yet.
-        assert!(frames <= stream.sequence + 1 && rectified >= 3, "{frames}, {rectified}");
+        // Of each kind one may be under way: counted and not numbered, or there and not counted.
+        assert!(frames <= stream.sequence + 1 && rectified >= 2, "{frames}, {rectified}");
         drop(stream);
         camera.close().await;
         viewer.close().await;
