@@ -9,6 +9,7 @@ import os
 import re
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 from chromium import CHROMIUM, sync_playwright
@@ -123,11 +124,10 @@ def lose_link_while_held(page):
     page.evaluate("document.activeElement.blur()")
     page.locator("button[data-command=hold]").dispatch_event("keydown", {"key": " "})
     time.sleep(0.2)
-    asked("STOP")
-    wait(page, "document.querySelector('button[data-command=hold]').disabled", 5)
-    # The second is over meanwhile.
-    time.sleep(0.3)
-    asked("CONT")
+    with stopped():
+        wait(page, "document.querySelector('button[data-command=hold]').disabled", 5)
+        # The second is over meanwhile.
+        time.sleep(0.3)
     wait(page, CONNECTED, 10)
     time.sleep(0.5)
     assert "nothing was sent" in text(page, "#reply"), text(page, "#reply")
@@ -137,14 +137,15 @@ def lose_answer(page):
     """Loses the connection between a command and its answer."""
     tab_to(page, "hold")
     page.keyboard.down("Space")
-    time.sleep(0.6)
-    asked("STOP")
-    wait(page, replied("Sent, waiting"), 2)
-    page.keyboard.up("Space")
-    wait(page, "!" + replied("Sent, waiting"), 10)
+    # Half of the second; the page still counts as connected when it is over.
+    wait(page, "document.querySelector('button.holding') !== null", 5)
+    time.sleep(0.5)
+    with stopped():
+        wait(page, replied("Sent, waiting"), 2)
+        page.keyboard.up("Space")
+        wait(page, "!" + replied("Sent, waiting"), 10)
     told = text(page, "#reply")
     assert told.startswith("hold: ") and "may have been carried out" in told, told
-    asked("CONT")
     wait(page, CONNECTED, 10)
 
 
@@ -174,7 +175,8 @@ def meet_another_vehicle(browser):
     page.goto(URL)
     wait(page, CONNECTED)
     assert page.title() == f"{text(page, '#vehicle-name')} - Alight" != "kestrel - Alight", page.title()
-    connections[0].close()
+    with page.expect_navigation():
+        connections[0].close()
     wait(page, "document.getElementById('vehicle-name').textContent === 'kestrel'", 10)
     begun = page.evaluate("performance.getEntriesByType('navigation')[0].type")
     assert begun == "reload", f"the page of another vehicle goes on ({begun})"
@@ -190,6 +192,16 @@ def replied(begin):
 def asked(what):
     print(what, flush=True)
     sys.stdin.readline()
+
+
+@contextmanager
+def stopped():
+    """While the page's server is stopped."""
+    asked("STOP")
+    try:
+        yield
+    finally:
+        asked("CONT")
 
 
 def text(page, selector):
