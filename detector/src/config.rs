@@ -58,6 +58,9 @@ pub struct TrackingConfig {
     pub full_search_period: u32,
 }
 
+/// The default list of markers.
+const DEFAULT_MARKERS: [&str; 1] = ["rings:0.15341"];
+
 impl Settings for Config {
     const DEFAULTS: &'static str = include_str!("../detector.toml");
 
@@ -84,9 +87,9 @@ impl Config {
     /// # Errors
     /// Says which marker is wrong and why.
     pub fn detector(&self) -> Result<Detector, String> {
-        let mut markers = self.parsed_markers()?;
+        let mut markers = self.listed_markers()?;
         for pad in self.parsed_pads()? {
-            pad.add_markers(&mut markers);
+            pad.add_markers(&mut markers).map_err(|problem| problem.to_string())?;
         }
         if markers.is_empty() {
             return Err(
@@ -146,12 +149,24 @@ impl Config {
         let read = |name: &String| Pad::named(name, |file| read_text(file));
         let pads: Vec<Pad> =
             self.pads.iter().map(read).collect::<Result<_, _>>().map_err(|e| e.to_string())?;
-        for (i, pad) in pads.iter().enumerate() {
-            if pads[..i].iter().any(|other| other.id() == pad.id()) {
-                return Err(format!("two pads are called `{}`; give one another `id`", pad.name()));
-            }
-        }
+        Pad::check_together(&pads).map_err(|e| e.to_string())?;
         Ok(pads)
+    }
+
+    /// The markers of the list. Where that is the default one, it gives way to a pad with the same marker in its own size.
+    ///
+    /// # Errors
+    /// Says which marker or pad is wrong and why.
+    pub fn listed_markers(&self) -> Result<Vec<Marker>, String> {
+        let mut markers = self.parsed_markers()?;
+        if self.markers == DEFAULT_MARKERS {
+            let pads = self.parsed_pads()?;
+            let is_on_pad = |marker: &Marker| {
+                pads.iter().flat_map(Pad::markers).any(|it| it.marker.looks_like(marker))
+            };
+            markers.retain(|marker| !is_on_pad(marker));
+        }
+        Ok(markers)
     }
 
     fn parsed_markers(&self) -> Result<Vec<Marker>, String> {
@@ -171,7 +186,7 @@ mod tests {
 
     #[test]
     fn the_defaults_are_complete_and_wrong_markers_are_refused() {
-        assert_eq!(load("").unwrap().markers, ["rings:0.15341"]);
+        assert_eq!(load("").unwrap().markers, DEFAULT_MARKERS);
         assert!(load("markers=[\"hexagons:1\"]").unwrap_err().contains("no family `hexagons`"));
         assert!(load("markers=[]").unwrap_err().contains("at least one marker"));
         let twice = "markers=[\"rings:0.1\", \"rings:0.2\"]";
@@ -180,6 +195,28 @@ mod tests {
         assert!(load("thesis_threshold=0").unwrap_err().contains("from 1 to 255"));
         // A number that does not fit its type is refused too, whatever its range says.
         assert!(load("thesis_threshold=300").is_err());
+    }
+
+    #[test]
+    fn a_pads_marker_has_the_pads_size() {
+        let folder = tempfile::tempdir().unwrap();
+        let pad = |id: u32, marker: &str| {
+            let file = folder.path().join(format!("{id}.toml"));
+            let text = format!("id = {id}\nmarkers = [{{ marker = \"{marker}\" }}]");
+            std::fs::write(&file, text).unwrap();
+            format!("{file:?}")
+        };
+        let rings = pad(1, "rings:0.3");
+        // The default list gives way to the pad, one of the user's own is refused.
+        let config = load(&format!("pads=[{rings}]")).unwrap();
+        assert_eq!(config.listed_markers(), Ok(vec![]));
+        assert!(config.detector().is_ok());
+        let refused = |key: &str, value: &str| config.with(key, value).unwrap_err();
+        assert!(refused("markers", "[\"rings:0.2\"]").contains("listed as `rings:0.2`"));
+        assert!(refused("markers", "[\"rings\"]").contains("listed as `rings`"));
+        assert!(config.with("markers", "[\"rings:0.3\"]").is_ok());
+        let two = [pad(2, "aruco-4x4-50:0:0.1"), pad(3, "aruco-4x4-50:0:0.1")].join(",");
+        assert!(refused("pads", &format!("[{two}]")).contains("`aruco-4x4-50:0:0.1` of `pad:3`"));
     }
 
     #[test]

@@ -148,7 +148,8 @@ fn accept(node: &Node, known: Option<&CameraInfo>, info: &CameraInfo, silence: D
 
 /// What this detector says about itself.
 fn info(config: &Config) -> Result<DetectorInfo, String> {
-    let mut markers = config.markers.clone();
+    let listed = config.listed_markers()?;
+    let mut markers: Vec<String> = listed.iter().map(ToString::to_string).collect();
     markers.extend(config.parsed_pads()?.iter().map(Pad::name));
     Ok(DetectorInfo {
         detector: config.id.clone(),

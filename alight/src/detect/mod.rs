@@ -82,9 +82,10 @@ impl Examiner {
     fn new(args: &DetectArgs, lens: Lens) -> anyhow::Result<Self> {
         let read = |name: &String| Pad::named(name, |file| read_text(file));
         let pads: Vec<Pad> = args.pads.iter().map(read).collect::<Result<_, _>>()?;
+        Pad::check_together(&pads)?;
         let mut markers = args.markers.clone();
         for pad in &pads {
-            pad.add_markers(&mut markers);
+            pad.add_markers(&mut markers)?;
         }
         if !pads.is_empty() && matches!(lens, Lens::Unknown) {
             write_error(

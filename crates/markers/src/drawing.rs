@@ -59,6 +59,18 @@ pub struct Drawing {
     pub layers: Vec<Layer>,
 }
 
+impl Marker {
+    /// Whether the print of two markers of one size is the same, by whatever names: small ArUco dictionaries are the beginnings
+    /// of large ones.
+    pub fn looks_like(&self, other: &Self) -> bool {
+        let drawing = |marker: &Self| Drawing::new(marker, 1.0);
+        match self.family == other.family {
+            true => self.id == other.id,
+            false => drawing(self).is_some_and(|it| Some(it) == drawing(other)),
+        }
+    }
+}
+
 impl Drawing {
     /// The drawing of `marker` at `size_m`, whatever size the marker itself states; `None` when the family has ids and
     /// this is none of them.

@@ -89,6 +89,22 @@ pub enum PadError {
         /// What is wrong with it.
         problem: String,
     },
+    /// Two pads of one name.
+    #[error("two pads are called `{name}`; give one another `id`")]
+    SameName {
+        /// Their name.
+        name: String,
+    },
+    /// A marker of a pad that may be seen elsewhere, so that an image of it does not tell where the pad is.
+    #[error("the marker `{marker}` of `{pad}` is also {elsewhere}")]
+    Shared {
+        /// The pad's name.
+        pad: String,
+        /// Its marker.
+        marker: Marker,
+        /// Where else it is, and what to do.
+        elsewhere: String,
+    },
 }
 
 /// The built-in pads: name and description.
@@ -150,13 +166,57 @@ impl Pad {
         &self.markers
     }
 
-    /// Adds its markers to a list of markers to detect, without duplicates.
-    pub fn add_markers(&self, markers: &mut Vec<Marker>) {
-        for PlacedMarker { marker, .. } in &self.markers {
-            if !markers.iter().any(|m| m.family == marker.family && m.id == marker.id) {
-                markers.push(*marker);
+    /// Checks that pads can be told apart in an image.
+    ///
+    /// # Errors
+    /// [`PadError`] when two have one name, or a marker that looks the same.
+    pub fn check_together(pads: &[Self]) -> Result<(), PadError> {
+        for (i, pad) in pads.iter().enumerate() {
+            for other in &pads[..i] {
+                if other.id == pad.id {
+                    return Err(PadError::SameName { name: pad.name() });
+                }
+                for PlacedMarker { marker, .. } in &pad.markers {
+                    if let Some(same) = other.markers.iter().find(|it| it.marker.looks_like(marker))
+                    {
+                        return Err(PadError::Shared {
+                            pad: pad.name(),
+                            marker: *marker,
+                            elsewhere: format!(
+                                "on `{}`, as `{}`, and one image of it cannot tell which pad it shows; give one of them another marker",
+                                other.name(),
+                                same.marker
+                            ),
+                        });
+                    }
+                }
             }
         }
+        Ok(())
+    }
+
+    /// Adds its markers to a list of markers to detect, without duplicates.
+    ///
+    /// # Errors
+    /// [`PadError::Shared`] when one is listed with another size or without one: its distance, and so the pad's, would be wrong or
+    /// unknown.
+    pub fn add_markers(&self, markers: &mut Vec<Marker>) -> Result<(), PadError> {
+        for PlacedMarker { marker, .. } in &self.markers {
+            match markers.iter().find(|it| it.family == marker.family && it.id == marker.id) {
+                None => markers.push(*marker),
+                Some(listed) if listed.size_m == marker.size_m => {}
+                Some(listed) => {
+                    return Err(PadError::Shared {
+                        pad: self.name(),
+                        marker: *marker,
+                        elsewhere: format!(
+                            "listed as `{listed}`, and its size must be one and the same; take it out of the list of markers"
+                        ),
+                    });
+                }
+            }
+        }
+        Ok(())
     }
 
     /// All its markers, each on white paper of its quiet zone, later ones over earlier ones; `None` for an id that cannot
@@ -310,9 +370,11 @@ impl Placed {
         }
         let size_m =
             marker.size_m.ok_or("a marker of a pad needs a size in metres, as its last part")?;
-        if before.iter().any(|it| it.marker.includes(marker.family, marker.id)) {
-            return Err("it is on the pad twice, and the two could not be told apart in an image"
-                .to_owned());
+        if let Some(same) = before.iter().find(|it| it.marker.looks_like(&marker)) {
+            return Err(format!(
+                "it is on the pad twice, first as `{}`, and the two could not be told apart in an image",
+                same.marker
+            ));
         }
         let position_m = [self.x_m, self.y_m];
         Ok(PlacedMarker { marker, size_m, position_m, quarter_turns: self.quarter_turns })
@@ -348,6 +410,12 @@ mod tests {
             "id = 1\nmarkers = [{ marker = \"rings:0.1\" }, { marker = \"rings:0.2\" }]",
             "twice",
         );
+        for (one, other) in
+            [("aruco-4x4-50:1:0.06", "aruco-4x4-250:1:0.1"), ("rings:0.06", "rings-thesis:0.1")]
+        {
+            let text = format!("[{{ marker = \"{one}\" }}, {{ marker = \"{other}\", x_m = 0.3 }}]");
+            check(&format!("id = 1\nmarkers = {text}"), &format!("twice, first as `{one}`"));
+        }
         check("id = 1\nmarkers = [{ marker = \"rings:0.1\", x_m = 11 }]", "from -10 to 10");
         check("id = 1\nmarkers = [{ marker = \"rings:0.1\", x_m = nan }]", "x_m of marker 1");
         check("id = 1\nmarkers = [{ marker = \"rings:0.1\", quarter_turns = 4 }]", "from 0 to 3");
@@ -371,6 +439,31 @@ mod tests {
         let missing = Pad::named("no/such.toml", |_| Err("there is no such file"));
         let missing = missing.unwrap_err().to_string();
         assert!(missing.contains("no/such.toml") && missing.contains("a4"), "{missing}");
+    }
+
+    #[test]
+    fn a_marker_has_one_size_and_one_pad() {
+        let pad = |id: u32, marker: &str| -> Pad {
+            format!("id = {id}\nmarkers = [{{ marker = \"{marker}\" }}]").parse().unwrap()
+        };
+        let with = |listed: &str, on_pad: &str| {
+            let mut markers: Vec<Marker> = vec![listed.parse().unwrap()];
+            pad(1, on_pad).add_markers(&mut markers).map(|()| markers.len())
+        };
+        assert_eq!(with("rings:0.1", "rings:0.1"), Ok(1));
+        assert_eq!(with("apriltag-36h11:*:0.2", "apriltag-36h11:7:0.15"), Ok(2));
+        for listed in ["apriltag-36h11:7:0.2", "apriltag-36h11:7"] {
+            let problem = with(listed, "apriltag-36h11:7:0.15").unwrap_err().to_string();
+            assert!(problem.contains(&format!("listed as `{listed}`")), "{problem}");
+        }
+        let together = |pads: [Pad; 2]| Pad::check_together(&pads).map_err(|e| e.to_string());
+        assert!(together([pad(1, "rings:0.1"), pad(2, "aruco-4x4-50:0:0.1")]).is_ok());
+        for other in ["aruco-4x4-50:0:0.1", "aruco-4x4-100:0:0.2"] {
+            let problem = together([pad(1, other), pad(2, "aruco-4x4-50:0:0.1")]).unwrap_err();
+            assert!(problem.contains(&format!("on `pad:1`, as `{other}`")), "{problem}");
+        }
+        let same_name = together([pad(1, "rings:0.1"), pad(1, "aruco-4x4-50:0:0.1")]);
+        assert!(same_name.unwrap_err().contains("two pads are called `pad:1`"));
     }
 
     #[test]
