@@ -26,6 +26,16 @@ pub enum DetectorError {
         /// The marker's name.
         name: String,
     },
+    /// Two markers of one print, in two sizes.
+    #[error(
+        "the markers `{marker}` and `{other}` are one print; one image cannot tell two sizes of it apart"
+    )]
+    LookAlike {
+        /// The marker.
+        marker: Marker,
+        /// Another one before it in the list.
+        other: Marker,
+    },
 }
 
 /// Finds markers in images. It keeps its memory from image to image.
@@ -53,7 +63,7 @@ impl Detector {
     /// A detector for these markers.
     ///
     /// # Errors
-    /// [`DetectorError`] when there are none, or two of the same name.
+    /// [`DetectorError`] when there are none, or two of the same name or of one print in two sizes.
     pub fn new(markers: &[Marker], settings: Settings) -> Result<Self, DetectorError> {
         if markers.is_empty() {
             return Err(DetectorError::NoMarker);
@@ -61,6 +71,12 @@ impl Detector {
         for (i, marker) in markers.iter().enumerate() {
             if markers[..i].iter().any(|m| m.family == marker.family && m.id == marker.id) {
                 return Err(DetectorError::Twice { name: marker.name() });
+            }
+            let has_other_size = |m: &&Marker| {
+                m.size_m.zip(marker.size_m).is_some_and(|(a, b)| a != b) && m.looks_like(marker)
+            };
+            if let Some(other) = markers[..i].iter().find(has_other_size) {
+                return Err(DetectorError::LookAlike { marker: *marker, other: *other });
             }
         }
         let families = families::detectors(markers, settings);

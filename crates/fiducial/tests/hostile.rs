@@ -130,4 +130,9 @@ fn a_detector_needs_different_markers() {
     assert_eq!(new(&[]), Err(DetectorError::NoMarker.to_string()));
     assert_eq!(new(&["rings", "rings-thesis"]), Ok(()));
     assert!(new(&["rings:1", "rings:2"]).unwrap_err().contains("`rings` is listed twice"));
+    // The same print by two names, as where dictionaries are compared, has one size.
+    let same = ["aruco-4x4-50:3:0.1", "aruco-4x4-250:3:0.1", "aruco-4x4-250:4:0.2"];
+    assert_eq!(new(&same), Ok(()));
+    let problem = new(&["aruco-4x4-50:3:0.1", "aruco-4x4-250:3:0.2"]).unwrap_err();
+    assert!(problem.contains("are one print"), "{problem}");
 }
