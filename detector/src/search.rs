@@ -110,19 +110,19 @@ impl Search {
 }
 
 /// What is published of the markers that were found, in the whole frame's pixels: those that are sure enough, and the
-/// pads they make up.
+/// pads that these make up.
 fn told(
     found: &[Observation],
     pads: &[Pad],
     camera: Option<&CameraModel>,
     least: f64,
 ) -> Vec<Detection> {
-    let markers = found.iter().filter(|seen| seen.confidence >= least).map(wire::detection);
+    let sure = found.iter().filter(|seen| seen.confidence >= least);
     let pads = pads.iter().filter_map(|pad| {
-        let seen = fiducial::observe_pad(pad, found, camera?)?;
-        (seen.confidence >= least).then(|| wire::pad_detection(pad, &seen))
+        let seen = fiducial::observe_pad(pad, sure.clone(), camera?)?;
+        Some(wire::pad_detection(pad, &seen))
     });
-    markers.chain(pads).collect()
+    sure.clone().map(wire::detection).chain(pads).collect()
 }
 
 /// Times the stages of a search.

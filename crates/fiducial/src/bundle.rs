@@ -43,29 +43,27 @@ const MIN_VARIANCE_PX2: f64 = 1e-6;
 const MAX_RESIDUAL: f64 = 25.0;
 
 /// The pose of `pad` from the markers found in one image; `None` when none of its markers with a pose is among them.
-/// Markers whose residual against the pose of all is too large are left out; of two that contradict each other the
-/// smaller one is.
-pub fn observe_pad(
+/// Markers whose residual against the pose of all is too large are left out, and so is one without which the others have a
+/// pose, where all have none; of two that contradict each other the smaller or less sure one is.
+pub fn observe_pad<'a>(
     pad: &Pad,
-    found: &[Observation],
+    found: impl IntoIterator<Item = &'a Observation>,
     camera: &CameraModel,
 ) -> Option<PadObservation> {
-    let mut seen: Vec<Member<'_>> = found.iter().filter_map(|it| member(pad, it, camera)).collect();
+    let found = found.into_iter();
+    let mut seen: Vec<Member<'_>> = found.filter_map(|it| member(pad, it, camera)).collect();
     let all = seen.len();
-    loop {
-        let pose = match seen.as_slice() {
-            [] => return None,
-            [only] => only.pad_pose(pad.tolerance_m())?,
-            several => joint_pose(several, camera)?,
-        };
-        let outlier = if seen.len() < 2 { None } else { outlier(&seen, &pose, camera) };
-        match outlier {
-            Some(index) => {
+    while seen.len() > 1 {
+        let pose = joint_pose(&seen, camera);
+        match (outlier(&seen, pose.as_ref(), camera), pose) {
+            (Some(index), _) => {
                 seen.remove(index);
             }
-            None => return observation(&seen, pose, all - seen.len(), camera),
+            (None, pose) => return observation(&seen, pose?, all - seen.len(), camera),
         }
     }
+    let only = seen.first()?.pad_pose(pad.tolerance_m())?;
+    observation(&seen, only, all - seen.len(), camera)
 }
 
 fn member<'a>(pad: &Pad, found: &'a Observation, camera: &CameraModel) -> Option<Member<'a>> {
@@ -130,9 +128,9 @@ impl<'a> Member<'a> {
         Some(Self { placed: *placed, found, marker_pose, points })
     }
 
-    /// Its weight among contradicting markers: its extent in the image, zero without corners.
+    /// Its weight among contradicting markers: its extent in the image by its confidence, zero without corners.
     fn weight(&self) -> f64 {
-        self.found.corners.map_or(0.0, |_| self.found.size_px)
+        self.found.corners.map_or(0.0, |_| self.found.size_px * self.found.confidence)
     }
 
     /// The pad's pose from this marker alone; `None` for a marker without orientation, unless it lies at the landing point.
@@ -231,12 +229,22 @@ fn joint_pose(members: &[Member<'_>], camera: &CameraModel) -> Option<MarkerPose
     planar_pose(&points, camera)
 }
 
-/// The member to leave out, if the largest residual is beyond the gate. Of two members the smaller one is left out, since
-/// their residuals do not show which is wrong.
-fn outlier(members: &[Member<'_>], pose: &MarkerPose, camera: &CameraModel) -> Option<usize> {
-    let residuals = members.iter().map(|member| member.residual(pose, camera));
-    let (worst, max) = residuals.enumerate().max_by(|(_, a), (_, b)| a.total_cmp(b))?;
-    if max.is_finite() && max <= MAX_RESIDUAL {
+/// The member to leave out, if the largest residual is beyond the gate or all together have no pose. Of two members the one of
+/// less weight is left out, since their residuals do not show which is wrong.
+fn outlier(
+    members: &[Member<'_>],
+    pose: Option<&MarkerPose>,
+    camera: &CameraModel,
+) -> Option<usize> {
+    let largest = |of: &dyn Fn(&Member<'_>) -> f64| {
+        let values = members.iter().map(of).enumerate();
+        values.max_by(|(_, a), (_, b)| a.total_cmp(b))
+    };
+    let (worst, residual) = match pose {
+        Some(pose) => largest(&|member| member.residual(pose, camera))?,
+        None => (largest(&|member| -member.weight())?.0, f64::INFINITY),
+    };
+    if residual <= MAX_RESIDUAL {
         return None;
     }
     match members {

@@ -3,7 +3,9 @@
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 
 use fiducial::{Detector, Observation, PadObservation, Settings, observe_pad};
-use geometry::{Body, Camera, CameraModel, Marker as MarkerFrame, Ned, Point, Rotation, Transform};
+use geometry::{
+    Body, Camera, CameraModel, Marker as MarkerFrame, Ned, Pixel, Point, Rotation, Transform,
+};
 use markers::{Marker, Pad};
 use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
 
@@ -161,6 +163,62 @@ fn a_marker_that_lies_elsewhere_is_left_out() {
         let seen = observe_pad(&pad, &found, &over.camera).unwrap();
         assert_eq!((seen.used, seen.left_out), (3, 1), "{right}");
         assert!(apart(&seen.pose.camera_from_marker, &truth) < 0.001, "{seen:?}");
+    }
+}
+
+#[test]
+fn a_false_marker_far_aside_does_not_hide_the_pad() {
+    let mut over = Over::new(built_in());
+    let (mut found, truth) = over.look([0.0, 0.0, 3.0], 0.0);
+    assert_eq!(found.len(), 2);
+    let inner = found.iter_mut().min_by(|a, b| a.size_px.total_cmp(&b.size_px)).unwrap();
+    let camera = over.camera;
+    let aside = |pixel: Pixel| Pixel::new(pixel.x + 300.0, pixel.y);
+    let pose = inner.pose.as_mut().unwrap();
+    let place = pose.camera_from_marker.origin();
+    let [u, v] = [300.0 / camera.fx, 0.0].map(|tangent| tangent * place.z());
+    let place = Point::new(place.x() + u, place.y() + v, place.z());
+    pose.camera_from_marker = Transform::new(pose.camera_from_marker.rotation(), place);
+    inner.centre = aside(inner.centre);
+    inner.corners = inner.corners.map(|corners| corners.map(aside));
+    let seen = over.observe(&found).unwrap();
+    assert_eq!((seen.used, seen.left_out), (1, 1));
+    assert!(apart(&seen.pose.camera_from_marker, &truth) < 0.005, "{seen:?}");
+    // An unsure marker does not drive out a surer one, however large it is.
+    for one in &mut found {
+        one.confidence = if one.size_px > 50.0 { 0.1 } else { 1.0 };
+    }
+    let seen = over.observe(&found).unwrap();
+    assert_eq!((seen.used, seen.left_out), (1, 1));
+    assert!(apart(&seen.pose.camera_from_marker, &truth) > 0.1, "{seen:?}");
+}
+
+#[test]
+fn a_false_marker_among_several_is_left_out_wherever_it_is() {
+    let mut over = Over::new(FOUR.parse().unwrap());
+    let (found, truth) = over.look([0.0, 0.0, 3.0], 0.0);
+    // Each square is described turned, in one other quarter.
+    for (marker, turns) in [
+        ("apriltag-36h11:1", 2),
+        ("apriltag-36h11:1", 1),
+        ("aruco-4x4-50:2", 3),
+        ("apriltag-16h5:3", 0),
+    ] {
+        let mut text = String::new();
+        for part in FOUR.split("[[markers]]").filter(|part| !part.contains("rings")) {
+            text.push_str(if text.is_empty() { "" } else { "[[markers]]" });
+            match part.contains(marker) {
+                true => {
+                    let rest = part.split("quarter_turns").next().unwrap();
+                    text.push_str(&format!("{rest}quarter_turns = {turns}\n"));
+                }
+                false => text.push_str(part),
+            }
+        }
+        let pad: Pad = text.parse().unwrap();
+        let seen = observe_pad(&pad, &found, &over.camera).unwrap();
+        assert_eq!((seen.used, seen.left_out), (2, 1), "{marker} {turns}");
+        assert!(apart(&seen.pose.camera_from_marker, &truth) < 0.003, "{seen:?}");
     }
 }
 
