@@ -519,9 +519,10 @@ fn decode_with_erasures(
         return None;
     }
     let rotated = |word: u64| code.rotated(word);
+    let of_all = || word.best_codeword(code.codewords, 0..code.codewords.len() as u32, rotated);
     let best = match ids {
         Some(ids) => word.best_codeword(code.codewords, ids.iter().copied(), rotated),
-        None => word.best_codeword(code.codewords, 0..code.codewords.len() as u32, rotated),
+        None => of_all(),
     };
     let codeword = code.codewords.get(best.id as usize).copied()?;
     let erased = code.bits.len() as u32 - known;
@@ -529,6 +530,10 @@ fn decode_with_erasures(
     let correctable = u32::from(code.min_hamming).saturating_sub(erased + 1) / 2;
     let max_hamming = correctable.max(u32::from(erased == 0));
     if best.hamming > max_hamming || best.second <= best.hamming {
+        return None;
+    }
+    // In some families two ids differ in a single bit: what reads as another one exactly is that one, though not looked for.
+    if ids.is_some() && best.hamming > 0 && of_all().hamming < best.hamming {
         return None;
     }
     let evidence = false_positive::evidence(code, codeword, count, known, best.hamming) as f32;
@@ -558,5 +563,23 @@ mod tests {
             let reading = decode_with_erasures(word, code, None);
             assert_eq!(reading.map(|reading| reading.id), is_read.then_some(7), "{hidden} bits");
         }
+    }
+
+    #[test]
+    fn another_id_is_not_taken_for_one_from_which_it_differs_in_a_bit() {
+        let code = SquareCode::for_family(Family::ArucoOriginal).unwrap();
+        let known = (1 << code.bits.len()) - 1;
+        let read = |bits: u64| {
+            let reading = decode_with_erasures(ErasedWord { bits, known }, code, Some(&[255]));
+            reading.map(|reading| reading.hamming)
+        };
+        let other = code.rotated(code.rotated(code.codewords[1022]));
+        assert_eq!((other ^ code.codewords[255]).count_ones(), 1);
+        assert_eq!(read(other), None);
+        assert_eq!(read(code.codewords[255]), Some(0));
+        // A wrong bit that makes no other id is corrected.
+        let is_other = |word: u64| code.nearest(word, 0).is_some();
+        let damaged = (0..25).map(|bit| code.codewords[255] ^ 1 << bit).find(|it| !is_other(*it));
+        assert_eq!(read(damaged.unwrap()), Some(1));
     }
 }
