@@ -32,13 +32,15 @@ pub struct Observation {
 }
 
 impl Observation {
-    /// An observation in a region of interest, in pixels of the whole frame.
+    /// An observation in a region of interest, in pixels of the whole frame. What binned pixels tell of how the camera shows light,
+    /// as its sharpening, is not so of the frame's.
     pub fn mapped(&self, roi: &Roi) -> Self {
         let mut seen = self.clone();
         seen.centre = roi.to_frame(seen.centre);
         seen.corners = seen.corners.map(|corners| corners.map(|corner| roi.to_frame(corner)));
         seen.centre_covariance_px2 *= roi.scale * roi.scale;
         seen.size_px *= roi.scale;
+        seen.response = seen.response.filter(|_| roi.scale <= 1.0);
         if let Some(pose) = &mut seen.pose {
             pose.reprojection_rms_px *= roi.scale;
             if let Some(other) = &mut pose.alternative {
@@ -82,4 +84,31 @@ pub trait StageObserver {
 /// Ignores the stages.
 impl StageObserver for () {
     fn ended(&mut self, _stage: &'static str) {}
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::response::Measured;
+
+    #[test]
+    fn binned_pixels_do_not_tell_the_cameras_response() {
+        let told = Measured { value: 0.5, deviation: 0.1 };
+        let seen = Observation {
+            family: Family::Rings,
+            id: None,
+            centre: Pixel::new(10.0, 20.0),
+            centre_covariance_px2: Matrix2::identity(),
+            corners: None,
+            wrong_bits: 0,
+            size_px: 30.0,
+            confidence: 1.0,
+            pose: None,
+            response: Some(ResponseEstimate { curve: told, sharpening: told }),
+        };
+        let cropped = seen.mapped(&Roi::cropped(5.0, 5.0, 40, 40));
+        assert!(cropped.response.is_some());
+        let binned = seen.mapped(&Roi::binned(0.0, 0.0, 40, 40, 2.0));
+        assert_eq!((binned.response, binned.size_px), (None, 60.0));
+    }
 }
