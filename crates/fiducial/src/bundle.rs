@@ -5,8 +5,8 @@
 //! point of the plane; alone they give the pad's pose only when they lie at the landing point.
 
 use geometry::{
-    Camera, CameraModel, Marker as MarkerFrame, Pad as PadFrame, Pixel, Point, Rotation, Transform,
-    Vector,
+    Camera, CameraModel, Distortion, Marker as MarkerFrame, Pad as PadFrame, Pixel, Point,
+    Rotation, Transform, Vector,
 };
 use markers::{Pad, PlacedMarker};
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix6, SMatrix, Vector2};
@@ -77,18 +77,34 @@ fn observation(
     left_out: usize,
     camera: &CameraModel,
 ) -> Option<PadObservation> {
-    let (centre, by_place) = camera.project_with_jacobian(pose.camera_from_marker.origin())?;
-    let place = pose.covariance.fixed_view::<3, 3>(0, 0);
+    let (centre, centre_covariance_px2) = landing_point(&pose, camera)?;
     let max = |of: fn(&Observation) -> f64| used.iter().map(|m| of(m.found)).fold(0.0, f64::max);
     Some(PadObservation {
         centre,
-        centre_covariance_px2: by_place * place * by_place.transpose(),
+        centre_covariance_px2,
         pose,
         size_px: max(|found| found.size_px),
         confidence: max(|found| found.confidence),
         used: used.len(),
         left_out,
     })
+}
+
+/// The pixel of the landing point, and its covariance. Beside a marker that is seen near the ground it may lie where the lens
+/// model has no pixels: then its pixel is the last one on the way there, and is uncertain by the rest of the way.
+fn landing_point(pose: &MarkerPose, camera: &CameraModel) -> Option<(Pixel, Matrix2<f64>)> {
+    let origin = pose.camera_from_marker.origin();
+    let reached = camera.project_with_jacobian(origin).map(|it| (it, 0.0)).or_else(|| {
+        let ideal = CameraModel { distortion: Distortion::None, ..*camera }.project(origin)?;
+        let ray = camera.unproject_clamped(ideal);
+        let on_ray = Point::from_coords((ray.coords * origin.z()).into());
+        let last = camera.project_with_jacobian(on_ray)?;
+        Some((last, last.0.distance(&ideal)))
+    });
+    let ((pixel, by_place), beyond_px) = reached?;
+    let place = pose.covariance.fixed_view::<3, 3>(0, 0);
+    let beyond = Matrix2::identity() * (beyond_px * beyond_px);
+    Some((pixel, by_place * place * by_place.transpose() + beyond))
 }
 
 /// The marker's frame in the pad's.

@@ -5,7 +5,7 @@
 mod render;
 
 use fiducial::{Detector, Observation, Settings};
-use geometry::{Camera, CameraModel, Marker as MarkerFrame, Transform};
+use geometry::{Camera, CameraModel, Distortion, Marker as MarkerFrame, Transform};
 use render::{SIZE_M, Scene};
 
 const RANGES_M: [f64; 8] = [0.3, 0.6, 1.0, 2.0, 4.0, 7.0, 10.0, 13.0];
@@ -127,6 +127,24 @@ fn errors_are_as_large_as_the_covariances_say() {
         let (centre, place) = (Row::mean(&of_centre), Row::mean(&of_place));
         println!("{range_m} m: centre {centre:.2} of 2, place {place:.2} of 3");
         assert!((0.6..4.5).contains(&centre) && (0.9..7.0).contains(&place), "at {range_m} m");
+    }
+}
+
+/// Half a marker's diameter above it the outer circle is where the lens model has no pixels, and the inner rings fill the image.
+#[test]
+fn the_inner_rings_are_enough_where_the_lens_model_ends() {
+    let distortion = Distortion::BrownConrady([0.15, -0.35, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    let camera = CameraModel { distortion, ..CameraModel::pinhole(1280, 960, 1000.0) };
+    let marker = format!("rings:{SIZE_M}").parse().unwrap();
+    let mut detector = Detector::new(&[marker], Settings::default()).unwrap();
+    for range in [0.6, 0.5] {
+        let scene = Scene::new(camera, [0.004, 0.002, range * SIZE_M], 0.02, 1.0);
+        let image = scene.render();
+        let found = detector.detect(image.view().unwrap(), Some(&camera), &mut ());
+        assert_eq!(found.len(), 1, "{range} diameters");
+        let pose = found[0].pose.unwrap().camera_from_marker;
+        let off = pose.origin().coords - scene.camera_from_marker.origin().coords;
+        assert!(off.norm() < 0.005 * scene.range_m(), "{off:?}");
     }
 }
 

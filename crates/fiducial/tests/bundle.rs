@@ -4,7 +4,8 @@
 
 use fiducial::{Detector, Observation, PadObservation, Settings, observe_pad};
 use geometry::{
-    Body, Camera, CameraModel, Marker as MarkerFrame, Ned, Pixel, Point, Rotation, Transform,
+    Body, Camera, CameraModel, Distortion, Marker as MarkerFrame, Ned, Pixel, Point, Rotation,
+    Transform,
 };
 use markers::{Marker, Pad};
 use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
@@ -220,6 +221,25 @@ fn a_false_marker_among_several_is_left_out_wherever_it_is() {
         assert_eq!((seen.used, seen.left_out), (2, 1), "{marker} {turns}");
         assert!(apart(&seen.pose.camera_from_marker, &truth) < 0.003, "{seen:?}");
     }
+}
+
+#[test]
+fn the_landing_point_may_be_beyond_what_the_lens_model_reaches() {
+    let pad = "id = 1\nmarkers = [{ marker = \"aruco-4x4-50:2:0.08\", x_m = 0.6 }]";
+    let mut over = Over::new(pad.parse().unwrap());
+    let at = over.ned_from_pad * Point::new(0.6, 0.0, 0.0);
+    let (found, truth) = over.look([at.x(), at.y(), 0.5], 0.0);
+    let near = over.observe(&found).unwrap();
+    let distortion = Distortion::BrownConrady([0.15, -0.35, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    over.camera = CameraModel { distortion, ..over.camera };
+    assert_eq!(over.camera.project(truth.origin()), None);
+    let seen = over.observe(&found).unwrap();
+    assert_eq!(seen.pose.camera_from_marker, near.pose.camera_from_marker);
+    // Its pixel is on the way to where it would be, as unsure as that is far.
+    let middle = Pixel::new(over.camera.cx, over.camera.cy);
+    let [short, long] = [seen.centre.distance(&middle), near.centre.distance(&middle)];
+    assert!(short < long && seen.centre.distance(&near.centre) < 1.01 * (long - short));
+    assert!(seen.centre_covariance_px2.trace().sqrt() > long - short);
 }
 
 #[test]

@@ -491,7 +491,7 @@ impl Evaluation<'_> {
         let centre_covariance_px2 =
             pixel_covariance(measured.pose.centre, &of_centre, self.camera).ok_or(Reason::Pose)?;
         let centre = project(pose.centre, camera).ok_or(Reason::Pose)?;
-        let outline = pose.projected(size_m.unwrap_or(1.0) / 2.0, camera).ok_or(Reason::Pose)?;
+        let outline = pose.outline(size_m.unwrap_or(1.0) / 2.0, camera).ok_or(Reason::Pose)?;
         Ok(Observation {
             family: Family::Rings,
             id: None,

@@ -113,18 +113,21 @@ impl Scene {
         (light + noise).round().clamp(0.0, 255.0) as u8
     }
 
-    /// First and last column and row around the paper, beyond the image's edge by the blur's reach only.
+    /// First and last column and row around the paper, beyond the image's edge by the blur's reach only; the whole image where the
+    /// lens model does not reach all of the paper.
     fn area_of_marker(&self) -> [i64; 4] {
         let half = self.paper * SIZE_M;
+        let limits = [f64::from(self.camera.width), f64::from(self.camera.height)];
         let mut area = [f64::MAX, f64::MAX, f64::MIN, f64::MIN];
         for i in 0..32 {
             let t = f64::from(i) * std::f64::consts::TAU / 32.0;
             let corner = Point::<MarkerFrame>::new(1.5 * half * t.cos(), 1.5 * half * t.sin(), 0.0);
-            if let Some(at) = self.camera.project(self.camera_from_marker * corner) {
-                area = [area[0].min(at.x), area[1].min(at.y), area[2].max(at.x), area[3].max(at.y)];
-            }
+            let Some(at) = self.camera.project(self.camera_from_marker * corner) else {
+                area = [0.0, 0.0, limits[0], limits[1]];
+                break;
+            };
+            area = [area[0].min(at.x), area[1].min(at.y), area[2].max(at.x), area[3].max(at.y)];
         }
-        let limits = [f64::from(self.camera.width), f64::from(self.camera.height)];
         let edge = |value: f64, axis: usize| value.clamp(-9.0, limits[axis] + 9.0) as i64;
         [edge(area[0], 0), edge(area[1], 1), edge(area[2], 0) + 1, edge(area[3], 1) + 1]
     }

@@ -33,6 +33,8 @@ pub(crate) struct EdgePoint {
 
 /// Points sampled on an ellipse to map it through a lens.
 const ELLIPSE_POINTS: u32 = 24;
+/// Shares of a circle's radius, of which the largest that the lens model reaches tells its size.
+const REACHED_SHARES: [f64; 5] = [1.0, 0.8, 0.6, 0.4, 0.2];
 /// Huber limit of edge residuals, in pixels.
 pub(crate) const HUBER_PX: f64 = 0.3;
 /// Lower bound of the edges' standard deviation, in pixels. Errors common to all edges, such as the blur of
@@ -137,6 +139,15 @@ impl CirclePose {
             *point = [pixel.x, pixel.y];
         }
         fit_ellipse(points.iter().copied())
+    }
+
+    /// As [`Self::projected`]; where the lens model does not reach all of the circle, as it may be beyond the image, a smaller circle
+    /// that it reaches, scaled.
+    pub(crate) fn outline(&self, radius: f64, camera: &CameraModel) -> Option<Ellipse> {
+        REACHED_SHARES.into_iter().find_map(|share| {
+            let inner = self.projected(share * radius, camera)?;
+            Some(Ellipse { minor: inner.minor / share, major: inner.major / share, ..inner })
+        })
     }
 
     /// The pose that fits the edge points best, with the remaining root mean square distance in pixels.

@@ -342,7 +342,7 @@ impl EdgeSearch<'_> {
     }
 
     fn diameter_px(&self, pose: &CirclePose) -> Option<f64> {
-        pose.projected(self.size_m / 2.0, self.camera).map(|outline| outline.major)
+        pose.outline(self.size_m / 2.0, self.camera).map(|outline| outline.major)
     }
 
     fn photometric(&self) -> PhotometricInput<'_> {
