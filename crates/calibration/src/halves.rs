@@ -35,8 +35,8 @@ struct Half {
 }
 
 impl Half {
-    fn new(whole: &Solved, remainder: usize) -> Option<Self> {
-        let part = whole.part(|view| view % 2 == remainder);
+    fn new(whole: &Solved, keep: impl Fn(usize) -> bool) -> Option<Self> {
+        let part = whole.part(keep);
         let certainty = part.information()?.certainty(&part.free)?;
         let covariance =
             certainty.covariance.fixed_view::<INTRINSICS, INTRINSICS>(0, 0).into_owned();
@@ -44,9 +44,15 @@ impl Half {
     }
 }
 
-/// What every second view says of the others; `None` where a half shows no camera.
+/// What every second view says of the others, and the first half of them of the second, which shows what changed in between: the
+/// worse of both. `None` where a half shows no camera in either way.
 pub(crate) fn cross_validation(whole: &Solved) -> Option<CrossValidation> {
-    compare(&Half::new(whole, 0)?, &Half::new(whole, 1)?)
+    let middle = whole.views.len() / 2;
+    let by = |is_first: &dyn Fn(usize) -> bool| {
+        compare(&Half::new(whole, is_first)?, &Half::new(whole, |view| !is_first(view))?)
+    };
+    let both = [by(&|view| view % 2 == 0), by(&|view| view < middle)];
+    both.into_iter().flatten().max_by(|a, b| a.ratio().total_cmp(&b.ratio()))
 }
 
 /// Columns and rows of the places that are compared.

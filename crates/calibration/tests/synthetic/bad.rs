@@ -19,10 +19,11 @@ pub enum Bad {
     Mirrored,
     MixedSizes,
     Blurred,
+    Refocused,
 }
 
 impl Bad {
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::TooFew,
         Self::OneDistance,
         Self::NoTilt,
@@ -33,6 +34,7 @@ impl Bad {
         Self::Mirrored,
         Self::MixedSizes,
         Self::Blurred,
+        Self::Refocused,
     ];
 
     /// A set of this kind, and the lens that is asked for.
@@ -77,6 +79,14 @@ impl Bad {
                     .iter_mut()
                     .for_each(|p| (p.seen.x, p.seen.y) = (p.seen.x / 2.0, p.seen.y / 2.0));
             }
+            Self::Refocused => {
+                // From the middle of the set on; by more than this it looks like motion.
+                let other = CameraModel { fx: 1.007 * camera.fx, fy: 1.007 * camera.fy, ..*camera };
+                let later = super::views(&other, &taking, seed + 1);
+                let middle = views.len() / 2;
+                views.truncate(middle);
+                views.extend(later.into_iter().skip(middle));
+            }
             _ => {}
         }
         (views, if self == Self::WrongLens { truth.wrong_lens() } else { truth.lens })
@@ -97,6 +107,7 @@ impl Bad {
             Self::Mirrored => matches!(refusal, Refusal::Mirrored { .. }),
             Self::MixedSizes => matches!(refusal, Refusal::MixedSizes { .. }),
             Self::Blurred => matches!(refusal, Refusal::Noisy { .. }),
+            Self::Refocused => matches!(refusal, Refusal::Inconsistent { .. }),
         }
     }
 }
