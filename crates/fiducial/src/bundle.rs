@@ -9,10 +9,10 @@ use geometry::{
     Rotation, Transform, Vector,
 };
 use markers::{Pad, PlacedMarker};
-use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix6, SMatrix, Vector2};
+use nalgebra::{Matrix2, Matrix6, SMatrix, Vector2};
 
 use crate::observation::{MarkerPose, Observation, PoseSolution};
-use crate::pose::{PlanePoint, planar_pose};
+use crate::pose::{PlanePoint, Sheets, pose_of_sheets};
 
 /// A pad found in an image.
 #[derive(Clone, Debug, PartialEq)]
@@ -54,7 +54,7 @@ pub fn observe_pad<'a>(
     let mut seen: Vec<Member<'_>> = found.filter_map(|it| member(pad, it, camera)).collect();
     let all = seen.len();
     while seen.len() > 1 {
-        let pose = joint_pose(&seen, camera);
+        let pose = joint_pose(seen.iter(), camera);
         match (outlier(&seen, pose.as_ref(), camera), pose) {
             (Some(index), _) => {
                 seen.remove(index);
@@ -62,7 +62,7 @@ pub fn observe_pad<'a>(
             (None, pose) => return observation(&seen, pose?, all - seen.len(), camera),
         }
     }
-    let only = seen.first()?.pad_pose(pad.tolerance_m())?;
+    let only = seen.first()?.pad_pose()?;
     observation(&seen, only, all - seen.len(), camera)
 }
 
@@ -127,6 +127,8 @@ struct Member<'a> {
     marker_pose: &'a MarkerPose,
     /// Its corners on the pad and in the image, or its centre where it has no corners.
     points: Vec<PlanePoint>,
+    /// Standard deviation of its place on the pad, in metres: it moves as a whole.
+    tolerance_m: f64,
 }
 
 impl<'a> Member<'a> {
@@ -138,10 +140,10 @@ impl<'a> Member<'a> {
     ) -> Option<Self> {
         let marker_pose = found.pose.as_ref()?;
         let points = match found.corners {
-            Some(corners) => corner_points(placed, corners, marker_pose, tolerance_m, camera)?,
-            None => vec![centre_point(placed, found, marker_pose, tolerance_m, camera)?],
+            Some(corners) => corner_points(placed, corners, marker_pose, camera)?,
+            None => vec![plane_point(placed.position_m, found.centre, found.centre_covariance_px2)],
         };
-        Some(Self { placed: *placed, found, marker_pose, points })
+        Some(Self { placed: *placed, found, marker_pose, points, tolerance_m })
     }
 
     /// Its weight among contradicting markers: its extent in the image by its confidence, zero without corners.
@@ -150,7 +152,7 @@ impl<'a> Member<'a> {
     }
 
     /// The pad's pose from this marker alone; `None` for a marker without orientation, unless it lies at the landing point.
-    fn pad_pose(&self, tolerance_m: f64) -> Option<MarkerPose> {
+    fn pad_pose(&self) -> Option<MarkerPose> {
         if self.found.corners.is_none() && self.placed.position_m != [0.0; 2] {
             return None;
         }
@@ -161,7 +163,10 @@ impl<'a> Member<'a> {
         let mut lever = Matrix6::identity();
         lever.fixed_view_mut::<3, 3>(0, 3).copy_from(&-arm.cross_matrix());
         let mut covariance = lever * pose.covariance * lever.transpose();
-        let placement = Matrix3::identity() * (tolerance_m * tolerance_m);
+        // The marker lies elsewhere in the pad's plane.
+        let turn = camera_from_pad.rotation().quaternion.to_rotation_matrix();
+        let along = turn.matrix().fixed_view::<3, 2>(0, 0) * self.tolerance_m;
+        let placement = along * along.transpose();
         let mut place = covariance.fixed_view_mut::<3, 3>(0, 0);
         place += placement;
         covariance.iter().all(|c| c.is_finite()).then_some(MarkerPose {
@@ -180,9 +185,11 @@ impl<'a> Member<'a> {
         let squares = self.points.iter().map(|point| {
             let [x, y] = point.place_m;
             let place = pose.camera_from_marker * Point::<MarkerFrame>::new(x, y, 0.0);
-            let pixel = camera.project(place)?;
+            let (pixel, by_place) = camera.project_with_jacobian(place)?;
             let residual = Vector2::new(point.seen.x - pixel.x, point.seen.y - pixel.y);
-            Some(residual.dot(&(point.covariance_px2.cholesky()?.inverse() * residual)))
+            let placement = by_place * by_place.transpose() * self.tolerance_m.powi(2);
+            let covariance = point.covariance_px2 + placement;
+            Some(residual.dot(&(covariance.cholesky()?.inverse() * residual)))
         });
         let values = 2.0 * self.points.len() as f64;
         squares.sum::<Option<f64>>().map_or(f64::INFINITY, |sum| sum / values)
@@ -194,7 +201,6 @@ fn corner_points(
     placed: &PlacedMarker,
     seen: [Pixel; 4],
     marker_pose: &MarkerPose,
-    tolerance_m: f64,
     camera: &CameraModel,
 ) -> Option<Vec<PlanePoint>> {
     let half = placed.size_m / 2.0;
@@ -209,40 +215,29 @@ fn corner_points(
         by_pose.fixed_view_mut::<2, 3>(0, 3).copy_from(&(by_place * -arm));
         let spread = by_pose * marker_pose.covariance * by_pose.transpose() * CORNERS_PER_POSE;
         let place_m = placed.position_on_pad(*corner);
-        Some(plane_point(place_m, seen, spread, &by_place, tolerance_m))
+        Some(plane_point(place_m, seen, spread))
     });
     points.collect()
 }
 
-/// A marker's centre, on the pad and in the image.
-fn centre_point(
-    placed: &PlacedMarker,
-    found: &Observation,
-    marker_pose: &MarkerPose,
-    tolerance_m: f64,
-    camera: &CameraModel,
-) -> Option<PlanePoint> {
-    let (_, by_place) = camera.project_with_jacobian(marker_pose.camera_from_marker.origin())?;
-    let spread = found.centre_covariance_px2;
-    Some(plane_point(placed.position_m, found.centre, spread, &by_place, tolerance_m))
-}
-
-/// A point with the uncertainty of its pixel and of its place in print.
-fn plane_point(
-    place_m: [f64; 2],
-    seen: Pixel,
-    spread_px2: Matrix2<f64>,
-    by_place: &Matrix2x3<f64>,
-    tolerance_m: f64,
-) -> PlanePoint {
-    let placement = by_place * by_place.transpose() * (tolerance_m * tolerance_m);
+/// A point with the uncertainty of its pixel.
+fn plane_point(place_m: [f64; 2], seen: Pixel, spread_px2: Matrix2<f64>) -> PlanePoint {
     let min = Matrix2::identity() * MIN_VARIANCE_PX2;
-    PlanePoint { place_m, seen, covariance_px2: spread_px2 + placement + min }
+    PlanePoint { place_m, seen, covariance_px2: spread_px2 + min }
 }
 
-fn joint_pose(members: &[Member<'_>], camera: &CameraModel) -> Option<MarkerPose> {
-    let points: Vec<PlanePoint> = members.iter().flat_map(|m| m.points.iter().copied()).collect();
-    planar_pose(&points, camera)
+/// The pose of the pad from several members.
+fn joint_pose<'a>(
+    members: impl Iterator<Item = &'a Member<'a>>,
+    camera: &CameraModel,
+) -> Option<MarkerPose> {
+    let (mut points, mut last, mut tolerance_m) = (Vec::new(), Vec::new(), 0.0);
+    for member in members {
+        points.extend_from_slice(&member.points);
+        last.push(points.len() - 1);
+        tolerance_m = member.tolerance_m;
+    }
+    pose_of_sheets(&points, Sheets { last: &last, tolerance_m }, camera)
 }
 
 /// The member to leave out, if the largest residual is beyond the gate or all together have no pose. Of two members the one of
@@ -274,10 +269,92 @@ fn outlier(
 fn leave_one_out(members: &[Member<'_>], camera: &CameraModel) -> Option<usize> {
     let cost = |without: usize| {
         let kept = members.iter().enumerate().filter(|(i, _)| *i != without).map(|(_, m)| m);
-        let points: Vec<PlanePoint> = kept.clone().flat_map(|m| m.points.iter().copied()).collect();
-        let pose = planar_pose(&points, camera)?;
+        let pose = joint_pose(kept.clone(), camera)?;
         Some(kept.map(|member| member.residual(&pose, camera)).sum::<f64>())
     };
     let costs = (0..members.len()).filter_map(|without| Some((without, cost(without)?)));
     costs.min_by(|(_, a), (_, b)| a.total_cmp(b)).map(|(without, _)| without)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pose::square_pose;
+    use markers::Family;
+
+    const TWO: &str = r#"
+id = 1
+tolerance_m = 0.005
+markers = [{ marker = "aruco-4x4-50:1:0.15", x_m = -0.15 }, { marker = "aruco-4x4-50:2:0.15", x_m = 0.15 }]
+"#;
+    const NOISE_PX: f64 = 0.05;
+
+    /// The markers of a pad, each moved on the ground as a whole.
+    fn sheets(
+        pad: &Pad,
+        camera_from_pad: &Transform<Camera, PadFrame>,
+        camera: &CameraModel,
+        gaussian: &mut impl FnMut() -> f64,
+    ) -> Vec<Observation> {
+        let seen = pad.markers().iter().map(|placed| {
+            let shift = [gaussian(), gaussian()].map(|it| it * pad.tolerance_m());
+            let half = placed.size_m / 2.0;
+            let corners = [[-half, half], [half, half], [half, -half], [-half, -half]].map(|at| {
+                let [x, y] = placed.position_on_pad(at);
+                let place = *camera_from_pad * Point::new(x + shift[0], y + shift[1], 0.0);
+                let pixel = camera.project(place).unwrap();
+                let noise = [gaussian(), gaussian()].map(|it| it * NOISE_PX);
+                Pixel::new(pixel.x + noise[0], pixel.y + noise[1])
+            });
+            let spread = SMatrix::identity() * (NOISE_PX * NOISE_PX);
+            Observation {
+                family: Family::Aruco4x4_50,
+                id: placed.marker.id,
+                centre: corners[0],
+                centre_covariance_px2: Matrix2::identity() * (NOISE_PX * NOISE_PX),
+                corners: Some(corners),
+                wrong_bits: 0,
+                size_px: corners[0].distance(&corners[2]),
+                confidence: 1.0,
+                pose: square_pose(&corners, &spread, placed.size_m, camera),
+                response: None,
+            }
+        });
+        seen.collect()
+    }
+
+    #[test]
+    fn sheets_that_lie_elsewhere_as_a_whole_do_not_change_the_distance() {
+        let pad: Pad = TWO.parse().unwrap();
+        let camera = CameraModel::pinhole(1280, 960, 900.0);
+        let turn = Rotation::from_euler(std::f64::consts::PI - 0.2, 0.1, 0.3);
+        let truth = Transform::new(turn, Point::new(0.05, -0.02, 1.0));
+        let mut seed = 7_u64;
+        let mut gaussian = move || {
+            let mut uniform = || {
+                seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(99);
+                ((seed >> 33) as f64 + 0.5) / 2_f64.powi(31)
+            };
+            let radius = (-2.0 * uniform().ln()).sqrt();
+            radius * (std::f64::consts::TAU * uniform()).cos()
+        };
+        const SETS: usize = 200;
+        let (mut squares, mut off_m, mut one_off_m) = (0.0, 0.0, 0.0);
+        for _ in 0..SETS {
+            let found = sheets(&pad, &truth, &camera, &mut gaussian);
+            let seen = observe_pad(&pad, &found, &camera).unwrap();
+            assert_eq!(seen.used, 2);
+            let error = |of: &PadObservation| {
+                of.pose.camera_from_marker.origin().coords.coords - truth.origin().coords.coords
+            };
+            let covariance = seen.pose.covariance.fixed_view::<3, 3>(0, 0).into_owned();
+            squares += error(&seen).dot(&(covariance.try_inverse().unwrap() * error(&seen)));
+            off_m += error(&seen).z.powi(2);
+            let one = observe_pad(&pad, &found[..1], &camera).unwrap();
+            one_off_m += error(&one).z.powi(2);
+        }
+        let [nees, off_m, one_off_m] = [squares, off_m, one_off_m].map(|it| it / SETS as f64);
+        assert!((2.3..3.8).contains(&nees), "{nees}");
+        assert!(off_m <= one_off_m, "{off_m} {one_off_m}");
+    }
 }

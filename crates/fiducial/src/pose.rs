@@ -32,7 +32,16 @@ pub struct PlanePoint {
 /// markers of a pad. `None` for fewer than four points, for points on a line, and when no visible face in
 /// front of the camera explains them.
 pub fn planar_pose(points: &[PlanePoint], camera: &CameraModel) -> Option<MarkerPose> {
-    Plane { points, joint: None, camera }.pose()
+    Plane { points, joint: None, sheets: None, camera }.pose()
+}
+
+/// As [`planar_pose`], of points on several sheets.
+pub(crate) fn pose_of_sheets(
+    points: &[PlanePoint],
+    sheets: Sheets<'_>,
+    camera: &CameraModel,
+) -> Option<MarkerPose> {
+    Plane { points, joint: None, sheets: Some(sheets), camera }.pose()
 }
 
 /// The pose of a square marker from its four corners and their joint covariance (x and y of the first corner,
@@ -56,7 +65,7 @@ pub fn square_pose(
         point.covariance_px2 = covariance_px2.fixed_view::<2, 2>(2 * i, 2 * i).into_owned();
     }
     let information = covariance_px2.cholesky()?.inverse();
-    Plane { points: &points, joint: Some(&information), camera }.pose()
+    Plane { points: &points, joint: Some(&information), sheets: None, camera }.pose()
 }
 
 /// The closed form is so near that a handful of steps is enough.
@@ -84,7 +93,44 @@ struct Plane<'a> {
     points: &'a [PlanePoint],
     /// Inverse of the joint covariance of four points, where it is known.
     joint: Option<&'a SMatrix<f64, 8, 8>>,
+    sheets: Option<Sheets<'a>>,
     camera: &'a CameraModel,
+}
+
+/// Which points are on one sheet, that may lie elsewhere in the plane than it should.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Sheets<'a> {
+    /// The index of the last point of each sheet, in the points' order.
+    pub(crate) last: &'a [usize],
+    /// Standard deviation of a sheet's place along each axis, in metres.
+    pub(crate) tolerance_m: f64,
+}
+
+/// The part of the normal equations that the displacement of one sheet has.
+struct Displacement {
+    matrix: Matrix2<f64>,
+    by_pose: SMatrix<f64, 6, 2>,
+    right: Vector2<f64>,
+}
+
+impl Displacement {
+    fn new() -> Self {
+        let (matrix, by_pose, right) = (Matrix2::zeros(), SMatrix::zeros(), Vector2::zeros());
+        Self { matrix, by_pose, right }
+    }
+
+    /// Takes the displacement out of the normal equations of the pose, as far as its tolerance lets it differ.
+    fn eliminate(self, tolerance_m: f64, equations: &mut NormalEquations<6, f64>) -> Option<()> {
+        if tolerance_m <= 0.0 {
+            return Some(());
+        }
+        let prior = Matrix2::identity() / (tolerance_m * tolerance_m);
+        let inverse = (self.matrix + prior).cholesky()?.inverse();
+        equations.matrix -= self.by_pose * inverse * self.by_pose.transpose();
+        equations.right -= self.by_pose * (inverse * self.right);
+        equations.cost -= self.right.dot(&(inverse * self.right));
+        Some(())
+    }
 }
 
 /// A pose, the normal equations there (translation, then rotation vector) and the reprojection error in
@@ -97,7 +143,9 @@ impl Problem<6> for Plane<'_> {
 
     /// `None` where a point would lie behind the camera, or the face away from it.
     fn linearised(&mut self, pose: &Isometry3<f64>) -> Option<NormalEquations<6, f64>> {
-        let (mut matrix, mut right, mut cost) = (Matrix6::zeros(), Vector6::zeros(), 0.0);
+        let (matrix, right) = (Matrix6::zeros(), Vector6::zeros());
+        let mut equations = NormalEquations { matrix, right, cost: 0.0, extra: 0.0 };
+        let mut displacement = Displacement::new();
         let rotation = pose.rotation.to_rotation_matrix();
         let facing = rotation.matrix().column(2).dot(&pose.translation.vector);
         if facing.is_nan() || facing >= 0.0 {
@@ -121,18 +169,29 @@ impl Problem<6> for Plane<'_> {
                 continue;
             }
             let weight = point.covariance_px2.cholesky()?.inverse();
-            matrix += slope.transpose() * weight * slope;
-            right += slope.transpose() * weight * residual;
-            cost += residual.dot(&(weight * residual));
+            equations.matrix += slope.transpose() * weight * slope;
+            equations.right += slope.transpose() * weight * residual;
+            equations.cost += residual.dot(&(weight * residual));
+            if let Some(sheets) = self.sheets {
+                let by_shift = by_place * rotation.matrix().fixed_view::<3, 2>(0, 0);
+                displacement.matrix += by_shift.transpose() * weight * by_shift;
+                displacement.by_pose += slope.transpose() * weight * by_shift;
+                displacement.right += by_shift.transpose() * weight * residual;
+                if sheets.last.contains(&i) {
+                    displacement.eliminate(sheets.tolerance_m, &mut equations)?;
+                    displacement = Displacement::new();
+                }
+            }
         }
         if let Some(information) = self.joint {
-            matrix = jacobian.transpose() * information * jacobian;
-            right = jacobian.transpose() * (information * residuals);
-            cost = residuals.dot(&(information * residuals));
+            equations.matrix = jacobian.transpose() * information * jacobian;
+            equations.right = jacobian.transpose() * (information * residuals);
+            equations.cost = residuals.dot(&(information * residuals));
         }
-        let rms_px = (squares / self.points.len() as f64).sqrt();
-        let is_finite = cost.is_finite() && matrix.iter().all(|m| m.is_finite());
-        is_finite.then_some(NormalEquations { matrix, right, cost, extra: rms_px })
+        equations.extra = (squares / self.points.len() as f64).sqrt();
+        let is_finite =
+            equations.cost.is_finite() && equations.matrix.iter().all(|m| m.is_finite());
+        is_finite.then_some(equations)
     }
 
     fn moved(&self, from: &Isometry3<f64>, step: &Vector6<f64>) -> Option<Isometry3<f64>> {
