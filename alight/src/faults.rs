@@ -21,9 +21,8 @@ use crate::real_time;
 use crate::runtime::{block_on, cores};
 use crate::terminal::{print, write_error};
 
-/// Numbers of flights.
+/// Number of flights in lock-step.
 const LOCKSTEP_FLIGHTS: u64 = 1000;
-const REAL_TIME_FLIGHTS: u64 = 25;
 
 #[derive(Args)]
 pub(crate) struct FaultsArgs {
@@ -33,7 +32,7 @@ pub(crate) struct FaultsArgs {
     /// Replace the results of an experiment that are in the output folder, once there are new ones; without it they are refused.
     #[arg(long)]
     replace: bool,
-    /// Number of flights [default: 1000, in real time 25].
+    /// Number of flights [default: 1000, in real time as many as there are kinds].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     flights: Option<u64>,
     /// Seed of the first flight; the others follow. A seed draws the fault's begin and duration, and the wind.
@@ -107,7 +106,8 @@ impl FaultsArgs {
             let how = if self.real_time { "without" } else { "with" };
             return Err(format!("`{}` is flown {how} --real-time only", kind.name()));
         }
-        let usual = if self.real_time { REAL_TIME_FLIGHTS } else { LOCKSTEP_FLIGHTS };
+        // In real time each kind has its flight: neighbouring seeds have different ones.
+        let usual = if self.real_time { possible.len() as u64 } else { LOCKSTEP_FLIGHTS };
         Ok(Plan {
             flights: self.flights.unwrap_or(usual),
             seed: self.seed,
@@ -218,4 +218,37 @@ pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
     let is_bad =
         findings.outcomes.iter().any(|outcome| outcome.is_unsafe() || outcome.is_unended());
     Ok(ExitCode::from(u8::from(is_bad)))
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Tool {
+        #[command(flatten)]
+        args: FaultsArgs,
+    }
+
+    fn plan(options: &[&str]) -> Plan {
+        let words = ["faults"].iter().chain(options);
+        Tool::try_parse_from(words).unwrap().args.plan().unwrap()
+    }
+
+    #[test]
+    fn each_kind_has_a_flight_unless_a_number_is_given() {
+        for (options, kinds) in [
+            (&["--real-time"][..], Kind::in_real_time().collect::<Vec<Kind>>()),
+            (&[], Kind::in_lockstep().collect()),
+        ] {
+            let flights = plan(options).flights();
+            for kind in kinds {
+                let is_flown = flights.iter().any(|flight| flight.faults[0].kind == kind);
+                assert!(is_flown, "{options:?}: {}", kind.name());
+            }
+        }
+        assert_eq!(plan(&["--real-time", "--flights", "3"]).flights().len(), 3);
+    }
 }
