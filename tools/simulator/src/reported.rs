@@ -2,7 +2,7 @@
 //!
 //! A simulated ArduPilot sends the truth in SIM_STATE, a simulated PX4 in HIL_STATE_QUATERNION, with the
 //! position in steps of about a centimetre and an accurate velocity; combined they give a smooth motion. Of
-//! other autopilots the estimate is used.
+//! other autopilots, and of an ArduPilot whose SIM_STATE lacks that position, the estimate is used.
 
 use std::collections::VecDeque;
 
@@ -110,6 +110,10 @@ impl ReportedVehicle {
         let numbers = [state.roll, state.pitch, state.yaw, state.alt, state.vn, state.ve, state.vd];
         let rates = [state.xgyro, state.ygyro, state.zgyro];
         if !numbers.iter().chain(&rates).all(|n| n.is_finite()) {
+            return;
+        }
+        // Both are extension fields, which older autopilots leave out; the others know the place to half a metre only.
+        if state.lat_int == 0 && state.lon_int == 0 {
             return;
         }
         let here = GlobalPosition {
@@ -410,5 +414,21 @@ mod tests {
         reported.handle(0.01, &packet(MavMessage::ATTITUDE(ATTITUDE_DATA::default())));
         reported.handle(0.02, &packet(MavMessage::LOCAL_POSITION_NED(position)));
         assert!((reported.truth().unwrap().height_m - 3.0).abs() < 1e-6 && !reported.is_true(0.02));
+    }
+
+    #[test]
+    fn a_truth_without_its_accurate_position_is_none() {
+        let mut reported = ReportedVehicle::default();
+        for tick in 0..50 {
+            let time_s = f64::from(tick) * 0.02;
+            let coarse = SIM_STATE_DATA { lat: -35.36, lon: 149.16, ..Default::default() };
+            reported.handle(time_s, &packet(MavMessage::SIM_STATE(coarse)));
+            reported.handle(time_s, &packet(MavMessage::ATTITUDE(ATTITUDE_DATA::default())));
+            let local =
+                LOCAL_POSITION_NED_DATA { x: tick as f32 * 0.02, vx: 1.0, ..Default::default() };
+            reported.handle(time_s, &packet(MavMessage::LOCAL_POSITION_NED(local)));
+        }
+        assert!(!reported.is_true(0.98));
+        assert!((reported.truth().unwrap().position.x() - 0.98).abs() < 1e-6);
     }
 }
