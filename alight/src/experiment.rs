@@ -191,6 +191,7 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
         jobs: args.jobs.unwrap_or_else(cores),
         recordings: args.recordings,
     };
+    request.plan.check()?;
     let mut folder = Folder::claim(&args.output, args.replace)?;
     let interruption = Interruption::on_signals(FLIGHTS_END)?;
     let steps = Steps::of_flights();

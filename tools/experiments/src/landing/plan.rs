@@ -5,7 +5,9 @@ use std::ops::RangeInclusive;
 use std::str::FromStr;
 
 use anyhow::bail;
+use node::ConfigError;
 
+use super::configuration;
 use super::fault::{Change, Fault, START_ANGLE, drawn, drawn_angle};
 
 /// The vision of a flight.
@@ -229,6 +231,18 @@ pub struct Planned {
 }
 
 impl Plan {
+    /// Checks the settings of every flight, so that none is refused after others were flown.
+    ///
+    /// # Errors
+    /// The first setting that a service refuses.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        self.flights().iter().try_for_each(|planned| {
+            configuration::<simulator::Config>("simulator", &planned.change.simulator)?;
+            configuration::<controller::Config>("controller", &planned.change.controller)?;
+            Ok(())
+        })
+    }
+
     /// Its flights, cell after cell.
     pub fn flights(&self) -> Vec<Planned> {
         let mut flights = Vec::new();
@@ -396,5 +410,15 @@ mod tests {
         let command = Plan { set: set.clone(), ..Plan::default() }.flights()[0].command();
         let words = shlex::split(&command).unwrap();
         assert!(words.windows(2).any(|pair| pair == ["--set", &set[0]]), "{command}");
+    }
+
+    #[test]
+    fn a_plan_with_a_flight_that_would_be_refused_is_refused() {
+        let windy = |wind: &str| Plan { wind: wind.parse().unwrap(), ..Plan::default() }.check();
+        assert!(windy("0,20").is_ok());
+        for wind in ["0,25", "0..200"] {
+            let told = windy(wind).unwrap_err().to_string();
+            assert!(told.contains("wind.mean_m_s") && told.contains("20"), "{told}");
+        }
     }
 }
