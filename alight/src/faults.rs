@@ -41,7 +41,7 @@ pub(crate) struct FaultsArgs {
     /// Only this kind of fault. May be repeated. An unknown name lists all.
     #[arg(long = "kind", value_name = "NAME")]
     kinds: Vec<Kind>,
-    /// Height over the pad at which it begins, in metres: a value, a list 0.3,2,5, or a range.
+    /// Height over the pad at which it begins, in metres, up to that of the start (10): a value, a list 0.3,2,5, or a range.
     #[arg(long, allow_hyphen_values = true, value_name = "M", default_value = "0.2..9")]
     height: Values,
     /// How long it lasts, in seconds, or `ever`; a list as well [default: one of 0.5, 2, 5 and ever].
@@ -196,6 +196,7 @@ pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
     let (real_time, tapes_in, replaces) = (args.real_time, args.record_tapes.clone(), args.replace);
     refuse_swept(&args.set, &SWEPT)?;
     let plan = args.plan().map_err(anyhow::Error::msg)?;
+    plan.check()?;
     let request = Request { command: this_command(), plan, tapes_in, jobs };
     let mut folder = Folder::claim(&output, replaces)?;
     request.tapes_in.as_deref().map_or(Ok(()), results::claim_for_recordings)?;

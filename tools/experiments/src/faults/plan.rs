@@ -2,7 +2,10 @@
 
 use std::path::PathBuf;
 
+use node::ConfigError;
+
 use super::kind::{Kind, LIAR};
+use crate::landing::configuration;
 use crate::landing::fault::{START_ANGLE, drawn, drawn_angle};
 use crate::landing::plan::{Swept, Values, set_option};
 
@@ -119,6 +122,28 @@ pub struct Planned {
 }
 
 impl Plan {
+    /// Checks every flight before one is flown: its settings, and that its fault begins no higher than it starts.
+    ///
+    /// # Errors
+    /// The first setting that a service refuses, or the start that is too low.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        self.flights().iter().try_for_each(|planned| {
+            let simulated =
+                configuration::<simulator::Config>("simulator", &planned.simulator)?.settings;
+            configuration::<controller::Config>("controller", &planned.controller)?;
+            let (start_m, begins_m) = (simulated.start.height_m, planned.height_m);
+            if begins_m <= start_m {
+                return Ok(());
+            }
+            Err(ConfigError::Refused {
+                source_name: format!("--height {}", self.height),
+                key: "simulator.start.height_m".to_owned(),
+                value: start_m.to_string(),
+                limit: format!("a fault cannot begin at {begins_m} m, over the start; choose a lower `--height`"),
+            })
+        })
+    }
+
     /// Its flights.
     pub fn flights(&self) -> Vec<Planned> {
         (0..self.flights).map(|i| self.flight(self.seed.wrapping_add(i))).collect()
@@ -296,5 +321,25 @@ mod tests {
         names.sort_unstable();
         names.dedup();
         assert_eq!(names.len(), 39);
+    }
+
+    #[test]
+    fn heights_over_the_start_and_settings_that_a_service_refuses_are_refused_before_the_first_flight()
+     {
+        let plan = |heights: &[f64], set: &[&str]| Plan {
+            flights: 20,
+            height: Values::List(heights.to_vec()),
+            set: set.iter().map(|&setting| setting.to_owned()).collect(),
+            ..Plan::default()
+        };
+        let told = |plan: Plan| plan.check().unwrap_err().to_string();
+        assert!(plan(&[0.3, 10.0], &[]).check().is_ok());
+        assert!(plan(&[30.0], &["simulator.start.height_m=30"]).check().is_ok());
+        let high = told(plan(&[3.0, 30.0], &[]));
+        assert!(high.contains("--height 3,30") && high.contains("at 30 m"), "{high}");
+        let unknown = told(plan(&[3.0], &["simulator.nonsense=3"]));
+        assert!(unknown.contains("no key `simulator.nonsense`"), "{unknown}");
+        let refused = told(plan(&[3.0], &["controller.start=never"]));
+        assert!(refused.contains("controller.start"), "{refused}");
     }
 }
