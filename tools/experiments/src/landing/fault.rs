@@ -194,11 +194,29 @@ impl FromStr for Fault {
 /// The index of the random angle from the pad to the start.
 pub const START_ANGLE: u32 = 6;
 
+/// The index from which on numbers are mixed thoroughly. Of those below, which published landings depend on, two whose indices
+/// differ by 15 are nearly one.
+const THOROUGH: u32 = 20;
+
 /// A random number from 0 to 1 for a seed and an index.
 pub fn drawn(seed: u64, which: u32) -> f64 {
-    let mixed =
-        (seed.wrapping_add(1)).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(17 * which + 5);
-    (mixed.wrapping_mul(0xd6e8_feb8_6659_fd93) >> 11) as f64 / (1u64 << 53) as f64
+    let mixed = if which < THOROUGH {
+        (seed.wrapping_add(1))
+            .wrapping_mul(0x9e37_79b9_7f4a_7c15)
+            .rotate_left(17 * which + 5)
+            .wrapping_mul(0xd6e8_feb8_6659_fd93)
+    } else {
+        splitmix64(splitmix64(seed).wrapping_add(u64::from(which)))
+    };
+    (mixed >> 11) as f64 / (1u64 << 53) as f64
+}
+
+/// A number all of whose bits depend on all of these.
+fn splitmix64(number: u64) -> u64 {
+    let mixed = number.wrapping_add(0x9e37_79b9_7f4a_7c15);
+    let mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    mixed ^ (mixed >> 31)
 }
 
 /// A random angle for a seed and an index, in radians.
@@ -219,6 +237,24 @@ mod tests {
             let layers = |set: Vec<String>| Layers { file: None, set };
             layers(simulator).load::<simulator::Config>().unwrap();
             layers(controller).load::<controller::Config>().unwrap();
+        }
+    }
+
+    #[test]
+    fn numbers_that_one_flight_draws_do_not_depend_on_each_other() {
+        // Those of a landing, and those of a flight with faults.
+        for indices in [(1..=9).collect(), [6, 7, 8].into_iter().chain(20..=28).collect()] {
+            let indices: Vec<u32> = indices;
+            for (at, &one) in indices.iter().enumerate() {
+                for &other in &indices[at + 1..] {
+                    let mut cells = [0; 64];
+                    for seed in 1..=1000 {
+                        let part = |which| (8.0 * drawn(seed, which)) as usize;
+                        cells[8 * part(one) + part(other)] += 1;
+                    }
+                    assert!(!cells.contains(&0), "{one} and {other}: {cells:?}");
+                }
+            }
         }
     }
 }
