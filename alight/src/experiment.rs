@@ -76,7 +76,7 @@ struct LandingArgs {
     /// Horizontal distance from the pad at the start, in metres. A list or range as well.
     #[arg(long, allow_hyphen_values = true, value_name = "M", default_value = "2.12")]
     offset: Values,
-    /// Fault; `all` for each of them. May be repeated. An unknown name lists all.
+    /// Fault; `all` for each of them that has an effect with the vision. May be repeated. An unknown name lists all.
     #[arg(long = "fault", value_name = "NAME", default_value = "none", value_parser = faults_named)]
     faults: Vec<Faults>,
     /// One further setting: simulator.KEY=VALUE or controller.KEY=VALUE. May be repeated.
@@ -149,13 +149,50 @@ pub(crate) fn run(args: ExperimentArgs) -> anyhow::Result<ExitCode> {
 }
 
 /// One fault, or all.
-#[derive(Clone)]
-struct Faults(Vec<Fault>);
+#[derive(Clone, Copy, Debug)]
+enum Faults {
+    All,
+    One(Fault),
+}
 
 fn faults_named(text: &str) -> Result<Faults, String> {
     match text {
-        "all" => Ok(Faults(Fault::all().collect())),
-        name => Ok(Faults(vec![name.parse()?])),
+        "all" => Ok(Faults::All),
+        name => Ok(Faults::One(name.parse()?)),
+    }
+}
+
+/// The faults that are meant, for flights with this vision.
+///
+/// # Errors
+/// When one was named that has no effect with it: its flights would be told as survived.
+fn faults_meant(named: &[Faults], vision: Vision) -> Result<Vec<Fault>, String> {
+    let mut meant = Vec::new();
+    for faults in named {
+        match *faults {
+            Faults::All => meant.extend(Fault::all().filter(|fault| fault.works_in(vision))),
+            Faults::One(fault) if fault.works_in(vision) => meant.push(fault),
+            Faults::One(fault) => {
+                return Err(format!(
+                    "`--fault {}` has no effect with `--vision {}`; take the other vision",
+                    fault.name(),
+                    vision.name()
+                ));
+            }
+        }
+    }
+    Ok(meant)
+}
+
+/// Tells which faults `all` leaves out.
+fn tell_left_out(named: &[Faults], vision: Vision) {
+    let left_out = Fault::all().filter(|fault| !fault.works_in(vision)).map(Fault::name);
+    if named.iter().any(|faults| matches!(faults, Faults::All)) {
+        write_error(&format!(
+            "not flown, as they have no effect with `--vision {}`: {}",
+            vision.name(),
+            left_out.collect::<Vec<_>>().join(", ")
+        ));
     }
 }
 
@@ -170,14 +207,16 @@ fn family_name(text: &str) -> Result<String, String> {
 
 fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
     plan::refuse_swept(&args.set, &plan::SWEPT)?;
-    let faults = args.faults.into_iter().flat_map(|Faults(faults)| faults).collect();
+    let vision = match args.vision {
+        VisionArg::Rendered => Vision::Rendered,
+        VisionArg::Modelled => Vision::Modelled,
+    };
+    let faults = faults_meant(&args.faults, vision).map_err(anyhow::Error::msg)?;
+    tell_left_out(&args.faults, vision);
     let request = plan::Request {
         command: this_command(),
         plan: Plan {
-            vision: match args.vision {
-                VisionArg::Rendered => Vision::Rendered,
-                VisionArg::Modelled => Vision::Modelled,
-            },
+            vision,
             flights: args.flights,
             seed: args.seed,
             wind: args.wind,
@@ -315,6 +354,22 @@ mod tests {
         assert_eq!(family_name("aruco-4x4-50").as_deref(), Ok("aruco-4x4-50"));
         for other in ["aruco", "apriltag-36h11:7", "bogus"] {
             assert!(family_name(other).unwrap_err().contains("stag-hd23"), "{other}");
+        }
+    }
+
+    #[test]
+    fn faults_without_an_effect_are_refused_by_name_and_left_out_of_all() {
+        let meant = |name: &str, vision| {
+            let faults = faults_meant(&[faults_named(name).unwrap()], vision)?;
+            Ok::<_, String>(faults.into_iter().map(Fault::name).collect::<Vec<_>>())
+        };
+        for (vision, works, does_not) in
+            [(Vision::Modelled, "lie", "glare"), (Vision::Rendered, "glare", "lie")]
+        {
+            assert_eq!(meant(works, vision).unwrap(), [works]);
+            assert!(meant(does_not, vision).unwrap_err().contains(does_not));
+            let all = meant("all", vision).unwrap();
+            assert!(all.contains(&"none") && all.contains(&works) && !all.contains(&does_not));
         }
     }
 

@@ -5,6 +5,25 @@ use std::str::FromStr;
 
 use world::vision::VisionFaults;
 
+/// The vision of a flight.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Vision {
+    /// Rendered frames with the real detector.
+    Rendered,
+    /// A model of the detector's errors.
+    Modelled,
+}
+
+impl Vision {
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Rendered => "rendered",
+            Self::Modelled => "modelled",
+        }
+    }
+}
+
 /// A circumstance besides wind, height, offset and latency.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Fault(usize);
@@ -23,6 +42,14 @@ pub struct Change {
 /// A row of the table of faults: its name, its description, and its changes for a random number from 0 to 1.
 type Row = (&'static str, &'static str, fn(f64) -> Change);
 
+/// The faults that have an effect in one vision only.
+const ONE_VISION: [(&str, Vision); 4] = [
+    ("wrong-marker", Vision::Modelled),
+    ("lie", Vision::Modelled),
+    ("glare", Vision::Rendered),
+    ("cover", Vision::Rendered),
+];
+
 const TABLE: [Row; 24] = [
     ("none", "nothing goes wrong", |_| Change::default()),
     ("lost-below-2m", "no frame is taken from 2 m on", |_| {
@@ -39,13 +66,15 @@ const TABLE: [Row; 24] = [
     ("out-of-order", "frames arrive up to 250 ms late, a third twice", |_| {
         simulator(&["camera.jitter_ms=250", "camera.duplicate=0.33"])
     }),
-    ("wrong-marker", "in 30 % of the frames another marker, 1 m away, is taken for ours", |_| {
-        Change {
+    (
+        "wrong-marker",
+        "in 30 % of the frames another marker, 1 m away, is taken for ours (modelled only)",
+        |_| Change {
             vision: VisionFaults { wrong: Some((0.3, 1.0)), ..VisionFaults::default() },
             ..simulator(&["pad.wrong_marker=aruco-4x4-50:7:0.15", "pad.wrong_east_m=1"])
-        }
-    }),
-    ("lie", "detections are off by 0.5 m for 1 s, at any time", |part| {
+        },
+    ),
+    ("lie", "detections are off by 0.5 m for 1 s, at any time (modelled only)", |part| {
         let from_s = 1.0 + 9.0 * part;
         let offset = Some((from_s, from_s + 1.0, 0.5));
         Change { vision: VisionFaults { offset, ..VisionFaults::default() }, ..Change::default() }
@@ -166,6 +195,12 @@ impl Fault {
         TABLE.get(self.0).map_or("", |row| row.1)
     }
 
+    /// Whether it has an effect in flights with this vision, or is none.
+    pub fn works_in(self, vision: Vision) -> bool {
+        let only = ONE_VISION.iter().find(|(name, _)| *name == self.name());
+        only.is_none_or(|(_, only)| *only == vision)
+    }
+
     /// Its changes in the flight of a seed.
     pub fn change(self, seed: u64) -> Change {
         let mut change =
@@ -237,6 +272,20 @@ mod tests {
             let layers = |set: Vec<String>| Layers { file: None, set };
             layers(simulator).load::<simulator::Config>().unwrap();
             layers(controller).load::<controller::Config>().unwrap();
+        }
+    }
+
+    #[test]
+    fn a_fault_changes_flights_in_each_vision_in_which_it_works() {
+        for fault in Fault::all().skip(1) {
+            let change = fault.change(3);
+            let is_of_frames = change.simulator.iter().any(|it| it.starts_with("occluder."));
+            let is_of_model = change.vision != VisionFaults::default();
+            assert_eq!(fault.works_in(Vision::Rendered), !is_of_model, "{}", fault.name());
+            assert_eq!(fault.works_in(Vision::Modelled), !is_of_frames, "{}", fault.name());
+        }
+        for (name, _) in ONE_VISION {
+            assert!(name.parse::<Fault>().is_ok(), "{name}");
         }
     }
 

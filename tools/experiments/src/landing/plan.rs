@@ -8,26 +8,8 @@ use anyhow::bail;
 use node::ConfigError;
 
 use super::configuration;
+pub use super::fault::Vision;
 use super::fault::{Change, Fault, START_ANGLE, drawn, drawn_angle};
-
-/// The vision of a flight.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub enum Vision {
-    /// Rendered frames with the real detector.
-    Rendered,
-    /// A model of the detector's errors.
-    Modelled,
-}
-
-impl Vision {
-    /// Its name.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Rendered => "rendered",
-            Self::Modelled => "modelled",
-        }
-    }
-}
 
 /// Values of one axis of the grid: a list `1,2,3`, or a range `0..8` with a random value for each seed.
 #[derive(Clone, Debug, PartialEq)]
