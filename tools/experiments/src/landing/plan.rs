@@ -23,7 +23,9 @@ pub enum Values {
 impl Values {
     fn cells(&self) -> Vec<Self> {
         match self {
-            Self::List(values) => values.iter().map(|value| Self::List(vec![*value])).collect(),
+            Self::List(values) => {
+                without_repeats(values).map(|value| Self::List(vec![*value])).collect()
+            }
             Self::Range(..) => vec![self.clone()],
         }
     }
@@ -229,7 +231,7 @@ impl Plan {
     pub fn flights(&self) -> Vec<Planned> {
         let mut flights = Vec::new();
         let mut row = 0;
-        for fault in &self.faults {
+        for fault in without_repeats(&self.faults) {
             for [wind, turbulence, latency, height, offset] in self.cells() {
                 row += 1;
                 let axes = [&wind, &turbulence, &latency, &height, &offset];
@@ -333,6 +335,16 @@ impl Planned {
     }
 }
 
+/// Each value once: the same flights again would count twice.
+fn without_repeats<T: PartialEq>(values: &[T]) -> impl Iterator<Item = &T> {
+    let is_first = |at: usize, value: &T| values.iter().position(|it| it == value) == Some(at);
+    values
+        .iter()
+        .enumerate()
+        .filter(move |(at, value)| is_first(*at, value))
+        .map(|(_, value)| value)
+}
+
 /// The option that sets this, for a shell.
 pub(crate) fn set_option(setting: &str) -> String {
     // Only a zero byte cannot be quoted, and no argument has one.
@@ -392,6 +404,17 @@ mod tests {
         let command = Plan { set: set.clone(), ..Plan::default() }.flights()[0].command();
         let words = shlex::split(&command).unwrap();
         assert!(words.windows(2).any(|pair| pair == ["--set", &set[0]]), "{command}");
+    }
+
+    #[test]
+    fn what_is_given_twice_is_flown_once() {
+        let winds = |wind: &str| {
+            let faults = vec![Fault::NONE, Fault::NONE];
+            let plan = Plan { wind: wind.parse().unwrap(), faults, flights: 2, ..Plan::default() };
+            plan.flights().iter().map(|planned| planned.wind_m_s).collect::<Vec<_>>()
+        };
+        assert_eq!(winds("5,5"), [5.0, 5.0]);
+        assert_eq!(winds("5,2,5"), [5.0, 5.0, 2.0, 2.0]);
     }
 
     #[test]
