@@ -131,8 +131,7 @@ impl<'a> RealFlight<'a> {
             begun: Vec::new(),
             outcome: Outcome::new(planned),
         };
-        let mut world: Vec<String> = planned.simulator.clone();
-        world.retain(|setting| !setting.starts_with("camera.") && !setting.starts_with("begin_"));
+        let mut world = settings_of_world(planned);
         world.push(format!("autopilot.address=udpout:127.0.0.1:{world_port}"));
         if flight.has_own_camera() {
             // The camera follows what the autopilot reports; the world's own would only take time.
@@ -157,12 +156,15 @@ impl<'a> RealFlight<'a> {
     }
 
     fn settings(&self, part: Part, again: bool) -> Vec<String> {
-        let text = |settings: &[&str]| settings.iter().map(|&s| s.to_owned()).collect();
+        let text =
+            |settings: &[&str]| settings.iter().map(|&s| s.to_owned()).collect::<Vec<String>>();
         match part {
             Part::World => Vec::new(),
             Part::Camera => {
                 let seed = format!("seed={}", self.planned.seed);
-                text(&["id=camera", "vehicle=reported", &seed])
+                let mut settings = self.planned.given("simulator");
+                settings.extend(text(&["id=camera", "vehicle=reported", &seed]));
+                settings
             }
             Part::Detector => Vec::new(),
             Part::Controller => {
@@ -411,8 +413,37 @@ impl Drop for RealFlight<'_> {
     }
 }
 
+/// The simulator's settings: of those that are drawn, the camera's and the landing's begin are for lock-step, as here images and
+/// processes take their own time.
+fn settings_of_world(planned: &Planned) -> Vec<String> {
+    let given = planned.given("simulator");
+    let drawn = planned.simulator.len().saturating_sub(given.len());
+    let is_for_lockstep =
+        |setting: &String| setting.starts_with("camera.") || setting.starts_with("begin_");
+    let drawn = planned.simulator.iter().take(drawn).filter(|setting| !is_for_lockstep(setting));
+    drawn.cloned().chain(given).collect()
+}
+
 async fn open(meet: u16, vehicle: &str) -> anyhow::Result<Node> {
     let network =
         Network { vehicle: Some(vehicle.to_owned()), meet: Some(meet), ..Network::default() };
     Node::open(tool_identity("faults"), &network.source(crate::args::OPERATOR)?).await
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use experiments::faults::plan::Plan;
+
+    #[test]
+    fn the_worlds_settings_are_drawn_but_for_lock_steps_own_and_then_those_given() {
+        let set = vec!["simulator.camera.rate_hz=20".to_owned()];
+        let planned = Plan { set, ..Plan::default() }.flights().remove(0);
+        let settings = settings_of_world(&planned);
+        let cameras: Vec<&String> =
+            settings.iter().filter(|setting| setting.starts_with("camera.")).collect();
+        assert_eq!(cameras, ["camera.rate_hz=20"]);
+        assert!(!settings.iter().any(|setting| setting.starts_with("begin_")));
+        assert!(settings.iter().any(|setting| setting.starts_with("start.height_m=")));
+    }
 }

@@ -234,13 +234,17 @@ impl Planned {
         if self.faults.iter().any(|fault| fault.kind.is_preferred_liar()) {
             self.controller.push(format!("detectors.preferred=\"{LIAR}\""));
         }
-        for setting in &self.set {
-            match setting.split_once('.') {
-                Some(("simulator", rest)) => self.simulator.push(rest.to_owned()),
-                Some(("controller", rest)) => self.controller.push(rest.to_owned()),
-                _ => {}
-            }
-        }
+        self.simulator.extend(self.given("simulator"));
+        self.controller.extend(self.given("controller"));
+    }
+
+    /// The further settings of a service, which come after those that are drawn.
+    pub fn given(&self, service: &str) -> Vec<String> {
+        let of_service = |setting: &String| {
+            let (owner, rest) = setting.split_once('.')?;
+            (owner == service).then(|| rest.to_owned())
+        };
+        self.set.iter().filter_map(of_service).collect()
     }
 
     /// Names of its faults.
