@@ -105,7 +105,27 @@ struct RealFlight<'a> {
     reached: Option<Instant>,
     rest_since: Option<Instant>,
     begun: Vec<Begun>,
+    ground: Ground,
     outcome: Outcome,
+}
+
+/// The ground as the vehicle met it.
+#[derive(Debug, Default)]
+struct Ground {
+    /// Where it first touched, downwards, in metres.
+    touched_z: Option<f64>,
+}
+
+impl Ground {
+    /// Notes the first touch, and how far the vehicle rises from there.
+    fn see(&mut self, truth: &Truth, outcome: &mut Outcome) {
+        let Some(touch) = truth.touchdown else { return };
+        let z = truth.position_ned_m[2];
+        if self.touched_z.is_none() {
+            outcome.touch(touch.vertical_speed_m_s, touch.lateral_speed_m_s, touch.error_m);
+        }
+        outcome.hop(*self.touched_z.get_or_insert(z) - z);
+    }
 }
 
 impl<'a> RealFlight<'a> {
@@ -129,6 +149,7 @@ impl<'a> RealFlight<'a> {
             reached: None,
             rest_since: None,
             begun: Vec::new(),
+            ground: Ground::default(),
             outcome: Outcome::new(planned),
         };
         let mut world = settings_of_world(planned);
@@ -242,10 +263,7 @@ impl<'a> RealFlight<'a> {
     }
 
     fn see(&mut self, truth: Truth) {
-        let is_first = self.truth.as_ref().is_none_or(|before| before.touchdown.is_none());
-        if let Some(touch) = truth.touchdown.filter(|_| is_first) {
-            self.outcome.touch(touch.vertical_speed_m_s, touch.lateral_speed_m_s, touch.error_m);
-        }
+        self.ground.see(&truth, &mut self.outcome);
         self.outcome.max_tilt_deg = truth.max_tilt_rad.to_degrees();
         let speed_m_s = truth.velocity_ned_m_s.iter().map(|v| v * v).sum::<f64>().sqrt();
         let was_on_ground = self.truth.as_ref().is_some_and(|before| before.on_ground);
@@ -434,6 +452,7 @@ async fn open(meet: u16, vehicle: &str) -> anyhow::Result<Node> {
 mod tests {
     use super::*;
     use experiments::faults::plan::Plan;
+    use messages::Touchdown;
 
     #[test]
     fn the_worlds_settings_are_drawn_but_for_lock_steps_own_and_then_those_given() {
@@ -445,5 +464,33 @@ mod tests {
         assert_eq!(cameras, ["camera.rate_hz=20"]);
         assert!(!settings.iter().any(|setting| setting.starts_with("begin_")));
         assert!(settings.iter().any(|setting| setting.starts_with("start.height_m=")));
+    }
+
+    #[test]
+    fn a_vehicle_that_leaves_the_ground_again_is_told() {
+        let mut outcome = Outcome::new(&Plan::default().flights()[0]);
+        let mut ground = Ground::default();
+        let touch = Touchdown {
+            stamp_ns: 0,
+            error_m: 0.1,
+            vertical_speed_m_s: 0.5,
+            lateral_speed_m_s: 0.0,
+        };
+        for (height_m, touchdown) in [(1.0, None), (0.02, Some(touch)), (0.62, Some(touch))] {
+            let truth = Truth {
+                stamp_ns: 0,
+                ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
+                position_ned_m: [0.0, 0.0, -height_m],
+                velocity_ned_m_s: [0.0; 3],
+                pad_ned_m: [0.0; 3],
+                on_ground: height_m < 0.03,
+                touchdown,
+                max_tilt_rad: 0.0,
+                frames: 0,
+            };
+            ground.see(&truth, &mut outcome);
+        }
+        assert_eq!(outcome.touches, 1);
+        assert!(outcome.has_left_ground() && (outcome.hop_m.unwrap() - 0.6).abs() < 1e-9);
     }
 }
