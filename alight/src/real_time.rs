@@ -2,11 +2,11 @@
 //! their link to the simulated autopilot through a proxy that fails.
 
 use std::fs::{File, OpenOptions};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use experiments::faults::kind::Kind;
 use experiments::faults::outcome::{Ending, Outcome};
 use experiments::faults::plan::{Fault, Planned};
@@ -58,6 +58,11 @@ impl Part {
             Self::Controller => "controller",
             Self::Bridge => "gcs-bridge",
         }
+    }
+
+    /// Its log in the folder of a flight.
+    fn log(self, folder: &Path) -> PathBuf {
+        folder.join(format!("{self:?}.log").to_lowercase())
     }
 
     fn of(kind: Kind) -> Option<Self> {
@@ -135,7 +140,26 @@ impl<'a> RealFlight<'a> {
         let (meet, apart, world_port, port) = (port()?, port()?, port()?, port()?);
         let seed = planned.seed;
         let proxy = Proxy::start(seed, world_port, port).await?;
-        let mut flight = Self {
+        let mut flight = Self::waiting(planned, folder, [meet, apart, port], proxy);
+        let mut world = settings_of_world(planned);
+        world.push(format!("autopilot.address=udpout:127.0.0.1:{world_port}"));
+        if flight.has_own_camera() {
+            // The camera follows what the autopilot reports; the world's own would only take time.
+            world.extend(["autopilot.errors=0", "camera.rate_hz=0.1"].map(str::to_owned));
+        }
+        flight.start(Part::World, &world)?;
+        for part in [Part::Camera, Part::Detector, Part::Controller, Part::Bridge] {
+            if part != Part::Camera || flight.has_own_camera() {
+                flight.start(part, &flight.settings(part, false))?;
+            }
+        }
+        Ok(flight)
+    }
+
+    /// A flight of which no process is started yet, with the ports of its networks and its controller.
+    fn waiting(planned: &'a Planned, folder: &'a Path, ports: [u16; 3], proxy: Proxy) -> Self {
+        let [meet, apart, port] = ports;
+        Self {
             planned,
             folder,
             meet,
@@ -151,20 +175,7 @@ impl<'a> RealFlight<'a> {
             begun: Vec::new(),
             ground: Ground::default(),
             outcome: Outcome::new(planned),
-        };
-        let mut world = settings_of_world(planned);
-        world.push(format!("autopilot.address=udpout:127.0.0.1:{world_port}"));
-        if flight.has_own_camera() {
-            // The camera follows what the autopilot reports; the world's own would only take time.
-            world.extend(["autopilot.errors=0", "camera.rate_hz=0.1"].map(str::to_owned));
         }
-        flight.start(Part::World, &world)?;
-        for part in [Part::Camera, Part::Detector, Part::Controller, Part::Bridge] {
-            if part != Part::Camera || flight.has_own_camera() {
-                flight.start(part, &flight.settings(part, false))?;
-            }
-        }
-        Ok(flight)
     }
 
     /// True when the camera is a process apart from the world's.
@@ -220,8 +231,7 @@ impl<'a> RealFlight<'a> {
             command.env("ALIGHT_LOG", "debug");
             File::create("/dev/full").context("opening /dev/full")?
         } else {
-            let path = self.folder.join(format!("{part:?}.log").to_lowercase());
-            OpenOptions::new().create(true).append(true).open(path)?
+            OpenOptions::new().create(true).append(true).open(part.log(self.folder))?
         };
         let child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log).spawn();
         let child = child.with_context(|| format!("starting {}", part.service()))?;
@@ -245,6 +255,7 @@ impl<'a> RealFlight<'a> {
                 Some(truth) = truths.next() => self.see(truth),
                 _ = looks.tick() => {}
             }
+            self.check_parts()?;
             self.begin_and_end_faults()?;
             self.describe();
             let (since, patience_s) = match self.started {
@@ -258,6 +269,26 @@ impl<'a> RealFlight<'a> {
         for node in [node, aside] {
             // A peer that was killed may leave a session that does not end in good order.
             let _ = timeout(Duration::from_secs(2), node.close()).await;
+        }
+        Ok(())
+    }
+
+    /// Checks that all processes live until the landing begins; where one ends later, the flight shows what comes of it.
+    fn check_parts(&mut self) -> anyhow::Result<()> {
+        // These are there from the start, and a process that they end is what they do.
+        let may_end = self.has(|kind| matches!(kind, Kind::FullDisk | Kind::FullSharedMemory));
+        if self.started.is_some() || may_end {
+            return Ok(());
+        }
+        for (part, child) in &mut self.parts {
+            if let Some(status) = child.try_wait().context("looking after the processes")? {
+                let log = std::fs::read_to_string(part.log(self.folder)).unwrap_or_default();
+                bail!(
+                    "{} ended before the landing began ({status}): {}",
+                    part.service(),
+                    last_line(&log)
+                );
+            }
         }
         Ok(())
     }
@@ -442,6 +473,11 @@ fn settings_of_world(planned: &Planned) -> Vec<String> {
     drawn.cloned().chain(given).collect()
 }
 
+/// The last thing that a log says.
+fn last_line(log: &str) -> &str {
+    log.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("its log is empty")
+}
+
 async fn open(meet: u16, vehicle: &str) -> anyhow::Result<Node> {
     let network =
         Network { vehicle: Some(vehicle.to_owned()), meet: Some(meet), ..Network::default() };
@@ -453,6 +489,29 @@ mod tests {
     use super::*;
     use experiments::faults::plan::Plan;
     use messages::Touchdown;
+
+    #[test]
+    fn a_process_that_ends_before_the_landing_is_told_with_its_last_words() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut plan = Plan { flights: 1, ..Plan::default() };
+        plan.kinds = vec![Kind::ControllerKilled];
+        let planned = plan.flights().remove(0);
+        let told = crate::runtime::block_on(async {
+            let proxy = Proxy::start(1, 0, 9).await?;
+            let mut flight = RealFlight::waiting(&planned, folder.path(), [0; 3], proxy);
+            let log = Part::Controller.log(folder.path());
+            std::fs::write(&log, "starting\nno key `nonsense`\n\n")?;
+            let mut child = Command::new("false").spawn()?;
+            child.wait()?;
+            flight.parts.push((Part::Controller, child));
+            let told = flight.check_parts().unwrap_err().to_string();
+            flight.started = Some(Instant::now());
+            flight.check_parts()?;
+            anyhow::Ok(told)
+        });
+        let told = told.unwrap().unwrap();
+        assert!(told.contains("controller ended") && told.contains("`nonsense`"), "{told}");
+    }
 
     #[test]
     fn the_worlds_settings_are_drawn_but_for_lock_steps_own_and_then_those_given() {
