@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use anyhow::{Context, ensure};
 use clap::{Args, ValueEnum};
+use media::write_whole;
 use report::{
     Figure, Flight, FlightReader, comparison, document, figures, marks, page, replay_tapes, summary,
 };
@@ -178,25 +179,6 @@ fn has_marks(page: &Path, marks: &str) -> bool {
         // Of HTML, and of a PDF document.
         parts.iter().any(|part| page.windows(part.len()).any(|at| at == part.as_bytes()))
     })
-}
-
-/// Writes a file under another name first, so that what was there stays until all of the new one is.
-fn write_whole(file: &Path, contents: &[u8]) -> std::io::Result<()> {
-    // A device or a pipe is written as it is.
-    if file.exists() && !file.is_file() {
-        return std::fs::write(file, contents);
-    }
-    // What a link leads to is written, not the link.
-    let file = file.canonicalize().unwrap_or_else(|_| file.to_owned());
-    let mut name = file.file_name().unwrap_or_default().to_owned();
-    name.push(format!(".{}.new", std::process::id()));
-    let new = file.with_file_name(name);
-    let written = std::fs::write(&new, contents).and_then(|()| std::fs::rename(&new, &file));
-    if written.is_err() {
-        // It may not be there.
-        let _ = std::fs::remove_file(&new);
-    }
-    written
 }
 
 fn write_figures(figures: &[Figure], folder: &Path) -> anyhow::Result<()> {

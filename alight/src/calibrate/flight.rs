@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use calibration::{FlightCalibration, FlightEstimate, Quantity, calibrate_flight};
 use clap::Args;
+use media::write_whole;
 use serde_json::{Value, json};
 
 use super::corrected::{self, Before, Changes};
@@ -47,7 +48,7 @@ pub(crate) struct FlightArgs {
 pub(super) fn run(args: &FlightArgs) -> anyhow::Result<ExitCode> {
     let FlightArgs { file, camera, detector, marker, output, replace, .. } = args;
     if let Some(path) = output {
-        super::refuse_existing(path, *replace, "and may be of another flight")?;
+        super::check_output(path, *replace, "and may be of another flight")?;
     }
     let wanted = Wanted {
         camera: camera.as_deref(),
@@ -67,7 +68,7 @@ pub(super) fn run(args: &FlightArgs) -> anyhow::Result<ExitCode> {
     write_error(&match output {
         Some(path) => {
             // Also where no key changes: a file that is replaced says nothing of another flight.
-            std::fs::write(path, changes.toml(&flight.camera))
+            write_whole(path, changes.toml(&flight.camera).as_bytes())
                 .with_context(|| format!("writing {path:?}; name another file with `--output`"))?;
             match count {
                 0 => format!("{}: no key changes", path.display()),

@@ -52,6 +52,10 @@ pub(super) fn watch_camera(
             };
             let frame = next.context("the session is closed")?;
             let picture = picture(&frame, &mut converter)?;
+            if let Some(sensor) = args.on_sensor() {
+                let FrameHeader { width, height, .. } = frame.header;
+                sensor.check([width, height])?;
+            }
             found.add(finder, picture);
             if say(&found, args, &mut said)? || found.is_full {
                 break;

@@ -61,12 +61,21 @@ pub(crate) fn run(args: &CalibrateArgs) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// Refuses a file that is there already and is not to be replaced, before anything is calibrated.
-fn refuse_existing(path: &Path, is_replaced: bool, may_be: &str) -> anyhow::Result<()> {
+/// Refuses a file that is there already and is not to be replaced, or that cannot be written, before anything is calibrated.
+fn check_output(path: &Path, is_replaced: bool, may_be: &str) -> anyhow::Result<()> {
     ensure!(
         is_replaced || !path.exists(),
         "{path:?} is there already, {may_be}: name another with `--output`, or replace it with `--replace`"
     );
+    // A device or a pipe is written as it is.
+    if path.exists() && !path.is_file() {
+        return Ok(());
+    }
+    let file = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
+    tempfile::tempfile_in(folder.unwrap_or(Path::new("."))).with_context(|| {
+        format!("trying whether {path:?} can be written; name another with `--output`, or make its folder")
+    })?;
     Ok(())
 }
 
@@ -87,7 +96,7 @@ fn board(args: &BoardArgs) -> anyhow::Result<ExitCode> {
     }
     args.check()?;
     if let Some(path) = &args.output {
-        refuse_existing(path, args.replace, "and may be the calibration in use")?;
+        check_output(path, args.replace, "and may be the calibration in use")?;
     }
     let mut finder = Finder::new(&board)?;
     let mut found = match &args.live {
@@ -124,26 +133,30 @@ fn accept(
         rms_px: calibration.rms_px,
         uncertainty_px: calibration.worst_uncertainty_px(),
     };
-    if let Some(path) = &args.output {
-        let details = CalibrationDetails { sensor: args.on_sensor(), note: Some(note) };
-        write_calibration(path, &calibration.camera, args.file_format().format(), &details)?;
-    }
+    // The result is told first: a file that cannot be written does not take it along.
     match args.format {
         Format::Text => {
             print(report::found_text(found, guidance).trim_end())?;
             print(report::shown_text(guidance).trim_end())?;
-            print(report::worth_text(calibration).trim_end())?;
-            print(&match &args.output {
-                Some(path) => format!(
-                    "{}: written; name it in camera-pub's configuration as `calibration.file`.",
-                    path.display()
-                ),
-                None => "Nothing was written: pass -o camera.yaml.".to_owned(),
-            })
+            print(report::worth_text(calibration).trim_end())
         }
         Format::Json => print(&report::json(found, guidance, Some(calibration), None).to_string()),
     }
     .context("writing the result")?;
+    let said = match &args.output {
+        Some(path) => {
+            let details = CalibrationDetails { sensor: args.on_sensor(), note: Some(note) };
+            write_calibration(path, &calibration.camera, args.file_format().format(), &details)?;
+            format!(
+                "{}: written; name it in camera-pub's configuration as `calibration.file`.",
+                path.display()
+            )
+        }
+        None => "Nothing was written: pass -o camera.yaml.".to_owned(),
+    };
+    if args.format == Format::Text {
+        print(&said).context("writing the result")?;
+    }
     Ok(ExitCode::SUCCESS)
 }
 
@@ -167,3 +180,22 @@ fn refuse(
 
 #[cfg(test)]
 mod rendered;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_that_cannot_be_written_is_refused_before_the_calibration() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("camera.yaml");
+        check_output(&file, false, "").unwrap();
+        assert!(!file.exists());
+        let told = check_output(&folder.path().join("missing/camera.yaml"), false, "").unwrap_err();
+        assert!(format!("{told:#}").contains("make its folder"), "{told:#}");
+        std::fs::write(&file, "in use").unwrap();
+        assert!(check_output(&file, false, "").is_err());
+        check_output(&file, true, "").unwrap();
+        assert_eq!(std::fs::read_to_string(&file).unwrap(), "in use");
+    }
+}

@@ -5,7 +5,7 @@
 //! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, `huffman` gives them the tables that a camera leaves
 //! out, `scan` says whether their data are whole, [`image`] reads image files, [`video`] reads videos frame by frame, [`h264`]
 //! decodes what a camera streams, [`calibration`] reads and writes the calibration files of other programs, [`rectify`] takes a
-//! lens's distortion out of images.
+//! lens's distortion out of images, [`whole`] writes a file whole or not at all.
 
 mod boxes;
 mod budget;
@@ -18,6 +18,7 @@ pub mod jpeg;
 pub mod rectify;
 mod scan;
 pub mod video;
+pub mod whole;
 
 pub use calibration::{
     CalibrationDetails, CalibrationError, CalibrationFile, CalibrationFormat, CalibrationNote,
@@ -32,3 +33,4 @@ pub use image::{
 pub use jpeg::JpegScanner;
 pub use rectify::Rectifier;
 pub use video::{VIDEO_EXTENSIONS, Video, VideoError, VideoFrame, VideoImage, is_video};
+pub use whole::write_whole;

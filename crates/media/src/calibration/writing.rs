@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use geometry::{CameraModel, Distortion};
 
 use super::mode::{SensorMode, SensorRegion};
+use crate::whole::write_whole;
 
 /// A format of calibration files.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -115,7 +116,7 @@ enum Syntax {
     Json,
 }
 
-/// Writes a camera in a format.
+/// Writes a camera in a format, over what is there only when all of it is written.
 ///
 /// # Errors
 /// [`CalibrationWriteError`] where the format cannot hold the lens, the mode does not give such images, or the file cannot be
@@ -137,7 +138,7 @@ pub fn write_calibration(
         (CalibrationFormat::Ros | CalibrationFormat::Kalibr, _) => Syntax::Yaml,
     };
     let text = syntax.text(&entries(camera, format, details)?);
-    std::fs::write(path, text)
+    write_whole(path, text.as_bytes())
         .map_err(|cause| CalibrationWriteError::Unwritable { path: path.to_owned(), cause })
 }
 
