@@ -16,6 +16,18 @@ pub(crate) const OPERATOR: &str = "operator";
 pub(crate) const MEET_RULE: &str =
     "all processes of a machine meet at the same port: write a number from 1 to 65535";
 
+/// What a command line asks for that cannot be.
+#[derive(Debug)]
+pub(crate) struct WrongUse(pub(crate) String);
+
+impl std::fmt::Display for WrongUse {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for WrongUse {}
+
 /// The arguments of every service.
 #[derive(Args, Clone, Default)]
 pub(crate) struct ServiceArgs {

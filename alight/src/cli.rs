@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use node::{ConfigError, Layers};
 
-use crate::args::{NetworkArgs, ServiceArgs};
+use crate::args::{NetworkArgs, ServiceArgs, WrongUse};
 use crate::services::{self, Service};
 use crate::terminal::{print, write_error};
 use crate::{
@@ -109,7 +109,14 @@ pub(crate) fn run() -> ExitCode {
     let mut command = with_negative_numbers(Cli::command());
     let cli = Cli::from_arg_matches(&command.get_matches_mut())
         .unwrap_or_else(|problem| problem.format(&mut command).exit());
-    let result = match cli.command.unwrap_or(Command::Land(cli.land)) {
+    perform(cli).unwrap_or_else(|problem| {
+        write_error(&format!("alight: {problem:#}"));
+        ExitCode::from(if is_wrong_use(&problem) { WRONG_USE } else { 1 })
+    })
+}
+
+fn perform(cli: Cli) -> anyhow::Result<ExitCode> {
+    match cli.command.unwrap_or(Command::Land(cli.land)) {
         Command::Land(args) => land::run(&args),
         Command::Up(args) => up::run(&args),
         Command::CameraPub(args) => services::run(Service::CameraPub, &args),
@@ -134,11 +141,7 @@ pub(crate) fn run() -> ExitCode {
         Command::Command(args) => command::run(&args),
         Command::Detectors(args) => detectors::run(args),
         Command::Swap(args) => swap::run(&args),
-    };
-    result.unwrap_or_else(|problem| {
-        write_error(&format!("alight: {problem:#}"));
-        ExitCode::from(if is_wrong_use(&problem) { WRONG_USE } else { 1 })
-    })
+    }
 }
 
 /// A command whose options take one number with a minus for a value, and say what is wrong with it; otherwise it is told as an unknown
@@ -156,7 +159,8 @@ fn with_negative_numbers(command: clap::Command) -> clap::Command {
 
 /// Whether an error is due to the command line or the configuration.
 fn is_wrong_use(problem: &anyhow::Error) -> bool {
-    problem.is::<ConfigError>()
+    problem.is::<WrongUse>()
+        || problem.is::<ConfigError>()
         || problem.is::<clap::Error>()
         || problem.is::<fiducial::DetectorError>()
         || problem.is::<markers::PadError>()
@@ -193,6 +197,26 @@ mod tests {
             let problem = with_negative_numbers(Cli::command()).try_get_matches_from(arguments);
             let told = problem.unwrap_err().to_string();
             assert!(told.contains("invalid value '-3") && told.contains("for '--wind"), "{told}");
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_asked_for_is_a_wrong_use() {
+        for words in [
+            &["land", "--vehicle", "a/b"][..],
+            &["land", "--zenoh", "nosuch.json5"],
+            &["experiment", "faults", "--kind", "bridge-killed"],
+            &["experiment", "faults", "--with", "foo"],
+            &["experiment", "faults", "--set", "simulator.seed=3"],
+            &["experiment", "faults", "--height", "30"],
+            &["experiment", "landing", "--wind", "0,25"],
+            &["experiment", "landing", "--fault", "glare"],
+            &["experiment", "landing", "--set", "simulator.seed=3"],
+            &["experiment", "markers", "--binned"],
+        ] {
+            let cli = Cli::try_parse_from(["alight"].iter().chain(words)).unwrap();
+            let problem = perform(cli).unwrap_err();
+            assert!(is_wrong_use(&problem), "{words:?}: {problem:#}");
         }
     }
 

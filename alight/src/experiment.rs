@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context, ensure};
+use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
 use experiments::Preset;
 use experiments::landing::fault::Fault;
@@ -16,7 +16,7 @@ use experiments::results::Folder;
 use experiments::set::{Set, families};
 use experiments::sets::Variant;
 
-use crate::args::flight_setting;
+use crate::args::{WrongUse, flight_setting};
 use crate::children::this_command;
 use crate::faults::{self, FaultsArgs};
 use crate::interruption::{FLIGHTS_END, Interruption};
@@ -206,12 +206,12 @@ fn family_name(text: &str) -> Result<String, String> {
 }
 
 fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
-    plan::refuse_swept(&args.set, &plan::SWEPT)?;
+    plan::refuse_swept(&args.set, &plan::SWEPT).map_err(WrongUse)?;
     let vision = match args.vision {
         VisionArg::Rendered => Vision::Rendered,
         VisionArg::Modelled => Vision::Modelled,
     };
-    let faults = faults_meant(&args.faults, vision).map_err(anyhow::Error::msg)?;
+    let faults = faults_meant(&args.faults, vision).map_err(WrongUse)?;
     tell_left_out(&args.faults, vision);
     let request = plan::Request {
         command: this_command(),
@@ -249,10 +249,10 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
 }
 
 fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
-    ensure!(
-        !args.binned || (args.processings == [Preset::Linear] && args.sets == [Set::Positions]),
-        "`--binned` is for `--set positions` and `--processing linear`: the thesis' frames, of a camera that gives out raw ones"
-    );
+    if args.binned && (args.processings != [Preset::Linear] || args.sets != [Set::Positions]) {
+        let rule = "`--binned` is for `--set positions` and `--processing linear`: the thesis' frames, of a camera that gives out raw ones";
+        return Err(WrongUse(rule.to_owned()).into());
+    }
     let ids = if args.known_id { Ids::Shown } else { Ids::Any };
     let sets = if args.sets.is_empty() { Set::ALL.to_vec() } else { args.sets };
     let mut photographs = args.photographs;
@@ -345,7 +345,7 @@ mod tests {
     fn a_setting_that_results_are_sorted_by_and_a_family_without_frames_are_refused() {
         let told = |setting: &str| {
             let refusal = plan::refuse_swept(&[setting.to_owned()], &plan::SWEPT).err();
-            refusal.map(|refusal| refusal.to_string()).unwrap_or_default()
+            refusal.unwrap_or_default()
         };
         assert!(told("simulator.wind.mean_m_s=7").contains("`--wind`"));
         assert!(told("simulator.camera.latency_ms=400").contains("`--latency`"));

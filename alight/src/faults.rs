@@ -13,7 +13,7 @@ use experiments::landing::Watch;
 use experiments::landing::plan::{Values, refuse_swept};
 use experiments::results::{self, Folder};
 
-use crate::args::flight_setting;
+use crate::args::{WrongUse, flight_setting};
 use crate::children::this_command;
 use crate::interruption::{FLIGHTS_END, Interruption};
 use crate::progress::Steps;
@@ -194,8 +194,8 @@ fn run_in_lockstep(
 pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
     let (output, jobs) = (args.output.clone(), args.jobs.unwrap_or_else(cores));
     let (real_time, tapes_in, replaces) = (args.real_time, args.record_tapes.clone(), args.replace);
-    refuse_swept(&args.set, &SWEPT)?;
-    let plan = args.plan().map_err(anyhow::Error::msg)?;
+    refuse_swept(&args.set, &SWEPT).map_err(WrongUse)?;
+    let plan = args.plan().map_err(WrongUse)?;
     plan.check()?;
     let request = Request { command: this_command(), plan, tapes_in, jobs };
     let mut folder = Folder::claim(&output, replaces)?;

@@ -16,7 +16,7 @@ use node::{Layers, Network, Node, Shutdown, read_text};
 use tempfile::TempDir;
 use tokio::time::Instant;
 
-use crate::args::{Format, OPERATOR, address, meet_port};
+use crate::args::{Format, OPERATOR, WrongUse, address, meet_port};
 use crate::children::{ChildEvent, Children, options_for_shell};
 use crate::ending::recording;
 use crate::outcome::{LandingSummary, OurRecorder};
@@ -298,7 +298,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         vehicle: args.vehicle.clone(),
         ..Network::default()
     };
-    let zenoh = network.source(OPERATOR)?;
+    let zenoh = network.source(OPERATOR).map_err(|problem| WrongUse(format!("{problem:#}")))?;
     let node = Node::open_tool(tool_identity("land"), &zenoh).await?;
     let mut progress = Progress::new(args.format);
     progress.say(&format!(

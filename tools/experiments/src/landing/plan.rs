@@ -4,7 +4,6 @@ use std::borrow::Cow;
 use std::ops::RangeInclusive;
 use std::str::FromStr;
 
-use anyhow::bail;
 use node::ConfigError;
 
 use super::configuration;
@@ -162,11 +161,13 @@ pub const SWEPT: [Swept; 7] = [
 ///
 /// # Errors
 /// When there is such a setting.
-pub fn refuse_swept(settings: &[String], swept: &[Swept]) -> anyhow::Result<()> {
+pub fn refuse_swept(settings: &[String], swept: &[Swept]) -> Result<(), String> {
     for setting in settings {
         let key = setting.split('=').next().unwrap_or_default().trim();
         if let Some(Swept { option, .. }) = swept.iter().find(|swept| swept.setting == key) {
-            bail!("`--set {setting}`: results are sorted by it, so say it with `{option}`");
+            return Err(format!(
+                "`--set {setting}`: results are sorted by it, so say it with `{option}`"
+            ));
         }
     }
     Ok(())
