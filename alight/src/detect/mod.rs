@@ -25,7 +25,7 @@ use queue::process_all;
 use report::{Detection, Found, Line};
 pub(crate) use source::{Item, Source, stem};
 
-/// Prints the detections in each image, in the order given. Exit status 1 when an image could not be read.
+/// Prints the detections in each image, in the order given. Exit status 1 when an image could not be read, or a drawing not be written.
 ///
 /// # Errors
 /// When the calibration or the markers are invalid, or standard output cannot be written.
@@ -40,7 +40,8 @@ pub(crate) fn run(args: &DetectArgs) -> anyhow::Result<ExitCode> {
     let examiner = Examiner::new(args, lens)?;
     let source = Source::new(&args.images);
     let printed = examiner.examine_all(source, threads, args.format, Output)?;
-    Ok(if printed.unreadable == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    let is_whole = printed.unreadable == 0 && !examiner.lacks_drawing.load(Ordering::Relaxed);
+    Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 /// The camera model for poses.
@@ -64,6 +65,8 @@ struct Examiner {
     lens: Lens,
     tracks: bool,
     gallery: Option<Gallery>,
+    /// Whether a drawing could not be written.
+    lacks_drawing: AtomicBool,
     was_warned: AtomicBool,
     /// How many more are searched without the camera, in doubt of it.
     looks_without_camera: AtomicUsize,
@@ -99,6 +102,7 @@ impl Examiner {
             lens,
             tracks: args.track,
             gallery: args.draw.as_deref().map(Gallery::new).transpose()?,
+            lacks_drawing: AtomicBool::new(false),
             was_warned: AtomicBool::new(false),
             looks_without_camera: AtomicUsize::new(MAX_LOOKS_WITHOUT_CAMERA),
             was_doubted: AtomicBool::new(false),
@@ -171,10 +175,12 @@ impl Examiner {
         {
             write_error(&warning);
         }
-        if let Some(gallery) = &self.gallery {
-            gallery
-                .add(stem, image, found, camera.as_ref())
-                .map_err(|problem| format!("{problem:#}"))?;
+        // What was found counts without its drawing.
+        if let Some(gallery) = &self.gallery
+            && let Err(problem) = gallery.add(stem, image, found, camera.as_ref())
+        {
+            write_error(&format!("{problem:#}"));
+            self.lacks_drawing.store(true, Ordering::Relaxed);
         }
         let pads = self.pads.iter().filter_map(|pad| {
             let seen = fiducial::observe_pad(pad, found, camera.as_ref()?)?;
@@ -251,6 +257,7 @@ mod tests {
     use std::io::{ErrorKind, Write};
 
     use super::queue::Totals;
+    use super::source::DRAWN_ENDING;
     use super::*;
     use clap::Parser;
     use serde_json::Value;
@@ -403,6 +410,24 @@ mod tests {
         let other = examiner("30");
         assert_eq!(found(&other), 0);
         assert!(other.was_doubted.load(Ordering::Relaxed));
+    }
+
+    #[test]
+    fn a_marker_is_found_also_where_its_drawing_cannot_be_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let picture = folder.path().join("photo.png");
+        picture_of_rings(150.0).save(&picture).unwrap();
+        // A folder is where the drawing is to be.
+        std::fs::create_dir_all(folder.path().join(format!("drawn/photo.png{DRAWN_ENDING}"))).unwrap();
+        let drawn = folder.path().join("drawn");
+        let text = ["--marker", "rings:0.2", "--draw", drawn.to_str().unwrap()];
+        let args = args(&[&text[..], &[picture.to_str().unwrap()]].concat()).unwrap();
+        let examiner = Examiner::new(&args, Lens::Unknown).unwrap();
+        let source = Source::new(&args.images);
+        let totals = examiner.examine_all(source, 1, args.format, Vec::new()).unwrap();
+        assert_eq!(totals, Totals { images: 1, detections: 1, unreadable: 0 });
+        assert!(examiner.lacks_drawing.load(Ordering::Relaxed));
+        assert_eq!(run(&args).unwrap(), ExitCode::FAILURE);
     }
 
     #[test]
