@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
 use camera_pub::{
     Announced, AnnouncedCamera, AnnouncedStream, Config, ConnectedDevice, DeviceDescription,
     SizeDescription, announced_cameras, connected_devices, source_table, take_picture,
@@ -80,7 +80,11 @@ struct Entry {
 
 /// Lists the cameras, or takes a picture.
 pub(crate) fn run(args: &CamerasArgs) -> anyhow::Result<ExitCode> {
-    let listing = listing(Path::new(DEVICES), args.device.as_deref());
+    let folder = Path::new(DEVICES);
+    let listing = listing(folder, args.device.as_deref());
+    if let (Some(device), true) = (&args.device, listing.devices.is_empty()) {
+        return Err(not_there(device, folder));
+    }
     #[cfg(feature = "genicam")]
     let listing = Listing { genicam: camera_pub::genicam_cameras(), ..listing };
     let mavlink = match &args.mavlink {
@@ -118,6 +122,18 @@ fn listing(folder: &Path, only: Option<&Path>) -> Listing {
         mavlink: None,
         programs: programs.collect(),
     }
+}
+
+/// That a device is none of those in a folder, which are named.
+fn not_there(device: &Path, folder: &Path) -> anyhow::Error {
+    let others = listing(folder, None).devices;
+    let names: Vec<String> =
+        others.iter().map(|other| other.device.path.display().to_string()).collect();
+    let there_is = match names.is_empty() {
+        true => "no device of Video4Linux here".to_owned(),
+        false => names.join(", "),
+    };
+    anyhow!("{} is no device of Video4Linux; there is {there_is}", device.display())
 }
 
 /// Whether a program is in one of the folders of `PATH`.
@@ -333,6 +349,16 @@ mod tests {
         assert!(text.contains("rpicam-vid") && text.contains("`source.command`"), "{text}");
         let problem = save_picture(&listing, Path::new("unused.png")).unwrap_err().to_string();
         assert!(problem.contains("no camera that can be read"), "{problem}");
+    }
+
+    #[test]
+    fn a_device_that_is_not_there_is_told_with_those_that_are() {
+        let folder = tempfile::tempdir().unwrap();
+        let told = |device: &str| not_there(Path::new(device), folder.path()).to_string();
+        assert!(told("/dev/video77").contains("no device of Video4Linux here"));
+        std::fs::write(folder.path().join("video0"), "").unwrap();
+        let told = told("/dev/video77");
+        assert!(told.contains("/dev/video77") && told.contains("video0"), "{told}");
     }
 
     #[test]
