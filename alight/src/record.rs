@@ -1,8 +1,9 @@
 //! `alight record`: the recorder, and the repair of a file whose recorder was killed.
 
-use std::fs::{File, OpenOptions};
+use std::fs::Permissions;
 use std::io::BufWriter;
 use std::net::SocketAddr;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -76,15 +77,7 @@ fn repair(file: &Path, output: Option<&Path>) -> anyhow::Result<ExitCode> {
     let output = output.unwrap_or(&beside);
     let doing = || format!("writing {output:?}; name another file with `-o`");
     ensure!(!output.exists(), "{output:?} is there already; name another file with `-o`");
-    let copy: File =
-        OpenOptions::new().write(true).create_new(true).open(output).with_context(doing)?;
-    let mut buffered = BufWriter::new(copy);
-    let found = flightlog::repair(&recording, &mut buffered).with_context(doing)?;
-    buffered
-        .into_inner()
-        .map_err(std::io::IntoInnerError::into_error)
-        .and_then(|f| f.sync_all())
-        .with_context(doing)?;
+    let found = write_repaired(&recording, output).with_context(doing)?;
     for damage in &found.damage {
         print(&format!("{}: {damage}", file.display()))?;
     }
@@ -95,4 +88,33 @@ fn repair(file: &Path, output: Option<&Path>) -> anyhow::Result<ExitCode> {
         found.chunks
     ))?;
     Ok(ExitCode::FAILURE)
+}
+
+/// Writes the repaired copy, which is there once it is whole: what a full disk lets be written only in part is removed.
+fn write_repaired(recording: &[u8], output: &Path) -> anyhow::Result<flightlog::Repaired> {
+    let folder = output.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let part = tempfile::Builder::new()
+        .prefix(".")
+        .suffix(".new")
+        .permissions(Permissions::from_mode(0o666))
+        .tempfile_in(folder.unwrap_or(Path::new(".")))?;
+    let mut buffered = BufWriter::new(part);
+    let found = flightlog::repair(recording, &mut buffered)?;
+    let part = buffered.into_inner().map_err(std::io::IntoInnerError::into_error)?;
+    part.as_file().sync_all()?;
+    part.persist_noclobber(output)?;
+    Ok(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_copy_that_is_not_whole_is_not_left() {
+        let folder = tempfile::tempdir().unwrap();
+        let copy = folder.path().join("flight-repaired.mcap");
+        assert!(write_repaired(b"no recording", &copy).is_err());
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
 }
