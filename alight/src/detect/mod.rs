@@ -418,9 +418,9 @@ mod tests {
         let picture = folder.path().join("photo.png");
         picture_of_rings(150.0).save(&picture).unwrap();
         // A folder is where the drawing is to be.
-        std::fs::create_dir_all(folder.path().join(format!("drawn/photo.png{DRAWN_ENDING}")))
-            .unwrap();
         let drawn = folder.path().join("drawn");
+        let name = format!("{}{DRAWN_ENDING}", stem(picture.to_str().unwrap()));
+        std::fs::create_dir_all(drawn.join(name)).unwrap();
         let text = ["--marker", "rings:0.2", "--draw", drawn.to_str().unwrap()];
         let args = args(&[&text[..], &[picture.to_str().unwrap()]].concat()).unwrap();
         let examiner = Examiner::new(&args, Lens::Unknown).unwrap();
