@@ -129,7 +129,7 @@ impl Flight {
     /// tells the rest may be a second away.
     fn stop_before_resuming(&mut self, now_ns: i64, packet: &Packet) {
         let pinned = self.config.autopilot.system_id;
-        let is_vehicle = packet.sender.component == autopilot::client::AUTOPILOT
+        let is_vehicle = packet.sender.component == autopilot::packet::AUTOPILOT
             && packet.message.is_some()
             && (pinned == 0 || packet.sender.system == pinned);
         if self.config.start == Start::Resume && is_vehicle && self.autopilot.state().is_none() {
@@ -430,6 +430,11 @@ impl Flight {
     /// The detector in use.
     pub fn active_detector(&self) -> Option<&str> {
         self.frames.selection.active()
+    }
+
+    /// The vehicle's system id; none before it is found.
+    pub fn system(&self) -> Option<u8> {
+        self.autopilot.system()
     }
 
     /// The vehicle's state, once attitude and position are known.

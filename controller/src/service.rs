@@ -222,7 +222,7 @@ fn pass_up(
             "Packet of a ground station refused: {name} (`autopilot.ground_may`; further ones are only counted)"
         );
     }
-    denials(&packets).for_each(|answer| reports.pass_on(node, answer));
+    denials(&packets, flight.flight().system()).for_each(|answer| reports.pass_on(node, answer));
     false
 }
 
@@ -236,8 +236,8 @@ fn refused(permission: Permission, packets: &[Packet], bytes: usize) -> Option<&
 }
 
 /// The answers to the commands in refused packets, as of whom they were for: they would be given again until one comes.
-fn denials(packets: &[Packet]) -> impl Iterator<Item = Vec<u8>> {
-    packets.iter().filter_map(|it| Some(GivenCommand::of(it)?.denied(0, it.sender)))
+fn denials(packets: &[Packet], system: Option<u8>) -> impl Iterator<Item = Vec<u8>> {
+    packets.iter().filter_map(move |it| Some(GivenCommand::of(it)?.denied(system, 0, it.sender)))
 }
 
 /// Sends the flight's packets.
@@ -408,7 +408,7 @@ mod tests {
         assert_eq!(refused(Permission::Everything, &packets, bytes.len()), None);
         let name = refused(Permission::NoArming, &packets, bytes.len());
         assert_eq!(name, Some("arming or stopping motors"));
-        let answer = Parser::new().push(&denials(&packets).next().unwrap()).remove(0);
+        let answer = Parser::new().push(&denials(&packets, None).next().unwrap()).remove(0);
         assert_eq!(answer.sender, Sender { system: 7, component: 1 });
         let Some(MavMessage::COMMAND_ACK(answer)) = answer.message else { panic!("no answer") };
         assert_eq!(answer.command, MavCmd::MAV_CMD_COMPONENT_ARM_DISARM);

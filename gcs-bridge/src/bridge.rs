@@ -135,8 +135,9 @@ const MAX_PROBLEM_CHARS: usize = 120;
 /// Minimum pause between two texts about refused packets, in nanoseconds.
 const REFUSAL_PAUSE_NS: i64 = 5_000_000_000;
 
-/// Maximum number of the camera's heartbeats that are known when they come back; longer than for three seconds none is on its way.
-const MAX_CAMERA_HEARTBEATS: usize = 3;
+/// Maximum number of the camera's heartbeats that are known when they come back: those of a minute, as long as the backlog of a link
+/// may be under way.
+const MAX_CAMERA_HEARTBEATS: usize = 60;
 
 /// Maximum number of texts that wait for their sending.
 const MAX_TO_TELL: usize = 16;
@@ -416,7 +417,7 @@ impl Bridge {
             );
         }
         if let Some(command) = GivenCommand::of(packet) {
-            self.send(&command.denied(self.sequence, to));
+            self.send(&command.denied(self.vehicle.system(now_ns), self.sequence, to));
         }
         let is_due =
             self.refusal_ns.is_none_or(|last| now_ns.saturating_sub(last) > REFUSAL_PAUSE_NS);

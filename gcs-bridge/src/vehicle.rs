@@ -2,13 +2,10 @@
 
 use std::collections::HashSet;
 
-use autopilot::dialect::{MavAutopilot, MavMessage};
 use autopilot::{Packet, Sender};
 
 /// Assumed without an autopilot: the default system id of autopilots.
 const DEFAULT_SYSTEM: u8 = 1;
-/// The component id of an autopilot.
-const AUTOPILOT: u8 = 1;
 /// Silence of the autopilot after which another one is accepted, in nanoseconds.
 const TIMEOUT_NS: i64 = 10_000_000_000;
 
@@ -38,7 +35,7 @@ impl Vehicle {
 
     /// Registers the sender of a packet from the autopilot's side.
     pub(crate) fn received(&mut self, now_ns: i64, packet: &Packet) {
-        if is_autopilot(packet) {
+        if packet.is_heartbeat_of_autopilot() {
             self.autopilot_active(now_ns, packet.sender.system);
         }
         if self.id() == Some(packet.sender.system) {
@@ -81,21 +78,11 @@ impl Vehicle {
     }
 }
 
-fn is_autopilot(packet: &Packet) -> bool {
-    match &packet.message {
-        Some(MavMessage::HEARTBEAT(heartbeat)) => {
-            packet.sender.component == AUTOPILOT
-                && heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
-        }
-        _ => false,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use autopilot::Parser;
-    use autopilot::dialect::HEARTBEAT_DATA;
+    use autopilot::dialect::{HEARTBEAT_DATA, MavAutopilot, MavMessage};
     use autopilot::packet::encode;
 
     const SECOND_NS: i64 = 1_000_000_000;

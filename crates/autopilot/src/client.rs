@@ -25,7 +25,7 @@ use crate::contact::Contact;
 use crate::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, TIMESYNC_DATA};
 use crate::event::Event;
 use crate::mode::{Firmware, FlightMode};
-use crate::packet::{self, Packet, Sender};
+use crate::packet::{self, AUTOPILOT, Packet, Sender};
 use crate::parameter::{Parameter, Parameters};
 use crate::px4_listener::Listener;
 use crate::setpoint_stream::SetpointStream;
@@ -34,8 +34,6 @@ use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, V
 use crate::stream::Streams;
 use crate::text::Joiner;
 
-/// The component id of every autopilot.
-pub const AUTOPILOT: u8 = 1;
 /// Maximum number of events and packets that wait; the oldest are dropped.
 const MAX_QUEUED: usize = 1024;
 /// Maximum number of finished commands whose outcome is kept.
@@ -137,7 +135,9 @@ impl Autopilot {
             return;
         }
         if let MavMessage::HEARTBEAT(heartbeat) = message {
-            self.take_heartbeat(now_ns, packet.sender.system, heartbeat);
+            if packet.is_heartbeat_of_autopilot() {
+                self.take_heartbeat(now_ns, packet.sender.system, heartbeat);
+            }
             return;
         }
         if self.vehicle.as_ref().is_none_or(|vehicle| vehicle.system != packet.sender.system) {

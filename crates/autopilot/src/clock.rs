@@ -13,7 +13,7 @@ const MS: i64 = 1_000_000;
 const FIRST_NS: i64 = 100 * MS;
 /// Period of later requests, in nanoseconds.
 const LATER_NS: i64 = 1_000 * MS;
-/// Number of round trips at the first period, also of those that are too long to be used.
+/// Number of round trips at the first period.
 const FIRST: usize = 12;
 /// Maximum number of round trips kept.
 const MAX_TRIPS: usize = 64;
@@ -60,6 +60,8 @@ pub struct Clock {
     requests: VecDeque<i64>,
     due_ns: i64,
     trips: VecDeque<Trip>,
+    /// Number of round trips since the start or since the clock was found to be another one, also of those too long to be used.
+    answers: usize,
     /// All round trips, also those too long to be used.
     lengths: VecDeque<Length>,
     /// How old the newest measurements were when they came.
@@ -104,8 +106,7 @@ impl Clock {
         if now_ns < self.due_ns {
             return None;
         }
-        let is_first = self.trips.len().max(self.lengths.len()) < FIRST;
-        let pause_ns = if is_first { FIRST_NS } else { LATER_NS };
+        let pause_ns = if self.answers < FIRST { FIRST_NS } else { LATER_NS };
         self.due_ns = now_ns.saturating_add(pause_ns);
         if self.requests.len() >= MAX_REQUESTS {
             self.requests.pop_front();
@@ -121,6 +122,7 @@ impl Clock {
             return false;
         };
         self.requests.remove(index);
+        self.answers = self.answers.saturating_add(1);
         let length_ns = now_ns.saturating_sub(ts1_ns);
         if self.lengths.len() >= MAX_LENGTHS {
             self.lengths.pop_front();
@@ -137,6 +139,7 @@ impl Clock {
                 return false;
             }
             self.trips.clear();
+            self.answers = 0;
         }
         self.contradictions = 0;
         if self.trips.len() >= MAX_TRIPS {

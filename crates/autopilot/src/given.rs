@@ -5,11 +5,10 @@
 
 use mavlink::{Message, MessageData, calculate_crc};
 
-use crate::client::AUTOPILOT;
 use crate::dialect::{
     COMMAND_ACK_DATA, COMMAND_INT_DATA, COMMAND_LONG_DATA, MavMessage, MavResult,
 };
-use crate::packet::{Packet, Sender, encode};
+use crate::packet::{AUTOPILOT, Packet, Sender, encode};
 
 /// Where both messages for commands have the number, the system and the component, in bytes of the payload.
 const NUMBER: usize = 28;
@@ -53,12 +52,17 @@ impl GivenCommand {
         self.refused(MavResult::MAV_RESULT_UNSUPPORTED, sequence, to)
     }
 
-    /// The packet that says to its sender that the command may not be given.
-    pub fn denied(&self, sequence: u8, to: Sender) -> Vec<u8> {
-        self.refused(MavResult::MAV_RESULT_DENIED, sequence, to)
+    /// The packet that says to its sender that the command may not be given; for one to all, as the autopilot of this system, if that
+    /// is known.
+    pub fn denied(&self, system: Option<u8>, sequence: u8, to: Sender) -> Vec<u8> {
+        let Sender { system: to_system, component: to_component } = self.target;
+        let system = if to_system == 0 { system.unwrap_or(0) } else { to_system };
+        let component = if to_component == 0 { AUTOPILOT } else { to_component };
+        let named = Self { target: Sender { system, component }, ..*self };
+        named.refused(MavResult::MAV_RESULT_DENIED, sequence, to)
     }
 
-    /// The acknowledgement with a result that is not zero; for a command to all components that of the autopilot.
+    /// The acknowledgement with a result that is not zero.
     fn refused(&self, result: MavResult, sequence: u8, to: Sender) -> Vec<u8> {
         let answer = MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
             result,
@@ -66,8 +70,7 @@ impl GivenCommand {
             target_component: to.component,
             ..COMMAND_ACK_DATA::default()
         });
-        let component = if self.target.component == 0 { AUTOPILOT } else { self.target.component };
-        let mut packet = encode(Sender { component, ..self.target }, sequence, &answer);
+        let mut packet = encode(self.target, sequence, &answer);
         // The number is the first field of the acknowledgement, and the result behind it is never zero.
         packet.iter_mut().skip(HEADER).zip(self.number.to_le_bytes()).for_each(|(to, of)| *to = of);
         let end = packet.len().saturating_sub(CHECKSUM);
@@ -135,10 +138,10 @@ mod tests {
     }
 
     #[test]
-    fn the_answer_to_a_command_to_all_components_is_the_autopilots() {
-        let to_all = GivenCommand { number: 400, target: Sender { component: 0, ..CAMERA } };
-        let answer = Parser::new().push(&to_all.denied(0, GROUND)).remove(0);
-        assert_eq!(answer.sender, Sender { component: AUTOPILOT, ..CAMERA });
+    fn the_answer_to_a_command_to_all_is_the_autopilots() {
+        let to_all = GivenCommand { number: 400, target: Sender { system: 0, component: 0 } };
+        let answer = Parser::new().push(&to_all.denied(Some(7), 0, GROUND)).remove(0);
+        assert_eq!(answer.sender, Sender { system: 7, component: AUTOPILOT });
         let Some(MavMessage::COMMAND_ACK(answer)) = answer.message else { panic!("no answer") };
         assert_eq!(answer.command, MavCmd::MAV_CMD_COMPONENT_ARM_DISARM);
         assert_eq!(answer.result, MavResult::MAV_RESULT_DENIED);

@@ -1,4 +1,4 @@
-//! The link to the autopilot over UDP, TCP or a serial line.
+//! A link to an autopilot or a ground station over UDP, TCP or a serial line.
 //!
 //! A permanent problem (a port used by another program) is an error at once; a temporary one (no device yet,
 //! no reply, a cable pulled) is retried for ever. Slow readers and slow lines block nothing: queues are
@@ -47,14 +47,17 @@ const LAST_RETRY: Duration = Duration::from_secs(2);
 const CONNECT_LIMIT: Duration = Duration::from_secs(3);
 /// Timeout of writing one packet.
 const WRITE_LIMIT: Duration = Duration::from_secs(2);
-/// Time without a datagram that could be sent, after which a UDP connection is made anew.
+/// Time without a datagram that could be sent, after which it is looked whether a UDP connection would have another address.
 const SEND_LIMIT: Duration = Duration::from_secs(2);
 /// Silence after which a TCP connection counts as dead.
 const TCP_SILENCE: Duration = Duration::from_secs(10);
+/// Silence after which an incomplete packet of a TCP connection is noise. It loses no byte, and what a stall holds up comes later; but
+/// it may begin inside a packet, or bring the noise of a serial line behind it.
+const TCP_GAP: Duration = Duration::from_secs(2);
 /// A time that nothing takes.
 const NO_LIMIT: Duration = Duration::from_secs(3600);
 
-/// A connection to an autopilot that reconnects by itself.
+/// A connection to an autopilot or a ground station that reconnects by itself.
 #[derive(Debug)]
 pub struct Link {
     shared: Arc<Shared>,
@@ -538,9 +541,9 @@ async fn serve(address: &Address, listener: &mut Listener, port: &mut Port) -> (
         Address::Serial { device, baud } => match open_serial(device, *baud) {
             Ok(stream) => {
                 port.connected(address.to_string());
-                (true, serve_stream(stream, serial(), port).await)
+                (true, serve_stream(stream, serial(*baud), port).await)
             }
-            Err(error) => (false, explain_serial(device, &error, port.peering.other_side())),
+            Err(error) => (false, explain_serial(device, &error)),
         },
     }
 }
@@ -584,17 +587,17 @@ fn explain_socket(error: &io::Error, other_side: &str) -> String {
             format!("connection refused; is the {other_side} running?")
         }
         io::ErrorKind::TimedOut => {
-            format!("no reply; is the {other_side} switched on and in reach?")
+            format!("no reply; is the {other_side} there and in reach?")
         }
         _ => format!("cannot reach it: {error}"),
     }
 }
 
-fn explain_serial(device: &str, error: &tokio_serial::Error, other_side: &str) -> String {
+fn explain_serial(device: &str, error: &tokio_serial::Error) -> String {
     use tokio_serial::ErrorKind;
     match error.kind() {
         ErrorKind::NoDevice | ErrorKind::Io(io::ErrorKind::NotFound) => {
-            format!("no device {device}; is the cable plugged in and the {other_side} switched on?")
+            format!("no device {device}; is the cable plugged in and the other side switched on?")
         }
         ErrorKind::Io(io::ErrorKind::PermissionDenied) => format!(
             "no permission to open {device}; on most systems the group `dialout` has it (then log in again)"
@@ -656,25 +659,23 @@ fn refuse(shared: &Shared, peer: SocketAddr, reason: &str) {
 struct Manner<B> {
     /// The time that the line needs for what it has still to send.
     backlog: B,
-    /// Silence after which an incomplete packet is noise; on a line that delivers every byte its rest is only late.
-    gap: Option<Duration>,
+    /// Silence after which an incomplete packet is noise.
+    gap: Duration,
     /// Silence after which the connection counts as dead.
     silence: Option<Duration>,
 }
 
-fn serial() -> Manner<impl Fn(&SerialStream) -> Duration> {
-    let backlog = |line: &SerialStream| {
-        let (Ok(bytes), Ok(baud)) = (line.bytes_to_write(), line.baud_rate()) else {
-            return Duration::ZERO;
-        };
+fn serial(baud: u32) -> Manner<impl Fn(&SerialStream) -> Duration> {
+    let backlog = move |line: &SerialStream| {
+        let bytes = line.bytes_to_write().unwrap_or(0);
         // A byte takes ten bits.
         Duration::from_secs(u64::from(bytes) * 10) / baud.max(1)
     };
-    Manner { backlog, gap: Some(PACKET_GAP), silence: None }
+    Manner { backlog, gap: PACKET_GAP, silence: None }
 }
 
 fn tcp(silence: Option<Duration>) -> Manner<impl Fn(&TcpStream) -> Duration> {
-    Manner { backlog: |_: &TcpStream| Duration::ZERO, gap: None, silence }
+    Manner { backlog: |_: &TcpStream| Duration::ZERO, gap: TCP_GAP, silence }
 }
 
 /// What happened on a line: bytes were read, or written.
@@ -716,7 +717,7 @@ where
     let mut rest = Vec::new();
     let mut writing = active;
     loop {
-        let [gap, limit] = [manner.gap, manner.silence].map(|it| it.unwrap_or(NO_LIMIT));
+        let limit = manner.silence.unwrap_or(NO_LIMIT);
         let is_writing = !rest.is_empty();
         let is_free = !is_writing && (manner.backlog)(&line) <= SPARE_BACKLOG;
         tokio::select! {
@@ -746,7 +747,7 @@ where
             () = sleep_until(writing + WRITE_LIMIT), if is_writing => {
                 return "the other side takes no more bytes".into();
             }
-            () = sleep_until(active + gap), if manner.gap.is_some() && parser.is_waiting() => {
+            () = sleep_until(active + manner.gap), if parser.is_waiting() => {
                 let packets = port.admit(parser.finish()).packets;
                 port.received(packets, parser.take_counters());
             }
@@ -757,15 +758,15 @@ where
     }
 }
 
-/// Moves datagrams in both directions until the socket breaks; returns why. Without a `fixed` peer, the peer
-/// is the sender of the autopilot's heartbeat.
+/// Moves datagrams in both directions until the socket breaks; returns why. Without a `fixed` peer,
+/// the peer is whom [`Peering`] says: the sender of the autopilot's heartbeat, or the first ground station.
 async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr>) -> String {
     let mut peers = Peers::new(fixed, port.peering.clone());
     if let Some(peer) = fixed {
         port.connected(peer.to_string());
     }
     let mut bytes = vec![0; 65_536];
-    let mut unsent_since = None;
+    let mut unsent: Option<Unsent> = None;
     loop {
         tokio::select! {
             read = socket.recv_from(&mut bytes) => match read {
@@ -798,17 +799,40 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
                     // A network may be away for a moment; the packet counts as lost.
                     Err(error) if !is_refusal(&error) => {
                         tracing::debug!(%error, "datagram not sent");
-                        let since = *unsent_since.get_or_insert_with(Instant::now);
-                        // A connection keeps the address that this machine had when it was made.
-                        if fixed.is_some() && since.elapsed() > SEND_LIMIT {
-                            let seconds = SEND_LIMIT.as_secs();
-                            return format!("nothing could be sent for {seconds} s: {error}");
+                        let failing = Unsent::after(unsent);
+                        let is_long = failing.first.elapsed() > SEND_LIMIT;
+                        unsent = Some(failing).filter(|_| !is_long);
+                        if is_long && let Some(peer) = fixed && has_moved(socket, peer).await {
+                            return format!("this machine's address has changed: {error}");
                         }
                     }
-                    _ => unsent_since = None,
+                    _ => unsent = None,
                 }
             }
         }
+    }
+}
+
+/// Whether a new connection would have another address of this machine: one keeps that with which it was made.
+async fn has_moved(socket: &UdpSocket, peer: SocketAddr) -> bool {
+    let of = |socket: &UdpSocket| socket.local_addr().map(|address| address.ip());
+    let Ok(new) = connect_udp(peer).await else { return false };
+    matches!((of(socket), of(&new)), (Ok(old), Ok(new)) if old != new)
+}
+
+/// Datagrams that could not be sent, one soon after the other.
+#[derive(Copy, Clone)]
+struct Unsent {
+    first: Instant,
+    last: Instant,
+}
+
+impl Unsent {
+    /// One more now.
+    fn after(before: Option<Self>) -> Self {
+        let last = Instant::now();
+        let first = before.filter(|it| it.last.elapsed() < SEND_LIMIT).map_or(last, |it| it.first);
+        Self { first, last }
     }
 }
 
@@ -860,7 +884,7 @@ mod tests {
             true => SPARE_BACKLOG * 2,
             false => SPARE_BACKLOG,
         };
-        let manner = Manner { backlog, gap: None, silence: None };
+        let manner = Manner { backlog, gap: PACKET_GAP, silence: None };
         let (sender, mut port) = pair();
         port.connected("peer".into());
         let (line, mut other_end) = tokio::io::duplex(4096);
@@ -888,7 +912,7 @@ mod tests {
         let (sender, mut port) = pair();
         port.connected("peer".into());
         let (line, mut other_end) = tokio::io::duplex(4);
-        let manner = Manner { backlog: |_: &_| Duration::ZERO, gap: None, silence: None };
+        let manner = Manner { backlog: |_: &_| Duration::ZERO, gap: PACKET_GAP, silence: None };
         sender.send(b"more than the line takes").unwrap();
         let receiving = async {
             sleep(Duration::from_millis(20)).await;

@@ -6,7 +6,7 @@
 
 use mavlink::{MAVLinkV2MessageRaw, MavHeader, MavlinkVersion, Message, calculate_crc};
 
-use crate::dialect::MavMessage;
+use crate::dialect::{MavAutopilot, MavMessage, MavType};
 
 const START_V1: u8 = 0xFE;
 const START_V2: u8 = 0xFD;
@@ -33,6 +33,9 @@ pub struct Sender {
     /// Component id: 1 is the autopilot, 190 a ground station, 191 a companion computer.
     pub component: u8,
 }
+
+/// The component id of every autopilot.
+pub const AUTOPILOT: u8 = 1;
 
 /// A packet with a correct checksum, or a plausible one with an unknown message id.
 #[derive(Clone, Debug, PartialEq)]
@@ -168,6 +171,14 @@ impl Packet {
     pub fn from_raw(raw: &[u8]) -> Option<Self> {
         let shape = shape(raw).ok().filter(|shape| shape.length == raw.len())?;
         Some(decode(raw, &shape))
+    }
+
+    /// Whether it is the heartbeat of an autopilot, as opposed to that of a ground station, a camera or a companion.
+    pub fn is_heartbeat_of_autopilot(&self) -> bool {
+        let Some(MavMessage::HEARTBEAT(heartbeat)) = &self.message else { return false };
+        self.sender.component == AUTOPILOT
+            && heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
+            && heartbeat.mavtype != MavType::MAV_TYPE_GCS
     }
 
     /// The payload as it was sent; MAVLink 2 leaves out zero bytes at its end.

@@ -170,12 +170,17 @@ impl Parameters {
             _ => f64::from(message.param_value),
         };
         if value.is_finite() {
+            let was_silent = wanted.is_silent();
             wanted.value = Some(value);
             wanted.is_unanswered = false;
             // Before the first request it answers another one.
             let is_answer = wanted.attempts > 0;
             wanted.set = wanted.set.filter(|set| !(is_answer && is_same(*set, value)));
             self.due_ns = i64::MIN;
+            // The link works now, so the others may answer as well.
+            for other in self.list.iter_mut().filter(|other| was_silent && other.is_silent()) {
+                other.attempts = 0;
+            }
         }
     }
 }
@@ -225,6 +230,13 @@ mod tests {
         parameters.take(Firmware::Copter, &value("A", 4.0, MavParamType::MAV_PARAM_TYPE_REAL32));
         assert_eq!(parameters.get("A"), Parameter::Value(4.0));
         assert!(parameters.request(90_000_000_000, 1, 1).is_none());
+        let mut silent = Parameters::new(&["A", "B", "C"]);
+        (0..60).for_each(|s| drop(silent.request(s * 1_000_000_000, 1, 1)));
+        silent.take(Firmware::Copter, &value("B", 4.0, MavParamType::MAV_PARAM_TYPE_REAL32));
+        assert_eq!(silent.get("C"), Parameter::Unknown, "the link works now");
+        let quick =
+            (0..20).filter(|i| silent.request(60_000_000_000 + i * 500_000_000, 1, 1).is_some());
+        assert!(quick.count() >= 2 * ATTEMPTS as usize);
         parameters.restart();
         assert_eq!(parameters.get("B"), Parameter::Unknown);
     }

@@ -3,8 +3,6 @@
 use std::net::{IpAddr, SocketAddr};
 use std::time::{Duration, Instant};
 
-use crate::client::AUTOPILOT;
-use crate::dialect::{MavAutopilot, MavMessage};
 use crate::gate::Gate;
 use crate::packet::{Counters, Packet, Parser};
 
@@ -65,17 +63,11 @@ impl Peering {
         }
     }
 
-    /// True for the heartbeat of the autopilot, as opposed to another vehicle's, a ground station, camera or companion.
+    /// True for the heartbeat of the autopilot, as opposed to another vehicle's.
     fn is_heartbeat(&self, packet: &Packet) -> bool {
         let Self::Autopilot { system } = self else { return false };
-        match &packet.message {
-            Some(MavMessage::HEARTBEAT(heartbeat)) => {
-                heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
-                    && packet.sender.component == AUTOPILOT
-                    && system.is_none_or(|system| system == packet.sender.system)
-            }
-            _ => false,
-        }
+        packet.is_heartbeat_of_autopilot()
+            && system.is_none_or(|system| system == packet.sender.system)
     }
 }
 
@@ -209,7 +201,8 @@ impl Peers {
 mod tests {
     use super::*;
     use crate::dialect::HEARTBEAT_DATA;
-    use crate::packet::{Sender, encode};
+    use crate::dialect::{MavAutopilot, MavMessage};
+    use crate::packet::{AUTOPILOT, Sender, encode};
     use crate::signing::Signing;
 
     impl Peers {

@@ -78,8 +78,24 @@ pub struct VehicleClock {
     own: Option<String>,
     /// The name of the controller's, by which messages are stamped that do not name their clock.
     controllers: Option<String>,
-    /// Added to stamps of another clock, so that they are of ours.
-    offset_ns: Option<i64>,
+    offset: Option<Offset>,
+}
+
+/// What makes stamps of another clock ours.
+#[derive(Clone, Debug)]
+struct Offset {
+    /// The name of that clock, where it is known; it has another one after each start of its computer.
+    clock: Option<String>,
+    /// Added to stamps of it, in nanoseconds.
+    ns: i64,
+}
+
+impl Offset {
+    /// Whether it is of a clock of this name by which a message came so long after its stamp.
+    fn fits(&self, clock: Option<&str>, apart_ns: i64) -> bool {
+        let is_same = self.clock.as_deref().zip(clock).is_none_or(|(known, told)| known == told);
+        is_same && self.ns.abs_diff(apart_ns) <= MAX_AGE_NS.unsigned_abs()
+    }
 }
 
 impl VehicleClock {
@@ -99,15 +115,17 @@ impl VehicleClock {
     /// known, a stamp that is far away is of another.
     pub fn ours(&mut self, received_ns: i64, stamp_ns: i64, clock: Option<&str>) -> i64 {
         let apart_ns = received_ns.saturating_sub(stamp_ns);
-        let is_ours = match (self.own.as_deref(), clock.or(self.controllers.as_deref())) {
+        let clock = clock.or(self.controllers.as_deref());
+        let is_ours = match (self.own.as_deref(), clock) {
             (Some(own), Some(clock)) => own == clock,
             _ => apart_ns.unsigned_abs() <= MAX_AGE_NS.unsigned_abs(),
         };
         if is_ours {
             return stamp_ns;
         }
-        let known = self.offset_ns.filter(|it| it.abs_diff(apart_ns) <= MAX_AGE_NS as u64);
-        stamp_ns.saturating_add(*self.offset_ns.insert(known.unwrap_or(apart_ns)))
+        let known = self.offset.take().filter(|known| known.fits(clock, apart_ns));
+        let new = || Offset { clock: clock.map(str::to_owned), ns: apart_ns };
+        stamp_ns.saturating_add(self.offset.insert(known.unwrap_or_else(new)).ns)
     }
 }
 
@@ -544,6 +562,7 @@ mod tests {
         assert_eq!(clock.ours(50 * S, 30 * S, None), 50 * S);
         assert_eq!(clock.ours(53 * S, 32 * S, Some("drone")), 52 * S);
         assert_eq!(clock.ours(200 * S, 100 * S, Some("ground")), 100 * S, "ours, and late");
+        assert_eq!(clock.ours(60 * S, 10 * S, Some("drone, started again")), 60 * S);
     }
 
     #[test]

@@ -2,8 +2,7 @@
 //! companion.
 
 use autopilot::Packet;
-use autopilot::client::AUTOPILOT;
-use autopilot::dialect::{MavAutopilot, MavMessage, MavType};
+use autopilot::packet::AUTOPILOT;
 use messages::Configuration;
 
 /// Tells the packets of the vehicle's own autopilot from others, as the controller does.
@@ -32,10 +31,7 @@ impl OwnAutopilot {
         if packet.sender.component != AUTOPILOT {
             return false;
         }
-        if let Some(MavMessage::HEARTBEAT(heartbeat)) = &packet.message
-            && heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
-            && heartbeat.mavtype != MavType::MAV_TYPE_GCS
-        {
+        if packet.is_heartbeat_of_autopilot() {
             self.heard.get_or_insert(system);
         }
         self.configured.or(self.heard) == Some(system)
@@ -44,7 +40,7 @@ impl OwnAutopilot {
 
 #[cfg(test)]
 mod tests {
-    use autopilot::dialect::{HEARTBEAT_DATA, STATUSTEXT_DATA};
+    use autopilot::dialect::{HEARTBEAT_DATA, MavAutopilot, MavMessage, STATUSTEXT_DATA};
     use autopilot::{Sender, packet};
 
     use super::*;

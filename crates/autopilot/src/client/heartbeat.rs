@@ -4,7 +4,7 @@ use super::{Autopilot, Vehicle};
 use crate::boot::BootClock;
 use crate::command::MODE_OF_NOW_NS;
 use crate::contact::Contact;
-use crate::dialect::{HEARTBEAT_DATA, MavAutopilot, MavModeFlag, MavType};
+use crate::dialect::{HEARTBEAT_DATA, MavModeFlag};
 use crate::event::Event;
 use crate::mode::{Firmware, FlightMode};
 use crate::px4_listener::Listener;
@@ -18,9 +18,7 @@ const OVERTAKEN_NS: i64 = 300_000_000;
 
 impl Autopilot {
     pub(super) fn take_heartbeat(&mut self, now_ns: i64, system: u8, heartbeat: &HEARTBEAT_DATA) {
-        let flies = heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
-            && heartbeat.mavtype != MavType::MAV_TYPE_GCS;
-        if !flies || self.config.system_id.is_some_and(|pinned| pinned != system) {
+        if self.config.system_id.is_some_and(|pinned| pinned != system) {
             return;
         }
         match &self.vehicle {
