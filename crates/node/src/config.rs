@@ -62,7 +62,7 @@ pub enum ConfigError {
         hint: &'static str,
     },
     /// Text that is not TOML.
-    #[error("{source_name} is not valid TOML: {cause}")]
+    #[error("{source_name} is not valid TOML: {}", shown(cause))]
     Syntax {
         /// The file or setting.
         source_name: String,
@@ -76,7 +76,7 @@ pub enum ConfigError {
         text: String,
     },
     /// A key that does not exist.
-    #[error("{source_name}: there is no key `{key}`{hint}")]
+    #[error("{source_name}: there is no key `{}`{hint}", shown(key))]
     UnknownKey {
         /// The file or setting.
         source_name: String,
@@ -100,7 +100,7 @@ pub enum ConfigError {
         wanted: &'static str,
     },
     /// A value that the service rejects.
-    #[error("{source_name}: `{key}` = {} is invalid: {limit}", shown(value))]
+    #[error("{source_name}: `{key}` = {} is invalid: {}", shown(value), shown(limit))]
     Refused {
         /// The file or setting.
         source_name: String,
@@ -441,9 +441,14 @@ pub fn without_credentials(address: &str) -> String {
     format!("{scheme}{shown}")
 }
 
-/// A setting or its value as it is told: it may be an address with a password in it.
+/// A setting, its value or what is wrong with it as it is told: any line may have addresses with passwords in it.
 fn shown(text: &str) -> String {
-    if text.contains("://") { without_credentials(text) } else { text.to_owned() }
+    let line = |line: &str| {
+        let mut parts = line.split("://");
+        let before = parts.next().unwrap_or_default().to_owned();
+        parts.fold(before, |before, rest| format!("{before}://{}", without_credentials(rest)))
+    };
+    text.split('\n').map(line).collect::<Vec<_>>().join("\n")
 }
 
 /// The rule of [`is_name`].
@@ -575,6 +580,20 @@ mod tests {
         for problem in [file, set("name"), set("rate_hz"), set("nam")] {
             assert!(!problem.contains("s3cret"), "{problem}");
             assert!(problem.contains("//host:554/main") || problem.contains("nam`"), "{problem}");
+        }
+        // Also where the quotes are missing, and in a word that a key or an enumeration lacks.
+        let word = format!("lens.kind = \"{address}\"");
+        for text in [format!("name = {address}"), format!("\"{address}\" = 1"), word] {
+            let problem = load(Some(&text), &[]).unwrap_err();
+            assert!(
+                !problem.contains("s3cret") && problem.contains("//host:554/main"),
+                "{problem}"
+            );
+        }
+        let two = format!("rate_hz=[\"{address}\", \"rtsp://you:0ther@host\"]");
+        for problem in [load(Some(&two), &[]).unwrap_err(), load(None, &[&two]).unwrap_err()] {
+            let is_told = ["s3cret", "0ther"].iter().any(|password| problem.contains(password));
+            assert!(!is_told && problem.contains("\"rtsp://host\""), "{problem}");
         }
         let form = load(None, &[address]).unwrap_err();
         assert!(form.contains("`rtsp://host:554/main`") && !form.contains("s3cret"), "{form}");
