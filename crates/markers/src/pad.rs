@@ -199,21 +199,18 @@ impl Pad {
     ///
     /// # Errors
     /// [`PadError::Shared`] when one is listed with another size or without one: its distance, and so the pad's, would be wrong or
-    /// unknown.
+    /// unknown; or when its print is listed under another name, under which alone it would be found.
     pub fn add_markers(&self, markers: &mut Vec<Marker>) -> Result<(), PadError> {
         for PlacedMarker { marker, .. } in &self.markers {
-            match markers.iter().find(|it| it.family == marker.family && it.id == marker.id) {
-                None => markers.push(*marker),
-                Some(listed) if listed.size_m == marker.size_m => {}
-                Some(listed) => {
-                    return Err(PadError::Shared {
-                        pad: self.name(),
-                        marker: *marker,
-                        elsewhere: format!(
-                            "listed as `{listed}`, and its size must be one and the same; take it out of the list of markers"
-                        ),
-                    });
+            let mut is_listed = false;
+            for listed in markers.iter() {
+                if let Some(elsewhere) = marker.conflict(listed) {
+                    return Err(PadError::Shared { pad: self.name(), marker: *marker, elsewhere });
                 }
+                is_listed |= listed.family == marker.family && listed.id == marker.id;
+            }
+            if !is_listed {
+                markers.push(*marker);
             }
         }
         Ok(())
@@ -234,6 +231,30 @@ impl Pad {
             whole.half_extent_m = whole.half_extent_m.max(x.max(y) + half_m);
         }
         Some(whole)
+    }
+}
+
+impl Marker {
+    /// As what else this marker of a pad is listed, and what to do; `None` where the list may have the other one.
+    fn conflict(&self, listed: &Self) -> Option<String> {
+        let has_any_id = listed.id.is_none() && self.id.is_some();
+        if self.family == listed.family {
+            let is_other_size = self.id == listed.id && self.size_m != listed.size_m;
+            return is_other_size.then(|| {
+                format!("listed as `{listed}`, and its size must be one and the same; take it out of the list of markers")
+            });
+        }
+        // Dictionaries that share prints number them alike.
+        let same = Self { id: listed.id.or(self.id), ..*listed };
+        self.looks_like(&same).then(|| match has_any_id {
+            true => format!(
+                "listed as `{listed}`, where its print is `{}`; list the ids that are needed instead of all, or give it that name in the pad",
+                same.name()
+            ),
+            false => format!(
+                "listed as `{listed}`, which is the same print by another name; take it out of the list of markers"
+            ),
+        })
     }
 }
 
@@ -455,6 +476,20 @@ mod tests {
         for listed in ["apriltag-36h11:7:0.2", "apriltag-36h11:7"] {
             let problem = with(listed, "apriltag-36h11:7:0.15").unwrap_err().to_string();
             assert!(problem.contains(&format!("listed as `{listed}`")), "{problem}");
+        }
+        // One print by another name is found by one of the names only.
+        assert_eq!(with("aruco-4x4-50:*:0.1", "aruco-4x4-250:60:0.08"), Ok(2));
+        assert_eq!(with("aruco-4x4-250:3:0.1", "aruco-4x4-50:2:0.08"), Ok(2));
+        for (listed, on_pad, part) in [
+            ("aruco-4x4-250:2:0.08", "aruco-4x4-50:2:0.08", "by another name; take it out"),
+            ("aruco-4x4-250:2", "aruco-4x4-50:2:0.08", "by another name; take it out"),
+            ("aruco-4x4-250:*:0.1", "aruco-4x4-50:2:0.08", "its print is `aruco-4x4-250:2`"),
+            ("aruco-4x4-50", "aruco-4x4-250:2:0.08", "its print is `aruco-4x4-50:2`"),
+            ("rings-thesis:0.1", "rings:0.1", "by another name; take it out"),
+        ] {
+            let problem = with(listed, on_pad).unwrap_err().to_string();
+            assert!(problem.contains(&format!("listed as `{listed}")), "{problem}");
+            assert!(problem.contains(part), "{problem}");
         }
         let together = |pads: [Pad; 2]| Pad::check_together(&pads).map_err(|e| e.to_string());
         assert!(together([pad(1, "rings:0.1"), pad(2, "aruco-4x4-50:0:0.1")]).is_ok());
