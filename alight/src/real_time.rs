@@ -119,17 +119,24 @@ struct RealFlight<'a> {
 struct Ground {
     /// Where it first touched, downwards, in metres.
     touched_z: Option<f64>,
+    /// When it touched last: every truth tells the latest touch, until the vehicle is well in the air again.
+    touch_ns: Option<i64>,
 }
 
 impl Ground {
-    /// Notes the first touch, and how far the vehicle rises from there.
+    /// Notes each touch, and how far the vehicle rises from the first.
     fn see(&mut self, truth: &Truth, outcome: &mut Outcome) {
-        let Some(touch) = truth.touchdown else { return };
         let z = truth.position_ned_m[2];
-        if self.touched_z.is_none() {
+        if let Some(touch) = truth.touchdown
+            && self.touch_ns != Some(touch.stamp_ns)
+        {
+            self.touch_ns = Some(touch.stamp_ns);
+            self.touched_z.get_or_insert(z);
             outcome.touch(touch.vertical_speed_m_s, touch.lateral_speed_m_s, touch.error_m);
         }
-        outcome.hop(*self.touched_z.get_or_insert(z) - z);
+        if let Some(touched_z) = self.touched_z {
+            outcome.hop(touched_z - z);
+        }
     }
 }
 
@@ -529,13 +536,13 @@ mod tests {
     fn a_vehicle_that_leaves_the_ground_again_is_told() {
         let mut outcome = Outcome::new(&Plan::default().flights()[0]);
         let mut ground = Ground::default();
-        let touch = Touchdown {
-            stamp_ns: 0,
-            error_m: 0.1,
-            vertical_speed_m_s: 0.5,
-            lateral_speed_m_s: 0.0,
+        let touch = |stamp_ns, vertical_speed_m_s| {
+            Some(Touchdown { stamp_ns, error_m: 0.1, vertical_speed_m_s, lateral_speed_m_s: 0.0 })
         };
-        for (height_m, touchdown) in [(1.0, None), (0.02, Some(touch)), (0.62, Some(touch))] {
+        let (soft, hard) = (touch(1, 0.5), touch(2, 2.0));
+        let seen =
+            [(1.0, None), (0.02, soft), (0.22, soft), (0.62, None), (0.02, hard), (0.02, hard)];
+        for (height_m, touchdown) in seen {
             let truth = Truth {
                 stamp_ns: 0,
                 ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
@@ -549,7 +556,7 @@ mod tests {
             };
             ground.see(&truth, &mut outcome);
         }
-        assert_eq!(outcome.touches, 1);
+        assert_eq!((outcome.touches, outcome.sink_m_s), (2, Some(2.0)));
         assert!(outcome.has_left_ground() && (outcome.hop_m.unwrap() - 0.6).abs() < 1e-9);
     }
 }
