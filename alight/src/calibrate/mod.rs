@@ -10,6 +10,7 @@ mod recorded;
 mod report;
 mod sharpness;
 
+use std::fs::OpenOptions;
 use std::path::Path;
 use std::process::ExitCode;
 use std::time::SystemTime;
@@ -67,8 +68,8 @@ fn check_output(path: &Path, is_replaced: bool, may_be: &str) -> anyhow::Result<
         is_replaced || !path.exists(),
         "{path:?} is there already, {may_be}: name another with `--output`, or replace it with `--replace`"
     );
-    // A device or a pipe is written as it is.
-    if path.exists() && !path.is_file() {
+    // A device or a pipe is written as it is, as is a file where nothing can be put beside it.
+    if path.exists() && (!path.is_file() || OpenOptions::new().append(true).open(path).is_ok()) {
         return Ok(());
     }
     let file = path.canonicalize().unwrap_or_else(|_| path.to_owned());
@@ -184,6 +185,8 @@ mod rendered;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs::Permissions;
+    use std::os::unix::fs::PermissionsExt;
 
     #[test]
     fn a_file_that_cannot_be_written_is_refused_before_the_calibration() {
@@ -196,6 +199,10 @@ mod tests {
         std::fs::write(&file, "in use").unwrap();
         assert!(check_output(&file, false, "").is_err());
         check_output(&file, true, "").unwrap();
+        // Root may write into every folder.
+        std::fs::set_permissions(folder.path(), Permissions::from_mode(0o500)).unwrap();
+        check_output(&file, true, "").unwrap();
+        std::fs::set_permissions(folder.path(), Permissions::from_mode(0o700)).unwrap();
         assert_eq!(std::fs::read_to_string(&file).unwrap(), "in use");
     }
 }

@@ -1,12 +1,16 @@
 //! Files that are written whole or not at all.
 
+use std::fs::{File, Metadata};
+use std::io::{ErrorKind, Result, Write};
+use std::os::unix::fs::{MetadataExt, fchown};
 use std::path::Path;
 
-/// Writes a file under another name first, so that what was there stays until all of the new one is.
+/// Writes a file under another name first, so that what was there stays until all of the new one is. Where nothing can be put
+/// beside it or in its place it is written as it is.
 ///
 /// # Errors
-/// When it cannot be written; what was there is there still.
-pub fn write_whole(file: &Path, contents: &[u8]) -> std::io::Result<()> {
+/// When it cannot be written; unless that is while it is written as it is, what was there is there still.
+pub fn write_whole(file: &Path, contents: &[u8]) -> Result<()> {
     // A device or a pipe is written as it is.
     if file.exists() && !file.is_file() {
         return std::fs::write(file, contents);
@@ -16,17 +20,38 @@ pub fn write_whole(file: &Path, contents: &[u8]) -> std::io::Result<()> {
     let mut name = file.file_name().unwrap_or_default().to_owned();
     name.push(format!(".{}.new", std::process::id()));
     let new = file.with_file_name(name);
-    let written = std::fs::write(&new, contents).and_then(|()| std::fs::rename(&new, &file));
-    if written.is_err() {
-        // It may not be there.
-        let _ = std::fs::remove_file(&new);
+    let written = write_new(&new, std::fs::metadata(&file).ok(), contents)
+        .and_then(|()| std::fs::rename(&new, &file));
+    let Err(problem) = written else { return Ok(()) };
+    // It may not be there.
+    let _ = std::fs::remove_file(&new);
+    match problem.kind() {
+        // The folder is another's or read-only, the file is mounted by itself, or the longer name is too long.
+        ErrorKind::PermissionDenied
+        | ErrorKind::ReadOnlyFilesystem
+        | ErrorKind::ResourceBusy
+        | ErrorKind::InvalidFilename => std::fs::write(&file, contents),
+        _ => Err(problem),
     }
-    written
+}
+
+/// Writes a file onto the disk, with owner and mode of the one that it replaces.
+fn write_new(new: &Path, old: Option<Metadata>, contents: &[u8]) -> Result<()> {
+    let mut file = File::create(new)?;
+    if let Some(old) = old {
+        // Only root gives files away, and not every file system has owners and modes.
+        let _ = fchown(&file, Some(old.uid()), Some(old.gid()));
+        let _ = file.set_permissions(old.permissions());
+    }
+    file.write_all(contents)?;
+    file.sync_all()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs::Permissions;
+    use std::os::unix::fs::PermissionsExt;
 
     #[test]
     fn what_a_link_leads_to_is_replaced_and_nothing_else_is_left() {
@@ -38,6 +63,35 @@ mod tests {
         assert_eq!(std::fs::read(&file).unwrap(), b"new");
         assert!(link.is_symlink());
         assert!(write_whole(&folder.path().join("missing/camera.yaml"), b"new").is_err());
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2);
+    }
+
+    #[test]
+    fn the_mode_stays_and_another_file_is_there_instead() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("camera.yaml");
+        std::fs::write(&file, "old").unwrap();
+        std::fs::set_permissions(&file, Permissions::from_mode(0o604)).unwrap();
+        let before = std::fs::metadata(&file).unwrap();
+        write_whole(&file, b"new").unwrap();
+        let after = std::fs::metadata(&file).unwrap();
+        assert_eq!((after.mode(), after.uid()), (before.mode(), before.uid()));
+        assert_ne!(after.ino(), before.ino());
+    }
+
+    #[test]
+    fn where_nothing_can_be_put_beside_a_file_it_is_written_as_it_is() {
+        let folder = tempfile::tempdir().unwrap();
+        let long = folder.path().join("c".repeat(255));
+        write_whole(&long, b"new").unwrap();
+        assert_eq!(std::fs::read(&long).unwrap(), b"new");
+        // Root may write into every folder, and replaces it.
+        let file = folder.path().join("camera.yaml");
+        std::fs::write(&file, "old").unwrap();
+        std::fs::set_permissions(folder.path(), Permissions::from_mode(0o500)).unwrap();
+        write_whole(&file, b"new").unwrap();
+        std::fs::set_permissions(folder.path(), Permissions::from_mode(0o700)).unwrap();
+        assert_eq!(std::fs::read(&file).unwrap(), b"new");
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2);
     }
 }
