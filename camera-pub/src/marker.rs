@@ -334,6 +334,29 @@ mod tests {
     }
 
     #[test]
+    fn a_camera_that_refuses_a_gain_while_it_meters_gets_its_own_back_before() {
+        let mut exposing = Loop::new(Stamps::FirstPacket);
+        exposing.fake.choose_gain();
+        exposing.fake.light(0.05);
+        exposing.run(1500 * MS, still);
+        assert!(exposing.truth().gain > 1.5, "{:?}", exposing.truth());
+        exposing.run(1500 * MS, |_| None);
+        assert!(exposing.truth().gain < 1.01, "{:?}", exposing.truth());
+        assert!(exposing.fake.is_metering() && exposing.refused == 0, "{}", exposing.refused);
+    }
+
+    #[test]
+    fn a_gain_that_is_always_refused_is_given_up_and_the_camera_meters() {
+        let mut exposing = Loop::new(Stamps::FirstPacket);
+        exposing.fake.light(0.05);
+        exposing.run(1500 * MS, still);
+        exposing.fake.refuse(Some(GAIN));
+        exposing.run(9000 * MS, |_| None);
+        assert!(exposing.fake.is_metering());
+        assert_eq!(exposing.refused, 5);
+    }
+
+    #[test]
     fn a_stamp_is_exact_to_a_millisecond_or_marked_also_while_the_exposure_changes() {
         let all = [Stamps::ExposureStart, Stamps::FirstPacket, Stamps::FrameEnd];
         // Whoever needs several periods for a frame finds frames that waited in all buffers.

@@ -13,6 +13,8 @@ const UNIT_S: f64 = 1e-4;
 const CLOSE: std::ops::RangeInclusive<f64> = 0.9..=1.13;
 /// `V4L2_EXPOSURE_APERTURE_PRIORITY`, with which UVC cameras meter, and `V4L2_EXPOSURE_AUTO` of others.
 const METERING: [i32; 2] = [3, 0];
+/// Number of refusals after which a camera's own gain is not put back any more.
+const MAX_GAIN_REFUSALS: u32 = 5;
 
 /// How a device's exposure is to be set for the marker.
 #[derive(Clone, Debug, PartialEq)]
@@ -48,6 +50,8 @@ pub(crate) struct Exposer {
     is_metering: bool,
     /// The gain's value before it was set here.
     own_gain: Option<i32>,
+    /// How often the camera has refused to have it back.
+    gain_refusals: u32,
     setting: Option<Setting>,
     /// Frames since the last change, and when that was ordered.
     frames: u32,
@@ -109,6 +113,7 @@ impl Exposer {
             gain: gain.map(|gain| Gain { id: gain.id, range: range(gain) }),
             is_metering: false,
             own_gain: None,
+            gain_refusals: 0,
             setting: None,
             frames: 0,
             ordered_ns: i64::MIN,
@@ -166,24 +171,25 @@ impl Exposer {
         match order {
             Order::Keep => Ok(None),
             Order::OwnMetering => {
-                let Some(value) = self.metering.filter(|_| !self.is_metering) else {
+                let Some(value) = self.metering else { return Ok(None) };
+                if self.is_metering && self.own_gain.is_none() {
                     return Ok(None);
-                };
-                set(device, CID_EXPOSURE_AUTO, value)?;
-                self.setting = None;
-                // What is refused is kept, and tried again with all of this.
-                if let Some((gain, value)) = self.gain.zip(self.own_gain) {
-                    set(device, gain.id, value)?;
                 }
-                (self.is_metering, self.own_gain) = (true, None);
-                Ok(Some(0))
+                self.setting = None;
+                // Before the camera meters: it may refuse a gain that it then chooses by itself. It meters also with another one.
+                let put_back = self.put_gain_back(device);
+                if !self.is_metering {
+                    set(device, CID_EXPOSURE_AUTO, value)?;
+                    self.is_metering = true;
+                }
+                put_back.map(|()| Some(0))
             }
             Order::TakeOver => {
                 let exposure = control_value(device, CID_EXPOSURE_ABSOLUTE)?.unwrap_or(1);
                 let value = self.gain.map(|gain| control_value(device, gain.id));
                 let value = value.transpose()?.flatten();
                 // One that could not be put back is still the camera's own.
-                self.own_gain = self.own_gain.or(value);
+                (self.own_gain, self.gain_refusals) = (self.own_gain.or(value), 0);
                 let gain = self.gain.zip(value).map(|(gain, value)| self.factor(gain, value));
                 if self.metering.is_some() {
                     set(device, CID_EXPOSURE_AUTO, EXPOSURE_MANUAL)?;
@@ -199,6 +205,17 @@ impl Exposer {
             }
             Order::Set(setting) => self.set(device, setting).map(Some),
         }
+    }
+
+    /// Sets the gain that the camera had. One that is refused is kept and tried again, a few times.
+    fn put_gain_back(&mut self, device: &impl Device) -> std::io::Result<()> {
+        let Some((gain, value)) = self.gain.zip(self.own_gain) else { return Ok(()) };
+        let put_back = set(device, gain.id, value);
+        self.gain_refusals += u32::from(put_back.is_err());
+        if put_back.is_ok() || self.gain_refusals >= MAX_GAIN_REFUSALS {
+            self.own_gain = None;
+        }
+        put_back
     }
 
     fn set(&mut self, device: &impl Device, setting: Setting) -> std::io::Result<u32> {

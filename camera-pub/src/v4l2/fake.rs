@@ -103,6 +103,8 @@ pub(crate) struct Fake {
     is_linked: Cell<bool>,
     /// The control that it does not set.
     refused: Cell<Option<u32>>,
+    /// Whether it sets no gain while it meters.
+    chooses_gain: Cell<bool>,
     /// The control that it does not tell.
     hidden: Cell<Option<u32>>,
     open_devices: Cell<u32>,
@@ -173,6 +175,7 @@ impl Fake {
             bus: Cell::new(*b"usb-0000:0e:00.0-2.4"),
             is_linked: Cell::new(false),
             refused: Cell::new(None),
+            chooses_gain: Cell::new(false),
             hidden: Cell::new(None),
             open_devices: Cell::new(0),
             mappings: Cell::new(0),
@@ -216,6 +219,16 @@ impl Fake {
     /// Refuses to set this control from now on, or none.
     pub(crate) fn refuse(&self, control: Option<u32>) {
         self.refused.set(control);
+    }
+
+    /// Refuses to set its gain while it meters, as UVC allows.
+    pub(crate) fn choose_gain(&self) {
+        self.chooses_gain.set(true);
+    }
+
+    fn refuses(&self, control: u32) -> bool {
+        let chooses = control == GAIN && self.chooses_gain.get() && self.is_metering();
+        chooses || self.refused.get() == Some(control)
     }
 
     /// Fails to tell this control from now on, or none.
@@ -445,7 +458,7 @@ impl Device for FakeDevice {
                 control.value = self.fake.exposure.get();
             }
             Call::GetControl(control) if control.id == GAIN => control.value = self.fake.gain.get(),
-            Call::SetControl(control) if self.fake.refused.get() == Some(control.id) => {
+            Call::SetControl(control) if self.fake.refuses(control.id) => {
                 return Err(errno(libc::EIO));
             }
             Call::SetControl(control) => self.fake.control(state.next, control.id, control.value),
