@@ -371,7 +371,6 @@ impl Stream {
                             let now_ns = video.now_ns();
                             let unreadable_ns = now_ns - *unreadable_since_ns.get_or_insert(now_ns);
                             if unreadable_ns >= patience_ns {
-                                unreadable_since_ns = None;
                                 let lost = why.as_loss(config.size, unreadable_ns);
                                 video.lose(&lost);
                                 self.health.failed(lost.reason());
@@ -382,6 +381,10 @@ impl Stream {
                 Next::Nothing => {}
                 Next::Wait(time) => tokio::time::sleep(time).await,
                 Next::Lost(reason) => drop(self.health.failed(reason)),
+            }
+            // An outage is no time of damaged frames.
+            if video.capture().is_none() {
+                unreadable_since_ns = None;
             }
             // Waiting for a frame blocks this thread, briefly: a shutdown is noticed between.
             tokio::task::yield_now().await;
@@ -836,6 +839,21 @@ mod tests {
             assert_eq!(health.failures("camera's format changed"), 0);
             assert!(health.failures("unreadable image") >= u64::from(damaged));
         }
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn damaged_frames_before_and_after_an_outage_are_not_taken_for_a_time_of_nothing_else() {
+        let away = Happening::Unplugged(900 * MS);
+        let script = [(20, Happening::Cut), (21, away), (22, Happening::Cut)];
+        let mut opened = 0;
+        let health = publish("MJPG", &script, |fake, frame| {
+            opened = fake.opened();
+            fake.number_at(frame.header.stamp_ns + 1000) > 100
+        })
+        .await;
+        assert_eq!((opened, health.failures("unreadable image")), (2, 2));
+        assert_eq!(health.failures("camera unplugged"), 1);
+        assert_eq!(health.failures("camera's frames unreadable"), 0);
     }
 
     /// Grey levels that differ everywhere, so that no two places of a frame can be taken for each other.
