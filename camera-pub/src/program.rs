@@ -3,6 +3,7 @@
 //!
 //! Any camera with such a program can be used, and none of their libraries is needed here.
 
+use std::future::poll_fn;
 use std::io::ErrorKind;
 use std::pin::pin;
 use std::process::Stdio;
@@ -214,6 +215,12 @@ impl<R: AsyncBufRead + Unpin> FrameReader<R> {
     }
 
     async fn read(&mut self, samples: &mut [u8]) -> std::io::Result<Vec<u8>> {
+        let (jpeg, waiting) = waiting_of(self.read_rest(samples)).await;
+        self.queue.has_read(waiting);
+        jpeg
+    }
+
+    async fn read_rest(&mut self, samples: &mut [u8]) -> std::io::Result<Vec<u8>> {
         let jpeg = match self.format {
             FrameFormat::Samples { row_bytes, stride_bytes, rows: _, chroma_bytes } => {
                 for row in samples.chunks_exact_mut(row_bytes.max(1)) {
@@ -260,11 +267,41 @@ impl<R: AsyncBufRead + Unpin> FrameReader<R> {
     }
 }
 
+/// How a read waited for bytes.
+#[derive(Copy, Clone, Debug, Default)]
+struct Waiting {
+    total_ns: i64,
+    /// When the last wait ended.
+    ended_ns: i64,
+}
+
+/// Does the work; returns its result, and how it waited.
+async fn waiting_of<T>(work: impl Future<Output = T>) -> (T, Waiting) {
+    let mut work = pin!(work);
+    let mut waiting = Waiting::default();
+    let mut since_ns = None;
+    let result = poll_fn(|context| {
+        if let Some(since_ns) = since_ns.take() {
+            waiting.ended_ns = now_ns();
+            waiting.total_ns += waiting.ended_ns - since_ns;
+        }
+        let polled = work.as_mut().poll(context);
+        if polled.is_pending() {
+            since_ns = Some(now_ns());
+        }
+        polled
+    })
+    .await;
+    (result, waiting)
+}
+
 /// Tells which frames were queued on their way.
 struct Queue {
     /// Nominal time between frames.
     period_ns: i64,
     last: Option<Last>,
+    /// When the frame before had all been read, where it came as slowly as it was made: until then nothing was queued.
+    empty_ns: Option<i64>,
 }
 
 /// The frame before.
@@ -278,17 +315,30 @@ struct Last {
 
 impl Queue {
     fn of(period: Duration) -> Self {
-        Self { period_ns: period.as_nanos().try_into().unwrap_or(i64::MAX), last: None }
+        Self {
+            period_ns: period.as_nanos().try_into().unwrap_or(i64::MAX),
+            last: None,
+            empty_ns: None,
+        }
+    }
+
+    /// Notes how the rest of a frame was waited for. Of a frame that was queued all is there, or comes at once; over most of
+    /// a period come those of a program that writes rows as they are scanned, or over a narrow link.
+    fn has_read(&mut self, waiting: Waiting) {
+        let is_made = waiting.total_ns >= self.period_ns / 4 * 3;
+        self.empty_ns = is_made.then_some(waiting.ended_ns);
     }
 
     /// Whether the frame whose first byte is read at `stamp_ns`, after the read waited so long for it, was queued: one that
     /// follows sooner than a camera can deliver, and one that was there already and is later than it was due. What is due is
-    /// counted on from the last frame that was waited for, so that what a slow reader is behind adds up.
+    /// counted on from the last frame that was waited for, so that what a slow reader is behind adds up, and is no sooner than the
+    /// end of a frame that came as it was made.
     fn has_held(&mut self, stamp_ns: i64, waited_ns: i64) -> bool {
         let quarter_ns = self.period_ns / 4;
         let due_ns = match self.last {
             Some(last) if waited_ns < IMMEDIATE_NS => {
-                last.due_ns.saturating_add(self.period_ns).min(stamp_ns)
+                let due_ns = last.due_ns.saturating_add(self.period_ns);
+                due_ns.max(self.empty_ns.unwrap_or(i64::MIN)).min(stamp_ns)
             }
             _ => stamp_ns,
         };
@@ -386,6 +436,53 @@ mod tests {
             fresh += 1;
         }
         (Duration::from_nanos(oldest_ns as u64), fresh)
+    }
+
+    #[test]
+    fn frames_that_come_over_the_whole_period_are_fresh_also_when_that_is_longer_than_it_is_said_to_be()
+     {
+        let (made_ns, needed_ns) = (1_000_000_000_000 / 29_970, 5_000_000);
+        let mut queue = Queue::of(Duration::from_secs_f64(1.0 / 30.0));
+        let mut stamp_ns = 0;
+        for number in 1..=2000 {
+            assert!(!queue.has_held(stamp_ns, 0), "frame {number}");
+            // Its last byte comes with the first of the next one.
+            let ended_ns = number * made_ns;
+            queue.has_read(Waiting { total_ns: ended_ns - stamp_ns, ended_ns });
+            stamp_ns = ended_ns + needed_ns;
+        }
+    }
+
+    #[tokio::test]
+    async fn a_program_that_writes_all_the_time_and_is_a_little_slow_loses_no_frames() {
+        let format =
+            FrameFormat::Samples { row_bytes: 64, stride_bytes: 64, rows: 8, chroma_bytes: 0 };
+        let (mut program, output) = tokio::io::duplex(1 << 16);
+        let writing = async move {
+            // No frame begins with a write: eight of these take 44 ms or more.
+            let mut bytes = 32;
+            while tokio::io::AsyncWriteExt::write_all(&mut program, &[0; 64][..bytes]).await.is_ok()
+            {
+                bytes = 64;
+                tokio::time::sleep(Duration::from_micros(5500)).await;
+            }
+        };
+        let reading = async {
+            let input = BufReader::with_capacity(BUFFER_BYTES, output);
+            let mut frames = FrameReader::new(input, format, PERIOD);
+            let mut queued = 0;
+            for _ in 0..20 {
+                queued += u32::from(frames.wait().await.unwrap().unwrap().was_queued);
+                frames.read(&mut [0; 8 * 64]).await.unwrap();
+            }
+            queued
+        };
+        let queued = tokio::select! {
+            () = writing => panic!("nobody reads"),
+            queued = reading => queued,
+        };
+        // A busy machine may hold a few.
+        assert!(queued <= 5, "{queued} of 20");
     }
 
     #[test]
