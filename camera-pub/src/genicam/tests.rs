@@ -85,6 +85,10 @@ fn watch(feed: &mut Feed, time: Duration) -> Seen {
             Next::Frame(taken) => {
                 match number_in(&taken) {
                     Some(number) => {
+                        if last.is_none() {
+                            // What is left out before the first frame is missing between no two.
+                            feed.take_counts();
+                        }
                         let expected = last.map(|last| (u64::from(last) + 1) % 255);
                         let apart = expected.map_or(0, |it| (u64::from(number) + 255 - it) % 255);
                         seen.missing += apart;
