@@ -532,9 +532,14 @@ fn decode_with_erasures(
     if best.hamming > max_hamming || best.second <= best.hamming {
         return None;
     }
-    // In some families two ids differ in a single bit: what reads as another one exactly is that one, though not looked for.
-    if ids.is_some() && best.hamming > 0 && of_all().hamming < best.hamming {
-        return None;
+    // In some families two ids differ in one or two bits: what reads as another one exactly is that one, though not looked for,
+    // and where those bits are erased it may be either.
+    let may_be_other = erased > 0 && code.min_hamming <= 2;
+    if ids.is_some() && (best.hamming > 0 || may_be_other) {
+        let all = of_all();
+        if all.hamming < best.hamming || may_be_other && all.second <= best.hamming {
+            return None;
+        }
     }
     let evidence = false_positive::evidence(code, codeword, count, known, best.hamming) as f32;
     (evidence >= MIN_EVIDENCE).then_some(Reading {
@@ -581,5 +586,13 @@ mod tests {
         let is_other = |word: u64| code.nearest(word, 0).is_some();
         let damaged = (0..25).map(|bit| code.codewords[255] ^ 1 << bit).find(|it| !is_other(*it));
         assert_eq!(read(damaged.unwrap()), Some(1));
+        // A hidden bit does no harm, unless it is the one.
+        let read_without = |hidden: u64| {
+            let known = known & !hidden;
+            let word = ErasedWord { bits: code.codewords[255] & known, known };
+            decode_with_erasures(word, code, Some(&[255])).map(|reading| reading.hamming)
+        };
+        assert_eq!(read_without(other ^ code.codewords[255]), None);
+        assert_eq!(read_without(damaged.unwrap() ^ code.codewords[255]), Some(0));
     }
 }
