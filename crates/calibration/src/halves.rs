@@ -44,15 +44,15 @@ impl Half {
     }
 }
 
-/// What every second view says of the others, and the first half of them of the second, which shows what changed in between: the
-/// worse of both. `None` where a half shows no camera in either way.
-pub(crate) fn cross_validation(whole: &Solved) -> Option<CrossValidation> {
+/// What every second view says of the others, and the first half of them of the second, which shows what changed in between.
+/// Nothing where a half shows no camera.
+pub(crate) fn cross_validations(whole: &Solved) -> impl Iterator<Item = CrossValidation> {
     let middle = whole.views.len() / 2;
     let by = |is_first: &dyn Fn(usize) -> bool| {
         compare(&Half::new(whole, is_first)?, &Half::new(whole, |view| !is_first(view))?)
     };
     let both = [by(&|view| view % 2 == 0), by(&|view| view < middle)];
-    both.into_iter().flatten().max_by(|a, b| a.ratio().total_cmp(&b.ratio()))
+    both.into_iter().flatten()
 }
 
 /// Columns and rows of the places that are compared.

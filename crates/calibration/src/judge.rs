@@ -5,7 +5,7 @@ use libm::{fmax, fmin};
 use crate::board::Sheet;
 use crate::calibration::{Calibration, Options};
 use crate::evidence::{Coverage, Estimate, Evidence};
-use crate::halves;
+use crate::halves::{self, CrossValidation};
 use crate::lens::Lens;
 use crate::refusal::Refusal;
 use crate::stages;
@@ -80,7 +80,7 @@ impl<'a> Task<'a> {
         let middle_m = self.sheet.middle_m;
         let mut calibration =
             Calibration::new(&solved, &self.views, middle_m).ok_or(undetermined)?;
-        calibration.cross_validation = halves::cross_validation(&solved);
+        calibration.cross_validation = worst(halves::cross_validations(&solved));
         Ok(calibration)
     }
 }
@@ -239,8 +239,42 @@ fn agreed_well(calibration: &Calibration) -> Result<(), Refusal> {
     let Some(halves) = calibration.cross_validation else { return Ok(()) };
     let (difference_px, ratio) = (halves.difference_px, halves.ratio());
     let (max_px, max_ratio) = (limit::MAX_DIFFERENCE_PX, limit::MAX_RATIO);
-    if difference_px > max_px && ratio > max_ratio {
+    if excess(&halves) > 1.0 {
         return Err(Refusal::Inconsistent { difference_px, ratio, max_px, max_ratio });
     }
     Ok(())
+}
+
+/// The one of several comparisons that is the last to be believed.
+fn worst(comparisons: impl Iterator<Item = CrossValidation>) -> Option<CrossValidation> {
+    comparisons.max_by(|a, b| excess(a).total_cmp(&excess(b)))
+}
+
+/// Above 1 where the difference of two halves and its ratio are both beyond their limits, or are no numbers.
+fn excess(halves: &CrossValidation) -> f64 {
+    let [of_difference, of_ratio] =
+        [halves.difference_px / limit::MAX_DIFFERENCE_PX, halves.ratio() / limit::MAX_RATIO];
+    let excess = fmin(of_difference, of_ratio);
+    if excess.is_nan() { f64::INFINITY } else { excess }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_comparison_that_is_not_believed_hides_behind_no_other() {
+        let halves =
+            |difference_px: f64, expected_px| CrossValidation { difference_px, expected_px };
+        // A hundred times its uncertainty, but small; large, but uncertain; and five times its uncertainty of 0.2 px.
+        let (small, uncertain, bad) = (halves(0.1, 0.001), halves(2.0, 1.0), halves(1.0, 0.2));
+        for others in [[small, bad, uncertain], [uncertain, bad, small]] {
+            assert_eq!(worst(others.into_iter()), Some(bad));
+        }
+        assert!(excess(&bad) > 1.0 && excess(&small) < 1.0 && excess(&uncertain) < 1.0);
+        for nan in [f64::NAN, -f64::NAN] {
+            let found = worst([halves(nan, 0.1), small].into_iter()).unwrap();
+            assert!(found.difference_px.is_nan() && excess(&found) > 1.0);
+        }
+    }
 }
