@@ -169,6 +169,16 @@ impl Config {
         Ok(markers)
     }
 
+    /// What is looked for, by name: the markers of the list, then the pads.
+    ///
+    /// # Errors
+    /// As [`Config::listed_markers`].
+    pub fn looked_for(&self) -> Result<Vec<String>, String> {
+        let mut names: Vec<String> = self.listed_markers()?.iter().map(Marker::to_string).collect();
+        names.extend(self.parsed_pads()?.iter().map(Pad::name));
+        Ok(names)
+    }
+
     fn parsed_markers(&self) -> Result<Vec<Marker>, String> {
         self.markers.iter().map(|text| text.parse().map_err(|e| format!("{e}"))).collect()
     }
@@ -209,12 +219,13 @@ mod tests {
         let rings = pad(1, "rings:0.3");
         // The default list gives way to the pad, one of the user's own is refused.
         let config = load(&format!("pads=[{rings}]")).unwrap();
-        assert_eq!(config.listed_markers(), Ok(vec![]));
+        assert_eq!(config.looked_for(), Ok(vec!["pad:1".to_owned()]));
         assert!(config.detector().is_ok());
         let refused = |key: &str, value: &str| config.with(key, value).unwrap_err();
         assert!(refused("markers", "[\"rings:0.2\"]").contains("listed as `rings:0.2`"));
         assert!(refused("markers", "[\"rings\"]").contains("listed as `rings`"));
-        assert!(config.with("markers", "[\"rings:0.3\"]").is_ok());
+        let both = config.with("markers", "[\"rings:0.3\"]").unwrap();
+        assert_eq!(both.looked_for(), Ok(vec!["rings:0.3".to_owned(), "pad:1".to_owned()]));
         let two = [pad(2, "aruco-4x4-50:0:0.1"), pad(3, "aruco-4x4-50:0:0.1")].join(",");
         assert!(refused("pads", &format!("[{two}]")).contains("`aruco-4x4-50:0:0.1` of `pad:3`"));
     }

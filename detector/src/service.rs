@@ -14,7 +14,6 @@ use fiducial::overlay::debug;
 use fiducial::{ResponseEstimate, ResponseSetting, StageObserver};
 use geometry::CameraModel;
 use imaging::{Converter, GrayView};
-use markers::Pad;
 use messages::{
     CameraInfo, CameraResponse, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo,
     FrameHeader, PixelFormat, Refusals, topic,
@@ -148,15 +147,12 @@ fn accept(node: &Node, known: Option<&CameraInfo>, info: &CameraInfo, silence: D
 
 /// What this detector says about itself.
 fn info(config: &Config) -> Result<DetectorInfo, String> {
-    let listed = config.listed_markers()?;
-    let mut markers: Vec<String> = listed.iter().map(ToString::to_string).collect();
-    markers.extend(config.parsed_pads()?.iter().map(Pad::name));
     Ok(DetectorInfo {
         detector: config.id.clone(),
         host: node::host_name(),
         place: config.place,
         camera: config.camera.clone(),
-        markers,
+        markers: config.looked_for()?,
         version: format!("alight {}", node::version()),
         pid: std::process::id(),
     })

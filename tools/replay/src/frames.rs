@@ -184,6 +184,7 @@ pub fn search(
     let then = facts.found.remove(&name).unwrap_or_default();
     ensure!(!then.is_empty(), "the recording has no detections of the detector `{name}`");
     let info = facts.cameras.get(&config.camera).cloned();
+    let looked_for = config.looked_for().map_err(anyhow::Error::msg)?;
     let mut frames = Frames {
         camera: config.camera.clone(),
         search: Search::new(&config).map_err(anyhow::Error::msg)?,
@@ -196,7 +197,7 @@ pub fn search(
         searched: Searched {
             detector: name.clone(),
             camera: config.camera,
-            looked_for: [config.markers, config.pads].concat(),
+            looked_for,
             then: Found { marker: facts.marker(tapes, &[])?, ..Found::default() },
             now: Found { marker: facts.marker(tapes, &again.of_controller)?, ..Found::default() },
             ..Searched::default()

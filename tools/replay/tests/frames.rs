@@ -210,6 +210,14 @@ fn the_same_search_of_the_same_pixels_finds_the_same() {
 }
 
 #[test]
+fn a_pad_that_is_looked_for_is_named_as_the_controller_names_it() {
+    let set = ["markers=[\"rings:0.15341\"]", "pads=[\"a4\"]"].map(str::to_owned);
+    let searched =
+        again(recording(pixels), &Again { of_detector: set.to_vec(), ..Again::default() }).unwrap();
+    assert_eq!(searched.looked_for, ["rings:0.15341", "pad:0"]);
+}
+
+#[test]
 fn pictures_that_were_compressed_are_searched_as_well_and_said_to_be_so() {
     let kept =
         |header: &FrameHeader, pixels: &[u8]| Picture::Jpeg(jpeg(header, pixels, 80).unwrap());
