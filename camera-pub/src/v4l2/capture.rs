@@ -91,6 +91,9 @@ pub(crate) enum Lost {
     /// It does not do what is configured.
     #[error("{0}")]
     Refused(String),
+    /// It is another camera than the one that is waited for.
+    #[error("{0}")]
+    Another(String),
     /// It failed in another way.
     #[error("{call}: {cause}")]
     Failed {
@@ -123,6 +126,19 @@ pub(crate) struct Identity {
     pub(crate) card: String,
     /// Where it is plugged in.
     pub(crate) bus: String,
+}
+
+impl Identity {
+    /// Of an open device; `None` where it is no camera.
+    pub(crate) fn of(device: &impl Device) -> Option<Self> {
+        let mut capability = Capability::default();
+        device.call(Call::QueryCap(&mut capability)).ok()?;
+        is_camera(&capability).then(|| Self::in_answer(&capability))
+    }
+
+    fn in_answer(capability: &Capability) -> Self {
+        Self { card: text(&capability.card), bus: text(&capability.bus_info) }
+    }
 }
 
 /// A device that gives frames.
@@ -171,7 +187,7 @@ impl<D: Device> Capture<D> {
     ) -> Result<Self, Lost> {
         let mut capability = Capability::default();
         failed("VIDIOC_QUERYCAP", device.call(Call::QueryCap(&mut capability)))?;
-        let identity = Identity { card: text(&capability.card), bus: text(&capability.bus_info) };
+        let identity = Identity::in_answer(&capability);
         // Before anything is set: it may be another service's.
         accept(&identity)?;
         if !is_camera(&capability) {
@@ -480,6 +496,7 @@ impl Lost {
             Self::Unreadable(_) => "camera's frames unreadable",
             Self::FormatChanged(_) => "camera's format changed",
             Self::ForeignClock { .. } => "camera's stamps of another clock",
+            Self::Another(_) => "another camera",
             Self::Refused(_) => "camera refused what is configured",
             Self::Failed { .. } => "camera failed",
         }

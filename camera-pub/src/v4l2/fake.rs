@@ -101,6 +101,8 @@ pub(crate) struct Fake {
     /// Where it is plugged in, and whether its path is a link.
     bus: Cell<[u8; 20]>,
     is_linked: Cell<bool>,
+    /// What is at other numbers.
+    beside: RefCell<Vec<Rc<Self>>>,
     /// The control that it does not set.
     refused: Cell<Option<u32>>,
     /// Whether it sets no gain while it meters.
@@ -174,6 +176,7 @@ impl Fake {
             oddity: Cell::new(None),
             bus: Cell::new(*b"usb-0000:0e:00.0-2.4"),
             is_linked: Cell::new(false),
+            beside: RefCell::default(),
             refused: Cell::new(None),
             chooses_gain: Cell::new(false),
             hidden: Cell::new(None),
@@ -270,6 +273,11 @@ impl Fake {
         self.bus.set(*bus);
     }
 
+    /// Puts another camera at another number.
+    pub(crate) fn put_beside(&self, other: &Rc<Self>) {
+        self.beside.borrow_mut().push(Rc::clone(other));
+    }
+
     /// Gives it a path that is a link.
     pub(crate) fn link(&self) {
         self.is_linked.set(true);
@@ -335,6 +343,14 @@ impl Port for Rc<Fake> {
 
     fn is_by_number(&self) -> bool {
         !self.is_linked.get()
+    }
+
+    fn others(&self) -> Vec<Self> {
+        self.beside.borrow().clone()
+    }
+
+    fn name(&self) -> String {
+        "/dev/video0".to_owned()
     }
 
     fn now_ns(&self) -> i64 {

@@ -52,6 +52,16 @@ impl Port for DevicePath {
         number.is_some_and(|number| number.bytes().all(|byte| byte.is_ascii_digit()))
     }
 
+    fn others(&self) -> Vec<Self> {
+        let entries = self.0.parent().and_then(|folder| std::fs::read_dir(folder).ok());
+        let devices = entries.into_iter().flatten().flatten().map(|entry| Self(entry.path()));
+        devices.filter(|device| device.is_by_number() && device.0 != self.0).collect()
+    }
+
+    fn name(&self) -> String {
+        self.0.display().to_string()
+    }
+
     fn now_ns(&self) -> i64 {
         node::now_ns()
     }
@@ -182,6 +192,18 @@ mod tests {
         assert!(device.map(&buffer).is_err());
         let missing = KernelDevice::open(Path::new("/dev/video-none")).err().unwrap();
         assert_eq!(missing.kind(), io::ErrorKind::NotFound);
+    }
+
+    #[test]
+    fn the_devices_of_other_numbers_are_those_in_its_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["video0", "video2", "video10", "v4l-subdev0", "null"] {
+            std::fs::write(folder.path().join(name), "").unwrap();
+        }
+        let others = DevicePath(folder.path().join("video0")).others();
+        let mut names: Vec<_> = others.iter().map(|other| other.0.file_name().unwrap()).collect();
+        names.sort_unstable();
+        assert_eq!(names, ["video10", "video2"]);
     }
 
     #[test]

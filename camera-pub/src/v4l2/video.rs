@@ -14,7 +14,7 @@ const POLL: Duration = Duration::from_millis(50);
 const STALL_NS: i64 = 1_000_000_000;
 
 /// Where a camera is opened.
-pub(crate) trait Port {
+pub(crate) trait Port: Sized {
     /// What it opens.
     type Device: Device;
 
@@ -26,6 +26,12 @@ pub(crate) trait Port {
 
     /// Whether the path is a device's number (`/dev/video0`), which another camera may have after a loss.
     fn is_by_number(&self) -> bool;
+
+    /// The devices of all other numbers.
+    fn others(&self) -> Vec<Self>;
+
+    /// What a message calls it.
+    fn name(&self) -> String;
 
     /// The host's clock.
     fn now_ns(&self) -> i64;
@@ -151,7 +157,11 @@ impl<P: Port> Video<P> {
     }
 
     fn reopen(&mut self) -> Next {
-        match open(&self.port, &self.wanted, Some(&self.identity)) {
+        let opened = match open(&self.port, &self.wanted, Some(&self.identity)) {
+            Err(lost @ Lost::Another(_)) => self.open_elsewhere().unwrap_or(Err(lost)),
+            opened => opened,
+        };
+        match opened {
             Ok(mut capture) => {
                 if self.has_clock {
                     capture.believe_clock();
@@ -165,6 +175,28 @@ impl<P: Port> Video<P> {
                 Next::Wait(POLL)
             }
         }
+    }
+
+    /// Opens the camera at another number, where another camera has got its own one.
+    fn open_elsewhere(&self) -> Option<Result<Capture<P::Device>, Lost>> {
+        if !self.port.is_by_number() {
+            return None;
+        }
+        let is_it = |port: &P| {
+            port.open().is_ok_and(|device| Identity::of(&device).as_ref() == Some(&self.identity))
+        };
+        let mut found = self.port.others().into_iter().filter(is_it);
+        // Several cameras of one device cannot be told apart.
+        let (Some(port), None) = (found.next(), found.next()) else { return None };
+        let opened = open(&port, &self.wanted, Some(&self.identity));
+        if opened.is_ok() {
+            tracing::warn!(
+                number = port.name(),
+                "The camera has another number now, where it is read until it is lost again. Started again, the service would take \
+                 the camera that has its number: set `source.device` to a path in /dev/v4l/by-id or by-path, which stays with it"
+            );
+        }
+        Some(opened)
     }
 }
 
@@ -184,7 +216,7 @@ fn open<P: Port>(
     Capture::start(device, wanted, |now| match before {
         // A link is of a camera or of a place, but a camera of the same name may be plugged in elsewhere.
         Some(before) if now.card != before.card || port.is_by_number() && now != before => {
-            Err(Lost::Refused(format!(
+            Err(Lost::Another(format!(
                 "another camera is there now, `{}` at {}; `{}` at {} is waited for. A path in /dev/v4l/by-id or by-path stays \
                  with its camera; start the service again if this is the one to take",
                 now.card, now.bus, before.card, before.bus
@@ -373,6 +405,35 @@ mod tests {
         fake.unplug(200 * MS);
         fake.plug_in_at(b"usb-0000:0e:00.0-2.1");
         assert!(run(&fake, &mut video, 6000 * MS).frames > 10);
+    }
+
+    #[test]
+    fn a_camera_that_has_changed_its_number_with_another_is_found_at_the_other_one() {
+        let fake = Fake::of("GREY", Stamps::ExposureStart, 0);
+        let mut video = Video::start(Rc::clone(&fake), wanted(&fake)).unwrap();
+        assert!(run(&fake, &mut video, 200 * MS).frames > 10);
+        let there = Fake::of("GREY", Stamps::ExposureStart, 0);
+        there.plug_in_at(b"usb-0000:0e:00.0-2.2");
+        fake.put_beside(&there);
+        let other = Fake::of("GREY", Stamps::ExposureStart, 0);
+        other.plug_in_at(b"usb-0000:0e:00.0-2.3");
+        fake.put_beside(&other);
+        fake.unplug(200 * MS);
+        fake.plug_in_at(b"usb-0000:0e:00.0-2.1");
+        assert_eq!(run(&fake, &mut video, 3000 * MS).frames, 0);
+        assert_eq!((fake.open_devices(), there.open_devices()), (0, 0));
+        // Two at its place are two of one device.
+        there.plug_in_at(b"usb-0000:0e:00.0-2.4");
+        other.plug_in_at(b"usb-0000:0e:00.0-2.4");
+        assert_eq!(run(&fake, &mut video, 4000 * MS).frames, 0);
+        other.plug_in_at(b"usb-0000:0e:00.0-2.3");
+        assert!(run(&fake, &mut video, 8000 * MS).frames > 10);
+        assert_eq!((fake.open_devices(), there.open_devices()), (0, 1));
+        // Back at its own number it is read there.
+        fake.plug_in_at(b"usb-0000:0e:00.0-2.4");
+        video.lose(&Lost::Unplugged);
+        assert!(run(&fake, &mut video, 10_000 * MS).frames > 10);
+        assert_eq!((fake.open_devices(), there.open_devices()), (1, 0));
     }
 
     #[test]
