@@ -1,6 +1,6 @@
 // @ts-check
 // The page: takes what the server tells, shows it, and greys what is no longer current.
-import { answered, connectionLost, holdable, isHeld, nonceCame, release } from './hold.js';
+import { answered, connectionLost, doubted, holdable, isHeld, nonceCame, release } from './hold.js';
 import { Map2 } from './map.js';
 import { follow } from './picture.js';
 import { Strip } from './strips.js';
@@ -164,12 +164,15 @@ function take(message) {
   }
 }
 
-/** The server is that of another vehicle by now: nothing of the one before is shown beside it, and no button that is held commands it. */
+/** The server is that of another vehicle by now: nothing of the one before is shown beside it, and no button that is held commands it.
+ * Only what a command may have done is still told, with the name of its vehicle. */
 function startAnew() {
   const old = socket;
   socket = null;
   old?.close();
   connectionLost(link);
+  const doubt = doubted();
+  if (doubt !== null) sessionStorage.setItem('doubt', `${known.hello.vehicle}: ${doubt}.`);
   location.reload();
 }
 
@@ -515,6 +518,9 @@ element('theme').addEventListener('click', () => {
 setTheme(localStorage.getItem('theme') === 'sun' ? 'sun' : 'dark');
 
 for (const button of document.querySelectorAll('button.hold')) holdable(link, /** @type {HTMLButtonElement} */ (button));
+const doubtBefore = sessionStorage.getItem('doubt');
+if (doubtBefore !== null) link.tell(doubtBefore, 'bad');
+sessionStorage.removeItem('doubt');
 enable();
 begin();
 setInterval(lookAtAges, 100);

@@ -16,6 +16,8 @@ let press = null;
 let presses = 0;
 /** The command that was sent last and has no answer yet. @type {string | null} */
 let unanswered = null;
+/** What is not known of the last command, as its answer was lost. @type {string | null} */
+let doubt = null;
 
 /** @param {HTMLButtonElement} button */
 function named(button) {
@@ -27,6 +29,7 @@ function named(button) {
 function begin(link, button) {
   if (press || button.disabled) return;
   presses += 1;
+  doubt = null;
   press = { button, number: presses, nonce: null, timer: 0 };
   link.tell('Keep holding ...', 'busy');
   if (!link.send({ kind: 'nonce', ...named(button), press: presses })) {
@@ -75,9 +78,13 @@ export function release(link) {
 export function connectionLost(link) {
   release(link);
   if (unanswered === null) return;
-  link.tell(`${unanswered}: the connection was lost before the answer: it may have been carried out; see "What happened".`, 'bad');
+  doubt = `${unanswered}: the connection was lost before the answer: it may have been carried out`;
   unanswered = null;
+  link.tell(`${doubt}; see "What happened".`, 'bad');
 }
+
+/** What is not known of the last command; `null` where it was answered or another was begun. */
+export const doubted = () => doubt;
 
 /** Whether this button is held. @param {HTMLButtonElement} button */
 export function isHeld(button) {

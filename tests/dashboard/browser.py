@@ -163,12 +163,14 @@ def refuse_a_third(browser):
 
 
 def meet_another_vehicle(browser):
-    """A page whose server is replaced by that of another vehicle begins anew."""
+    """A page whose server is replaced by that of another vehicle begins anew, and tells of the command that the one before did not answer."""
     page, connections = browser.new_page(), []
 
     def connect(socket):
         connections.append(socket)
         server = socket.connect_to_server()
+        # A command gets no answer.
+        socket.on_message(lambda said: None if json.loads(said)["kind"] == "command" else server.send(said))
         if len(connections) > 1:
             server.on_message(lambda told: socket.send(re.sub('"vehicle":"[^"]+"', '"vehicle":"kestrel"', told)))
 
@@ -176,9 +178,15 @@ def meet_another_vehicle(browser):
     page.goto(URL)
     wait(page, CONNECTED)
     assert page.title() == f"{text(page, '#vehicle-name')} - Alight" != "kestrel - Alight", page.title()
+    name = text(page, "#vehicle-name")
+    wait(page, "!document.querySelector('button[data-command=hold]').disabled")
+    page.locator("button[data-command=hold]").dispatch_event("keydown", {"key": " "})
+    wait(page, replied("Sent, waiting"), 10)
     with page.expect_navigation():
         connections[0].close()
     wait(page, "document.getElementById('vehicle-name').textContent === 'kestrel'", 10)
+    told = text(page, "#reply")
+    assert told.startswith(f"{name}: hold: ") and "may have been carried out" in told, told
     begun = page.evaluate("performance.getEntriesByType('navigation')[0].type")
     assert begun == "reload", f"the page of another vehicle goes on ({begun})"
     page.screenshot(path=FOLDER / "another-vehicle.png")
