@@ -211,7 +211,7 @@ fn flights(files: &[PathBuf]) -> anyhow::Result<Vec<Flight>> {
         );
         parts.push(Part { place, file, reader });
     }
-    parts.sort_by_key(|part| part.reader.first_ns());
+    parts.sort_by_key(|part| part.reader.begin());
     let mut recordings: Vec<Part<'_>> = Vec::new();
     for part in parts {
         match recordings.iter_mut().find(|it| it.reader.goes_on_in(&part.reader)) {

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use flightlog::{Entry, Received};
+use flightlog::{Begin, Entry, Received, is_state};
 use messages::{Delivery, FrameHeader, Row, TOPICS, topic};
 use node::{Announcement, FramePublisher, Node, Publisher, clock_name, now_ns};
 use replay::Restamp;
@@ -66,7 +66,7 @@ impl Name {
 /// What a recording says before it is published.
 #[derive(Default)]
 struct Overview {
-    /// When the first message came that is no state from before, in nanoseconds.
+    /// When the first message came that is published and no state from before, in nanoseconds.
     first_ns: Option<i64>,
     last_ns: i64,
     /// The name of the recorder's clock.
@@ -151,7 +151,7 @@ fn in_order(files: Vec<Vec<u8>>, without: &[String]) -> anyhow::Result<(Vec<Vec<
     let mut whole = Overview::default();
     let mut parts = Vec::new();
     for file in files {
-        let part = overview(&file, without)?;
+        let (begin, part) = overview(&file, without)?;
         whole.first_ns = whole.first_ns.into_iter().chain(part.first_ns).min();
         whole.last_ns = whole.last_ns.max(part.last_ns);
         whole.clock = whole.clock.or(part.clock);
@@ -159,16 +159,17 @@ fn in_order(files: Vec<Vec<u8>>, without: &[String]) -> anyhow::Result<(Vec<Vec<
             let newest_ns = whole.services.entry(name).or_insert(last_ns);
             *newest_ns = last_ns.max(*newest_ns);
         }
-        parts.push((part.first_ns, file));
+        parts.push((begin, file));
     }
-    parts.sort_by_key(|(first_ns, _)| *first_ns);
+    parts.sort_by_key(|(begin, _)| *begin);
     Ok((parts.into_iter().map(|(_, file)| file).collect(), whole))
 }
 
-fn overview(file: &[u8], without: &[String]) -> anyhow::Result<Overview> {
-    let mut overview = Overview::default();
+/// The begin of a file, and what it says.
+fn overview(file: &[u8], without: &[String]) -> anyhow::Result<(Begin, Overview)> {
+    let (mut begin, mut overview) = (Begin::default(), Overview::default());
     flightlog::read(file, |entry| {
-        let Received { key, received_ns, .. } = match entry {
+        let message = match entry {
             Entry::Message(message) => message,
             Entry::About(facts) => {
                 overview.clock = facts.get("clock").cloned();
@@ -176,16 +177,20 @@ fn overview(file: &[u8], without: &[String]) -> anyhow::Result<Overview> {
             }
             _ => return,
         };
-        let Some(row) = played(key, without) else { return };
-        if row.delivery != Delivery::LastValue {
-            overview.first_ns.get_or_insert(received_ns);
+        begin.take(message);
+        let Received { key, received_ns, .. } = message;
+        if played(key, without).is_none() {
+            return;
+        }
+        if overview.first_ns.is_none() && !is_state(key) {
+            overview.first_ns = Some(received_ns);
         }
         overview.last_ns = overview.last_ns.max(received_ns);
         if let Some(name) = Name::of_health(key) {
             overview.services.insert(name, received_ns);
         }
     })?;
-    Ok(overview)
+    Ok((begin, overview))
 }
 
 /// A controller that flies now must not be taken for one of a recording, nor the other way round.

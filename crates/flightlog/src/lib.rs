@@ -27,7 +27,7 @@ pub use channel::{Received, Record, Schema, is_state};
 pub use display::{Picture, VehicleClock};
 pub use live::Live;
 pub use own_autopilot::OwnAutopilot;
-pub use reader::{Entry, Reading, in_order, read};
+pub use reader::{Begin, Entry, Reading, in_order, read};
 pub use repair::{Repaired, repair};
 pub use tape::{RecordedTape, TapeReader};
 pub use writer::{About, Problem, Writer};

@@ -113,6 +113,22 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
     Ok(found.reading)
 }
 
+/// When the first message of a file came that is no state from before: it tells the order of a recording's files.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Begin {
+    /// In nanoseconds of the recorder's clock; `None` before such a message.
+    received_ns: Option<i64>,
+}
+
+impl Begin {
+    /// Takes the file's next message.
+    pub fn take(&mut self, message: Received<'_>) {
+        if self.received_ns.is_none() && !is_state(message.key) {
+            self.received_ns = Some(message.received_ns);
+        }
+    }
+}
+
 /// The files of a recording in the order in which they were written.
 ///
 /// # Errors
@@ -120,15 +136,15 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
 pub fn in_order(files: &[Vec<u8>]) -> Result<Vec<&[u8]>, Problem> {
     let mut parts = Vec::new();
     for file in files {
-        let mut first_ns = None;
+        let mut begin = Begin::default();
         read(file, |entry| {
-            if let Entry::Message(Received { key, received_ns, .. }) = entry {
-                first_ns = first_ns.or_else(|| (!is_state(key)).then_some(received_ns));
+            if let Entry::Message(message) = entry {
+                begin.take(message);
             }
         })?;
-        parts.push((first_ns, file.as_slice()));
+        parts.push((begin, file.as_slice()));
     }
-    parts.sort_by_key(|(first_ns, _)| *first_ns);
+    parts.sort_by_key(|(begin, _)| *begin);
     Ok(parts.into_iter().map(|(_, file)| file).collect())
 }
 

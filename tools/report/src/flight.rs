@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-use flightlog::{Entry, Reading, Received, RecordedTape, TapeReader, is_state};
+use flightlog::{Begin, Entry, Reading, Received, RecordedTape, TapeReader};
 use messages::{
     CameraInfo, Configuration, ControllerStatus, Detections, DetectorInfo, FrameHeader, Health,
     MavlinkBytes, Message, RecorderStatus, TapeEvent, TargetEstimate, Topic, Truth, VehicleState,
@@ -199,8 +199,7 @@ pub struct FlightReader {
     /// Starts of the vehicle's computer that there had been when a part of a tape came last, by the tape's begin.
     boot_of_tape: BTreeMap<i64, usize>,
     meter: Meter,
-    /// When the first message came that is no state from before, in nanoseconds of the recorder's clock.
-    first_ns: Option<i64>,
+    begin: Begin,
     /// Messages that a recorder lost since its start, by its run and their key.
     lost_by_run: BTreeMap<String, BTreeMap<String, u64>>,
 }
@@ -212,12 +211,12 @@ impl FlightReader {
         Self { flight, ..Self::default() }
     }
 
-    /// Adds a file of the recording, after those that were written before it ([`FlightReader::first_ns`]).
+    /// Adds a file of the recording, after those that were written before it ([`FlightReader::begin`]).
     ///
     /// # Errors
     /// When it is no MCAP file at all.
     pub fn add(&mut self, recording: &[u8]) -> Result<(), flightlog::Problem> {
-        let Self { flight, tapes, boot_of_tape, meter, first_ns, lost_by_run } = self;
+        let Self { flight, tapes, boot_of_tape, meter, begin, lost_by_run } = self;
         let tape_key = topic::TAPE.key(&[]);
         let mut lost = BTreeMap::new();
         let mut run = String::new();
@@ -230,11 +229,10 @@ impl FlightReader {
                 }
                 Entry::Dropped(counts) => lost = counts,
                 Entry::Message(message) => {
-                    let Received { key, payload, received_ns, .. } = message;
-                    *first_ns = first_ns.or_else(|| (!is_state(key)).then_some(received_ns));
-                    if key != tape_key {
+                    begin.take(message);
+                    if message.key != tape_key {
                         flight.take(message);
-                    } else if let Some(begun_ns) = tapes.take(payload) {
+                    } else if let Some(begun_ns) = tapes.take(message.payload) {
                         boot_of_tape.insert(begun_ns, flight.other_boots.len());
                     }
                 }
@@ -259,9 +257,9 @@ impl FlightReader {
         self.flight.messages == 0 && self.tapes.is_empty()
     }
 
-    /// When the first message came that is no state from before, in nanoseconds of the recorder's clock: it tells the order of files.
-    pub fn first_ns(&self) -> Option<i64> {
-        self.first_ns
+    /// The begin of the first file: it tells the order of files.
+    pub fn begin(&self) -> Begin {
+        self.begin
     }
 
     /// True when another is of the same recording: a tape goes on in it, and its times are of the same clock. The ground's of the
