@@ -135,7 +135,7 @@ async fn failed_swaps_and_twenty_more_detectors_change_nothing() -> anyhow::Resu
 }
 
 async fn swaps_fail_and_many_speak() -> anyhow::Result<()> {
-    let _flight = time_for(4).await?;
+    let _flight = time_for(3).await?;
     let landing = Landing::start(&["--seed", "22"]).await?;
     landing.descends_below(9.0).await?;
     command(&landing, ControllerCommand::Hold).await?;

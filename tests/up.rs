@@ -164,7 +164,7 @@ async fn two_roles_meet_what_dies_comes_back_and_the_end_is_orderly() -> anyhow:
 }
 
 async fn two_roles_meet() -> anyhow::Result<()> {
-    let _flight = time_for(4).await?;
+    let _flight = time_for(3).await?;
     let folder = tempfile::tempdir()?;
     let meet = write_site(folder.path())?;
     let mut drone = Up::start(folder.path(), "drone")?;
