@@ -644,14 +644,8 @@ impl Autopilot {
         if !self.is_present(now_ns, attitude.boot_ms, newest) {
             return;
         }
-        match self.clock.arrived(now_ns, attitude.boot_ms) {
-            Measured::At(stamp_ns) => attitude.stamp_ns = stamp_ns,
-            Measured::LongAgo => {
-                self.late += 1;
-                return;
-            }
-            Measured::Unknown => {}
-        }
+        let Some(stamp_ns) = self.measured_ns(now_ns, attitude.boot_ms) else { return };
+        attitude.stamp_ns = stamp_ns;
         if let Some(vehicle) = &mut self.vehicle {
             vehicle.state.attitude = Some(attitude);
             vehicle.state.stamp_ns = now_ns;
@@ -676,14 +670,8 @@ impl Autopilot {
             return;
         }
         self.clock.position_arrived(now_ns);
-        match self.clock.arrived(now_ns, position.boot_ms) {
-            Measured::At(stamp_ns) => position.stamp_ns = stamp_ns,
-            Measured::LongAgo => {
-                self.late += 1;
-                return;
-            }
-            Measured::Unknown => {}
-        }
+        let Some(stamp_ns) = self.measured_ns(now_ns, position.boot_ms) else { return };
+        position.stamp_ns = stamp_ns;
         if let Some(vehicle) = &mut self.vehicle {
             vehicle.readiness.take_position();
             vehicle.state.position = Some(position);
@@ -692,6 +680,19 @@ impl Autopilot {
             self.push(Event::Position(position));
             self.push(Event::State(state));
             self.check_readiness();
+        }
+    }
+
+    /// When a measurement that comes now was made, by our clock; that of its reception where the offset is unknown. `None` for one
+    /// that was made too long ago, which is counted as late.
+    fn measured_ns(&mut self, now_ns: i64, boot_ms: u32) -> Option<i64> {
+        match self.clock.arrived(now_ns, boot_ms) {
+            Measured::At(stamp_ns) => Some(stamp_ns),
+            Measured::Unknown => Some(now_ns),
+            Measured::LongAgo => {
+                self.late += 1;
+                None
+            }
         }
     }
 
