@@ -92,12 +92,11 @@ fn repair(file: &Path, output: Option<&Path>) -> anyhow::Result<ExitCode> {
 
 /// Writes the repaired copy, which is there once it is whole: what a full disk lets be written only in part is removed.
 fn write_repaired(recording: &[u8], output: &Path) -> anyhow::Result<flightlog::Repaired> {
-    let folder = output.parent().filter(|folder| !folder.as_os_str().is_empty());
     let part = tempfile::Builder::new()
         .prefix(".")
         .suffix(".new")
         .permissions(Permissions::from_mode(0o666))
-        .tempfile_in(folder.unwrap_or(Path::new(".")))?;
+        .tempfile_in(media::folder_of(output))?;
     let mut buffered = BufWriter::new(part);
     let found = flightlog::repair(recording, &mut buffered)?;
     let part = buffered.into_inner().map_err(std::io::IntoInnerError::into_error)?;

@@ -125,8 +125,7 @@ impl Site {
                 limit: MEET_RULE.to_owned(),
             });
         }
-        let folder = path.parent().filter(|folder| *folder != Path::new(""));
-        let folder = folder.unwrap_or(Path::new("."));
+        let folder = media::folder_of(path);
         site.folder = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
         Ok(site)
     }

@@ -73,8 +73,7 @@ fn check_output(path: &Path, is_replaced: bool, may_be: &str) -> anyhow::Result<
         return Ok(());
     }
     let file = path.canonicalize().unwrap_or_else(|_| path.to_owned());
-    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
-    tempfile::tempfile_in(folder.unwrap_or(Path::new("."))).with_context(|| {
+    tempfile::tempfile_in(media::folder_of(&file)).with_context(|| {
         format!("trying whether {path:?} can be written; name another with `--output`, or make its folder")
     })?;
     Ok(())

@@ -33,4 +33,4 @@ pub use image::{
 pub use jpeg::JpegScanner;
 pub use rectify::Rectifier;
 pub use video::{VIDEO_EXTENSIONS, Video, VideoError, VideoFrame, VideoImage, is_video};
-pub use whole::write_whole;
+pub use whole::{folder_of, write_whole};

@@ -5,6 +5,12 @@ use std::io::{ErrorKind, Result, Write};
 use std::os::unix::fs::{MetadataExt, fchown};
 use std::path::Path;
 
+/// The folder of a file, also of one that is named without it.
+pub fn folder_of(file: &Path) -> &Path {
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
+    folder.unwrap_or(Path::new("."))
+}
+
 /// Writes a file under another name first, so that what was there stays until all of the new one is. Where nothing can be put
 /// beside it or in its place it is written as it is.
 ///
