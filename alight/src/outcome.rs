@@ -442,15 +442,11 @@ mod tests {
 
     fn truth(touchdown: Option<Touchdown>) -> Truth {
         Truth {
-            stamp_ns: 0,
-            ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
-            position_ned_m: [0.0; 3],
-            velocity_ned_m_s: [0.0; 3],
-            pad_ned_m: [0.0; 3],
             on_ground: touchdown.is_some(),
             touchdown,
             max_tilt_rad: 0.1,
             frames: 300,
+            ..Truth::sample()
         }
     }
 

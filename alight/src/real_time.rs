@@ -544,15 +544,10 @@ mod tests {
             [(1.0, None), (0.02, soft), (0.22, soft), (0.62, None), (0.02, hard), (0.02, hard)];
         for (height_m, touchdown) in seen {
             let truth = Truth {
-                stamp_ns: 0,
-                ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
                 position_ned_m: [0.0, 0.0, -height_m],
-                velocity_ned_m_s: [0.0; 3],
-                pad_ned_m: [0.0; 3],
                 on_ground: height_m < 0.03,
                 touchdown,
-                max_tilt_rad: 0.0,
-                frames: 0,
+                ..Truth::sample()
             };
             ground.see(&truth, &mut outcome);
         }

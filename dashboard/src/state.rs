@@ -494,18 +494,14 @@ mod tests {
     fn health(service: &str, pid: u32, clock: &str, cpu_s: f64, uptime_s: f64) -> Input {
         let health = Health {
             service: service.into(),
-            instance: "main".into(),
             host: "pi".into(),
             version: "0.1.0".into(),
             clock: clock.into(),
-            stamp_ns: 0,
             pid,
             cpu_s,
             uptime_s,
-            rates: Vec::new(),
-            latencies: Vec::new(),
-            drops: Vec::new(),
             errors: vec![Count { reason: "publish".into(), count: 1 }],
+            ..Health::sample()
         };
         Input::Health(service.into(), "main".into(), Box::new(health))
     }

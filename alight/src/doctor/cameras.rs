@@ -344,17 +344,9 @@ mod tests {
         Health {
             service: "camera-pub".into(),
             instance: "down".into(),
-            host: String::new(),
-            version: String::new(),
-            clock: String::new(),
-            stamp_ns: 0,
-            pid: 0,
-            cpu_s: 0.0,
-            uptime_s: 0.0,
             rates: vec![Rate { name: "frames".into(), count: 1000, hz: 30.0 }],
-            latencies: Vec::new(),
             drops,
-            errors: Vec::new(),
+            ..Health::sample()
         }
     }
 

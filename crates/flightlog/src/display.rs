@@ -541,17 +541,7 @@ mod tests {
         let health = |service: &str, clock: &str| Health {
             service: service.into(),
             clock: clock.into(),
-            instance: "main".into(),
-            host: String::new(),
-            version: String::new(),
-            stamp_ns: 0,
-            pid: 0,
-            cpu_s: 0.0,
-            uptime_s: 0.0,
-            rates: Vec::new(),
-            latencies: Vec::new(),
-            drops: Vec::new(),
-            errors: Vec::new(),
+            ..Health::sample()
         };
         let mut clock = VehicleClock::new(Some("ground"));
         // The vehicle was started 20 s after the ground.

@@ -6,6 +6,8 @@ use std::f64::consts::FRAC_1_SQRT_2;
 use crate::camera::{CameraInfo, FrameAck, FrameHeader, LensModel, PixelFormat, Transform3};
 use crate::controller::{Candidate, DetectorState, TargetEstimate};
 use crate::detector::{Detection, Detections, MarkerPose, Refusal, Refusals, RefusedShape};
+use crate::health::Health;
+use crate::simulation::Truth;
 
 impl FrameHeader {
     /// A grey frame of the camera `down`, 1296 x 972, stamped 0.
@@ -146,6 +148,44 @@ impl TargetEstimate {
             nis: Some(3.0),
             time_offset_ms: Some(0.0),
             wind_ned_m_s: None,
+        }
+    }
+}
+
+impl Health {
+    /// A service that has neither name nor clock, and nothing to count.
+    pub fn sample() -> Self {
+        Self {
+            service: String::new(),
+            instance: "main".into(),
+            host: String::new(),
+            version: String::new(),
+            clock: String::new(),
+            stamp_ns: 0,
+            pid: 0,
+            cpu_s: 0.0,
+            uptime_s: 0.0,
+            rates: Vec::new(),
+            latencies: Vec::new(),
+            drops: Vec::new(),
+            errors: Vec::new(),
+        }
+    }
+}
+
+impl Truth {
+    /// A level vehicle at rest over the pad, on the ground, before any frame.
+    pub fn sample() -> Self {
+        Self {
+            stamp_ns: 0,
+            ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
+            position_ned_m: [0.0; 3],
+            velocity_ned_m_s: [0.0; 3],
+            pad_ned_m: [0.0; 3],
+            on_ground: true,
+            touchdown: None,
+            max_tilt_rad: 0.0,
+            frames: 0,
         }
     }
 }

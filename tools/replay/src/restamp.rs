@@ -178,17 +178,7 @@ mod tests {
             vertical_speed_m_s: 0.0,
             lateral_speed_m_s: 0.0,
         };
-        Truth {
-            stamp_ns,
-            ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
-            position_ned_m: [0.0; 3],
-            velocity_ned_m_s: [0.0; 3],
-            pad_ned_m: [0.0; 3],
-            on_ground: true,
-            touchdown: Some(touchdown),
-            max_tilt_rad: 0.0,
-            frames: 0,
-        }
+        Truth { stamp_ns, touchdown: Some(touchdown), ..Truth::sample() }
     }
 
     #[test]

@@ -85,15 +85,11 @@ fn truth(sequence: u64, stamp_ns: i64) -> Truth {
     let pad = mount() * geometry::Point::new(x, y, z);
     Truth {
         stamp_ns,
-        ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
         position_ned_m: [-pad.x(), -pad.y(), -pad.z()],
-        velocity_ned_m_s: [0.0; 3],
-        pad_ned_m: [0.0; 3],
         // The first frame shows the pad as well, and counts for nobody: on the ground only a part of it may be seen.
         on_ground: sequence == 0,
-        touchdown: None,
-        max_tilt_rad: 0.0,
         frames: sequence,
+        ..Truth::sample()
     }
 }
 

@@ -491,21 +491,8 @@ fn without_detections_the_controllers_health_names_the_vehicles_clock() {
     let about = About { program: "test".to_owned(), facts, utc_offset_ns: 0 };
     let mut copy = Vec::new();
     let mut writer = Writer::new(&mut copy, &about).unwrap();
-    let health = Health {
-        service: "controller".into(),
-        instance: "main".into(),
-        host: String::new(),
-        version: String::new(),
-        clock: landing_clock(),
-        stamp_ns: 0,
-        pid: 0,
-        cpu_s: 0.0,
-        uptime_s: 0.0,
-        rates: Vec::new(),
-        latencies: Vec::new(),
-        drops: Vec::new(),
-        errors: Vec::new(),
-    };
+    let health =
+        Health { service: "controller".into(), clock: landing_clock(), ..Health::sample() };
     let (key, payload) = ("health/controller/main", encode(&health));
     writer.receive(Received { key, payload: &payload, attachment: b"", received_ns: 1 }).unwrap();
     flightlog::read(&landing().recording, |entry| {
