@@ -273,7 +273,11 @@ impl Inquiry {
         let mut questions = Vec::new();
         if self.components.is_empty() {
             // It opens the way to whom this program sends to.
-            questions.push(Question { to: None, system: 1, message: compose::heartbeat() });
+            questions.push(Question {
+                to: None,
+                system: 1,
+                message: MavMessage::HEARTBEAT(compose::heartbeat()),
+            });
         }
         for (&(system, component), known) in &self.components {
             let mut ask = |message| questions.push(Question { to: known.from, system, message });
@@ -287,7 +291,7 @@ impl Inquiry {
                     ..Default::default()
                 })
             };
-            ask(compose::heartbeat());
+            ask(MavMessage::HEARTBEAT(compose::heartbeat()));
             if known.names.is_empty() {
                 ask(command(MavCmd::MAV_CMD_REQUEST_MESSAGE, CAMERA_INFORMATION_DATA::ID));
                 ask(command(MavCmd::MAV_CMD_REQUEST_CAMERA_INFORMATION, 1));

@@ -192,7 +192,7 @@ struct Bridge {
     sequence: u8,
     camera_sequence: u8,
     /// The camera's last heartbeats with their sequence numbers, the newest first.
-    camera_heartbeats: VecDeque<(u8, MavMessage)>,
+    camera_heartbeats: VecDeque<(u8, HEARTBEAT_DATA)>,
 }
 
 impl Bridge {
@@ -279,8 +279,9 @@ impl Bridge {
     /// known by heartbeats that the bridge has not sent.
     fn is_echo_of_camera(&self, packet: &Packet) -> bool {
         let is_heartbeat = packet.message_id == HEARTBEAT_DATA::ID;
-        let is_sent = self.camera_heartbeats.iter().any(|(sequence, message)| {
-            *sequence == packet.sequence && packet.message.as_ref() == Some(message)
+        let is_sent = self.camera_heartbeats.iter().any(|(sequence, sent)| {
+            *sequence == packet.sequence
+                && matches!(&packet.message, Some(MavMessage::HEARTBEAT(heartbeat)) if heartbeat == sent)
         });
         packet.sender.component == self.camera_component && (is_sent || !is_heartbeat)
     }
@@ -627,7 +628,7 @@ impl Bridge {
             self.tell_taken(now_ns);
             self.camera_heartbeats.truncate(MAX_CAMERA_HEARTBEATS - 1);
             self.camera_heartbeats.push_front((self.camera_sequence, heartbeat.clone()));
-            self.send_from_camera(now_ns, &heartbeat);
+            self.send_from_camera(now_ns, &MavMessage::HEARTBEAT(heartbeat));
         }
         self.tell_more(now_ns);
         self.send_texts(now_ns);
@@ -654,13 +655,11 @@ impl Bridge {
             .status
             .as_ref()
             .is_some_and(|status| !status.finished && status.phase != Phase::Idle);
-        let mut message = heartbeat();
-        if let MavMessage::HEARTBEAT(heartbeat) = &mut message
-            && !is_landing
-        {
+        let mut heartbeat = heartbeat();
+        if !is_landing {
             heartbeat.system_status = MavState::MAV_STATE_STANDBY;
         }
-        message
+        MavMessage::HEARTBEAT(heartbeat)
     }
 
     /// Sends a message of our own to the ground station, if we have a system id.

@@ -7,8 +7,8 @@ use autopilot::compose::heartbeat;
 use autopilot::dialect::{
     CAMERA_CAPTURE_STATUS_DATA, CAMERA_INFORMATION_DATA, CAMERA_SETTINGS_DATA,
     CAMERA_TRACKING_IMAGE_STATUS_DATA, CameraCapFlags, CameraMode, CameraTrackingMode,
-    CameraTrackingStatusFlags, CameraTrackingTargetData, MavMessage, MavState, MavType,
-    STORAGE_INFORMATION_DATA, StorageStatus, VIDEO_STREAM_INFORMATION_DATA,
+    CameraTrackingStatusFlags, CameraTrackingTargetData, HEARTBEAT_DATA, MavMessage, MavState,
+    MavType, STORAGE_INFORMATION_DATA, StorageStatus, VIDEO_STREAM_INFORMATION_DATA,
     VIDEO_STREAM_STATUS_DATA, VideoStreamEncoding, VideoStreamStatusFlags, VideoStreamType,
 };
 use messages::{ControllerStatus, Detection, Detections};
@@ -120,14 +120,13 @@ impl Camera {
     }
 
     /// The camera's heartbeat, while there is a camera.
-    pub(crate) fn heartbeat(&self, now_ns: i64) -> Option<MavMessage> {
+    pub(crate) fn heartbeat(&self, now_ns: i64) -> Option<HEARTBEAT_DATA> {
         self.frame(now_ns)?;
-        let mut message = heartbeat();
-        if let MavMessage::HEARTBEAT(heartbeat) = &mut message {
-            heartbeat.mavtype = MavType::MAV_TYPE_CAMERA;
-            heartbeat.system_status = MavState::MAV_STATE_STANDBY;
-        }
-        Some(message)
+        Some(HEARTBEAT_DATA {
+            mavtype: MavType::MAV_TYPE_CAMERA,
+            system_status: MavState::MAV_STATE_STANDBY,
+            ..heartbeat()
+        })
     }
 
     /// Sends the tracked marker's place with this period from now on, in nanoseconds; no more without one.

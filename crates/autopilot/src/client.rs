@@ -173,7 +173,7 @@ impl Autopilot {
     /// Lets time pass: to be called at 20 Hz or more, also when nothing is received.
     pub fn tick(&mut self, now_ns: i64) {
         if self.config.heartbeat && now_ns >= self.heartbeat_due_ns {
-            self.send(&compose::heartbeat());
+            self.send(&MavMessage::HEARTBEAT(compose::heartbeat()));
             // The next one is due a second after this one was, unless time jumped ahead.
             let regular = self.heartbeat_due_ns.saturating_add(HEARTBEAT_NS);
             self.heartbeat_due_ns =

@@ -16,15 +16,15 @@ const PART: usize = 50;
 const MAX_PARTS: usize = 10;
 
 /// The heartbeat of a companion computer.
-pub fn heartbeat() -> MavMessage {
-    MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+pub fn heartbeat() -> HEARTBEAT_DATA {
+    HEARTBEAT_DATA {
         custom_mode: 0,
         mavtype: MavType::MAV_TYPE_ONBOARD_CONTROLLER,
         autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
         base_mode: MavModeFlag::empty(),
         system_status: MavState::MAV_STATE_ACTIVE,
         mavlink_version: 3,
-    })
+    }
 }
 
 /// Asks for one message, by its number; the recipient is added when it is sent.

@@ -431,7 +431,7 @@ fn a_second_controller_with_our_ids_is_reported_once() {
     let mut world = World::standing();
     let companion = Sender { system: 1, component: 191 };
     for _ in 0..3 {
-        world.receive(companion, &autopilot::compose::heartbeat());
+        world.receive(companion, &MavMessage::HEARTBEAT(autopilot::compose::heartbeat()));
         world.step();
     }
     assert_eq!(world.count(|event| *event == Event::SameAddress { sender: companion }), 1);
@@ -851,7 +851,7 @@ fn a_vehicle_that_flies_already_needs_no_takeoff() {
 fn a_vehicle_of_another_controller_with_our_ids_is_neither_lifted_nor_taken_over() {
     for mut world in [World::standing(), World::flying()] {
         let companion = Sender { system: 1, component: 191 };
-        world.receive(companion, &autopilot::compose::heartbeat());
+        world.receive(companion, &MavMessage::HEARTBEAT(autopilot::compose::heartbeat()));
         let (end, _) = world.take_off(&mut Takeoff::new(10.0), 5);
         let TakeoffProgress::Failed(TakeoffError::SameAddress { sender }) = &end else {
             panic!("{end:?}")
@@ -868,11 +868,11 @@ fn a_vehicle_of_another_controller_with_our_ids_is_neither_lifted_nor_taken_over
 fn once_the_other_controller_with_our_ids_has_ended_the_vehicle_takes_off() {
     let mut world = World::standing();
     let companion = Sender { system: 1, component: 191 };
-    world.receive(companion, &autopilot::compose::heartbeat());
+    world.receive(companion, &MavMessage::HEARTBEAT(autopilot::compose::heartbeat()));
     world.run(11);
     let (end, _) = world.take_off(&mut Takeoff::new(10.0), 60);
     assert_eq!(end, TakeoffProgress::Done);
-    world.receive(companion, &autopilot::compose::heartbeat());
+    world.receive(companion, &MavMessage::HEARTBEAT(autopilot::compose::heartbeat()));
     world.step();
     assert_eq!(world.count(|event| *event == Event::SameAddress { sender: companion }), 2);
 }
