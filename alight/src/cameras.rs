@@ -11,6 +11,7 @@ use camera_pub::{
     SizeDescription, announced_cameras, connected_devices, source_table, take_picture,
 };
 use clap::Args;
+use imaging::GrayImage;
 use node::Layers;
 use serde::Serialize;
 
@@ -18,6 +19,8 @@ use crate::args::Format;
 use crate::ending::png_file;
 use crate::runtime::block_on;
 use crate::terminal::{aligned, print};
+
+mod picture;
 
 /// Where the system has its devices.
 const DEVICES: &str = "/dev";
@@ -41,9 +44,16 @@ const MAX_SIZES: usize = 6;
 /// The arguments of `alight cameras`.
 #[derive(Args)]
 pub(crate) struct CamerasArgs {
-    /// Take a picture (PNG) with the camera that is listed first, or with `--device`.
+    /// Take a picture (PNG) with the camera that is listed first, with `--device`, or as `--config` says.
     #[arg(long, value_name = "FILE.png", value_parser = png_file)]
     picture: Option<PathBuf>,
+    /// Take the picture as camera-pub does with this configuration: its source, size and exposure. Only while nothing else
+    /// reads the camera.
+    #[arg(long, value_name = "FILE", requires = "picture", conflicts_with = "device")]
+    config: Option<PathBuf>,
+    /// One setting over that configuration: dotted key, TOML value. May be repeated.
+    #[arg(long, value_name = "KEY=VALUE", requires = "picture", conflicts_with = "device")]
+    set: Vec<String>,
     /// Only this device.
     #[arg(long, value_name = "PATH")]
     device: Option<PathBuf>,
@@ -80,6 +90,9 @@ struct Entry {
 
 /// Lists the cameras, or takes a picture.
 pub(crate) fn run(args: &CamerasArgs) -> anyhow::Result<ExitCode> {
+    if let (Some(file), true) = (&args.picture, args.config.is_some() || !args.set.is_empty()) {
+        return save_published(args, file);
+    }
     let folder = Path::new(DEVICES);
     let listing = listing(folder, args.device.as_deref());
     if let (Some(device), true) = (&args.device, listing.devices.is_empty()) {
@@ -182,7 +195,7 @@ fn text(listing: &Listing) -> String {
         if let Some(problem) = problem {
             text += &format!("MAVLink: {problem}\n\n");
         } else if cameras.is_empty() {
-            text += "MAVLink: nobody there says that it is a camera; an autopilot in between must pass its packets on\n\n";
+            text += "MAVLink: no device at this address identifies itself as a camera; an autopilot in between must pass its packets on\n\n";
         }
     }
     if listing.devices.is_empty() {
@@ -204,7 +217,7 @@ fn announced_text(camera: &AnnouncedCamera) -> String {
     let name = if name.is_empty() { "a camera without a name" } else { name };
     let mut text = format!("MAVLink {system}/{component}{of_several}: {name}\n");
     if streams.is_empty() {
-        text += "  it tells of no video stream\n";
+        text += "  it announces no video stream\n";
     }
     for AnnouncedStream { id, name, transport, encoding, address, size_px, rate_hz, source } in
         streams
@@ -275,11 +288,22 @@ fn save_picture(listing: &Listing, file: &Path) -> anyhow::Result<ExitCode> {
     std::fs::write(&path, table).with_context(|| format!("writing {path:?}"))?;
     let config = Layers { file: Some(path), set: Vec::new() }.load::<Config>()?.settings;
     let picture = take_picture(&config)?;
+    save(&picture, file, &entry.device.path.display().to_string())
+}
+
+fn save_published(args: &CamerasArgs, file: &Path) -> anyhow::Result<ExitCode> {
+    node::start_logging("warn");
+    let layers = Layers { file: args.config.clone(), set: args.set.clone() };
+    let config = layers.load::<Config>()?.settings;
+    let camera = format!("camera `{}`", config.instance());
+    save(&picture::published(config)?, file, &camera)
+}
+
+fn save(picture: &GrayImage, file: &Path, of: &str) -> anyhow::Result<ExitCode> {
     let [width, height] = [picture.width() as u32, picture.height() as u32];
     image::save_buffer(file, picture.pixels(), width, height, image::ExtendedColorType::L8)
         .with_context(|| format!("writing the picture {file:?}"))?;
-    let device = entry.device.path.display();
-    print(&format!("{}: {width} x {height} pixels of {device}", file.display()))?;
+    print(&format!("{}: {width} x {height} pixels of {of}", file.display()))?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -1,0 +1,102 @@
+//! A picture as `camera-pub` publishes it, whatever its configuration reads: a device, a program, a stream or files.
+
+use std::time::Duration;
+
+use anyhow::Context;
+use camera_pub::Config;
+use imaging::{Converter, GrayImage};
+use messages::topic;
+use node::{Identity, Node, Shutdown, ZenohSource};
+
+use crate::grey::grey;
+use crate::runtime::block_on;
+
+/// A session that meets no other: the frames stay in this process.
+const NO_NETWORK: &str = r#"{
+  mode: "peer",
+  namespace: "picture",
+  listen: { endpoints: [] },
+  connect: { endpoints: [] },
+  scouting: { multicast: { enabled: false }, gossip: { enabled: false } },
+}"#;
+/// Number of frames in which a camera's own metering settles.
+const SETTLING_FRAMES: usize = 10;
+/// Maximum time until there is a picture: programs of cameras take seconds to start.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// A picture of the camera with this configuration, as a detector would get it: the tenth frame, or the last of fewer.
+///
+/// # Errors
+/// When the camera cannot be read, or gives no frame in 20 s.
+pub(super) fn published(config: Config) -> anyhow::Result<GrayImage> {
+    let camera = config.instance().to_owned();
+    block_on(async {
+        let identity = Identity { service: "camera-pub", instance: camera.clone() };
+        let node = Node::open(identity, &ZenohSource::Text(NO_NETWORK.to_owned())).await?;
+        let taken = tokio::time::timeout(PATIENCE, take(&node, config)).await;
+        node.close().await;
+        taken.with_context(|| {
+            format!("camera `{camera}` gave no picture within {} s", PATIENCE.as_secs())
+        })?
+    })?
+}
+
+async fn take(node: &Node, config: Config) -> anyhow::Result<GrayImage> {
+    let frames = node.frame_subscriber(topic::FRAME, &[config.instance()]).await?;
+    let mut service = camera_pub::run(node.clone(), config, Shutdown::on_signals()?);
+    let mut converter = Converter::new();
+    let mut newest = None;
+    for _ in 0..SETTLING_FRAMES {
+        let frame = tokio::select! {
+            frame = frames.next() => frame.context("the session was closed")?,
+            ended = &mut service => {
+                ended?;
+                let Some(frame) = frames.waiting() else { break };
+                newest = Some(grey(&frame, &mut converter)?);
+                break;
+            }
+        };
+        newest = Some(grey(&frame, &mut converter)?);
+    }
+    newest.context("the camera ended before its first frame")
+}
+
+#[cfg(test)]
+mod tests {
+    use node::Layers;
+
+    use super::*;
+
+    fn picture(set: &[&str]) -> anyhow::Result<GrayImage> {
+        let calibration = "calibration.focal_px=[50.0, 50.0]";
+        let set = set.iter().chain([&calibration]).map(|&set| set.to_owned()).collect();
+        published(Layers { file: None, set }.load::<Config>()?.settings)
+    }
+
+    #[test]
+    fn a_file_gives_its_own_pixels() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        let pixels: Vec<u8> = (0..64 * 48).map(|i| (i % 251) as u8).collect();
+        image::save_buffer(&path, &pixels, 64, 48, image::ExtendedColorType::L8).unwrap();
+        let picture = picture(&[&format!("source.paths=[{:?}]", path.display())]).unwrap();
+        assert_eq!((picture.width(), picture.height()), (64, 48));
+        assert_eq!(picture.pixels(), pixels);
+    }
+
+    #[test]
+    fn a_program_gives_a_frame_of_its_size_or_why_there_is_none() {
+        let shape = ["source.pixels=\"gray8\"", "source.size_px=[32, 24]"];
+        let with = |command: &str| {
+            let command = format!("source.command={command}");
+            picture(&[&command, shape[0], shape[1]])
+        };
+        let picture = with(r#"["cat", "/dev/urandom"]"#).unwrap();
+        assert_eq!((picture.width(), picture.height()), (32, 24));
+        let first = picture.pixels()[0];
+        assert!(picture.pixels().iter().any(|&pixel| pixel != first));
+        let problem = format!("{:#}", with(r#"["no-such-program-of-a-camera"]"#).unwrap_err());
+        assert!(problem.contains("no-such-program-of-a-camera"), "{problem}");
+        assert!(with(r#"["true"]"#).is_err());
+    }
+}
