@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Maximum number of names that are listed of a file.
-const MAX_NAMES: usize = 12;
+const MAX_NAMES: usize = 16;
+/// Folders of a room, in the order of the list. The package `tests` is a room that is one folder.
+const FOLDERS: [&str; 4] = ["src", "tests", "examples", "benches"];
 
 /// The list as it must stand in the document.
 ///
@@ -13,29 +15,48 @@ pub(crate) fn list<'a>(
     files: impl Iterator<Item = &'a Path>,
     read: impl Fn(&Path) -> anyhow::Result<String>,
 ) -> anyhow::Result<String> {
-    let mut rooms: BTreeMap<&str, BTreeMap<String, String>> = BTreeMap::new();
+    let mut rooms: BTreeMap<(&str, usize), BTreeMap<String, String>> = BTreeMap::new();
     for file in files {
-        let Some((room, within)) = file.to_str().and_then(|name| name.split_once("/src/")) else {
-            continue;
-        };
+        let Some((room, folder, within)) = file.to_str().and_then(place) else { continue };
         let text = read(file)?;
         let sentence = first_sentence(&text);
         anyhow::ensure!(!sentence.is_empty(), "{} does not begin with `//!`", file.display());
         rooms
-            .entry(room)
+            .entry((room, folder))
             .or_default()
             .insert(sort_key(within), format!("- `{within}`: {sentence}{}", names(&text)));
     }
-    let sections = rooms.iter().map(|(room, files)| {
+    let sections = rooms.iter().map(|((room, folder), files)| {
         let lines: Vec<&str> = files.values().map(String::as_str).collect();
-        format!("### `{room}/src`\n\n{}\n", lines.join("\n"))
+        let folder = if room.is_empty() { "" } else { "/" }.to_owned() + FOLDERS[*folder];
+        format!("### `{room}{folder}`\n\n{}\n", lines.join("\n"))
     });
     Ok(sections.collect::<Vec<_>>().join("\n"))
 }
 
-/// What a file defines, outside of its tests: types, then functions, in their order; the first of them.
+/// The room of a file, the index of its folder there, and its path in that folder.
+fn place(file: &str) -> Option<(&str, usize, &str)> {
+    if let Some(within) = file.strip_prefix("tests/") {
+        return Some(("", 1, within));
+    }
+    FOLDERS.iter().enumerate().find_map(|(index, folder)| {
+        let (room, within) = file.split_once(&format!("/{folder}/"))?;
+        Some((room, index, within))
+    })
+}
+
+/// What a file defines, but for its tests: types, then functions, in their order; the first of them.
 fn names(text: &str) -> String {
     let before_tests = text.split("\nmod tests {").next().unwrap_or_default();
+    let mut is_test = false;
+    let helpers = before_tests.lines().filter(|line| {
+        let was_test = is_test;
+        is_test = line.starts_with("#[test]")
+            || line.starts_with("#[tokio::test")
+            || (is_test && line.starts_with("#["));
+        !was_test
+    });
+    let helpers: Vec<&str> = helpers.collect();
     let defines = |keywords: &[&str]| -> Vec<String> {
         let name_of = |line: &str| {
             let line = line.strip_prefix("pub(crate) ").unwrap_or(line);
@@ -48,7 +69,7 @@ fn names(text: &str) -> String {
             let end = rest.find(|c: char| !c.is_alphanumeric() && c != '_')?;
             Some(format!("`{}`", &rest[..end]))
         };
-        before_tests.lines().filter_map(name_of).collect()
+        helpers.iter().copied().filter_map(name_of).collect()
     };
     let mut names = defines(&["struct ", "enum ", "trait ", "union "]);
     names.extend(defines(&["fn "]));
