@@ -184,7 +184,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
         Err(_) if is_key_wrong => findings.doubtful(
             "network",
             "not looked at, as the operator's key cannot be used".to_owned(),
-            "mend the key, then run this again",
+            "fix the key, then run this again",
         ),
         Err(problem) => findings.wrong(
             "network",
@@ -589,7 +589,7 @@ fn check_reply(
     let Some(median_ms) = stats::quantile(times_ms, 0.5) else {
         // Cameras and detectors of others need not tell it (docs/wire-format.md).
         if health.is_none() && seen.hears(service, instance) {
-            return findings.good("services", format!("{who} is heard (tells no health)"));
+            return findings.good("services", format!("{who} is present (publishes no health)"));
         }
         return findings.wrong(
             "services",
@@ -802,7 +802,7 @@ mod tests {
         };
         for (service, instance) in [("camera-pub", "down"), ("detector", "mine")] {
             let text = told(service, instance);
-            let well = format!("{service} `{instance}` is heard (tells no health)");
+            let well = format!("{service} `{instance}` is present (publishes no health)");
             assert!(text.contains(&well) && text.ends_with("Nothing is wrong."), "{text}");
         }
         for (service, instance) in

@@ -436,7 +436,7 @@ impl Swap<'_> {
     /// Waits for the controller's configuration, which it publishes every few seconds: the limit is in it.
     async fn learn_limit(&mut self) {
         let deadline = Instant::now() + CONFIGURATION_TIMEOUT;
-        let waiting_for = "the controller tells its configuration";
+        let waiting_for = "the controller publishes its configuration";
         // Without it the keys of the limit are named, and not their values.
         while !self.comparison.is_configured()
             && self.next_event(deadline, waiting_for).await.is_ok()

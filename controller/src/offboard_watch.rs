@@ -43,9 +43,7 @@ impl OffboardWatch {
     fn lead_out(&mut self, now_ns: i64, autopilot: &mut Autopilot, is_left: bool) -> bool {
         let is_left = is_left && is_flying_offboard(autopilot) && is_ours(now_ns, autopilot);
         if self.exit.is_none() && is_left && !self.is_done {
-            tracing::warn!(
-                "PX4 is in OFFBOARD and nothing steers it: it is asked to hold its place"
-            );
+            tracing::warn!("PX4 is in OFFBOARD without setpoints: it is asked to hold its place");
             self.exit = Some(OffboardExit::begin(now_ns, autopilot));
         }
         let goes_on = self.exit.as_mut().is_some_and(|exit| exit.step(now_ns, autopilot));

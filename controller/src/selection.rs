@@ -351,8 +351,9 @@ impl Selection {
             }
         }
         if self.crowded_ns.is_some_and(|at| now_ns.saturating_sub(at) < CROWDED_NS) {
-            let text =
-                format!("more than {MAX_DETECTORS} detectors are heard; somebody invents them");
+            let text = format!(
+                "more than {MAX_DETECTORS} detectors announce themselves; the others are ignored"
+            );
             warn("crowded".to_owned(), text);
         }
         warnings
@@ -522,7 +523,7 @@ impl Selection {
     /// Why a detector is not healthy.
     fn ailment(&self, now_ns: i64, known: &Known) -> Option<String> {
         if !known.alive {
-            return Some("it has gone".to_owned());
+            return Some("it has left the network".to_owned());
         }
         if !known.has_frame() {
             return Some("it has not searched a frame yet".to_owned());

@@ -128,7 +128,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                 let more = link.strangers().saturating_sub(strangers);
                 if more > 0 {
                     strangers += more;
-                    node.health().failed_times("packets of a stranger at the autopilot's port", more);
+                    node.health().failed_times("packets of an unknown sender at the autopilot's port", more);
                 }
                 for (reason, more) in link.refusals().since(refusals) {
                     node.health().failed_times(&format!("from autopilot: refused: {reason}"), more);
@@ -301,7 +301,7 @@ impl Tapes {
             self.health.dropped("parts of the tape");
             if !std::mem::replace(&mut self.is_cut, true) {
                 tracing::info!(
-                    "Nobody records, or not quickly enough: what is recorded from now on cannot be replayed from the start"
+                    "No recorder, or one that is too slow: what is recorded from now on cannot be replayed from the start"
                 );
             }
         }

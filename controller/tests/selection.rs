@@ -127,7 +127,11 @@ fn a_crash_hands_over_at_once_and_uses_the_frame_that_is_there() {
     assert_eq!(bench.used.last().unwrap().0, 10 * PERIOD);
     bench.frames(11..20, &BOTH[1..]);
     assert_eq!(bench.used.len(), 20);
-    assert!(bench.selection.why().contains("main: it has gone"), "{}", bench.selection.why());
+    assert!(
+        bench.selection.why().contains("main: it has left the network"),
+        "{}",
+        bench.selection.why()
+    );
     assert_eq!(bench.selection.changes(), 1);
 }
 

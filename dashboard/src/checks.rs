@@ -197,7 +197,7 @@ fn detector(facts: &Facts<'_>) -> Finding {
 fn marker(facts: &Facts<'_>) -> Finding {
     let todo = "Show the pad to the camera, give the detector the marker's family and size, and the controller its name (`marker`).";
     let Some(found) = facts.found.filter(|_| is_current(facts.found_age_ms)) else {
-        return finding(Verdict::Bad, "nobody looks", todo);
+        return finding(Verdict::Bad, "no detector searches for it", todo);
     };
     let any = found.detections.first();
     let wanted = facts.status.and_then(ControllerStatus::landing_marker);
@@ -246,7 +246,7 @@ fn battery(facts: &Facts<'_>) -> Finding {
             finding(Verdict::Good, format!("{:.0} %", 100.0 * level), todo)
         }
         Some(level) => finding(Verdict::Bad, format!("only {:.0} %", 100.0 * level), todo),
-        None => finding(Verdict::Open, "the autopilot does not tell", "Look at it yourself."),
+        None => finding(Verdict::Open, "the autopilot reports none", "Look at it yourself."),
     }
 }
 
@@ -257,7 +257,7 @@ fn recording(facts: &Facts<'_>) -> Finding {
         Some(RecorderStatus { problem: Some(problem), .. }) => finding(
             Verdict::Bad,
             problem.as_str(),
-            "Free or mend the disk; it records again by itself.",
+            "Make room on the disk, or replace it; it records again by itself.",
         ),
         Some(status) => finding(Verdict::Good, status.file.as_str(), todo),
     }
@@ -269,8 +269,8 @@ fn keys(facts: &Facts<'_>) -> Finding {
         Some(true) => {
             finding(Verdict::Bad, "a process listens beyond its machine without keys", todo)
         }
-        Some(false) => finding(Verdict::Good, "nobody listens to strangers", todo),
-        None => finding(Verdict::Open, "no process is heard", todo),
+        Some(false) => finding(Verdict::Good, "no process listens without keys", todo),
+        None => finding(Verdict::Open, "no process is present", todo),
     }
 }
 

@@ -127,7 +127,7 @@ fn check_names(names: &[String]) -> Result<(), String> {
     let is_host =
         |name: &&String| !name.is_empty() && name.len() < 254 && name.chars().all(is_part);
     match names.iter().find(|name| !is_host(name)) {
-        Some(name) => Err(format!("`{name}` is no host name")),
+        Some(name) => Err(format!("`{name}` is not a host name")),
         None if names.len() > MAX_NAMES => Err(format!("there may be {MAX_NAMES} names at most")),
         None => Ok(()),
     }

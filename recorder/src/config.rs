@@ -104,7 +104,7 @@ fn check_origins(origins: &[String]) -> Result<(), String> {
         text.len() < 254 && text.contains("://") && text.chars().all(|c| c.is_ascii_graphic())
     };
     match origins.iter().find(|text| !is_origin(text)) {
-        Some(text) => Err(format!("`{text}` is no origin, such as https://app.foxglove.dev")),
+        Some(text) => Err(format!("`{text}` is not an origin such as https://app.foxglove.dev")),
         None if origins.len() > MAX_ORIGINS => {
             Err(format!("there may be {MAX_ORIGINS} origins at most"))
         }

@@ -183,7 +183,7 @@ fn check_certificate(findings: &mut Findings, keys: &Path, name: &str, vehicle: 
         }
         Ok(false) => findings.wrong(
             "keys",
-            format!("{told} is not signed by the authority whose certificate lies beside it, so nobody takes it"),
+            format!("{told} is not signed by the authority whose certificate lies beside it, so no process accepts it"),
             "copy all files from one directory of `alight keys issue`, of one authority",
         ),
         // It was told above that the authority's certificate cannot be read.
@@ -208,7 +208,7 @@ fn check_key(findings: &mut Findings, keys: &Path, name: &str, vehicle: &str) {
     let told = path.display();
     match File::open(&path) {
         Err(cause) if cause.kind() == ErrorKind::NotFound => {
-            let told = format!("there is no {told}{}", without(name));
+            let told = format!("{told} does not exist{}", without(name));
             findings.wrong("keys", told, &issue(name, vehicle));
             return;
         }

@@ -188,7 +188,7 @@ impl Feed {
                 self.unknown += 1;
                 ensure!(
                     f64::from(self.unknown) < CLOCK_S * self.config.rate_hz,
-                    "the camera does not tell its clock (RTCP sender reports): set `source.rtsp_stamps` to \"arrival\""
+                    "the camera sends no times of its clock (RTCP sender reports): set `source.rtsp_stamps` to \"arrival\""
                 );
                 return Ok(Next::Dropped("pictures before the camera told its clock"));
             }

@@ -779,7 +779,7 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
                         port.connected(peer.to_string());
                     }
                     if taken.strangers > 0 && port.shared.count_strangers(taken.strangers) {
-                        tracing::warn!(%from, "Packets of a stranger dropped (further ones are only counted)");
+                        tracing::warn!(%from, "Packets of an unknown sender dropped (further ones are only counted)");
                     }
                     port.received(taken.packets, taken.counted);
                 }

@@ -275,7 +275,7 @@ named! {
         /// The pose puts the marker beside or above the vehicle, or out of range.
         Implausible = "implausible", "its pose is not below the vehicle";
         /// The covariance is not one: not symmetric, not positive semi-definite, or huge.
-        BadCovariance = "bad-covariance", "its covariance is none: not symmetric, not positive semi-definite or larger than any range";
+        BadCovariance = "bad-covariance", "its covariance is not valid: not symmetric, not positive semi-definite or larger than any range";
         /// The detector's confidence is too low.
         LowConfidence = "low-confidence", "its confidence is too low";
         /// The camera repeats an old picture.

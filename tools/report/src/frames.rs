@@ -81,7 +81,7 @@ fn refusal(name: &str) -> &str {
         "no-attitude" => "refused: the vehicle's attitude at its stamp is not known",
         "no-pose" => "refused: it has no pose",
         "implausible" => "refused: its pose is not below the vehicle",
-        "bad-covariance" => "refused: its covariance is none",
+        "bad-covariance" => "refused: its covariance is not valid",
         "low-confidence" => "refused: its confidence is too low",
         "repeated-picture" => "refused: an old picture, which the camera repeats",
         "duplicate" => "refused: a frame of the same stamp was used already",
