@@ -56,7 +56,7 @@ pub(crate) struct ParentArgs {
 #[command(next_help_heading = "Network")]
 pub(crate) struct NetworkArgs {
     /// The network configuration: `local` (one machine), `ground`, or for the relay `drone` or `relay`; or a
-    /// JSON5 file [default: local].
+    /// JSON5 file [default: local; of `alight relay`: drone].
     #[arg(long, value_name = "ROLE|FILE", env = variable::ZENOH)]
     zenoh: Option<PathBuf>,
     /// Address of the drone, or of the relay to it: HOST or HOST:PORT.

@@ -37,7 +37,7 @@ enum Command {
     Land(land::LandArgs),
     /// Start the processes of this machine, and restart them when they end, until Ctrl-C.
     Up(up::UpArgs),
-    /// Publish frames from a camera program, image files or videos.
+    /// Publish frames of a camera: a device, a program, a stream, image files or videos.
     CameraPub(ServiceArgs),
     /// Find markers in frames.
     Detector(ServiceArgs),

@@ -46,8 +46,8 @@ pub(crate) struct LandArgs {
     /// Guidance law: `metric`, or `thesis` (Algorithm 18 of the thesis).
     #[arg(long, value_name = "GUIDANCE")]
     guidance: Option<String>,
-    /// Fly this autopilot instead of the simulated one: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or
-    /// serial:DEVICE:BAUD. The simulated camera then follows the pose it reports. Only a vehicle that says that
+    /// Fly this autopilot instead of the simulated one: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT,
+    /// tcpin:HOST:PORT or serial:DEVICE[:BAUD]. The simulated camera then follows the pose it reports. Only a vehicle that says that
     /// it is a simulation takes off.
     #[arg(long, value_name = "ADDRESS")]
     autopilot: Option<String>,

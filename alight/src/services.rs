@@ -17,7 +17,7 @@ pub(crate) const RELAY: &str = "relay";
 /// The services.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Service {
-    /// A camera program, image files or videos to frames.
+    /// A camera (a device, a program, a stream, image files or videos) to frames.
     CameraPub,
     /// Frames to detections.
     Detector,
