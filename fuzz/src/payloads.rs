@@ -4,8 +4,9 @@ use airlink::Unpacker;
 use autopilot::{Autopilot, Config, Parser};
 use messages::{
     CameraInfo, CameraResponse, CommandReply, ControllerCommand, ControllerStatus, Detections,
-    DetectorCommand, DetectorInfo, FrameAck, FrameHeader, FramePart, Health, MavlinkBytes, Message,
-    PixelFormat, Refusals, TargetEstimate, Truth, VehicleState, Wind, decode, encode,
+    DetectorCommand, DetectorInfo, FrameAck, FrameHeader, FramePart, GcsStatus, Health,
+    MavlinkBytes, Message, PixelFormat, Refusals, TargetEstimate, Truth, VehicleState, Wind,
+    decode, encode,
 };
 
 /// Edges of the frames that an air-link payload is read for, in pixels.
@@ -27,6 +28,7 @@ pub fn codec(input: &[u8]) {
     again::<CommandReply>(input);
     again::<VehicleState>(input);
     again::<MavlinkBytes>(input);
+    again::<GcsStatus>(input);
     again::<Health>(input);
     again::<Truth>(input);
     again::<Wind>(input);

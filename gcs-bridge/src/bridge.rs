@@ -24,7 +24,8 @@ use crate::camera::Camera;
 use crate::config::Config;
 use crate::params::{Ask, Parameters};
 use crate::request;
-use crate::route::{self, Own, Route};
+use crate::route::{self, ECHO, Own, Route};
+use crate::status::{GroundStatus, LinkCounts};
 use crate::target::LandingTargetPublisher;
 use crate::text::StatusTextSender;
 use crate::vehicle::Vehicle;
@@ -53,11 +54,14 @@ pub fn run(
 async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     let address: Address = config.ground.parse()?;
     node.claim_unique_name(&node.identity().instance).await?;
-    let mut ground = Link::open_for(address, config.peering(), config.signing()?)
+    let signing = config.signing()?;
+    let link_id = signing.as_ref().map(|it| it.link_id);
+    let mut ground = Link::open_for(address, config.peering(), signing)
         .await
         .context("opening the link to the ground station")?;
     let from_autopilot = node.subscriber(topic::FROM_AUTOPILOT, &[]).await?;
     let to_autopilot = node.publisher(topic::TO_AUTOPILOT, &[]).await?;
+    let ground_statuses = node.publisher(topic::GCS_STATUS, &[]).await?;
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     let targets = node.subscriber(topic::TARGET, &[]).await?;
     let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
@@ -70,7 +74,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     second.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut ticks = interval(TICK);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let mut bridge = Bridge::new(&config, ground.sender(), node.shared_health())?;
+    let mut bridge = Bridge::new(&config, link_id, ground.sender(), node.shared_health())?;
     if config.is_open() && node.health().failed(OPEN) {
         tracing::warn!(
             ground = config.ground,
@@ -90,6 +94,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                 let is_late = standstill.step(now_ns()).is_some();
                 if is_late && matches!(event, LinkEvent::Packet { .. }) {
                     node.health().dropped("packets of the ground station: too late");
+                    bridge.ground_status.refused(None, "too late");
                 } else if let Some(packet) = bridge.up(now_ns(), event) {
                     to_autopilot.publish(&MavlinkBytes { packet }).await;
                 }
@@ -110,6 +115,10 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
             _ = ticks.tick() => {
                 bridge.track(now_ns());
                 bridge.send_parameters(now_ns());
+                let system = bridge.vehicle.system(now_ns());
+                if let Some(told) = bridge.ground_status.due(now_ns(), system, counts(&ground)) {
+                    ground_statuses.publish(&told).await;
+                }
             }
             change = controllers.next() => {
                 let (controller, is_there) = change.context(CLOSED)?;
@@ -124,6 +133,17 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                 bridge.every_second(now_ns());
             }
         }
+    }
+}
+
+/// What the link to the ground has counted.
+fn counts(ground: &Link) -> LinkCounts {
+    LinkCounts {
+        strangers: ground.strangers(),
+        bad_checksums: ground.counters().bad_checksums,
+        unread: ground.dropped(),
+        refusals: ground.refusals(),
+        lacks_key: ground.lacks_key(),
     }
 }
 
@@ -163,6 +183,8 @@ struct Bridge {
     /// When the ground station was told of a refusal.
     refusal_ns: Option<i64>,
     ground: LinkSender,
+    /// What is published of the ground stations.
+    ground_status: GroundStatus,
     health: Arc<HealthCounters>,
     vehicle: Vehicle,
     /// Reads what comes from the autopilot's topic.
@@ -198,6 +220,7 @@ struct Bridge {
 impl Bridge {
     fn new(
         config: &Config,
+        link_id: Option<u8>,
         ground: LinkSender,
         health: Arc<HealthCounters>,
     ) -> anyhow::Result<Self> {
@@ -213,6 +236,7 @@ impl Bridge {
             permission: config.ground_may.parse()?,
             refusal_ns: None,
             ground,
+            ground_status: GroundStatus::new(config, link_id),
             health,
             vehicle: Vehicle::new(config.system_id, assume_at_ns),
             parser: Parser::new(),
@@ -291,6 +315,7 @@ impl Bridge {
         match event {
             LinkEvent::Connected { peer } => {
                 tracing::info!(peer, "Link to the ground station is up");
+                self.ground_status.up(&peer);
                 // It may be another one, and what was said meanwhile is lost.
                 self.ground_ns = None;
                 None
@@ -298,6 +323,7 @@ impl Bridge {
             LinkEvent::Disconnected { reason } => {
                 self.health.failed("link to the ground station lost");
                 tracing::warn!(reason, "Link to the ground station is down; reconnecting");
+                self.ground_status.down(&reason);
                 None
             }
             LinkEvent::Packet { packet, .. } => self.packet_from_ground(now_ns, *packet),
@@ -306,13 +332,21 @@ impl Bridge {
 
     fn packet_from_ground(&mut self, now_ns: i64, packet: Packet) -> Option<Vec<u8>> {
         self.health.count("from ground");
+        let route = route::from_ground(&packet, self.own(now_ns), &self.vehicle);
+        if route != Route::Drop(ECHO) {
+            self.ground_status.heard(now_ns, &packet);
+        }
         let asked = self.me(now_ns).and_then(|me| Ask::of(&packet, me));
         if let Some(asked) = asked {
             self.ground_active(now_ns, packet.sender);
-            self.asked_for_parameters(now_ns, &asked);
+            self.asked_for_parameters(now_ns, packet.sender, &asked);
         }
-        match route::from_ground(&packet, self.own(now_ns), &self.vehicle) {
-            Route::Drop(reason) => self.health.dropped(reason),
+        match route {
+            Route::Drop(reason) => {
+                self.health.dropped(reason);
+                let reason = reason.strip_prefix("from ground: ").unwrap_or(reason);
+                self.ground_status.refused(Some(packet.sender), reason);
+            }
             Route::Parameters => {}
             Route::Answer(message) => {
                 self.ground_active(now_ns, packet.sender);
@@ -324,6 +358,7 @@ impl Bridge {
             }
             Route::Key => {
                 self.ground_active(now_ns, packet.sender);
+                self.ground_status.refused(Some(packet.sender), "SETUP_SIGNING");
                 if self.health.failed("from ground: refused: SETUP_SIGNING") {
                     tracing::warn!(
                         "A key for signed packets was not passed on; set it on the autopilot's own USB port"
@@ -364,13 +399,14 @@ impl Bridge {
     }
 
     /// Answers what the ground station asks of our parameters.
-    fn asked_for_parameters(&mut self, now_ns: i64, asked: &Ask) {
+    fn asked_for_parameters(&mut self, now_ns: i64, from: Sender, asked: &Ask) {
         let answer = self.parameters.answer(asked);
         if let Some(message) = &answer.message {
             self.send_own(now_ns, message);
         }
         if let Some(why) = answer.why {
             self.health.failed("from ground: a parameter is not set from there");
+            self.ground_status.refused(Some(from), "a parameter is not set from there");
             self.send_answer(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &format!("Alight: {why}"));
         }
     }
@@ -406,8 +442,9 @@ impl Bridge {
     }
 
     /// Counts a packet that the ground station may not send, and tells it.
-    fn refuse(&mut self, now_ns: i64, packet: &Packet, refusal: &str) {
+    fn refuse(&mut self, now_ns: i64, packet: &Packet, refusal: &'static str) {
         let to = packet.sender;
+        self.ground_status.refused(Some(to), refusal);
         if self.health.failed(&format!("from ground: refused: {refusal}")) {
             let Sender { system, component } = to;
             tracing::warn!(

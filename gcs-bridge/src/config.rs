@@ -29,7 +29,7 @@ pub struct Config {
     pub video: String,
     /// IP addresses of the ground stations; any if there are none.
     pub ground_stations: Vec<String>,
-    /// Silence after which another ground station is heard, in seconds.
+    /// Silence after which another ground station is heard, and one counts as silent, in seconds.
     pub ground_silence_s: f64,
     /// File with the key of signed packets, or nothing.
     pub signing_key: String,

@@ -9,7 +9,7 @@
 //! `route` decides which packets pass, `text` and `target` turn the controller's status and estimate into
 //! MAVLink; `camera` shows the detector's camera, whose `video` another program serves, and `request` is what a ground
 //! station asks of it; `params` shows it the keys of the controller's
-//! configuration that are in `parameter_table`.
+//! configuration that are in `parameter_table`; `status` is what is published of the ground.
 
 pub mod config;
 
@@ -19,6 +19,7 @@ mod parameter_table;
 mod params;
 mod request;
 mod route;
+mod status;
 mod target;
 mod text;
 mod vehicle;

@@ -12,6 +12,9 @@ use crate::params::Ask;
 use crate::request::Command;
 use crate::vehicle::Vehicle;
 
+/// Why a packet of the vehicle's own that comes from the ground is dropped.
+pub(crate) const ECHO: &str = "from ground: an echo of the vehicle";
+
 /// Our components, once the vehicle's system id is known.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) struct Own {
@@ -45,7 +48,7 @@ pub(crate) fn from_ground(packet: &Packet, own: Option<Own>, vehicle: &Vehicle) 
     let is_own = own.is_some_and(|own| own.is(packet.sender));
     if is_own || vehicle.is_aboard(packet.sender) {
         // A ground program that repeats everything would otherwise send the vehicle its own packets.
-        return Route::Drop("from ground: an echo of the vehicle");
+        return Route::Drop(ECHO);
     }
     if is_key(packet) {
         return Route::Key;

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::net::SocketAddr;
 use std::os::unix::fs::PermissionsExt;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::{Context, bail, ensure};
 use autopilot::dialect::{
@@ -14,11 +14,12 @@ use autopilot::dialect::{
     PARAM_VALUE_DATA, calculate_crc,
 };
 use autopilot::packet::encode;
+use autopilot::signing::{Signing, stamp};
 use autopilot::{Packet, Parser, Sender};
 use gcs_bridge::Config;
 use messages::{
-    ControllerStatus, Detections, Health, MavlinkBytes, Phase, RecorderStatus, TargetEstimate,
-    topic,
+    ControllerStatus, Detections, GcsStatus, Health, MavlinkBytes, PacketSignature, Phase,
+    RecorderStatus, SigningState, TargetEstimate, topic,
 };
 use node::{INSECURE, Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, now_ns};
 use testing::ports;
@@ -524,6 +525,130 @@ async fn only_what_the_ground_station_signs_is_answered() -> anyhow::Result<()> 
     ensure!(format!("{problem:#}").contains("chmod 600"), "{problem:#}");
     bridge.abort();
     Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_ground_stations_are_told_with_what_is_refused_and_when_they_are_silent()
+-> anyhow::Result<()> {
+    let port = free_port()?;
+    let ([], _, listening) = ports::free()?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let statuses = vehicle.node.subscriber(topic::GCS_STATUS, &[]).await?;
+    let link = format!("udpin:127.0.0.1:{listening}");
+    let setting = format!("ground={link}");
+    let settings = [setting.as_str(), "ground_silence_s=1", "ground_may=no-arming"];
+    let bridge = start_bridge(port, &Ground::open().await?, &settings).await?;
+    let told = until_told(&statuses, |it| it.system == Some(AUTOPILOT.system)).await?;
+    assert_eq!((told.bridge.as_str(), told.link, told.peer), ("main", link, None));
+    assert_eq!((told.ground_may.as_str(), told.stations.len()), ("no-arming", 0));
+    assert_eq!(told.signing.state, SigningState::Off);
+
+    // A station, a stranger, a packet that may not pass, and a damaged one.
+    let to = SocketAddr::from(([127, 0, 0, 1], listening));
+    let ground = Ground { bridge: Some(to), ..Ground::open().await? };
+    let stranger = UdpSocket::bind("127.0.0.1:0").await?;
+    let heartbeat = |sender| encode(sender, 0, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()));
+    let arm = COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
+        target_system: AUTOPILOT.system,
+        ..COMMAND_LONG_DATA::default()
+    };
+    let mut damaged = encode(GROUND, 2, &param_request(2));
+    damaged[12] ^= 0x40;
+    let speaking = async {
+        loop {
+            ground.send(&heartbeat(GROUND)).await?;
+            ground.send(&encode(GROUND, 1, &MavMessage::COMMAND_LONG(arm.clone()))).await?;
+            ground.send(&damaged).await?;
+            stranger.send_to(&heartbeat(GROUND), to).await?;
+            sleep(Duration::from_millis(50)).await;
+        }
+    };
+    let is_all_counted = |it: &GcsStatus| {
+        ["arming or stopping motors", "wrong checksum", "packets or connections of a stranger"]
+            .iter()
+            .all(|reason| it.refused.iter().any(|count| count.reason == *reason))
+    };
+    let told = tokio::select! {
+        told = until_told(&statuses, is_all_counted) => told?,
+        problem = speaking => return problem,
+    };
+    let address = ground.socket.local_addr()?.to_string();
+    assert_eq!(told.peer.as_ref(), Some(&address));
+    let [station] = told.stations.as_slice() else { bail!("{told:?}") };
+    assert_eq!((station.system, station.component), (GROUND.system, GROUND.component));
+    assert_eq!((station.silent, &station.peer), (false, &address));
+    ensure!(station.refused > 0 && station.packets > station.refused, "{station:?}");
+    ensure!((0..PATIENCE.as_nanos() as i64).contains(&(now_ns() - station.last_ns)), "{told:?}");
+    assert_eq!(station.signature, PacketSignature::Unsigned);
+
+    // It falls silent, which who comes late is told as well.
+    until_told(&statuses, |it| it.stations.iter().all(|station| station.silent)).await?;
+    let late = open("dashboard", "main", port).await?;
+    let late = late.subscriber(topic::GCS_STATUS, &[]).await?;
+    let told = until_told(&late, |_| true).await?;
+    assert_eq!(told.stations.iter().map(|it| it.silent).collect::<Vec<_>>(), [true]);
+
+    // Very many stations behind one address: some are listed, and the others counted.
+    for number in 0..300_u16 {
+        let [high, component] = number.to_be_bytes();
+        ground.send(&heartbeat(Sender { system: 100 + high, component })).await?;
+        sleep(Duration::from_millis(1)).await;
+    }
+    let told = until_told(&statuses, |it| it.unlisted > 0).await?;
+    assert_eq!(told.stations.len(), 16);
+    bridge.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_state_of_signing_is_told() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let mut ground = Ground::open().await?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let statuses = vehicle.node.subscriber(topic::GCS_STATUS, &[]).await?;
+    let mut key = tempfile::Builder::new().permissions(Permissions::from_mode(0o600)).tempfile()?;
+    writeln!(key, "correct horse battery")?;
+    let setting = format!("signing_key={}", key.path().display());
+    let bridge = start_bridge(port, &ground, &[&setting]).await?;
+    ground.expect(|f| f.sender == COMPANION && f.is_signed()).await?;
+    ground.send(&encode(GROUND, 1, &param_request(1))).await?;
+    let has_refused = |it: &GcsStatus, reason: &str| it.refused.iter().any(|c| c.reason == reason);
+    let told = until_told(&statuses, |it| has_refused(it, "not signed")).await?;
+    assert_eq!(told.signing.state, SigningState::Wanted);
+    assert_eq!((told.signing.link_id, told.signing.verified_ns), (Some(191), None));
+    ensure!(told.stations.is_empty(), "{told:?}");
+
+    let mut signing = Signing::new("correct horse battery".parse()?, 7, 0);
+    let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH)?;
+    let signed = signing.sign(stamp(since_1970), &encode(GROUND, 2, &param_request(2)));
+    let signed = signed.context("signing")?;
+    for _ in 0..2 {
+        ground.send(&signed).await?;
+    }
+    let told = until_told(&statuses, |it| has_refused(it, "signed, but sent before")).await?;
+    assert_eq!(told.signing.state, SigningState::InForce);
+    ensure!(told.signing.verified_ns.is_some(), "{told:?}");
+    let [station] = told.stations.as_slice() else { bail!("{told:?}") };
+    assert_eq!((station.packets, station.signature), (1, PacketSignature::Verified));
+    bridge.abort();
+    Ok(())
+}
+
+/// Waits for a status of the bridge.
+async fn until_told(
+    statuses: &Subscriber<GcsStatus>,
+    wanted: impl Fn(&GcsStatus) -> bool,
+) -> anyhow::Result<GcsStatus> {
+    let told = async {
+        loop {
+            let status = statuses.next().await.context("status")?;
+            if wanted(&status) {
+                return anyhow::Ok(status);
+            }
+        }
+    };
+    timeout(PATIENCE, told).await.context("the status that was expected did not come")?
 }
 
 /// What a script of `tests/gcs` says; none where it cannot run.

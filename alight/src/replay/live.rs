@@ -76,7 +76,7 @@ struct Overview {
 }
 
 /// The topic of a key, if it is published again. What goes to the autopilot never is, nor what tells of the recording
-/// itself.
+/// itself or of the ground stations of then.
 fn played(key: &str, without: &[String]) -> Option<&'static Row> {
     let is_same = |row: &&Row| {
         let mut wanted = row.key.split('/');
@@ -90,6 +90,7 @@ fn played(key: &str, without: &[String]) -> Option<&'static Row> {
         topic::TO_AUTOPILOT.key(&[]),
         topic::TAPE.key(&[]),
         topic::RECORDER_STATUS.key(&["{recorder}"]),
+        topic::GCS_STATUS.key(&[]),
     ];
     if row.delivery == Delivery::Query || never.iter().any(|it| it == row.key) {
         return None;
@@ -369,7 +370,8 @@ mod tests {
 
     #[test]
     fn nothing_goes_to_an_autopilot_again_and_what_is_left_out_is() {
-        for key in ["mavlink/to-autopilot", "controller/tape", "recorder/main/status"] {
+        for key in ["mavlink/to-autopilot", "controller/tape", "recorder/main/status", "gcs/status"]
+        {
             assert!(played(key, &[]).is_none(), "{key}");
         }
         for key in ["controller/command", "health/gcs-bridge/main", "config/dashboard/main", "?"] {

@@ -108,6 +108,17 @@ impl Refusal {
     pub const ALL: [Self; 5] =
         [Self::Unsigned, Self::WrongKey, Self::Replayed, Self::Old, Self::TooManyStreams];
 
+    /// Its name for counters.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Unsigned => "not signed",
+            Self::WrongKey => "signed with another key",
+            Self::Replayed => "signed, but sent before",
+            Self::Old => "signed, but more than a minute old",
+            Self::TooManyStreams => "signed, but of too many senders",
+        }
+    }
+
     /// What can be done about it.
     pub fn advice(self) -> &'static str {
         match self {
@@ -126,13 +137,7 @@ impl Refusal {
 
 impl fmt::Display for Refusal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Unsigned => "not signed",
-            Self::WrongKey => "signed with another key",
-            Self::Replayed => "signed, but sent before",
-            Self::Old => "signed, but more than a minute old",
-            Self::TooManyStreams => "signed, but of too many senders",
-        })
+        f.write_str(self.name())
     }
 }
 

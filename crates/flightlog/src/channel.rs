@@ -2,8 +2,8 @@
 
 use messages::{
     CameraInfo, CameraResponse, Configuration, ControllerStatus, DecodeError, Delivery, Detections,
-    DetectorInfo, FrameAck, FrameHeader, Health, Message, RecorderStatus, Refusals, TOPICS,
-    TargetEstimate, Truth, VehicleState, Wind, decode, topic,
+    DetectorInfo, FrameAck, FrameHeader, GcsStatus, Health, Message, RecorderStatus, Refusals,
+    TOPICS, TargetEstimate, Truth, VehicleState, Wind, decode, topic,
 };
 
 use crate::protobuf::{MessageType, descriptor_set};
@@ -120,7 +120,7 @@ const fn json_topic<M: Message>(key: fn(&[&str]) -> String) -> JsonTopic {
     JsonTopic { key, name: M::NAME, json: json::<M> }
 }
 
-static JSON_TOPICS: [JsonTopic; 14] = [
+static JSON_TOPICS: [JsonTopic; 15] = [
     json_topic::<CameraInfo>(|names| topic::CAMERA_INFO.key(names)),
     json_topic::<Detections>(|names| topic::DETECTIONS.key(names)),
     json_topic::<FrameAck>(|names| topic::FRAME_ACK.key(names)),
@@ -133,6 +133,7 @@ static JSON_TOPICS: [JsonTopic; 14] = [
     json_topic::<Wind>(|names| topic::WIND.key(names)),
     json_topic::<Truth>(|names| topic::TRUTH.key(names)),
     json_topic::<RecorderStatus>(|names| topic::RECORDER_STATUS.key(names)),
+    json_topic::<GcsStatus>(|names| topic::GCS_STATUS.key(names)),
     json_topic::<Health>(|names| topic::HEALTH.key(names)),
     json_topic::<Configuration>(|names| topic::CONFIGURATION.key(names)),
 ];

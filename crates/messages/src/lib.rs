@@ -15,6 +15,7 @@ pub mod codec;
 pub mod controller;
 pub mod convert;
 pub mod detector;
+pub mod gcs;
 pub mod health;
 pub mod recorder;
 pub mod sample;
@@ -35,6 +36,7 @@ pub use detector::{
     AlternativePose, CameraResponse, Detection, Detections, DetectorCommand, DetectorInfo,
     EllipsePx, MarkerPose, Place, Refusal, Refusals, RefusedShape, StageTime, marker_name,
 };
+pub use gcs::{GcsSigning, GcsStatus, GroundStation, PacketSignature, SigningState};
 pub use health::{Configuration, Count, Health, Latency, Rate};
 pub use recorder::{NEVER_CAME, RecorderLoss, RecorderStatus, has_never_come};
 pub use simulation::{Touchdown, Truth, Wind};

@@ -8,6 +8,7 @@ use crate::camera::{CameraInfo, FrameAck, FrameHeader};
 use crate::codec::Message;
 use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, TargetEstimate};
 use crate::detector::{CameraResponse, Detections, DetectorCommand, DetectorInfo, Refusals};
+use crate::gcs::GcsStatus;
 use crate::health::{Configuration, Health};
 use crate::recorder::RecorderStatus;
 use crate::simulation::{Truth, Wind};
@@ -206,6 +207,9 @@ pub const TO_AUTOPILOT: Topic<MavlinkBytes> = Topic::new(
 /// What a recorder has kept, and what not.
 pub const RECORDER_STATUS: Topic<RecorderStatus> =
     Topic::new("recorder/{recorder}/status", Delivery::LastValue, &["recorder"], BRIDGE);
+/// Ground stations that are heard, refused packets by reason, and signing.
+pub const GCS_STATUS: Topic<GcsStatus> =
+    Topic::new("gcs/status", Delivery::LastValue, BRIDGE, NO_OTHERS);
 /// Health of a service.
 pub const HEALTH: Topic<Health> = Topic::new(
     "health/{service}/{instance}",
@@ -265,6 +269,7 @@ pub const TOPICS: &[Row] = &[
     FROM_AUTOPILOT.row,
     TO_AUTOPILOT.row,
     RECORDER_STATUS.row,
+    GCS_STATUS.row,
     HEALTH.row,
     CONFIGURATION.row,
 ];

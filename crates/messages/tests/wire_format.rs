@@ -6,11 +6,11 @@ use messages::{
     AlternativePose, BayerPattern, CameraInfo, CameraResponse, Candidate, CommandReply,
     Configuration, ControllerCommand, ControllerStatus, Count, DecodeError, Detection, Detections,
     DetectorCommand, DetectorInfo, DetectorState, EllipsePx, FrameAck, FrameHeader, FramePart,
-    Health, LandedState, Latency, LensModel, MarkerPose, MavlinkBytes, Message, Phase, PixelFormat,
-    Place, Rate, RecorderLoss, RecorderStatus, Refusal, Refusals, RefusedShape, Setpoint,
-    StageTime, Tape, TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapePad, TapeState,
-    TapeTarget, TapeWriter, TargetEstimate, Touchdown, Transform3, Truth, VehicleState, Wind,
-    decode, encode,
+    GcsSigning, GcsStatus, GroundStation, Health, LandedState, Latency, LensModel, MarkerPose,
+    MavlinkBytes, Message, PacketSignature, Phase, PixelFormat, Place, Rate, RecorderLoss,
+    RecorderStatus, Refusal, Refusals, RefusedShape, Setpoint, SigningState, StageTime, Tape,
+    TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapePad, TapeState, TapeTarget,
+    TapeWriter, TargetEstimate, Touchdown, Transform3, Truth, VehicleState, Wind, decode, encode,
 };
 use proptest::prelude::*;
 
@@ -132,6 +132,47 @@ fn recorder_status() {
         problem: Some("x".into()),
     };
     check(&message, "411201046d61696e010166ac020102010477696e6403010178");
+}
+
+#[test]
+fn gcs_status() {
+    let message = GcsStatus {
+        bridge: "main".into(),
+        stamp_ns: -1,
+        system: Some(7),
+        link: "l".into(),
+        peer: Some("p".into()),
+        problem: None,
+        ground_may: "monitor".into(),
+        stations: vec![GroundStation {
+            system: 255,
+            component: 190,
+            peer: "p".into(),
+            last_ns: -1,
+            silent: true,
+            packets: 300,
+            refused: 1,
+            signature: PacketSignature::Verified,
+        }],
+        unlisted: 2,
+        refused: vec![Count { reason: "x".into(), count: 3 }],
+        signing: GcsSigning {
+            state: SigningState::InForce,
+            link_id: Some(191),
+            verified_ns: Some(-1),
+        },
+    };
+    check(
+        &message,
+        "411601046d61696e010107016c01017000076d6f6e69746f7201ffbe01700101ac02010202010178030301bf0101",
+    );
+    let states =
+        [SigningState::Off, SigningState::NoKey, SigningState::Wanted, SigningState::InForce];
+    for (number, state) in (0..).zip(states) {
+        let signing = GcsSigning { state, ..GcsSigning::default() };
+        let bytes = encode(&GcsStatus { signing, ..GcsStatus::default() });
+        assert_eq!(bytes[13..], [number, 0, 0], "{state:?}");
+    }
 }
 
 #[test]
@@ -706,6 +747,32 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
         drops: vec![Count { reason: "x".into(), count: 1 }],
         errors: Vec::new(),
     };
+    let gcs = GcsStatus {
+        bridge: "main".into(),
+        stamp_ns: 1_000_000_000,
+        system: Some(1),
+        link: "udpin:0.0.0.0:14550".into(),
+        peer: Some("10.0.0.2:14550".into()),
+        problem: None,
+        ground_may: "no-arming".into(),
+        stations: vec![GroundStation {
+            system: 255,
+            component: 190,
+            peer: "10.0.0.2:14550".into(),
+            last_ns: 1_000_000_000,
+            silent: false,
+            packets: 300,
+            refused: 2,
+            signature: PacketSignature::Verified,
+        }],
+        unlisted: 0,
+        refused: vec![Count { reason: "arming or stopping motors".into(), count: 2 }],
+        signing: GcsSigning {
+            state: SigningState::InForce,
+            link_id: Some(191),
+            verified_ns: Some(1_000_000_000),
+        },
+    };
     let named = ControllerCommand::UseDetector("main".into());
     vec![
         ("FrameHeader", encode(&header)),
@@ -723,6 +790,7 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
         ("TargetEstimate", encode(&target)),
         ("VehicleState", encode(&vehicle)),
         ("Health", encode(&health)),
+        ("GcsStatus", encode(&gcs)),
     ]
 }
 

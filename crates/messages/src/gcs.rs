@@ -1,0 +1,97 @@
+//! What the bridge to the ground station publishes.
+
+use serde::{Deserialize, Serialize};
+
+use crate::codec::wire;
+use crate::health::Count;
+
+wire! {
+    GcsStatus = 22 v 1;
+}
+
+/// Who is heard on the ground, what of it is refused, and whether packets are signed.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GcsStatus {
+    /// The bridge's name.
+    pub bridge: String,
+    /// When, in nanoseconds of the bridge's clock.
+    pub stamp_ns: i64,
+    /// MAVLink system id of the vehicle; none while it is neither known nor assumed.
+    pub system: Option<u8>,
+    /// Address of the link to the ground, as it is configured.
+    pub link: String,
+    /// The other side of that link, as text; none while the link is down, and where the bridge listens and nobody was heard.
+    pub peer: Option<String>,
+    /// Why the link is down, as a sentence.
+    pub problem: Option<String>,
+    /// What a ground station may send to the autopilot: `everything`, `no-arming` or `monitor`.
+    pub ground_may: String,
+    /// The ground stations that were heard since the start, silent ones included, in the order in which they were first heard.
+    pub stations: Vec<GroundStation>,
+    /// Packets of further ground stations since the start, which are not listed.
+    pub unlisted: u64,
+    /// Packets from the ground that were neither passed on nor answered as they ask, since the start, by reason.
+    pub refused: Vec<Count>,
+    /// Whether packets on the link to the ground are signed.
+    pub signing: GcsSigning,
+}
+
+/// A ground station that was heard.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GroundStation {
+    /// Its MAVLink system id.
+    pub system: u8,
+    /// Its MAVLink component id.
+    pub component: u8,
+    /// The other side of the link when its last packet came, as text.
+    pub peer: String,
+    /// When its last packet came, in nanoseconds of the bridge's clock.
+    pub last_ns: i64,
+    /// True when no packet of it came for `ground_silence_s` of the bridge.
+    pub silent: bool,
+    /// Packets of it since the start, those that were refused included, and those that the link refused left out.
+    pub packets: u64,
+    /// Those of them that were refused.
+    pub refused: u64,
+    /// What is known of its last packet's signature.
+    pub signature: PacketSignature,
+}
+
+/// What is known of a packet's signature.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PacketSignature {
+    /// It has none.
+    Unsigned,
+    /// It has one, which was not checked: there is no key here.
+    Unchecked,
+    /// It is of a holder of the key, and new.
+    Verified,
+}
+
+/// Whether packets on the link to the ground are signed. The key itself never leaves the bridge.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GcsSigning {
+    /// Whether they are.
+    pub state: SigningState,
+    /// Id of the link in the signatures of what the bridge sends; none without a key.
+    pub link_id: Option<u8>,
+    /// When the last packet with a right signature came, in nanoseconds of the bridge's clock.
+    pub verified_ns: Option<i64>,
+}
+
+/// Whether the packets of a link are signed.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SigningState {
+    /// There is no key here, and no packet from the ground was signed.
+    #[default]
+    Off,
+    /// There is no key here, but packets from the ground are signed: they are passed on unchecked, and the ground station may refuse
+    /// what comes from here.
+    NoKey,
+    /// What is sent is signed and what is not signed is refused, but no packet with a right signature has come yet.
+    Wanted,
+    /// What is sent is signed, what is not signed is refused, and packets with right signatures have come.
+    InForce,
+}
