@@ -5,9 +5,9 @@ use std::ops::Range;
 
 use flightlog::{Begin, Entry, Reading, Received, RecordedTape, TapeReader};
 use messages::{
-    CameraInfo, Configuration, ControllerStatus, Detections, DetectorInfo, FrameHeader, Health,
-    MavlinkBytes, Message, RecorderStatus, TapeEvent, TargetEstimate, Topic, Truth, VehicleState,
-    Wind, decode, topic,
+    CameraInfo, Configuration, ControllerStatus, Detections, DetectorInfo, FrameHeader, GcsStatus,
+    Health, MavlinkBytes, Message, RecorderStatus, TapeEvent, TargetEstimate, Topic, Truth,
+    VehicleState, Wind, decode, topic,
 };
 
 use replay::{Brightness, Meter};
@@ -163,6 +163,8 @@ pub struct Flight {
     pub changes: Vec<Change>,
     /// Detectors by name.
     pub detectors: BTreeMap<String, DetectorInfo>,
+    /// The last status of each bridge to the ground stations, by its name.
+    pub bridges: BTreeMap<String, GcsStatus>,
     /// Cameras by name.
     pub cameras: BTreeMap<String, CameraInfo>,
     /// The recorder's last status.
@@ -473,6 +475,10 @@ impl Flight {
                 let status = self.decoded(topic::RECORDER_STATUS, key, payload);
                 self.recorder = status.or(self.recorder.take());
             }
+            ["gcs", "status"] => {
+                let status = self.decoded(topic::GCS_STATUS, key, payload);
+                self.bridges.extend(status.map(|status| (status.bridge.clone(), status)));
+            }
             ["mavlink", "from-autopilot"] => {
                 if let Some(MavlinkBytes { packet }) =
                     self.decoded(topic::FROM_AUTOPILOT, key, payload)
@@ -532,6 +538,7 @@ impl Flight {
         self.name.clone_from(&before.name);
         self.configurations.clone_from(&before.configurations);
         self.detectors.clone_from(&before.detectors);
+        self.bridges.clone_from(&before.bridges);
         self.cameras.clone_from(&before.cameras);
         self.packets.own.clone_from(&before.packets.own);
         self.other_boots = std::mem::take(&mut before.other_boots);

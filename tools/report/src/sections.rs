@@ -2,7 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use messages::SigningState;
+
 use crate::chart::Chart;
+use crate::flight::Flight;
 use crate::frames::Fate;
 use crate::html::{Block, Cell, count, details, missing, number, paragraph, table, text};
 use crate::summary::counted;
@@ -392,7 +395,48 @@ fn battery(view: &View<'_>) -> Section {
         }
     }
     section.after.push(table(&[], rows));
+    ground(flight, &mut section);
     section
+}
+
+/// Adds who was heard on the ground, and what of it was refused, by the last word of each bridge.
+fn ground(flight: &Flight, section: &mut Section) {
+    if flight.bridges.is_empty() {
+        section.before.push(missing("the ground stations: no gcs-bridge was heard"));
+        return;
+    }
+    let mut stations = Vec::new();
+    let mut refused = Vec::new();
+    for (name, bridge) in &flight.bridges {
+        let signing = match bridge.signing.state {
+            SigningState::Off => "packets are not signed",
+            SigningState::NoKey => "the other side signs, and there is no key here",
+            SigningState::Wanted => "only signed packets pass, and none has come",
+            SigningState::InForce => "packets are signed",
+        };
+        let further = match bridge.unlisted {
+            0 => String::new(),
+            more => format!("; {} of further stations", counted(more, "packet", "packets")),
+        };
+        section.before.push(paragraph(&format!(
+            "gcs-bridge {name}, {}: {signing}; a ground station may send: {}{further}.",
+            bridge.link, bridge.ground_may
+        )));
+        stations.extend(bridge.stations.iter().map(|it| {
+            let heard = if it.silent { "silent at the end" } else { "yes" };
+            vec![
+                text(format!("{}/{} at {}", it.system, it.component, it.peer)),
+                text(heard),
+                count(it.packets),
+                count(it.refused),
+            ]
+        }));
+        let of_bridge = bridge.refused.iter();
+        refused.extend(of_bridge.map(|it| vec![text(&it.reason), count(it.count)]));
+    }
+    let head = ["ground station (system/component)", "heard", "packets", "refused"];
+    section.after.push(table(&head, stations));
+    section.after.push(table(&["packets from the ground that were refused", "times"], refused));
 }
 
 fn log(view: &View<'_>) -> Section {

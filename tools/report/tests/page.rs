@@ -10,7 +10,8 @@ use experiments::landing::outcome::Outcome;
 use experiments::landing::plan::{Plan, Planned, Values, Vision};
 use flightlog::{About, Entry, Picture, Received, TapeReader, Writer};
 use messages::{
-    Configuration, ControllerStatus, Detections, FrameHeader, Health, Message as _, Tape, encode,
+    Configuration, ControllerStatus, Count, Detections, FrameHeader, GcsStatus, GroundStation,
+    Health, Message as _, PacketSignature, SigningState, Tape, encode,
 };
 use report::chart::Shape;
 use report::frames::Fate;
@@ -121,6 +122,61 @@ fn has_all_sections(html: &str) {
 fn near(one: Option<f64>, other: Option<f64>, within: f64) {
     let (one, other) = (one.unwrap(), other.unwrap());
     assert!((one - other).abs() <= within, "{one} is not {other}");
+}
+
+/// The recording with the last word of a bridge to the ground station.
+fn with_ground(recording: &[u8], status: &GcsStatus) -> Vec<u8> {
+    let about = About { program: "test".to_owned(), facts: BTreeMap::new(), utc_offset_ns: 0 };
+    let mut copy = Vec::new();
+    let mut writer = Writer::new(&mut copy, &about).unwrap();
+    let mut received_ns = 0;
+    flightlog::read(recording, |entry| {
+        if let Entry::Message(message) = entry {
+            received_ns = message.received_ns;
+            writer.receive(message).unwrap();
+        }
+    })
+    .unwrap();
+    let payload = encode(status);
+    let key = "gcs/status";
+    writer.receive(Received { key, payload: &payload, attachment: &[], received_ns }).unwrap();
+    writer.finish().unwrap();
+    copy
+}
+
+#[test]
+fn a_page_has_the_ground_stations_and_what_was_refused() {
+    let station = GroundStation {
+        system: 255,
+        component: 190,
+        peer: "10.0.0.2:14550".into(),
+        last_ns: 0,
+        silent: true,
+        packets: 300,
+        refused: 2,
+        signature: PacketSignature::Verified,
+    };
+    let mut status = GcsStatus {
+        bridge: "main".into(),
+        link: "udpin:0.0.0.0:14550".into(),
+        ground_may: "no-arming".into(),
+        stations: vec![station],
+        refused: vec![Count { reason: "arming or stopping motors".into(), count: 2 }],
+        ..GcsStatus::default()
+    };
+    status.signing.state = SigningState::InForce;
+    let without_bridge = page(&read(&landing().recording)).unwrap();
+    assert!(without_bridge.contains("no gcs-bridge was heard"));
+    let html = page(&read(&with_ground(&landing().recording, &status))).unwrap();
+    for part in [
+        "gcs-bridge main, udpin:0.0.0.0:14550: packets are signed",
+        "255/190 at 10.0.0.2:14550",
+        "silent at the end",
+        "arming or stopping motors",
+    ] {
+        assert!(html.contains(part), "no {part}");
+    }
+    assert!(!html.contains("no gcs-bridge was heard"));
 }
 
 #[test]
