@@ -276,7 +276,7 @@ function forget(body, keys) {
 }
 
 /** @param {any} slow */
-function showSlow({ detectors, services, recorders, checks }) {
+function showSlow({ detectors, services, recorders, bridges, checks }) {
   const table = /** @type {HTMLElement} */ (element('detectors').querySelector('tbody'));
   for (const it of detectors) {
     const line = row(table, it.name, 9);
@@ -324,6 +324,7 @@ function showSlow({ detectors, services, recorders, checks }) {
   }
   forget(processes, keys);
   put('recorders', recorders.length === 0 ? 'Nothing records.' : recorders.map((/** @type {any} */ it) => `Recorder ${it.name}: ${it.problem ?? `${it.file}, ${(it.bytes / 1e6).toFixed(1)} MB, ${it.kept} messages, ${it.lost} lost`} (${age(it.age_ms)} ago)`).join(' '));
+  put('bridges', bridges.map((/** @type {any} */ it) => `Ground stations of ${it.name}: ${it.problem ?? (it.stations.join(', ') || 'none yet')}, packets ${it.signing}, ${it.refused} refused (${age(it.age_ms)} ago)`).join(' '));
 
   const list = element('checks');
   const signs = /** @type {any} */ ({ good: '✓', open: '·', bad: '✗' });
@@ -406,7 +407,7 @@ function lookAtAges() {
     const limit = line.closest('#detectors') ? SLOW_STALE_MS - 1000 : SLOW_STALE_MS + 1000;
     line.classList.toggle('old', !told || Number(told) + slowOld > limit);
   }
-  for (const id of ['checks', 'recorders']) element(id).classList.toggle('old', slowOld > SLOW_STALE_MS);
+  for (const id of ['checks', 'recorders', 'bridges']) element(id).classList.toggle('old', slowOld > SLOW_STALE_MS);
   if (picture) {
     const old = since(at, picture.at, picture.header.shown_ms);
     const isOld = old > STALE_MS;

@@ -96,6 +96,7 @@ async fn follow(node: &Node, state: &Mutex<State>) -> anyhow::Result<()> {
     let cameras = node.subscriber(topic::CAMERA_INFO, &[]).await?;
     let healths = node.subscriber(topic::HEALTH, &[]).await?;
     let recorders = node.subscriber(topic::RECORDER_STATUS, &[]).await?;
+    let grounds = node.subscriber(topic::GCS_STATUS, &[]).await?;
     let configurations = node.subscriber(topic::CONFIGURATION, &["controller", "*"]).await?;
     loop {
         let input = tokio::select! {
@@ -123,6 +124,7 @@ async fn follow(node: &Node, state: &Mutex<State>) -> anyhow::Result<()> {
                 let (key, status) = it.context(CLOSED)?;
                 Input::Recorder(name(topic::RECORDER_STATUS.first_name(&key)), Box::new(status))
             }
+            it = grounds.next() => Input::Ground(Box::new(it.context(CLOSED)?)),
             it = configurations.next() => Input::Configuration(Box::new(it.context(CLOSED)?)),
         };
         lock(state).take(now_ns(), input);

@@ -6,8 +6,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use messages::{
-    CameraInfo, Configuration, ControllerStatus, Detections, DetectorInfo, Health, Phase,
-    RecorderStatus, TargetEstimate, VehicleState,
+    CameraInfo, Configuration, ControllerStatus, Detections, DetectorInfo, GcsStatus,
+    GroundStation, Health, Phase, RecorderStatus, TargetEstimate, VehicleState,
 };
 use serde_json::{Value, json};
 
@@ -17,7 +17,7 @@ use crate::funnel::Funnel;
 use crate::log::{Level, Log};
 use crate::words;
 
-/// Maximum number of detectors, cameras and recorders, each, and of services.
+/// Maximum number of detectors, cameras, recorders and bridges, each, and of services.
 const MAX_NAMES: usize = 64;
 /// Maximum number of faults of all services that are told once.
 const MAX_FAULTS: usize = 512;
@@ -54,6 +54,8 @@ pub enum Input {
     Health(String, String, Box<Health>),
     /// What a recorder has kept.
     Recorder(String, Box<RecorderStatus>),
+    /// Who is heard on the ground.
+    Ground(Box<GcsStatus>),
     /// The controller's configuration.
     Configuration(Box<Configuration>),
 }
@@ -83,6 +85,7 @@ pub struct State {
     detectors: BTreeMap<String, Seen<DetectorInfo>>,
     cameras: BTreeMap<String, Seen<CameraInfo>>,
     recorders: BTreeMap<String, Seen<RecorderStatus>>,
+    bridges: BTreeMap<String, Seen<GcsStatus>>,
     funnel: Option<Funnel>,
     services: BTreeMap<(String, String), Service>,
     faults: BTreeSet<String>,
@@ -134,6 +137,7 @@ impl State {
                 self.take_health(now_ns, service, instance, *health);
             }
             Input::Recorder(name, status) => self.take_recorder(now_ns, name, *status),
+            Input::Ground(status) => self.take_ground(now_ns, *status),
             Input::Configuration(configuration) => self.funnel = Funnel::of(&configuration),
         }
     }
@@ -212,6 +216,24 @@ impl State {
             Some(_) | None => {}
         }
         put(&mut self.recorders, name, status, now_ns);
+    }
+
+    fn take_ground(&mut self, now_ns: i64, status: GcsStatus) {
+        let before = self.bridges.get(&status.bridge).map(|seen| &seen.value);
+        let is_speaking = |stations: &[GroundStation], station: &GroundStation| {
+            let id = |it: &GroundStation| (it.system, it.component);
+            stations.iter().any(|it| id(it) == id(station) && !it.silent)
+        };
+        for station in &status.stations {
+            let was_speaking = before.is_some_and(|it| is_speaking(&it.stations, station));
+            let name = format!("ground station {}/{}", station.system, station.component);
+            if !station.silent && !was_speaking {
+                self.log.add(now_ns, Level::Info, &format!("{name} is heard"));
+            } else if station.silent && was_speaking {
+                self.log.add(now_ns, Level::Warn, &format!("{name} is silent"));
+            }
+        }
+        put(&mut self.bridges, status.bridge.clone(), status, now_ns);
     }
 
     /// Looks for services that have fallen silent; once a second.
@@ -302,7 +324,7 @@ impl State {
         json!({ "kind": "now", "now_ms": ms(now_ns), "status": status, "target": target, "vehicle": vehicle })
     }
 
-    /// What changes slowly: detectors, services, recorders, and the list before a flight.
+    /// What changes slowly: detectors, services, recorders, ground stations, and the list before a flight.
     pub fn slow(&self, now_ns: i64) -> Value {
         let services: Vec<Value> = self.services.iter().map(|(key, it)| {
             let health = &it.health;
@@ -331,10 +353,33 @@ impl State {
                 "problem": it.problem,
             })
         }).collect();
+        let bridges: Vec<Value> = self
+            .bridges
+            .iter()
+            .map(|(name, seen)| {
+                let it = &seen.value;
+                let stations: Vec<String> = it
+                    .stations
+                    .iter()
+                    .map(|station| {
+                        let GroundStation { system, component, peer, silent, .. } = station;
+                        format!(
+                            "{system}/{component} at {peer}{}",
+                            if *silent { " (silent)" } else { "" }
+                        )
+                    })
+                    .collect();
+                json!({
+                    "name": name, "age_ms": age_ms(now_ns, seen.received_ns), "stations": stations,
+                    "refused": it.refused.iter().map(|it| it.count).fold(0, u64::saturating_add),
+                    "signing": words::signing(it.signing.state), "problem": it.problem,
+                })
+            })
+            .collect();
         let checks = checks(&self.facts(now_ns));
         json!({
             "kind": "slow", "now_ms": ms(now_ns), "detectors": self.detectors_json(now_ns),
-            "services": services, "recorders": recorders, "checks": checks,
+            "services": services, "recorders": recorders, "bridges": bridges, "checks": checks,
             "funnel": self.funnel,
         })
     }
@@ -473,7 +518,7 @@ fn euler([w, x, y, z]: [f64; 4]) -> [f64; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::{Candidate, Count, DetectorState, LandedState, Place};
+    use messages::{Candidate, Count, DetectorState, LandedState, PacketSignature, Place};
 
     const SECOND: i64 = 1_000_000_000;
 
@@ -592,6 +637,35 @@ mod tests {
     }
 
     #[test]
+    fn ground_stations_are_shown_and_their_silence_is_told_once() {
+        let mut state = State::new("ours");
+        let station = |silent| GroundStation {
+            system: 255,
+            component: 190,
+            peer: "10.0.0.2:14550".into(),
+            last_ns: 0,
+            silent,
+            packets: 1,
+            refused: 0,
+            signature: PacketSignature::Unsigned,
+        };
+        for silent in [false, false, true, true] {
+            let status = GcsStatus {
+                bridge: "main".into(),
+                stations: vec![station(silent)],
+                refused: vec![Count { reason: "wrong checksum".into(), count: 3 }],
+                ..GcsStatus::default()
+            };
+            state.take(0, Input::Ground(Box::new(status)));
+        }
+        let told = texts(&state);
+        assert_eq!(told, ["ground station 255/190 is heard", "ground station 255/190 is silent"]);
+        let bridge = &state.slow(SECOND)["bridges"][0];
+        assert_eq!(bridge["stations"], json!(["255/190 at 10.0.0.2:14550 (silent)"]));
+        assert_eq!((&bridge["refused"], &bridge["signing"]), (&json!(3), &json!("not signed")));
+    }
+
+    #[test]
     fn a_detector_joins_what_is_known_of_it() {
         let mut state = State::new("ours");
         state.take(0, status(Phase::Search, "looking"));
@@ -649,10 +723,12 @@ mod tests {
         for number in 0..500 {
             let name = format!("n{number}");
             state.take(0, Input::Detections(name.clone(), Box::new(Detections::sample())));
+            let bridge = GcsStatus { bridge: name.clone(), ..GcsStatus::default() };
+            state.take(0, Input::Ground(Box::new(bridge)));
             state.take(0, Input::Recorder(name, Box::default()));
             state.take(0, health(&format!("s{number}"), 1, "a", 0.0, 1.0));
         }
         assert_eq!((state.found.len(), state.recorders.len()), (MAX_NAMES, MAX_NAMES));
-        assert_eq!(state.services.len(), MAX_NAMES);
+        assert_eq!((state.services.len(), state.bridges.len()), (MAX_NAMES, MAX_NAMES));
     }
 }

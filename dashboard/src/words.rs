@@ -1,6 +1,6 @@
 //! Phases, states and places in words for an operator.
 
-use messages::{DetectorState, LandedState, Phase};
+use messages::{DetectorState, LandedState, Phase, SigningState};
 
 /// A phase as an operator reads it.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -52,6 +52,16 @@ pub fn phase(phase: Phase) -> Words {
         Phase::Failed => ("Failed", "Nothing is sent any more; the pilot must take over.", "bad"),
     };
     Words { title, next, mood }
+}
+
+/// Whether the packets of the link to the ground are signed.
+pub fn signing(state: SigningState) -> &'static str {
+    match state {
+        SigningState::Off => "not signed",
+        SigningState::NoKey => "signed by the ground station, and no key here",
+        SigningState::Wanted => "no signed packet yet",
+        SigningState::InForce => "signed",
+    }
 }
 
 /// Whether a detector is used.
