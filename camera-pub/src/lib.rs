@@ -8,13 +8,14 @@
 //! finds each frame's own, `exposure` says from its stamp when the frame was exposed. `repeated` knows a picture that
 //! comes again. `rect` publishes frames without the lens' distortion for whoever wants them.
 //! `v4l2` reads cameras without a program, `genicam` (a feature) those of that standard, `rtsp` (a feature) those that stream over a network; `clock` is the host's time
-//! of a camera's own. `marker` says how cameras are exposed for the marker; [`devices`] lists those of this machine,
+//! of a camera's own. `marker` says how cameras are exposed for the marker, `control` publishes that; [`devices`] lists those of this machine,
 //! [`announced`] those that are announced over MAVLink.
 
 pub mod announced;
 #[cfg(any(feature = "genicam", feature = "rtsp"))]
 mod clock;
 pub mod config;
+mod control;
 pub mod devices;
 mod exposure;
 #[cfg(feature = "genicam")]

@@ -1,8 +1,10 @@
 //! How a camera is exposed for the marker, from where detectors have seen it in earlier frames.
 
 use imaging::GrayView;
-use messages::{ControllerStatus, Detections, topic};
-use metering::{ExposureControl, Handover, Limits, PadTrack, Seen, Setting, levels};
+use messages::{
+    CameraControl, ControllerStatus, Detections, ExposureReason, ExposureSetter, topic,
+};
+use metering::{ExposureControl, Handover, Levels, Limits, PadTrack, Seen, Setting, levels};
 use node::{Node, Subscriber};
 
 use crate::v4l2::exposer::Order;
@@ -25,13 +27,60 @@ struct Sightings {
 /// How a frame was exposed, and how the next ones can be.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Exposed {
-    /// True when the camera does not meter by itself.
-    pub(crate) is_taken_over: bool,
-    /// `None` while it is not known.
+    /// True when the camera certainly meters by itself.
+    pub(crate) is_metering: bool,
+    /// What was set last; `None` while it is not set here.
+    pub(crate) ordered: Option<Setting>,
+    /// With what the frame was taken; `None` while that is not known.
     pub(crate) setting: Option<Setting>,
     pub(crate) limits: Limits,
     /// Whether its luma is from 16 to 235.
     pub(crate) is_limited: bool,
+}
+
+/// What to do after a frame, and why.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Decision {
+    pub(crate) order: Order,
+    why: ExposureReason,
+    /// The marker's levels in the frame, where they were measured.
+    levels: Option<Levels>,
+    /// How fast the marker moves; `None` without one.
+    motion_px_s: Option<f64>,
+    /// Within which it was decided.
+    limits: Limits,
+    /// Of the frame after which it was decided.
+    before: Exposed,
+}
+
+impl Decision {
+    /// What is told of it once it was carried out, which made the exposure `after`, or was refused with this answer.
+    pub(crate) fn told(&self, after: &Exposed, refusal: Option<&str>) -> CameraControl {
+        let wanted = match self.order {
+            Order::Keep | Order::TakeOver => after.ordered,
+            Order::OwnMetering => None,
+            Order::Set(setting) => Some(setting),
+        };
+        let set_by = match after.ordered {
+            // A camera without metering keeps what was set.
+            Some(_) if self.order == Order::OwnMetering => ExposureSetter::Fixed,
+            Some(_) => ExposureSetter::Marker,
+            None if after.is_metering => ExposureSetter::Camera,
+            None => ExposureSetter::Fixed,
+        };
+        let refused = refusal.filter(|_| self.order != Order::Keep).map(str::to_owned);
+        CameraControl {
+            set_by,
+            in_use: self.before.setting.map(Into::into),
+            wanted: wanted.map(Into::into),
+            why: self.why,
+            refused,
+            levels: self.levels.map(Into::into),
+            motion_px_s: self.motion_px_s,
+            limits: Some(self.limits.into()),
+            ..CameraControl::default()
+        }
+    }
 }
 
 impl MarkerExposure {
@@ -57,8 +106,13 @@ impl MarkerExposure {
         Ok(())
     }
 
-    /// What to do after a frame with this stamp.
-    pub(crate) fn after(&mut self, stamp_ns: i64, frame: GrayView<'_>, exposed: &Exposed) -> Order {
+    /// What to do after a frame with this stamp, and why.
+    pub(crate) fn after(
+        &mut self,
+        stamp_ns: i64,
+        frame: GrayView<'_>,
+        exposed: &Exposed,
+    ) -> Decision {
         if let Some(sightings) = &self.sightings {
             while let Some(status) = sightings.status.waiting() {
                 self.track.follow(&status);
@@ -69,22 +123,47 @@ impl MarkerExposure {
         }
         let pad = self.track.at(stamp_ns);
         let is_metered = self.handover.meters_pad(stamp_ns, pad.is_some());
-        let Some(pad) = pad.filter(|_| is_metered) else {
-            self.control = ExposureControl::default();
-            return Order::OwnMetering;
+        let motion_px_s = pad.map(|pad| pad.motion_px_s);
+        let limits = exposed.limits;
+        let decision = |order, why| Decision {
+            order,
+            why,
+            levels: None,
+            motion_px_s,
+            limits,
+            before: *exposed,
         };
-        if !exposed.is_taken_over {
-            return Order::TakeOver;
+        let Some(pad) = pad else {
+            self.control = ExposureControl::default();
+            return decision(Order::OwnMetering, ExposureReason::NoMarker);
+        };
+        if !is_metered {
+            self.control = ExposureControl::default();
+            return decision(Order::OwnMetering, ExposureReason::LostSoon);
+        }
+        if exposed.ordered.is_none() {
+            return decision(Order::TakeOver, ExposureReason::TakenOver);
         }
         let levels = levels(frame, &pad).map(|levels| match exposed.is_limited {
             true => levels.of_limited_range(),
             false => levels,
         });
-        let next = exposed.setting.zip(levels).and_then(|(setting, levels)| {
-            let seen = Seen { setting, levels, motion_px_s: pad.motion_px_s };
-            self.control.next(&seen, &exposed.limits)
-        });
-        next.map_or(Order::Keep, Order::Set)
+        let Some(levels) = levels else {
+            return decision(Order::Keep, ExposureReason::NotInFrame);
+        };
+        let Some(setting) = exposed.setting else {
+            return Decision {
+                levels: Some(levels),
+                ..decision(Order::Keep, ExposureReason::Settling)
+            };
+        };
+        let seen = Seen { setting, levels, motion_px_s: pad.motion_px_s };
+        let step = self.control.next(&seen, &exposed.limits);
+        Decision {
+            levels: Some(levels),
+            limits: step.limits,
+            ..decision(step.next.map_or(Order::Keep, Order::Set), step.why)
+        }
     }
 }
 
@@ -135,6 +214,8 @@ mod tests {
         marker: MarkerExposure,
         /// Of each frame: its number, whether its stamp is exact, and how far that is from the truth.
         frames: Vec<Frame>,
+        /// What is told after each.
+        told: Vec<CameraControl>,
         /// How often a control was refused.
         refused: u32,
         /// How long each frame takes.
@@ -182,7 +263,15 @@ mod tests {
             };
             let video = Video::start(Rc::clone(&fake), wanted).unwrap();
             let marker = MarkerExposure::new("down");
-            Self { fake, video, marker, frames: Vec::new(), refused: 0, needed: Duration::ZERO }
+            Self {
+                fake,
+                video,
+                marker,
+                frames: Vec::new(),
+                told: Vec::new(),
+                refused: 0,
+                needed: Duration::ZERO,
+            }
         }
 
         /// Reads frames for so long; a detector finds the pad where it says.
@@ -199,8 +288,10 @@ mod tests {
                 capture.give_back(taken).unwrap();
                 let exposed = capture.exposed().unwrap();
                 let frame = GrayView::packed(&grey, 640, 480).unwrap();
-                let order = self.marker.after(exposure.mid_ns, frame, &exposed);
-                self.refused += u32::from(capture.expose(order).is_err());
+                let decision = self.marker.after(exposure.mid_ns, frame, &exposed);
+                self.refused += u32::from(capture.expose(decision.order).is_err());
+                let after = capture.exposed().unwrap();
+                self.told.push(decision.told(&after, capture.refusal()));
                 self.marker.track.update(&message(exposure.mid_ns, pad_at(exposure.mid_ns)));
                 let error_ns = exposure.mid_ns - self.fake.mid_exposure_ns(number);
                 let white = f64::from(grey[240 * 640 + 320]) / 255.0;
@@ -354,6 +445,92 @@ mod tests {
         exposing.run(9000 * MS, |_| None);
         assert!(exposing.fake.is_metering());
         assert_eq!(exposing.refused, 5);
+    }
+
+    #[test]
+    fn after_each_frame_it_is_told_who_sets_the_exposure_what_is_wanted_and_why() {
+        let mut exposing = Loop::new(Stamps::ExposureStart);
+        exposing.fake.light(0.2);
+        exposing.run(500 * MS, |_| None);
+        assert_eq!(exposing.told.len(), exposing.frames.len());
+        let told = exposing.told.last().unwrap();
+        assert_eq!((told.set_by, told.why), (ExposureSetter::Camera, ExposureReason::NoMarker));
+        assert_eq!((told.in_use, told.wanted, told.levels), (None, None, None));
+        assert_eq!(told.limits.unwrap().max_exposure_ns, 5_000_000);
+        // A marker is seen, in too little light.
+        exposing.told.clear();
+        exposing.run(1000 * MS, still);
+        let of = |told: &[CameraControl], why| told.iter().find(|told| told.why == why).cloned();
+        let taken = of(&exposing.told, ExposureReason::TakenOver).unwrap();
+        assert!(taken.set_by == ExposureSetter::Marker && taken.wanted.is_some(), "{taken:?}");
+        let settling = of(&exposing.told, ExposureReason::Settling).unwrap();
+        assert!(settling.in_use.is_none() && settling.wanted.is_some(), "{settling:?}");
+        exposing.fake.light(0.05);
+        exposing.run(1000 * MS, still);
+        let dark = of(&exposing.told, ExposureReason::TooDark).unwrap();
+        let light = |setting: messages::ExposureSetting| {
+            f64::from(setting.exposure_ns) * setting.gain.unwrap_or_default()
+        };
+        assert!(light(dark.wanted.unwrap()) > light(dark.in_use.unwrap()), "{dark:?}");
+        let levels = dark.levels.unwrap();
+        assert!(levels.white < 0.6 && levels.black < levels.white, "{dark:?}");
+        let good = exposing.told.last().unwrap();
+        assert_eq!((good.set_by, good.why), (ExposureSetter::Marker, ExposureReason::Good));
+        assert!(good.wanted.is_some() && good.wanted == good.in_use, "{good:?}");
+        assert!((0.6..=0.85).contains(&good.levels.unwrap().white), "{good:?}");
+        // Suddenly in bright light.
+        exposing.told.clear();
+        exposing.fake.light(4.0);
+        exposing.run(1000 * MS, still);
+        let clipped = of(&exposing.told, ExposureReason::Clipped).unwrap();
+        assert!(clipped.levels.unwrap().white > 0.98, "{clipped:?}");
+        assert!(light(clipped.wanted.unwrap()) < light(clipped.in_use.unwrap()), "{clipped:?}");
+        // In so little that the largest exposure and gain are not enough.
+        exposing.fake.light(0.001);
+        exposing.run(1500 * MS, still);
+        let limited = exposing.told.last().unwrap();
+        assert_eq!(limited.why, ExposureReason::AtLimits, "{limited:?}");
+        let (wanted, limits) = (limited.wanted.unwrap(), limited.limits.unwrap());
+        assert_eq!(wanted.exposure_ns, limits.max_exposure_ns);
+        assert_eq!(wanted.gain, Some(limits.max_gain));
+    }
+
+    #[test]
+    fn what_a_device_answers_to_an_order_that_it_refuses_is_told_until_it_takes_one() {
+        let mut exposing = Loop::new(Stamps::FirstPacket);
+        exposing.fake.light(0.2);
+        exposing.run(1500 * MS, still);
+        assert!(exposing.told.iter().all(|told| told.refused.is_none()));
+        exposing.fake.refuse(Some(CID_EXPOSURE_ABSOLUTE));
+        exposing.fake.light(1.0);
+        exposing.told.clear();
+        exposing.run(1500 * MS, still);
+        // Also while it is not tried again.
+        let refused: Vec<_> = exposing.told.iter().filter(|told| told.refused.is_some()).collect();
+        assert!(refused.len() > 100, "{} of {}", refused.len(), exposing.told.len());
+        for told in refused {
+            let answer = told.refused.as_deref().unwrap();
+            assert!(answer.starts_with("VIDIOC_S_EXT_CTRLS: "), "{answer}");
+            assert!(told.wanted != told.in_use && told.set_by == ExposureSetter::Marker);
+            let is_bright = [ExposureReason::Clipped, ExposureReason::TooBright];
+            assert!(is_bright.contains(&told.why), "{told:?}");
+        }
+        exposing.fake.refuse(None);
+        exposing.run(1500 * MS, still);
+        let last = exposing.told.last().unwrap();
+        assert_eq!((last.why, &last.refused), (ExposureReason::Good, &None));
+    }
+
+    #[test]
+    fn a_marker_that_is_lost_soon_is_told_as_the_reason_for_the_cameras_own_metering() {
+        let mut exposing = Loop::new(Stamps::ExposureStart);
+        exposing.fake.light(0.2);
+        exposing.run(500 * MS, still);
+        exposing.run(1000 * MS, |_| None);
+        exposing.run(500 * MS, still);
+        let told = exposing.told.last().unwrap();
+        assert_eq!((told.set_by, told.why), (ExposureSetter::Camera, ExposureReason::LostSoon));
+        assert!(told.motion_px_s.is_some() && told.wanted.is_none(), "{told:?}");
     }
 
     #[test]

@@ -11,7 +11,7 @@ use anyhow::{Context, bail, ensure};
 use geometry::CameraModel;
 use imaging::{GrayImage, GrayView, SampleFormat};
 use media::{DecodedImage, frame_bytes, images_in, samples_to_grey};
-use messages::{BayerPattern, CameraInfo, FrameHeader, PixelFormat, topic};
+use messages::{BayerPattern, CameraControl, CameraInfo, FrameHeader, PixelFormat, topic};
 use node::{
     BoxFuture, FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns,
 };
@@ -20,6 +20,7 @@ use tokio::sync::oneshot;
 use crate::config::{
     Config, DeviceConfig, FrameFormat, FrameSize, GenicamConfig, ProgramConfig, RtspConfig,
 };
+use crate::control::ControlPublisher;
 use crate::exposure::Exposure;
 #[cfg(feature = "genicam")]
 use crate::genicam;
@@ -208,6 +209,7 @@ struct Stream {
     rect: RectPublisher,
     health: Arc<HealthCounters>,
     marker: MarkerExposure,
+    control: ControlPublisher,
     pictures: Pictures,
     /// Samples of a frame before they are binned.
     raw: Vec<u8>,
@@ -234,6 +236,13 @@ enum NoFrame {
     Damaged,
     /// It has another size.
     OtherSize(FrameSize),
+}
+
+/// What was read of a device.
+struct Read {
+    frame: Result<Prepared, NoFrame>,
+    /// What is told of the exposure after it.
+    control: Option<CameraControl>,
 }
 
 /// A frame ready to be published.
@@ -263,6 +272,7 @@ impl Stream {
                 .await?,
             health: node.shared_health(),
             marker,
+            control: ControlPublisher::new(node, config.instance()).await?,
             pictures: Pictures::default(),
             raw: Vec::new(),
             sequence: 0,
@@ -360,12 +370,12 @@ impl Stream {
                 Next::Frame(taken) => {
                     let exposure = taken.exposure;
                     let began = Instant::now();
-                    let frame = self.prepare_taken(&mut video, taken, config);
+                    let read = self.prepare_taken(&mut video, taken, config);
                     self.health.latency("read", began.elapsed());
-                    match frame {
+                    match read.frame {
                         Ok(frame) => {
                             unreadable_since_ns = None;
-                            self.publish_live(frame, exposure).await;
+                            self.publish_exposed(frame, exposure, read.control).await;
                         }
                         Err(why) => {
                             let now_ns = video.now_ns();
@@ -414,7 +424,8 @@ impl Stream {
                     };
                     self.health.latency("read", began.elapsed());
                     if let Some(frame) = frame {
-                        self.publish_live(frame, exposure).await;
+                        let control = feed.configured().map(CameraControl::from);
+                        self.publish_exposed(frame, exposure, control).await;
                     }
                 }
                 genicam::feed::Next::Nothing => {}
@@ -490,9 +501,11 @@ impl Stream {
         video: &mut Video<P>,
         taken: Taken,
         config: &DeviceConfig,
-    ) -> Result<Prepared, NoFrame> {
+    ) -> Read {
         let FrameSize { width, height } = config.size;
-        let capture = video.capture().ok_or(NoFrame::Damaged)?;
+        let Some(capture) = video.capture() else {
+            return Read { frame: Err(NoFrame::Damaged), control: None };
+        };
         let frame = if Pixels::of(&config.wanted.fourcc) == Some(Pixels::Mjpeg) {
             capture.read(&taken, |jpeg| self.prepare_jpeg(jpeg))
         } else {
@@ -511,8 +524,11 @@ impl Stream {
             .as_ref()
             .ok()
             .and_then(|frame| GrayView::packed(&frame.pixels, frame.width, frame.height).ok());
+        let configured = capture.configured().filter(|_| !self.config.exposes_for_marker());
+        let mut control = configured.map(CameraControl::from);
         if let Some((exposed, view)) = capture.exposed().zip(view).filter(|_| lost.is_none()) {
-            match capture.expose(self.marker.after(stamp_ns, view, &exposed)) {
+            let decision = self.marker.after(stamp_ns, view, &exposed);
+            match capture.expose(decision.order) {
                 Ok(()) => {}
                 Err(Lost::Unplugged) => lost = Some(Lost::Unplugged),
                 // A refused control is no reason to be without frames.
@@ -522,6 +538,7 @@ impl Stream {
                     }
                 }
             }
+            control = capture.exposed().map(|after| decision.told(&after, capture.refusal()));
         }
         for (reason, count) in [
             ("frames that were queued", counts.queued),
@@ -541,7 +558,7 @@ impl Stream {
             video.lose(&lost);
             self.health.failed(lost.reason());
         }
-        frame
+        Read { frame, control }
     }
 
     fn prepare_samples(
@@ -659,11 +676,27 @@ impl Stream {
         format != PixelFormat::Mono8 && (self.air.is_wanted() || self.rect.is_wanted())
     }
 
-    /// Publishes the frame of a camera, but no picture a second time: it would not be of the time that its stamp says.
-    async fn publish_live(&mut self, frame: Prepared, exposure: Exposure) {
+    /// Publishes the frame of a camera, and what is told of its exposure.
+    async fn publish_exposed(
+        &mut self,
+        frame: Prepared,
+        exposure: Exposure,
+        control: Option<CameraControl>,
+    ) {
+        let sequence = self.publish_live(frame, exposure).await;
+        if let Some(control) = control {
+            self.control.publish(sequence, exposure.mid_ns, control).await;
+        }
+    }
+
+    /// Publishes the frame of a camera and returns its number, but no picture a second time: it would not be of the time that
+    /// its stamp says.
+    async fn publish_live(&mut self, frame: Prepared, exposure: Exposure) -> Option<u64> {
         let picture = self.pictures.add(&frame.pixels, Instant::now());
         if picture == Picture::New {
-            return self.publish(frame, exposure).await;
+            let sequence = self.sequence;
+            self.publish(frame, exposure).await;
+            return Some(sequence);
         }
         self.health.dropped("frames that repeat the picture before");
         if picture == Picture::Stuck && self.health.failed("camera repeats one picture") {
@@ -673,6 +706,7 @@ impl Stream {
                  Still pictures are published from `source.paths`"
             );
         }
+        None
     }
 
     async fn publish(&mut self, frame: Prepared, exposure: Exposure) {
@@ -746,7 +780,9 @@ fn pixel_format(raw_bits: Option<u32>, bayer: Option<imaging::BayerPattern>) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::v4l2::abi::CID_EXPOSURE_ABSOLUTE;
     use crate::v4l2::fake::{Fake, Happening, MS, Stamps, grey_level};
+    use messages::{Detection, Detections, ExposureReason, ExposureSetter, ExposureSetting};
     use node::{Frame, Identity, Layers, ZenohSource};
     use std::rc::Rc;
 
@@ -796,6 +832,162 @@ mod tests {
         camera.close().await;
         viewer.close().await;
         health
+    }
+
+    /// A played device whose exposure is published, and who listens to that.
+    struct Exposing {
+        fake: Rc<Fake>,
+        device: DeviceConfig,
+        camera: Node,
+        viewer: Node,
+        stream: Stream,
+    }
+
+    impl Exposing {
+        async fn new(control: &str) -> Self {
+            let fake = Fake::of("GREY", Stamps::ExposureStart, 0);
+            fake.light(0.05);
+            let device = ["source.device=/dev/video0", "source.fourcc=GREY"];
+            let mode = ["source.size_px=[640, 480]", "source.rate_hz=100"];
+            let mut set: Vec<_> = device.into_iter().chain(mode).map(str::to_owned).collect();
+            set.push(format!("exposure.control={control}"));
+            let config = Layers { file: None, set }.load::<Config>().unwrap().settings;
+            let found = find(&config).unwrap();
+            let ([port], _, _) = testing::ports::free().unwrap();
+            let (camera, viewer) = (open("camera-pub", port).await, open("detector", port).await);
+            let stream = Stream::new(&camera, &config, &found).await.unwrap();
+            let Source::Device(device) = found.source else { panic!("no device") };
+            Self { fake, device, camera, viewer, stream }
+        }
+
+        /// Publishes the device's frames until `seeing` has seen enough.
+        async fn while_seeing(mut self, seeing: impl Future<Output = ()>) {
+            let seeing = tokio::time::timeout(Duration::from_secs(60), seeing);
+            tokio::select! {
+                result = self.stream.publish_device(Rc::clone(&self.fake), &self.device) => result.unwrap(),
+                seen = seeing => seen.expect("all is seen in time"),
+            }
+            drop(self.stream);
+            self.camera.close().await;
+            self.viewer.close().await;
+        }
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_subscriber_sees_what_the_marker_wants_of_the_exposure_and_why() {
+        let exposing = Exposing::new("marker").await;
+        let (fake, viewer) = (Rc::clone(&exposing.fake), exposing.viewer.clone());
+        let seeing = async {
+            let controls = viewer.subscriber(topic::CAMERA_CONTROL, &["down"]).await.unwrap();
+            let detections = viewer.publisher(topic::DETECTIONS, &["main"]).await.unwrap();
+            let mut last: Option<CameraControl> = None;
+            let light = |setting: Option<ExposureSetting>| {
+                let setting = setting.unwrap();
+                f64::from(setting.exposure_ns) * setting.gain.unwrap()
+            };
+            // What is seen first, and what happens then. The pad is in the middle of each frame, and found while it says so.
+            for (why, is_found, then) in [
+                (ExposureReason::NoMarker, false, None),
+                (ExposureReason::TakenOver, true, None),
+                (ExposureReason::TooDark, true, None),
+                (ExposureReason::Good, true, Some(Then::Light(4.0))),
+                (ExposureReason::Clipped, true, None),
+                (ExposureReason::Good, true, Some(Then::Refuse)),
+                (ExposureReason::TooDark, true, Some(Then::Take)),
+                (ExposureReason::Good, true, None),
+                (ExposureReason::NoMarker, false, None),
+            ] {
+                let control = loop {
+                    let control = controls.next().await.unwrap();
+                    let is_later = last.as_ref().is_none_or(|last| {
+                        control.stamp_ns > last.stamp_ns && control.sequence > last.sequence
+                    });
+                    assert!(is_later, "{control:?} after {last:?}");
+                    last = Some(control.clone());
+                    let header = FrameHeader {
+                        camera: control.camera.clone(),
+                        stamp_ns: control.stamp_ns,
+                        ..FrameHeader::sample()
+                    };
+                    let centre_px = [320.0, 240.0];
+                    let pad = Detection { centre_px, size_px: 80.0, ..Detection::sample() };
+                    let found = if is_found { vec![pad] } else { Vec::new() };
+                    let message = Detections { header, detections: found, ..Detections::sample() };
+                    detections.publish(&message).await;
+                    let is_awaited = then != Some(Then::Take) || control.refused.is_some();
+                    if control.why == why && is_awaited {
+                        break control;
+                    }
+                };
+                assert_eq!((control.camera.as_str(), &*control.clock), ("down", clock_name()));
+                match why {
+                    ExposureReason::NoMarker => {
+                        assert_eq!(control.set_by, ExposureSetter::Camera);
+                        assert_eq!((control.in_use, control.wanted), (None, None));
+                    }
+                    _ => assert_eq!(control.set_by, ExposureSetter::Marker, "{control:?}"),
+                }
+                match why {
+                    ExposureReason::TooDark => {
+                        assert!(control.levels.unwrap().white < 0.63, "{control:?}");
+                        assert!(light(control.wanted) > light(control.in_use), "{control:?}");
+                    }
+                    ExposureReason::Clipped => {
+                        assert!(control.levels.unwrap().white >= 0.98, "{control:?}");
+                        assert!(light(control.wanted) < light(control.in_use), "{control:?}");
+                    }
+                    ExposureReason::Good => assert_eq!(control.wanted, control.in_use),
+                    _ => {}
+                }
+                match then {
+                    Some(Then::Light(light)) => fake.light(light),
+                    Some(Then::Refuse) => {
+                        fake.refuse(Some(CID_EXPOSURE_ABSOLUTE));
+                        fake.light(0.2);
+                    }
+                    Some(Then::Take) => {
+                        let answer = control.refused.unwrap();
+                        assert!(answer.starts_with("VIDIOC_S_EXT_CTRLS: "), "{answer}");
+                        fake.refuse(None);
+                    }
+                    None => {}
+                }
+            }
+        };
+        exposing.while_seeing(seeing).await;
+    }
+
+    /// What happens to a played device once something was seen of it.
+    #[derive(Copy, Clone, Debug, PartialEq)]
+    enum Then {
+        Light(f64),
+        /// It refuses to be set, in less light.
+        Refuse,
+        Take,
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_subscriber_sees_that_the_exposure_is_as_it_is_configured() {
+        let exposing = Exposing::new("camera").await;
+        let (fake, viewer) = (Rc::clone(&exposing.fake), exposing.viewer.clone());
+        let seeing = async {
+            let controls = viewer.subscriber(topic::CAMERA_CONTROL, &["down"]).await.unwrap();
+            let first = controls.next().await.unwrap();
+            assert_eq!(
+                (first.set_by, first.why),
+                (ExposureSetter::Fixed, ExposureReason::Configured)
+            );
+            let fixed = ExposureSetting { exposure_ns: 5_000_000, gain: None };
+            assert_eq!((first.in_use, first.wanted, first.limits), (Some(fixed), None, None));
+            // Once a second.
+            let second = controls.next().await.unwrap();
+            let since_ns = second.stamp_ns - first.stamp_ns;
+            assert!((1000 * MS..1100 * MS).contains(&since_ns), "{since_ns}");
+            // Another program may change that.
+            fake.meter();
+            while controls.next().await.unwrap().set_by != ExposureSetter::Camera {}
+        };
+        exposing.while_seeing(seeing).await;
     }
 
     #[tokio::test(flavor = "multi_thread")]

@@ -3,8 +3,8 @@
 use airlink::Unpacker;
 use autopilot::{Autopilot, Config, Parser};
 use messages::{
-    CameraInfo, CameraResponse, CommandReply, ControllerCommand, ControllerStatus, Detections,
-    DetectorCommand, DetectorInfo, FrameAck, FrameHeader, FramePart, GcsStatus, Health,
+    CameraControl, CameraInfo, CameraResponse, CommandReply, ControllerCommand, ControllerStatus,
+    Detections, DetectorCommand, DetectorInfo, FrameAck, FrameHeader, FramePart, GcsStatus, Health,
     MavlinkBytes, Message, PixelFormat, Refusals, TargetEstimate, Truth, VehicleState, Wind,
     decode, encode,
 };
@@ -17,6 +17,7 @@ pub fn codec(input: &[u8]) {
     again::<FrameHeader>(input);
     again::<FrameAck>(input);
     again::<CameraInfo>(input);
+    again::<CameraControl>(input);
     again::<Detections>(input);
     again::<Refusals>(input);
     again::<DetectorInfo>(input);

@@ -14,6 +14,7 @@ use serde::Serialize;
 
 use crate::clock::{CameraClock, UtcArrivals};
 use crate::config::{FrameSize, GenicamConfig};
+use crate::control::Configured;
 use crate::exposure::{Exposure, Shutter, StampedAt};
 
 /// Number of frames that Aravis may hold.
@@ -65,6 +66,8 @@ pub(super) struct OpenCamera {
     delay_ns: i64,
     /// The exposure time, where the camera does not change it by itself.
     exposure_ns: Option<u32>,
+    /// Whether it says that it changes the exposure time by itself.
+    is_metering: bool,
     size: FrameSize,
     is_gone: Arc<AtomicBool>,
     counts: Counts,
@@ -138,8 +141,8 @@ impl OpenCamera {
         })?;
         // Setting the rate ends what a trigger was set to.
         set_features()?;
-        let is_fixed = camera.exposure_time_auto().map_or(true, |auto| auto == Auto::Off);
-        let exposure_us = camera.exposure_time().ok().filter(|_| is_fixed);
+        let is_metering = camera.exposure_time_auto().is_ok_and(|auto| auto != Auto::Off);
+        let exposure_us = camera.exposure_time().ok().filter(|_| !is_metering);
         let payload = camera.payload().context("asking for the size of frames")? as usize;
         ensure!(
             (config.size.pixels()..=config.size.pixels() + MAX_EXTRA_BYTES).contains(&payload),
@@ -162,10 +165,19 @@ impl OpenCamera {
             shutter: config.shutter,
             delay_ns: config.delay_ns,
             exposure_ns: exposure_us.map(|us| (us * 1e3).clamp(1.0, f64::from(u32::MAX)) as u32),
+            is_metering,
             size: config.size,
             is_gone,
             counts: Counts::default(),
         })
+    }
+
+    /// How the camera is exposed; `None` where it does not tell.
+    pub(super) fn configured(&self) -> Option<Configured> {
+        match self.exposure_ns {
+            Some(exposure_ns) => Some(Configured::Fixed { exposure_ns }),
+            None => self.is_metering.then_some(Configured::Metering),
+        }
     }
 
     /// Whether the camera has stopped to answer.

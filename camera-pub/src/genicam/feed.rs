@@ -6,6 +6,7 @@ use node::now_ns;
 
 use super::camera::{Counts, OpenCamera, Taken, genicam_cameras};
 use crate::config::GenicamConfig;
+use crate::control::Configured;
 
 /// Time between attempts to open the camera.
 const RETRY_NS: i64 = 500_000_000;
@@ -120,6 +121,11 @@ impl Feed {
         }
         self.outage = Some((since_ns, problem.to_owned()));
         Next::Lost(reason)
+    }
+
+    /// How the camera is exposed; `None` while it is lost, and where it does not tell.
+    pub(crate) fn configured(&self) -> Option<Configured> {
+        self.camera.as_ref()?.configured()
     }
 
     fn reopen(&mut self) -> Next {

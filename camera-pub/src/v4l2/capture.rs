@@ -15,6 +15,7 @@ use super::describe::{
 };
 use super::exposer::{Exposer, ForMarker, Order};
 use super::pixels::{Pixels, Rows};
+use crate::control::Configured;
 use crate::exposure::{Exposure, Shutter, StampedAt};
 use crate::marker::Exposed;
 
@@ -159,11 +160,15 @@ pub(crate) struct Capture<D: Device> {
     has_clock: bool,
     cut_in_a_row: u32,
     exposure_ns: u32,
+    /// Whether it said, when that was read, that it meters by itself.
+    says_metering: bool,
     /// When `exposure_ns` was read, so long ago at first that it is read.
     exposure_read_ns: i64,
     exposer: Option<Exposer>,
     /// Until when no control is set after a refusal.
     expose_again_ns: i64,
+    /// What the device answered to the last order, where it refused it.
+    refusal: Option<String>,
     counts: Counts,
 }
 
@@ -228,9 +233,11 @@ impl<D: Device> Capture<D> {
             has_clock: false,
             cut_in_a_row: 0,
             exposure_ns: 0,
+            says_metering: false,
             exposure_read_ns: i64::MIN,
             exposer: exposer.transpose()?,
             expose_again_ns: i64::MIN,
+            refusal: None,
             counts: Counts::default(),
         };
         // From here on `drop` gives back what there is.
@@ -271,7 +278,8 @@ impl<D: Device> Capture<D> {
     pub(crate) fn exposed(&self) -> Option<Exposed> {
         let exposer = self.exposer.as_ref()?;
         Some(Exposed {
-            is_taken_over: exposer.is_taken_over(),
+            is_metering: exposer.is_metering(),
+            ordered: exposer.ordered(),
             setting: exposer.setting(),
             limits: exposer.limits(),
             is_limited: self.rows.is_limited,
@@ -288,6 +296,7 @@ impl<D: Device> Capture<D> {
             return Ok(());
         };
         let set = failed("VIDIOC_S_EXT_CTRLS", exposer.follow(&self.device, order));
+        self.refusal = set.as_ref().err().map(ToString::to_string);
         if set.is_err() {
             self.expose_again_ns = now_ns.saturating_add(EXPOSE_PAUSE_NS);
             // A part of it may have been set.
@@ -297,6 +306,19 @@ impl<D: Device> Capture<D> {
             (self.exposure_ns, self.exposure_read_ns) = (exposure_ns, now_ns);
         }
         Ok(())
+    }
+
+    /// What the device answered when it refused the last order that it was given, until it takes one.
+    pub(crate) fn refusal(&self) -> Option<&str> {
+        self.refusal.as_deref()
+    }
+
+    /// How the device is exposed where the exposure does not follow the marker; `None` as long as it does not tell.
+    pub(crate) fn configured(&self) -> Option<Configured> {
+        match self.exposure_ns {
+            0 => self.says_metering.then_some(Configured::Metering),
+            exposure_ns => Some(Configured::Fixed { exposure_ns }),
+        }
     }
 
     /// What happened since the last call.
@@ -402,7 +424,8 @@ impl<D: Device> Capture<D> {
         let by_arrival = Exposure::estimated(arrival_ns - self.delay_ns);
         let Some((stamp_ns, shutter)) = self.stamp(buffer) else { return Ok(by_arrival) };
         if arrival_ns.saturating_sub(self.exposure_read_ns) > EXPOSURE_READ_NS {
-            (self.exposure_ns, self.exposure_read_ns) = (self.exposure_time_ns(), arrival_ns);
+            self.read_exposure();
+            self.exposure_read_ns = arrival_ns;
         }
         let unsure_ns = self.exposer.as_ref().map_or(0, Exposer::unsure_ns);
         // Half of what is open is the stamp's error.
@@ -450,14 +473,15 @@ impl<D: Device> Capture<D> {
         is_possible.then(|| stamp_ns.saturating_add(shutter.until_read_ns(self.exposure_ns)))
     }
 
-    /// The exposure time; 0 while the camera meters by itself, as it does not say then what it chose for which frame, and
+    /// Reads the exposure time; 0 while the camera meters by itself, as it does not say then what it chose for which frame, and
     /// where it does not say whether it meters.
-    fn exposure_time_ns(&self) -> u32 {
-        let is_manual = control_value(&self.device, CID_EXPOSURE_AUTO)
-            .is_ok_and(|auto| auto.is_none_or(|auto| auto == EXPOSURE_MANUAL));
+    fn read_exposure(&mut self) {
+        let auto = control_value(&self.device, CID_EXPOSURE_AUTO);
+        self.says_metering = matches!(auto, Ok(Some(auto)) if auto != EXPOSURE_MANUAL);
+        let is_manual = auto.is_ok() && !self.says_metering;
         let value = control_value(&self.device, CID_EXPOSURE_ABSOLUTE).ok().flatten();
         let units = value.filter(|_| is_manual).and_then(|value| u32::try_from(value).ok());
-        units.and_then(|units| units.checked_mul(100_000)).unwrap_or(0)
+        self.exposure_ns = units.and_then(|units| units.checked_mul(100_000)).unwrap_or(0);
     }
 
     /// Reads the bytes of a frame where the driver wrote them.

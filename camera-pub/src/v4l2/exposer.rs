@@ -145,9 +145,14 @@ impl Exposer {
         self.setting.filter(|_| !self.is_settling())
     }
 
-    /// True while the camera's exposure is set here.
-    pub(crate) fn is_taken_over(&self) -> bool {
-        self.setting.is_some()
+    /// What was set last; `None` while the camera's exposure is not set here.
+    pub(crate) fn ordered(&self) -> Option<Setting> {
+        self.setting
+    }
+
+    /// True when the camera certainly meters by itself.
+    pub(crate) fn is_metering(&self) -> bool {
+        self.is_metering
     }
 
     /// Within how much the exposure time of the newest frame is known.

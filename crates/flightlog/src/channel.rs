@@ -1,9 +1,9 @@
 //! The records of a recording: messages as they came, and as JSON.
 
 use messages::{
-    CameraInfo, CameraResponse, Configuration, ControllerStatus, DecodeError, Delivery, Detections,
-    DetectorInfo, FrameAck, FrameHeader, GcsStatus, Health, Message, RecorderStatus, Refusals,
-    TOPICS, TargetEstimate, Truth, VehicleState, Wind, decode, topic,
+    CameraControl, CameraInfo, CameraResponse, Configuration, ControllerStatus, DecodeError,
+    Delivery, Detections, DetectorInfo, FrameAck, FrameHeader, GcsStatus, Health, Message,
+    RecorderStatus, Refusals, TOPICS, TargetEstimate, Truth, VehicleState, Wind, decode, topic,
 };
 
 use crate::protobuf::{MessageType, descriptor_set};
@@ -122,6 +122,7 @@ const fn json_topic<M: Message>(key: fn(&[&str]) -> String) -> JsonTopic {
 
 static JSON_TOPICS: [JsonTopic; 15] = [
     json_topic::<CameraInfo>(|names| topic::CAMERA_INFO.key(names)),
+    json_topic::<CameraControl>(|names| topic::CAMERA_CONTROL.key(names)),
     json_topic::<Detections>(|names| topic::DETECTIONS.key(names)),
     json_topic::<FrameAck>(|names| topic::FRAME_ACK.key(names)),
     json_topic::<Refusals>(|names| topic::REFUSALS.key(names)),

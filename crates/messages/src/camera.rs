@@ -1,4 +1,4 @@
-//! What a camera publishes: frame headers and its calibration.
+//! What a camera publishes: frame headers, its calibration, and how it is exposed.
 
 use libm::fmax;
 use serde::{Deserialize, Serialize};
@@ -9,6 +9,7 @@ wire! {
     FrameHeader = 1 v 3;
     CameraInfo = 2 v 1;
     FrameAck = 16 v 1;
+    CameraControl = 23 v 1;
 }
 
 /// Layout of a frame's pixels in its payload, row by row without gaps.
@@ -244,6 +245,117 @@ impl CameraInfo {
             LensModel::KannalaBrandt(k) => k.to_vec(),
         }
     }
+}
+
+/// How a camera is exposed: with what a frame was taken, what is wanted for later ones, and why. It follows each frame after
+/// which the marker's exposure was decided; else it is sent when it changes, and once a second.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct CameraControl {
+    /// The camera's name.
+    pub camera: String,
+    /// Number of the frame that it follows; none where that frame was not published, as it repeats the picture before.
+    pub sequence: Option<u64>,
+    /// Mid-exposure of that frame, in nanoseconds of `clock`.
+    pub stamp_ns: i64,
+    /// Name of the stamp's clock.
+    pub clock: String,
+    /// Who sets exposure and gain from now on.
+    pub set_by: ExposureSetter,
+    /// With what the frame was taken; none while that is not known: a camera that meters by itself does not tell, and while
+    /// a change is under way a frame may be from before it.
+    pub in_use: Option<ExposureSetting>,
+    /// What the marker wants for later frames; none where it does not set them.
+    pub wanted: Option<ExposureSetting>,
+    /// Why that is wanted, or why nothing is.
+    pub why: ExposureReason,
+    /// What the device answered when it refused to be set so; none where it did not. It is asked again after a second.
+    pub refused: Option<String>,
+    /// The marker's levels in the frame; none where they were not measured.
+    pub levels: Option<MarkerLevels>,
+    /// How fast the marker moved lately in the image, in pixels per second; none without a marker.
+    pub motion_px_s: Option<f64>,
+    /// What `wanted` is kept within; none where nothing follows the marker.
+    pub limits: Option<ExposureLimits>,
+}
+
+/// Who sets a camera's exposure and gain.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ExposureSetter {
+    /// Nobody: they stay as the configuration, or the last order for the marker, has set them.
+    #[default]
+    Fixed,
+    /// The camera's own metering.
+    Camera,
+    /// The service, for the marker.
+    Marker,
+}
+
+/// Why an exposure is wanted for the marker, or why none is.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ExposureReason {
+    /// By its configuration the camera's exposure does not follow the marker.
+    #[default]
+    Configured,
+    /// No marker was seen for a while: the camera meters by itself.
+    NoMarker,
+    /// A marker is seen, but was lost soon after the exposure followed it: for a while the camera goes on to meter by itself.
+    LostSoon,
+    /// A marker is seen: exposure and gain are taken over as the camera's own metering has chosen them.
+    TakenOver,
+    /// A change may be under way: frames do not tell yet what came of it.
+    Settling,
+    /// The frame shows too little of the marker, or the marker may be elsewhere by now: nothing changes.
+    NotInFrame,
+    /// Where the marker should be there is no white beside black: nothing changes.
+    NoContrast,
+    /// The marker's white is right, or as near to it as steps reach: nothing changes.
+    Good,
+    /// White is clipped: less light.
+    Clipped,
+    /// White is too bright: less light.
+    TooBright,
+    /// White is too dark: more light.
+    TooDark,
+    /// A longer exposure would blur the marker by more than a pixel: it is made shorter, with more gain, or, at the largest gain,
+    /// white stays too dark.
+    MotionBlur,
+    /// A longer exposure would not blur it: with less gain there is less noise.
+    LessNoise,
+    /// White is too dark or too bright, and the limits of device or configuration are reached.
+    AtLimits,
+}
+
+/// An exposure time and a gain.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ExposureSetting {
+    /// Exposure time in nanoseconds.
+    pub exposure_ns: u32,
+    /// How many times brighter frames are than at the smallest gain: a factor from 1, not decibels. None where the camera's own
+    /// unit is not known as one.
+    pub gain: Option<f64>,
+}
+
+/// Grey levels of a marker in a frame, from 0 to 1 for full scale.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MarkerLevels {
+    /// That of its white, where the light falls on it.
+    pub white: f64,
+    /// That of its black.
+    pub black: f64,
+}
+
+/// What a camera's exposure and gain are kept within.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ExposureLimits {
+    /// Minimum exposure time in nanoseconds, that of the device.
+    pub min_exposure_ns: u32,
+    /// Maximum exposure time in nanoseconds: that of the device, of the configuration, or the one in which the marker's motion blurs it by a
+    /// pixel.
+    pub max_exposure_ns: u32,
+    /// Maximum gain, a factor; the minimum is 1.
+    pub max_gain: f64,
 }
 
 fn differ(ours: &[f64], theirs: &[f64]) -> bool {

@@ -25,7 +25,9 @@ pub mod topic;
 pub mod vehicle;
 
 pub use camera::{
-    BayerPattern, CameraInfo, FrameAck, FrameHeader, FramePart, LensModel, PixelFormat, Transform3,
+    BayerPattern, CameraControl, CameraInfo, ExposureLimits, ExposureReason, ExposureSetter,
+    ExposureSetting, FrameAck, FrameHeader, FramePart, LensModel, MarkerLevels, PixelFormat,
+    Transform3,
 };
 pub use codec::{DecodeError, Message, decode, encode};
 pub use controller::{

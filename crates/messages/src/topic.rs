@@ -4,7 +4,7 @@
 
 use std::marker::PhantomData;
 
-use crate::camera::{CameraInfo, FrameAck, FrameHeader};
+use crate::camera::{CameraControl, CameraInfo, FrameAck, FrameHeader};
 use crate::codec::Message;
 use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, TargetEstimate};
 use crate::detector::{CameraResponse, Detections, DetectorCommand, DetectorInfo, Refusals};
@@ -136,6 +136,9 @@ pub const RECT: Topic<FrameHeader> =
 /// A camera's calibration and mount.
 pub const CAMERA_INFO: Topic<CameraInfo> =
     Topic::new("camera/{camera}/info", Delivery::LastValue, CAMERAS, &["controller", "detector"]);
+/// How a camera is exposed, and why.
+pub const CAMERA_CONTROL: Topic<CameraControl> =
+    Topic::new("camera/{camera}/control", Delivery::Latest, CAMERAS, NO_OTHERS);
 /// Markers found in a frame.
 pub const DETECTIONS: Topic<Detections> = Topic::new(
     "detector/{detector}/detections",
@@ -250,6 +253,7 @@ pub const TOPICS: &[Row] = &[
     JPEG.row,
     RECT.row,
     CAMERA_INFO.row,
+    CAMERA_CONTROL.row,
     DETECTIONS.row,
     FRAME_ACK.row,
     REFUSALS.row,

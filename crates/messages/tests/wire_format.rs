@@ -3,10 +3,11 @@
 use std::borrow::Cow;
 
 use messages::{
-    AlternativePose, BayerPattern, CameraInfo, CameraResponse, Candidate, CommandReply,
-    Configuration, ControllerCommand, ControllerStatus, Count, DecodeError, Detection, Detections,
-    DetectorCommand, DetectorInfo, DetectorState, EllipsePx, FrameAck, FrameHeader, FramePart,
-    GcsSigning, GcsStatus, GroundStation, Health, LandedState, Latency, LensModel, MarkerPose,
+    AlternativePose, BayerPattern, CameraControl, CameraInfo, CameraResponse, Candidate,
+    CommandReply, Configuration, ControllerCommand, ControllerStatus, Count, DecodeError,
+    Detection, Detections, DetectorCommand, DetectorInfo, DetectorState, EllipsePx, ExposureLimits,
+    ExposureReason, ExposureSetter, ExposureSetting, FrameAck, FrameHeader, FramePart, GcsSigning,
+    GcsStatus, GroundStation, Health, LandedState, Latency, LensModel, MarkerLevels, MarkerPose,
     MavlinkBytes, Message, PacketSignature, Phase, PixelFormat, Place, Rate, RecorderLoss,
     RecorderStatus, Refusal, Refusals, RefusedShape, Setpoint, SigningState, StageTime, Tape,
     TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapePad, TapeState, TapeTarget,
@@ -185,6 +186,66 @@ fn frame_ack() {
         bytes: 300,
     };
     check(&message, "41100104646f776eac02010163ac02");
+}
+
+/// A camera that is too dark for its marker and refuses to be set.
+fn camera_control() -> CameraControl {
+    CameraControl {
+        camera: "down".into(),
+        sequence: Some(300),
+        stamp_ns: 1_000_000_000,
+        clock: "monotonic/1a2b3c4d".into(),
+        set_by: ExposureSetter::Marker,
+        in_use: Some(ExposureSetting { exposure_ns: 2_000_000, gain: Some(1.0) }),
+        wanted: Some(ExposureSetting { exposure_ns: 4_000_000, gain: Some(2.0) }),
+        why: ExposureReason::TooDark,
+        refused: Some("x".into()),
+        levels: Some(MarkerLevels { white: 0.25, black: 0.0625 }),
+        motion_px_s: Some(250.0),
+        limits: Some(ExposureLimits {
+            min_exposure_ns: 100_000,
+            max_exposure_ns: 4_000_000,
+            max_gain: 16.0,
+        }),
+    }
+}
+
+#[test]
+fn control_of_a_camera() {
+    check(
+        &camera_control(),
+        "41170104646f776e01ac0280a8d6b907126d6f6e6f746f6e69632f3161326233633464020180897a01000000000000f03f018092f4010100000000000000400a01017801000000000000d03f000000000000b03f010000000000406f4001a08d068092f4010000000000003040",
+    );
+    check(
+        &CameraControl { camera: "down".into(), clock: "c".into(), ..CameraControl::default() },
+        "41170104646f776e000001630000000000000000",
+    );
+    // Numbers on the wire stay those of their reasons and setters.
+    let reasons = [
+        ExposureReason::Configured,
+        ExposureReason::NoMarker,
+        ExposureReason::LostSoon,
+        ExposureReason::TakenOver,
+        ExposureReason::Settling,
+        ExposureReason::NotInFrame,
+        ExposureReason::NoContrast,
+        ExposureReason::Good,
+        ExposureReason::Clipped,
+        ExposureReason::TooBright,
+        ExposureReason::TooDark,
+        ExposureReason::MotionBlur,
+        ExposureReason::LessNoise,
+        ExposureReason::AtLimits,
+    ];
+    let setters = [ExposureSetter::Fixed, ExposureSetter::Camera, ExposureSetter::Marker];
+    for (number, why) in reasons.into_iter().enumerate() {
+        let bytes = encode(&CameraControl { why, ..CameraControl::default() });
+        assert_eq!(usize::from(bytes[10]), number, "{why:?}");
+    }
+    for (number, set_by) in setters.into_iter().enumerate() {
+        let bytes = encode(&CameraControl { set_by, ..CameraControl::default() });
+        assert_eq!(usize::from(bytes[7]), number, "{set_by:?}");
+    }
 }
 
 #[test]
@@ -777,6 +838,7 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
     vec![
         ("FrameHeader", encode(&header)),
         ("CameraInfo", encode(&camera)),
+        ("CameraControl", encode(&camera_control())),
         ("Detections", encode(&detections)),
         ("DetectorInfo", encode(&info)),
         ("CameraResponse", encode(&response)),

@@ -1,4 +1,6 @@
-//! The next exposure time and gain.
+//! The next exposure time and gain, and why.
+
+use messages::ExposureReason;
 
 use crate::region::Levels;
 
@@ -62,6 +64,17 @@ pub struct Seen {
     pub motion_px_s: f64,
 }
 
+/// What follows from a frame.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Step {
+    /// The setting for the next frames; `None` when that of this frame stays.
+    pub next: Option<Setting>,
+    /// Why.
+    pub why: ExposureReason,
+    /// The limits within which it is chosen: those of the camera, and no longer an exposure than the motion allows.
+    pub limits: Limits,
+}
+
 impl Setting {
     /// How much light it makes of the same scene, relative to others.
     fn light(self) -> f64 {
@@ -90,30 +103,51 @@ impl Default for ExposureControl {
 }
 
 impl ExposureControl {
-    /// The setting for the next frames; `None` when that of this frame is good, or the region shows no pad.
-    pub fn next(&mut self, seen: &Seen, limits: &Limits) -> Option<Setting> {
+    /// The setting for the next frames; none when that of this frame is good, or the region shows no pad.
+    pub fn next(&mut self, seen: &Seen, limits: &Limits) -> Step {
         let Levels { white, black } = seen.levels;
+        let sharp = limits.without_blur(seen.motion_px_s);
         let is_flat = white < MIN_CONTRAST * black && white < CLIPPED;
         if black > MAX_FLAT && is_flat {
-            return None;
+            return Step { next: None, why: ExposureReason::NoContrast, limits: sharp };
         }
-        let step = if GOOD.contains(&white) {
+        let is_good = GOOD.contains(&white);
+        let step = if is_good {
             *self = Self::default();
             1.0
         } else {
             self.damped(brightness(seen.levels))
         };
         let light = seen.setting.light() * step.clamp(1.0 / MAX_STEP, MAX_STEP);
-        let next = share(light, seen.motion_px_s, limits);
+        let next = share(light, &sharp);
         let is_sharp = seen.setting.exposure_s <= LONGER * next.exposure_s;
         let is_long = seen.setting.exposure_s >= SHORTER * next.exposure_s;
-        if step == 1.0 && is_sharp && is_long {
-            return None;
-        }
         let is_same = |now: f64, next: f64| (next / now - 1.0).abs() < MIN_CHANGE;
-        let same = is_same(seen.setting.exposure_s, next.exposure_s)
+        let stays = is_same(seen.setting.exposure_s, next.exposure_s)
             && is_same(seen.setting.gain, next.gain);
-        (!same && next.exposure_s.is_finite() && next.gain.is_finite()).then_some(next)
+        let why = match is_good {
+            true if is_sharp && is_long => ExposureReason::Good,
+            true if is_sharp => ExposureReason::LessNoise,
+            true => ExposureReason::MotionBlur,
+            // White is not good then, and stays as it is: there is no more light within the limits, or the step is too small.
+            false if stays && is_same(light, next.light()) => ExposureReason::Good,
+            false
+                if stays
+                    && sharp.max_exposure_s < limits.max_exposure_s
+                    && next.light() < light =>
+            {
+                ExposureReason::MotionBlur
+            }
+            false if stays => ExposureReason::AtLimits,
+            false if white >= CLIPPED => ExposureReason::Clipped,
+            false if white > *GOOD.end() => ExposureReason::TooBright,
+            false => ExposureReason::TooDark,
+        };
+        let is_change = why != ExposureReason::Good
+            && !stays
+            && next.exposure_s.is_finite()
+            && next.gain.is_finite();
+        Step { next: is_change.then_some(next), why, limits: sharp }
     }
 
     /// The step in light from white of this brightness.
@@ -137,11 +171,18 @@ fn brightness(levels: Levels) -> f64 {
     }
 }
 
-/// Shares light between exposure, as long as nothing blurs, and gain.
-fn share(light: f64, motion_px_s: f64, limits: &Limits) -> Setting {
-    let sharp_s = if motion_px_s > 0.0 { MAX_BLUR_PX / motion_px_s } else { f64::INFINITY };
-    let max_s = sharp_s.min(limits.max_exposure_s).max(limits.min_exposure_s);
-    let exposure_s = light.min(max_s).max(limits.min_exposure_s);
+impl Limits {
+    /// The same with no longer an exposure than one in which this motion blurs by [`MAX_BLUR_PX`].
+    fn without_blur(&self, motion_px_s: f64) -> Self {
+        let sharp_s = if motion_px_s > 0.0 { MAX_BLUR_PX / motion_px_s } else { f64::INFINITY };
+        let max_exposure_s = sharp_s.min(self.max_exposure_s).max(self.min_exposure_s);
+        Self { max_exposure_s, ..*self }
+    }
+}
+
+/// Shares light between exposure, as long as the limits allow, and gain.
+fn share(light: f64, limits: &Limits) -> Setting {
+    let exposure_s = light.min(limits.max_exposure_s).max(limits.min_exposure_s);
     let gain = (light / exposure_s).clamp(1.0, limits.max_gain.max(1.0));
     Setting { exposure_s, gain }
 }
@@ -181,7 +222,7 @@ mod tests {
             let mut control = ExposureControl::default();
             for steps in 0..40 {
                 let seen = Seen { setting, levels: self.levels(setting), motion_px_s };
-                match control.next(&seen, &LIMITS) {
+                match control.next(&seen, &LIMITS).next {
                     Some(next) => setting = next,
                     None => return Settled { steps, setting, white: seen.levels.white },
                 }
@@ -236,12 +277,45 @@ mod tests {
         let setting = Setting { exposure_s: 1e-3, gain: 2.0 };
         let seen =
             |white, black| Seen { setting, levels: Levels { white, black }, motion_px_s: 0.0 };
-        let next = |white, black| ExposureControl::default().next(&seen(white, black), &LIMITS);
+        let next =
+            |white, black| ExposureControl::default().next(&seen(white, black), &LIMITS).next;
         assert_eq!(next(0.5, 0.45), None);
         assert!(next(0.5, 0.05).is_some());
         // Far too light, and far too dark.
         assert!(next(1.0, 1.0).is_some_and(|next| next.light() < 3e-4));
         assert!(next(0.0, 0.0).is_some_and(|next| next.light() > 0.1));
+    }
+
+    #[test]
+    fn the_reason_says_what_is_wrong_with_white_or_what_keeps_it_so() {
+        let why = |exposure_s, gain, white, motion_px_s| {
+            let (setting, levels) =
+                (Setting { exposure_s, gain }, Levels { white, black: white / 16.0 });
+            let step =
+                ExposureControl::default().next(&Seen { setting, levels, motion_px_s }, &LIMITS);
+            (step.why, step.next.is_some())
+        };
+        for (is, exposure_s, gain, white, motion_px_s, changes) in [
+            (ExposureReason::Good, 8e-3, 1.0, 0.7, 0.0, false),
+            (ExposureReason::Good, 1e-3, 4.0, 0.7, 1000.0, false),
+            (ExposureReason::Clipped, 1e-3, 1.0, 1.0, 0.0, true),
+            (ExposureReason::TooBright, 1e-3, 1.0, 0.9, 0.0, true),
+            (ExposureReason::TooDark, 1e-3, 1.0, 0.3, 0.0, true),
+            (ExposureReason::MotionBlur, 8e-3, 1.0, 0.7, 1000.0, true),
+            (ExposureReason::LessNoise, 1e-3, 8.0, 0.7, 0.0, true),
+            // No more light within the limits: those of the camera, or, as it moves, of a sharp frame.
+            (ExposureReason::AtLimits, 8e-3, 64.0, 0.1, 0.0, false),
+            (ExposureReason::AtLimits, 20e-6, 1.0, 1.0, 1000.0, false),
+            (ExposureReason::MotionBlur, 1e-3, 64.0, 0.1, 1000.0, false),
+        ] {
+            assert_eq!(why(exposure_s, gain, white, motion_px_s), (is, changes), "{exposure_s}");
+        }
+        let flat = Levels { white: 0.5, black: 0.45 };
+        let setting = Setting { exposure_s: 1e-3, gain: 1.0 };
+        let seen = Seen { setting, levels: flat, motion_px_s: 500.0 };
+        let step = ExposureControl::default().next(&seen, &LIMITS);
+        assert_eq!((step.next, step.why), (None, ExposureReason::NoContrast));
+        assert_eq!(step.limits, Limits { max_exposure_s: 2e-3, ..LIMITS });
     }
 
     proptest! {
@@ -280,7 +354,7 @@ mod tests {
         ) {
             let levels = Levels { white, black };
             let seen = Seen { setting: Setting { exposure_s, gain }, levels, motion_px_s };
-            if let Some(next) = ExposureControl::default().next(&seen, &LIMITS) {
+            if let Some(next) = ExposureControl::default().next(&seen, &LIMITS).next {
                 prop_assert!((20e-6..=8e-3).contains(&next.exposure_s), "{next:?}");
                 prop_assert!((1.0..=64.0).contains(&next.gain), "{next:?}");
             }

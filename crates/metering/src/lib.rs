@@ -6,14 +6,17 @@
 //! and the pixels there; who sets a camera's controls is camera-pub, or the simulated camera.
 //!
 //! Modules in reading order: [`pad`] follows the pad from detections, [`region`] has the grey levels of its white and black,
-//! [`control`] the next exposure time and gain, and [`handover`] says when they count, and when the camera's own metering.
+//! [`control`] the next exposure time and gain, and why, and [`handover`] says when they count, and when the camera's own metering.
+//! [`telling`] says what others are told of it.
 
 pub mod control;
 pub mod handover;
 pub mod pad;
 pub mod region;
+pub mod telling;
 
-pub use control::{ExposureControl, Limits, Seen, Setting};
+pub use control::{ExposureControl, Limits, Seen, Setting, Step};
 pub use handover::Handover;
 pub use pad::{Pad, PadTrack};
 pub use region::{Levels, levels};
+pub use telling::Telling;

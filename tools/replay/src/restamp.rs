@@ -3,8 +3,8 @@
 use airlink::Unpacker;
 use flightlog::{Received, VehicleClock};
 use messages::{
-    ControllerStatus, Detections, FrameAck, FrameHeader, Health, Message, PixelFormat, Refusals,
-    TargetEstimate, Truth, VehicleState, Wind, decode, encode, topic,
+    CameraControl, ControllerStatus, Detections, FrameAck, FrameHeader, Health, Message,
+    PixelFormat, Refusals, TargetEstimate, Truth, VehicleState, Wind, decode, encode, topic,
 };
 
 /// Moves stamps from the time of a recording to that of its publication.
@@ -48,6 +48,11 @@ impl Restamp {
             self.stamped(message, |now, it: &mut Refusals| it.header = now.header(&it.header))
         } else if topic::FRAME_ACK.first_name(key).is_some() {
             self.stamped(message, |now, it: &mut FrameAck| {
+                it.stamp_ns = now.stamp_of(it.stamp_ns, Some(&it.clock));
+                now.clock.clone_into(&mut it.clock);
+            })
+        } else if topic::CAMERA_CONTROL.first_name(key).is_some() {
+            self.stamped(message, |now, it: &mut CameraControl| {
                 it.stamp_ns = now.stamp_of(it.stamp_ns, Some(&it.clock));
                 now.clock.clone_into(&mut it.clock);
             })
@@ -190,6 +195,10 @@ mod tests {
         assert_eq!(moved.header.stamp_ns, 5_000_000_000_000 - 40);
         assert_eq!(moved.header.clock, "here");
         assert_eq!(moved.detections, found.detections);
+        let stamp_ns = RECEIVED_NS - 40;
+        let control = CameraControl { stamp_ns, ..CameraControl::default() };
+        let moved = again(&mut restamp, "camera/down/control", &control);
+        assert_eq!((moved.stamp_ns, moved.clock.as_str()), (5_000_000_000_000 - 40, "here"));
     }
 
     #[test]
@@ -246,6 +255,7 @@ mod tests {
             Detections::NAME,
             Refusals::NAME,
             FrameAck::NAME,
+            CameraControl::NAME,
             Health::NAME,
             VehicleState::NAME,
             TargetEstimate::NAME,

@@ -4,7 +4,7 @@
 use anyhow::Context;
 use geometry::{Body, Camera, Marker, Ned, Pixel, Rotation, Transform, Vector};
 use imaging::GrayView;
-use messages::{ControllerStatus, Detections};
+use messages::{CameraControl, ControllerStatus, Detections};
 use rendering::occluder::Line;
 use rendering::{CameraSettings, Occluder, RenderError, Renderer, Scene};
 use world::camera::{Passage, Shutter};
@@ -52,6 +52,7 @@ pub struct SimCamera {
     occluder: OccluderSettings,
     marker_m: f64,
     exposing: Exposing,
+    control: CameraControl,
     light: LightSettings,
     /// Exposure time times gain times light for which the levels of what lies between camera and pad are stated.
     nominal: f64,
@@ -102,6 +103,7 @@ impl SimCamera {
         Ok(Self {
             true_settings: CameraSettings { body_from_camera, ..settings.clone() },
             exposing: Exposing::new(config, &settings),
+            control: CameraControl::default(),
             light,
             nominal: usual.exposure_s * usual.gain * ground.light,
             scene,
@@ -148,6 +150,11 @@ impl SimCamera {
         self.exposing.follow(status);
     }
 
+    /// What is told of the exposure after the frame that was rendered last, but for its header.
+    pub fn control(&self) -> &CameraControl {
+        &self.control
+    }
+
     /// Renders a frame into `out`. `truth_at` gives the vehicle's state at a time, in seconds of the
     /// simulation.
     ///
@@ -183,7 +190,7 @@ impl SimCamera {
         renderer.render_through(&mut apply, &poses, request.sequence, out)?;
         let model = &self.settings.model;
         let frame = GrayView::packed(out, model.width as usize, model.height as usize)?;
-        self.exposing.taken(request.sequence, request.stamp_ns, frame);
+        self.control = self.exposing.taken(request.sequence, request.stamp_ns, frame);
         Ok(())
     }
 

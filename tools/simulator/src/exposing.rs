@@ -1,10 +1,10 @@
 //! How the simulated camera sets exposure and gain: fixed, by the mean of its frames as a camera's own metering does, or for
-//! the marker as camera-pub does.
+//! the marker as camera-pub does, and what it tells of that.
 
 use std::collections::VecDeque;
 
 use imaging::GrayView;
-use messages::{ControllerStatus, Detections};
+use messages::{CameraControl, ControllerStatus, Detections, ExposureReason, ExposureSetter};
 use metering::{ExposureControl, Handover, Limits, PadTrack, Seen, Setting, levels};
 use rendering::{CameraSettings, Processing};
 
@@ -43,6 +43,15 @@ struct Ordered {
     /// The first frame that is taken with it.
     sequence: u64,
     setting: Setting,
+}
+
+/// What follows from a frame.
+#[derive(Default)]
+struct Decision {
+    /// The setting for later frames; `None` when nothing changes.
+    next: Option<Setting>,
+    /// What is told of it, without the settings.
+    control: CameraControl,
 }
 
 impl Exposing {
@@ -84,29 +93,69 @@ impl Exposing {
         self.track.follow(status);
     }
 
-    /// Orders the setting that follows from a frame.
-    pub(crate) fn taken(&mut self, sequence: u64, stamp_ns: i64, frame: GrayView<'_>) {
-        let next = match self.how {
-            ExposureKind::Fixed => None,
-            ExposureKind::Average => Some(self.by_mean(frame)),
+    /// Orders the setting that follows from a frame, and returns what is told of it.
+    pub(crate) fn taken(
+        &mut self,
+        sequence: u64,
+        stamp_ns: i64,
+        frame: GrayView<'_>,
+    ) -> CameraControl {
+        let decision = match self.how {
+            ExposureKind::Fixed => Decision::default(),
+            ExposureKind::Average => Decision {
+                next: Some(self.by_mean(frame)),
+                control: CameraControl {
+                    set_by: ExposureSetter::Camera,
+                    ..CameraControl::default()
+                },
+            },
             ExposureKind::Marker => self.for_pad(stamp_ns, frame),
         };
+        let Decision { next, control } = decision;
         if let Some(setting) = next {
             self.ordered.push_back(Ordered { sequence: sequence + SETTING_FRAMES, setting });
+        }
+        let last = self.ordered.back().map_or(self.setting, |last| last.setting);
+        let is_wanted = control.set_by == ExposureSetter::Marker;
+        CameraControl {
+            in_use: Some(self.setting.into()),
+            wanted: is_wanted.then(|| last.into()),
+            ..control
         }
     }
 
     /// What the pad makes of it, or without one the camera's own metering.
-    fn for_pad(&mut self, stamp_ns: i64, frame: GrayView<'_>) -> Option<Setting> {
+    fn for_pad(&mut self, stamp_ns: i64, frame: GrayView<'_>) -> Decision {
         let pad = self.track.at(stamp_ns);
         let is_metered = self.handover.meters_pad(stamp_ns, pad.is_some());
+        let told = CameraControl {
+            set_by: ExposureSetter::Marker,
+            why: ExposureReason::NotInFrame,
+            motion_px_s: pad.map(|pad| pad.motion_px_s),
+            limits: Some(self.limits.into()),
+            ..CameraControl::default()
+        };
         let Some(pad) = pad.filter(|_| is_metered) else {
             self.control = ExposureControl::default();
-            return Some(self.by_mean(frame));
+            let why = match pad {
+                Some(_) => ExposureReason::LostSoon,
+                None => ExposureReason::NoMarker,
+            };
+            let control = CameraControl { set_by: ExposureSetter::Camera, why, ..told };
+            return Decision { next: Some(self.by_mean(frame)), control };
         };
-        let (setting, motion_px_s) = (self.setting, pad.motion_px_s);
-        let levels = levels(frame, &pad)?;
-        self.control.next(&Seen { setting, levels, motion_px_s }, &self.limits)
+        let Some(levels) = levels(frame, &pad) else {
+            return Decision { next: None, control: told };
+        };
+        let seen = Seen { setting: self.setting, levels, motion_px_s: pad.motion_px_s };
+        let step = self.control.next(&seen, &self.limits);
+        let control = CameraControl {
+            why: step.why,
+            levels: Some(levels.into()),
+            limits: Some(step.limits.into()),
+            ..told
+        };
+        Decision { next: step.next, control }
     }
 
     /// What the camera's own metering makes of a frame.
@@ -166,5 +215,32 @@ mod tests {
         }
         assert!((0.17..0.19).contains(&level), "{level}");
         assert_eq!(fixed.open(40), first);
+    }
+
+    #[test]
+    fn what_is_told_says_who_sets_the_exposure_what_the_pad_wants_and_why() {
+        let linear = "camera.processing=linear";
+        let mut marker = exposing(&["camera.exposure=marker", "camera.max_gain=16", linear]);
+        let dark = GrayImage::filled(64, 48, 10);
+        marker.open(0);
+        let told = marker.taken(0, 0, dark.view().unwrap());
+        assert_eq!((told.set_by, told.why), (ExposureSetter::Camera, ExposureReason::NoMarker));
+        assert!(told.in_use.is_some() && told.wanted.is_none() && told.limits.is_some());
+        let mut found = Detections::sample();
+        found.header.camera = "down".to_owned();
+        (found.detections[0].centre_px, found.detections[0].size_px) = ([32.0, 24.0], 40.0);
+        marker.detected(&found);
+        let setting = marker.open(1);
+        let told = marker.taken(1, 66_000_000, dark.view().unwrap());
+        assert_eq!((told.set_by, told.why), (ExposureSetter::Marker, ExposureReason::TooDark));
+        assert_eq!(told.in_use, Some(setting.into()));
+        assert!(told.wanted.unwrap().exposure_ns > told.in_use.unwrap().exposure_ns, "{told:?}");
+        assert!(told.levels.unwrap().white < 0.05, "{told:?}");
+        let mut fixed = exposing(&["camera.exposure=fixed"]);
+        let told = fixed.taken(0, 0, dark.view().unwrap());
+        assert_eq!((told.set_by, told.why), (ExposureSetter::Fixed, ExposureReason::Configured));
+        let mut average = exposing(&["camera.exposure=average"]);
+        let told = average.taken(0, 0, dark.view().unwrap());
+        assert_eq!((told.set_by, told.why), (ExposureSetter::Camera, ExposureReason::Configured));
     }
 }

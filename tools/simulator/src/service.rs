@@ -15,9 +15,10 @@ use autopilot::{
     Address, Firmware, Link, LinkEvent, Packet, Parser, Peering, Sender, SigningConfig,
 };
 use messages::{
-    CameraInfo, ControllerStatus, Detections, FrameHeader, MavlinkBytes, PixelFormat, Touchdown,
-    Truth, Wind, topic,
+    CameraControl, CameraInfo, ControllerStatus, Detections, FrameHeader, MavlinkBytes,
+    PixelFormat, Touchdown, Truth, Wind, topic,
 };
+use metering::Telling;
 use node::{
     BoxFuture, FramePublisher, Loan, Node, Publisher, Shutdown, Subscriber, clock_name, now_ns,
 };
@@ -456,6 +457,8 @@ struct Camera {
     air: AirSender,
     infos: Publisher<CameraInfo>,
     info: CameraInfo,
+    controls: Publisher<CameraControl>,
+    telling: Telling,
     period_s: f64,
 }
 
@@ -486,6 +489,8 @@ impl Camera {
             air: AirSender::start(node, name, jpegs, &config.air).await?,
             infos: node.publisher(topic::CAMERA_INFO, &[name]).await?,
             info,
+            controls: node.publisher(topic::CAMERA_CONTROL, &[name]).await?,
+            telling: Telling::default(),
             period_s: 1.0 / config.camera.rate_hz,
             node: node.clone(),
             simulation,
@@ -569,6 +574,7 @@ impl Camera {
             format: PixelFormat::Mono8,
             parts: Vec::new(),
         };
+        self.tell_control(&header).await;
         let again = passage.again_after_s.map(|after_s| (time_s + after_s, frame.to_vec()));
         if passage.arrives_after_s > 0.0 {
             self.delay(time_s + passage.arrives_after_s, header.clone(), frame);
@@ -579,6 +585,20 @@ impl Camera {
             self.delay(due_s, header, Loan::Private(copy));
         }
         self.publish_delayed().await;
+    }
+
+    /// Publishes how the camera is exposed after the frame with this header.
+    async fn tell_control(&mut self, header: &FrameHeader) {
+        let control = CameraControl {
+            camera: header.camera.clone(),
+            sequence: Some(header.sequence),
+            stamp_ns: header.stamp_ns,
+            clock: header.clock.clone(),
+            ..self.sensor.control().clone()
+        };
+        if self.telling.is_due(&control) {
+            self.controls.publish(&control).await;
+        }
     }
 
     /// Publishes a frame, and offers it to the air link.
