@@ -32,6 +32,7 @@ async fn others_read_a_landing() -> anyhow::Result<()> {
         "camera/down/frame",
         "camera/down/picture",
         "camera/down/calibration",
+        "camera/down/control",
         "detector/main/detections",
         "detector/main/overlay",
         "detector/main/poses",

@@ -12,6 +12,7 @@ use testing::with_second_try;
 use super::camera::{OpenCamera, Taken};
 use super::feed::{Feed, Next};
 use crate::config::{FrameSize, GenicamConfig};
+use crate::control::Configured;
 use crate::exposure::{Shutter, StampedAt};
 
 const ADDRESS: &str = "127.0.0.1";
@@ -149,6 +150,18 @@ fn every_frame_is_whole() -> anyhow::Result<()> {
     // A busy machine sends the quickest of its frames late as well.
     ensure!(median_ns.abs() < 10_000_000, "{median_ns} ns");
     Ok(())
+}
+
+#[test]
+fn whether_a_camera_meters_by_itself_or_for_how_long_it_is_exposed_is_told() {
+    let _alone = alone();
+    let _fake = fake();
+    let feed = Feed::start(&config()).unwrap();
+    assert_eq!(feed.configured(), Some(Configured::Fixed { exposure_ns: 10_000_000 }));
+    drop(feed);
+    let features = vec!["ExposureAuto=Continuous".to_owned()];
+    let feed = Feed::start(&GenicamConfig { features, ..config() }).unwrap();
+    assert_eq!(feed.configured(), Some(Configured::Metering));
 }
 
 #[test]
