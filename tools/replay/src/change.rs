@@ -47,7 +47,7 @@ pub struct Change {
 /// Replays a tape, under its configuration with some settings `key=value` over it, and sums up what is different.
 ///
 /// # Errors
-/// When the configuration cannot be used.
+/// As [`crate::run()`].
 pub fn change(tape: &RecordedTape, set: &[String]) -> anyhow::Result<Change> {
     change_with(tape, set, |_event| None)
 }
@@ -55,7 +55,7 @@ pub fn change(tape: &RecordedTape, set: &[String]) -> anyhow::Result<Change> {
 /// As [`change()`], with another event in the place of those for which `instead` has one.
 ///
 /// # Errors
-/// When the configuration cannot be used.
+/// As [`crate::run()`].
 pub fn change_with(
     tape: &RecordedTape,
     set: &[String],

@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
+use std::fmt;
 
 use airlink::Unpacker;
 use anyhow::{Context, bail, ensure};
@@ -13,9 +14,9 @@ use messages::{
     CameraInfo, Configuration, Detection, Detections, FrameHeader, PixelFormat, TapeEvent, Truth,
     decode, topic,
 };
-use node::from_toml;
 
 use crate::change::{Change, change_with};
+use crate::run::configured;
 use crate::truth::{Truths, is_in_picture};
 
 /// What is searched again, and how.
@@ -28,6 +29,18 @@ pub struct Again {
     /// Settings `key=value` of the controller over the recorded configuration.
     pub of_controller: Vec<String>,
 }
+
+/// A detector that cannot be meant: the recording has none of the name, or several of which none is named.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WrongDetector(String);
+
+impl fmt::Display for WrongDetector {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for WrongDetector {}
 
 /// What was found of the marker that the controller wants, in the frames that were searched then and now.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -116,25 +129,25 @@ impl Facts {
     fn detector(&self, again: &Again) -> anyhow::Result<detector::Config> {
         let names = || self.detectors.keys().cloned().collect::<Vec<_>>().join(", ");
         let toml = match &again.detector {
-            Some(name) => self.detectors.get(name).with_context(|| {
-                format!(
+            Some(name) => self.detectors.get(name).ok_or_else(|| {
+                WrongDetector(format!(
                     "the recording has no configuration of a detector `{name}`; it has: {}",
                     names()
-                )
+                ))
             })?,
             None => {
-                ensure!(
-                    self.detectors.len() < 2,
-                    "the recording has several detectors, name one with `--detector`: {}",
-                    names()
-                );
+                let several = || {
+                    WrongDetector(format!(
+                        "the recording has several detectors, name one with `--detector`: {}",
+                        names()
+                    ))
+                };
+                ensure!(self.detectors.len() < 2, several());
                 let only = self.detectors.values().next();
                 only.context("the recording has no configuration of a detector")?
             }
         };
-        let config =
-            from_toml("the recorded configuration of the detector", toml, &again.of_detector)?;
-        Ok(config.settings)
+        configured("the recorded configuration of the detector", toml, &again.of_detector)
     }
 
     /// The marker that the controller wants.
@@ -142,12 +155,8 @@ impl Facts {
         let of_tape = tapes.first().and_then(configuration);
         let toml = of_tape.or_else(|| self.controllers.last().cloned());
         let toml = toml.context("the recording has no configuration of a controller")?;
-        let config = from_toml::<controller::Config>(
-            "the recorded configuration of the controller",
-            &toml,
-            set,
-        )?;
-        Ok(config.settings.marker)
+        let name = "the recorded configuration of the controller";
+        Ok(configured::<controller::Config>(name, &toml, set)?.marker)
     }
 }
 
@@ -163,7 +172,8 @@ fn configuration(tape: &RecordedTape) -> Option<String> {
 /// after the other. The tapes, of the same recording, are replayed with what is found.
 ///
 /// # Errors
-/// When the recording lacks what it takes, a setting is refused, or a file is no recording.
+/// When the recording lacks what it takes, a setting is refused (a [`node::ConfigError`]), the detector cannot be meant (a
+/// [`WrongDetector`]), or a file is no recording.
 pub fn search(
     files: &[Vec<u8>],
     tapes: &[RecordedTape],

@@ -19,7 +19,7 @@ pub mod verify;
 
 pub use brightness::{Brightness, Meter};
 pub use change::{Begun, Change, change};
-pub use frames::{Again, Searched, search};
+pub use frames::{Again, Searched, WrongDetector, search};
 pub use restamp::Restamp;
 pub use run::{End, Replayed, Stop, run};
 pub use verify::{Verdict, verify};

@@ -4,12 +4,12 @@ use std::fmt;
 use std::ops::ControlFlow;
 use std::sync::Arc;
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use controller::flight::Flight;
 use controller::tape::TapedFlight;
 use flightlog::RecordedTape;
 use messages::{TapeEvent, TapeRecord};
-use node::from_toml;
+use node::{Settings, from_toml};
 
 /// An event that was replayed.
 #[derive(Copy, Clone)]
@@ -114,7 +114,7 @@ impl fmt::Display for Stop {
 /// beginning, and may end it.
 ///
 /// # Errors
-/// When the configuration cannot be used.
+/// When the configuration cannot be used: a [`node::ConfigError`] where that is for a setting of `set`.
 pub fn run(
     tape: &RecordedTape,
     set: &[String],
@@ -126,7 +126,7 @@ pub fn run(
 /// As [`run`], with another event in the place of those for which `instead` has one.
 ///
 /// # Errors
-/// When the configuration cannot be used.
+/// As [`run`].
 pub fn run_with(
     tape: &RecordedTape,
     set: &[String],
@@ -167,9 +167,10 @@ pub fn run_with(
                     end.stop = damaged(Some(record.event.name()));
                     return Ok(end);
                 };
-                let read = |set| from_toml("the recorded configuration", configuration, set);
-                read(&[]).with_context(|| recorded_by(program))?;
-                let config = read(set)?;
+                let name = "the recorded configuration";
+                check_recorded::<controller::Config>(name, configuration)
+                    .with_context(|| recorded_by(program))?;
+                let config = from_toml(name, configuration, set)?;
                 let mut new = TapedFlight::new(record.now_ns, config.settings, Arc::default())?;
                 drop(new.take_tape());
                 flight = Some(new);
@@ -207,6 +208,25 @@ pub fn run_with(
     Ok(end)
 }
 
+/// A recorded configuration with settings of now over it, which may mend it: it may name files of another machine.
+///
+/// # Errors
+/// When it cannot be read: a [`node::ConfigError`] where that is for a setting of now alone.
+pub(crate) fn configured<T: Settings>(name: &str, toml: &str, set: &[String]) -> anyhow::Result<T> {
+    from_toml(name, toml, set).map(|config| config.settings).or_else(|problem| {
+        check_recorded::<T>(name, toml)?;
+        Err(problem.into())
+    })
+}
+
+/// Whether a recorded configuration can be read as it is.
+///
+/// # Errors
+/// When it cannot, in words only: whoever replays it has not configured it wrongly.
+fn check_recorded<T: Settings>(name: &str, toml: &str) -> anyhow::Result<()> {
+    from_toml::<T>(name, toml, &[]).map(drop).map_err(|problem| anyhow!("{problem}"))
+}
+
 /// What a recorded configuration is that cannot be read, which settings have no part in.
 fn recorded_by(program: &str) -> String {
     let ours = controller::tape::program();
@@ -226,5 +246,28 @@ mod tests {
         assert_eq!(recorded_by(&ours).matches(&ours).count(), 1);
         let other = recorded_by("alight 9.9.9");
         assert!(other.contains("alight 9.9.9") && other.contains(&ours), "{other}");
+    }
+
+    /// The tape of a controller that begins with this configuration.
+    fn tape(configuration: &str) -> RecordedTape {
+        let mut tape = messages::TapeWriter::new(0);
+        let configuration = configuration.into();
+        let begin =
+            TapeEvent::Begin { program: "test".into(), build: "test".into(), configuration };
+        tape.write(0, &begin, &messages::TapeOutput::default());
+        RecordedTape { begun_ns: 0, parts: vec![tape.take().unwrap()] }
+    }
+
+    #[test]
+    fn only_a_setting_of_now_is_a_wrong_configuration() {
+        let problem = |configuration: &str, set: &[&str]| {
+            let set: Vec<String> = set.iter().map(|&it| it.to_owned()).collect();
+            run(&tape(configuration), &set, |_| ControlFlow::Continue(())).unwrap_err()
+        };
+        let recorded = problem("no_such_key = 3", &[]);
+        assert!(!recorded.is::<node::ConfigError>(), "{recorded:#}");
+        assert!(format!("{recorded:#}").contains("no_such_key"), "{recorded:#}");
+        let given = problem("", &["no_such_key=3"]);
+        assert!(given.is::<node::ConfigError>(), "{given:#}");
     }
 }

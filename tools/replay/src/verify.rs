@@ -27,7 +27,7 @@ impl Verdict {
 /// Replays a tape, under its configuration with some settings `key=value` over it, up to the first difference.
 ///
 /// # Errors
-/// When the configuration cannot be used.
+/// As [`run`].
 pub fn verify(tape: &RecordedTape, set: &[String]) -> anyhow::Result<Verdict> {
     let mut comparison = Comparison::default();
     let mut other_state = None;

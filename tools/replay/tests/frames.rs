@@ -256,3 +256,29 @@ fn what_a_recording_lacks_is_named() {
     let wrong = refusal(recording(pixels), &wrong);
     assert!(wrong.contains("at least one marker"), "{wrong}");
 }
+
+#[test]
+fn only_what_was_asked_for_now_can_be_wrong_to_ask() {
+    let refusal = |of: &Again| again(recording(pixels), of).unwrap_err();
+    let named = Again { detector: Some("other".to_owned()), ..Again::default() };
+    assert!(refusal(&named).is::<replay::WrongDetector>());
+    let wrong = Again { of_controller: vec!["no_such_key=3".to_owned()], ..Again::default() };
+    assert!(refusal(&wrong).is::<node::ConfigError>());
+    let of_detector = vec!["no_such_key=3".to_owned()];
+    assert!(refusal(&Again { of_detector, ..Again::default() }).is::<node::ConfigError>());
+    // The recorded configuration of a detector of another version.
+    let mut file = Vec::new();
+    let mut writer = Writer::new(&mut file, &About::default()).unwrap();
+    let configuration = Configuration {
+        service: "detector".to_owned(),
+        instance: "other".to_owned(),
+        host: "here".to_owned(),
+        version: "0".to_owned(),
+        toml: "key_of_another_version = 3".to_owned(),
+    };
+    put(&mut writer, topic::CONFIGURATION, "detector", 0, &configuration);
+    writer.finish().unwrap();
+    let problem = search(&[recording(pixels), file], &[], &named).unwrap_err();
+    assert!(format!("{problem:#}").contains("key_of_another_version"), "{problem:#}");
+    assert!(!problem.is::<node::ConfigError>(), "{problem:#}");
+}
