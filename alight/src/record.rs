@@ -18,8 +18,13 @@ use crate::terminal::print;
 /// How far a recorder stands back when the processor is short.
 const NICENESS: i32 = 5;
 
+/// What the exit status says of a recorder.
+const EXIT_STATUS: &str = "Exit status of a recorder: 1 also when messages that came are in no file, or a file lacks its end, although it goes on \
+                           recording then; frames that never came to it are counted and are no loss of its.";
+
 /// The arguments of a recorder.
 #[derive(Args, Clone)]
+#[command(after_help = EXIT_STATUS)]
 pub(crate) struct RecordArgs {
     /// The recording, an MCAP file: short for `--set file=FILE`. With `--repair`: the repaired copy [default:
     /// NAME-repaired.mcap beside it].

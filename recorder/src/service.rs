@@ -7,7 +7,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::{Context, bail, ensure};
 use flightlog::About;
-use messages::{Delivery, FrameHeader, RecorderLoss, RecorderStatus, Row, TOPICS, topic};
+use messages::{
+    Delivery, FrameHeader, RecorderLoss, RecorderStatus, Row, TOPICS, has_never_come, topic,
+};
 use node::{BoxFuture, HealthCounters, Node, Shutdown, Tap, Tapped, now_ns};
 
 use crate::config::{Config, Frames};
@@ -27,7 +29,9 @@ const RETRY_PAUSE: Duration = Duration::from_secs(2);
 const STALLED: Duration = Duration::from_secs(1);
 /// Time for the last messages of others that end at the same time, as a controller does that puts parameters back.
 const LAST_MESSAGES: Duration = Duration::from_millis(600);
-/// Time that the disk gets for the rest at the end; `alight land` kills after 2 s.
+/// Time in which those are written that came before that and still wait.
+const CATCH_UP: Duration = Duration::from_millis(200);
+/// Time from the last messages on in which the disk is to have the rest; `alight land` kills after 4 s.
 const END_PATIENCE: Duration = Duration::from_millis(1100);
 /// A change of the clock of UTC that is noted in the file, in nanoseconds; corrections of NTP are smaller.
 const TIME_SET_NS: i64 = 100_000_000;
@@ -41,8 +45,8 @@ const OTHER_KEYS: &str = "other keys";
 /// Records until shutdown. A disk that fails ends nothing: it is told, what is lost is counted, and another file is tried.
 ///
 /// # Errors
-/// When another recorder has this name, the address for viewers is taken and there is no file, the network session cannot be used, or the last
-/// file could not be ended.
+/// When another recorder has this name, the address for viewers is taken and there is no file, the network session cannot be used, a
+/// file could not be ended, or messages that came are in no file.
 pub fn run(
     node: Node,
     config: Config,
@@ -175,6 +179,26 @@ struct Recorder {
     states: BTreeMap<String, Tapped>,
 }
 
+/// The end of the time in which messages are still taken.
+#[derive(Clone, Copy)]
+struct Last {
+    at: Instant,
+    /// The same by the clock of the messages, in nanoseconds.
+    at_ns: i64,
+}
+
+impl Last {
+    fn from_now() -> Self {
+        let after_ns = i64::try_from(LAST_MESSAGES.as_nanos()).unwrap_or(i64::MAX);
+        Self { at: Instant::now() + LAST_MESSAGES, at_ns: now_ns().saturating_add(after_ns) }
+    }
+
+    /// Whether a message came in that time: others that go on publish for ever.
+    fn has(self, message: &Tapped) -> bool {
+        message.received_ns <= self.at_ns
+    }
+}
+
 impl Recorder {
     fn run(mut self, tap: &Tap, is_over: &AtomicBool) -> anyhow::Result<()> {
         // Before the first message, which would be lost without a file.
@@ -184,9 +208,10 @@ impl Recorder {
         loop {
             let is_last = is_over.load(Ordering::Relaxed);
             if is_last {
-                last.get_or_insert_with(|| Instant::now() + LAST_MESSAGES);
+                last.get_or_insert_with(Last::from_now);
             }
             let message = tap.next(MAX_WAIT);
+            let message = message.filter(|it| last.is_none_or(|last| last.has(it)));
             let is_empty = message.is_none();
             if let Some(message) = message {
                 self.take(message);
@@ -196,13 +221,17 @@ impl Recorder {
                 self.count_dropped(tap);
                 self.look_after_file();
             }
-            if last.is_some_and(|last| Instant::now() >= last) {
+            // Those that still wait and came in time are behind it in the queue.
+            let patience = if is_empty { Duration::ZERO } else { CATCH_UP };
+            if let Some(last) = last.filter(|last| Instant::now() >= last.at + patience) {
                 while let Some(message) = tap.next(Duration::ZERO) {
-                    self.take_number(&message);
-                    self.lose(message.key, 1);
+                    if last.has(&message) {
+                        self.take_number(&message);
+                        self.lose(message.key, 1);
+                    }
                 }
                 self.count_dropped(tap);
-                return self.end();
+                return self.end(last.at + END_PATIENCE);
             }
         }
     }
@@ -403,9 +432,8 @@ impl Recorder {
         status.waiting_bytes = 0;
     }
 
-    /// Ends the file, and waits for the disk a moment.
-    fn end(self) -> anyhow::Result<()> {
-        let until = Instant::now() + END_PATIENCE;
+    /// Ends the file, and waits for the disk until then.
+    fn end(self, until: Instant) -> anyhow::Result<()> {
         let last = match self.recording {
             Some(mut recording) => {
                 recording.writer.dropped(now_ns(), &self.lost)?;
@@ -422,11 +450,24 @@ impl Recorder {
             }
             ensure!(
                 disk.has_ended,
-                "the disk did not take the end of {name:?} within {END_PATIENCE:?}; `alight record --repair` ends it"
+                "the disk did not take the end of {name:?} in time; `alight record --repair` ends it"
             );
             tracing::info!(file = %name.display(), bytes = disk.bytes, messages = self.kept, "Recorded");
         }
         ensure!(!is_missing, "nothing could be recorded at the end; see the log above");
+        if let Some(problem) = self.end_problem {
+            bail!("{problem}");
+        }
+        // Without a file only viewers missed them, who were told.
+        let is_lost = |(key, _): &(&String, &u64)| self.config.has_file() && !has_never_come(key);
+        let lost: Vec<_> = self.lost.iter().filter(is_lost).collect();
+        let keys: Vec<_> = lost.iter().map(|(key, count)| format!("{count} of {key}")).collect();
+        let count: u64 = lost.iter().map(|(_, count)| **count).sum();
+        ensure!(
+            count == 0,
+            "{count} messages came and are in no file, as the recording counts them: {}",
+            keys.join(", ")
+        );
         Ok(())
     }
 }
@@ -440,4 +481,65 @@ fn keep(recording: &mut Recording, message: &Tapped, frame: Option<&Frame>) -> a
         None => recording.writer.receive(received(message))?,
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use node::Layers;
+
+    use super::*;
+
+    /// A recorder with a file, and whether it has done all when it ends.
+    fn ends(change: impl FnOnce(&mut Recorder)) -> Result<(), String> {
+        let folder = tempfile::tempdir().unwrap();
+        let set = vec![format!("file={:?}", folder.path().join("flight.mcap"))];
+        let config = Layers { file: None, set }.load::<Config>().unwrap().settings;
+        let about = About::default();
+        let mut recorder = Recorder {
+            pictures: Pictures::new(&config, Frames::None),
+            live: None,
+            max_waiting_bytes: 1000,
+            health: Arc::default(),
+            status: Arc::default(),
+            utc_offset_ns: 0,
+            recording: Some(Recording::begin(config.file.clone(), &about).unwrap()),
+            ending: None,
+            end_problem: None,
+            retry: None,
+            kept: 0,
+            unseen: Unseen::default(),
+            lost: BTreeMap::new(),
+            lost_in_file: None,
+            states: BTreeMap::new(),
+            about,
+            config,
+        };
+        change(&mut recorder);
+        let ended = recorder.end(Instant::now() + Duration::from_secs(20));
+        ended.map_err(|problem| format!("{problem:#}"))
+    }
+
+    #[test]
+    fn a_recorder_that_lost_messages_or_the_end_of_a_file_says_so_at_its_end() {
+        ends(|_| {}).unwrap();
+        ends(|it| it.lose("camera/down/frame (never came)".to_owned(), 7)).unwrap();
+        let told = ends(|it| it.lose("wind".to_owned(), 3)).unwrap_err();
+        assert!(told.contains("3 messages") && told.contains("3 of wind"), "{told}");
+        let told = ends(|it| it.end_problem = Some("the end is missing".to_owned())).unwrap_err();
+        assert!(told.contains("the end is missing"), "{told}");
+        // Who only serves viewers has told them.
+        ends(|it| {
+            it.lose("wind".to_owned(), 3);
+            it.config.file = std::path::PathBuf::new();
+        })
+        .unwrap();
+    }
+
+    #[test]
+    fn what_comes_after_the_last_moment_is_of_no_recording() {
+        let last = Last::from_now();
+        let message = |received_ns| Tapped { received_ns, ..Tapped::default() };
+        assert!(last.has(&message(now_ns())) && last.has(&message(last.at_ns)));
+        assert!(!last.has(&message(last.at_ns + 1)));
+    }
 }
