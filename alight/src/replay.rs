@@ -13,7 +13,7 @@ use messages::Phase;
 use node::stats::quantile;
 use replay::{Again, Begun, Change, End, Searched, change, search, verify};
 
-use crate::args::NetworkArgs;
+use crate::args::{NetworkArgs, WrongUse};
 use crate::terminal::{aligned, print, write_error};
 
 #[derive(Args)]
@@ -25,10 +25,11 @@ pub(crate) struct ReplayArgs {
     /// result is named, with the value. Exit status 0 when there is none, 1 otherwise.
     #[arg(long)]
     verify: bool,
-    /// From where it is flown again, to see what `--set` changes: from detections on, with estimator and guidance, or from
-    /// frames on, which are searched again. The vehicle moves as it was recorded. Without it the phases are listed.
-    #[arg(long, value_enum, conflicts_with = "verify")]
-    from: Option<From>,
+    /// From where it is flown again: from the controller's events, whose phases are listed, or, to see what `--set` changes, from
+    /// detections on, with estimator and guidance, or from frames on, which are searched again. The vehicle moves as it was
+    /// recorded. `--verify` is from events.
+    #[arg(long, value_enum, default_value_t)]
+    from: From,
     /// One setting of the controller over the recorded configuration; with `--from frames` also
     /// detector.KEY=VALUE, one of the detector. May be repeated.
     #[arg(long, value_name = "KEY=VALUE")]
@@ -38,7 +39,8 @@ pub(crate) struct ReplayArgs {
     #[arg(long, value_name = "NAME")]
     detector: Option<String>,
     /// Publish what was recorded on the network, at the pace at which it was recorded and with stamps of now: to a dashboard, a
-    /// gcs-bridge with its ground station, a viewer, or a detector to try. Nothing is sent to an autopilot.
+    /// gcs-bridge with its ground station, a viewer, or a detector to try. Nothing is sent to an autopilot. Exit status 1 when
+    /// a part of the recording is damaged or a picture cannot be read, which is left out.
     #[arg(long, conflicts_with_all = ["verify", "from", "set", "detector"])]
     live: bool,
     /// With `--live`, a service whose messages are left out, as one that runs takes its place. May be repeated.
@@ -48,26 +50,40 @@ pub(crate) struct ReplayArgs {
     network: NetworkArgs,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 enum From {
+    /// All that the controller handled.
+    #[default]
+    Events,
     /// Detections.
     Detections,
     /// Frames, as far as their pictures were recorded.
     Frames,
 }
 
-/// Replays, and prints what came out.
+impl ReplayArgs {
+    /// Whether its options go together.
+    fn check(&self) -> Result<(), WrongUse> {
+        let rule = if self.detector.is_some() && self.from != From::Frames {
+            "`--detector` is for `--from frames`"
+        } else if self.verify && self.from != From::Events {
+            "`--verify` compares what comes out of the recorded events: without `--from`, or with `--from events`"
+        } else {
+            return Ok(());
+        };
+        Err(WrongUse(rule.to_owned()))
+    }
+}
+
+/// Replays, and prints what came out: a failure where something of the recording could not be, or is not the same.
 pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
-    ensure!(
-        args.detector.is_none() || args.from == Some(From::Frames),
-        "`--detector` is for `--from frames`"
-    );
+    args.check()?;
     let mut reader = TapeReader::default();
     let mut recordings = Vec::new();
     for file in &args.files {
         let recording = std::fs::read(file).with_context(|| format!("reading {file:?}"))?;
         reader.read(&recording).with_context(|| format!("{file:?} is no recording (MCAP file)"))?;
-        if args.live || args.from == Some(From::Frames) {
+        if args.live || args.from == From::Frames {
             recordings.push(recording);
         }
     }
@@ -78,8 +94,8 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     damage.iter().for_each(|damage| write_error(damage));
     let mut is_whole = damage.is_empty();
     let tapes = reader.tapes();
-    if args.from == Some(From::Frames) {
-        from_frames(&recordings, &tapes, args)?;
+    if args.from == From::Frames {
+        is_whole &= from_frames(&recordings, &tapes, args)?;
         return Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE });
     }
     ensure!(
@@ -99,12 +115,12 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// Searches the frames again, and prints what is different.
+/// Searches the frames again, and prints what is different; true when all pictures could be read and all tapes replayed.
 fn from_frames(
     recordings: &[Vec<u8>],
     tapes: &[RecordedTape],
     args: &ReplayArgs,
-) -> anyhow::Result<()> {
+) -> anyhow::Result<bool> {
     let mut again = Again { detector: args.detector.clone(), ..Again::default() };
     for setting in &args.set {
         match setting.strip_prefix("detector.") {
@@ -120,7 +136,12 @@ fn from_frames(
             print(&stop.to_string())?;
         }
     }
-    Ok(())
+    Ok(is_whole(&searched))
+}
+
+/// Whether every picture of a frame that was searched then could be read, and every tape be replayed to its end.
+fn is_whole(searched: &Searched) -> bool {
+    searched.unreadable == 0 && searched.changes.iter().all(|change| change.end.stop.is_none())
 }
 
 /// The difference between two searches of the same frames, for people.
@@ -188,7 +209,7 @@ fn one(tape: &RecordedTape, args: &ReplayArgs) -> anyhow::Result<bool> {
         for begun in &change.phases {
             print(&format!("{:9.3} s  {:<16}  {}", begun.time_s, begun.phase, begun.why))?;
         }
-        if args.from.is_some() || !args.set.is_empty() {
+        if args.from != From::Events || !args.set.is_empty() {
             print(&told(&change))?;
             if change.other_phase > 0 && ends_with_pilot(&change.phases) {
                 print(RECORDED_MODES)?;
@@ -269,6 +290,34 @@ mod tests {
         for marker in ["rings", "stag-hd23:4"] {
             assert!(!compared(&searched(marker)).contains("looks for"), "{marker}");
         }
+    }
+
+    #[test]
+    fn pictures_that_cannot_be_read_and_tapes_that_stop_are_losses() {
+        assert!(is_whole(&Searched::default()));
+        assert!(!is_whole(&Searched { unreadable: 1, ..Searched::default() }));
+        let stopped = |stop| {
+            let end = End { stop, ..End::default() };
+            Searched { changes: vec![Change { end, ..Change::default() }], ..Searched::default() }
+        };
+        assert!(is_whole(&stopped(None)));
+        assert!(!is_whole(&stopped(Some(replay::Stop::NoBeginning { first: 3 }))));
+    }
+
+    #[test]
+    fn from_events_is_a_plain_replay_which_may_be_verified() {
+        let parsed = |words: &[&str]| {
+            let words = ["replay", "flight.mcap"].iter().chain(words);
+            Program::try_parse_from(words).map(|program| program.args)
+        };
+        let plain = parsed(&[]).unwrap();
+        assert_eq!(plain.from, From::Events);
+        for words in [&["--from", "events"][..], &["--verify"], &["--verify", "--from", "events"]] {
+            let args = parsed(words).unwrap();
+            assert!(args.from == plain.from && args.check().is_ok(), "{words:?}");
+        }
+        assert!(parsed(&["--verify", "--from", "frames"]).unwrap().check().is_err());
+        assert!(parsed(&["--live"]).is_ok() && parsed(&["--live", "--from", "events"]).is_err());
     }
 
     #[derive(Parser)]

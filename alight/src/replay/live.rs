@@ -73,6 +73,8 @@ struct Overview {
     clock: Option<String>,
     /// When the last health report of each service and instance came.
     services: BTreeMap<Name, i64>,
+    /// What cannot be read of it, as sentences.
+    damage: Vec<String>,
 }
 
 /// The topic of a key, if it is published again. What goes to the autopilot never is, nor what tells of the recording
@@ -107,15 +109,18 @@ fn is_played(service: &str, without: &[String]) -> bool {
     PLAYED.contains(&service) && !without.iter().any(|it| it == service)
 }
 
-/// Publishes a recording, in several files or one, at the pace at which it was recorded.
+/// Publishes a recording, in several files or one, at the pace at which it was recorded: a failure where something of it cannot be
+/// read.
 pub(crate) fn run(
     files: Vec<Vec<u8>>,
     without: &[String],
     network: &NetworkArgs,
 ) -> anyhow::Result<ExitCode> {
     let (files, overview) = in_order(files, without)?;
+    overview.damage.iter().for_each(|damage| write_error(damage));
     let first_ns = overview.first_ns.context("nothing in the recording is to be published")?;
-    with_node(network, "replay", async |node| {
+    let is_whole = overview.damage.is_empty();
+    let unreadable = with_node(network, "replay", async |node| {
         for pause in LOOKS {
             sleep(pause).await;
             nobody_is_doubled(node, &overview).await?;
@@ -133,18 +138,21 @@ pub(crate) fn run(
             .collect();
         let (sender, receiver) = mpsc::channel(MAX_READ_AHEAD);
         let left_out = without.to_vec();
-        let reading = tokio::task::spawn_blocking(move || {
-            read_all(&files, &left_out, &mut restamp, &sender);
-        });
+        let reading =
+            tokio::task::spawn_blocking(move || read_all(&files, &left_out, &mut restamp, &sender));
         tokio::select! {
             played = player.play(receiver, alive) => played?,
             interrupted = tokio::signal::ctrl_c() => interrupted?,
         }
         // A channel without its receiver ends it.
-        reading.await?;
-        player.tell()
+        let unreadable = reading.await?;
+        player.tell()?;
+        Ok(unreadable)
     })?;
-    Ok(ExitCode::SUCCESS)
+    if unreadable > 0 {
+        write_error(&format!("{unreadable} pictures cannot be read, and were left out"));
+    }
+    Ok(if is_whole && unreadable == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 /// The files of a recording in the order in which they were written, and what they say together.
@@ -156,6 +164,7 @@ fn in_order(files: Vec<Vec<u8>>, without: &[String]) -> anyhow::Result<(Vec<Vec<
         whole.first_ns = whole.first_ns.into_iter().chain(part.first_ns).min();
         whole.last_ns = whole.last_ns.max(part.last_ns);
         whole.clock = whole.clock.or(part.clock);
+        whole.damage.extend(part.damage);
         for (name, last_ns) in part.services {
             let newest_ns = whole.services.entry(name).or_insert(last_ns);
             *newest_ns = last_ns.max(*newest_ns);
@@ -169,7 +178,7 @@ fn in_order(files: Vec<Vec<u8>>, without: &[String]) -> anyhow::Result<(Vec<Vec<
 /// The begin of a file, and what it says.
 fn overview(file: &[u8], without: &[String]) -> anyhow::Result<(Begin, Overview)> {
     let (mut begin, mut overview) = (Begin::default(), Overview::default());
-    flightlog::read(file, |entry| {
+    let reading = flightlog::read(file, |entry| {
         let message = match entry {
             Entry::Message(message) => message,
             Entry::About(facts) => {
@@ -191,6 +200,7 @@ fn overview(file: &[u8], without: &[String]) -> anyhow::Result<(Begin, Overview)
             overview.services.insert(name, received_ns);
         }
     })?;
+    overview.damage = reading.damage;
     Ok((begin, overview))
 }
 
@@ -218,10 +228,17 @@ async fn nobody_is_doubled(node: &Node, overview: &Overview) -> anyhow::Result<(
     );
 }
 
-/// Reads the recording as far ahead as there is room, until nobody listens any more.
-fn read_all(files: &[Vec<u8>], without: &[String], restamp: &mut Restamp, due: &mpsc::Sender<Due>) {
+/// Reads the recording as far ahead as there is room, until nobody listens any more. The result is how many pictures could not be
+/// read.
+fn read_all(
+    files: &[Vec<u8>],
+    without: &[String],
+    restamp: &mut Restamp,
+    due: &mpsc::Sender<Due>,
+) -> usize {
+    let mut unreadable = 0;
     for file in files {
-        // It was read before.
+        // It was read before, with its damage.
         let _ = flightlog::read(file, |entry| {
             if due.is_closed() {
                 return;
@@ -236,8 +253,9 @@ fn read_all(files: &[Vec<u8>], without: &[String], restamp: &mut Restamp, due: &
                     if played(&topic::FRAME.key(&[&header.camera]), without).is_some() =>
                 {
                     let at_ns = restamp.due_ns(received_ns);
-                    restamp
-                        .frame(&header, bytes, received_ns)
+                    let frame = restamp.frame(&header, bytes, received_ns);
+                    unreadable += usize::from(frame.is_none());
+                    frame
                         .map(|(header, pixels)| Due { at_ns, item: Item::Frame { header, pixels } })
                 }
                 _ => None,
@@ -248,6 +266,7 @@ fn read_all(files: &[Vec<u8>], without: &[String], restamp: &mut Restamp, due: &
             }
         });
     }
+    unreadable
 }
 
 /// Whether a message is published as it is: one with an attachment is a frame, whose pixels follow.
@@ -390,5 +409,45 @@ mod tests {
         }
         assert!(played("detector/main/detections", &without).is_some());
         assert!(played("camera/down/frame", &without).is_some());
+    }
+
+    /// A recording of a JPEG picture with these bytes, in a chunk of its own, and of another chunk.
+    fn recording(jpeg: &[u8]) -> Vec<u8> {
+        let mut recording = Vec::new();
+        let about = flightlog::About::default();
+        let mut writer = flightlog::Writer::new(&mut recording, &about).unwrap();
+        let header = FrameHeader::sample();
+        let key = topic::FRAME.key(&[&header.camera]);
+        let attachment = messages::encode(&header);
+        let message = Received { key: &key, payload: b"", attachment: &attachment, received_ns: 9 };
+        let picture = flightlog::Picture::Jpeg(jpeg.to_vec());
+        writer.frame(message, &header, &picture).unwrap();
+        writer.flush().unwrap();
+        let wind =
+            messages::encode(&messages::Wind { stamp_ns: 9, velocity_ned_m_s: [1.0, 0.0, 0.0] });
+        let key = topic::WIND.key(&[]);
+        writer
+            .receive(Received { key: &key, payload: &wind, attachment: b"", received_ns: 10 })
+            .unwrap();
+        writer.finish().unwrap();
+        recording
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_counted() {
+        let mut file = recording(b"no JPEG file");
+        let (_, overview) = in_order(vec![file.clone()], &[]).unwrap();
+        assert!(overview.damage.is_empty(), "{:?}", overview.damage);
+        let (due, mut published) = mpsc::channel(9);
+        let mut restamp = Restamp::new(9, 9, "here");
+        assert_eq!(read_all(&[file.clone()], &[], &mut restamp, &due), 1);
+        drop(due);
+        let item = published.try_recv().map(|due| due.item);
+        assert!(matches!(item, Ok(Item::Message { key, .. }) if key == "wind"));
+        // A byte of the first chunk.
+        let place = file.windows(4).position(|it| it == b"no J").unwrap();
+        file[place] ^= 1;
+        let (_, overview) = in_order(vec![file], &[]).unwrap();
+        assert!(!overview.damage.is_empty());
     }
 }
