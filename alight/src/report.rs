@@ -10,10 +10,16 @@ use report::{
     Figure, Flight, FlightReader, comparison, document, figures, marks, page, replay_tapes, summary,
 };
 
+use crate::args::WrongUse;
 use crate::ending::{Ending, format_of};
 use crate::terminal::{print, write_error};
 
+/// What the exit status says of a report.
+const EXIT_STATUS: &str = "Exit status 1 also when there is a page and something of a recording could not be read: a damaged part, its end, \
+                           messages of another version. The page says what.";
+
 #[derive(Args)]
+#[command(after_help = EXIT_STATUS)]
 pub(crate) struct ReportArgs {
     /// The recording of a flight (MCAP), or those of two to compare. Files that share a controller's tape and the recorder's clock are
     /// one flight, in whatever order they are named, as a recorder begins a new file when one is large.
@@ -73,7 +79,7 @@ impl std::str::FromStr for Page {
 /// Maximum number of flights on a page.
 const MAX_FLIGHTS: usize = 2;
 
-/// Prints the summary, and writes the page.
+/// Prints the summary, and writes the page: a failure also where something of a recording could not be read.
 pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     let is_pdf = args.is_pdf()?;
     let mut flights = flights(&args.files)?;
@@ -81,15 +87,16 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
         let (name, number) = (flight.name.clone(), args.landing.unwrap_or(0));
         flight.keep_landing(args.landing).map_err(|of| {
             let of = summary::counted(of as u64, "landing", "landings");
-            anyhow::anyhow!("`--landing {number}`: {name} has {of}, counted from 1")
+            WrongUse(format!("`--landing {number}`: {name} has {of}, counted from 1"))
         })?;
     }
-    ensure!(
-        flights.len() <= MAX_FLIGHTS,
-        "{} flights in {:?}, a page has one, or {MAX_FLIGHTS} to compare",
-        flights.len(),
-        args.files
-    );
+    let too_many = || {
+        let (flights, files) = (flights.len(), &args.files);
+        WrongUse(format!(
+            "{flights} flights in {files:?}, a page has one, or {MAX_FLIGHTS} to compare"
+        ))
+    };
+    ensure!(flights.len() <= MAX_FLIGHTS, too_many());
     // Also where there is a reason against the page.
     for flight in &flights {
         let summary = summary(flight);
@@ -100,10 +107,12 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     }
     let beside = args.beside(&flights, if is_pdf { "pdf" } else { "html" });
     let output = args.output.as_ref().map_or(&beside, |page| &page.path);
-    ensure!(
-        !args.files.iter().any(|file| is_same_file(file, output)),
-        "{output:?} is a recording; name another file for the page with `--output`"
-    );
+    let over = || {
+        WrongUse(format!(
+            "{output:?} is a recording; name another file for the page with `--output`"
+        ))
+    };
+    ensure!(!args.files.iter().any(|file| is_same_file(file, output)), over());
     let is_own = args.output.is_none() && flights.len() == 1;
     if !is_own && !has_marks(output, &marks(&flights.iter().collect::<Vec<_>>())) {
         args.check_is_free(output, "--output")?;
@@ -134,7 +143,8 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
         write_figures(figures, folder)?;
     }
     write_error(&format!("the page: {}", output.display()));
-    Ok(ExitCode::SUCCESS)
+    let are_whole = flights.iter().all(Flight::is_whole);
+    Ok(if are_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 impl ReportArgs {
@@ -164,10 +174,12 @@ impl ReportArgs {
     fn is_pdf(&self) -> anyhow::Result<bool> {
         let wants_pdf = self.format == Format::Pdf;
         let Some(Page { path, is_pdf }) = &self.output else { return Ok(wants_pdf) };
-        ensure!(
-            *is_pdf || !wants_pdf,
-            "`--format pdf` writes a PDF document, and {path:?} is the name of a page: let it end in .pdf"
-        );
+        let refused = || {
+            WrongUse(format!(
+                "`--format pdf` writes a PDF document, and {path:?} is the name of a page: let it end in .pdf"
+            ))
+        };
+        ensure!(*is_pdf || !wants_pdf, refused());
         Ok(*is_pdf)
     }
 }
@@ -380,6 +392,29 @@ mod tests {
         assert_eq!(text("page.html"), first);
         reported(&[&other], &[&named[..], &["--replace"]].concat()).unwrap();
         assert_ne!(text("page.html"), first);
+    }
+
+    #[test]
+    fn a_page_of_what_could_not_all_be_read_is_no_success() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        let [whole, cut, damaged] = ["whole.mcap", "cut.mcap", "damaged.mcap"].map(path);
+        fly(&whole, 1);
+        let recording = std::fs::read(&whole).unwrap();
+        std::fs::write(&cut, &recording[..recording.len() * 3 / 4]).unwrap();
+        let mut bytes = recording;
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+        std::fs::write(&damaged, bytes).unwrap();
+        let status = |files: &[&Path]| format!("{:?}", reported(files, &[]).unwrap());
+        let [success, failure] = [ExitCode::SUCCESS, ExitCode::FAILURE].map(|it| format!("{it:?}"));
+        assert_eq!(status(&[&whole]), success);
+        assert_eq!(status(&[&cut]), failure);
+        assert_eq!(status(&[&damaged]), failure);
+        assert_eq!(status(&[&whole, &cut]), failure);
+        for page in ["cut.html", "damaged.html"] {
+            assert!(path(page).is_file(), "{page}");
+        }
     }
 
     #[test]

@@ -545,6 +545,11 @@ impl Flight {
         self.other_boots.push(before);
     }
 
+    /// Whether all of its recording could be read, up to its end. What the recorder lost before is another matter.
+    pub fn is_whole(&self) -> bool {
+        self.is_ended && self.damage.is_empty() && self.unreadable.is_empty()
+    }
+
     /// Takes over what another one knows of the recording as a whole.
     fn take_over(&mut self, other: &Self) {
         (self.is_ended, self.messages) = (other.is_ended, other.messages);
