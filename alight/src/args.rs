@@ -28,6 +28,14 @@ impl std::fmt::Display for WrongUse {
 
 impl std::error::Error for WrongUse {}
 
+/// The session's configuration for a process with this key.
+///
+/// # Errors
+/// Whatever is wrong with the network is so by the command line, or by files that it names.
+pub(crate) fn source_of(network: &Network, key_name: &str) -> Result<ZenohSource, WrongUse> {
+    network.source(key_name).map_err(|problem| WrongUse(format!("{problem:#}")))
+}
+
 /// The arguments of every service.
 #[derive(Args, Clone, Default)]
 pub(crate) struct ServiceArgs {
@@ -83,17 +91,21 @@ pub(crate) struct NetworkArgs {
 
 impl NetworkArgs {
     /// The session's configuration for a process with this key.
-    pub(crate) fn source(&self, key_name: &str) -> anyhow::Result<ZenohSource> {
-        self.network().source(key_name)
+    pub(crate) fn source(&self, key_name: &str) -> Result<ZenohSource, WrongUse> {
+        source_of(&self.network(), key_name)
     }
 
     /// The session's configuration for a program that may be started in any directory: paths of keys are absolute.
+    ///
+    /// # Errors
+    /// As [`source_of`], and when this process has no working directory.
     pub(crate) fn session(&self, key_name: &str) -> anyhow::Result<serde_json::Value> {
         let mut network = self.network();
         if let Some(keys) = &mut network.keys {
             *keys = std::path::absolute(&keys).with_context(|| format!("the path {keys:?}"))?;
         }
-        network.configuration(key_name)
+        let session = network.configuration(key_name);
+        Ok(session.map_err(|problem| WrongUse(format!("{problem:#}")))?)
     }
 
     pub(crate) fn network(&self) -> Network {

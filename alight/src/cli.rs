@@ -17,12 +17,17 @@ use crate::{
 /// Exit status for an invalid command line or configuration.
 const WRONG_USE: u8 = 2;
 
+/// The rule for the exit status of all subcommands.
+const EXIT_STATUS: &str = "Exit status: 0 done; 1 not done, or done with losses (not landed, not verified, something lost, damaged or unreadable: what is \
+                           printed says what); 2 wrong use: a command line, a setting or a configuration that cannot be. An experiment that a signal cuts \
+                           short ends with that of the signal: 130 by Ctrl-C, 143 by SIGTERM, 129 by the end of its terminal.";
+
 /// The version with the commit, of the build script.
 pub(crate) const VERSION: &str = env!("ALIGHT_VERSION");
 
 /// Lands a UAV on a printed marker. Without a subcommand: `alight land`.
 #[derive(Parser)]
-#[command(version = VERSION, args_conflicts_with_subcommands = true)]
+#[command(version = VERSION, args_conflicts_with_subcommands = true, after_help = EXIT_STATUS)]
 struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
@@ -168,6 +173,7 @@ fn is_wrong_use(problem: &anyhow::Error) -> bool {
         || problem.is::<media::CalibrationError>()
         || problem.is::<media::CalibrationWriteError>()
         || problem.is::<marker::SheetError>()
+        || problem.is::<::replay::WrongDetector>()
 }
 
 fn print_config(args: ConfigArgs) -> anyhow::Result<ExitCode> {
@@ -200,11 +206,31 @@ mod tests {
         }
     }
 
+    /// Performs what the words of a command line say.
+    fn performed(words: &[&str]) -> anyhow::Result<ExitCode> {
+        perform(Cli::try_parse_from(["alight"].iter().chain(words)).unwrap())
+    }
+
     #[test]
     fn what_cannot_be_asked_for_is_a_wrong_use() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name).display().to_string();
         for words in [
             &["land", "--vehicle", "a/b"][..],
             &["land", "--zenoh", "nosuch.json5"],
+            &["detectors", "--vehicle", "a/b"],
+            &["command", "hold", "--zenoh", "nosuch.json5"],
+            &["calibrate", "board", "--live", "down", "--zenoh", "ground"],
+            &["config", "--session", "operator", "--zenoh", "nosuch.json5"],
+            &["relay", "--zenoh", "relay"],
+            &["replay", "nosuch.mcap", "--detector", "main"],
+            &["replay", "nosuch.mcap", "--verify", "--from", "frames"],
+            &["replay", "nosuch.mcap", "--verify", "--from", "detections"],
+            &["report", "nosuch.mcap", "--format", "pdf", "-o", "x.html"],
+            &["keys", "issue", "--role", "drone", "-o", &path("keys")],
+            &["keys", "issue", "--role", "operator", "--name", "a/b", "-o", &path("keys")],
+            &["dashboard", "certificate", "-o", &path("x.key")],
+            &["dashboard", "certificate", "-o", &path("x.pem"), "--address", "x:80"],
             &["experiment", "faults", "--kind", "bridge-killed"],
             &["experiment", "faults", "--with", "foo"],
             &["experiment", "faults", "--set", "simulator.seed=3"],
@@ -214,10 +240,60 @@ mod tests {
             &["experiment", "landing", "--set", "simulator.seed=3"],
             &["experiment", "markers", "--binned"],
         ] {
-            let cli = Cli::try_parse_from(["alight"].iter().chain(words)).unwrap();
-            let problem = perform(cli).unwrap_err();
+            let problem = performed(words).unwrap_err();
             assert!(is_wrong_use(&problem), "{words:?}: {problem:#}");
         }
+        // Before anything is done.
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn a_network_that_cannot_be_is_a_wrong_use_of_every_service() {
+        for service in Service::value_variants() {
+            for network in [["--zenoh", "nosuch.json5"], ["--vehicle", "a/b"]] {
+                let problem = performed(&[&[service.name()][..], &network].concat()).unwrap_err();
+                assert!(is_wrong_use(&problem), "{}, {network:?}: {problem:#}", service.name());
+            }
+        }
+    }
+
+    #[test]
+    fn a_site_that_cannot_be_is_a_wrong_use() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("site.toml");
+        let detector = "{ run = 'detector' }";
+        for (role, site) in [
+            ("local", "vehicle = 'x'".to_owned()),
+            ("local", "vehicle = 'a/b'\nlocal = [{ command = ['true'] }]".to_owned()),
+            ("local", format!("local = [{detector}, {detector}]")),
+            ("local", "local = [{ name = 'x' }]".to_owned()),
+            ("local", "local = [{ command = ['true'], set = ['x=1'] }]".to_owned()),
+            ("ground", format!("ground = [{detector}]")),
+            ("drone", "address = '10.0.0.1:x'\ninsecure = true".to_owned()),
+            ("drone", "address = 'fd00::1'\nkeys = 'keys'".to_owned()),
+        ] {
+            std::fs::write(&path, &site).unwrap();
+            let words = ["up", role, "--dry-run", "--config", path.to_str().unwrap()];
+            let problem = performed(&words).unwrap_err();
+            assert!(is_wrong_use(&problem), "{site}: {problem:#}");
+        }
+    }
+
+    #[test]
+    fn what_is_wrong_with_a_recording_is_no_wrong_use() {
+        for words in [&["replay", "nosuch.mcap", "--verify"][..], &["report", "nosuch.mcap"]] {
+            let problem = performed(words).unwrap_err();
+            assert!(!is_wrong_use(&problem), "{words:?}: {problem:#}");
+        }
+    }
+
+    #[test]
+    fn the_help_says_the_rule_of_the_exit_status_and_a_landing_its_own() {
+        let mut command = Cli::command();
+        let help = command.render_long_help().to_string();
+        assert!(help.contains("Exit status: 0 done; 1 not done"), "{help}");
+        let land = command.find_subcommand_mut("land").unwrap().render_long_help().to_string();
+        assert!(land.contains("Exit status of a landing"), "{land}");
     }
 
     #[test]

@@ -10,7 +10,7 @@ use clap::{Args, Subcommand, ValueEnum};
 use dashboard::tokens::{Kind, Tokens, secret, usual_file, usual_folder};
 use node::{Layers, host_name};
 
-use crate::args::ServiceArgs;
+use crate::args::{ServiceArgs, WrongUse};
 use crate::keys::self_signed;
 use crate::services::{self, Service};
 use crate::terminal::{print, write_error};
@@ -104,7 +104,8 @@ fn make_certificate(
             .join("dashboard.pem"),
     };
     let key = certificate.with_extension("key");
-    ensure!(key != certificate, "{certificate:?} has the ending of the key; name it `.pem`");
+    let refused = || WrongUse(format!("{certificate:?} has the ending of the key; name it `.pem`"));
+    ensure!(key != certificate, refused());
     let host = host_name();
     let own = ["localhost".to_owned(), "127.0.0.1".to_owned(), format!("{host}.local"), host];
     let names: BTreeSet<String> = addresses.iter().cloned().chain(own).collect();

@@ -25,7 +25,7 @@ use rcgen::{
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 
-use crate::args::Format;
+use crate::args::{Format, WrongUse};
 use crate::terminal::{aligned, print};
 
 /// The authority's private key, which is not copied to other machines.
@@ -230,7 +230,8 @@ pub(crate) fn run(args: &KeysArgs) -> anyhow::Result<ExitCode> {
         Action::Init { output, days } => init(output, *days)?,
         Action::Issue { role, name, vehicle, output, authority, address, days } => {
             let default = (*role == Role::Detector).then_some("main");
-            let holder = Holder::new(&role.name(), name.as_deref().or(default), vehicle)?;
+            let holder = Holder::new(&role.name(), name.as_deref().or(default), vehicle)
+                .map_err(|problem| WrongUse(format!("{problem:#}")))?;
             let authority = authority.as_deref().unwrap_or(output);
             issue(*role, &holder, output, authority, address, *days)?
         }
@@ -314,10 +315,12 @@ fn issue(
     days: u32,
 ) -> anyhow::Result<Vec<PathBuf>> {
     let name = holder.key_name();
-    ensure!(
-        !role.is_found_by_others() || !addresses.is_empty(),
-        "the key of `{name}` needs the address to which others connect: add `--address HOST`"
-    );
+    let lacking = || {
+        WrongUse(format!(
+            "the key of `{name}` needs the address to which others connect: add `--address HOST`"
+        ))
+    };
+    ensure!(!role.is_found_by_others() || !addresses.is_empty(), lacking());
     let files = [output.join(format!("{name}.key")), output.join(format!("{name}.pem"))];
     refuse_existing(&files)?;
     let read = |file: &str| {
@@ -468,10 +471,12 @@ fn is_host(address: &str) -> bool {
 
 fn parameters(name: &str, addresses: &[String], days: u32) -> anyhow::Result<CertificateParams> {
     for address in addresses {
-        ensure!(
-            is_host(address),
-            "invalid address `{address}`: expected an IP address or a host name, without a port"
-        );
+        let refused = || {
+            WrongUse(format!(
+                "invalid address `{address}`: expected an IP address or a host name, without a port"
+            ))
+        };
+        ensure!(is_host(address), refused());
     }
     let mut params = CertificateParams::new(addresses.to_vec())
         .with_context(|| format!("invalid addresses {addresses:?}"))?;

@@ -14,7 +14,7 @@ use node::access::{HOLDERS, Holders};
 use node::{HealthCounters, Identity, Network, Node, Shutdown, denied};
 use tokio::time::MissedTickBehavior;
 
-use crate::args::{NetworkArgs, ParentArgs};
+use crate::args::{NetworkArgs, ParentArgs, source_of};
 use crate::runtime::block_on;
 use crate::services::{RELAY, tell_if_open};
 
@@ -57,7 +57,7 @@ pub(crate) fn run(args: &RelayArgs) -> anyhow::Result<ExitCode> {
     // The certificate is that of the drone itself, or of a relay between drone and ground.
     let role = if config.as_os_str() == "drone" { "drone" } else { RELAY };
     let identity = Identity { service: RELAY, instance: args.id.clone() };
-    let zenoh = network.source(role)?;
+    let zenoh = source_of(&network, role)?;
     wait_for_ports(&network, role)?;
     let holders = HoldersFile::new(&network);
     relaunch_after_panics();

@@ -8,7 +8,7 @@ use clap::ValueEnum;
 use node::access::key_name;
 use node::{Effective, INSECURE, Identity, Layers, Network, Node, Settings, Shutdown};
 
-use crate::args::ServiceArgs;
+use crate::args::{ServiceArgs, source_of};
 use crate::runtime::block_on;
 
 /// The name of the relay as a service.
@@ -116,7 +116,7 @@ where
     let Effective { settings: config, table } = layers.load::<C>()?;
     let identity = Identity { service: service.name(), instance: instance(&config) };
     let network = args.network.network();
-    let zenoh = network.source(&key_name(service.name(), &identity.instance))?;
+    let zenoh = source_of(&network, &key_name(service.name(), &identity.instance))?;
     block_on(node::run(identity, &zenoh, async |node, shutdown| {
         tell_if_open(&node, &network);
         let told = node.clone();

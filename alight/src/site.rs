@@ -10,7 +10,7 @@ use node::network::{Address, NO_KEYS_OVER_IPV6};
 use node::{ConfigError, Layers, Network};
 use serde::Deserialize;
 
-use crate::args::MEET_RULE;
+use crate::args::{MEET_RULE, WrongUse, source_of};
 use crate::services::{RELAY, Service};
 
 /// The role of a machine.
@@ -187,11 +187,9 @@ impl Site {
             jobs.push(job);
         }
         self.check_detectors(role)?;
-        ensure!(
-            !jobs.is_empty(),
-            "the site has no [[{}]], so there is nothing to run",
-            role.name()
-        );
+        let nothing =
+            || WrongUse(format!("the site has no [[{}]], so there is nothing to run", role.name()));
+        ensure!(!jobs.is_empty(), nothing());
         for index in 1..jobs.len() {
             let (before, rest) = jobs.split_at_mut(index);
             let taken = before.iter().filter(|job| job.name == rest[0].name).count();
@@ -200,7 +198,7 @@ impl Site {
             }
         }
         for job in &jobs {
-            job.network.source(&job.key).with_context(|| job.name.clone())?;
+            source_of(&job.network, &job.key).with_context(|| job.name.clone())?;
         }
         Ok(jobs)
     }
@@ -229,9 +227,9 @@ impl Site {
                 let place = format!("[[{}]] number {}", role.name(), number + 1);
                 if let Some(first) = taken.insert(job.key.clone(), place.clone()) {
                     let id = job.key.split_once('.').map_or(job.key.as_str(), |(_, id)| id);
-                    anyhow::bail!(
+                    anyhow::bail!(WrongUse(format!(
                         "{first} and {place} are detectors with one id, `{id}`; give one of them another: set = ['id=\"other\"']"
-                    );
+                    )));
                 }
             }
         }
@@ -246,9 +244,10 @@ impl Site {
         };
         // It listens at the port to which others connect, and for IPv6 where that is what they use: by itself it does not.
         let address = reached_at.as_deref().map(Address::parse).transpose();
-        let address = address.with_context(|| format!("`{key}` of the site"))?;
+        let refused = |problem: &str| WrongUse(format!("`{key}` of the site: {problem}"));
+        let address = address.map_err(|problem| refused(&format!("{problem:#}")))?;
         let is_ipv6 = address.as_ref().is_some_and(|address| address.host.starts_with('['));
-        ensure!(!is_ipv6 || self.keys.is_none(), "`{key}` of the site: {NO_KEYS_OVER_IPV6}");
+        ensure!(!is_ipv6 || self.keys.is_none(), refused(NO_KEYS_OVER_IPV6));
         let listen = address.and_then(|Address { port, .. }| {
             let port = port.map(|port| format!(":{port}"));
             match is_ipv6 {
@@ -289,15 +288,16 @@ impl Site {
                 (Some(service), vec!["alight".to_owned(), service.name().to_owned()])
             }
             (None, Some(command)) if !command.is_empty() => {
-                ensure!(
-                    entry.config.is_none() && entry.set.is_empty(),
-                    "`config` and `set` are for services; put the arguments of a program into its `command`"
-                );
+                let rule = "`config` and `set` are for services; put the arguments of a program into its `command`";
+                let has_settings = entry.config.is_some() || !entry.set.is_empty();
+                ensure!(!has_settings, WrongUse(rule.to_owned()));
                 (None, command.clone())
             }
-            _ => anyhow::bail!(
-                "needs either `run`, a service, or `command`, a program with its arguments"
-            ),
+            _ => {
+                let rule =
+                    "needs either `run`, a service, or `command`, a program with its arguments";
+                anyhow::bail!(WrongUse(rule.to_owned()))
+            }
         };
         let mut layers = Layers {
             file: entry.config.as_ref().map(|file| self.folder.join(file)),

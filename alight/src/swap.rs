@@ -27,7 +27,7 @@ use tokio::process::{Child, Command};
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
 use self::comparison::Comparison;
-use crate::args::{Format, NetworkArgs};
+use crate::args::{Format, NetworkArgs, WrongUse};
 use crate::runtime::with_node;
 use crate::terminal::{print, write_error};
 
@@ -230,7 +230,7 @@ impl NewDetector {
         }
         let words = shlex::split(&args.to).filter(|words| !words.is_empty());
         let mut words = words
-            .with_context(|| format!("`{}` is not a command: a quote is missing", args.to))?
+            .ok_or_else(|| WrongUse(format!("`{}` is not a command: a quote is missing", args.to)))?
             .into_iter();
         let program = words.next().unwrap_or_default().into();
         Ok(Self { program, args: words.collect(), id: args.id.clone() })
