@@ -16,7 +16,7 @@ use node::{Layers, Network, Node, Shutdown, read_text};
 use tempfile::TempDir;
 use tokio::time::Instant;
 
-use crate::args::{Format, OPERATOR, WrongUse, address, meet_port};
+use crate::args::{Format, OPERATOR, WrongUse, address, meet_port, source_of};
 use crate::children::{ChildEvent, Children, options_for_shell};
 use crate::ending::recording;
 use crate::outcome::{LandingSummary, OurRecorder};
@@ -92,8 +92,9 @@ fn timeout_s(text: &str) -> Result<f64, String> {
 }
 
 const EXIT_STATUS: &str = "Exit status of a landing: 0 when it landed on the pad (led there by the marker, and at most 0.3 m from its centre), 1 when it did not, \
-                           also when it came down otherwise (after an abort, by `land-here`, for an alarm, by the pilot: the result says how far from the pad), \
-                           2 for a wrong command line or setting, and 3 when it landed but the recording of `--record` failed (its problem is in the result).";
+                           also when it came down otherwise (after an abort, by `land-here`, for an alarm, by the pilot: the result says how far from the pad) or \
+                           when it landed and the recording of `--record` failed or lost messages (the result tells `landed`, the recording's `problem` and what it `dropped`), \
+                           and 2 for a wrong command line or setting.";
 
 /// The loopback interface.
 pub(crate) const LOOPBACK: &str = "127.0.0.1";
@@ -118,7 +119,7 @@ pub(crate) fn run(args: &LandArgs) -> anyhow::Result<ExitCode> {
         Format::Json => serde_json::to_string(&outcome)?,
     })
     .context("printing the result")?;
-    Ok(ExitCode::from(outcome.exit_status()))
+    Ok(if outcome.is_done() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 /// Asks before the motors of a vehicle may start that may be a real one.
@@ -133,7 +134,8 @@ fn confirm_real_vehicle(args: &LandArgs, settings: &ServiceSettings) -> anyhow::
         args.autopilot.as_deref().unwrap_or("the autopilot's address")
     );
     if !std::io::stdin().is_terminal() {
-        bail!("{warning} There is no terminal to ask on; if so, say `--real-vehicle --yes`");
+        let remedy = "There is no terminal to ask on; if so, say `--real-vehicle --yes`";
+        bail!(WrongUse(format!("{warning} {remedy}")));
     }
     write_error(&format!("{warning} Type `yes` to start the motors:"));
     let mut answer = String::new();
@@ -298,7 +300,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         vehicle: args.vehicle.clone(),
         ..Network::default()
     };
-    let zenoh = network.source(OPERATOR).map_err(|problem| WrongUse(format!("{problem:#}")))?;
+    let zenoh = source_of(&network, OPERATOR)?;
     let node = Node::open_tool(tool_identity("land"), &zenoh).await?;
     let mut progress = Progress::new(args.format);
     progress.say(&format!(
@@ -340,9 +342,13 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     let watched = watch(&node, settings, &mut children, &resume, &mut progress, limits).await;
     progress.finish();
     let mut recorders_end = None;
+    let mut recorders_word = None;
     let mut note_end = |event: &ChildEvent<Service>| match event {
         ChildEvent::Exited(Service::Recorder, exit) if exit.status != Some(0) => {
             recorders_end = Some(exit.clone());
+        }
+        ChildEvent::Line(Service::Recorder, line) => {
+            recorders_word = error_in(line).map(str::to_owned).or(recorders_word.take());
         }
         ChildEvent::Exited(..) | ChildEvent::Line(..) => {}
     };
@@ -369,9 +375,14 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     node.close().await;
     let mut landing = watched?;
     if let Some(exit) = recorders_end {
-        landing.recording_ended_early(&exit);
+        landing.recording_failed(&exit, recorders_word);
     }
     Ok(landing)
+}
+
+/// The error with which a service ended, where a line of its standard error is that.
+fn error_in(line: &str) -> Option<&str> {
+    line.strip_prefix("alight: ")
 }
 
 /// What ends the watch of a landing that is not over.
@@ -696,7 +707,7 @@ mod tests {
         let json = serde_json::to_string(&outcome)?;
         let told = "the simulator exited: exit status: 3; it was in descend: because";
         assert!(json.contains(told) && json.contains("\"landed\":false"), "{json}");
-        assert_eq!(outcome.exit_status(), 1);
+        assert!(!outcome.is_done());
 
         let landed = ControllerStatus {
             disarmed_ns: Some(3),
@@ -723,7 +734,7 @@ mod tests {
         let outcome = without_its_simulator(landed, Some(truth)).await?;
         let json = serde_json::to_string(&outcome)?;
         assert!(json.contains("\"outcome\":\"landed\""), "{json}");
-        assert_eq!(outcome.exit_status(), 0);
+        assert!(outcome.is_done());
         Ok(())
     }
 

@@ -29,8 +29,10 @@ pub(crate) struct LandingSummary {
     /// Detections used by earlier controllers.
     detections_before: u64,
     recorder: Option<RecorderStatus>,
-    /// How the recorder exited before it was to.
+    /// How the recorder exited before it was to, or with an error.
     recorders_exit: Option<Exit>,
+    /// The error with which it exited at the end, as it says.
+    recorders_word: Option<String>,
     /// The recorder that is to record it.
     recorded_by: Option<OurRecorder>,
 }
@@ -140,9 +142,6 @@ const MAX_PAUSE_NS: i64 = 3_000_000_000;
 /// Longest time after a touchdown in which an autopilot may stop the motors, in nanoseconds: ArduPilot takes 7 s.
 const MAX_DISARMING_NS: i64 = 12_000_000_000;
 
-/// Exit status of a landing whose recording failed.
-const RECORDING_FAILED: u8 = 3;
-
 impl LandingSummary {
     /// Of a landing that this recorder is to record.
     pub(crate) fn recorded_by(recorder: OurRecorder) -> Self {
@@ -202,6 +201,12 @@ impl LandingSummary {
         self.recorders_exit = Some(exit.clone());
     }
 
+    /// Notes that the recorder exited with an error when it was to, and what it said.
+    pub(crate) fn recording_failed(&mut self, exit: &Exit, said: Option<String>) {
+        self.recording_ended_early(exit);
+        self.recorders_word = said;
+    }
+
     /// Why the recording lacks something. What it told before it exited may be heard later, and does not undo that.
     fn recording_problem(&self, recorder: &RecorderStatus) -> Option<String> {
         let Some(exit) = &self.recorders_exit else { return recorder.problem.clone() };
@@ -217,7 +222,7 @@ impl LandingSummary {
             (_, false) => format!("the recorder exited: {exit}"),
         };
         let known = recorder.problem.clone().filter(|problem| problem != UNHEARD);
-        Some(known.unwrap_or(ended_early))
+        Some(known.or(self.recorders_word.clone()).unwrap_or(ended_early))
     }
 
     /// Notes why the landing was not watched to its end.
@@ -363,14 +368,13 @@ impl LandingSummary {
 }
 
 impl Outcome {
-    /// The exit status of `alight land`: 0, 1 without a landing on the pad, and another where only the recording failed.
-    pub(crate) fn exit_status(&self) -> u8 {
-        let problem = self.recording.as_ref().and_then(|recording| recording.problem.as_ref());
-        match self.landed {
-            false => 1,
-            true if self.is_to_be_recorded && problem.is_some() => RECORDING_FAILED,
-            true => 0,
-        }
+    /// Whether all is done that was asked for: it landed on the pad, and what was to be recorded of it is. Frames that never came
+    /// to the recorder are no loss of its.
+    pub(crate) fn is_done(&self) -> bool {
+        let is_whole =
+            |recording: &Recording| recording.problem.is_none() && recording.dropped == 0;
+        let is_recorded = self.recording.as_ref().is_none_or(is_whole);
+        self.landed && (is_recorded || !self.is_to_be_recorded)
     }
 
     /// The result beside that of the thesis, as a table.
@@ -429,6 +433,8 @@ impl Outcome {
 
 #[cfg(test)]
 mod tests {
+    use messages::RecorderLoss;
+
     use super::*;
 
     fn status(phase: Phase) -> ControllerStatus {
@@ -508,7 +514,7 @@ mod tests {
     #[test]
     fn what_came_down_otherwise_has_not_landed_on_the_pad() {
         let landed = ended(Phase::Landed, "on the ground, disarmed", 0.02);
-        assert_eq!((landed.landed, landed.down, landed.exit_status()), (true, true, 0));
+        assert_eq!((landed.landed, landed.down, landed.is_done()), (true, true, true));
         for (phase, why, error_m, told) in [
             (
                 Phase::Landed,
@@ -537,7 +543,7 @@ mod tests {
         ] {
             let outcome = ended(phase, why, error_m);
             assert_eq!(outcome.outcome, told);
-            assert_eq!((outcome.landed, outcome.down, outcome.exit_status()), (false, true, 1));
+            assert_eq!((outcome.landed, outcome.down, outcome.is_done()), (false, true, false));
             let how =
                 if told.contains("counts") { "beside the pad" } else { "but not led to the pad" };
             let verdict = outcome.table().lines().next().unwrap_or_default().to_owned();
@@ -576,7 +582,7 @@ mod tests {
     }
 
     #[test]
-    fn a_landing_whose_recording_failed_has_an_exit_status_of_its_own() {
+    fn a_landing_whose_recording_failed_or_lost_messages_is_not_done() {
         let landed = |mut landing: LandingSummary| {
             landing.status(ControllerStatus { disarmed_ns: Some(2), ..status(Phase::Landed) });
             let touchdown = Touchdown {
@@ -588,9 +594,13 @@ mod tests {
             landing.truth(truth(Some(touchdown)));
             landing
         };
-        let status = |landing: &LandingSummary| landing.outcome().exit_status();
-        assert_eq!(status(&LandingSummary::default()), 1);
-        assert_eq!(status(&landed(LandingSummary::default())), 0);
+        let is_done = |landing: &LandingSummary| {
+            let outcome = landing.outcome();
+            assert_eq!(outcome.landed, landing.disarmed_ns.is_some(), "whatever was recorded");
+            outcome.is_done()
+        };
+        assert!(!is_done(&LandingSummary::default()));
+        assert!(is_done(&landed(LandingSummary::default())));
         let told = |recorder: &str, file: &str, problem: Option<&str>| RecorderStatus {
             recorder: recorder.into(),
             file: file.into(),
@@ -599,36 +609,54 @@ mod tests {
         };
         let ours = || OurRecorder { name: "main".into(), file: "flight.mcap".into() };
         let mut landing = landed(LandingSummary::recorded_by(ours()));
-        assert_eq!(status(&landing), RECORDING_FAILED, "nobody knows of a recording");
+        assert!(!is_done(&landing), "nobody knows of a recording");
         landing.recorder(told("main", "", Some("No space left")));
-        assert_eq!(status(&landing), RECORDING_FAILED);
+        assert!(!is_done(&landing));
         landing.recorder(told("main", "flight-2.mcap", None));
         landing.recorder(told("another", "", Some("No space left")));
-        assert_eq!(status(&landing), 0, "another file took its place");
+        assert!(is_done(&landing), "another file took its place");
         let exit = |words: &str, status| Exit { words: words.into(), status };
         landing.recording_ended_early(&exit("exit status: 1", Some(1)));
-        assert_eq!(status(&landing), RECORDING_FAILED);
+        assert!(!is_done(&landing));
         assert!(landing.outcome().table().contains("--repair"));
         landing.recorder(told("main", "flight-2.mcap", None));
-        assert_eq!(status(&landing), RECORDING_FAILED, "what it told before comes late");
+        assert!(!is_done(&landing), "what it told before comes late");
         assert!(landing.outcome().table().contains("--repair"));
         landing.recorder(told("main", "", None));
         landing.recorder(told("main", "elsewhere/flight.mcap", None));
-        assert_eq!(status(&landing), RECORDING_FAILED, "one of the same name says nothing of it");
+        assert!(!is_done(&landing), "one of the same name says nothing of it");
         for (wanted, file) in [("flight-{time}.mcap", "flight-20261122T105011Z.mcap"), ("", "")] {
             let ours = OurRecorder { name: "main".into(), file: wanted.into() };
             let mut landing = landed(LandingSummary::recorded_by(ours));
             landing.recorder(told("main", file, None));
-            assert_eq!(status(&landing), 0, "{wanted}");
+            assert!(is_done(&landing), "{wanted}");
         }
         let mut landing = landed(LandingSummary::recorded_by(ours()));
         landing.recorder(told("main", "flight.mcap", None));
         landing.recording_ended_early(&exit("exit status: 0", Some(0)));
-        assert_eq!(status(&landing), RECORDING_FAILED, "the landing is not in it");
+        assert!(!is_done(&landing), "the landing is not in it");
         let table = landing.outcome().table();
         assert!(table.contains("its file is whole") && !table.contains("--repair"), "{table}");
         landing.recorder(told("main", "flight-2.mcap", None));
-        assert_eq!(status(&landing), 0, "another recorder goes on");
+        assert!(is_done(&landing), "another recorder goes on");
+        let losing = |key: &str| RecorderStatus {
+            dropped: vec![RecorderLoss { key: key.into(), count: 3 }],
+            ..told("main", "flight-2.mcap", None)
+        };
+        landing.recorder(losing("camera/down/frame (never came)"));
+        assert!(is_done(&landing), "the recorder lost nothing");
+        landing.recorder(losing("wind"));
+        assert!(!is_done(&landing), "the recorder lost something");
+        let mut landing = landed(LandingSummary::recorded_by(ours()));
+        landing.recorder(told("main", "flight.mcap", None));
+        let said = "running recorder: 3 messages came and are in no file".to_owned();
+        landing.recording_failed(&exit("exit status: 1", Some(1)), Some(said));
+        let table = landing.outcome().table();
+        assert!(!is_done(&landing) && table.contains("in no file"), "{table}");
+        assert!(!table.contains("--repair"), "{table}");
+        let mut beside = landed(LandingSummary::default());
+        beside.recorder(losing("wind"));
+        assert!(is_done(&beside), "it is another's recording");
     }
 
     #[test]
