@@ -135,6 +135,8 @@ struct Supervised {
     exits: VecDeque<Instant>,
     /// How often in a row it exited with status 0.
     completions: usize,
+    /// Whether it has once run for [`PERIOD`]: with what it is given it can run.
+    has_run: bool,
     keeps_failing: bool,
     state: State,
 }
@@ -158,6 +160,7 @@ impl Supervised {
             started: Instant::now(),
             exits: VecDeque::new(),
             completions: 0,
+            has_run: false,
             keeps_failing: false,
             state: State::Running,
         }
@@ -195,14 +198,17 @@ impl Supervised {
         self.exits.push_back(now);
         self.exits.retain(|exit| now.duration_since(*exit) <= PERIOD);
         self.completions = if exit.status == Some(0) { self.completions + 1 } else { 0 };
+        let has_run_long = now.duration_since(self.started) >= PERIOD;
+        self.has_run |= has_run_long;
         let name = &self.job.name;
-        if exit.status == Some(WRONG_USE) {
+        // What has run may be refused for a moment, as while somebody copies its keys, and in flight it is to come back.
+        if exit.status == Some(WRONG_USE) && !self.has_run {
             self.state = State::GivenUp;
             return format!(
                 "{name}: cannot run with its configuration ({exit}); given up. See its stderr above, then restart `alight up`"
             );
         }
-        let kept_failing = self.keeps_failing && now.duration_since(self.started) < PERIOD;
+        let kept_failing = self.keeps_failing && !has_run_long;
         self.keeps_failing = kept_failing || self.exits.len() >= MAX_EXITS;
         if self.keeps_failing && self.is_foreign() && self.completions >= MAX_EXITS {
             self.state = State::GivenUp;
@@ -681,5 +687,20 @@ mod tests {
         assert_eq!(process.state, State::GivenUp);
         assert!(process.is_out());
         assert!(message.contains("cannot run"), "{message}");
+    }
+
+    #[test]
+    fn what_has_run_is_started_again_although_it_is_refused_now() {
+        let mut process = supervised();
+        let mut now = process.started + PERIOD;
+        process.on_exit(&failure(1), now);
+        for _ in 0..2 * MAX_EXITS {
+            process.started = now;
+            now += Duration::from_millis(100);
+            process.on_exit(&failure(WRONG_USE), now);
+            assert!(matches!(process.state, State::Waiting(_)), "{:?}", process.state);
+        }
+        // Where it is alone, `alight up` ends in the end, as with any other failure.
+        assert!(process.is_out());
     }
 }
