@@ -41,7 +41,7 @@ enum Experiment {
     Landing(LandingArgs),
     /// Fly landings in which a process dies or stands still, a link fails, or somebody lies; write a table of
     /// the worst touchdowns, and the command that repeats each. Exit status 1 when one was unsafe or did not end. Ctrl-C ends
-    /// it with the results of the flights that were flown, exit status 130.
+    /// it with the results of the flights that were flown, exit status 130 also when one of those was unsafe, which is said.
     Faults(FaultsArgs),
 }
 

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use clap::Args;
 use experiments::faults::kind::Kind;
+use experiments::faults::outcome::Outcome;
 use experiments::faults::plan::{Plan, Request, SWEPT, Second};
 use experiments::faults::report;
 use experiments::faults::{self, Findings};
@@ -214,16 +215,30 @@ pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
         write_error(&format!("flights and this report: {}", output.display()));
     }
     if interruption.is_requested() {
+        if let Some(bad) = told_of_bad(&findings.outcomes) {
+            write_error(&format!("{bad}, which the exit status of an interruption does not tell"));
+        }
         return Ok(interruption.exit_code());
     }
-    let is_bad =
-        findings.outcomes.iter().any(|outcome| outcome.is_unsafe() || outcome.is_unended());
-    Ok(ExitCode::from(u8::from(is_bad)))
+    let is_good = told_of_bad(&findings.outcomes).is_none();
+    Ok(if is_good { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// What must not be, of the flights that were flown; `None` when nothing was unsafe and every flight ended.
+fn told_of_bad(outcomes: &[Outcome]) -> Option<String> {
+    let count = |of: fn(&Outcome) -> bool| outcomes.iter().filter(|outcome| of(outcome)).count();
+    let [beyond, unended] = [count(Outcome::is_unsafe), count(Outcome::is_unended)];
+    let flown = outcomes.len();
+    let told = || {
+        format!("of {flown} flights that were flown {beyond} were unsafe and {unended} did not end")
+    };
+    (beyond + unended > 0).then(told)
 }
 
 #[cfg(test)]
 mod tests {
     use clap::Parser;
+    use experiments::faults::outcome::Ending;
 
     use super::*;
 
@@ -231,6 +246,21 @@ mod tests {
     struct Tool {
         #[command(flatten)]
         args: FaultsArgs,
+    }
+
+    #[test]
+    fn what_must_not_be_is_told_of_the_flights_that_were_flown() {
+        let planned = &plan(&["--flights", "1"]).flights()[0];
+        let safe = Outcome { ending: Ending::Landed, is_over: true, ..Outcome::new(planned) };
+        assert_eq!(told_of_bad(&[]), None);
+        assert_eq!(told_of_bad(std::slice::from_ref(&safe)), None);
+        let beyond = Outcome { sink_m_s: Some(3.0), ..safe.clone() };
+        let unended = Outcome { is_over: false, ..safe.clone() };
+        let told = told_of_bad(&[safe, beyond.clone(), unended, beyond]).unwrap();
+        assert!(
+            told.contains("4 flights") && told.contains("2 were unsafe and 1 did not"),
+            "{told}"
+        );
     }
 
     fn plan(options: &[&str]) -> Plan {
