@@ -122,8 +122,17 @@ fn a_second_marker_is_rejected_while_the_first_is_out_of_view() {
 #[test]
 fn a_gust_close_to_the_ground_does_not_cause_a_sliding_touchdown() {
     for (planned, outcome) in with_fault("gust", &[26, 64, 68, 74, 92, 129]) {
-        let is_slow = outcome.slide_m_s.is_some_and(|slide| slide < 0.4);
-        expect(&planned, &outcome, outcome.is_within(0.3) && is_slow);
+        expect(&planned, &outcome, outcome.is_within(0.3) && !outcome.is_unsafe());
+    }
+}
+
+#[test]
+fn frames_with_wrong_stamps_do_not_lead_it_hard_onto_the_ground() {
+    // With this seed three of them close to the ground show a pad that sinks.
+    let plan = Plan { wind: Values::List(vec![5.0]), ..Plan::default() };
+    for (planned, outcome) in fly_seeds(&plan, "stamp-jumps", &[770_039]) {
+        let is_soft = outcome.sink_m_s.is_some_and(|sink| sink < 0.75);
+        expect(&planned, &outcome, is_soft && !outcome.is_unsafe());
     }
 }
 

@@ -86,6 +86,10 @@ const MAX_TOUCHDOWN_M_S: f64 = 0.3;
 /// Minimum descent speed at touchdown on a heaving pad, in m/s.
 const MIN_TOUCHDOWN_M_S: f64 = 0.3;
 
+/// Maximum speed at which a pad that does not heave is followed down, in m/s: twice what the autopilot's height drifts. A faster one
+/// is a wrong estimate, as from frames with wrong stamps, and would be followed hard onto the ground.
+const MAX_DRIFT_DOWN_M_S: f64 = 0.2;
+
 /// Time ahead for which the error of a low vehicle is predicted, in seconds.
 const LOW_LEAD_S: f64 = 0.4;
 
@@ -235,9 +239,10 @@ impl Guidance for Metric {
                 observer.path = Path::new(lateral);
             }
         }
+        let followed_m_s = fmin(target.velocity.z(), MAX_DRIFT_DOWN_M_S + situation.pad_heave_m_s);
         let down = approach_speed(
             before.setpoint.z(),
-            descent_m_s + target.velocity.z(),
+            descent_m_s + followed_m_s,
             self.config.descend_acceleration_m_s2 * step_s,
         );
         let setpoint = Vector::new(lateral.x(), lateral.y(), down);

@@ -188,7 +188,7 @@ fn a_vehicle_that_stands_is_pushed_down_and_not_steered_whatever_it_says_of_its_
     assert!(stands.is_some_and(|s| s < 0.5), "{stands:?} s");
 }
 
-/// The least speed down, in m/s, that is asked from 0.2 m down to the ground and for a second there, of a vehicle that sinks at
+/// The minimum speed down, in m/s, that is asked from 0.2 m down to the ground and for a second there, of a vehicle that sinks at
 /// 0.5 m/s while the estimate of its pad changes by the time in seconds; and whether it is known to stand at the end.
 fn touched(noise_m_s: f64, change: impl Fn(f64, &mut TargetEstimate)) -> (f64, bool) {
     let mut metric = Metric::new(MetricConfig::default());
@@ -231,6 +231,31 @@ fn nothing_that_the_estimate_becomes_lifts_a_vehicle_that_touches_down() {
     {
         assert!(stands && down_m_s >= 2.0 * PUSHING_M_S - 1e-9, "{name}: {down_m_s} m/s, {stands}");
     }
+}
+
+#[test]
+fn a_pad_that_seems_to_sink_is_not_followed_hard_onto_the_ground() {
+    let touchdown_m_s = |pad_m_s: f64, pad_heave_m_s: f64| {
+        let mut metric = Metric::new(MetricConfig::default());
+        let mut down_m_s = 0.0;
+        for i in 0..=40u32 {
+            let s = f64::from(i) / 40.0;
+            let vehicle = sinking(s, 0.0, 0.7 - 0.7 * s, 0.7);
+            let mut situation = Situation { pad_heave_m_s, ..situation(&vehicle) };
+            let pad_velocity = Vector::new(0.0, 0.0, pad_m_s);
+            situation.target.as_mut().into_iter().for_each(|target| target.velocity = pad_velocity);
+            down_m_s = metric.velocity(&situation).0.z();
+        }
+        down_m_s
+    };
+    // As after three frames with wrong stamps.
+    for pad_m_s in [0.31, 1.0] {
+        let down_m_s = touchdown_m_s(pad_m_s, 0.0);
+        assert!(down_m_s <= 0.7 + 1e-9, "{pad_m_s} m/s: {down_m_s} m/s");
+    }
+    assert!(touchdown_m_s(0.1, 0.0) > 0.59, "the autopilot's height drifts");
+    assert!(touchdown_m_s(-0.3, 0.0) < 0.21, "or rises");
+    assert!(touchdown_m_s(0.45, 0.4) > 0.74, "a pad that heaves is followed");
 }
 
 #[test]
