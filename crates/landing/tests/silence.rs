@@ -4,14 +4,10 @@
 
 mod scene;
 
-use scene::{Flight, Sample, Scene, Silence, Then};
+use scene::{Flight, MAX_SINK_M_S, MAX_SLIDE_M_S, Sample, Scene, Silence, Then};
 
 /// Heights over the pad at which the silence begins, in metres.
 const HEIGHTS_M: [f64; 9] = [0.3, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0];
-
-/// Hardest touchdown that is safe, downwards and sideways, in m/s.
-const MAX_SINK_M_S: f64 = 0.8;
-const MAX_SLIDE_M_S: f64 = 0.3;
 
 /// A flight in the wind of this speed whose lander falls silent.
 fn silent(seed: u64, wind_m_s: f64, silence: Silence) -> Scene {

@@ -25,6 +25,9 @@ use world::{World, WorldConfig};
 
 use eyes::Eyes;
 
+/// Maximum speeds of a safe touchdown, downwards and sideways, in m/s.
+pub(crate) const MAX_SINK_M_S: f64 = 0.8;
+pub(crate) const MAX_SLIDE_M_S: f64 = 0.3;
 /// Minimum interval between setpoints that are not sent with a frame, in seconds.
 const SETPOINT_PERIOD_S: f64 = 0.04;
 /// Age of a state on arrival, in seconds.
@@ -326,11 +329,11 @@ impl Flight {
         self.samples.iter().find(|sample| sample.seconds >= seconds)
     }
 
-    /// True when the vehicle touched down far from the pad, hard or sliding, in a landing that was not
-    /// aborted.
+    /// True when the vehicle touched down hard or sliding, or far from the pad in a landing that was not aborted.
     pub(crate) fn is_unsafe(&self) -> bool {
         self.touchdown.is_some_and(|it| {
-            !self.aborted && (it.error_m > 0.3 || it.sink_m_s > 0.8 || it.slide_m_s > 0.5)
+            let is_far = !self.aborted && it.error_m > 0.3;
+            is_far || it.sink_m_s > MAX_SINK_M_S || it.slide_m_s > MAX_SLIDE_M_S
         })
     }
 }

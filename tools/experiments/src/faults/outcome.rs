@@ -3,12 +3,7 @@
 use serde::Serialize;
 
 use super::plan::Planned;
-use crate::landing::outcome::{MAX_HOP_M, greater};
-
-/// Maximum downward speed of a safe touchdown, in m/s.
-pub const MAX_SINK_M_S: f64 = 0.8;
-/// Maximum horizontal speed of a safe touchdown, in m/s.
-pub const MAX_SLIDE_M_S: f64 = 0.3;
+use crate::landing::outcome::{MAX_HOP_M, MAX_SINK_M_S, MAX_SLIDE_M_S, greater, is_too_fast};
 
 /// How it ended.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize)]
@@ -111,8 +106,7 @@ impl Outcome {
 
     /// True when it touched the ground faster than the bar allows.
     pub fn is_unsafe(&self) -> bool {
-        let beyond = |value: Option<f64>, limit| value.is_some_and(|value| value > limit);
-        beyond(self.sink_m_s, MAX_SINK_M_S) || beyond(self.slide_m_s, MAX_SLIDE_M_S)
+        is_too_fast(self.sink_m_s, self.slide_m_s)
     }
 
     /// How near it came to the bar: above 1 it is unsafe. A flight without a touch has 0.

@@ -3,8 +3,8 @@
 use std::fmt::Write as _;
 
 use super::kind::Kind;
-use super::outcome::{Ending, MAX_SINK_M_S, MAX_SLIDE_M_S, Outcome};
-use crate::landing::outcome::MAX_HOP_M;
+use super::outcome::{Ending, Outcome};
+use crate::landing::outcome::{MAX_HOP_M, MAX_SINK_M_S, MAX_SLIDE_M_S};
 use crate::landing::report::{csv, json_lines};
 use crate::results::{self, FAULTS_HEADING, FLIGHTS_AS_CSV, FLIGHTS_AS_JSON, Folder, REPORT};
 

@@ -11,12 +11,21 @@ pub const HARD_M_S: f64 = 0.6;
 pub const SLIDING_M_S: f64 = 0.1;
 /// Specified limit of the tilt at touchdown, in degrees.
 pub const TILTED_DEG: f64 = 10.0;
-/// Vertical speed at touchdown above which the vehicle may bounce, in m/s.
-pub const CRASH_SINK_M_S: f64 = 0.8;
-/// Horizontal speed at touchdown above which the vehicle may tip over, in m/s.
-pub const CRASH_SLIDE_M_S: f64 = 0.5;
+/// Maximum downward speed of a safe touchdown, in m/s: a faster vehicle may bounce.
+pub const MAX_SINK_M_S: f64 = 0.8;
+/// Maximum horizontal speed of a safe touchdown, in m/s: a faster vehicle may tip over.
+pub const MAX_SLIDE_M_S: f64 = 0.3;
 /// Height after a touch, in metres, beyond which a vehicle has left the ground again.
 pub const MAX_HOP_M: f64 = 0.15;
+
+/// Whether a touch of the ground with these greatest speeds in m/s, if there was one, was faster than is safe.
+pub(crate) fn is_too_fast(sink_m_s: Option<f64>, slide_m_s: Option<f64>) -> bool {
+    beyond(sink_m_s, MAX_SINK_M_S) || beyond(slide_m_s, MAX_SLIDE_M_S)
+}
+
+fn beyond(value: Option<f64>, limit: f64) -> bool {
+    value.is_some_and(|value| value > limit)
+}
 
 /// The greater one of those that are there.
 pub(crate) fn greater(before: Option<f64>, value: Option<f64>) -> Option<f64> {
@@ -130,13 +139,11 @@ impl Outcome {
         self.ending == Ending::Landed && self.error_m.is_some_and(|error| error <= metres)
     }
 
-    /// Whether it touched down, without an abort, far from the pad or dangerously fast.
+    /// Whether it touched the ground dangerously fast, or, without an abort, far from the pad. Where an aborted flight comes
+    /// down is the pilot's affair.
     pub fn is_unsafe(&self) -> bool {
-        let beyond = |value: Option<f64>, limit: f64| value.is_some_and(|value| value > limit);
-        self.ending != Ending::Aborted
-            && (beyond(self.error_m, Touchdown::MAX_ERROR_M)
-                || beyond(self.sink_m_s, CRASH_SINK_M_S)
-                || beyond(self.slide_m_s, CRASH_SLIDE_M_S))
+        let is_far = self.ending != Ending::Aborted && beyond(self.error_m, Touchdown::MAX_ERROR_M);
+        is_far || is_too_fast(self.sink_m_s, self.slide_m_s)
     }
 
     /// Whether it left the ground again after a touch.

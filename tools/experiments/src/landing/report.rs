@@ -6,11 +6,12 @@ use std::fs::File;
 use std::io::BufWriter;
 
 use anyhow::Context;
+use messages::Touchdown;
 use serde::Serialize;
 use serde_json::Value;
 
 use super::flight::{fly, fly_recorded};
-use super::outcome::{Ending, MAX_HOP_M, Outcome};
+use super::outcome::{Ending, MAX_HOP_M, MAX_SINK_M_S, MAX_SLIDE_M_S, Outcome};
 use super::plan::{Planned, Request};
 use super::table::{markdown, share_interval};
 use super::{in_parallel_until, plots, thesis_figures};
@@ -64,7 +65,7 @@ fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
     let again = outcomes.iter().filter(|o| o.has_left_ground()).count();
     format!(
         "{LANDINGS_HEADING}\n{}{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe, {again} left the ground again after a touch (by more than {MAX_HOP_M} m).\n\n\
-         Unsafe: touched down, without having given up, more than 0.3 m off, faster than 0.8 m/s down or 0.5 m/s sideways. Times count from the start of the landing. \
+         Unsafe: touched the ground faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways, or, without having given up, more than {} m off. Times count from the start of the landing. \
          Numbers of error, time, speed and tilt are of those that landed.\n\n",
         results::interrupted(outcomes.len(), planned),
         results::origin(&request.command),
@@ -74,6 +75,7 @@ fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
         100.0 * within as f64 / outcomes.len().max(1) as f64,
         100.0 * low,
         100.0 * high,
+        Touchdown::MAX_ERROR_M,
     )
 }
 
@@ -83,7 +85,8 @@ fn failures(flights: &[Planned], outcomes: &[Outcome]) -> String {
     if failed.is_empty() {
         return "\nEvery flight landed within 0.1 m.\n".to_owned();
     }
-    let mut text = format!("\n## Farther off than 0.1 m, or not landed: {}\n\n", failed.len());
+    let mut text =
+        format!("\n## Unsafe, farther off than 0.1 m, or not landed: {}\n\n", failed.len());
     for (planned, outcome) in failed.iter().take(MAX_LISTED) {
         let error = outcome.error_m.map_or("no touch".to_owned(), |error| format!("{error:.3} m"));
         let ending = match outcome.ending {
@@ -91,8 +94,15 @@ fn failures(flights: &[Planned], outcomes: &[Outcome]) -> String {
             Ending::Aborted => "given up",
             Ending::Unfinished => "unfinished",
         };
+        let speed = match (outcome.sink_m_s, outcome.slide_m_s) {
+            (Some(sink), Some(slide)) if outcome.is_unsafe() => {
+                format!(", unsafe: {sink:.2} m/s down, {slide:.2} m/s sideways")
+            }
+            _ => String::new(),
+        };
+        let (why, command) = (&outcome.why, planned.command());
         // Writing to a string cannot fail.
-        let _ = writeln!(text, "- {ending}, {error}, {}: `{}`", outcome.why, planned.command());
+        let _ = writeln!(text, "- {ending}, {error}{speed}, {why}: `{command}`");
     }
     text
 }
