@@ -309,7 +309,7 @@ impl LandingSummary {
             processes: self.processes(),
             recording: self.recorder.as_ref().map(|recorder| Recording {
                 file: Some(&recorder.file).filter(|file| !file.is_empty()).cloned(),
-                kept: recorder.kept,
+                kept: recorder.total_kept(),
                 dropped: recorder.lost(),
                 never_came: recorder.never_came(),
                 problem: self.recording_problem(recorder),

@@ -323,7 +323,7 @@ function showSlow({ detectors, services, recorders, bridges, checks }) {
     line.dataset.age = String(it.age_ms);
   }
   forget(processes, keys);
-  put('recorders', recorders.length === 0 ? 'Nothing records.' : recorders.map((/** @type {any} */ it) => `Recorder ${it.name}: ${it.problem ?? `${it.file}, ${(it.bytes / 1e6).toFixed(1)} MB, ${it.kept} messages, ${it.lost} lost`} (${age(it.age_ms)} ago)`).join(' '));
+  put('recorders', recorders.length === 0 ? 'Nothing records.' : recorders.map((/** @type {any} */ it) => `Recorder ${it.name}: ${it.problem ?? `${it.file}, ${(it.bytes / 1e6).toFixed(1)} MB, ${it.kept} messages, ${it.lost} lost${it.free_bytes === null ? '' : `, ${(it.free_bytes / 1e9).toFixed(1)} GB free`}`} (${age(it.age_ms)} ago)`).join(' '));
   put('bridges', bridges.map((/** @type {any} */ it) => `Ground stations of ${it.name}: ${it.problem ?? (it.stations.join(', ') || 'none yet')}, packets ${it.signing}, ${it.refused} refused (${age(it.age_ms)} ago)`).join(' '));
 
   const list = element('checks');

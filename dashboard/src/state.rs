@@ -349,7 +349,7 @@ impl State {
             let it = &seen.value;
             json!({
                 "name": name, "age_ms": age_ms(now_ns, seen.received_ns), "file": it.file, "bytes": it.bytes,
-                "kept": it.kept, "lost": it.lost(),
+                "kept": it.total_kept(), "lost": it.lost(), "free_bytes": it.free_bytes,
                 "problem": it.problem,
             })
         }).collect();

@@ -9,6 +9,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail};
+use rustix::fs::fstatvfs;
 
 /// A file that is being written.
 #[derive(Debug)]
@@ -41,6 +42,8 @@ pub(crate) struct DiskStatus {
     pub(crate) path: Option<PathBuf>,
     /// Bytes that are on the disk.
     pub(crate) bytes: u64,
+    /// Bytes that are free on it, once the file is open; `None` where its file system has no bound.
+    pub(crate) free_bytes: Option<u64>,
     /// Bytes that wait for it.
     pub(crate) waiting_bytes: usize,
     /// How long the oldest of them wait.
@@ -120,7 +123,12 @@ impl Shared {
     /// Writes until everything is there.
     fn write_all(&self, wanted: &Path) -> anyhow::Result<()> {
         let (path, mut file) = create(wanted)?;
-        self.lock().status.path = Some(path.clone());
+        // Asked for by this thread, as a disk that stands still does not answer.
+        let room_bytes = free_bytes(&file);
+        let mut state = self.lock();
+        state.status.path = Some(path.clone());
+        state.status.free_bytes = room_bytes;
+        drop(state);
         let result = self.write(&path, &mut file);
         if result.is_err() && self.lock().status.bytes == 0 {
             // A disk without room still takes empty files, one for each attempt. A file that others put there is theirs.
@@ -146,8 +154,10 @@ impl Shared {
             }
             file.sync_data().with_context(doing)?;
             is_still_there(path, file).with_context(|| format!("writing {path:?}"))?;
+            let room_bytes = free_bytes(file);
             let mut state = self.lock();
             state.status.bytes += bytes as u64;
+            state.status.free_bytes = room_bytes;
             state.waiting_bytes = state.waiting_bytes.saturating_sub(bytes);
             state.since = (!state.waiting.is_empty()).then(Instant::now);
         }
@@ -175,6 +185,13 @@ fn is_still_there(path: &Path, file: &File) -> anyhow::Result<()> {
         bail!("another file was put in its place");
     }
     Ok(())
+}
+
+/// What this user may still write to the disk of a file.
+fn free_bytes(file: &File) -> Option<u64> {
+    let about = fstatvfs(file).ok()?;
+    // A file system without a bound has no blocks.
+    (about.f_blocks > 0).then(|| about.f_bavail.saturating_mul(about.f_frsize))
 }
 
 /// Creates a file, and the directories that it is in.
@@ -217,6 +234,7 @@ mod tests {
             disk.complete();
             let status = disk.wait(PATIENCE);
             assert_eq!((status.bytes, status.waiting_bytes, status.problem), (3, 0, None));
+            assert!(status.free_bytes.is_some_and(|bytes| bytes > 0), "{:?}", status.free_bytes);
             assert_eq!(status.path, Some(folder.path().join(name)));
             assert_eq!(std::fs::read(folder.path().join(name)).unwrap(), b"abc");
         }

@@ -8,7 +8,8 @@ use std::time::{Duration, Instant, SystemTime};
 use anyhow::{Context, bail, ensure};
 use flightlog::About;
 use messages::{
-    Delivery, FrameHeader, RecorderLoss, RecorderStatus, Row, TOPICS, has_never_come, topic,
+    Delivery, FrameHeader, OTHER_KEYS, RecorderCount, RecorderStatus, Row, TOPICS, has_never_come,
+    topic,
 };
 use node::{BoxFuture, HealthCounters, Node, Shutdown, Tap, Tapped, now_ns};
 
@@ -37,10 +38,8 @@ const END_PATIENCE: Duration = Duration::from_millis(1100);
 const TIME_SET_NS: i64 = 100_000_000;
 /// Period of the status.
 const STATUS_PERIOD: Duration = Duration::from_millis(500);
-/// Maximum number of keys whose last values or losses are remembered.
-const MAX_KEYS: usize = 1024;
-/// The name under which the losses of further keys are counted.
-const OTHER_KEYS: &str = "other keys";
+/// Maximum number of keys whose last values are remembered.
+const MAX_STATES: usize = 1024;
 
 /// Records until shutdown. A disk that fails ends nothing: it is told, what is lost is counted, and another file is tried.
 ///
@@ -80,9 +79,9 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
         ending: None,
         end_problem: None,
         retry: None,
-        kept: 0,
+        kept: Counts::default(),
         unseen: Unseen::default(),
-        lost: BTreeMap::new(),
+        lost: Counts::default(),
         lost_in_file: None,
         states: BTreeMap::new(),
     };
@@ -168,11 +167,12 @@ struct Recorder {
     end_problem: Option<String>,
     /// When a file that failed is tried again.
     retry: Option<Instant>,
-    kept: u64,
+    /// Messages that were kept.
+    kept: Counts,
     /// Frames that never came.
     unseen: Unseen,
-    /// Messages that were lost, by key.
-    lost: BTreeMap<String, u64>,
+    /// Messages that were lost.
+    lost: Counts,
     /// How many the file says.
     lost_in_file: Option<u64>,
     /// The last value of each state: every file begins with them.
@@ -196,6 +196,38 @@ impl Last {
     /// Whether a message came in that time: others that go on publish for ever.
     fn has(self, message: &Tapped) -> bool {
         message.received_ns <= self.at_ns
+    }
+}
+
+/// Numbers of messages by key; of the keys that came first, as many as a status may have, and of all others together.
+#[derive(Debug, Default)]
+struct Counts(BTreeMap<String, u64>);
+
+impl Counts {
+    fn add(&mut self, key: &str, count: u64) {
+        if let Some(so_far) = self.0.get_mut(key) {
+            *so_far += count;
+            return;
+        }
+        // The last place is for the others.
+        let is_new = self.0.len() + 1 < RecorderStatus::MAX_KEYS;
+        *self.0.entry(if is_new { key } else { OTHER_KEYS }.to_owned()).or_default() += count;
+    }
+
+    fn take_back(&mut self, key: &str, count: u64) {
+        let key = if self.0.contains_key(key) { key } else { OTHER_KEYS };
+        if let Some(so_far) = self.0.get_mut(key) {
+            *so_far = so_far.saturating_sub(count);
+        }
+    }
+
+    fn total(&self) -> u64 {
+        self.0.values().sum()
+    }
+
+    fn list(&self) -> Vec<RecorderCount> {
+        let counts = self.0.iter().map(|(key, count)| (key.clone(), *count));
+        counts.map(|(key, count)| RecorderCount { key, count }).collect()
     }
 }
 
@@ -227,7 +259,7 @@ impl Recorder {
                 while let Some(message) = tap.next(Duration::ZERO) {
                     if last.has(&message) {
                         self.take_number(&message);
-                        self.lose(message.key, 1);
+                        self.lost.add(&message.key, 1);
                     }
                 }
                 self.count_dropped(tap);
@@ -239,11 +271,11 @@ impl Recorder {
     fn count_dropped(&mut self, tap: &Tap) {
         for (key, count) in tap.take_dropped() {
             self.unseen.dropped(&key, count);
-            self.lose(key, count);
+            self.lost.add(&key, count);
         }
         for (key, count) in self.unseen.more() {
             self.health.dropped_times("frames that never came", count);
-            self.lose(key, count);
+            self.lost.add(&key, count);
         }
     }
 
@@ -272,7 +304,7 @@ impl Recorder {
             match keep(recording, &message, frame.as_ref()) {
                 Ok(()) => {
                     recording.count(&message.key);
-                    self.kept += 1;
+                    self.kept.add(&message.key, 1);
                     self.health.count("messages");
                 }
                 Err(problem) => self.give_up(&format!("{problem:#}")),
@@ -280,7 +312,7 @@ impl Recorder {
         } else if self.config.has_file() {
             let is_slow = self.recording.is_some();
             self.health.dropped(if is_slow { "the disk is too slow" } else { "no file" });
-            self.lose(message.key.clone(), 1);
+            self.lost.add(&message.key, 1);
         }
         if frame.as_ref().is_some_and(|frame| !frame.is_whole) {
             self.health.dropped("a picture that is no whole image");
@@ -289,7 +321,7 @@ impl Recorder {
             live.take(&message, frame.as_ref());
         }
         if message.is_state
-            && (self.states.len() < MAX_KEYS || self.states.contains_key(&message.key))
+            && (self.states.len() < MAX_STATES || self.states.contains_key(&message.key))
         {
             self.states.insert(message.key.clone(), message);
         }
@@ -300,22 +332,22 @@ impl Recorder {
         self.ending.as_ref().map_or(0, |ending| ending.status().waiting_bytes)
     }
 
-    fn lose(&mut self, key: String, count: u64) {
-        let is_known = self.lost.len() < MAX_KEYS || self.lost.contains_key(&key);
-        let key = if is_known { key } else { OTHER_KEYS.to_owned() };
-        *self.lost.entry(key).or_default() += count;
-    }
-
     /// Opens, flushes, ends and replaces the file, and says how it is doing.
     fn look_after_file(&mut self) {
         if let Some(live) = &mut self.live
             && live.is_followed(utc_offset_ns, self.states.values())
         {
-            live.tell_lost(&self.lost);
+            live.tell_lost(&self.lost.0);
         }
-        if !self.config.has_file() {
-            return;
+        if self.config.has_file() {
+            self.write_file();
         }
+        let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
+        status.kept = self.kept.list();
+        status.dropped = self.lost.list();
+    }
+
+    fn write_file(&mut self) {
         match self.write_out() {
             Ok(()) => {}
             Err(problem) => self.give_up(&format!("{problem:#}")),
@@ -342,8 +374,8 @@ impl Recorder {
     /// Messages that were kept and are not on the disk are lost.
     fn count_unsynced(&mut self, unsynced: BTreeMap<String, u64>) {
         for (key, count) in unsynced {
-            self.kept = self.kept.saturating_sub(count);
-            self.lose(key, count);
+            self.kept.take_back(&key, count);
+            self.lost.add(&key, count);
         }
     }
 
@@ -363,7 +395,7 @@ impl Recorder {
     fn write_out(&mut self) -> anyhow::Result<()> {
         let before_bytes = self.ending_bytes();
         let Some(recording) = &mut self.recording else { return Ok(()) };
-        let lost = self.lost.values().sum();
+        let lost = self.lost.total();
         let waiting_bytes = recording.status().waiting_bytes + before_bytes;
         let has_room = waiting_bytes <= self.max_waiting_bytes;
         let utc_offset_ns = utc_offset_ns();
@@ -377,7 +409,7 @@ impl Recorder {
         }
         if recording.hand_over()? && has_room && self.lost_in_file != Some(lost) {
             // On the disk with the next flush; the sums of a file that is not flushed again are those of the one before.
-            recording.writer.dropped(now_ns(), &self.lost)?;
+            recording.writer.dropped(now_ns(), &self.lost.0)?;
             self.lost_in_file = Some(lost);
         }
         let disk = recording.status();
@@ -398,9 +430,7 @@ impl Recorder {
         status.file = shown;
         status.bytes = disk.bytes;
         status.waiting_bytes = (disk.waiting_bytes + before_bytes) as u64;
-        status.kept = self.kept;
-        let losses = self.lost.iter().map(|(key, count)| (key.clone(), *count));
-        status.dropped = losses.map(|(key, count)| RecorderLoss { key, count }).collect();
+        status.free_bytes = disk.free_bytes;
         if self.retry.is_none() {
             status.problem = problem.or_else(|| self.end_problem.clone());
         }
@@ -430,13 +460,14 @@ impl Recorder {
         status.problem = Some(problem.to_owned());
         status.file.clear();
         status.waiting_bytes = 0;
+        status.free_bytes = None;
     }
 
     /// Ends the file, and waits for the disk until then.
     fn end(self, until: Instant) -> anyhow::Result<()> {
         let last = match self.recording {
             Some(mut recording) => {
-                recording.writer.dropped(now_ns(), &self.lost)?;
+                recording.writer.dropped(now_ns(), &self.lost.0)?;
                 Some(recording.end()?)
             }
             None => None,
@@ -452,7 +483,7 @@ impl Recorder {
                 disk.has_ended,
                 "the disk did not take the end of {name:?} in time; `alight record --repair` ends it"
             );
-            tracing::info!(file = %name.display(), bytes = disk.bytes, messages = self.kept, "Recorded");
+            tracing::info!(file = %name.display(), bytes = disk.bytes, messages = self.kept.total(), "Recorded");
         }
         ensure!(!is_missing, "nothing could be recorded at the end; see the log above");
         if let Some(problem) = self.end_problem {
@@ -460,7 +491,7 @@ impl Recorder {
         }
         // Without a file only viewers missed them, who were told.
         let is_lost = |(key, _): &(&String, &u64)| self.config.has_file() && !has_never_come(key);
-        let lost: Vec<_> = self.lost.iter().filter(is_lost).collect();
+        let lost: Vec<_> = self.lost.0.iter().filter(is_lost).collect();
         let keys: Vec<_> = lost.iter().map(|(key, count)| format!("{count} of {key}")).collect();
         let count: u64 = lost.iter().map(|(_, count)| **count).sum();
         ensure!(
@@ -506,9 +537,9 @@ mod tests {
             ending: None,
             end_problem: None,
             retry: None,
-            kept: 0,
+            kept: Counts::default(),
             unseen: Unseen::default(),
-            lost: BTreeMap::new(),
+            lost: Counts::default(),
             lost_in_file: None,
             states: BTreeMap::new(),
             about,
@@ -522,14 +553,14 @@ mod tests {
     #[test]
     fn a_recorder_that_lost_messages_or_the_end_of_a_file_says_so_at_its_end() {
         ends(|_| {}).unwrap();
-        ends(|it| it.lose("camera/down/frame (never came)".to_owned(), 7)).unwrap();
-        let told = ends(|it| it.lose("wind".to_owned(), 3)).unwrap_err();
+        ends(|it| it.lost.add("camera/down/frame (never came)", 7)).unwrap();
+        let told = ends(|it| it.lost.add("wind", 3)).unwrap_err();
         assert!(told.contains("3 messages") && told.contains("3 of wind"), "{told}");
         let told = ends(|it| it.end_problem = Some("the end is missing".to_owned())).unwrap_err();
         assert!(told.contains("the end is missing"), "{told}");
         // Who only serves viewers has told them.
         ends(|it| {
-            it.lose("wind".to_owned(), 3);
+            it.lost.add("wind", 3);
             it.config.file = std::path::PathBuf::new();
         })
         .unwrap();
@@ -541,5 +572,23 @@ mod tests {
         let message = |received_ns| Tapped { received_ns, ..Tapped::default() };
         assert!(last.has(&message(now_ns())) && last.has(&message(last.at_ns)));
         assert!(!last.has(&message(last.at_ns + 1)));
+    }
+
+    #[test]
+    fn messages_are_counted_by_key_and_those_of_too_many_keys_together() {
+        let max = RecorderStatus::MAX_KEYS;
+        let mut counts = Counts::default();
+        for number in 0..max + 10 {
+            counts.add(&format!("key {number:05}"), 2);
+        }
+        counts.add("key 00000", 1);
+        let list = counts.list();
+        let of = |key: &str| list.iter().find(|it| it.key == key).map(|it| it.count);
+        assert_eq!((list.len(), counts.total()), (max, 2 * (max as u64 + 10) + 1));
+        assert_eq!((of("key 00000"), of("wind"), of(OTHER_KEYS)), (Some(3), None, Some(22)));
+        counts.take_back("key 00000", 3);
+        counts.take_back("wind", 1);
+        assert_eq!(counts.total(), 2 * (max as u64 + 10) - 3);
+        assert!(counts.list().contains(&RecorderCount { key: OTHER_KEYS.into(), count: 21 }));
     }
 }

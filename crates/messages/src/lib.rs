@@ -40,7 +40,7 @@ pub use detector::{
 };
 pub use gcs::{GcsSigning, GcsStatus, GroundStation, PacketSignature, SigningState};
 pub use health::{Configuration, Count, Health, Latency, Rate};
-pub use recorder::{NEVER_CAME, RecorderLoss, RecorderStatus, has_never_come};
+pub use recorder::{NEVER_CAME, OTHER_KEYS, RecorderCount, RecorderStatus, has_never_come};
 pub use simulation::{Touchdown, Truth, Wind};
 pub use tape::{
     Tape, TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapePad, TapeRecord,

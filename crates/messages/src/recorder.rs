@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::codec::wire;
 
 wire! {
-    RecorderStatus = 18 v 1;
+    RecorderStatus = 18 v 2;
 }
 
 /// What a recorder has kept, and what not.
@@ -21,13 +21,20 @@ pub struct RecorderStatus {
     pub bytes: u64,
     /// Bytes that wait for the disk.
     pub waiting_bytes: u64,
-    /// Messages that were kept since the start.
-    pub kept: u64,
-    /// Messages that were lost since the start, by key; with [`NEVER_CAME`] after it, frames whose numbers are missing.
-    pub dropped: Vec<RecorderLoss>,
+    /// Bytes that are free for the recorder on the disk of the file, as of the last time that something was written to it;
+    /// `None` while there is no file, or where its file system has no bound.
+    pub free_bytes: Option<u64>,
+    /// Messages that were kept since the start, by key; of at most [`Self::MAX_KEYS`] keys.
+    pub kept: Vec<RecorderCount>,
+    /// Messages that were lost since the start, by key; with [`NEVER_CAME`] after it, frames whose numbers are missing. Of at most
+    /// [`Self::MAX_KEYS`] keys.
+    pub dropped: Vec<RecorderCount>,
     /// Why nothing is being kept, as a sentence.
     pub problem: Option<String>,
 }
+
+/// The name under which messages of further keys are counted.
+pub const OTHER_KEYS: &str = "other keys";
 
 /// Follows the key of frames whose numbers are missing: the simulator left them out, or they were lost on their way to the
 /// recorder. What a real camera misses has no number, and stands in its own health.
@@ -39,6 +46,14 @@ pub fn has_never_come(key: &str) -> bool {
 }
 
 impl RecorderStatus {
+    /// Maximum number of keys that are counted, [`OTHER_KEYS`] among them.
+    pub const MAX_KEYS: usize = 1024;
+
+    /// How many messages were kept.
+    pub fn total_kept(&self) -> u64 {
+        self.kept.iter().map(|kept| kept.count).sum()
+    }
+
     /// How many messages came to the recorder and were lost by it.
     pub fn lost(&self) -> u64 {
         self.sum(|key| !has_never_come(key))
@@ -55,9 +70,9 @@ impl RecorderStatus {
     }
 }
 
-/// Messages of one key that a recorder lost.
+/// Messages of one key that a recorder kept or lost.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RecorderLoss {
+pub struct RecorderCount {
     /// The key.
     pub key: String,
     /// How many.
@@ -70,13 +85,14 @@ mod tests {
 
     #[test]
     fn what_never_came_is_no_loss_of_the_recorder() {
-        let loss = |key: &str, count| RecorderLoss { key: key.into(), count };
+        let count = |key: &str, count| RecorderCount { key: key.into(), count };
         let dropped = vec![
-            loss("wind", 3),
-            loss("camera/down/frame", 2),
-            loss("camera/down/frame (never came)", 7),
+            count("wind", 3),
+            count("camera/down/frame", 2),
+            count("camera/down/frame (never came)", 7),
         ];
-        let status = RecorderStatus { dropped, ..RecorderStatus::default() };
-        assert_eq!((status.lost(), status.never_came()), (5, 7));
+        let kept = vec![count("wind", 40), count("camera/down/frame", 2)];
+        let status = RecorderStatus { kept, dropped, ..RecorderStatus::default() };
+        assert_eq!((status.total_kept(), status.lost(), status.never_came()), (42, 5, 7));
     }
 }

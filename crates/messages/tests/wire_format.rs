@@ -8,7 +8,7 @@ use messages::{
     Detection, Detections, DetectorCommand, DetectorInfo, DetectorState, EllipsePx, ExposureLimits,
     ExposureReason, ExposureSetter, ExposureSetting, FrameAck, FrameHeader, FramePart, GcsSigning,
     GcsStatus, GroundStation, Health, LandedState, Latency, LensModel, MarkerLevels, MarkerPose,
-    MavlinkBytes, Message, PacketSignature, Phase, PixelFormat, Place, Rate, RecorderLoss,
+    MavlinkBytes, Message, PacketSignature, Phase, PixelFormat, Place, Rate, RecorderCount,
     RecorderStatus, Refusal, Refusals, RefusedShape, Setpoint, SigningState, StageTime, Tape,
     TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapePad, TapeState, TapeTarget,
     TapeWriter, TargetEstimate, Touchdown, Transform3, Truth, VehicleState, Wind, decode, encode,
@@ -128,11 +128,12 @@ fn recorder_status() {
         file: "f".into(),
         bytes: 300,
         waiting_bytes: 1,
-        kept: 2,
-        dropped: vec![RecorderLoss { key: "wind".into(), count: 3 }],
+        free_bytes: Some(300),
+        kept: vec![RecorderCount { key: "wind".into(), count: 2 }],
+        dropped: vec![RecorderCount { key: "wind".into(), count: 3 }],
         problem: Some("x".into()),
     };
-    check(&message, "411201046d61696e010166ac020102010477696e6403010178");
+    check(&message, "411202046d61696e010166ac020101ac02010477696e6402010477696e6403010178");
 }
 
 #[test]
