@@ -270,14 +270,12 @@ impl Flight {
     }
 
     /// Handles the detections that were published on the key of the detector `publisher`. True when a frame
-    /// was used or these detections were refused; false when they wait, as those of a detector on standby do.
+    /// was used or these detections were refused, and so the target is to be told; false when they wait, as those of a detector on
+    /// standby do, or when what such a detector publishes was refused.
     pub fn detections(&mut self, now_ns: i64, publisher: &str, message: &Detections) -> bool {
         self.journal.count("detections");
         match self.frames.add(now_ns, publisher, message) {
-            Arrival::Refused(reason) => {
-                self.journal.reject(reason);
-                return true;
-            }
+            Arrival::Refused(reason) => return self.refuse(publisher, reason),
             Arrival::Late(frame) => {
                 self.journal.count("late frames");
                 self.decide(now_ns, LanderEvent::Frame(frame));
@@ -288,6 +286,19 @@ impl Flight {
             Arrival::Kept => {}
         }
         self.use_newest(now_ns)
+    }
+
+    /// Counts what a detector published and was refused. True when it is the detector in use, or none is: why another one is refused
+    /// says nothing about the target.
+    fn refuse(&mut self, publisher: &str, reason: &str) -> bool {
+        let active = self.frames.selection.active();
+        let is_in_use = active.is_none_or(|active| active == publisher);
+        if is_in_use {
+            self.journal.reject(reason);
+        } else {
+            self.journal.reject_unused(reason);
+        }
+        is_in_use
     }
 
     /// Gives the lander the next frame, if there is one, and reports a change of the active detector.
@@ -365,7 +376,7 @@ impl Flight {
     /// Handles the information that was published on the key of the detector `publisher`.
     pub fn on_detector_info(&mut self, now_ns: i64, publisher: &str, info: &DetectorInfo) {
         if info.detector != publisher {
-            self.journal.reject("another-detectors-name");
+            self.refuse(publisher, "another-detectors-name");
             return;
         }
         self.frames.camera_watch.heard(now_ns, publisher, &info.camera);

@@ -18,7 +18,7 @@ const STAMP_TO_SETPOINT: &str = "stamp to setpoint";
 #[derive(Debug)]
 pub struct Journal {
     health: Arc<HealthCounters>,
-    /// Why the latest detection was rejected, if it was.
+    /// Why the latest detection of the detector in use was rejected, if it was.
     rejection: Option<String>,
     /// The matters of which the log has told.
     told: Vec<String>,
@@ -60,10 +60,15 @@ impl Journal {
         self.health.count(name);
     }
 
-    /// Counts a rejected detection and remembers the reason, a short name for programs.
+    /// Counts a rejected detection of the detector in use and remembers the reason, a short name for programs.
     pub fn reject(&mut self, reason: &str) {
         self.health.dropped(&format!("detection: {reason}"));
         self.rejection = Some(reason.to_owned());
+    }
+
+    /// Counts a rejected detection of a detector that is not in use.
+    pub fn reject_unused(&self, reason: &str) {
+        self.health.dropped(&format!("detection: {reason}"));
     }
 
     /// Counts a rejected detection that arrived after a newer one.
@@ -76,7 +81,7 @@ impl Journal {
         self.rejection = None;
     }
 
-    /// Why the latest detection was rejected, if it was.
+    /// Why the latest detection of the detector in use was rejected, if it was.
     pub fn rejection(&self) -> Option<&str> {
         self.rejection.as_deref()
     }
