@@ -85,7 +85,9 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                 _ = introduction.tick() => {
                     infos_of_ours.publish(&live.info).await;
                     let now = lock(&response).clone();
-                    if let Some(response) = now.as_ref().filter(|_| now != told) {
+                    // What is no longer so would stay the last value for those that come late.
+                    let told_of_none = now.is_none().then(|| unknown_response(&live.config));
+                    if now != told && let Some(response) = now.as_ref().or(told_of_none.as_ref()) {
                         responses.publish(response).await;
                     }
                     told = now;
@@ -163,6 +165,20 @@ fn configured_response(config: &Config) -> Option<CameraResponse> {
     match config.response() {
         Ok(ResponseSetting::Known(known)) => Some(camera_response(config, true, 0, &known)),
         _ => None,
+    }
+}
+
+/// Says that nothing is known of the camera's response.
+fn unknown_response(config: &Config) -> CameraResponse {
+    CameraResponse {
+        detector: config.id.clone(),
+        camera: config.camera.clone(),
+        configured: false,
+        markers: 0,
+        curve: 0.0,
+        curve_deviation: 0.0,
+        sharpening: 0.0,
+        sharpening_deviation: 0.0,
     }
 }
 
