@@ -179,7 +179,8 @@ pub struct ControllerStatus {
     pub candidates: Vec<Candidate>,
     /// Age of the last frame that was used, since its exposure, in milliseconds.
     pub detection_age_ms: Option<f64>,
-    /// Height above the target, in metres; above the take-off point while no target was seen.
+    /// Height above the target, in metres; while there is none, above the origin of the autopilot's local frame, which need not be
+    /// where the vehicle took off.
     pub height_m: Option<f64>,
     /// Horizontal distance to the target, in metres.
     pub lateral_error_m: Option<f64>,
