@@ -3,18 +3,20 @@
 //! Each test flies `alight land` in real time, beside one other at most, and joins its network as one more process.
 
 use std::process::{Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
-use messages::{ControllerCommand, DetectorCommand, Phase, topic};
+use messages::{ControllerCommand, DetectorCommand, Phase, Touchdown, topic};
 use node::now_ns;
 use rustix::process::{Pid, Signal, kill_process};
 use testing::{ports, python, python_passes, skip, with_second_try};
 
 use crate::flight::{
-    ALIGHT, Landing, beside_another, descent_m_s, output_of, seconds, speed_m_s, time_for,
+    ALIGHT, Landing, Vehicle, beside_another, descent_m_s, output_of, seconds, speed_m_s, time_for,
 };
 
+/// Longest time that the processes of a landing which was killed may go on.
+const MAX_ORPHANED: Duration = Duration::from_secs(6);
 /// Exit status of a script that lacks a package.
 const LACKS_MAVSDK: i32 = 77;
 
@@ -169,14 +171,65 @@ async fn the_controller_is_killed_again_and_again() -> anyhow::Result<()> {
             -stopped.position_ned_m[2]
         );
         if let Some(touchdown) = stopped.touchdown {
-            let is_soft = touchdown.vertical_speed_m_s <= 0.8 && touchdown.lateral_speed_m_s <= 0.3;
-            ensure!(is_soft, "it hit the ground: {touchdown:?}");
+            ensure!(is_soft(&touchdown), "it hit the ground: {touchdown:?}");
             return Ok(());
         }
         resumed = Some(landing.start_by_hand("controller", &[])?);
     }
     landing.lands().await?;
     Ok(())
+}
+
+/// Of its own simulated vehicle nothing would be seen after the kill, as its simulator ends with it: it leads another one.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_landing_killed_in_the_descent_takes_its_processes_with_it_and_lets_nothing_hit_the_ground()
+-> anyhow::Result<()> {
+    for height_m in [3.0, 0.7] {
+        let _flight = time_for(2).await?;
+        with_second_try(|| a_landing_is_killed(height_m)).await?;
+    }
+    Ok(())
+}
+
+async fn a_landing_is_killed(height_m: f64) -> anyhow::Result<()> {
+    let vehicle = Vehicle::start().await?;
+    let mut landing = Landing::start(&["--seed", "4", "--autopilot", &vehicle.address]).await?;
+    landing.descends_below(height_m).await?;
+    landing.land.kill()?;
+    let killed = Instant::now();
+    landing.land.wait()?;
+    let mut motion = Vec::new();
+    while landing.services.iter().any(|it| runs(it.pid)) && killed.elapsed() < MAX_ORPHANED {
+        motion.extend(vehicle.motion(Duration::from_millis(20)).await);
+    }
+    let ended_s = killed.elapsed().as_secs_f64();
+    let left: Vec<_> = landing.services.iter().filter(|it| runs(it.pid)).collect();
+    for service in &left {
+        let _ = kill_process(service.pid, Signal::KILL);
+    }
+    let left: Vec<_> = left.iter().map(|it| &it.name).collect();
+    ensure!(left.is_empty(), "{left:?} outlive their landing by {MAX_ORPHANED:?}");
+    motion.extend(vehicle.motion(Duration::from_secs(8)).await);
+    let last = motion.last().context("nothing is told of the vehicle")?;
+    println!(
+        "killed below {height_m} m: its processes ended after {ended_s:.1} s, the vehicle is at {:.2} m; {:?}",
+        last.pad_ned_m[2] - last.position_ned_m[2],
+        last.touchdown
+    );
+    ensure!(last.on_ground || speed_m_s(last) < 0.1, "it goes on: {last:?}");
+    ensure!(last.touchdown.as_ref().is_none_or(is_soft), "it hit the ground: {last:?}");
+    Ok(())
+}
+
+/// Whether a process that is not a child of ours runs; one that has ended stays as a zombie where nobody waits for orphans.
+fn runs(pid: Pid) -> bool {
+    let stat = std::fs::read_to_string(format!("/proc/{}/stat", pid.as_raw_nonzero()));
+    let state = stat.ok().and_then(|stat| stat.rsplit_once(')')?.1.trim_start().chars().next());
+    state.is_some_and(|state| state != 'Z')
+}
+
+fn is_soft(touchdown: &Touchdown) -> bool {
+    touchdown.vertical_speed_m_s <= 0.8 && touchdown.lateral_speed_m_s <= 0.3
 }
 
 async fn without_a_controller_the_autopilot_stops_it(landing: &Landing) -> anyhow::Result<()> {

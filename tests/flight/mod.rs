@@ -91,6 +91,62 @@ pub(crate) struct Landing {
     pub(crate) by_hand: Vec<Child>,
 }
 
+/// A simulated vehicle of its own, in a network of its own, which flies on when the landing that leads it is killed.
+pub(crate) struct Vehicle {
+    simulator: Child,
+    truths: Subscriber<Truth>,
+    _node: Node,
+    /// Where its autopilot is, for `alight land --autopilot`.
+    pub(crate) address: String,
+}
+
+impl Vehicle {
+    pub(crate) async fn start() -> anyhow::Result<Self> {
+        let ([meet], _, port) = testing::ports::free()?;
+        let simulator = Command::new(ALIGHT)
+            .args(["simulator", "--meet", &meet.to_string()])
+            .args(["--set", &format!("autopilot.address=udpout:127.0.0.1:{port}")])
+            // Nobody looks at its pictures: the landing's camera follows its pose.
+            .args(["--set", "camera.rate_hz=1"])
+            .args(SMALL_CAMERA.iter().flat_map(|key| ["--set", key]))
+            .env("ALIGHT_LOG", "warn")
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .spawn()?;
+        let identity = Identity { service: "alight", instance: "test".into() };
+        let network = Network { meet: Some(meet), ..Network::default() };
+        let node = Node::open(identity, &network.source("operator")?).await?;
+        let truths = node.subscriber(topic::TRUTH, &[]).await?;
+        let address = format!("udpin:127.0.0.1:{port}");
+        let vehicle = Self { simulator, truths, _node: node, address };
+        timeout(PATIENCE, vehicle.truths.next()).await.context("waiting for the vehicle")?;
+        Ok(vehicle)
+    }
+
+    /// Its motion over a time, newest last.
+    pub(crate) async fn motion(&self, duration: Duration) -> Vec<Truth> {
+        motion(&self.truths, duration).await
+    }
+}
+
+impl Drop for Vehicle {
+    fn drop(&mut self) {
+        let _ = self.simulator.kill();
+        let _ = self.simulator.wait();
+    }
+}
+
+async fn motion(truths: &Subscriber<Truth>, duration: Duration) -> Vec<Truth> {
+    let mut motion = Vec::new();
+    let _ = timeout(duration, async {
+        while let Some(truth) = truths.next().await {
+            motion.push(truth);
+        }
+    })
+    .await;
+    motion
+}
+
 /// A service that `alight land` started.
 pub(crate) struct Service {
     pub(crate) name: String,
@@ -215,14 +271,7 @@ impl Landing {
 
     /// The vehicle's motion over a time, newest last.
     pub(crate) async fn motion(&self, duration: Duration) -> Vec<Truth> {
-        let mut motion = Vec::new();
-        let _ = timeout(duration, async {
-            while let Some(truth) = self.truths.next().await {
-                motion.push(truth);
-            }
-        })
-        .await;
-        motion
+        motion(&self.truths, duration).await
     }
 
     /// Waits for the result, and checks that it landed on the pad.
