@@ -115,9 +115,9 @@ fn told(
     found: &[Observation],
     pads: &[Pad],
     camera: Option<&CameraModel>,
-    least: f64,
+    min_confidence: f64,
 ) -> Vec<Detection> {
-    let sure = found.iter().filter(|seen| seen.confidence >= least);
+    let sure = found.iter().filter(|seen| seen.confidence >= min_confidence);
     let pads = pads.iter().filter_map(|pad| {
         let seen = fiducial::observe_pad(pad, sure.clone(), camera?)?;
         Some(wire::pad_detection(pad, &seen))

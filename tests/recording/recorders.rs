@@ -18,10 +18,10 @@ use tokio::time::{Instant, sleep};
 
 use crate::flight::{LONG, Landing, PATIENCE};
 
-/// Most that a killed recorder may lose, in seconds.
+/// Maximum that a killed recorder may lose, in seconds.
 const MAX_LOSS_S: f64 = 1.0;
 
-/// Most frames by which those that an overloaded recorder kept and told as lost may differ from those that were published.
+/// Maximum number of frames by which those that an overloaded recorder kept and told as lost may differ from those that were published.
 const MAX_UNTOLD_FRAMES: u64 = 5;
 
 /// Why the simulator's camera leaves out numbers of frames.

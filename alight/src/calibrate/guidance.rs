@@ -122,7 +122,7 @@ impl Guidance {
             (down, across, "in the middle"),
         ] {
             let count = lacks(rows, columns);
-            if count > worst.map_or(0, |(most, _)| most) {
+            if count > worst.map_or(0, |(max_count, _)| max_count) {
                 worst = Some((count, name));
             }
         }

@@ -119,8 +119,8 @@ fn detections<'a>(flight: &'a Flight, wanted: &Wanted<'_>) -> anyhow::Result<Vec
         let sees = |name: &String| messages.iter().filter(|it| it.first_of(name).is_some()).count();
         named.as_ref().map_or(0, sees)
     };
-    let most = chosen.max_by_key(|(_, messages)| (seen_named(messages), seen(messages)));
-    let (_, messages) = most.with_context(|| match names.as_slice() {
+    let best = chosen.max_by_key(|(_, messages)| (seen_named(messages), seen(messages)));
+    let (_, messages) = best.with_context(|| match names.as_slice() {
         [] => "no detector's messages were recorded".to_owned(),
         names => format!("the recording has those of {}", names.join(", ")),
     })?;
@@ -183,8 +183,8 @@ fn marker(flight: &Flight, wanted: &Wanted<'_>, found: &[&Detections]) -> anyhow
             counts.keys().cloned().collect::<Vec<_>>().join(", ")
         );
     }
-    let most = || counts.iter().max_by_key(|(_, count)| **count).map(|(name, _)| name.clone());
-    named.filter(is_seen).or_else(most).context("the detector saw no marker")
+    let commonest = || counts.iter().max_by_key(|(_, count)| **count).map(|(name, _)| name.clone());
+    named.filter(is_seen).or_else(commonest).context("the detector saw no marker")
 }
 
 fn vehicle(flight: &Flight, at_s: impl Fn(i64) -> f64) -> Vec<VehicleSample> {

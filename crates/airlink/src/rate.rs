@@ -56,7 +56,7 @@ mod tests {
 
     #[test]
     fn there_are_no_more_than_the_rate_allows_and_hardly_fewer() {
-        for (camera_hz, max_hz, least) in [
+        for (camera_hz, max_hz, min) in [
             (15.0, 15.0, 149),
             (20.0, 15.0, 145),
             (30.0, 15.0, 149),
@@ -64,8 +64,8 @@ mod tests {
             (60.0, 0.5, 5),
         ] {
             let taken = taken(camera_hz, max_hz);
-            let most = (10.0 * max_hz) as usize + 1;
-            assert!((least..=most).contains(&taken), "{taken} of {camera_hz} Hz at {max_hz} Hz");
+            let max = (10.0 * max_hz) as usize + 1;
+            assert!((min..=max).contains(&taken), "{taken} of {camera_hz} Hz at {max_hz} Hz");
         }
     }
 

@@ -31,7 +31,7 @@ impl StageObserver for Clock {
         let now = Instant::now();
         let spent_ms = self.last.replace(now).map_or(0.0, |l| (now - l).as_secs_f64() * 1e3);
         match self.stages.iter_mut().find(|(name, _)| *name == stage) {
-            Some((_, least)) => *least = least.min(spent_ms),
+            Some((_, min_ms)) => *min_ms = min_ms.min(spent_ms),
             None => self.stages.push((stage, spent_ms)),
         }
     }

@@ -92,8 +92,8 @@ fn the_true_centre_and_range_at_four_by_four_binning() {
         assert_eq!(row.centre_px.len(), row.frames, "at {range_m} m");
         assert!(Row::worst(&row.centre_px) < 0.04, "at {range_m} m");
         // At 13 m it is 11 pixels wide.
-        let most = if *range_m > 10.0 { 0.6 } else { 0.3 };
-        assert!(Row::worst(&row.range_percent) < most, "at {range_m} m");
+        let max_percent = if *range_m > 10.0 { 0.6 } else { 0.3 };
+        assert!(Row::worst(&row.range_percent) < max_percent, "at {range_m} m");
     }
 }
 

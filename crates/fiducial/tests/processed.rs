@@ -385,8 +385,8 @@ fn the_response_of_a_camera_is_remembered_in_a_stream() {
             one_by_one.expect(&format!("{name}, {preset}, alone"), 3, [0.03, 0.3], [0.2, 0.8]);
             // Nearer by both are off by what the model of the processing lacks.
             let [median, _] = Errors::shares(&mut one_by_one.range_percent);
-            let most = [(1.5 * median).max(0.1), 0.8];
-            remembered.expect(&format!("{name}, {preset}, remembered"), 3, [0.03, 0.3], most);
+            let max = [(1.5 * median).max(0.1), 0.8];
+            remembered.expect(&format!("{name}, {preset}, remembered"), 3, [0.03, 0.3], max);
             assert!(remembered.centre_px.len() >= one_by_one.centre_px.len());
             match known {
                 Some(known) => {

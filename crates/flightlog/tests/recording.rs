@@ -123,8 +123,8 @@ fn flipped_bits_are_named_and_lose_no_other_chunk() {
         let before = chunks.iter().filter(|chunk| chunk.end <= bit / 8).count();
         // What says where a record ends is not repeated: whatever comes after it is lost.
         let is_in_chunk = chunks.iter().any(|chunk| chunk.contains(&(bit / 8)));
-        let least = if is_in_chunk { MESSAGES - 10 } else { 10 * before };
-        assert!(numbers(&mended).len() >= least, "bit {bit}: {found:?}");
+        let min = if is_in_chunk { MESSAGES - 10 } else { 10 * before };
+        assert!(numbers(&mended).len() >= min, "bit {bit}: {found:?}");
     }
     assert!(named > 5000, "{named}");
 }

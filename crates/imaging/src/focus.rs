@@ -11,7 +11,7 @@ const MIN_CONTRAST: i32 = 40;
 const MIN_EDGES: usize = 50;
 /// Noise that is left, in grey levels: of an image with more, so many lines are averaged that as much is left.
 const MAX_NOISE: f64 = 1.5;
-/// Most lines that are averaged. Those across a tilted edge make it wider; there are others.
+/// Maximum number of lines that are averaged. Those across a tilted edge make it wider; there are others.
 const MAX_AVERAGED: usize = 16;
 /// Median of the absolute second difference of normal noise, in its standard deviations.
 const SECOND_DIFFERENCE: f64 = 1.652;

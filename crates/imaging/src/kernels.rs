@@ -221,8 +221,8 @@ mod avx2 {
         let zero = _mm256_set1_epi8(0);
         let mut done = count * TILES;
         while (done + 8) * TILE <= rows[0].len() {
-            let (least, most) = extremes_of_tiles(rows, done * TILE);
-            for (row, groups) in [(&mut *low, least), (&mut *high, most)] {
+            let (min, max) = extremes_of_tiles(rows, done * TILE);
+            for (row, groups) in [(&mut *low, min), (&mut *high, max)] {
                 let bytes = lowest_bytes([groups, zero, zero, zero]);
                 let eight = _mm_cvtsi128_si64(_mm256_castsi256_si128(bytes)).to_le_bytes();
                 row[done..done + 8].copy_from_slice(&eight);
@@ -232,18 +232,18 @@ mod avx2 {
         done
     }
 
-    /// Of 8 tiles from a column on, the least and the greatest pixel in the lowest byte of each group of
+    /// Of 8 tiles from a column on, the minimum and the maximum pixel in the lowest byte of each group of
     /// four.
     #[target_feature(enable = "avx2")]
     fn extremes_of_tiles(rows: &[&[u8]; TILE], at: usize) -> (__m256i, __m256i) {
         let [a, b, c, d] = rows.map(|row| load(row, at));
-        let least = _mm256_min_epu8(_mm256_min_epu8(a, b), _mm256_min_epu8(c, d));
-        let most = _mm256_max_epu8(_mm256_max_epu8(a, b), _mm256_max_epu8(c, d));
-        let least = _mm256_min_epu8(least, _mm256_srli_epi16::<8>(least));
-        let most = _mm256_max_epu8(most, _mm256_srli_epi16::<8>(most));
+        let min = _mm256_min_epu8(_mm256_min_epu8(a, b), _mm256_min_epu8(c, d));
+        let max = _mm256_max_epu8(_mm256_max_epu8(a, b), _mm256_max_epu8(c, d));
+        let min = _mm256_min_epu8(min, _mm256_srli_epi16::<8>(min));
+        let max = _mm256_max_epu8(max, _mm256_srli_epi16::<8>(max));
         (
-            _mm256_min_epu8(least, _mm256_srli_epi32::<16>(least)),
-            _mm256_max_epu8(most, _mm256_srli_epi32::<16>(most)),
+            _mm256_min_epu8(min, _mm256_srli_epi32::<16>(min)),
+            _mm256_max_epu8(max, _mm256_srli_epi32::<16>(max)),
         )
     }
 

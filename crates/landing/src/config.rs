@@ -244,7 +244,7 @@ settings! {
         /// Height to which an aborted landing climbs with `on_abort = "climb"`, in m, over the same as
         /// `search_height_m`.
         abort_height_m: f64 = 10.0, 0.0..=100.0;
-        /// Least height at which an aborted landing hovers, in m, over the same as `search_height_m`: lower, it first
+        /// Minimum height at which an aborted landing hovers, in m, over the same as `search_height_m`: lower, it first
         /// climbs, but not above the height where the landing started. 0 never climbs.
         abort_hover_m: f64 = 2.5, 0.0..=20.0;
         /// Hover time of an aborted landing before setpoints stop, in s.

@@ -21,11 +21,11 @@ fn summary(flights: &[Flight]) -> String {
     let (land, _) = spread(flights, |f| f.land_s.unwrap_or(f64::INFINITY));
     let (disarm, slowest) = spread(flights, |f| f.disarm_s.unwrap_or(f64::INFINITY));
     let (error, worst) = spread(flights, |f| f.error_m);
-    let (overshoot, most) = spread(flights, |f| f.overshoot_m);
+    let (overshoot, max_overshoot) = spread(flights, |f| f.overshoot_m);
     let (_, tilt) = spread(flights, |f| f.max_tilt_rad.to_degrees());
     format!(
         "LAND {land:.1} s, disarmed {disarm:.1} (slowest {slowest:.1}) s, error {error:.3} (worst {worst:.3}) m, \
-         overshoot {overshoot:.2} ({most:.2}) m, tilt {tilt:.1} deg"
+         overshoot {overshoot:.2} ({max_overshoot:.2}) m, tilt {tilt:.1} deg"
     )
 }
 

@@ -531,9 +531,9 @@ mod tests {
 
     #[test]
     fn an_image_is_measured_before_it_is_decoded() {
-        let problem = |width, height, most| {
+        let problem = |width, height, max| {
             let image: DynamicImage = ImageBuffer::from_pixel(width, height, Luma([9_u8])).into();
-            read_bytes(&bytes_of(&image, ImageFormat::Png), most).map(|i| i.width())
+            read_bytes(&bytes_of(&image, ImageFormat::Png), max).map(|i| i.width())
         };
         assert_eq!(problem(65_535, 1, DEFAULT_MAX_PIXELS), Ok(65_535));
         assert!(problem(65_536, 1, DEFAULT_MAX_PIXELS).unwrap_err().contains("65536 x 1 pixels"));

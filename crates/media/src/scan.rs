@@ -13,9 +13,9 @@ use crate::jpeg::{DHT, DRI, SOF_BASELINE, SOF_EXTENDED, SOS, segments};
 const BLOCK: u32 = 64;
 /// Samples along an edge of a block.
 const BLOCK_EDGE: u64 = 8;
-/// Most components of a scan, and tables of a class.
+/// Maximum number of components of a scan, and tables of a class.
 const MAX_COMPONENTS: usize = 4;
-/// Most bits of a code.
+/// Maximum number of bits of a code.
 const MAX_CODE: usize = 16;
 /// Bits that are looked up at once: longer codes are rare, and several short ones are skipped in one step.
 const LOOKUP: usize = 11;

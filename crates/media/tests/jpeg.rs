@@ -124,7 +124,7 @@ fn a_file_with_a_hole_is_refused_or_shows_everything_in_its_place() {
     for (hole, passing, around) in
         [(1, 72, 12), (2, 70, 12), (10, 40, 16), (100, 1, 4), (1000, 0, 0)]
     {
-        let (mut holes, mut passed, mut most) = (0, 0, 0);
+        let (mut holes, mut passed, mut max) = (0, 0, 0);
         for (_, whole) in files() {
             let (first, picture) = (coded_at(&whole), shown(&whole));
             let places = whole.len().saturating_sub(2 + hole + first);
@@ -133,13 +133,13 @@ fn a_file_with_a_hole_is_refused_or_shows_everything_in_its_place() {
                 let file = [&whole[..at], &whole[at + hole..]].concat();
                 if decoded(&file).is_ok() {
                     passed += 1;
-                    most = most.max(changed_blocks([&picture, &shown(&file)]));
+                    max = max.max(changed_blocks([&picture, &shown(&file)]));
                 }
             }
         }
-        println!("{passed} of {holes} holes of {hole} bytes pass; {most} blocks at most changed");
+        println!("{passed} of {holes} holes of {hole} bytes pass; {max} blocks at most changed");
         assert!(100 * passed <= passing * holes, "{passed} of {holes} holes of {hole} bytes pass");
-        assert!(most <= around, "a hole of {hole} bytes changed {most} blocks");
+        assert!(max <= around, "a hole of {hole} bytes changed {max} blocks");
     }
 }
 

@@ -230,15 +230,10 @@ impl Occluder {
                     let away = (Pixel::new(x, y).distance(centre) as f32) / radius_px;
                     *level *= rest + (1.0 - rest) * (-0.5 * away * away).exp();
                 }
-                Self::Mottle {
-                    area,
-                    spot_px: [across, down],
-                    share: [least, most],
-                    level: own,
-                } => {
+                Self::Mottle { area, spot_px: [across, down], share: [min, max], level: own } => {
                     let spots = mottle(x as f32 / across, y as f32 / down);
                     let inside = area.cover(x, y, 0.5 * area.radius_px);
-                    let share = inside * (least + spots * (most - least));
+                    let share = inside * (min + spots * (max - min));
                     *level += share * (own - *level);
                 }
             }

@@ -413,7 +413,7 @@ fn a_yaw_rate_of_nought_holds_the_heading_and_another_turns() {
 #[test]
 fn a_yaw_is_turned_to_with_the_measured_overshoot() {
     let mut bench = Bench::flying(&steady(), 1, 10.0);
-    let mut most = 0.0f64;
+    let mut max_deg = 0.0f64;
     let mut crossed = None;
     let start_s = bench.now_s();
     for step in 0..3200 {
@@ -421,13 +421,13 @@ fn a_yaw_is_turned_to_with_the_measured_overshoot() {
             bench.velocity(LOCAL, WITH_YAW, [0.0; 3], [58.0f32.to_radians(), 0.0]);
         }
         bench.step();
-        most = most.max(yaw_deg(&bench));
+        max_deg = max_deg.max(yaw_deg(&bench));
         if crossed.is_none() && yaw_deg(&bench) >= 58.0 {
             crossed = Some(bench.now_s() - start_s);
         }
     }
     assert!(crossed.unwrap() < 1.5, "{crossed:?}");
-    near(most - 58.0, 8.0, 2.0);
+    near(max_deg - 58.0, 8.0, 2.0);
     near(yaw_deg(&bench), 58.0, 0.5);
 }
 
@@ -474,8 +474,8 @@ fn what_cannot_be_flown_is_a_stop() {
 #[test]
 fn absurd_numbers_leave_the_vehicle_finite() {
     let mut bench = Bench::flying(&WorldConfig::default(), 1, 10.0);
-    let most = f32::MAX;
-    for number in [most, -most, f32::INFINITY, f32::NAN] {
+    let max = f32::MAX;
+    for number in [max, -max, f32::INFINITY, f32::NAN] {
         bench.velocity(LOCAL, HOLD_HEADING, [number; 3], [number; 2]);
         bench.run(0.5);
         bench.velocity(LOCAL, WITH_YAW, [0.0, 0.0, -number], [number; 2]);

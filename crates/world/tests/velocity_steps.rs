@@ -73,9 +73,9 @@ fn rise_times_are_those_of_the_summary() {
     for (axis, speed, measured) in MEASURED {
         let curve = respond(axis, speed);
         compare(axis, speed, rise(&curve, speed), measured);
-        let most = curve.iter().copied().fold(0.0, f64::max) / speed;
+        let max = curve.iter().copied().fold(0.0, f64::max) / speed;
         let allowed = if axis == 2 { 1.05..1.13 } else { 0.99..1.03 };
-        assert!(allowed.contains(&most), "axis {axis}, {speed} m/s: overshoot {most}");
+        assert!(allowed.contains(&max), "axis {axis}, {speed} m/s: overshoot {max}");
     }
 }
 

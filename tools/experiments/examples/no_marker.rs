@@ -44,7 +44,7 @@ fn main() -> anyhow::Result<()> {
                 let found = detector.detect(view, Some(&model), &mut clock);
                 anyhow::ensure!(found.is_empty(), "found");
                 let ms = clock.elapsed().as_secs_f64() * 1e3;
-                if fastest.as_ref().is_none_or(|(least, _)| ms < *least) {
+                if fastest.as_ref().is_none_or(|(min_ms, _)| ms < *min_ms) {
                     fastest = Some((ms, clock.into_stages()));
                 }
             }

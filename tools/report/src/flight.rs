@@ -245,8 +245,8 @@ impl FlightReader {
         // Counted since the recorder's start: of its files the last has those before it.
         let so_far = lost_by_run.entry(run).or_default();
         for (key, count) in lost {
-            let most = so_far.entry(key).or_default();
-            *most = count.max(*most);
+            let max = so_far.entry(key).or_default();
+            *max = count.max(*max);
         }
         flight.is_ended &= is_ended;
         flight.messages += messages;

@@ -166,11 +166,11 @@ pub fn height(view: &View<'_>) -> Vec<Chart> {
     }
     let error = view.curve(&view.errors, |it| Some(at(it.time_s, it.horizontal_m)));
     // What the estimate claims before it knows much would flatten the rest.
-    let most = span(error.iter().map(|it| it.y), 0.0..0.05).end;
-    let most = if error.is_empty() { f64::INFINITY } else { 2.0 * most };
-    let is_cut = deviation.iter().any(|point| point.y > most);
+    let max = span(error.iter().map(|it| it.y), 0.0..0.05).end;
+    let max = if error.is_empty() { f64::INFINITY } else { 2.0 * max };
+    let is_cut = deviation.iter().any(|point| point.y > max);
     for point in &mut deviation {
-        point.y = point.y.min(most);
+        point.y = point.y.min(max);
     }
     let errors = vec![
         layer("claimed standard deviation", Ink::Blue, Shape::Area, deviation),
@@ -185,7 +185,7 @@ pub fn height(view: &View<'_>) -> Vec<Chart> {
         if view.errors.is_empty() {
             chart.note = "truth was not recorded".to_owned();
         } else if is_cut {
-            chart.note = format!("the claim is cut at {most:.2} m");
+            chart.note = format!("the claim is cut at {max:.2} m");
         }
     }
     charts

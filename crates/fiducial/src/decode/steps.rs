@@ -111,11 +111,11 @@ impl Steps {
             }
         }
         // Whatever the codeword is: texture ends here.
-        let least = |edge: &Edge| {
+        let min_cost = |edge: &Edge| {
             [-1.0, 0.0, 1.0].map(|at| edge.cost_of(at)).into_iter().fold(MAX_COST, f32::min)
         };
-        let least: f32 = steps.edges().map(least).sum();
-        (least <= MAX_MISFIT * MAX_COST * steps.count as f32).then_some(steps)
+        let min_cost: f32 = steps.edges().map(min_cost).sum();
+        (min_cost <= MAX_MISFIT * MAX_COST * steps.count as f32).then_some(steps)
     }
 
     fn edges(&self) -> impl Iterator<Item = &Edge> {
@@ -153,9 +153,9 @@ impl Steps {
         for (id, rotation, codeword) in near(min_hamming + RIVALS) {
             let cost = self.cost(seen(codeword, rotation), code);
             match best {
-                Some((least, ..)) if cost >= least => second = second.min(cost),
+                Some((min_cost, ..)) if cost >= min_cost => second = second.min(cost),
                 _ => {
-                    second = best.map_or(second, |(least, ..)| least);
+                    second = best.map_or(second, |(min_cost, ..)| min_cost);
                     best = Some((cost, id, rotation));
                 }
             }

@@ -128,7 +128,7 @@ const UNATTENDED_BRAKING: f64 = 0.9;
 const USUAL_LINK_S: f64 = 0.05;
 const HALF_GAIN_S: f64 = 0.15;
 
-/// Least share of the lateral speed that is allowed at the touchdown over a slow link: what is not seen in time must be
+/// Minimum share of the lateral speed that is allowed at the touchdown over a slow link: what is not seen in time must be
 /// slower beforehand, but it has to land.
 const MIN_TOUCHDOWN_SHARE: f64 = 0.5;
 

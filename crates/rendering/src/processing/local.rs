@@ -25,9 +25,9 @@ pub(super) fn adapt(local: &LocalTone, light: &mut [f32], width: usize) {
     let logs: Vec<f32> =
         sums.iter().zip(&counts).map(|(sum, n)| (sum / n).max(BLACK_LEVELS).ln()).collect();
     let mean = logs.iter().sum::<f32>() / logs.len() as f32;
-    let most = local.max_gain.ln();
+    let max_log = local.max_gain.ln();
     let gains: Vec<f32> =
-        logs.iter().map(|log| (local.strength * (mean - log)).clamp(-most, most)).collect();
+        logs.iter().map(|log| (local.strength * (mean - log)).clamp(-max_log, max_log)).collect();
     // The gain's logarithm between the centres of cells is bilinear.
     let around = |place: usize, count: usize| {
         let at = ((place as f32 + 0.5) / cell as f32 - 0.5).clamp(0.0, (count - 1) as f32);

@@ -253,14 +253,14 @@ fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
         })
         .collect();
     let errors = || distributions.iter().flat_map(|(_, errors)| errors.iter().copied());
-    let most = distributions.iter().map(|(_, errors)| errors.len()).max().unwrap_or(0).max(1);
-    let (max_cm, least) = (1.1 * errors().fold(1.0, f64::max), 0.7 / most as f64);
+    let max_count = distributions.iter().map(|(_, errors)| errors.len()).max().unwrap_or(0).max(1);
+    let (max_cm, min_share) = (1.1 * errors().fold(1.0, f64::max), 0.7 / max_count as f64);
     let mut chart = ChartBuilder::on(area)
         .caption("Proportion of the landings with a larger error", ("sans-serif", 20))
         .margin(12)
         .x_label_area_size(40)
         .y_label_area_size(64)
-        .build_cartesian_2d(0.0..max_cm, (least..1.0).log_scale())?;
+        .build_cartesian_2d(0.0..max_cm, (min_share..1.0).log_scale())?;
     chart
         .configure_mesh()
         .x_desc("touchdown error, cm")
@@ -270,7 +270,7 @@ fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     for ((name, errors), colour) in distributions.iter().zip(COLOURS) {
         let short: String = name.chars().take(80).collect();
         chart
-            .draw_series(LineSeries::new(steps(errors, least), colour.stroke_width(2)))?
+            .draw_series(LineSeries::new(steps(errors, min_share), colour.stroke_width(2)))?
             .label(format!("{short} ({})", errors.len()))
             .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
     }
@@ -279,10 +279,10 @@ fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
 
 /// The proportion of ascending errors that are larger than each, as the corners of its steps; the last falls to `least`, where a
 /// logarithmic axis ends.
-fn steps(errors: &[f64], least: f64) -> Vec<(f64, f64)> {
+fn steps(errors: &[f64], min_share: f64) -> Vec<(f64, f64)> {
     let count = errors.len() as f64;
     let corners = errors.iter().enumerate().flat_map(|(i, error)| {
-        let larger = [i, i + 1].map(|smaller| (1.0 - smaller as f64 / count).max(least));
+        let larger = [i, i + 1].map(|smaller| (1.0 - smaller as f64 / count).max(min_share));
         larger.map(|proportion| (*error, proportion))
     });
     std::iter::once((0.0, 1.0)).chain(corners).collect()

@@ -171,11 +171,11 @@ fn wet(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
 fn faded(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     let size_px = spec.size_px();
     let spot_px = (size_px * rng.random_range(0.08..0.4)) as f32;
-    let least = rng.random_range(0.2..0.5);
+    let min = rng.random_range(0.2..0.5);
     spec.occluder = Occluder::Mottle {
         area: whole(spec),
         spot_px: [spot_px; 2],
-        share: [least, least + rng.random_range(0.05..0.3)],
+        share: [min, min + rng.random_range(0.05..0.3)],
         level: paper_level(spec),
     };
 }
@@ -219,10 +219,10 @@ fn cloth(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     let (towards, form) = (rng.random_range(0.0..TAU), BendForm::Waves);
     spec.print = Print::Bent(Bend { towards, height, form });
     let thread_px = (size_px * rng.random_range(0.01..0.02)) as f32;
-    let mottle = |spot_px: [f32; 2], most: f32, level: f32| Occluder::Mottle {
+    let mottle = |spot_px: [f32; 2], max: f32, level: f32| Occluder::Mottle {
         area: whole(spec),
         spot_px,
-        share: [0.0, most],
+        share: [0.0, max],
         level,
     };
     spec.occluder = Occluder::Several(vec![

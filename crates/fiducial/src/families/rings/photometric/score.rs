@@ -338,7 +338,7 @@ impl Scene<'_> {
             });
             [scene.fitted(own), afresh].into_iter().flatten().map(|target| target.cost())
         });
-        costs.min_by(f64::total_cmp).map(|least| least / fit.cost())
+        costs.min_by(f64::total_cmp).map(|min_cost| min_cost / fit.cost())
     }
 
     /// Covariance of all that was fitted, from the remaining residuals: noise and errors of the model.

@@ -294,8 +294,8 @@ impl RingModel {
             Extras::Motion => ([self.motion[0] + by[0], self.motion[1] + by[1]], self.response),
             Extras::Response => (self.motion, self.response.moved(by)),
         };
-        let most = blur_px * blur_px - MIN_BLUR_PX * MIN_BLUR_PX;
-        let scale = (most / motion[0].hypot(motion[1]).max(1e-12)).min(1.0);
+        let max_px2 = blur_px * blur_px - MIN_BLUR_PX * MIN_BLUR_PX;
+        let scale = (max_px2 / motion[0].hypot(motion[1]).max(1e-12)).min(1.0);
         Some(Self {
             pose: self.pose.moved(&step.fixed_rows::<5>(0).into_owned())?,
             blur_px,
@@ -548,9 +548,9 @@ impl Scene<'_> {
         };
         let sharper = fit.model.sharper();
         let costs = Mosaic::ALL.iter().filter_map(|m| Some((*m, cost(&sharper, Some(*m))?)));
-        let (mosaic, least) = costs.min_by(|a, b| a.1.total_cmp(&b.1))?;
-        let is_likely = least < MAX_PROCESSED_STEP * fit.cost()
-            || least < MAX_MOSAIC_STEP * cost(&fit.model, None)?;
+        let (mosaic, min_cost) = costs.min_by(|a, b| a.1.total_cmp(&b.1))?;
+        let is_likely = min_cost < MAX_PROCESSED_STEP * fit.cost()
+            || min_cost < MAX_MOSAIC_STEP * cost(&fit.model, None)?;
         is_likely.then_some(mosaic)
     }
 
