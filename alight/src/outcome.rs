@@ -433,7 +433,7 @@ impl Outcome {
 
 #[cfg(test)]
 mod tests {
-    use messages::RecorderLoss;
+    use messages::RecorderCount;
 
     use super::*;
 
@@ -640,7 +640,7 @@ mod tests {
         landing.recorder(told("main", "flight-2.mcap", None));
         assert!(is_done(&landing), "another recorder goes on");
         let losing = |key: &str| RecorderStatus {
-            dropped: vec![RecorderLoss { key: key.into(), count: 3 }],
+            dropped: vec![RecorderCount { key: key.into(), count: 3 }],
             ..told("main", "flight-2.mcap", None)
         };
         landing.recorder(losing("camera/down/frame (never came)"));

@@ -44,7 +44,7 @@ pub(super) fn published(config: Config) -> anyhow::Result<GrayImage> {
 async fn take(node: &Node, config: Config) -> anyhow::Result<GrayImage> {
     let frames = node.frame_subscriber(topic::FRAME, &[config.instance()]).await?;
     let mut service = camera_pub::run(node.clone(), config, Shutdown::on_signals()?);
-    let mut converter = Converter::new();
+    let mut converter = Converter::default();
     let mut newest = None;
     for _ in 0..SETTLING_FRAMES {
         let frame = tokio::select! {

@@ -120,7 +120,7 @@ const fn json_topic<M: Message>(key: fn(&[&str]) -> String) -> JsonTopic {
     JsonTopic { key, name: M::NAME, json: json::<M> }
 }
 
-static JSON_TOPICS: [JsonTopic; 15] = [
+static JSON_TOPICS: [JsonTopic; 16] = [
     json_topic::<CameraInfo>(|names| topic::CAMERA_INFO.key(names)),
     json_topic::<CameraControl>(|names| topic::CAMERA_CONTROL.key(names)),
     json_topic::<Detections>(|names| topic::DETECTIONS.key(names)),
