@@ -86,9 +86,10 @@ const MAX_TOUCHDOWN_M_S: f64 = 0.3;
 /// Minimum descent speed at touchdown on a heaving pad, in m/s.
 const MIN_TOUCHDOWN_M_S: f64 = 0.3;
 
-/// Maximum speed at which a pad that does not heave is followed down, in m/s: twice what the autopilot's height drifts. A faster one
-/// is a wrong estimate, as from frames with wrong stamps, and would be followed hard onto the ground.
-const MAX_DRIFT_DOWN_M_S: f64 = 0.2;
+/// Maximum speed down, in m/s, up to which a pad that does not heave and seems to sink is followed: a touch is at 0.8 m/s at most. A pad that
+/// sinks faster is a wrong estimate, as from frames with wrong stamps, and would be followed hard onto the ground; an autopilot's height that drifts
+/// down by 0.5 m/s, twice what any was measured to do, leaves 0.2 m/s of descent.
+const MAX_FOLLOWING_M_S: f64 = 0.7;
 
 /// Time ahead for which the error of a low vehicle is predicted, in seconds.
 const LOW_LEAD_S: f64 = 0.4;
@@ -239,10 +240,10 @@ impl Guidance for Metric {
                 observer.path = Path::new(lateral);
             }
         }
-        let followed_m_s = fmin(target.velocity.z(), MAX_DRIFT_DOWN_M_S + situation.pad_heave_m_s);
+        let max_m_s = fmax(descent_m_s, MAX_FOLLOWING_M_S + situation.pad_heave_m_s);
         let down = approach_speed(
             before.setpoint.z(),
-            descent_m_s + followed_m_s,
+            fmin(descent_m_s + target.velocity.z(), max_m_s),
             self.config.descend_acceleration_m_s2 * step_s,
         );
         let setpoint = Vector::new(lateral.x(), lateral.y(), down);

@@ -235,8 +235,8 @@ fn nothing_that_the_estimate_becomes_lifts_a_vehicle_that_touches_down() {
 
 #[test]
 fn a_pad_that_seems_to_sink_is_not_followed_hard_onto_the_ground() {
-    let touchdown_m_s = |pad_m_s: f64, pad_heave_m_s: f64| {
-        let mut metric = Metric::new(MetricConfig::default());
+    let touchdown = |config: &MetricConfig, pad_m_s: f64, pad_heave_m_s: f64| {
+        let mut metric = Metric::new(config.clone());
         let mut down_m_s = 0.0;
         for i in 0..=40u32 {
             let s = f64::from(i) / 40.0;
@@ -248,6 +248,9 @@ fn a_pad_that_seems_to_sink_is_not_followed_hard_onto_the_ground() {
         }
         down_m_s
     };
+    let config = MetricConfig::default();
+    let touchdown_m_s =
+        |pad_m_s: f64, pad_heave_m_s: f64| touchdown(&config, pad_m_s, pad_heave_m_s);
     // As after three frames with wrong stamps.
     for pad_m_s in [0.31, 1.0] {
         let down_m_s = touchdown_m_s(pad_m_s, 0.0);
@@ -256,6 +259,9 @@ fn a_pad_that_seems_to_sink_is_not_followed_hard_onto_the_ground() {
     assert!(touchdown_m_s(0.1, 0.0) > 0.59, "the autopilot's height drifts");
     assert!(touchdown_m_s(-0.3, 0.0) < 0.21, "or rises");
     assert!(touchdown_m_s(0.45, 0.4) > 0.74, "a pad that heaves is followed");
+    // A slow descent goes on also where the autopilot's height drifts down quickly.
+    let slow = MetricConfig { touchdown_descend_m_s: 0.2, ..config.clone() };
+    assert!(touchdown(&slow, 0.4, 0.0) > 0.59);
 }
 
 #[test]
