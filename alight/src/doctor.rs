@@ -308,11 +308,11 @@ fn check_serial_ports(findings: &mut Findings, jobs: &[Job], has_controller: boo
     for job in jobs.iter().filter(|job| job.service == Some(Service::Controller)) {
         let Ok(config) = Service::Controller.effective_config(&job.layers) else { continue };
         let address = config["autopilot"]["address"].as_str();
-        let serial = address.and_then(|address| address.strip_prefix("serial:"));
-        if let Some(device) = serial.and_then(|rest| rest.split(':').next())
-            && let Err(cause) = std::fs::OpenOptions::new().read(true).write(true).open(device)
+        let address = address.and_then(|address| address.parse().ok());
+        if let Some(autopilot::Address::Serial { device, .. }) = address
+            && let Err(cause) = std::fs::OpenOptions::new().read(true).write(true).open(&device)
         {
-            tell_unopened(findings, device, &cause, has_controller);
+            tell_unopened(findings, &device, &cause, has_controller);
         }
     }
 }

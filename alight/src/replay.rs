@@ -25,9 +25,9 @@ pub(crate) struct ReplayArgs {
     /// result is named, with the value. Exit status 0 when there is none, 1 otherwise.
     #[arg(long)]
     verify: bool,
-    /// From where it is flown again: from the controller's events, whose phases are listed, or, to see what `--set` changes, from
-    /// detections on, with estimator and guidance, or from frames on, which are searched again. The vehicle moves as it was
-    /// recorded. `--verify` is from events.
+    /// From where it is flown again: from the controller's events, whose phases are listed; from detections on, with estimator and
+    /// guidance, to see what `--set` changes (with `--set`, events are the same); or from frames on, which are searched again. The vehicle moves
+    /// as it was recorded. `--verify` is from events.
     #[arg(long, value_enum, default_value_t)]
     from: From,
     /// One setting of the controller over the recorded configuration; with `--from frames` also

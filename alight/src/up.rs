@@ -135,7 +135,7 @@ struct Supervised {
     exits: VecDeque<Instant>,
     /// How often in a row it exited with status 0.
     completions: usize,
-    /// Whether it has once run for [`PERIOD`]: with what it is given it can run.
+    /// Whether it has once run for [`PERIOD`], or may have under a supervisor that crashed: with what it is given it can run.
     has_run: bool,
     keeps_failing: bool,
     state: State,
@@ -247,7 +247,12 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
     for line in jobs.iter().filter_map(|job| before.told_of(job, is_noted)) {
         say(line);
     }
-    let mut supervised: Vec<Supervised> = jobs.into_iter().map(Supervised::new).collect();
+    // After a crash its processes have run, perhaps a moment ago in flight.
+    let have_run = before != Before::Nothing;
+    let mut supervised: Vec<Supervised> = jobs
+        .into_iter()
+        .map(|job| Supervised { has_run: have_run, ..Supervised::new(job) })
+        .collect();
     for (index, first) in supervised.iter_mut().enumerate() {
         let start_as = before.start_mode(&first.job);
         start_or_retry(&mut children, index, first, start_as, site);

@@ -477,7 +477,9 @@ impl Recorder {
             let disk = ending.wait(until.saturating_duration_since(Instant::now()));
             let name = disk.path.as_ref().unwrap_or(&self.config.file);
             if let Some(problem) = disk.problem {
-                bail!("the end of the recording is missing: {problem}");
+                bail!(
+                    "the end of the recording is missing: {problem}; `alight record --repair` ends its file"
+                );
             }
             ensure!(
                 disk.has_ended,

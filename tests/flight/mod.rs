@@ -93,7 +93,7 @@ pub(crate) struct Landing {
 
 /// A simulated vehicle of its own, in a network of its own, which flies on when the landing that leads it is killed.
 pub(crate) struct Vehicle {
-    simulator: Child,
+    _simulator: Simulator,
     truths: Subscriber<Truth>,
     _node: Node,
     /// Where its autopilot is, for `alight land --autopilot`.
@@ -113,12 +113,13 @@ impl Vehicle {
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .spawn()?;
+        let simulator = Simulator(simulator);
         let identity = Identity { service: "alight", instance: "test".into() };
         let network = Network { meet: Some(meet), ..Network::default() };
         let node = Node::open(identity, &network.source("operator")?).await?;
         let truths = node.subscriber(topic::TRUTH, &[]).await?;
         let address = format!("udpin:127.0.0.1:{port}");
-        let vehicle = Self { simulator, truths, _node: node, address };
+        let vehicle = Self { _simulator: simulator, truths, _node: node, address };
         timeout(PATIENCE, vehicle.truths.next()).await.context("waiting for the vehicle")?;
         Ok(vehicle)
     }
@@ -129,10 +130,13 @@ impl Vehicle {
     }
 }
 
-impl Drop for Vehicle {
+/// It ends also where its start is given up.
+struct Simulator(Child);
+
+impl Drop for Simulator {
     fn drop(&mut self) {
-        let _ = self.simulator.kill();
-        let _ = self.simulator.wait();
+        let _ = self.0.kill();
+        let _ = self.0.wait();
     }
 }
 

@@ -143,7 +143,12 @@ impl Outcome {
     /// down is the pilot's affair.
     pub fn is_unsafe(&self) -> bool {
         let is_far = self.ending != Ending::Aborted && beyond(self.error_m, Touchdown::MAX_ERROR_M);
-        is_far || is_too_fast(self.sink_m_s, self.slide_m_s)
+        is_far || self.is_too_fast()
+    }
+
+    /// Whether it touched the ground faster than is safe.
+    pub fn is_too_fast(&self) -> bool {
+        is_too_fast(self.sink_m_s, self.slide_m_s)
     }
 
     /// Whether it left the ground again after a touch.

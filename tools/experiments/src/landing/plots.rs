@@ -277,7 +277,7 @@ fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     legend(&mut chart, SeriesLabelPosition::UpperRight)
 }
 
-/// The proportion of ascending errors that are larger than each, as the corners of its steps; the last falls to `least`, where a
+/// The proportion of ascending errors that are larger than each, as the corners of its steps; the last falls to `min_share`, where a
 /// logarithmic axis ends.
 fn steps(errors: &[f64], min_share: f64) -> Vec<(f64, f64)> {
     let count = errors.len() as f64;

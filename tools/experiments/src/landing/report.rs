@@ -95,9 +95,10 @@ fn failures(flights: &[Planned], outcomes: &[Outcome]) -> String {
             Ending::Unfinished => "unfinished",
         };
         let speed = match (outcome.sink_m_s, outcome.slide_m_s) {
-            (Some(sink), Some(slide)) if outcome.is_unsafe() => {
+            (Some(sink), Some(slide)) if outcome.is_too_fast() => {
                 format!(", unsafe: {sink:.2} m/s down, {slide:.2} m/s sideways")
             }
+            _ if outcome.is_unsafe() => ", unsafe: too far off".to_owned(),
             _ => String::new(),
         };
         let (why, command) = (&outcome.why, planned.command());
