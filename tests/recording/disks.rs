@@ -143,8 +143,9 @@ pub(crate) async fn fail() -> anyhow::Result<()> {
         false
     });
     ensure!(in_health.await?, "nothing in the health report");
-    let result = landing.lands().await?;
+    let (result, status) = landing.lands_with_losses().await?;
     println!("{}", result["recording"]);
+    ensure!(status == Some(1), "messages are lost, and the exit status is {status:?}: {result}");
     let contents = Contents::read(&file)?;
     let in_file = contents.dropped.get("vehicle/state").copied();
     ensure!(in_file.is_some_and(|lost| lost > 10), "{:?}", contents.dropped);

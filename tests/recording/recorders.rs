@@ -211,8 +211,11 @@ pub(crate) async fn overload() -> anyhow::Result<()> {
         kill_process(pid, Signal::CONT)?;
         sleep(Duration::from_millis(700)).await;
     }
-    landing.lands().await?;
+    let (result, status) = landing.lands_with_losses().await?;
     let contents = Contents::read(&file)?;
+    let has_lost = contents.dropped.keys().any(|key| !messages::has_never_come(key));
+    let wanted = if has_lost { 1 } else { 0 };
+    ensure!(status == Some(wanted), "{status:?}: {result}, {:?}", contents.dropped);
     let (mut stamps_ns, mut healths) = (Vec::new(), Vec::new());
     flightlog::read(&std::fs::read(&file)?, |entry| match entry {
         Entry::Picture { header, .. } => stamps_ns.push(header.stamp_ns),
