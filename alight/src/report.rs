@@ -395,6 +395,23 @@ mod tests {
     }
 
     #[test]
+    fn three_flights_and_a_landing_that_is_not_there_are_a_wrong_use() {
+        let folder = tempfile::tempdir().unwrap();
+        let files = ["one.mcap", "two.mcap", "three.mcap"].map(|name| folder.path().join(name));
+        (1..).zip(&files).for_each(|(seed, file)| fly(file, seed));
+        let refused = |files: &[PathBuf], options: &[&str]| {
+            let options = options.iter().map(|option| (*option).as_ref());
+            let files = files.iter().map(|file| file.as_os_str());
+            let text = std::iter::once("report".as_ref()).chain(files).chain(options);
+            let problem = run(&Program::try_parse_from(text).unwrap().args).unwrap_err();
+            assert!(problem.is::<WrongUse>(), "{problem:#}");
+        };
+        refused(&files, &[]);
+        refused(&files[..1], &["--landing", "9"]);
+        refused(&files[..1], &["--format", "pdf", "-o", "x.html"]);
+    }
+
+    #[test]
     fn a_page_of_what_could_not_all_be_read_is_no_success() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
