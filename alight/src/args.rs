@@ -98,7 +98,7 @@ pub(crate) struct NetworkArgs {
 
 impl NetworkArgs {
     /// The session's configuration for a process with this key.
-    pub(crate) fn source(&self, key_name: &str) -> Result<ZenohSource, WrongUse> {
+    pub(crate) fn source(&self, key_name: &str) -> anyhow::Result<ZenohSource> {
         source_of(&self.network(), key_name)
     }
 

@@ -308,11 +308,16 @@ fn check_serial_ports(findings: &mut Findings, jobs: &[Job], has_controller: boo
     for job in jobs.iter().filter(|job| job.service == Some(Service::Controller)) {
         let Ok(config) = Service::Controller.effective_config(&job.layers) else { continue };
         let address = config["autopilot"]["address"].as_str();
-        let address = address.and_then(|address| address.parse().ok());
-        if let Some(autopilot::Address::Serial { device, .. }) = address
-            && let Err(cause) = std::fs::OpenOptions::new().read(true).write(true).open(&device)
+        let serial = address.and_then(|address| address.strip_prefix("serial:"));
+        // The path of a device may contain colons: the speed is a number at the end.
+        let device = serial.map(|rest| match rest.rsplit_once(':') {
+            Some((device, baud)) if baud.bytes().all(|byte| byte.is_ascii_digit()) => device,
+            _ => rest,
+        });
+        if let Some(device) = device
+            && let Err(cause) = std::fs::OpenOptions::new().read(true).write(true).open(device)
         {
-            tell_unopened(findings, &device, &cause, has_controller);
+            tell_unopened(findings, device, &cause, has_controller);
         }
     }
 }
