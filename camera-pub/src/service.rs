@@ -783,8 +783,11 @@ mod tests {
     use crate::v4l2::abi::CID_EXPOSURE_ABSOLUTE;
     use crate::v4l2::fake::{Fake, Happening, MS, Stamps, grey_level};
     use messages::{Detection, Detections, ExposureReason, ExposureSetter, ExposureSetting};
-    use node::{Frame, Identity, Layers, ZenohSource};
+    use node::{Frame, FrameSubscriber, Identity, Layers, Subscriber, ZenohSource};
     use std::rc::Rc;
+
+    /// Time after which a frame does not come any more.
+    const FRAME_PATIENCE: Duration = Duration::from_millis(100);
 
     async fn open(service: &'static str, port: u16) -> Node {
         let text = include_str!("../../zenoh-config/local.json5");
@@ -873,19 +876,58 @@ mod tests {
         }
     }
 
+    /// Who listens, and finds the pad in the middle of each frame while it says so.
+    struct Viewer {
+        fake: Rc<Fake>,
+        frames: FrameSubscriber,
+        controls: Subscriber<CameraControl>,
+        detections: Publisher<Detections>,
+    }
+
+    impl Viewer {
+        /// The device is held from now on: a subscriber keeps only the newest messages, and played time would else pass it by.
+        async fn of(fake: Rc<Fake>, node: &Node) -> Self {
+            fake.hold();
+            Self {
+                fake,
+                controls: node.subscriber(topic::CAMERA_CONTROL, &["down"]).await.unwrap(),
+                detections: node.publisher(topic::DETECTIONS, &["main"]).await.unwrap(),
+                frames: node.frame_subscriber(topic::FRAME, &["down"]).await.unwrap(),
+            }
+        }
+
+        /// What is told next; the device gives one frame after the other until then.
+        async fn next(&self, is_found: bool) -> CameraControl {
+            loop {
+                if let Some(control) = self.controls.waiting() {
+                    return control;
+                }
+                self.fake.let_through();
+                // The first ones do not come, before each node knows of the other.
+                let frame = tokio::time::timeout(FRAME_PATIENCE, self.frames.next());
+                let Ok(frame) = frame.await else { continue };
+                let centre_px = [320.0, 240.0];
+                let pad = Detection { centre_px, size_px: 80.0, ..Detection::sample() };
+                let detections = if is_found { vec![pad] } else { Vec::new() };
+                let header = frame.unwrap().header.clone();
+                let message = Detections { header, detections, ..Detections::sample() };
+                self.detections.publish(&message).await;
+            }
+        }
+    }
+
     #[tokio::test(flavor = "multi_thread")]
     async fn a_subscriber_sees_what_the_marker_wants_of_the_exposure_and_why() {
         let exposing = Exposing::new("marker").await;
         let (fake, viewer) = (Rc::clone(&exposing.fake), exposing.viewer.clone());
         let seeing = async {
-            let controls = viewer.subscriber(topic::CAMERA_CONTROL, &["down"]).await.unwrap();
-            let detections = viewer.publisher(topic::DETECTIONS, &["main"]).await.unwrap();
+            let viewer = Viewer::of(Rc::clone(&fake), &viewer).await;
             let mut last: Option<CameraControl> = None;
             let light = |setting: Option<ExposureSetting>| {
                 let setting = setting.unwrap();
                 f64::from(setting.exposure_ns) * setting.gain.unwrap()
             };
-            // What is seen first, and what happens then. The pad is in the middle of each frame, and found while it says so.
+            // What is seen first, whether the pad is found until then, and what happens then.
             for (why, is_found, then) in [
                 (ExposureReason::NoMarker, false, None),
                 (ExposureReason::TakenOver, true, None),
@@ -898,23 +940,17 @@ mod tests {
                 (ExposureReason::NoMarker, false, None),
             ] {
                 let control = loop {
-                    let control = controls.next().await.unwrap();
+                    let control = viewer.next(is_found).await;
                     let is_later = last.as_ref().is_none_or(|last| {
                         control.stamp_ns > last.stamp_ns && control.sequence > last.sequence
                     });
                     assert!(is_later, "{control:?} after {last:?}");
                     last = Some(control.clone());
-                    let header = FrameHeader {
-                        camera: control.camera.clone(),
-                        stamp_ns: control.stamp_ns,
-                        ..FrameHeader::sample()
+                    // The first message without a marker follows a frame that was still exposed for it.
+                    let is_awaited = match why {
+                        ExposureReason::NoMarker => control.in_use.is_none(),
+                        _ => then != Some(Then::Take) || control.refused.is_some(),
                     };
-                    let centre_px = [320.0, 240.0];
-                    let pad = Detection { centre_px, size_px: 80.0, ..Detection::sample() };
-                    let found = if is_found { vec![pad] } else { Vec::new() };
-                    let message = Detections { header, detections: found, ..Detections::sample() };
-                    detections.publish(&message).await;
-                    let is_awaited = then != Some(Then::Take) || control.refused.is_some();
                     if control.why == why && is_awaited {
                         break control;
                     }
@@ -971,8 +1007,8 @@ mod tests {
         let exposing = Exposing::new("camera").await;
         let (fake, viewer) = (Rc::clone(&exposing.fake), exposing.viewer.clone());
         let seeing = async {
-            let controls = viewer.subscriber(topic::CAMERA_CONTROL, &["down"]).await.unwrap();
-            let first = controls.next().await.unwrap();
+            let viewer = Viewer::of(Rc::clone(&fake), &viewer).await;
+            let first = viewer.next(false).await;
             assert_eq!(
                 (first.set_by, first.why),
                 (ExposureSetter::Fixed, ExposureReason::Configured)
@@ -980,12 +1016,12 @@ mod tests {
             let fixed = ExposureSetting { exposure_ns: 5_000_000, gain: None };
             assert_eq!((first.in_use, first.wanted, first.limits), (Some(fixed), None, None));
             // Once a second.
-            let second = controls.next().await.unwrap();
+            let second = viewer.next(false).await;
             let since_ns = second.stamp_ns - first.stamp_ns;
             assert!((1000 * MS..1100 * MS).contains(&since_ns), "{since_ns}");
             // Another program may change that.
             fake.meter();
-            while controls.next().await.unwrap().set_by != ExposureSetter::Camera {}
+            while viewer.next(false).await.set_by != ExposureSetter::Camera {}
         };
         exposing.while_seeing(seeing).await;
     }

@@ -109,6 +109,8 @@ pub(crate) struct Fake {
     chooses_gain: Cell<bool>,
     /// The control that it does not tell.
     hidden: Cell<Option<u32>>,
+    /// How many frames it still gives while it is held, in which no time passes without one; `None` while it is not.
+    frames_left: Cell<Option<u32>>,
     open_devices: Cell<u32>,
     mappings: Cell<u32>,
     opened: Cell<u32>,
@@ -180,6 +182,7 @@ impl Fake {
             refused: Cell::new(None),
             chooses_gain: Cell::new(false),
             hidden: Cell::new(None),
+            frames_left: Cell::new(None),
             open_devices: Cell::new(0),
             mappings: Cell::new(0),
             opened: Cell::new(0),
@@ -263,6 +266,16 @@ impl Fake {
         }
         let (exposure, gain) = (self.exposure.get(), self.gain.get());
         self.changes.borrow_mut().push(Change { from: next + CONTROL_FRAMES, exposure, gain });
+    }
+
+    /// Gives no frame from now on, and lets no time pass, but for those that are let through.
+    pub(crate) fn hold(&self) {
+        self.frames_left.set(Some(0));
+    }
+
+    /// Lets one more frame through while it is held.
+    pub(crate) fn let_through(&self) {
+        self.frames_left.set(self.frames_left.get().map(|left| left + 1));
     }
 
     pub(crate) fn pass(&self, time: Duration) {
@@ -497,10 +510,15 @@ impl Device for FakeDevice {
         let until_ns = self.now_ns() + timeout.as_nanos() as i64;
         let mut state = self.state.borrow_mut();
         self.store(&mut state);
+        let frames_left = self.fake.frames_left.get();
+        if frames_left == Some(0) && state.filled.is_empty() {
+            return Ok(false);
+        }
         let ready_ns = self.fake.ready_ns(state.next);
         if state.filled.is_empty() && state.is_storing() && ready_ns <= until_ns {
             self.fake.now_ns.set(ready_ns);
             self.store(&mut state);
+            self.fake.frames_left.set(frames_left.map(|left| left - 1));
         }
         if state.filled.is_empty() {
             self.fake.now_ns.set(until_ns);
