@@ -247,8 +247,9 @@ impl CameraInfo {
     }
 }
 
-/// How a camera is exposed: with what a frame was taken, what is wanted for later ones, and why. It follows each frame after
-/// which the marker's exposure was decided; else it is sent when it changes, and once a second.
+/// How a camera is exposed: with what a frame was taken, what is wanted for later ones, and why. It follows a frame: at once
+/// when `set_by`, `in_use`, `wanted`, `why` or `refused` changes, else once a second, or five times a second while a camera that
+/// is exposed for the marker sees one.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CameraControl {
     /// The camera's name.

@@ -5,8 +5,10 @@ use messages::{CameraControl, ExposureLimits, ExposureReason, ExposureSetting, M
 use crate::control::{Limits, Setting};
 use crate::region::Levels;
 
-/// Time after which a setting that stays is told again, in nanoseconds: for those who have come since.
+/// Time after which what stays is told again, in nanoseconds: for those who have come since.
 const REPEAT_NS: i64 = 1_000_000_000;
+/// The same while the exposure follows a marker, whose levels and motion are told as well.
+const MARKER_REPEAT_NS: i64 = 200_000_000;
 
 impl From<Setting> for ExposureSetting {
     fn from(setting: Setting) -> Self {
@@ -35,7 +37,8 @@ fn nanoseconds(time_s: f64) -> u32 {
     (time_s * 1e9).round() as u32
 }
 
-/// Says which messages are due: each decision for the marker; what the configuration has set when it changes, and once a second.
+/// Says which messages are due: each change at once, and what stays once a second, or five times a second while a marker is
+/// seen. Levels, motion and limits are no change: they differ in each frame.
 #[derive(Clone, Debug, Default)]
 pub struct Telling {
     last: Option<CameraControl>,
@@ -44,19 +47,24 @@ pub struct Telling {
 impl Telling {
     /// True when this is to be published; at the next call it has been.
     pub fn is_due(&mut self, control: &CameraControl) -> bool {
-        let is_known = |last: &CameraControl| {
-            let is_same = (last.why, last.set_by, last.in_use)
-                == (control.why, control.set_by, control.in_use);
-            let age_ns = control.stamp_ns.saturating_sub(last.stamp_ns);
-            is_same && (0..REPEAT_NS).contains(&age_ns)
+        let repeat_ns = match control.why {
+            ExposureReason::Configured | ExposureReason::NoMarker => REPEAT_NS,
+            _ => MARKER_REPEAT_NS,
         };
-        let is_decision = control.why != ExposureReason::Configured;
-        if !is_decision && self.last.as_ref().is_some_and(is_known) {
-            return false;
+        let is_known = self.last.as_ref().is_some_and(|last| {
+            let age_ns = control.stamp_ns.saturating_sub(last.stamp_ns);
+            decided(last) == decided(control) && (0..repeat_ns).contains(&age_ns)
+        });
+        if !is_known {
+            self.last = Some(control.clone());
         }
-        self.last = Some(control.clone());
-        true
+        !is_known
     }
+}
+
+/// What is told at once when it changes.
+fn decided(control: &CameraControl) -> impl PartialEq {
+    (control.why, control.set_by, control.wanted, control.in_use, control.refused.as_deref())
 }
 
 #[cfg(test)]
@@ -65,25 +73,71 @@ mod tests {
     use messages::ExposureSetter;
 
     #[test]
-    fn each_decision_is_told_and_a_fixed_setting_once_a_second_or_when_it_changes() {
+    fn a_fixed_setting_is_told_once_a_second_or_when_it_changes() {
         let mut telling = Telling::default();
-        let mut is_due = |stamp_ms: i64, why, set_by, exposure_ns| {
+        let mut is_due = |stamp_ms: i64, set_by, exposure_ns| {
             let in_use = Some(ExposureSetting { exposure_ns, gain: None });
             let stamp_ns = stamp_ms * 1_000_000;
-            telling.is_due(&CameraControl { stamp_ns, why, set_by, in_use, ..Default::default() })
+            telling.is_due(&CameraControl { stamp_ns, set_by, in_use, ..Default::default() })
         };
-        let configured = ExposureReason::Configured;
-        assert!(is_due(0, configured, ExposureSetter::Fixed, 1000));
-        assert!(!is_due(500, configured, ExposureSetter::Fixed, 1000));
-        assert!(is_due(600, configured, ExposureSetter::Fixed, 2000));
-        assert!(is_due(700, configured, ExposureSetter::Camera, 2000));
-        assert!(!is_due(1699, configured, ExposureSetter::Camera, 2000));
-        assert!(is_due(1700, configured, ExposureSetter::Camera, 2000));
-        for stamp_ms in [1710, 1720] {
-            assert!(is_due(stamp_ms, ExposureReason::Good, ExposureSetter::Marker, 2000));
+        assert!(is_due(0, ExposureSetter::Fixed, 1000));
+        assert!(!is_due(500, ExposureSetter::Fixed, 1000));
+        assert!(is_due(600, ExposureSetter::Fixed, 2000));
+        assert!(is_due(700, ExposureSetter::Camera, 2000));
+        assert!(!is_due(1699, ExposureSetter::Camera, 2000));
+        assert!(is_due(1700, ExposureSetter::Camera, 2000));
+        assert!(is_due(0, ExposureSetter::Camera, 2000), "its clock began anew");
+        assert!(is_due(-1, ExposureSetter::Camera, 2000));
+    }
+
+    /// The number of messages that are due in ten seconds of 100 frames each, of which each one is made by `control`.
+    fn due_in_ten_seconds(control: impl Fn(u32) -> CameraControl) -> usize {
+        let mut telling = Telling::default();
+        let stamped = |frame: u32| {
+            let stamp_ns = i64::from(frame) * 10_000_000;
+            CameraControl { stamp_ns, ..control(frame) }
+        };
+        (0..1000).filter(|frame| telling.is_due(&stamped(*frame))).count()
+    }
+
+    #[test]
+    fn what_stays_is_not_told_at_the_rate_of_the_camera() {
+        let of = |why| {
+            due_in_ten_seconds(|frame| {
+                let noise = f64::from(frame % 7);
+                let levels = Some(MarkerLevels { white: 0.7 + 0.01 * noise, black: 0.1 });
+                let set_by = ExposureSetter::Marker;
+                let motion_px_s = Some(noise);
+                CameraControl { why, set_by, levels, motion_px_s, ..CameraControl::default() }
+            })
+        };
+        assert_eq!(of(ExposureReason::NoMarker), 10);
+        let seen = [ExposureReason::LostSoon, ExposureReason::Settling, ExposureReason::Good];
+        for why in seen {
+            assert_eq!(of(why), 50, "{why:?}");
         }
-        assert!(is_due(0, configured, ExposureSetter::Fixed, 1000), "its clock began anew");
-        assert!(is_due(-1, configured, ExposureSetter::Fixed, 1000));
+    }
+
+    #[test]
+    fn each_change_is_told_at_once() {
+        let setting = |exposure_ns| Some(ExposureSetting { exposure_ns, gain: Some(1.0) });
+        let good = || CameraControl { why: ExposureReason::Good, ..CameraControl::default() };
+        let changes: [&dyn Fn(u32) -> CameraControl; 5] = [
+            &|frame| CameraControl { in_use: setting(frame), ..good() },
+            &|frame| CameraControl { wanted: setting(frame), ..good() },
+            &|frame| CameraControl { refused: Some(frame.to_string()), ..good() },
+            &|frame| {
+                let whys = [ExposureReason::TakenOver, ExposureReason::Settling];
+                CameraControl { why: whys[frame as usize % 2], ..good() }
+            },
+            &|frame| {
+                let setters = [ExposureSetter::Camera, ExposureSetter::Marker];
+                CameraControl { set_by: setters[frame as usize % 2], ..good() }
+            },
+        ];
+        for change in changes {
+            assert_eq!(due_in_ten_seconds(change), 1000);
+        }
     }
 
     #[test]
