@@ -117,8 +117,10 @@ impl Exposing {
         }
         let last = self.ordered.back().map_or(self.setting, |last| last.setting);
         let is_wanted = control.set_by == ExposureSetter::Marker;
+        // A camera that meters by itself tells nobody what it has chosen.
+        let is_told = control.set_by != ExposureSetter::Camera;
         CameraControl {
-            in_use: Some(self.setting.into()),
+            in_use: is_told.then(|| self.setting.into()),
             wanted: is_wanted.then(|| last.into()),
             ..control
         }
@@ -225,7 +227,8 @@ mod tests {
         marker.open(0);
         let told = marker.taken(0, 0, dark.view().unwrap());
         assert_eq!((told.set_by, told.why), (ExposureSetter::Camera, ExposureReason::NoMarker));
-        assert!(told.in_use.is_some() && told.wanted.is_none() && told.limits.is_some());
+        assert_eq!((told.in_use, told.wanted), (None, None));
+        assert!(told.limits.is_some());
         let mut found = Detections::sample();
         found.header.camera = "down".to_owned();
         (found.detections[0].centre_px, found.detections[0].size_px) = ([32.0, 24.0], 40.0);
@@ -237,10 +240,13 @@ mod tests {
         assert!(told.wanted.unwrap().exposure_ns > told.in_use.unwrap().exposure_ns, "{told:?}");
         assert!(told.levels.unwrap().white < 0.05, "{told:?}");
         let mut fixed = exposing(&["camera.exposure=fixed"]);
+        let setting = fixed.open(0);
         let told = fixed.taken(0, 0, dark.view().unwrap());
         assert_eq!((told.set_by, told.why), (ExposureSetter::Fixed, ExposureReason::Configured));
+        assert_eq!(told.in_use, Some(setting.into()));
         let mut average = exposing(&["camera.exposure=average"]);
         let told = average.taken(0, 0, dark.view().unwrap());
         assert_eq!((told.set_by, told.why), (ExposureSetter::Camera, ExposureReason::Configured));
+        assert_eq!((told.in_use, told.wanted), (None, None));
     }
 }
