@@ -422,11 +422,12 @@ impl<D: Device> Capture<D> {
 
     fn exposure(&mut self, buffer: &Buffer, arrival_ns: i64) -> Result<Exposure, Lost> {
         let by_arrival = Exposure::estimated(arrival_ns - self.delay_ns);
-        let Some((stamp_ns, shutter)) = self.stamp(buffer) else { return Ok(by_arrival) };
+        // Also where the driver stamps on no clock of the host: how the device is exposed is told all the same.
         if arrival_ns.saturating_sub(self.exposure_read_ns) > EXPOSURE_READ_NS {
             self.read_exposure();
             self.exposure_read_ns = arrival_ns;
         }
+        let Some((stamp_ns, shutter)) = self.stamp(buffer) else { return Ok(by_arrival) };
         let unsure_ns = self.exposer.as_ref().map_or(0, Exposer::unsure_ns);
         // Half of what is open is the stamp's error.
         let is_known = unsure_ns < MAX_UNSURE_NS;

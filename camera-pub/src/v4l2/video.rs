@@ -229,6 +229,7 @@ fn open<P: Port>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::control::Configured;
     use crate::exposure::StampedAt;
     use crate::v4l2::abi::CID_EXPOSURE_AUTO;
     use crate::v4l2::capture::Counts;
@@ -309,6 +310,21 @@ mod tests {
                     assert!(seen.lost.is_empty());
                 }
             }
+        }
+    }
+
+    #[test]
+    fn how_it_is_exposed_is_told_also_of_a_driver_that_stamps_on_no_clock() {
+        for stamps in [Stamps::ExposureStart, Stamps::Unknown] {
+            let fake = Fake::of("GREY", stamps, 0);
+            let mut video = Video::start(Rc::clone(&fake), wanted(&fake)).unwrap();
+            run(&fake, &mut video, 100 * MS);
+            let fixed = Configured::Fixed { exposure_ns: 5_000_000 };
+            assert_eq!(video.capture().unwrap().configured(), Some(fixed), "{stamps:?}");
+            fake.meter();
+            run(&fake, &mut video, 1500 * MS);
+            let metering = Some(Configured::Metering);
+            assert_eq!(video.capture().unwrap().configured(), metering, "{stamps:?}");
         }
     }
 
