@@ -27,6 +27,8 @@ struct Sightings {
 /// How a frame was exposed, and how the next ones can be.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Exposed {
+    /// Whether the camera can meter by itself.
+    pub(crate) has_metering: bool,
     /// True when the camera certainly meters by itself.
     pub(crate) is_metering: bool,
     /// What was set last; `None` while it is not set here.
@@ -36,6 +38,14 @@ pub(crate) struct Exposed {
     pub(crate) limits: Limits,
     /// Whether its luma is from 16 to 235.
     pub(crate) is_limited: bool,
+}
+
+/// What a device refused to do.
+#[derive(Clone, Debug)]
+pub(crate) struct Refusal {
+    pub(crate) order: Order,
+    /// What it answered.
+    pub(crate) answer: String,
 }
 
 /// What to do after a frame, and why.
@@ -54,21 +64,28 @@ pub(crate) struct Decision {
 }
 
 impl Decision {
-    /// What is told of it once it was carried out, which made the exposure `after`, or was refused with this answer.
-    pub(crate) fn told(&self, after: &Exposed, refusal: Option<&str>) -> CameraControl {
+    /// What is told of it once it was carried out, which made the exposure `after`, was refused, or was put off in the pause
+    /// after a refusal.
+    pub(crate) fn told(&self, after: &Exposed, refusal: Option<&Refusal>) -> CameraControl {
         let wanted = match self.order {
             Order::Keep | Order::TakeOver => after.ordered,
             Order::OwnMetering => None,
             Order::Set(setting) => Some(setting),
         };
         let set_by = match after.ordered {
-            // A camera without metering keeps what was set.
-            Some(_) if self.order == Order::OwnMetering => ExposureSetter::Fixed,
+            // A camera without metering keeps what was set. Any other has only not been asked to meter yet.
+            Some(_) if self.order == Order::OwnMetering && !after.has_metering => {
+                ExposureSetter::Fixed
+            }
             Some(_) => ExposureSetter::Marker,
             None if after.is_metering => ExposureSetter::Camera,
             None => ExposureSetter::Fixed,
         };
-        let refused = refusal.filter(|_| self.order != Order::Keep).map(str::to_owned);
+        // An answer to another kind of order says nothing of this one.
+        let is_of_its_kind = |refusal: &&Refusal| {
+            std::mem::discriminant(&refusal.order) == std::mem::discriminant(&self.order)
+        };
+        let refused = refusal.filter(is_of_its_kind).map(|refusal| refusal.answer.clone());
         CameraControl {
             set_by,
             in_use: self.before.setting.map(Into::into),
@@ -519,6 +536,48 @@ mod tests {
         exposing.run(1500 * MS, still);
         let last = exposing.told.last().unwrap();
         assert_eq!((last.why, &last.refused), (ExposureReason::Good, &None));
+    }
+
+    #[test]
+    fn an_answer_to_another_order_is_not_told_of_a_marker_that_is_lost_meanwhile() {
+        let mut exposing = Loop::new(Stamps::FirstPacket);
+        exposing.fake.light(0.2);
+        exposing.run(1500 * MS, still);
+        exposing.fake.refuse(Some(CID_EXPOSURE_ABSOLUTE));
+        exposing.fake.light(1.0);
+        exposing.run(1000 * MS, still);
+        assert!(exposing.told.last().unwrap().refused.is_some());
+        exposing.told.clear();
+        exposing.run(2000 * MS, |_| None);
+        let lost = exposing.told.iter().filter(|told| told.why == ExposureReason::NoMarker);
+        // No order is given to the device for a second after it refused one.
+        let (paused, metering): (Vec<_>, Vec<_>) =
+            lost.partition(|told| told.set_by != ExposureSetter::Camera);
+        assert!(paused.len() > 10 && metering.len() > 10, "{} {}", paused.len(), metering.len());
+        for told in paused {
+            assert_eq!((told.set_by, &told.refused), (ExposureSetter::Marker, &None), "{told:?}");
+            assert!(told.in_use.is_some() && told.wanted.is_none(), "{told:?}");
+        }
+        assert!(metering.iter().all(|told| told.refused.is_none()));
+    }
+
+    #[test]
+    fn a_camera_without_metering_keeps_what_was_set_for_a_marker_that_is_lost() {
+        let setting = Setting { exposure_s: 1e-3, gain: 2.0 };
+        let limits = Limits { min_exposure_s: 1e-4, max_exposure_s: 5e-3, max_gain: 16.0 };
+        let grey = [0; 64];
+        let frame = GrayView::packed(&grey, 8, 8).unwrap();
+        for (has_metering, set_by) in
+            [(false, ExposureSetter::Fixed), (true, ExposureSetter::Marker)]
+        {
+            let (ordered, setting) = (Some(setting), Some(setting));
+            let (is_metering, is_limited) = (false, false);
+            let exposed =
+                Exposed { has_metering, is_metering, ordered, setting, limits, is_limited };
+            let decision = MarkerExposure::new("down").after(0, frame, &exposed);
+            assert_eq!(decision.order, Order::OwnMetering);
+            assert_eq!(decision.told(&exposed, None).set_by, set_by);
+        }
     }
 
     #[test]

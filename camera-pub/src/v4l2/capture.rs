@@ -17,7 +17,7 @@ use super::exposer::{Exposer, ForMarker, Order};
 use super::pixels::{Pixels, Rows};
 use crate::control::Configured;
 use crate::exposure::{Exposure, Shutter, StampedAt};
-use crate::marker::Exposed;
+use crate::marker::{Exposed, Refusal};
 
 /// Number of buffers that the driver fills in turn: one being read, the others for it. Fewer lose frames when the
 /// service is late by a period.
@@ -167,8 +167,8 @@ pub(crate) struct Capture<D: Device> {
     exposer: Option<Exposer>,
     /// Until when no control is set after a refusal.
     expose_again_ns: i64,
-    /// What the device answered to the last order, where it refused it.
-    refusal: Option<String>,
+    /// The last order that the device was given, and its answer, where it refused it.
+    refusal: Option<Refusal>,
     counts: Counts,
 }
 
@@ -278,6 +278,7 @@ impl<D: Device> Capture<D> {
     pub(crate) fn exposed(&self) -> Option<Exposed> {
         let exposer = self.exposer.as_ref()?;
         Some(Exposed {
+            has_metering: exposer.has_metering(),
             is_metering: exposer.is_metering(),
             ordered: exposer.ordered(),
             setting: exposer.setting(),
@@ -296,7 +297,7 @@ impl<D: Device> Capture<D> {
             return Ok(());
         };
         let set = failed("VIDIOC_S_EXT_CTRLS", exposer.follow(&self.device, order));
-        self.refusal = set.as_ref().err().map(ToString::to_string);
+        self.refusal = set.as_ref().err().map(|lost| Refusal { order, answer: lost.to_string() });
         if set.is_err() {
             self.expose_again_ns = now_ns.saturating_add(EXPOSE_PAUSE_NS);
             // A part of it may have been set.
@@ -308,9 +309,9 @@ impl<D: Device> Capture<D> {
         Ok(())
     }
 
-    /// What the device answered when it refused the last order that it was given, until it takes one.
-    pub(crate) fn refusal(&self) -> Option<&str> {
-        self.refusal.as_deref()
+    /// The last order that the device was given, where it refused it, until it takes one.
+    pub(crate) fn refusal(&self) -> Option<&Refusal> {
+        self.refusal.as_ref()
     }
 
     /// How the device is exposed where the exposure does not follow the marker; `None` as long as it does not tell.

@@ -150,6 +150,11 @@ impl Exposer {
         self.setting
     }
 
+    /// Whether the camera can meter by itself.
+    pub(crate) fn has_metering(&self) -> bool {
+        self.metering.is_some()
+    }
+
     /// True when the camera certainly meters by itself.
     pub(crate) fn is_metering(&self) -> bool {
         self.is_metering
