@@ -64,7 +64,12 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let work = Work::new(&node, &config, shared).await?;
     let responses = node.publisher(topic::CAMERA_RESPONSE, &[&config.id]).await?;
     let infos_of_ours = node.publisher(topic::DETECTOR_INFO, &[&config.id]).await?;
-    let mut live = Live { info: info(&config).map_err(anyhow::Error::msg)?, config, change };
+    let mut live = Live {
+        info: info(&config).map_err(anyhow::Error::msg)?,
+        config,
+        change,
+        response: Arc::clone(&response),
+    };
     infos_of_ours.publish(&live.info).await;
     let (stopped, thread) = work.start()?;
     node.announce().await?;
@@ -203,6 +208,7 @@ fn camera_response(
 /// What the image thread shares with the service's task.
 struct Shared {
     camera: Arc<Mutex<Option<CameraInfo>>>,
+    /// Locked before `response` by whoever locks both.
     change: Arc<Mutex<Option<Change>>>,
     /// How the camera shows light, to be published.
     response: Arc<Mutex<Option<CameraResponse>>>,
@@ -219,6 +225,7 @@ struct Live {
     config: Config,
     info: DetectorInfo,
     change: Arc<Mutex<Option<Change>>>,
+    response: Arc<Mutex<Option<CameraResponse>>>,
 }
 
 impl Live {
@@ -245,7 +252,10 @@ impl Live {
         let config = self.config.with(key, value)?;
         let search = Search::new(&config)?;
         self.info = info(&config)?;
-        *lock(&self.change) = Some(Change { config: config.clone(), search });
+        let mut change = lock(&self.change);
+        *change = Some(Change { config: config.clone(), search });
+        // What the search before knew is forgotten at once: of a camera that is gone there is no next frame.
+        *lock(&self.response) = configured_response(&config);
         self.config = config;
         Ok(())
     }
@@ -381,13 +391,16 @@ impl Work {
     fn take_change(&mut self) {
         if let Some(Change { config, search }) = lock(&self.shared.change).take() {
             self.search = search;
-            *lock(&self.shared.response) = configured_response(&config);
             self.config = config;
         }
     }
 
-    /// Has the response that was remembered of the camera published.
+    /// Has the response that was remembered of the camera published, unless a change is about to end that.
     fn keep_response(&self) {
+        let change = lock(&self.shared.change);
+        if change.is_some() {
+            return;
+        }
         let memory = self.search.response();
         if let (Ok(ResponseSetting::Auto), Some(known)) = (self.config.response(), memory.known()) {
             let response = camera_response(&self.config, false, memory.markers(), &known);

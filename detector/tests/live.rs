@@ -273,6 +273,20 @@ async fn several_families_are_found_and_parameters_change_while_it_runs() -> any
     Ok(())
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_response_that_is_not_configured_any_more_is_no_last_value_also_without_a_camera()
+-> anyhow::Result<()> {
+    let ([port], _, _) = ports::free()?;
+    let node = open("detector", "main", port).await?;
+    let operator = open("alight", "test", port).await?;
+    let set = vec![format!("markers={ALL}"), "response=1.1,0.5".into()];
+    let config = Layers { file: None, set }.load::<Config>()?.settings;
+    let service = tokio::spawn(detector::run(node, config, Shutdown::on_signals()?));
+    check_response(&operator).await?;
+    service.abort();
+    Ok(())
+}
+
 /// A frame of the air link, of noise, in which a search takes its time.
 async fn send_noise(
     jpegs: &FramePublisher,
