@@ -6,7 +6,9 @@ use std::time::Duration;
 
 use anyhow::Context;
 use autopilot::compose::heartbeat;
-use autopilot::dialect::{HEARTBEAT_DATA, MavMessage, MavSeverity, MavState, MessageData};
+use autopilot::dialect::{
+    HEARTBEAT_DATA, MavMessage, MavResult, MavSeverity, MavState, MessageData,
+};
 use autopilot::link::SendError;
 use autopilot::packet::{Counters, encode};
 use autopilot::signing::Refusals;
@@ -92,11 +94,13 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
             event = ground.recv() => {
                 // An arming or a mode that waited while this process was frozen is not wanted any more.
                 let is_late = standstill.step(now_ns()).is_some();
-                if is_late && matches!(event, LinkEvent::Packet { .. }) {
-                    node.health().dropped("packets of the ground station: too late");
-                    bridge.ground_status.refused(None, "too late");
-                } else if let Some(packet) = bridge.up(now_ns(), event) {
-                    to_autopilot.publish(&MavlinkBytes { packet }).await;
+                match event {
+                    LinkEvent::Packet { packet, .. } if is_late => bridge.too_late(now_ns(), &packet),
+                    event => {
+                        if let Some(packet) = bridge.up(now_ns(), event) {
+                            to_autopilot.publish(&MavlinkBytes { packet }).await;
+                        }
+                    }
                 }
             }
             message = from_autopilot.next() => {
@@ -143,9 +147,12 @@ fn counts(ground: &Link) -> LinkCounts {
         bad_checksums: ground.counters().bad_checksums,
         unread: ground.dropped(),
         refusals: ground.refusals(),
-        lacks_key: ground.lacks_key(),
     }
 }
+
+/// Why what only the companion or the camera could answer is refused; without an acknowledgement it is dropped for the same reason.
+const NOT_OF_COMPANION: &str = "for the companion, and not supported";
+const NOT_OF_CAMERA: &str = "for the camera, and not supported";
 
 /// Maximum number of controllers that are followed; there is one, and another while it is replaced.
 const MAX_CONTROLLERS: usize = 16;
@@ -330,35 +337,58 @@ impl Bridge {
         }
     }
 
+    /// Drops a packet that waited too long.
+    fn too_late(&mut self, now_ns: i64, packet: &Packet) {
+        self.health.dropped("packets of the ground station: too late");
+        if route::from_ground(packet, self.own(now_ns), &self.vehicle) != Route::Drop(ECHO) {
+            self.ground_status.heard(now_ns, packet);
+            self.ground_status.refused(packet, "too late");
+        }
+    }
+
     fn packet_from_ground(&mut self, now_ns: i64, packet: Packet) -> Option<Vec<u8>> {
         self.health.count("from ground");
         let route = route::from_ground(&packet, self.own(now_ns), &self.vehicle);
-        if route != Route::Drop(ECHO) {
-            self.ground_status.heard(now_ns, &packet);
+        // Nobody on the ground asked for anything.
+        if route == Route::Drop(ECHO) {
+            self.health.dropped(ECHO);
+            return None;
         }
+        self.ground_status.heard(now_ns, &packet);
         let asked = self.me(now_ns).and_then(|me| Ask::of(&packet, me));
+        let mut is_unset = false;
         if let Some(asked) = asked {
             self.ground_active(now_ns, packet.sender);
-            self.asked_for_parameters(now_ns, packet.sender, &asked);
+            is_unset = !self.asked_for_parameters(now_ns, &asked);
         }
         match route {
             Route::Drop(reason) => {
                 self.health.dropped(reason);
                 let reason = reason.strip_prefix("from ground: ").unwrap_or(reason);
-                self.ground_status.refused(Some(packet.sender), reason);
+                self.ground_status.refused(&packet, reason);
+            }
+            Route::Parameters if is_unset => {
+                self.ground_status.refused(&packet, "a parameter is not set from there");
             }
             Route::Parameters => {}
             Route::Answer(message) => {
                 self.ground_active(now_ns, packet.sender);
+                self.ground_status.refused(&packet, NOT_OF_COMPANION);
                 self.send_own(now_ns, &message);
             }
             Route::Camera(command) => {
                 self.ground_active(now_ns, packet.sender);
-                self.command_camera(now_ns, packet.sender, command);
+                match self.command_camera(now_ns, packet.sender, command) {
+                    MavResult::MAV_RESULT_ACCEPTED => {}
+                    MavResult::MAV_RESULT_UNSUPPORTED => {
+                        self.ground_status.refused(&packet, NOT_OF_CAMERA);
+                    }
+                    _ => self.ground_status.refused(&packet, "denied by the camera"),
+                }
             }
             Route::Key => {
                 self.ground_active(now_ns, packet.sender);
-                self.ground_status.refused(Some(packet.sender), "SETUP_SIGNING");
+                self.ground_status.refused(&packet, "SETUP_SIGNING");
                 if self.health.failed("from ground: refused: SETUP_SIGNING") {
                     tracing::warn!(
                         "A key for signed packets was not passed on; set it on the autopilot's own USB port"
@@ -369,6 +399,9 @@ impl Bridge {
             }
             Route::Unknown(command) => {
                 self.ground_active(now_ns, packet.sender);
+                let is_companions = command.target.component == self.component;
+                let reason = if is_companions { NOT_OF_COMPANION } else { NOT_OF_CAMERA };
+                self.ground_status.refused(&packet, reason);
                 self.send(&command.unsupported(self.sequence, packet.sender));
                 self.sequence = self.sequence.wrapping_add(1);
             }
@@ -384,8 +417,13 @@ impl Bridge {
         None
     }
 
-    /// Acknowledges a command to the camera, and sends what it asks for.
-    fn command_camera(&mut self, now_ns: i64, from: Sender, command: request::Command) {
+    /// Acknowledges a command to the camera with the result, and sends what it asks for.
+    fn command_camera(
+        &mut self,
+        now_ns: i64,
+        from: Sender,
+        command: request::Command,
+    ) -> MavResult {
         let answer = request::answer(&mut self.camera, now_ns, command);
         let acknowledgement = route::acknowledgement(command.command, answer.result, from);
         self.send_from_camera(now_ns, &acknowledgement);
@@ -396,19 +434,20 @@ impl Bridge {
             let text = format!("Alight: not tracked: {why}");
             self.send_answer(now_ns, MavSeverity::MAV_SEVERITY_NOTICE, &text);
         }
+        answer.result
     }
 
-    /// Answers what the ground station asks of our parameters.
-    fn asked_for_parameters(&mut self, now_ns: i64, from: Sender, asked: &Ask) {
+    /// Answers what the ground station asks of our parameters; false where it would set one, which it may not.
+    fn asked_for_parameters(&mut self, now_ns: i64, asked: &Ask) -> bool {
         let answer = self.parameters.answer(asked);
         if let Some(message) = &answer.message {
             self.send_own(now_ns, message);
         }
-        if let Some(why) = answer.why {
+        if let Some(why) = &answer.why {
             self.health.failed("from ground: a parameter is not set from there");
-            self.ground_status.refused(Some(from), "a parameter is not set from there");
             self.send_answer(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &format!("Alight: {why}"));
         }
+        answer.why.is_none()
     }
 
     /// Takes the configuration of a controller.
@@ -444,7 +483,7 @@ impl Bridge {
     /// Counts a packet that the ground station may not send, and tells it.
     fn refuse(&mut self, now_ns: i64, packet: &Packet, refusal: &'static str) {
         let to = packet.sender;
-        self.ground_status.refused(Some(to), refusal);
+        self.ground_status.refused(packet, refusal);
         if self.health.failed(&format!("from ground: refused: {refusal}")) {
             let Sender { system, component } = to;
             tracing::warn!(
@@ -629,7 +668,8 @@ impl Bridge {
     fn count_strangers(&mut self, strangers: u64) {
         let more = strangers.saturating_sub(self.strangers);
         if more > 0 {
-            self.health.failed_times("from ground: packets or connections of a stranger", more);
+            self.health
+                .failed_times("from ground: packets or connections of an unknown sender", more);
         }
         self.strangers = strangers;
     }
@@ -721,5 +761,134 @@ impl Bridge {
             Err(SendError::NotConnected) => self.health.dropped("to ground: not connected"),
             Err(SendError::Full) => self.health.dropped("to ground: the line is too slow"),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use autopilot::dialect::{
+        COMMAND_LONG_DATA, MavAutopilot, MavCmd, MavType, PARAM_REQUEST_READ_DATA, PARAM_SET_DATA,
+    };
+    use messages::GcsStatus;
+    use node::Layers;
+
+    const AUTOPILOT: Sender = Sender { system: 7, component: 1 };
+    const GROUND: Sender = Sender { system: 255, component: 190 };
+    const COMPANION: u8 = 191;
+    const CAMERA: u8 = 100;
+
+    fn packet(sender: Sender, message: &MavMessage) -> Packet {
+        Parser::new().push(&encode(sender, 0, message)).remove(0)
+    }
+
+    fn heartbeat_of(sender: Sender) -> Packet {
+        let heartbeat = HEARTBEAT_DATA {
+            mavtype: MavType::MAV_TYPE_QUADROTOR,
+            autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+            ..HEARTBEAT_DATA::default()
+        };
+        packet(sender, &MavMessage::HEARTBEAT(heartbeat))
+    }
+
+    fn command(target_component: u8, command: MavCmd) -> MavMessage {
+        MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+            command,
+            target_system: AUTOPILOT.system,
+            target_component,
+            ..COMMAND_LONG_DATA::default()
+        })
+    }
+
+    /// A bridge that has heard its autopilot, and the link that it must not lose.
+    async fn bridge(set: &[&str]) -> (Bridge, Link) {
+        let set = set.iter().map(|text| (*text).to_owned()).collect();
+        let config = Layers { file: None, set }.load::<Config>().unwrap().settings;
+        let link = Link::open("udpin:127.0.0.1:0".parse().unwrap()).await.unwrap();
+        let mut bridge = Bridge::new(&config, None, link.sender(), Arc::default()).unwrap();
+        bridge.down(0, &heartbeat_of(AUTOPILOT).raw);
+        assert!(bridge.me(0).is_some());
+        (bridge, link)
+    }
+
+    /// What is told a second later.
+    fn told(bridge: &mut Bridge) -> GcsStatus {
+        bridge.ground_status.due(1_000_000_000, None, LinkCounts::default()).unwrap()
+    }
+
+    fn by_reason(told: &GcsStatus) -> BTreeMap<&str, u64> {
+        told.refused.iter().map(|it| (it.reason.as_str(), it.count)).collect()
+    }
+
+    #[tokio::test]
+    async fn each_packet_that_is_neither_passed_on_nor_answered_as_it_asks_counts_once() {
+        let (mut bridge, _link) = bridge(&["ground_may=monitor"]).await;
+        let parameter = |target_system| {
+            MavMessage::PARAM_SET(PARAM_SET_DATA {
+                target_system,
+                target_component: COMPANION,
+                param_id: "ALIGHT_NONE".into(),
+                ..PARAM_SET_DATA::default()
+            })
+        };
+        let asked = MavMessage::PARAM_REQUEST_READ(PARAM_REQUEST_READ_DATA {
+            target_system: AUTOPILOT.system,
+            target_component: COMPANION,
+            param_index: 0,
+            ..PARAM_REQUEST_READ_DATA::default()
+        });
+        let mut unknown = packet(GROUND, &command(CAMERA, MavCmd::MAV_CMD_COMPONENT_ARM_DISARM));
+        // A number that no command has; the number of the command is behind seven parameters of four bytes.
+        unknown.raw[10 + 28..10 + 30].copy_from_slice(&60_001_u16.to_le_bytes());
+        unknown.message = None;
+        let messages = [
+            command(COMPANION, MavCmd::MAV_CMD_DO_SET_SERVO),
+            command(CAMERA, MavCmd::MAV_CMD_DO_SET_SERVO),
+            command(CAMERA, MavCmd::MAV_CMD_CAMERA_TRACK_POINT),
+            command(CAMERA, MavCmd::MAV_CMD_CAMERA_STOP_TRACKING),
+            command(AUTOPILOT.component, MavCmd::MAV_CMD_COMPONENT_ARM_DISARM),
+            parameter(AUTOPILOT.system),
+            // To all of this component, whatever their system: refused here, and not passed on.
+            parameter(0),
+            asked,
+        ];
+        let packets = messages.iter().map(|message| packet(GROUND, message));
+        for packet in packets.chain([unknown]) {
+            assert_eq!(bridge.packet_from_ground(0, packet), None);
+        }
+        let told = told(&mut bridge);
+        let expected = BTreeMap::from([
+            (NOT_OF_COMPANION, 1),
+            (NOT_OF_CAMERA, 2),
+            ("denied by the camera", 1),
+            ("a parameter is not set from there", 1),
+            ("only monitoring", 2),
+        ]);
+        assert_eq!(by_reason(&told), expected);
+        let [station] = told.stations.as_slice() else { panic!("{told:?}") };
+        assert_eq!((station.packets, station.refused), (9, 7));
+    }
+
+    #[tokio::test]
+    async fn an_echo_of_the_vehicle_is_of_no_station_and_refused_to_nobody() {
+        let (mut bridge, _link) = bridge(&[]).await;
+        for _ in 0..3 {
+            assert_eq!(bridge.packet_from_ground(0, heartbeat_of(AUTOPILOT)), None);
+            bridge.too_late(0, &heartbeat_of(AUTOPILOT));
+        }
+        let told = told(&mut bridge);
+        assert_eq!((told.stations.len(), told.refused.len()), (0, 0), "{told:?}");
+    }
+
+    #[tokio::test]
+    async fn what_comes_too_late_is_of_its_sender() {
+        let (mut bridge, _link) = bridge(&[]).await;
+        bridge.too_late(0, &heartbeat_of(GROUND));
+        let told = told(&mut bridge);
+        assert_eq!(by_reason(&told), BTreeMap::from([("too late", 1)]));
+        let [station] = told.stations.as_slice() else { panic!("{told:?}") };
+        assert_eq!((station.system, station.packets, station.refused), (GROUND.system, 1, 1));
     }
 }

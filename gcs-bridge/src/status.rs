@@ -29,8 +29,6 @@ pub(crate) struct LinkCounts {
     pub(crate) unread: u64,
     /// Packets refused because of their signatures.
     pub(crate) refusals: Refusals,
-    /// Whether packets came with signatures although there is no key here.
-    pub(crate) lacks_key: bool,
 }
 
 /// What is known of the ground.
@@ -108,10 +106,11 @@ impl GroundStatus {
         });
     }
 
-    /// A packet was refused; of a sender that is known, or none.
-    pub(crate) fn refused(&mut self, from: Option<Sender>, reason: &'static str) {
+    /// A packet that was heard was refused; once for each.
+    pub(crate) fn refused(&mut self, packet: &Packet, reason: &'static str) {
         *self.refused.entry(reason).or_default() += 1;
-        if let Some(station) = from.and_then(|from| self.station(from)) {
+        let is_of_radio = packet.message_id == RADIO_STATUS_DATA::ID;
+        if let Some(station) = self.station(packet.sender).filter(|_| !is_of_radio) {
             station.refused += 1;
         }
     }
@@ -144,7 +143,7 @@ impl GroundStatus {
             station.silent = self.is_silent(now_ns, station);
         }
         let on_link = [
-            ("packets or connections of a stranger", counts.strangers),
+            ("packets or connections of an unknown sender", counts.strangers),
             ("wrong checksum", counts.bad_checksums),
             ("not read in time", counts.unread),
         ];
@@ -158,7 +157,7 @@ impl GroundStatus {
         status.signing.state = match (status.signing.link_id, status.signing.verified_ns) {
             (Some(_), Some(_)) => SigningState::InForce,
             (Some(_), None) => SigningState::Wanted,
-            (None, _) if counts.lacks_key => SigningState::NoKey,
+            (None, _) if is_signing(&status.stations) => SigningState::NoKey,
             (None, _) => SigningState::Off,
         };
         status
@@ -185,6 +184,13 @@ impl GroundStatus {
         let oldest = silent.min_by_key(|(_, station)| station.last_ns).map(|(index, _)| index);
         oldest.map(|index| self.so_far.stations.remove(index)).is_some()
     }
+}
+
+/// Whether a station signs, by its last packet; what one that is silent did long ago no longer tells, unless nobody speaks since.
+fn is_signing(stations: &[GroundStation]) -> bool {
+    let newest_ns = stations.iter().map(|it| it.last_ns).max();
+    let mut that_count = stations.iter().filter(|it| !it.silent || Some(it.last_ns) == newest_ns);
+    that_count.any(|it| it.signature == PacketSignature::Unchecked)
 }
 
 /// What is worth a message at once: all but what every packet changes.
@@ -285,17 +291,20 @@ mod tests {
     fn refused_packets_are_counted_by_reason_and_by_station() {
         let mut status = ground(None);
         status.heard(0, &heartbeat(GROUND));
-        status.refused(Some(GROUND), "only monitoring");
-        status.refused(Some(GROUND), "only monitoring");
-        status.refused(None, "too late");
+        status.refused(&heartbeat(GROUND), "only monitoring");
+        status.refused(&heartbeat(GROUND), "only monitoring");
+        // Neither a station that is not listed, nor what a radio says that has a station's ids.
+        status.refused(&heartbeat(Sender { system: 254, ..GROUND }), "too late");
+        let radio = MavMessage::RADIO_STATUS(RADIO_STATUS_DATA::default());
+        status.refused(&packet(GROUND, &radio), "too late");
         let counts = LinkCounts { strangers: 40, bad_checksums: 3, ..LinkCounts::default() };
         let told = status.status(0, None, counts);
         let counted = |reason: &str| {
             told.refused.iter().find(|it| it.reason == reason).map_or(0, |it| it.count)
         };
         assert_eq!(counted("only monitoring"), 2);
-        assert_eq!(counted("too late"), 1);
-        assert_eq!(counted("packets or connections of a stranger"), 40);
+        assert_eq!(counted("too late"), 2);
+        assert_eq!(counted("packets or connections of an unknown sender"), 40);
         assert_eq!(counted("wrong checksum"), 3);
         assert_eq!(told.refused.len(), 4, "what was never refused is not named");
         assert_eq!(told.stations[0].refused, 2);
@@ -303,14 +312,21 @@ mod tests {
 
     #[test]
     fn signing_is_off_wanted_or_in_force() {
-        let lacking = LinkCounts { lacks_key: true, ..LinkCounts::default() };
         let mut status = ground(None);
         assert_eq!(now(&status, 0).signing, GcsSigning::default());
-        assert_eq!(status.status(0, None, lacking).signing.state, SigningState::NoKey);
         let mut signed = heartbeat(GROUND);
         signed.raw[2] = 1;
         status.heard(0, &signed);
         assert_eq!(now(&status, 0).stations[0].signature, PacketSignature::Unchecked);
+        assert_eq!(now(&status, 0).signing.state, SigningState::NoKey);
+        // It signs no more.
+        status.heard(1, &heartbeat(GROUND));
+        assert_eq!(now(&status, 1).signing.state, SigningState::Off);
+        // It was silent after a signed one: that is known as long as nobody else speaks.
+        status.heard(2, &signed);
+        assert_eq!(now(&status, 60 * SECOND_NS).signing.state, SigningState::NoKey);
+        status.heard(60 * SECOND_NS, &heartbeat(Sender { system: 254, ..GROUND }));
+        assert_eq!(now(&status, 60 * SECOND_NS).signing.state, SigningState::Off);
 
         let mut status = ground(Some(191));
         let wanted =
@@ -369,7 +385,7 @@ mod tests {
         // A flood of refused packets is told twice a second.
         let mut times = 0;
         for step in 0..200_i64 {
-            status.refused(None, "only monitoring");
+            status.refused(&heartbeat(GROUND), "only monitoring");
             let now_ns = 30 * SECOND_NS + step * 50_000_000;
             times += usize::from(status.due(now_ns, None, LinkCounts::default()).is_some());
         }

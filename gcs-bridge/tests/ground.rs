@@ -565,9 +565,13 @@ async fn the_ground_stations_are_told_with_what_is_refused_and_when_they_are_sil
         }
     };
     let is_all_counted = |it: &GcsStatus| {
-        ["arming or stopping motors", "wrong checksum", "packets or connections of a stranger"]
-            .iter()
-            .all(|reason| it.refused.iter().any(|count| count.reason == *reason))
+        [
+            "arming or stopping motors",
+            "wrong checksum",
+            "packets or connections of an unknown sender",
+        ]
+        .iter()
+        .all(|reason| it.refused.iter().any(|count| count.reason == *reason))
     };
     let told = tokio::select! {
         told = until_told(&statuses, is_all_counted) => told?,

@@ -30,7 +30,8 @@ pub struct GcsStatus {
     pub stations: Vec<GroundStation>,
     /// Packets of further ground stations since the start, which are not listed.
     pub unlisted: u64,
-    /// Packets from the ground that were neither passed on nor answered as they ask, since the start, by reason.
+    /// Packets from the ground that were neither passed on nor answered as they ask, since the start, by reason; each once, and
+    /// the vehicle's own that come back left out.
     pub refused: Vec<Count>,
     /// Whether packets on the link to the ground are signed.
     pub signing: GcsSigning,
@@ -84,11 +85,11 @@ pub struct GcsSigning {
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum SigningState {
-    /// There is no key here, and no packet from the ground was signed.
+    /// There is no key here, and no ground station signs.
     #[default]
     Off,
-    /// There is no key here, but packets from the ground are signed: they are passed on unchecked, and the ground station may refuse
-    /// what comes from here.
+    /// There is no key here, but a ground station signs, by the last packet of one that speaks or of the one that spoke last: its
+    /// packets are passed on unchecked, and it may refuse what comes from here.
     NoKey,
     /// What is sent is signed and what is not signed is refused, but no packet with a right signature has come yet.
     Wanted,
