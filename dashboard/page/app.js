@@ -324,7 +324,16 @@ function showSlow({ detectors, services, recorders, bridges, checks }) {
   }
   forget(processes, keys);
   put('recorders', recorders.length === 0 ? 'Nothing records.' : recorders.map((/** @type {any} */ it) => `Recorder ${it.name}: ${it.problem ?? `${it.file}, ${(it.bytes / 1e6).toFixed(1)} MB, ${it.kept} messages, ${it.lost} lost${it.free_bytes === null ? '' : `, ${(it.free_bytes / 1e9).toFixed(1)} GB free`}`} (${age(it.age_ms)} ago)`).join(' '));
-  put('bridges', bridges.map((/** @type {any} */ it) => `Ground stations of ${it.name}: ${it.problem ?? (it.stations.join(', ') || 'none yet')}, packets ${it.signing}, ${it.refused} refused (${age(it.age_ms)} ago)`).join(' '));
+  const ground = element('bridges');
+  rows(ground, bridges.map((/** @type {any} */ it, /** @type {number} */ n) => {
+    const further = it.unlisted > 0 ? `, and ${it.unlisted} packet${it.unlisted === 1 ? '' : 's'} of further stations` : '';
+    const stations = it.problem ?? `${it.stations.join(', ') || 'none yet'}${further}`;
+    // What is grey stays so until it is looked at its age.
+    return ['span', `Ground stations of ${it.name}: ${stations}; ${it.signing}; ${it.refused} refused (${age(it.age_ms)} ago). `, ground.children[n]?.className];
+  }));
+  bridges.forEach((/** @type {any} */ it, /** @type {number} */ n) => {
+    /** @type {HTMLElement} */ (ground.children[n]).dataset.age = String(it.age_ms);
+  });
 
   const list = element('checks');
   const signs = /** @type {any} */ ({ good: '✓', open: '·', bad: '✗' });
@@ -402,7 +411,7 @@ function lookAtAges() {
     put(badge, status ? `was: ${status.title}, ${age(phaseOld)} ago` : 'No controller');
     badge.className = 'badge lost';
   }
-  for (const line of document.querySelectorAll('tbody tr')) {
+  for (const line of document.querySelectorAll('tbody tr, #bridges span')) {
     const told = /** @type {HTMLElement} */ (line).dataset.age;
     const limit = line.closest('#detectors') ? SLOW_STALE_MS - 1000 : SLOW_STALE_MS + 1000;
     line.classList.toggle('old', !told || Number(told) + slowOld > limit);

@@ -269,7 +269,9 @@ fn keys(facts: &Facts<'_>) -> Finding {
         Some(true) => {
             finding(Verdict::Bad, "a process listens beyond its machine without keys", todo)
         }
-        Some(false) => finding(Verdict::Good, "no process listens without keys", todo),
+        Some(false) => {
+            finding(Verdict::Good, "no process listens beyond its machine without keys", todo)
+        }
         None => finding(Verdict::Open, "no process is present", todo),
     }
 }

@@ -21,7 +21,7 @@ use crate::words;
 const MAX_NAMES: usize = 64;
 /// Maximum number of faults of all services that are told once.
 const MAX_FAULTS: usize = 512;
-/// A service whose health is older is silent, in nanoseconds.
+/// A service whose health is older is silent, and so are the ground stations of a bridge whose status is older, in nanoseconds.
 const SILENT_NS: i64 = 3_000_000_000;
 /// A service that is silent for this time is forgotten, in nanoseconds.
 const FORGOTTEN_NS: i64 = 120_000_000_000;
@@ -236,7 +236,7 @@ impl State {
         put(&mut self.bridges, status.bridge.clone(), status, now_ns);
     }
 
-    /// Looks for services that have fallen silent; once a second.
+    /// Looks for services and ground stations that have fallen silent; once a second.
     pub fn every_second(&mut self, now_ns: i64) {
         for ((service, instance), known) in &mut self.services {
             let is_silent = now_ns.saturating_sub(known.received_ns) > SILENT_NS;
@@ -245,7 +245,20 @@ impl State {
             }
             known.is_silent = is_silent;
         }
+        for (name, bridge) in &mut self.bridges {
+            // Who speaks to a bridge that is gone is heard by nobody.
+            let is_silent = now_ns.saturating_sub(bridge.received_ns) > SILENT_NS;
+            for station in bridge.value.stations.iter_mut().filter(|it| is_silent && !it.silent) {
+                station.silent = true;
+                let GroundStation { system, component, .. } = station;
+                let text = format!(
+                    "ground station {system}/{component} is silent: no word of gcs-bridge {name}"
+                );
+                self.log.add(now_ns, Level::Warn, &text);
+            }
+        }
         let is_recent = |received_ns: i64| now_ns.saturating_sub(received_ns) < FORGOTTEN_NS;
+        self.bridges.retain(|_, bridge| is_recent(bridge.received_ns));
         self.services.retain(|_, service| is_recent(service.received_ns));
         self.found.retain(|_, found| is_recent(found.received_ns));
         self.detectors.retain(|_, info| is_recent(info.received_ns));
@@ -371,6 +384,7 @@ impl State {
                     .collect();
                 json!({
                     "name": name, "age_ms": age_ms(now_ns, seen.received_ns), "stations": stations,
+                    "unlisted": it.unlisted,
                     "refused": it.refused.iter().map(|it| it.count).fold(0, u64::saturating_add),
                     "signing": words::signing(it.signing.state), "problem": it.problem,
                 })
@@ -636,10 +650,8 @@ mod tests {
         assert_eq!(state.slow(0)["services"], json!([]));
     }
 
-    #[test]
-    fn ground_stations_are_shown_and_their_silence_is_told_once() {
-        let mut state = State::new("ours");
-        let station = |silent| GroundStation {
+    fn ground(silent: bool) -> Input {
+        let station = GroundStation {
             system: 255,
             component: 190,
             peer: "10.0.0.2:14550".into(),
@@ -649,20 +661,50 @@ mod tests {
             refused: 0,
             signature: PacketSignature::Unsigned,
         };
+        Input::Ground(Box::new(GcsStatus {
+            bridge: "main".into(),
+            stations: vec![station],
+            unlisted: 4,
+            refused: vec![Count { reason: "wrong checksum".into(), count: 3 }],
+            ..GcsStatus::default()
+        }))
+    }
+
+    #[test]
+    fn ground_stations_are_shown_and_their_silence_is_told_once() {
+        let mut state = State::new("ours");
         for silent in [false, false, true, true] {
-            let status = GcsStatus {
-                bridge: "main".into(),
-                stations: vec![station(silent)],
-                refused: vec![Count { reason: "wrong checksum".into(), count: 3 }],
-                ..GcsStatus::default()
-            };
-            state.take(0, Input::Ground(Box::new(status)));
+            state.take(0, ground(silent));
         }
         let told = texts(&state);
         assert_eq!(told, ["ground station 255/190 is heard", "ground station 255/190 is silent"]);
         let bridge = &state.slow(SECOND)["bridges"][0];
         assert_eq!(bridge["stations"], json!(["255/190 at 10.0.0.2:14550 (silent)"]));
-        assert_eq!((&bridge["refused"], &bridge["signing"]), (&json!(3), &json!("not signed")));
+        assert_eq!((&bridge["refused"], &bridge["unlisted"]), (&json!(3), &json!(4)));
+        assert_eq!(bridge["signing"], "packets are not signed");
+    }
+
+    #[test]
+    fn the_stations_of_a_bridge_that_is_gone_are_silent_and_then_forgotten() {
+        let mut state = State::new("ours");
+        state.take(0, ground(false));
+        state.every_second(3 * SECOND);
+        let stations = |state: &State| state.slow(SECOND)["bridges"][0]["stations"].clone();
+        assert_eq!(stations(&state), json!(["255/190 at 10.0.0.2:14550"]));
+        for second in 4..8 {
+            state.every_second(second * SECOND);
+        }
+        assert_eq!(stations(&state), json!(["255/190 at 10.0.0.2:14550 (silent)"]));
+        let gone = "ground station 255/190 is silent: no word of gcs-bridge main";
+        assert_eq!(texts(&state), ["ground station 255/190 is heard", gone]);
+        // It is back.
+        state.take(8 * SECOND, ground(false));
+        assert_eq!(stations(&state), json!(["255/190 at 10.0.0.2:14550"]));
+        assert_eq!(texts(&state).last(), Some(&"ground station 255/190 is heard"));
+        state.every_second(127 * SECOND);
+        assert_eq!(state.slow(0)["bridges"].as_array().unwrap().len(), 1);
+        state.every_second(128 * SECOND);
+        assert_eq!(state.slow(0)["bridges"], json!([]));
     }
 
     #[test]

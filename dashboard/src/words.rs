@@ -54,13 +54,13 @@ pub fn phase(phase: Phase) -> Words {
     Words { title, next, mood }
 }
 
-/// Whether the packets of the link to the ground are signed.
+/// Whether the packets of the link to the ground are signed, as a clause.
 pub fn signing(state: SigningState) -> &'static str {
     match state {
-        SigningState::Off => "not signed",
-        SigningState::NoKey => "signed by the ground station, and no key here",
-        SigningState::Wanted => "no signed packet yet",
-        SigningState::InForce => "signed",
+        SigningState::Off => "packets are not signed",
+        SigningState::NoKey => "the other side signs, and there is no key here",
+        SigningState::Wanted => "only signed packets pass, and none has come",
+        SigningState::InForce => "packets are signed",
     }
 }
 
