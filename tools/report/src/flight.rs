@@ -78,6 +78,15 @@ pub struct Process {
     pub last: Health,
 }
 
+/// The last status of a bridge to the ground stations.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Bridge {
+    /// When the recorder got it, in nanoseconds of the recorder's clock.
+    pub received_ns: i64,
+    /// The status.
+    pub status: GcsStatus,
+}
+
 /// A service's change of a setting.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Change {
@@ -163,8 +172,10 @@ pub struct Flight {
     pub changes: Vec<Change>,
     /// Detectors by name.
     pub detectors: BTreeMap<String, DetectorInfo>,
-    /// The last status of each bridge to the ground stations, by its name.
-    pub bridges: BTreeMap<String, GcsStatus>,
+    /// The last word of each bridge to the ground stations, by its name.
+    pub bridges: BTreeMap<String, Bridge>,
+    /// When the recorder got the last message, in nanoseconds of its clock.
+    pub last_received_ns: i64,
     /// Cameras by name.
     pub cameras: BTreeMap<String, CameraInfo>,
     /// The recorder's last status.
@@ -477,7 +488,9 @@ impl Flight {
             }
             ["gcs", "status"] => {
                 let status = self.decoded(topic::GCS_STATUS, key, payload);
-                self.bridges.extend(status.map(|status| (status.bridge.clone(), status)));
+                let told =
+                    |status: GcsStatus| (status.bridge.clone(), Bridge { received_ns, status });
+                self.bridges.extend(status.map(told));
             }
             ["mavlink", "from-autopilot"] => {
                 if let Some(MavlinkBytes { packet }) =
@@ -488,6 +501,8 @@ impl Flight {
             }
             _ => {}
         }
+        // At last: a message may have begun another boot.
+        self.last_received_ns = self.last_received_ns.max(received_ns);
     }
 
     fn decoded<M: Message>(&mut self, _topic: Topic<M>, key: &str, payload: &[u8]) -> Option<M> {
@@ -538,7 +553,6 @@ impl Flight {
         self.name.clone_from(&before.name);
         self.configurations.clone_from(&before.configurations);
         self.detectors.clone_from(&before.detectors);
-        self.bridges.clone_from(&before.bridges);
         self.cameras.clone_from(&before.cameras);
         self.packets.own.clone_from(&before.packets.own);
         self.other_boots = std::mem::take(&mut before.other_boots);

@@ -5,12 +5,15 @@ use std::collections::{BTreeMap, BTreeSet};
 use messages::SigningState;
 
 use crate::chart::Chart;
-use crate::flight::Flight;
+use crate::flight::{Bridge, Flight};
 use crate::frames::Fate;
 use crate::html::{Block, Cell, count, details, missing, number, paragraph, table, text};
 use crate::summary::counted;
 use crate::view::View;
 use crate::{journal, light, losses, plots};
+
+/// Age of a bridge's last status at the end beyond which it says nothing of the end, in nanoseconds; one comes every 2 s.
+const MAX_TOLD_AGE_NS: i64 = 5_000_000_000;
 
 /// A part of the page, for one flight.
 #[derive(Clone, Debug)]
@@ -402,12 +405,26 @@ fn battery(view: &View<'_>) -> Section {
 /// Adds who was heard on the ground, and what of it was refused, by the last word of each bridge.
 fn ground(flight: &Flight, section: &mut Section) {
     if flight.bridges.is_empty() {
-        section.before.push(missing("the ground stations: no gcs-bridge was heard"));
+        let processes = flight.processes.values().map(|process| &process.last);
+        let mut bridges = processes.filter(|health| health.service == "gcs-bridge");
+        let why = match bridges.next() {
+            Some(bridge) => format!(
+                "the ground stations: gcs-bridge {} ran, and its status was not recorded",
+                bridge.instance
+            ),
+            None => "the ground stations: no gcs-bridge was heard".to_owned(),
+        };
+        section.before.push(missing(&why));
         return;
     }
+    let end_ns = flight.landing.as_ref().map_or(i64::MAX, |it| it.time_ns.end);
+    let end_ns = end_ns.min(flight.vehicle_ns(flight.last_received_ns));
     let mut stations = Vec::new();
     let mut refused = Vec::new();
-    for (name, bridge) in &flight.bridges {
+    for (name, Bridge { received_ns, status: bridge }) in &flight.bridges {
+        let told_ns = flight.vehicle_ns(*received_ns);
+        let is_old = end_ns.saturating_sub(told_ns) > MAX_TOLD_AGE_NS;
+        let since = format!("not told since {:.1} s", flight.at_s(told_ns));
         let signing = match bridge.signing.state {
             SigningState::Off => "packets are not signed",
             SigningState::NoKey => "the other side signs, and there is no key here",
@@ -423,7 +440,11 @@ fn ground(flight: &Flight, section: &mut Section) {
             bridge.link, bridge.ground_may
         )));
         stations.extend(bridge.stations.iter().map(|it| {
-            let heard = if it.silent { "silent at the end" } else { "yes" };
+            let heard = match it.silent {
+                _ if is_old => since.as_str(),
+                true => "silent at the end",
+                false => "yes",
+            };
             vec![
                 text(format!("{}/{} at {}", it.system, it.component, it.peer)),
                 text(heard),

@@ -5,6 +5,7 @@
 use experiments::landing::flight::fly_recorded;
 use experiments::landing::plan::{Plan, Values, Vision};
 use flightlog::{About, Entry, Received, Writer};
+use messages::{ControllerStatus, GcsStatus, encode};
 use replay::Restamp;
 use report::{Flight, FlightReader, replay_tapes, summary};
 
@@ -48,6 +49,33 @@ fn twice(recording: &[u8]) -> Vec<u8> {
     }
     writer.finish().unwrap();
     copy
+}
+
+#[test]
+fn what_a_bridge_said_before_a_start_of_the_vehicles_computer_is_not_told_of_the_time_after_it() {
+    let about = About { program: "test".to_owned(), facts: [].into(), utc_offset_ns: 0 };
+    let mut recording = Vec::new();
+    let mut writer = Writer::new(&mut recording, &about).unwrap();
+    let bridge = encode(&GcsStatus { bridge: "main".into(), ..GcsStatus::default() });
+    let status = |stamp_ns| {
+        encode(&ControllerStatus { stamp_ns, started_ns: Some(0), ..ControllerStatus::default() })
+    };
+    for (received_ns, key, payload) in [
+        (0, "controller/status", status(1_000 * S)),
+        (S, "gcs/status", bridge),
+        (1_000 * S, "controller/status", status(S)),
+    ] {
+        let received = Received { key, payload: &payload, attachment: &[], received_ns };
+        writer.receive(received).unwrap();
+    }
+    writer.finish().unwrap();
+    let flight = read(&recording);
+    assert_eq!((flight.boot.number, flight.boot.of), (2, 2));
+    assert!(flight.bridges.is_empty());
+    assert_eq!(flight.last_received_ns, 1_000 * S);
+    let mut before = flight.clone();
+    before.keep_landing(Some(1)).unwrap();
+    assert_eq!((before.bridges.len(), before.last_received_ns), (1, S));
 }
 
 #[test]

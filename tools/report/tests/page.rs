@@ -124,8 +124,13 @@ fn near(one: Option<f64>, other: Option<f64>, within: f64) {
     assert!((one - other).abs() <= within, "{one} is not {other}");
 }
 
-/// The recording with the last word of a bridge to the ground station.
-fn with_ground(recording: &[u8], status: &GcsStatus) -> Vec<u8> {
+/// The recording with the last word of a bridge to the ground station, this long before its end.
+fn with_ground(recording: &[u8], status: &GcsStatus, before_ns: i64) -> Vec<u8> {
+    with(recording, "gcs/status", &encode(status), before_ns)
+}
+
+/// The recording with one more message, which came this long before its end.
+fn with(recording: &[u8], key: &str, payload: &[u8], before_ns: i64) -> Vec<u8> {
     let about = About { program: "test".to_owned(), facts: BTreeMap::new(), utc_offset_ns: 0 };
     let mut copy = Vec::new();
     let mut writer = Writer::new(&mut copy, &about).unwrap();
@@ -137,9 +142,8 @@ fn with_ground(recording: &[u8], status: &GcsStatus) -> Vec<u8> {
         }
     })
     .unwrap();
-    let payload = encode(status);
-    let key = "gcs/status";
-    writer.receive(Received { key, payload: &payload, attachment: &[], received_ns }).unwrap();
+    let received_ns = received_ns - before_ns;
+    writer.receive(Received { key, payload, attachment: &[], received_ns }).unwrap();
     writer.finish().unwrap();
     copy
 }
@@ -167,7 +171,7 @@ fn a_page_has_the_ground_stations_and_what_was_refused() {
     status.signing.state = SigningState::InForce;
     let without_bridge = page(&read(&landing().recording)).unwrap();
     assert!(without_bridge.contains("no gcs-bridge was heard"));
-    let html = page(&read(&with_ground(&landing().recording, &status))).unwrap();
+    let html = page(&read(&with_ground(&landing().recording, &status, 0))).unwrap();
     for part in [
         "gcs-bridge main, udpin:0.0.0.0:14550: packets are signed",
         "255/190 at 10.0.0.2:14550",
@@ -176,6 +180,20 @@ fn a_page_has_the_ground_stations_and_what_was_refused() {
     ] {
         assert!(html.contains(part), "no {part}");
     }
+    assert!(!html.contains("no gcs-bridge was heard"));
+    // Its bridge was gone before the end: nobody knows who was heard then.
+    status.stations[0].silent = false;
+    for (before_ns, is_old) in [(4_000_000_000, false), (6_000_000_000, true)] {
+        let html = page(&read(&with_ground(&landing().recording, &status, before_ns))).unwrap();
+        assert_eq!(html.contains("<td>yes</td>"), !is_old, "{before_ns}");
+        assert_eq!(html.contains("not told since "), is_old, "{before_ns}");
+    }
+    // One whose status was not recorded did run.
+    let health =
+        Health { service: "gcs-bridge".into(), instance: "main".into(), ..Health::sample() };
+    let recording = with(&landing().recording, "health/gcs-bridge/main", &encode(&health), 0);
+    let html = page(&read(&recording)).unwrap();
+    assert!(html.contains("gcs-bridge main ran, and its status was not recorded"));
     assert!(!html.contains("no gcs-bridge was heard"));
 }
 
