@@ -36,8 +36,10 @@ const CATCH_UP: Duration = Duration::from_millis(200);
 const END_PATIENCE: Duration = Duration::from_millis(1100);
 /// A change of the clock of UTC that is noted in the file, in nanoseconds; corrections of NTP are smaller.
 const TIME_SET_NS: i64 = 100_000_000;
-/// Period of the status.
-const STATUS_PERIOD: Duration = Duration::from_millis(500);
+/// Minimum time between two statuses.
+const MIN_STATUS_PERIOD: Duration = Duration::from_millis(500);
+/// Maximum time between two statuses, between which only messages and bytes are counted.
+const MAX_STATUS_PERIOD: Duration = Duration::from_secs(2);
 /// Maximum number of keys whose last values are remembered.
 const MAX_STATES: usize = 1024;
 
@@ -83,6 +85,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
         unseen: Unseen::default(),
         lost: Counts::default(),
         lost_in_file: None,
+        listed: None,
         states: BTreeMap::new(),
     };
     let status = Arc::clone(&recorder.status);
@@ -92,12 +95,20 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
         .name("recorder".to_owned())
         .spawn(move || recorder.run(&tap, &stop))
         .context("starting the thread of the recorder")?;
-    let mut due = tokio::time::interval(STATUS_PERIOD);
+    let mut due = tokio::time::interval(MIN_STATUS_PERIOD);
+    let mut published = None;
     loop {
         tokio::select! {
             _ = due.tick() => {
-                let now = status.lock().unwrap_or_else(PoisonError::into_inner).clone();
-                publisher.publish(&RecorderStatus { stamp_ns: now_ns(), ..now }).await;
+                let now = {
+                    let now = status.lock().unwrap_or_else(PoisonError::into_inner);
+                    is_due(published.as_ref(), &now, now_ns()).then(|| now.clone())
+                };
+                if let Some(now) = now {
+                    let now = RecorderStatus { stamp_ns: now_ns(), ..now };
+                    publisher.publish(&now).await;
+                    published = Some(now);
+                }
                 ensure!(!thread.is_finished(), "the thread of the recorder ended; see the log above");
             }
             () = shutdown.requested() => break,
@@ -106,6 +117,18 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     is_over.store(true, Ordering::Relaxed);
     let ended = tokio::task::spawn_blocking(move || thread.join()).await?;
     ended.unwrap_or_else(|_panic| bail!("the thread of the recorder panicked"))
+}
+
+/// Whether a status is published, after the last one: at once when something but the numbers of messages and bytes has changed.
+fn is_due(last: Option<&RecorderStatus>, now: &RecorderStatus, now_ns: i64) -> bool {
+    let Some(last) = last else { return true };
+    // A tick comes a little early or late.
+    let max_ns = (MAX_STATUS_PERIOD - MIN_STATUS_PERIOD / 2).as_nanos();
+    u128::from(now_ns.abs_diff(last.stamp_ns)) >= max_ns
+        || last.problem != now.problem
+        || last.file != now.file
+        || last.dropped != now.dropped
+        || last.free_bytes.is_some() != now.free_bytes.is_some()
 }
 
 /// Whether a topic is subscribed to. JPEG and rectified frames, a detector's refusals and its debug images are made only while
@@ -175,6 +198,8 @@ struct Recorder {
     lost: Counts,
     /// How many the file says.
     lost_in_file: Option<u64>,
+    /// When the messages by key were last put into the status: this thread looks after the file far more often than a status is due.
+    listed: Option<Instant>,
     /// The last value of each state: every file begins with them.
     states: BTreeMap<String, Tapped>,
 }
@@ -342,9 +367,12 @@ impl Recorder {
         if self.config.has_file() {
             self.write_file();
         }
-        let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
-        status.kept = self.kept.list();
-        status.dropped = self.lost.list();
+        if self.listed.is_none_or(|listed| listed.elapsed() >= MIN_STATUS_PERIOD) {
+            self.listed = Some(Instant::now());
+            let (kept, dropped) = (self.kept.list(), self.lost.list());
+            let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
+            (status.kept, status.dropped) = (kept, dropped);
+        }
     }
 
     fn write_file(&mut self) {
@@ -522,13 +550,12 @@ mod tests {
 
     use super::*;
 
-    /// A recorder with a file, and whether it has done all when it ends.
-    fn ends(change: impl FnOnce(&mut Recorder)) -> Result<(), String> {
-        let folder = tempfile::tempdir().unwrap();
+    /// A recorder with a file in the folder.
+    fn recorder(folder: &tempfile::TempDir) -> Recorder {
         let set = vec![format!("file={:?}", folder.path().join("flight.mcap"))];
         let config = Layers { file: None, set }.load::<Config>().unwrap().settings;
         let about = About::default();
-        let mut recorder = Recorder {
+        Recorder {
             pictures: Pictures::new(&config, Frames::None),
             live: None,
             max_waiting_bytes: 1000,
@@ -543,10 +570,17 @@ mod tests {
             unseen: Unseen::default(),
             lost: Counts::default(),
             lost_in_file: None,
+            listed: None,
             states: BTreeMap::new(),
             about,
             config,
-        };
+        }
+    }
+
+    /// Whether a recorder with a file has done all when it ends.
+    fn ends(change: impl FnOnce(&mut Recorder)) -> Result<(), String> {
+        let folder = tempfile::tempdir().unwrap();
+        let mut recorder = recorder(&folder);
         change(&mut recorder);
         let ended = recorder.end(Instant::now() + Duration::from_secs(20));
         ended.map_err(|problem| format!("{problem:#}"))
@@ -566,6 +600,44 @@ mod tests {
             it.config.file = std::path::PathBuf::new();
         })
         .unwrap();
+    }
+
+    #[test]
+    fn a_status_is_due_when_more_than_its_counts_has_changed_and_every_two_seconds() {
+        const MS: i64 = 1_000_000;
+        let last = RecorderStatus { stamp_ns: 500 * MS, ..RecorderStatus::default() };
+        assert!(is_due(None, &last, 0));
+        let count = vec![RecorderCount { key: "wind".into(), count: 1 }];
+        let counted = RecorderStatus {
+            bytes: 9,
+            waiting_bytes: 9,
+            kept: count.clone(),
+            ..RecorderStatus::default()
+        };
+        let at_ms = |at_ms: i64| is_due(Some(&last), &counted, at_ms * MS);
+        assert_eq!([1000, 1500, 2003, 2497, 3000].map(at_ms), [false, false, false, true, true]);
+        for now in [
+            RecorderStatus { problem: Some("the disk is full".into()), ..counted.clone() },
+            RecorderStatus { file: "next.mcap".into(), ..counted.clone() },
+            RecorderStatus { dropped: count, ..counted.clone() },
+        ] {
+            assert!(is_due(Some(&last), &now, 1000 * MS), "{now:?}");
+        }
+    }
+
+    #[test]
+    fn messages_by_key_are_listed_no_more_often_than_a_status_may_be_due() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut recorder = recorder(&folder);
+        let listed = |recorder: &Recorder| recorder.status.lock().unwrap().kept.len();
+        recorder.kept.add("wind", 1);
+        recorder.look_after_file();
+        recorder.kept.add("truth", 1);
+        recorder.look_after_file();
+        assert_eq!(listed(&recorder), 1);
+        recorder.listed = Instant::now().checked_sub(MIN_STATUS_PERIOD);
+        recorder.look_after_file();
+        assert_eq!(listed(&recorder), 2);
     }
 
     #[test]

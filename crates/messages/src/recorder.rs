@@ -47,7 +47,7 @@ pub fn has_never_come(key: &str) -> bool {
 
 impl RecorderStatus {
     /// Maximum number of keys that are counted, [`OTHER_KEYS`] among them.
-    pub const MAX_KEYS: usize = 1024;
+    pub const MAX_KEYS: usize = 256;
 
     /// How many messages were kept.
     pub fn total_kept(&self) -> u64 {
