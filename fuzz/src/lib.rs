@@ -28,7 +28,7 @@ pub const MAX_TIME_S: u64 = 20;
 
 /// All targets.
 pub const TARGETS: [Target; 12] = [
-    Target { name: "codec", read: payloads::codec, max_len: 4096 },
+    Target { name: "codec", read: |input| drop(payloads::codec(input)), max_len: 4096 },
     Target { name: "mavlink", read: payloads::mavlink, max_len: 4096 },
     Target { name: "airlink", read: payloads::airlink, max_len: 16_384 },
     Target { name: "jpeg", read: files::jpeg, max_len: 16_384 },

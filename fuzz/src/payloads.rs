@@ -3,47 +3,53 @@
 use airlink::Unpacker;
 use autopilot::{Autopilot, Config, Parser};
 use messages::{
-    CameraControl, CameraInfo, CameraResponse, CommandReply, ControllerCommand, ControllerStatus,
-    Detections, DetectorCommand, DetectorInfo, FrameAck, FrameHeader, FramePart, GcsStatus, Health,
-    MavlinkBytes, Message, PixelFormat, Refusals, TargetEstimate, Truth, VehicleState, Wind,
-    decode, encode,
+    CameraControl, CameraInfo, CameraResponse, CommandReply, Configuration, ControllerCommand,
+    ControllerStatus, Detections, DetectorCommand, DetectorInfo, FrameAck, FrameHeader, FramePart,
+    GcsStatus, Health, MavlinkBytes, Message, PixelFormat, RecorderStatus, Refusals,
+    TargetEstimate, Truth, VehicleState, Wind, decode, encode,
 };
 
 /// Edges of the frames that an air-link payload is read for, in pixels.
 const MAX_EDGE_PX: u32 = 512;
 
-/// A payload of any topic: read as each type. What was read is written, and must be read again.
-pub fn codec(input: &[u8]) {
-    again::<FrameHeader>(input);
-    again::<FrameAck>(input);
-    again::<CameraInfo>(input);
-    again::<CameraControl>(input);
-    again::<Detections>(input);
-    again::<Refusals>(input);
-    again::<DetectorInfo>(input);
-    again::<CameraResponse>(input);
-    again::<DetectorCommand>(input);
-    again::<TargetEstimate>(input);
-    again::<ControllerStatus>(input);
-    again::<ControllerCommand>(input);
-    again::<CommandReply>(input);
-    again::<VehicleState>(input);
-    again::<MavlinkBytes>(input);
-    again::<GcsStatus>(input);
-    again::<Health>(input);
-    again::<Truth>(input);
-    again::<Wind>(input);
+/// A payload of any topic: read as each type. What was read is written, and must be read again. The result is as what it could be read.
+pub fn codec(input: &[u8]) -> Vec<&'static str> {
+    let read = [
+        again::<FrameHeader>(input),
+        again::<FrameAck>(input),
+        again::<CameraInfo>(input),
+        again::<CameraControl>(input),
+        again::<Detections>(input),
+        again::<Refusals>(input),
+        again::<DetectorInfo>(input),
+        again::<CameraResponse>(input),
+        again::<DetectorCommand>(input),
+        again::<TargetEstimate>(input),
+        again::<ControllerStatus>(input),
+        again::<ControllerCommand>(input),
+        again::<CommandReply>(input),
+        again::<VehicleState>(input),
+        again::<MavlinkBytes>(input),
+        again::<GcsStatus>(input),
+        again::<Health>(input),
+        again::<Configuration>(input),
+        again::<RecorderStatus>(input),
+        again::<Truth>(input),
+        again::<Wind>(input),
+    ];
     if let Ok(info) = decode::<CameraInfo>(input) {
         let _ = info.body_from_camera.transform::<geometry::Body, geometry::Camera>();
         let _ = info.model();
     }
+    read.into_iter().flatten().collect()
 }
 
-fn again<M: Message>(input: &[u8]) {
-    if let Ok(message) = decode::<M>(input) {
-        let written = encode(&message);
-        assert_eq!(decode::<M>(&written).map(|read| encode(&read)), Ok(written));
-    }
+/// The name of the type, if it could be read.
+fn again<M: Message>(input: &[u8]) -> Option<&'static str> {
+    let message = decode::<M>(input).ok()?;
+    let written = encode(&message);
+    assert_eq!(decode::<M>(&written).map(|read| encode(&read)), Ok(written));
+    Some(M::NAME)
 }
 
 /// Bytes of the autopilot's link: found as packets whatever pieces they come in, and handled by the client.
