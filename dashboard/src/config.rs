@@ -146,7 +146,7 @@ mod tests {
     fn values_out_of_range_are_refused_by_name() {
         for (setting, part) in [
             ("listen=localhost:80", "IP:PORT"),
-            ("names=[\"a b\"]", "no host name"),
+            ("names=[\"a b\"]", "is not a host name"),
             ("commands=always", "`never`"),
             ("key=page.key", "`certificate`"),
             ("max_clients=0", "from 1 to 64"),

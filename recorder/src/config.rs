@@ -139,7 +139,7 @@ mod tests {
             ("file=", "give `serve` an address"),
             ("serve=localhost:8765", "IP:PORT"),
             ("serve=0.0.0.0:8765", "`insecure = true`"),
-            ("origins=[\"app.example\"]", "no origin"),
+            ("origins=[\"app.example\"]", "is not an origin"),
             ("max_clients=0", "from 1 to 16"),
         ] {
             let problem = load(setting).unwrap_err();
