@@ -213,7 +213,7 @@ pub(crate) async fn overload() -> anyhow::Result<()> {
     }
     let (result, status) = landing.lands_with_losses().await?;
     let contents = Contents::read(&file)?;
-    let has_lost = contents.dropped.keys().any(|key| !messages::has_never_come(key));
+    let has_lost = contents.dropped.keys().any(|key| !has_never_come(key));
     let wanted = if has_lost { 1 } else { 0 };
     ensure!(status == Some(wanted), "{status:?}: {result}, {:?}", contents.dropped);
     let (mut stamps_ns, mut healths) = (Vec::new(), Vec::new());
