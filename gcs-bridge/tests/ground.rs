@@ -169,7 +169,7 @@ async fn the_ground_station_that_was_heard_first_is_held_and_strangers_are_count
         stranger.send_to(&autopilot_heartbeat(), to).await?;
         stranger.send_to(&disarm, to).await?;
     }
-    let counted = until_error(&health, "stranger", 40).await?;
+    let counted = until_error(&health, "of an unknown sender", 40).await?;
     ensure!(counted == 40, "{counted} of 40 packets counted");
     ground.send(&encode(GROUND, 3, &param_request(3))).await?;
     loop {
@@ -206,7 +206,7 @@ async fn only_the_known_ground_stations_are_heard() -> anyhow::Result<()> {
             }
         };
         let counted = tokio::select! {
-            counted = until_error(&health, "stranger", 3) => counted?,
+            counted = until_error(&health, "of an unknown sender", 3) => counted?,
             () = knocking => bail!("{kind}: nothing was counted"),
         };
         ensure!(counted >= 3, "{kind}: {counted}");

@@ -236,7 +236,7 @@ fn nothing_that_the_estimate_becomes_lifts_a_vehicle_that_touches_down() {
 #[test]
 fn a_pad_that_seems_to_sink_is_not_followed_hard_onto_the_ground() {
     let touchdown = |config: &MetricConfig, pad_m_s: f64, pad_heave_m_s: f64| {
-        let mut metric = Metric::new(config.clone());
+        let mut metric = Metric::new(*config);
         let mut down_m_s = 0.0;
         for i in 0..=40u32 {
             let s = f64::from(i) / 40.0;
@@ -260,7 +260,7 @@ fn a_pad_that_seems_to_sink_is_not_followed_hard_onto_the_ground() {
     assert!(touchdown_m_s(-0.3, 0.0) < 0.21, "or rises");
     assert!(touchdown_m_s(0.45, 0.4) > 0.74, "a pad that heaves is followed");
     // A slow descent goes on also where the autopilot's height drifts down quickly.
-    let slow = MetricConfig { touchdown_descend_m_s: 0.2, ..config.clone() };
+    let slow = MetricConfig { touchdown_descend_m_s: 0.2, ..config };
     assert!(touchdown(&slow, 0.4, 0.0) > 0.59);
 }
 
