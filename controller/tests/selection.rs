@@ -591,7 +591,7 @@ fn names_are_crowded_out_by_better_ones_only() {
             .selection
             .warnings(bench.now_ns)
             .iter()
-            .any(|warning| warning.text.contains("invents"))
+            .any(|warning| warning.text.contains("ignored"))
     );
     // It starts again, and the preferred one comes.
     bench.gone("main");
