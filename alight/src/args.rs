@@ -31,16 +31,9 @@ impl std::error::Error for WrongUse {}
 /// The session's configuration for a process with this key.
 ///
 /// # Errors
-/// What is wrong with the network is so by the command line, or by files that it names: [`WrongUse`], but for a file that is there and cannot be
-/// read now.
-pub(crate) fn source_of(network: &Network, key_name: &str) -> anyhow::Result<ZenohSource> {
-    network.source(key_name).map_err(|problem| {
-        let may_pass = problem
-            .chain()
-            .filter_map(|cause| cause.downcast_ref::<std::io::Error>())
-            .any(|cause| cause.kind() != std::io::ErrorKind::NotFound);
-        if may_pass { problem } else { WrongUse(format!("{problem:#}")).into() }
-    })
+/// Whatever is wrong with the network is so by the command line, or by files that it names: [`WrongUse`].
+pub(crate) fn source_of(network: &Network, key_name: &str) -> Result<ZenohSource, WrongUse> {
+    network.source(key_name).map_err(|problem| WrongUse(format!("{problem:#}")))
 }
 
 /// The arguments of every service.
@@ -98,7 +91,7 @@ pub(crate) struct NetworkArgs {
 
 impl NetworkArgs {
     /// The session's configuration for a process with this key.
-    pub(crate) fn source(&self, key_name: &str) -> anyhow::Result<ZenohSource> {
+    pub(crate) fn source(&self, key_name: &str) -> Result<ZenohSource, WrongUse> {
         source_of(&self.network(), key_name)
     }
 

@@ -135,7 +135,7 @@ struct Supervised {
     exits: VecDeque<Instant>,
     /// How often in a row it exited with status 0.
     completions: usize,
-    /// Whether it has once run for [`PERIOD`], or may have under a supervisor that crashed: with what it is given it can run.
+    /// Whether it has once run for [`PERIOD`], or led a landing under a supervisor that crashed: with what it is given it can run.
     has_run: bool,
     keeps_failing: bool,
     state: State,
@@ -247,8 +247,8 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
     for line in jobs.iter().filter_map(|job| before.told_of(job, is_noted)) {
         say(line);
     }
-    // After a crash its processes have run, perhaps a moment ago in flight.
-    let have_run = before != Before::Nothing;
+    // Those of a landing that was under way have run.
+    let have_run = matches!(before, Before::Landing { .. });
     let mut supervised: Vec<Supervised> = jobs
         .into_iter()
         .map(|job| Supervised { has_run: have_run, ..Supervised::new(job) })

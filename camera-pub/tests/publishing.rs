@@ -344,7 +344,7 @@ async fn the_error_says_how_a_camera_program_ended() -> anyhow::Result<()> {
     let other = problem(&["head", "-c", "900000", "/dev/zero"], &["source.pixels=mjpeg"]).await?;
     ensure!(other.contains("is `source.pixels` the format it writes"), "{other}");
     let fast = ["sh", "-c", "while head -c 3072 /dev/zero; do sleep 0.001; done"];
-    let fast = problem(&fast, &["source.rate_hz=0.1", "source.timeout_s=0.5"]).await?;
+    let fast = problem(&fast, &["source.rate_hz=0.1", "source.timeout_s=3"]).await?;
     ensure!(fast.contains("`source.rate_hz` (0.1)"), "{fast}");
     Ok(())
 }

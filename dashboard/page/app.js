@@ -413,7 +413,7 @@ function lookAtAges() {
   }
   for (const line of document.querySelectorAll('tbody tr, #bridges span')) {
     const told = /** @type {HTMLElement} */ (line).dataset.age;
-    const limit = line.closest('#detectors') ? SLOW_STALE_MS - 1000 : SLOW_STALE_MS + 1000;
+    const limit = line.closest('#detectors') ? SLOW_STALE_MS - 1000 : line.closest('#bridges') ? SLOW_STALE_MS + 4000 : SLOW_STALE_MS + 1000;
     line.classList.toggle('old', !told || Number(told) + slowOld > limit);
   }
   for (const id of ['checks', 'recorders', 'bridges']) element(id).classList.toggle('old', slowOld > SLOW_STALE_MS);

@@ -21,8 +21,10 @@ use crate::words;
 const MAX_NAMES: usize = 64;
 /// Maximum number of faults of all services that are told once.
 const MAX_FAULTS: usize = 512;
-/// A service whose health is older is silent, and so are the ground stations of a bridge whose status is older, in nanoseconds.
+/// A service whose health is older is silent, in nanoseconds: it comes every second.
 const SILENT_NS: i64 = 3_000_000_000;
+/// A bridge or recorder whose status is older is silent, in nanoseconds: it comes every two seconds, and one may be lost.
+const SILENT_STATUS_NS: i64 = 6_000_000_000;
 /// A service that is silent for this time is forgotten, in nanoseconds.
 const FORGOTTEN_NS: i64 = 120_000_000_000;
 
@@ -247,7 +249,7 @@ impl State {
         }
         for (name, bridge) in &mut self.bridges {
             // Who speaks to a bridge that is gone is heard by nobody.
-            let is_silent = now_ns.saturating_sub(bridge.received_ns) > SILENT_NS;
+            let is_silent = now_ns.saturating_sub(bridge.received_ns) > SILENT_STATUS_NS;
             for station in bridge.value.stations.iter_mut().filter(|it| is_silent && !it.silent) {
                 station.silent = true;
                 let GroundStation { system, component, .. } = station;
@@ -484,7 +486,7 @@ impl State {
             recorder: self
                 .recorders
                 .values()
-                .find(|it| age_ms(now_ns, it.received_ns) < ms(SILENT_NS))
+                .find(|it| age_ms(now_ns, it.received_ns) < ms(SILENT_STATUS_NS))
                 .map(|it| &it.value),
             is_insecure: self
                 .services

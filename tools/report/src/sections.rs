@@ -424,7 +424,8 @@ fn ground(flight: &Flight, section: &mut Section) {
     for (name, Bridge { received_ns, status: bridge }) in &flight.bridges {
         let told_ns = flight.vehicle_ns(*received_ns);
         let is_old = end_ns.saturating_sub(told_ns) > MAX_TOLD_AGE_NS;
-        let since = format!("not told since {:.1} s", flight.at_s(told_ns));
+        let unknown =
+            format!("unknown after {:.1} s: the bridge told no more", flight.at_s(told_ns));
         let signing = match bridge.signing.state {
             SigningState::Off => "packets are not signed",
             SigningState::NoKey => "the other side signs, and there is no key here",
@@ -441,8 +442,8 @@ fn ground(flight: &Flight, section: &mut Section) {
         )));
         stations.extend(bridge.stations.iter().map(|it| {
             let heard = match it.silent {
-                _ if is_old => since.as_str(),
                 true => "silent at the end",
+                false if is_old => unknown.as_str(),
                 false => "yes",
             };
             vec![

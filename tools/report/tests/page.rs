@@ -186,7 +186,7 @@ fn a_page_has_the_ground_stations_and_what_was_refused() {
     for (before_ns, is_old) in [(4_000_000_000, false), (6_000_000_000, true)] {
         let html = page(&read(&with_ground(&landing().recording, &status, before_ns))).unwrap();
         assert_eq!(html.contains("<td>yes</td>"), !is_old, "{before_ns}");
-        assert_eq!(html.contains("not told since "), is_old, "{before_ns}");
+        assert_eq!(html.contains("the bridge told no more"), is_old, "{before_ns}");
     }
     // One whose status was not recorded did run.
     let health =

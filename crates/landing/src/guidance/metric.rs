@@ -90,8 +90,9 @@ const MIN_TOUCHDOWN_M_S: f64 = 0.3;
 /// sinks faster is a wrong estimate, as from frames with wrong stamps, and would be followed hard onto the ground; an autopilot's height that drifts
 /// down by 0.5 m/s, twice what any was measured to do, leaves 0.2 m/s of descent.
 const MAX_FOLLOWING_M_S: f64 = 0.7;
-/// Maximum speed at which it is followed in a faster descent, in m/s: the autopilot's height drifts there as well.
-const MAX_DRIFT_DOWN_M_S: f64 = 0.2;
+/// Within these it is followed, in m/s: by the first also in a faster descent, as the autopilot's height drifts there as well; by the second at most,
+/// also where the vehicle waits or is to climb, low and aside of the pad.
+const MAX_DRIFT_DOWN_M_S: [f64; 2] = [0.2, 0.5];
 
 /// Time ahead for which the error of a low vehicle is predicted, in seconds.
 const LOW_LEAD_S: f64 = 0.4;
@@ -242,10 +243,12 @@ impl Guidance for Metric {
                 observer.path = Path::new(lateral);
             }
         }
-        let max_m_s = fmax(descent_m_s + MAX_DRIFT_DOWN_M_S, MAX_FOLLOWING_M_S);
+        let [low, high] = MAX_DRIFT_DOWN_M_S;
+        let max_m_s = fmax(low, fmin(high, MAX_FOLLOWING_M_S - descent_m_s));
+        let followed_m_s = fmin(target.velocity.z(), max_m_s + situation.pad_heave_m_s);
         let down = approach_speed(
             before.setpoint.z(),
-            fmin(descent_m_s + target.velocity.z(), max_m_s + situation.pad_heave_m_s),
+            descent_m_s + followed_m_s,
             self.config.descend_acceleration_m_s2 * step_s,
         );
         let setpoint = Vector::new(lateral.x(), lateral.y(), down);

@@ -262,6 +262,16 @@ fn a_pad_that_seems_to_sink_is_not_followed_hard_onto_the_ground() {
     // A slow descent goes on also where the autopilot's height drifts down quickly.
     let slow = MetricConfig { touchdown_descend_m_s: 0.2, ..config };
     assert!(touchdown(&slow, 0.4, 0.0) > 0.59);
+    // One that is too far aside to touch down follows it by 0.5 m/s at most.
+    let mut metric = Metric::new(config);
+    for i in 0..=40u32 {
+        let vehicle = sinking(f64::from(i) / 40.0, 1.0, 0.3, 0.0);
+        let mut situation = situation(&vehicle);
+        let pad_velocity = Vector::new(0.0, 0.0, 1.0);
+        situation.target.as_mut().into_iter().for_each(|target| target.velocity = pad_velocity);
+        let down_m_s = metric.velocity(&situation).0.z();
+        assert!(down_m_s <= 0.5 + 1e-9, "{down_m_s} m/s");
+    }
 }
 
 #[test]
