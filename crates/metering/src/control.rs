@@ -157,7 +157,10 @@ impl ExposureControl {
             self.exponent = (self.exponent * BACK_EXPONENT).max(MIN_EXPONENT);
         }
         self.last_step = step;
-        step.powf(self.exponent)
+        let damped = step.powf(self.exponent);
+        // A step that is too small to be made would leave white where it is not good.
+        let min = 1.0 + 1.01 * MIN_CHANGE;
+        if step > 1.0 { damped.max(min.min(step)) } else { damped.min((2.0 - min).max(step)) }
     }
 }
 
@@ -270,6 +273,15 @@ mod tests {
         let night = Camera { light: 0.3, gamma: 1.0, in_decibels: false };
         let settled = night.settle(Setting { exposure_s: 1e-3, gain: 1.0 }, 500.0);
         assert_eq!(settled.setting, Setting { exposure_s: 2e-3, gain: 64.0 });
+    }
+
+    #[test]
+    fn small_steps_back_and_forth_do_not_end_before_white_is_good() {
+        let light = 0.72 / (8e-3 * 64.0f64.powf(0.898_634_454_564_418_5));
+        let camera = Camera { light, gamma: 1.0, in_decibels: true };
+        let setting = Setting { exposure_s: 8e-3, gain: 63.367_703_816_352_716 };
+        let settled = camera.settle(setting, 0.0);
+        assert!((0.6..=0.85).contains(&settled.white), "{settled:?}");
     }
 
     #[test]
