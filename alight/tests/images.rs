@@ -57,3 +57,47 @@ fn a_reader_that_goes_away_is_no_error() -> anyhow::Result<()> {
     ensure!(ended.stderr.is_empty(), "{}", String::from_utf8_lossy(&ended.stderr));
     Ok(())
 }
+
+/// Takes a picture with these settings of `camera-pub`; the output, and the picture where there is one.
+fn picture(set: &[&str], folder: &Path) -> anyhow::Result<(Output, Option<image::GrayImage>)> {
+    let mut args = vec!["cameras", "--picture", "seen.png"];
+    let calibration = "calibration.focal_px=[50.0, 50.0]";
+    args.extend(set.iter().chain([&calibration]).flat_map(|set| ["--set", set]));
+    let output = alight(&args, folder)?;
+    let picture = match output.status.success() {
+        true => Some(image::open(folder.join("seen.png"))?.into_luma8()),
+        false => None,
+    };
+    Ok((output, picture))
+}
+
+#[test]
+fn a_picture_is_what_a_detector_would_get_of_a_file_or_a_program() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let pixels: Vec<u8> = (0..64 * 48).map(|i| (i % 251) as u8).collect();
+    let path = folder.path().join("a.png");
+    image::save_buffer(path, &pixels, 64, 48, image::ExtendedColorType::L8)?;
+    let (output, taken) = picture(&["source.paths=[\"a.png\"]"], folder.path())?;
+    let taken = taken.with_context(|| format!("{output:?}"))?;
+    ensure!(taken.dimensions() == (64, 48) && *taken.as_raw() == pixels, "{output:?}");
+
+    let of = |command: &str| {
+        let command = format!("source.command={command}");
+        let shape = ["source.pixels=\"gray8\"", "source.size_px=[32, 24]"];
+        picture(&[&command, shape[0], shape[1]], folder.path())
+    };
+    // The second ends after three frames.
+    for command in [r#"["cat", "/dev/urandom"]"#, r#"["head", "-c", "2304", "/dev/urandom"]"#] {
+        let (output, taken) = of(command)?;
+        let taken = taken.with_context(|| format!("{output:?}"))?;
+        ensure!(taken.dimensions() == (32, 24), "{output:?}");
+        let first = taken.as_raw().first();
+        ensure!(taken.as_raw().iter().any(|pixel| Some(pixel) != first), "{output:?}");
+    }
+    let (output, taken) = of(r#"["no-such-program-of-a-camera"]"#)?;
+    let said = String::from_utf8_lossy(&output.stderr);
+    ensure!(taken.is_none() && said.contains("no-such-program-of-a-camera"), "{said}");
+    let (output, taken) = of(r#"["true"]"#)?;
+    ensure!(taken.is_none() && output.status.code() == Some(1), "{output:?}");
+    Ok(())
+}
