@@ -28,12 +28,19 @@ impl std::fmt::Display for WrongUse {
 
 impl std::error::Error for WrongUse {}
 
+impl WrongUse {
+    /// What is wrong with something that the user gave.
+    pub(crate) fn of(problem: &anyhow::Error) -> Self {
+        Self(format!("{problem:#}"))
+    }
+}
+
 /// The session's configuration for a process with this key.
 ///
 /// # Errors
 /// Whatever is wrong with the network is so by the command line, or by files that it names: [`WrongUse`].
 pub(crate) fn source_of(network: &Network, key_name: &str) -> Result<ZenohSource, WrongUse> {
-    network.source(key_name).map_err(|problem| WrongUse(format!("{problem:#}")))
+    network.source(key_name).map_err(|problem| WrongUse::of(&problem))
 }
 
 /// The arguments of every service.
@@ -104,8 +111,7 @@ impl NetworkArgs {
         if let Some(keys) = &mut network.keys {
             *keys = std::path::absolute(&keys).with_context(|| format!("the path {keys:?}"))?;
         }
-        let session = network.configuration(key_name);
-        Ok(session.map_err(|problem| WrongUse(format!("{problem:#}")))?)
+        Ok(network.configuration(key_name).map_err(|problem| WrongUse::of(&problem))?)
     }
 
     pub(crate) fn network(&self) -> Network {

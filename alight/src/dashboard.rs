@@ -104,8 +104,10 @@ fn make_certificate(
             .join("dashboard.pem"),
     };
     let key = certificate.with_extension("key");
-    let refused = || WrongUse(format!("{certificate:?} has the ending of the key; name it `.pem`"));
-    ensure!(key != certificate, refused());
+    ensure!(
+        key != certificate,
+        WrongUse(format!("{certificate:?} has the ending of the key; name it `.pem`"))
+    );
     let host = host_name();
     let own = ["localhost".to_owned(), "127.0.0.1".to_owned(), format!("{host}.local"), host];
     let names: BTreeSet<String> = addresses.iter().cloned().chain(own).collect();

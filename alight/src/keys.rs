@@ -231,7 +231,7 @@ pub(crate) fn run(args: &KeysArgs) -> anyhow::Result<ExitCode> {
         Action::Issue { role, name, vehicle, output, authority, address, days } => {
             let default = (*role == Role::Detector).then_some("main");
             let holder = Holder::new(&role.name(), name.as_deref().or(default), vehicle)
-                .map_err(|problem| WrongUse(format!("{problem:#}")))?;
+                .map_err(|problem| WrongUse::of(&problem))?;
             let authority = authority.as_deref().unwrap_or(output);
             issue(*role, &holder, output, authority, address, *days)?
         }
@@ -315,12 +315,12 @@ fn issue(
     days: u32,
 ) -> anyhow::Result<Vec<PathBuf>> {
     let name = holder.key_name();
-    let lacking = || {
+    ensure!(
+        !role.is_found_by_others() || !addresses.is_empty(),
         WrongUse(format!(
             "the key of `{name}` needs the address to which others connect: add `--address HOST`"
         ))
-    };
-    ensure!(!role.is_found_by_others() || !addresses.is_empty(), lacking());
+    );
     let files = [output.join(format!("{name}.key")), output.join(format!("{name}.pem"))];
     refuse_existing(&files)?;
     let read = |file: &str| {
@@ -471,12 +471,12 @@ fn is_host(address: &str) -> bool {
 
 fn parameters(name: &str, addresses: &[String], days: u32) -> anyhow::Result<CertificateParams> {
     for address in addresses {
-        let refused = || {
+        ensure!(
+            is_host(address),
             WrongUse(format!(
                 "invalid address `{address}`: expected an IP address or a host name, without a port"
             ))
-        };
-        ensure!(is_host(address), refused());
+        );
     }
     let mut params = CertificateParams::new(addresses.to_vec())
         .with_context(|| format!("invalid addresses {addresses:?}"))?;

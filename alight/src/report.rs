@@ -90,13 +90,14 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
             WrongUse(format!("`--landing {number}`: {name} has {of}, counted from 1"))
         })?;
     }
-    let too_many = || {
-        let (flights, files) = (flights.len(), &args.files);
+    ensure!(
+        flights.len() <= MAX_FLIGHTS,
         WrongUse(format!(
-            "{flights} flights in {files:?}, a page has one, or {MAX_FLIGHTS} to compare"
+            "{} flights in {:?}, a page has one, or {MAX_FLIGHTS} to compare",
+            flights.len(),
+            args.files
         ))
-    };
-    ensure!(flights.len() <= MAX_FLIGHTS, too_many());
+    );
     // Also where there is a reason against the page.
     for flight in &flights {
         let summary = summary(flight);
@@ -107,12 +108,12 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     }
     let beside = args.beside(&flights, if is_pdf { "pdf" } else { "html" });
     let output = args.output.as_ref().map_or(&beside, |page| &page.path);
-    let over = || {
+    ensure!(
+        !args.files.iter().any(|file| is_same_file(file, output)),
         WrongUse(format!(
             "{output:?} is a recording; name another file for the page with `--output`"
         ))
-    };
-    ensure!(!args.files.iter().any(|file| is_same_file(file, output)), over());
+    );
     let is_own = args.output.is_none() && flights.len() == 1;
     if !is_own && !has_marks(output, &marks(&flights.iter().collect::<Vec<_>>())) {
         args.check_is_free(output, "--output")?;
@@ -174,12 +175,12 @@ impl ReportArgs {
     fn is_pdf(&self) -> anyhow::Result<bool> {
         let wants_pdf = self.format == Format::Pdf;
         let Some(Page { path, is_pdf }) = &self.output else { return Ok(wants_pdf) };
-        let refused = || {
+        ensure!(
+            *is_pdf || !wants_pdf,
             WrongUse(format!(
                 "`--format pdf` writes a PDF document, and {path:?} is the name of a page: let it end in .pdf"
             ))
-        };
-        ensure!(*is_pdf || !wants_pdf, refused());
+        );
         Ok(*is_pdf)
     }
 }

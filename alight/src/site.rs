@@ -187,9 +187,10 @@ impl Site {
             jobs.push(job);
         }
         self.check_detectors(role)?;
-        let nothing =
-            || WrongUse(format!("the site has no [[{}]], so there is nothing to run", role.name()));
-        ensure!(!jobs.is_empty(), nothing());
+        ensure!(
+            !jobs.is_empty(),
+            WrongUse(format!("the site has no [[{}]], so there is nothing to run", role.name()))
+        );
         for index in 1..jobs.len() {
             let (before, rest) = jobs.split_at_mut(index);
             let taken = before.iter().filter(|job| job.name == rest[0].name).count();

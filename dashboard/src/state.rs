@@ -388,7 +388,7 @@ impl State {
                     "name": name, "age_ms": age_ms(now_ns, seen.received_ns), "stations": stations,
                     "unlisted": it.unlisted,
                     "refused": it.refused.iter().map(|it| it.count).fold(0, u64::saturating_add),
-                    "signing": words::signing(it.signing.state), "problem": it.problem,
+                    "signing": it.signing.state.to_string(), "problem": it.problem,
                 })
             })
             .collect();
@@ -534,7 +534,7 @@ fn euler([w, x, y, z]: [f64; 4]) -> [f64; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::{Candidate, Count, DetectorState, LandedState, PacketSignature, Place};
+    use messages::{Candidate, Count, DetectorState, LandedState, Place};
 
     const SECOND: i64 = 1_000_000_000;
 
@@ -653,16 +653,7 @@ mod tests {
     }
 
     fn ground(silent: bool) -> Input {
-        let station = GroundStation {
-            system: 255,
-            component: 190,
-            peer: "10.0.0.2:14550".into(),
-            last_ns: 0,
-            silent,
-            packets: 1,
-            refused: 0,
-            signature: PacketSignature::Unsigned,
-        };
+        let station = GroundStation { silent, ..GroundStation::sample() };
         Input::Ground(Box::new(GcsStatus {
             bridge: "main".into(),
             stations: vec![station],

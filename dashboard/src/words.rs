@@ -1,6 +1,6 @@
 //! Phases, states and places in words for an operator.
 
-use messages::{DetectorState, LandedState, Phase, SigningState};
+use messages::{DetectorState, LandedState, Phase};
 
 /// A phase as an operator reads it.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -52,16 +52,6 @@ pub fn phase(phase: Phase) -> Words {
         Phase::Failed => ("Failed", "Nothing is sent any more; the pilot must take over.", "bad"),
     };
     Words { title, next, mood }
-}
-
-/// Whether the packets of the link to the ground are signed, as a clause.
-pub fn signing(state: SigningState) -> &'static str {
-    match state {
-        SigningState::Off => "packets are not signed",
-        SigningState::NoKey => "the other side signs, and there is no key here",
-        SigningState::Wanted => "only signed packets pass, and none has come",
-        SigningState::InForce => "packets are signed",
-    }
 }
 
 /// Whether a detector is used.

@@ -178,12 +178,7 @@ fn unknown_response(config: &Config) -> CameraResponse {
     CameraResponse {
         detector: config.id.clone(),
         camera: config.camera.clone(),
-        configured: false,
-        markers: 0,
-        curve: 0.0,
-        curve_deviation: 0.0,
-        sharpening: 0.0,
-        sharpening_deviation: 0.0,
+        ..CameraResponse::default()
     }
 }
 

@@ -68,27 +68,14 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let publisher = node.publisher(topic::RECORDER_STATUS, &[&config.id]).await?;
     node.announce().await?;
     let status = RecorderStatus { recorder: config.id.clone(), ..RecorderStatus::default() };
+    let status = Arc::new(Mutex::new(status));
     let recorder = Recorder {
-        pictures: Pictures::new(&config, frames),
         live,
-        max_waiting_bytes,
-        about: about(&node),
         health: node.shared_health(),
-        status: Arc::new(Mutex::new(status)),
-        config,
+        status: Arc::clone(&status),
         utc_offset_ns: utc_offset_ns(),
-        recording: None,
-        ending: None,
-        end_problem: None,
-        retry: None,
-        kept: Counts::default(),
-        unseen: Unseen::default(),
-        lost: Counts::default(),
-        lost_in_file: None,
-        listed: None,
-        states: BTreeMap::new(),
+        ..Recorder::new(config, frames, max_waiting_bytes, about(&node))
     };
-    let status = Arc::clone(&recorder.status);
     let is_over = Arc::new(AtomicBool::new(false));
     let stop = Arc::clone(&is_over);
     let thread = std::thread::Builder::new()
@@ -257,6 +244,30 @@ impl Counts {
 }
 
 impl Recorder {
+    /// One that has no file yet, and serves no viewer.
+    fn new(config: Config, frames: Frames, max_waiting_bytes: usize, about: About) -> Self {
+        Self {
+            pictures: Pictures::new(&config, frames),
+            live: None,
+            max_waiting_bytes,
+            about,
+            health: Arc::default(),
+            status: Arc::default(),
+            config,
+            utc_offset_ns: 0,
+            recording: None,
+            ending: None,
+            end_problem: None,
+            retry: None,
+            kept: Counts::default(),
+            unseen: Unseen::default(),
+            lost: Counts::default(),
+            lost_in_file: None,
+            listed: None,
+            states: BTreeMap::new(),
+        }
+    }
+
     fn run(mut self, tap: &Tap, is_over: &AtomicBool) -> anyhow::Result<()> {
         // Before the first message, which would be lost without a file.
         self.look_after_file();
@@ -554,26 +565,10 @@ mod tests {
     fn recorder(folder: &tempfile::TempDir) -> Recorder {
         let set = vec![format!("file={:?}", folder.path().join("flight.mcap"))];
         let config = Layers { file: None, set }.load::<Config>().unwrap().settings;
-        let about = About::default();
+        let recording = Recording::begin(config.file.clone(), &About::default()).unwrap();
         Recorder {
-            pictures: Pictures::new(&config, Frames::None),
-            live: None,
-            max_waiting_bytes: 1000,
-            health: Arc::default(),
-            status: Arc::default(),
-            utc_offset_ns: 0,
-            recording: Some(Recording::begin(config.file.clone(), &about).unwrap()),
-            ending: None,
-            end_problem: None,
-            retry: None,
-            kept: Counts::default(),
-            unseen: Unseen::default(),
-            lost: Counts::default(),
-            lost_in_file: None,
-            listed: None,
-            states: BTreeMap::new(),
-            about,
-            config,
+            recording: Some(recording),
+            ..Recorder::new(config, Frames::None, 1000, About::default())
         }
     }
 

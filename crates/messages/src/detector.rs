@@ -180,7 +180,7 @@ pub struct DetectorInfo {
 /// Light from 0 (black ink) to 1 (white paper) has the level `(1 + curve) w / (1 + curve w)` between theirs; then
 /// `sharpening` times its difference from a copy blurred by a Gaussian of one pixel is added. Where it is neither configured nor
 /// told by a marker, nothing is known, and the other numbers are 0.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CameraResponse {
     /// The detector's name.
     pub detector: String,

@@ -1,5 +1,7 @@
 //! What the bridge to the ground station publishes.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 use crate::codec::wire;
@@ -95,4 +97,16 @@ pub enum SigningState {
     Wanted,
     /// What is sent is signed, what is not signed is refused, and packets with right signatures have come.
     InForce,
+}
+
+/// As a clause.
+impl fmt::Display for SigningState {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Off => "packets are not signed",
+            Self::NoKey => "the other side signs, and there is no key here",
+            Self::Wanted => "only signed packets pass, and none has come",
+            Self::InForce => "packets are signed",
+        })
+    }
 }

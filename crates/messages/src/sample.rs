@@ -6,6 +6,7 @@ use std::f64::consts::FRAC_1_SQRT_2;
 use crate::camera::{CameraInfo, FrameAck, FrameHeader, LensModel, PixelFormat, Transform3};
 use crate::controller::{Candidate, DetectorState, TargetEstimate};
 use crate::detector::{Detection, Detections, MarkerPose, Refusal, Refusals, RefusedShape};
+use crate::gcs::{GroundStation, PacketSignature};
 use crate::health::Health;
 use crate::simulation::Truth;
 
@@ -186,6 +187,22 @@ impl Truth {
             touchdown: None,
             max_tilt_rad: 0.0,
             frames: 0,
+        }
+    }
+}
+
+impl GroundStation {
+    /// QGroundControl at 10.0.0.2, of which one packet came, not signed.
+    pub fn sample() -> Self {
+        Self {
+            system: 255,
+            component: 190,
+            peer: "10.0.0.2:14550".into(),
+            last_ns: 0,
+            silent: false,
+            packets: 1,
+            refused: 0,
+            signature: PacketSignature::Unsigned,
         }
     }
 }

@@ -2,8 +2,6 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use messages::SigningState;
-
 use crate::chart::Chart;
 use crate::flight::{Bridge, Flight};
 use crate::frames::Fate;
@@ -426,19 +424,13 @@ fn ground(flight: &Flight, section: &mut Section) {
         let is_old = end_ns.saturating_sub(told_ns) > MAX_TOLD_AGE_NS;
         let unknown =
             format!("unknown after {:.1} s: the bridge told no more", flight.at_s(told_ns));
-        let signing = match bridge.signing.state {
-            SigningState::Off => "packets are not signed",
-            SigningState::NoKey => "the other side signs, and there is no key here",
-            SigningState::Wanted => "only signed packets pass, and none has come",
-            SigningState::InForce => "packets are signed",
-        };
         let further = match bridge.unlisted {
             0 => String::new(),
             more => format!("; {} of further stations", counted(more, "packet", "packets")),
         };
         section.before.push(paragraph(&format!(
-            "gcs-bridge {name}, {}: {signing}; a ground station may send: {}{further}.",
-            bridge.link, bridge.ground_may
+            "gcs-bridge {name}, {}: {}; a ground station may send: {}{further}.",
+            bridge.link, bridge.signing.state, bridge.ground_may
         )));
         stations.extend(bridge.stations.iter().map(|it| {
             let heard = match it.silent {

@@ -151,14 +151,11 @@ fn with(recording: &[u8], key: &str, payload: &[u8], before_ns: i64) -> Vec<u8> 
 #[test]
 fn a_page_has_the_ground_stations_and_what_was_refused() {
     let station = GroundStation {
-        system: 255,
-        component: 190,
-        peer: "10.0.0.2:14550".into(),
-        last_ns: 0,
         silent: true,
         packets: 300,
         refused: 2,
         signature: PacketSignature::Verified,
+        ..GroundStation::sample()
     };
     let mut status = GcsStatus {
         bridge: "main".into(),

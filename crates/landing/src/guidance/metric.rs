@@ -244,7 +244,7 @@ impl Guidance for Metric {
             }
         }
         let [low, high] = MAX_DRIFT_DOWN_M_S;
-        let max_m_s = fmax(low, fmin(high, MAX_FOLLOWING_M_S - descent_m_s));
+        let max_m_s = (MAX_FOLLOWING_M_S - descent_m_s).clamp(low, high);
         let followed_m_s = fmin(target.velocity.z(), max_m_s + situation.pad_heave_m_s);
         let down = approach_speed(
             before.setpoint.z(),
