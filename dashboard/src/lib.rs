@@ -7,7 +7,7 @@
 //! people, what was [`found`], the [`funnel`] of the descent, the [`checks`] before a flight and the [`log`]; [`pairing`] joins a picture with
 //! what was found in it, and [`window`] bounds what is on its way to a browser; [`guard`] decides who may read and command, with
 //! [`nonce`] for each command and [`tokens`] in a file. These are without network. `server` answers browsers, `video` makes pictures,
-//! `motion` gives them to viewers of Motion JPEG, `stream` (with the feature `h264`) sends them as H.264, both on a `canvas` where
+//! `mjpeg` gives them to viewers of Motion JPEG, `stream` (with the feature `h264`) sends them as H.264, both on a `canvas` where
 //! a picture comes in parts, and [`service`] follows the topics.
 
 mod canvas;
@@ -17,7 +17,7 @@ pub mod found;
 pub mod funnel;
 pub mod guard;
 pub mod log;
-mod motion;
+mod mjpeg;
 pub mod nonce;
 pub mod pairing;
 mod server;

@@ -31,7 +31,7 @@ use web::Tls;
 use crate::config::Config;
 use crate::guard::{Access, Guard, Refusal};
 use crate::log::Level;
-use crate::motion;
+use crate::mjpeg;
 use crate::nonce::Nonce;
 use crate::state::State;
 use crate::tokens::{Kind, SESSION_S, Sessions, Tokens, secret, usual_file};
@@ -412,7 +412,7 @@ async fn motion_jpeg(
     match std::future::ready(app.admit(peer, &headers).and_then(|it| Ok((it, permit?)))).await {
         Ok((visitor, permit)) => {
             let end = async move { visitor.loses_access().await };
-            motion::answer(app.pictures.files.subscribe(), connection, end, permit)
+            mjpeg::answer(app.pictures.files.subscribe(), connection, end, permit)
         }
         Err(refusal) => app.refuse(refusal),
     }

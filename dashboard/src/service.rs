@@ -11,7 +11,7 @@ use tokio::net::TcpListener;
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::config::Config;
-use crate::motion;
+use crate::mjpeg;
 use crate::server::{App, Texts, serve};
 use crate::state::{Input, State};
 use crate::video::{Pictures, Video};
@@ -47,7 +47,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let texts = Texts::default();
     let pictures = Pictures::default();
     let video = Video::new(node.clone(), config.video.clone(), Arc::clone(&state), &pictures);
-    let motion = motion::run(node.clone(), pictures.clone(), config.video.jpeg_quality);
+    let mjpeg = mjpeg::run(node.clone(), pictures.clone(), config.video.jpeg_quality);
     let address = listener.local_addr().context("the address of the page")?;
     let app =
         App::new(node.clone(), &config, address, Arc::clone(&state), texts.clone(), pictures)?;
@@ -63,7 +63,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
         result = tell(&state, &texts) => result,
         result = measure(&node, &state) => result,
         result = video.run() => result,
-        result = motion => result,
+        result = mjpeg => result,
         result = stream(node.clone(), &config, Arc::clone(&state)) => result,
         never = serve(listener, app) => match never {},
         () = shutdown.requested() => Ok(()),

@@ -7,8 +7,8 @@ use messages::{FrameHeader, topic};
 use node::{Frame, Node, Shutdown};
 
 use super::args::BoardArgs;
+use super::coverage::Coverage;
 use super::found::{Finder, FoundImages, Origin, Picture};
-use super::guidance::Guidance;
 use crate::args::Format;
 use crate::grey::grey;
 use crate::runtime::with_node;
@@ -76,7 +76,7 @@ fn picture(frame: &Frame, converter: &mut Converter) -> anyhow::Result<Picture> 
 }
 
 /// Says what is missing, when there is something new; whether nothing is.
-fn say(found: &FoundImages, args: &BoardArgs, said: &mut Option<Guidance>) -> anyhow::Result<bool> {
+fn say(found: &FoundImages, args: &BoardArgs, said: &mut Option<Coverage>) -> anyhow::Result<bool> {
     let views = found.views.len();
     if said.as_ref().is_some_and(|before| before.views == views) {
         return Ok(false);
@@ -85,16 +85,16 @@ fn say(found: &FoundImages, args: &BoardArgs, said: &mut Option<Guidance>) -> an
         .is_multiple_of(VIEWS_PER_SOLUTION)
         .then(|| calibrate_unjudged(&found.views, args.lens.model(), &args.options()).ok())
         .flatten();
-    let mut guidance = Guidance::new(found, first.as_ref());
-    let is_enough = first.is_some() && guidance.next.is_empty();
+    let mut coverage = Coverage::new(found, first.as_ref());
+    let is_enough = first.is_some() && coverage.next.is_empty();
     if let (None, Some(before)) = (&first, said.as_ref()) {
-        (guidance.tilt_deg, guidance.distance_ratio) = (before.tilt_deg, before.distance_ratio);
-        guidance.next = guidance.advice();
+        (coverage.tilt_deg, coverage.distance_ratio) = (before.tilt_deg, before.distance_ratio);
+        coverage.next = coverage.advice();
     }
     match args.format {
-        Format::Text => write_error(&guidance.line()),
-        Format::Json => print(&serde_json::json!({ "guidance": guidance.json() }).to_string())?,
+        Format::Text => write_error(&coverage.line()),
+        Format::Json => print(&serde_json::json!({ "guidance": coverage.json() }).to_string())?,
     }
-    *said = Some(guidance);
+    *said = Some(coverage);
     Ok(is_enough)
 }

@@ -2,9 +2,9 @@
 
 mod args;
 mod corrected;
+mod coverage;
 mod flight;
 mod found;
-mod guidance;
 mod live;
 mod recorded;
 mod report;
@@ -24,9 +24,9 @@ use crate::args::Format;
 use crate::marker::Sheet;
 use crate::terminal::print;
 pub(crate) use args::BoardArgs;
+use coverage::Coverage;
 use flight::FlightArgs;
 use found::{Finder, FoundImages, find_boards};
-use guidance::Guidance;
 use live::watch_camera;
 
 /// How often images are looked at again with the lens that was found before. Behind a fisheye of 120 degrees the first time leaves
@@ -113,17 +113,17 @@ fn board(args: &BoardArgs) -> anyhow::Result<ExitCode> {
         found.look_again(&mut finder, &camera);
         first = calibrate_unjudged(&found.views, lens, &options).ok().or(first);
     }
-    let guidance = Guidance::new(&found, first.as_ref());
+    let coverage = Coverage::new(&found, first.as_ref());
     match calibrate(&found.views, lens, &options) {
-        Ok(calibration) => accept(args, &found, &guidance, &calibration),
-        Err(refusal) => refuse(args, &found, &guidance, &refusal),
+        Ok(calibration) => accept(args, &found, &coverage, &calibration),
+        Err(refusal) => refuse(args, &found, &coverage, &refusal),
     }
 }
 
 fn accept(
     args: &BoardArgs,
     found: &FoundImages,
-    guidance: &Guidance,
+    coverage: &Coverage,
     calibration: &Calibration,
 ) -> anyhow::Result<ExitCode> {
     let note = CalibrationNote {
@@ -136,11 +136,11 @@ fn accept(
     // The result is told first: a file that cannot be written does not take it along.
     match args.format {
         Format::Text => {
-            print(report::found_text(found, guidance).trim_end())?;
-            print(report::shown_text(guidance).trim_end())?;
+            print(report::found_text(found, coverage).trim_end())?;
+            print(report::shown_text(coverage).trim_end())?;
             print(report::worth_text(calibration).trim_end())
         }
-        Format::Json => print(&report::json(found, guidance, Some(calibration), None).to_string()),
+        Format::Json => print(&report::json(found, coverage, Some(calibration), None).to_string()),
     }
     .context("writing the result")?;
     let said = match &args.output {
@@ -163,16 +163,16 @@ fn accept(
 fn refuse(
     args: &BoardArgs,
     found: &FoundImages,
-    guidance: &Guidance,
+    coverage: &Coverage,
     refusal: &Refusal,
 ) -> anyhow::Result<ExitCode> {
     match args.format {
         Format::Text => {
-            print(report::found_text(found, guidance).trim_end())?;
-            print(report::shown_text(guidance).trim_end())?;
+            print(report::found_text(found, coverage).trim_end())?;
+            print(report::shown_text(coverage).trim_end())?;
             print(&format!("No calibration: {refusal}."))
         }
-        Format::Json => print(&report::json(found, guidance, None, Some(refusal)).to_string()),
+        Format::Json => print(&report::json(found, coverage, None, Some(refusal)).to_string()),
     }
     .context("writing the result")?;
     Ok(ExitCode::FAILURE)

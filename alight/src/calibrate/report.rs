@@ -6,8 +6,8 @@ use calibration::{Calibration, Refusal};
 use geometry::{CameraModel, Distortion};
 use serde_json::{Value, json};
 
+use super::coverage::Coverage;
 use super::found::{BLURRED_PX, FoundImages};
-use super::guidance::Guidance;
 
 /// The distance that errors are told at, in metres.
 const FAR_M: f64 = 5.0;
@@ -17,7 +17,7 @@ const MAP: [usize; 2] = [6, 4];
 const MAX_NAMES: usize = 5;
 
 /// Which images show the board, and where in the image it was.
-pub(super) fn found_text(found: &FoundImages, guidance: &Guidance) -> String {
+pub(super) fn found_text(found: &FoundImages, coverage: &Coverage) -> String {
     let points: usize = found.views.iter().map(|view| view.points.len()).sum();
     let mut text = format!(
         "images: {}, with the board: {}, its points: {points}\n",
@@ -52,7 +52,7 @@ pub(super) fn found_text(found: &FoundImages, guidance: &Guidance) -> String {
         return text;
     }
     text.push_str("where in the image the points are (#: 20 or more, +: some, .: none, show the board there):\n");
-    for row in guidance.point_counts {
+    for row in coverage.point_counts {
         let sign = |count: &usize| match count {
             0 => '.',
             1..20 => '+',
@@ -68,18 +68,18 @@ fn blurred(found: &FoundImages) -> impl Iterator<Item = &str> {
 }
 
 /// How the board was shown, and what would help.
-pub(super) fn shown_text(guidance: &Guidance) -> String {
+pub(super) fn shown_text(coverage: &Coverage) -> String {
     let mut text = String::new();
-    if let (Some(tilt_deg), Some(ratio)) = (guidance.tilt_deg, guidance.distance_ratio) {
+    if let (Some(tilt_deg), Some(ratio)) = (coverage.tilt_deg, coverage.distance_ratio) {
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
             "tilt: up to {tilt_deg:.0} degrees; the farthest views are {ratio:.1} times as far as the nearest; points in {:.0} % \
              of the image",
-            100.0 * guidance.covered()
+            100.0 * coverage.covered()
         );
     }
-    for next in &guidance.next {
+    for next in &coverage.next {
         let _ = writeln!(text, "would help: {next}");
     }
     text
@@ -185,7 +185,7 @@ fn numbers(calibration: &Calibration) -> &[f64] {
 /// All of it for programs.
 pub(super) fn json(
     found: &FoundImages,
-    guidance: &Guidance,
+    coverage: &Coverage,
     calibration: Option<&Calibration>,
     refusal: Option<&Refusal>,
 ) -> Value {
@@ -203,7 +203,7 @@ pub(super) fn json(
         "blurred": blurred(found).collect::<Vec<_>>(),
         "edges": edges,
         "shaken": found.shaken,
-        "guidance": guidance.json(),
+        "guidance": coverage.json(),
         "refused": refusal.map(ToString::to_string),
         "calibration": calibration.map(calibration_json),
     })

@@ -1,4 +1,5 @@
-//! Motion JPEG: pictures one after the other in an answer without end (multipart/x-mixed-replace).
+//! Motion JPEG of one camera for the page: its frames as JPEG files, one after the other in an HTTP answer without end
+//! (multipart/x-mixed-replace).
 
 use std::convert::Infallible;
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! What the images show of the board so far, and what to show next.
+//! The cells (rows, columns) of the image that the calibration board has covered so far, and where and how to show it next.
 
 use calibration::{Calibration, View};
 use serde_json::{Value, json};
@@ -18,7 +18,7 @@ const FEW_POINTS: usize = 8;
 
 /// What is good about the images and what is missing.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Guidance {
+pub(super) struct Coverage {
     pub(super) views: usize,
     /// How many points lie in each part of the image, row by row.
     pub(super) point_counts: [[usize; COLUMNS]; ROWS],
@@ -32,10 +32,10 @@ pub(super) struct Guidance {
     pub(super) next: Vec<String>,
 }
 
-impl Guidance {
+impl Coverage {
     /// Of the images, and a first solution of them where there is one.
     pub(super) fn new(found: &FoundImages, first: Option<&Calibration>) -> Self {
-        let mut guidance = Self {
+        let mut coverage = Self {
             views: found.views.len(),
             point_counts: point_counts(&found.views),
             tilt_deg: first.map(|it| it.evidence.tilt.to_degrees()),
@@ -43,8 +43,8 @@ impl Guidance {
             blurred: found.edges.iter().filter(|edge| edge.width_px > BLURRED_PX).count(),
             next: Vec::new(),
         };
-        guidance.next = guidance.advice();
-        guidance
+        coverage.next = coverage.advice();
+        coverage
     }
 
     /// The share of the image's parts in which there are points.
@@ -182,7 +182,7 @@ mod tests {
 
     #[test]
     fn the_part_of_the_image_that_lacks_points_is_named() {
-        let next = |found: &FoundImages| Guidance::new(found, None).next.join("; ");
+        let next = |found: &FoundImages| Coverage::new(found, None).next.join("; ");
         let whole = next(&seen_in(|_, _| true));
         assert_eq!(whole, "take 19 more images");
         let no_right = next(&seen_in(|row, column| column < 6 || !(2..4).contains(&row)));
@@ -198,7 +198,7 @@ mod tests {
             let seen = Pixel::new(x, y);
             found.views[0].points.push(Sighting { tag: 0, place_m: [0.0; 2], seen });
         }
-        let counts = Guidance::new(&found, None).point_counts;
+        let counts = Coverage::new(&found, None).point_counts;
         assert_eq!((counts[0][0], counts[ROWS - 1][COLUMNS - 1], counts[ROWS - 1][0]), (1, 1, 1));
     }
 }
