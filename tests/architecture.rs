@@ -1,4 +1,5 @@
-//! Keeps true what ARCHITECTURE.md says of the tree: its arrows, its names, its topics, and what each room leaves out.
+//! Checks ARCHITECTURE.md against the tree: dependencies of the rooms, paths and names, topics, list of files; and
+//! rules of the code, as what algorithms leave out and how long files are.
 
 #[path = "architecture/circles.rs"]
 mod circles;

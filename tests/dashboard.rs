@@ -1,4 +1,5 @@
-//! The page of a landing: what it tells, how it looks in a real browser, and that nothing depends on it.
+//! The page of `alight land`'s landings: a real browser that commands, Motion JPEG, overlays found in the very picture,
+//! the page killed or its port taken, twenty browsers at once.
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::PathBuf;

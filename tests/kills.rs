@@ -1,5 +1,6 @@
-//! A drone and a ground station, each under its supervisor, on one machine; the world is apart from both. Processes of
-//! both sides, the relay and the supervisors are killed (`kill -9`) at random moments of landings.
+//! Kills processes of a drone and a ground station, each under `alight up`, at random moments of landings, and checks
+//! the touchdown and that all come back. The world is apart from both; the relay and the supervisors are killed
+//! (`kill -9`) as well.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{File, OpenOptions};

@@ -1,4 +1,5 @@
-//! The whole system as processes: it lands, and losing any process leaves the vehicle safe.
+//! `alight land` as processes: landings beside other programs, controllers and detectors killed in flight, aborts, two
+//! landings at once, ports that are taken, wrong settings.
 //!
 //! Each test flies `alight land` in real time, beside one other at most, and joins its network as one more process.
 

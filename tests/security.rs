@@ -1,4 +1,5 @@
-//! Keys: who has none or a foreign one stays outside, who has one says what its role may, and nobody else notices.
+//! Keys in the whole system: processes without or with foreign keys at a relay, the rights of each role, holders
+//! that are revoked, relays without keys, and what an insecure start logs.
 
 use std::io::{BufRead, BufReader};
 use std::os::unix::fs::PermissionsExt;

@@ -1,5 +1,5 @@
-//! Detectors that come, go, are swapped and die in flight; and one that is written in Python.
-//! `measure.rs` swaps them more often.
+//! Detectors in flight: `alight swap`, failed swaps, twenty more detectors beside ten dashboards, and a
+//! detector written in Python that leads a landing. `measure.rs` swaps them more often.
 
 use std::process::Command;
 use std::time::Duration;

@@ -1,4 +1,5 @@
-//! Two roles on one machine, each under its supervisor: they meet, what dies comes back, and the end is orderly.
+//! `alight up` for the drone and the ground on one machine: processes meet, are restarted when killed and given
+//! up when refused, the supervisor crashes; dry runs, systemd units.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};

@@ -1,4 +1,5 @@
-//! Arguments that several subcommands share.
+//! Arguments that several subcommands share: network and keys, settings of a service, output format, addresses and ports,
+//! and the error of a wrong command line.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;

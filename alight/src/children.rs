@@ -1,4 +1,5 @@
-//! Child processes: starts them, forwards their output, reports their exit, stops them.
+//! Child processes of a supervisor: starts services and other programs in process groups, forwards their lines of output,
+//! reports how each exits, and stops them by SIGTERM, then SIGKILL.
 
 use std::borrow::Cow;
 use std::ffi::OsString;

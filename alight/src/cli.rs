@@ -1,4 +1,5 @@
-//! The command line.
+//! The command line of `alight`: the list of subcommands, the call of the one that is given, `alight config`, and the exit status of an
+//! error.
 
 use std::path::PathBuf;
 use std::process::ExitCode;

@@ -1,4 +1,5 @@
-//! `alight dashboard`: the page, and for those who open it from elsewhere tokens and its certificate.
+//! `alight dashboard`: runs the page's service, adds tokens for browsers elsewhere that may read or command, and makes the
+//! page's self-signed certificate.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};

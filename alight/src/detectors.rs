@@ -1,4 +1,5 @@
-//! `alight detectors`: lists the detectors, and chooses the one to use.
+//! `alight detectors`: lists detectors with place, markers, frame rate and whether the controller uses them, from their
+//! information and its status; or sends it the choice of one, or of a place.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::process::ExitCode;

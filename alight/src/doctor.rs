@@ -1,4 +1,5 @@
-//! `alight doctor`: checks this machine and its network, and says what to do about each problem.
+//! `alight doctor`: checks this machine, its site, devices, the services on the network with their clocks and links, and serial
+//! ports; prints a verdict, a finding and a remedy for each.
 //!
 //! First the machine, the site, its keys and devices; then the network: services, `cameras`, clocks, links; then the serial ports,
 //! which controllers hold that run.

@@ -1,4 +1,5 @@
-//! `alight experiment`: repeats the thesis' experiments.
+//! `alight experiment`: the options of its landings (wind, latency, height, vision, faults) and of its rendered markers (sets, families,
+//! processing), the run of either, and the report printed.
 
 use std::ops::ControlFlow;
 use std::path::PathBuf;

@@ -1,4 +1,5 @@
-//! The link between the simulated autopilot and the controller, through a proxy that fails.
+//! A UDP proxy between the simulated autopilot and the controller, in real time: it delays, drops and changes
+//! MAVLink packets while a fault of the link lasts.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

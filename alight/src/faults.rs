@@ -1,4 +1,5 @@
-//! `alight experiment faults`: landings in which something dies, lies or falls silent.
+//! `alight experiment faults`: the options of a campaign of landings with faults, its flights in lock-step or in real time with
+//! processes, and its report with every unsafe touchdown.
 
 use std::path::PathBuf;
 use std::process::ExitCode;

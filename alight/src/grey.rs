@@ -1,4 +1,5 @@
-//! The image of a frame.
+//! The grey image of a camera's frame received from a topic: raw samples converted, JPEG decoded; of a frame
+//! in parts the largest at full resolution.
 
 use std::path::Path;
 

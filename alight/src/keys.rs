@@ -1,4 +1,5 @@
-//! `alight keys`: a development certificate authority, and a key for each role.
+//! `alight keys`: makes a development certificate authority, issues and revokes a certificate and private key for each role,
+//! and keeps the list of holders.
 //!
 //! The common name of a certificate is its role with its vehicle, and of a detector its name
 //! (`crates/node/src/access.rs`); `zenoh-config/secured.json5` has the rights of each role. The list of holders

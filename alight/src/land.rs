@@ -1,4 +1,5 @@
-//! `alight land`: all services as processes, watched until the vehicle has landed.
+//! `alight land`: checks all settings, starts simulator, detector, controller and the other services as processes, follows their
+//! statuses until the vehicle has landed, and stops them.
 
 use std::io::IsTerminal;
 use std::net::{SocketAddr, TcpListener, UdpSocket};

@@ -1,4 +1,5 @@
-//! The result of a landing, from the messages received during it.
+//! The result of a landing, collected from statuses, true poses, health reports and the recorder's status: time, touchdown error and
+//! speed, latency, each process's load, and what was recorded.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;

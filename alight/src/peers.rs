@@ -1,5 +1,5 @@
-//! The peers on which a supervisor's restarts depend: whether a landing is under way, and which detectors are
-//! running.
+//! What a supervisor's restarts depend on, from statuses and detectors' information: whether a landing is under way, noted in a file, and which
+//! detector has replaced one that exited.
 
 use std::collections::BTreeMap;
 use std::time::Duration;

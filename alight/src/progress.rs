@@ -1,5 +1,5 @@
-//! The display of a landing and of long work: a few lines that are redrawn on a terminal, else a line for each change, or now
-//! and then.
+//! Progress on standard error: a landing's phase, detector in use, height and the controller's warnings, each once; flights
+//! and steps of experiments; redrawn on a terminal, else a line for each change.
 
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};

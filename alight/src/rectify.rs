@@ -1,4 +1,5 @@
-//! `alight rectify`: images without the distortion of their lens.
+//! `alight rectify`: reads images and videos with a camera's calibration file, and writes each image without the distortion of its
+//! lens, over no other file unless it may be replaced.
 
 use std::collections::BTreeSet;
 use std::os::unix::fs::MetadataExt;

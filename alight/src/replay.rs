@@ -1,4 +1,5 @@
-//! `alight replay`: a recording back into the controller's decisions, into detections, and to services that run.
+//! `alight replay`: verifies the controller's tapes in a recording, flies them again with other settings, or searches its frames again, and
+//! prints what is different.
 
 mod live;
 

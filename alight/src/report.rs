@@ -1,4 +1,5 @@
-//! `alight report`: a recorded flight on one page.
+//! `alight report`: reads the recordings of one flight or two, prints a summary, and writes the page as HTML or PDF and its charts as
+//! SVG files.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;

@@ -1,4 +1,5 @@
-//! The services, and running one in this process.
+//! The services by name, from camera-pub to the dashboard: the effective configuration of each, and running one in
+//! this process until it is stopped.
 
 use std::future::Future;
 use std::process::ExitCode;

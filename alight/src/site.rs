@@ -1,4 +1,5 @@
-//! A site: one TOML file that lists the processes of every machine, and how the machines find each other.
+//! A site: one TOML file that lists the processes of every machine, read into jobs with program, settings, key and network, and
+//! checked, as for two detectors of one id.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,5 @@
-//! `alight swap`: replaces the detector in use in flight, without a gap.
+//! `alight swap`: starts a new detector beside the one in use, compares the detections of both, has the controller change over in
+//! flight without a gap, and stops the old one.
 //!
 //! The new detector is started as a process that outlives this one. It runs in shadow until it agrees with
 //! the active one, becomes the active one, and only then the old one is stopped. On any failure before that,

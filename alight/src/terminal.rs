@@ -1,4 +1,5 @@
-//! Output to the terminal.
+//! Prints lines and tables with aligned columns to standard output or error, without failing where a pipe was closed or a terminal hung
+//! up.
 
 use std::fmt::Write as _;
 use std::fs::File;

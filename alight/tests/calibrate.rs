@@ -1,4 +1,5 @@
-//! The program from a printed board to a calibration file, with a camera whose truth is known.
+//! The program `alight calibrate` on boards printed by it and rendered through a lens whose truth is known: the
+//! calibration file, its error in pixels, and refusals.
 
 use std::path::Path;
 use std::process::{Command, Output};

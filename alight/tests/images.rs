@@ -1,4 +1,5 @@
-//! The program from a marker's file to what is found in it.
+//! The program `alight` with files: a marker drawn by `alight marker` is found by `alight detect`, and
+//! `alight cameras` takes a picture of image files or of a program.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;

@@ -1,4 +1,5 @@
-//! Cameras that are announced over MAVLink, and the addresses of their video.
+//! Finds cameras on MAVLink by their heartbeats, requests CAMERA_INFORMATION and VIDEO_STREAM_INFORMATION, and lists the
+//! addresses of their video.
 //!
 //! Messages and commands are those of <https://mavlink.io/en/services/camera.html>: whoever sends a heartbeat is asked for
 //! CAMERA_INFORMATION and for VIDEO_STREAM_INFORMATION of all its streams, in the new and in the old form.

@@ -1,4 +1,5 @@
-//! The time of a camera's own clock as the host's.
+//! From stamps of a camera's own clock to the host's by the quickest arrivals, learnt anew where that clock was set; and arrival
+//! times told in UTC.
 
 /// Time in which the quickest frame is looked for, in nanoseconds. Clocks that go apart by 50 in a million move by half a
 /// millisecond in two of these.

@@ -1,4 +1,5 @@
-//! How a camera is exposed for the marker, from where detectors have seen it in earlier frames.
+//! Sets a camera's exposure for the marker frame by frame: where detections have it, the levels there, the next exposure
+//! time and gain or the camera's own metering, and what is published.
 
 use imaging::GrayView;
 use messages::{

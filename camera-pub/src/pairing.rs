@@ -1,4 +1,5 @@
-//! Which record of the metadata belongs to which frame.
+//! Pairs each frame of a camera's program with its own record of metadata by arrival, number and delay, for its stamp; one whose
+//! record is in doubt stays without.
 //!
 //! A program writes a frame and then, at once, its metadata, on two channels. Three things must agree before a record
 //! stamps a frame: the record arrived after the frame began and before the next one did; both have the same number,

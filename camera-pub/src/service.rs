@@ -1,5 +1,5 @@
-//! The camera service: publishes a camera's frames as they arrive, or image files, sorted by path, at a
-//! constant rate.
+//! The camera service: frames of a program, a V4L2, GenICam or RTSP camera, or of image files at a constant rate, stamped and
+//! published raw, rectified and for the air link.
 
 use std::convert::Infallible;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,5 @@
-//! A camera service and its subscribers, on a port of the test's own.
+//! The camera service as its subscribers see it: folders of images, programs with raw frames and metadata,
+//! ffmpeg, repeated pictures, Bayer samples, JPEG, rates, and errors.
 
 use std::path::Path;
 use std::time::Duration;

@@ -1,4 +1,5 @@
-//! Alarms of battery, autopilot link and operator.
+//! Alarms of a landing, each raised once: a low or critical battery, silence of the operator, silence of the autopilot's link;
+//! and why a battery is too empty for a flight.
 
 use autopilot::Battery;
 use landing::Alarm;

@@ -1,4 +1,5 @@
-//! The controller's configuration.
+//! The controller's configuration, `controller.toml`: mode, start, guidance, alarms, autopilot's link, landing targets, choice of
+//! detector; ranges checked, and made into the lander's settings.
 
 use std::time::Duration;
 

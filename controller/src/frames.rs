@@ -1,4 +1,5 @@
-//! Detections of all detectors in, the lander's next frame out.
+//! Takes the detections of all detectors, refuses those of another clock, from the future or in another's
+//! name, and gives the lander the newest frame of the active detector.
 
 use std::collections::BTreeMap;
 

@@ -1,4 +1,5 @@
-//! Logs and health counters of a flight.
+//! Logs a flight's phases, alarms, warnings and detector changes, and counts its setpoints, rejected
+//! detections and the latency from a frame's stamp to the setpoint for the health report.
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -1,4 +1,5 @@
-//! The mission: when a landing begins, and what comes before and after it.
+//! The mission around a landing: waiting, take-off, the change of a PX4 to OFFBOARD, what triggers the landing or refuses its start,
+//! and its end after the motors have stopped.
 
 use autopilot::{
     Autopilot, FlightMode, LandedState, OffboardExit, Takeoff, TakeoffError, TakeoffProgress,

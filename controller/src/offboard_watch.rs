@@ -1,4 +1,4 @@
-//! No PX4 is left in OFFBOARD without setpoints by us.
+//! Watches for a PX4 that flies in OFFBOARD while no setpoint is sent to it, and leads it out into HOLD.
 //!
 //! Every part that steers leads the vehicle out of OFFBOARD itself when it ends. This is for what no part expects: a request that
 //! was withdrawn and is carried out late, a takeover that was none, another station that chooses OFFBOARD while zeros are sent.

@@ -1,4 +1,5 @@
-//! What is refused again and again, so that the operator hears of it.
+//! Counts refusals by their reason over time (detections, camera information, messages of another version),
+//! and warns the operator of those that last.
 
 /// Time for which something must be refused before it is told, in nanoseconds: a single one means little.
 const MIN_LASTING_NS: i64 = 1_000_000_000;

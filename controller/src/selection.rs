@@ -1,4 +1,5 @@
-//! Selects the active detector: one at a time, by the operator's preference, then by health.
+//! Selects the active detector by the operator's preference, then by health: rate, latency, silence, failures and agreement with
+//! others on where the marker is.
 //!
 //! A function of time and of the messages received. Another detector becomes the active one when the active
 //! one is gone, silent, late or slow and the other is not, or when the operator prefers the other and it has

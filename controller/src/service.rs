@@ -1,4 +1,5 @@
-//! The service: detectors, autopilot and operator in, setpoints and reports out.
+//! The controller's service: topics and the autopilot's link joined to the flight, which gets detections, commands and packets;
+//! publishes status, tape and the packets for the ground station.
 
 use std::sync::Arc;
 use std::time::Duration;

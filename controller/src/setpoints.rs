@@ -1,4 +1,6 @@
-//! The lander's actions, sent to the autopilot as they are: what guidance believes is what was sent.
+//! Sends the lander's actions to the autopilot: velocity setpoints at their rate, LAND and GUIDED, disarming; stops
+//! the vehicle at the end, and leads a PX4 out of OFFBOARD. Actions are sent as they are: what guidance believes is
+//! what was sent.
 
 use std::time::Duration;
 

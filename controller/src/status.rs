@@ -1,4 +1,5 @@
-//! What the controller publishes about a flight.
+//! Builds the status and the target estimate that the controller publishes: phase and its reason in words, warnings, detector in
+//! use, height, link and ages.
 
 use autopilot::{Autopilot, LandedState};
 use landing::{Action, Decision, Lander, Reason};

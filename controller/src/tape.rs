@@ -1,4 +1,5 @@
-//! A flight with its tape: everything that it handles, and what comes out of it, in order.
+//! The flight that writes its tape: each packet, detection, command and tick with its time, and the decisions and packets
+//! out of it; a tape is replayed the same way.
 //!
 //! The tape is enough to fly the same flight again. [`TapedFlight::replay`] does so, with a tape of its own, which has
 //! the same hashes as long as the flight decides the same.

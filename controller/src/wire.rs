@@ -1,4 +1,5 @@
-//! Between messages, the autopilot's types and the lander's types.
+//! Converts between messages, the autopilot's types and the lander's: detections by the camera's mount into
+//! the body frame, covariances, phases, vehicle state and status.
 
 use autopilot::VehicleState;
 use geometry::{Body, Camera, Marker, Pixel, Rotation, Transform, Vector};

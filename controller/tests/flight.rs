@@ -1,4 +1,5 @@
-//! A flight by its packets and detections: what is sent, and in which phase it is.
+//! A flight fed packets of an ArduPilot and detections: starts and refusals, the pilot's mode changes, alarms,
+//! precision landing, restarts of autopilot and controller, and which setpoints go out.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 

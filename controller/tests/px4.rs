@@ -1,4 +1,5 @@
-//! A flight with a PX4: how it comes into OFFBOARD, and that it is not left there.
+//! A flight fed packets of a PX4: from HOLD or a take-off into OFFBOARD with zero setpoints, landings in LAND,
+//! and the way out to HOLD wherever setpoints end.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 

@@ -1,4 +1,5 @@
-//! Which detector is used, as they come, go, fall silent and disagree.
+//! The choice of detector among several with given latencies as they come, crash, fall silent, are preferred or
+//! see the marker at two places, with the gaps between used frames.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 

@@ -1,4 +1,5 @@
-//! The list before a flight: what must be well, and what to do where it is not. It turns green by itself.
+//! The list of checks before a flight: a verdict, a finding and what to do for controller, autopilot, camera,
+//! calibration, detector, mount, link, battery, recording and keys. It turns green by itself.
 
 use messages::{CameraInfo, ControllerStatus, Detections, RecorderStatus, VehicleState};
 use serde::Serialize;

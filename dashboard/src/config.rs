@@ -1,4 +1,5 @@
-//! The dashboard's configuration.
+//! The dashboard's configuration, `dashboard.toml`: address, names and certificate of the page, who may
+//! command, pictures as JPEG or H.264, where they come from.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;

@@ -1,4 +1,5 @@
-//! Answers browsers: the page, its data, its pictures, its commands.
+//! The page's HTTP routes: its files, WebSockets with the state and with pictures, Motion JPEG, login by a token, and commands
+//! with their nonce; each request is checked by the guard.
 
 use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};

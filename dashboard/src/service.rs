@@ -1,4 +1,5 @@
-//! The service: follows the topics, and serves the page.
+//! The dashboard's service: subscribes to the topics that the page shows, measures round trips to each
+//! service, makes the texts for all browsers, and runs server and pictures.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

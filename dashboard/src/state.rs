@@ -1,4 +1,5 @@
-//! What is known of the vehicle and its services, as JSON for the page, with the age of each number.
+//! The newest messages of controller, detectors, cameras, recorder, bridge and every service, made into the JSON of the page
+//! with the age of each number.
 //!
 //! The caller gives the time, in nanoseconds of this process' clock. Whoever publishes on a key is believed to have its
 //! name, whatever the message says. All that grows has a bound.

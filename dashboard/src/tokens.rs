@@ -1,4 +1,5 @@
-//! Tokens, which are stored as hashes only, and the sessions of browsers that have shown one.
+//! Tokens for browsers that read or command from elsewhere, kept in a file as hashes with their end, and the sessions by cookie of
+//! browsers that have shown one.
 
 use std::collections::BTreeMap;
 use std::fmt;

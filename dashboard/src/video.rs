@@ -1,4 +1,5 @@
-//! Pictures for the browsers that look, and for nobody else.
+//! Makes JPEG pictures of the used camera's frames, with what the detector found or refused in each, for the browsers
+//! that look; none without any.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;

@@ -1,4 +1,5 @@
-//! The page's server, asked by programs that are no browser, with a controller and a camera that are made up here.
+//! The dashboard's HTTP server and its WebSockets, with a controller and a camera made up here: refused requests,
+//! state with ages, held commands, pictures with detections, tokens, encryption.
 
 use std::fs::Permissions;
 use std::net::{IpAddr, SocketAddr, UdpSocket};

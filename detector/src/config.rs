@@ -1,4 +1,5 @@
-//! The detector's configuration, at the start and while it runs.
+//! The detector's configuration, `detector.toml`: markers, pads, input, tracking, thoroughness, the camera's response; its
+//! checks, and changes of it while the service runs.
 
 use fiducial::{Detector, ResponseSetting, TrackingSettings};
 use markers::{Marker, Pad};

@@ -1,4 +1,4 @@
-//! Between the algorithm's types and the messages.
+//! Converts observations, pads and refused candidates of the crate `fiducial` to the messages of a detector.
 
 use fiducial::trace::{Candidate, Trace};
 use fiducial::{MarkerPose, Observation, PadObservation};

@@ -1,4 +1,5 @@
-//! A detector service between a camera and an operator, on a port of the test's own.
+//! A running detector service with a camera and an operator made up here: markers of several families, changed parameters,
+//! acknowledged frames of the air link, a camera in Python.
 
 use std::time::Duration;
 

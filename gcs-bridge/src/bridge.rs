@@ -1,4 +1,5 @@
-//! The service: one loop over everything that arrives, from either side.
+//! The bridge's service: one loop between the link to the ground station and the topics, which routes packets both ways, answers for
+//! companion and camera, and sends texts and landing point.
 
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;

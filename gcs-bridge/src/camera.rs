@@ -1,4 +1,5 @@
-//! The camera as a component of the vehicle: how a ground station finds it, its video, and the marker in it.
+//! The camera as a MAVLink component of the vehicle: its heartbeat, information and video stream, and the marker of the
+//! detector in use as a tracked rectangle.
 //!
 //! The messages are those of <https://mavlink.io/en/services/camera.html>. The camera is there while a detector tells of
 //! its frames. What it shows as tracked is the best marker of the detector whose detections the controller uses.

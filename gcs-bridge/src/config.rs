@@ -1,4 +1,5 @@
-//! The bridge's configuration.
+//! The bridge's configuration, `gcs-bridge.toml`: link to the ground stations, ids, who of them is heard and
+//! may send what, signing key, rate of landing targets, the camera's video.
 
 use std::net::IpAddr;
 use std::time::Duration;

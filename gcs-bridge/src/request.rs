@@ -1,4 +1,5 @@
-//! What a ground station asks of the camera, and what it gets.
+//! A ground station's commands to the camera and their answers: messages of camera, video and tracking, once
+//! or at an interval, and whether tracking can be started.
 
 use autopilot::dialect::{
     CAMERA_CAPTURE_STATUS_DATA, CAMERA_INFORMATION_DATA, CAMERA_SETTINGS_DATA,

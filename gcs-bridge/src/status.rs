@@ -1,4 +1,5 @@
-//! What the bridge publishes of the ground: the stations that are heard, what of theirs is refused, and whether packets are signed.
+//! Collects the bridge's status for its topic: the link's peer or problem, ground stations by packets and silence, refused packets
+//! by reason, the state of signing, and when it is due.
 
 use std::collections::BTreeMap;
 

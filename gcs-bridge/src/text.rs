@@ -1,4 +1,5 @@
-//! The controller's status as texts for the ground station (STATUSTEXT).
+//! The controller's phases, warnings and answers as STATUSTEXT packets for the ground station, each change once and at a
+//! bounded rate.
 
 use autopilot::compose::status_text;
 use autopilot::dialect::{MavMessage, MavSeverity};

@@ -1,4 +1,5 @@
-//! The bridge between a vehicle that is made up here and a ground station on a plain UDP socket.
+//! The bridge between topics of a vehicle made up here and ground stations on UDP sockets: packets both ways,
+//! refusals, texts, camera, parameters, signing, silence.
 
 use std::fs::Permissions;
 use std::io::Write;

@@ -1,4 +1,5 @@
-//! The recorder's configuration.
+//! The recorder's configuration, `recorder.toml`: file and its size, what is kept of frames, address and
+//! origins of viewers.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;

@@ -1,4 +1,5 @@
-//! The channels that are offered, and who follows them.
+//! The channels offered to viewers and the viewers' places: who is subscribed to which channel, the last values for whoever
+//! comes, and a bound on their number.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

@@ -1,4 +1,5 @@
-//! Messages to those who follow a flight under way.
+//! Offers messages, and frames with a picture, to viewers who follow a flight over WebSocket; listens at the configured
+//! address, and does nothing while nobody follows.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;

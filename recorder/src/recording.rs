@@ -1,4 +1,5 @@
-//! One recording: the writer of its format in front of the thread of its disk.
+//! One recording under way: the MCAP writer with its chunks, the buffer in front of the disk's thread, and
+//! which messages have reached the disk.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::Write;

@@ -1,4 +1,5 @@
-//! Answers those who follow a flight: Foxglove, Lichtblick, and any other client of their protocol.
+//! A viewer's WebSocket (Foxglove, Lichtblick or another client of their protocol): origin checked,
+//! subscriptions taken, messages sent within its window, pings.
 
 use std::convert::Infallible;
 use std::sync::Arc;

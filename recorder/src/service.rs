@@ -1,4 +1,5 @@
-//! The service: takes messages from the network, and writes them on threads of its own.
+//! The recorder's service: takes messages and frames of the topics, writes them to a recording and the next one, counts by key what is
+//! kept, lost or never came, publishes its status.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,5 +1,5 @@
-//! A flight that is followed over the Foxglove WebSocket protocol, by programs that are no viewer, with a camera that is made
-//! up here.
+//! The recorder's WebSocket for viewers, with clients of the Foxglove protocol and a camera made up here: channels, refused
+//! pages, a slow client, an address that is taken.
 
 #![expect(clippy::print_stdout, reason = "what was measured is for people to read")]
 

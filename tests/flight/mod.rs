@@ -1,4 +1,5 @@
-//! A landing under way, for the tests that fly one: its processes, what they say, and their end.
+//! For the system tests: starts `alight land` or a vehicle of its own, kills and restarts its services, waits for statuses and true heights, and
+//! returns the result of the landing.
 
 #![allow(dead_code, reason = "each test uses its part")]
 

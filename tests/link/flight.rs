@@ -1,4 +1,5 @@
-//! Landings with the detector on the ground.
+//! Landings with the detector on the ground behind an emulated radio link, beside one onboard: errors, ages of the
+//! frames used, and what cuts of the link do.
 
 use std::time::Duration;
 

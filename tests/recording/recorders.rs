@@ -1,4 +1,5 @@
-//! What is in a recording, and recorders that are killed.
+//! Reads what a recorder has written beside a flight: its messages and gaps when it is killed or overloaded, compared with Python's
+//! reader; and what it costs.
 
 #![allow(dead_code, reason = "the test and the measurement use their parts")]
 

@@ -1,4 +1,5 @@
-//! The arguments of `alight calibrate board`.
+//! The arguments of `alight calibrate board`: size of the board and its tags, images or a running camera, lens model, region of
+//! the sensor, calibration file and its format.
 
 use std::path::{Path, PathBuf};
 

@@ -1,4 +1,5 @@
-//! The corrected camera as keys of camera-pub's configuration, and what each of them was.
+//! What a calibration from a flight changes of camera-pub's configuration: each TOML key (delay, mount, focal
+//! length) with its value before and after, for people and as tables.
 
 use calibration::flight::QUANTITIES;
 use calibration::{FlightCalibration, Quantity};

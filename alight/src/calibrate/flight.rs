@@ -1,4 +1,5 @@
-//! `alight calibrate flight`: what a recorded landing says of its camera.
+//! `alight calibrate flight`: from a recorded landing the camera's time offset, mount angles, focal length and k1, printed
+//! quantity by quantity with deviation, verdict and the key to change.
 
 use std::path::PathBuf;
 use std::process::ExitCode;

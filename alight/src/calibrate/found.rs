@@ -1,4 +1,5 @@
-//! Where the board is in each image.
+//! Finds the tags of the calibration board in images and in frames of a camera, leaves out those in which it has not moved or
+//! is shaken, and looks again once the lens is known.
 
 use anyhow::{Context, ensure};
 use calibration::{ImageSize, Sighting, View};

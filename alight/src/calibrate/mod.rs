@@ -1,4 +1,5 @@
-//! `alight calibrate`: a camera's calibration file, and what it is worth.
+//! `alight calibrate`: prints the board, or solves for a camera's intrinsics from images of it and writes the calibration file;
+//! the result or the refusal is printed as text or JSON.
 
 mod args;
 mod corrected;

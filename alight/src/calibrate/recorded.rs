@@ -1,4 +1,5 @@
-//! What a recording has of a camera, its vehicle and a pad.
+//! Reads from a recording what a calibration from a flight takes: the vehicle's poses, one detector's detections of a
+//! marker, the camera's information and configuration.
 
 use std::collections::BTreeMap;
 use std::path::Path;

@@ -1,4 +1,5 @@
-//! What is said of a calibration.
+//! A calibration from board images as text and JSON: images with the board, its coverage, focal lengths,
+//! distortion, maps of residuals and of uncertainty, or the refusal.
 
 use std::fmt::Write as _;
 

@@ -1,4 +1,5 @@
-//! `alight detect`: markers in image files and videos, one line per image.
+//! `alight detect`: finds markers and pads in image files and videos, with poses by a calibration file, a focal length or none, and
+//! warns where images and camera do not fit.
 
 mod args;
 mod picture;

@@ -1,4 +1,5 @@
-//! Annotated images: the detections drawn into the image.
+//! Draws detections into the images of `alight detect`: each marker's outline, the axes of its pose and a
+//! label with name and position; written as PNG files.
 
 use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,5 @@
-//! The rows of `alight doctor` about cameras.
+//! `alight doctor` on cameras: calibration, and of received frames their size, age, stamps, exposure and blur, sharpness, drops
+//! and silence.
 
 use std::fmt::Write;
 

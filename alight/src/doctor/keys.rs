@@ -1,4 +1,5 @@
-//! The keys of this machine: those of its processes, and on the ground that of its operator.
+//! `alight doctor` on keys: certificates, private keys, authority and list of holders of the site's processes and of the operator,
+//! with validity, vehicle and file modes.
 
 use std::collections::BTreeSet;
 use std::fs::File;

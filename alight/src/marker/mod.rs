@@ -1,4 +1,5 @@
-//! `alight marker`: a marker to print, true to scale.
+//! `alight marker`: writes a marker or a pad to print, true to scale, as PDF, SVG or PNG by the ending of the
+//! file's name.
 
 mod glyphs;
 mod pdf;

@@ -1,4 +1,5 @@
-//! The layout of the sheet: the marker, cut marks, a ruler, and text.
+//! Lays out the sheet of paper to print: a marker, pad or calibration board at its centre, cut marks, a ruler
+//! of 100 mm and lines of text, in millimetres.
 
 use clap::ValueEnum;
 use markers::{Board, Drawing, Ink, Marker, Pad, Shape};

@@ -1,4 +1,5 @@
-//! A recording to services that run: its messages on the network again, each when it is due.
+//! `alight replay --live`: publishes a recording's messages and frames on the network again, each when it is due and with stamps
+//! of now, and shows their services as ready.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::process::ExitCode;

@@ -1,4 +1,5 @@
-//! An open camera.
+//! Opens a GenICam camera with Aravis, sets its region, format, rate and exposure, and takes its buffers with stamps, counting
+//! those that were not delivered.
 #![allow(unsafe_code, reason = "the bytes of a buffer are behind a pointer; nothing else is here")]
 
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,4 +1,4 @@
-//! The frames of a camera that may be unplugged or stall: it is opened again until it is back.
+//! The frames of a GenICam camera that may be unplugged or stall: it is opened again until it is back.
 
 use std::time::Duration;
 

@@ -1,4 +1,5 @@
-//! Cameras as Aravis plays them: a camera of GigE Vision on the loopback interface.
+//! The feed of a GenICam camera against a camera of GigE Vision that Aravis plays on the loopback interface: whole frames,
+//! stamps, lost packets, a slow reader, loss and return.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};

@@ -1,4 +1,5 @@
-//! The pictures of a camera that may be lost: its stream is opened again until it is back.
+//! The decoded and stamped pictures of an RTSP camera that may be lost: its stream is opened again until it
+//! is back.
 
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 

@@ -1,4 +1,5 @@
-//! A stream that is open: pictures as they arrive, each with the times that are known of it.
+//! An open RTSP stream of `retina`: coded pictures (H.264, JPEG) as they arrive, each with its RTP time, the camera's sender
+//! report and its arrival.
 
 use std::fmt::Display;
 use std::fs::File;

@@ -1,4 +1,5 @@
-//! When a picture of a stream was taken.
+//! The host's time at which a picture of an RTSP stream was taken: by sender reports of the camera's clock, or by RTP time and
+//! arrival.
 
 use super::session::Times;
 use crate::clock::CameraClock;

@@ -1,4 +1,5 @@
-//! Streams of the camera that `server` plays, and of ffmpeg.
+//! The feed of an RTSP camera against the server that is played here, and against ffmpeg: pictures, stamps of each kind,
+//! damaged and lost streams.
 
 use std::os::unix::fs::PermissionsExt;
 use std::process::{Command, Stdio};

@@ -1,4 +1,5 @@
-//! Frames of a V4L2 device: opened as configured, each with its stamp by the driver.
+//! Opens a V4L2 device with a format, size, rate and controls, maps its buffers, and takes frames with the driver's stamps,
+//! counting those that were lost.
 
 use std::io;
 use std::time::Duration;

@@ -1,4 +1,5 @@
-//! The controls of a device with which its exposure is set for the marker.
+//! Sets exposure time and gain of a V4L2 device by its controls: their ranges, when a change has taken effect, and back to its
+//! own metering.
 
 use metering::{Limits, Setting};
 

@@ -1,4 +1,5 @@
-//! A device as uvcvideo shows one, played for tests, with a clock of its own.
+//! A V4L2 device as uvcvideo shows one, played for tests with a clock, formats, controls, buffers and faults of its
+//! own.
 //!
 //! Its answers are those that users of real cameras recorded: capabilities, and JPEG without bytes per line, of
 //! pikvm/ustreamer issue 2 (uvcvideo, PTZ Pro Camera); sizes and intervals, listed twice, of PhotonVision/photonvision

@@ -1,4 +1,4 @@
-//! The kernel's side of the border: the one file that calls it.
+//! The ioctl, mmap and poll calls to a V4L2 device of the kernel, in the one file that makes them.
 #![allow(unsafe_code, reason = "ioctl, mmap and poll have no safe form; nothing else is here")]
 
 use std::fs::{File, OpenOptions};

@@ -1,4 +1,5 @@
-//! The frames of a camera that may be unplugged, stall or change: it is opened again until it is back.
+//! The frames of a Video4Linux camera that may be unplugged, stall or change: it is opened again until it is
+//! back, also under another number.
 
 use std::io;
 use std::time::Duration;

@@ -1,4 +1,5 @@
-//! A flight for tests, its autopilot's packets, and what it sends.
+//! For the controller's tests: MAVLink packets of an autopilot (heartbeat, attitude, position), detections of
+//! a marker below, and what a flight sends for them.
 
 #![allow(dead_code, reason = "each test uses a part of it")]
 

@@ -1,4 +1,4 @@
-//! Pictures of frames, for people.
+//! A frame as a JPEG file or as 8-bit grey pixels, for the page, the recorder and viewers.
 
 use std::borrow::Cow;
 

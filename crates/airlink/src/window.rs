@@ -1,4 +1,5 @@
-//! Flow and congestion control: when the next frame may be sent, and how large it may be.
+//! The air link's flow and congestion control: from acknowledgements of frames by each receiver to when the next
+//! frame may be sent, on which lane, and how large it may be.
 //!
 //! A frame is sent only while fewer than `window` others are in flight, so that nothing queues on the link;
 //! frames that come meanwhile are dropped at the camera. A frame that takes much longer than those before it

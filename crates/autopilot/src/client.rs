@@ -1,4 +1,5 @@
-//! The conversation with one autopilot, as a state machine without input and output.
+//! The conversation with one autopilot, a state machine without input and output: packets and time in; vehicle state, events,
+//! commands, setpoints, parameters and stream requests out.
 //!
 //! Feed it every packet ([`Autopilot::handle`]) and the time ([`Autopilot::tick`], 20 times a second or
 //! more); send what [`Autopilot::poll_outgoing`] returns and act on what [`Autopilot::poll_event`] returns.

@@ -1,4 +1,5 @@
-//! Commands to the autopilot, and why they may fail.
+//! Commands to the autopilot (mode, arm, disarm, take-off): sent, repeated, matched with acknowledgements and the state shown, and why one
+//! failed with what to do about it.
 
 use std::fmt;
 use std::time::Duration;

@@ -1,4 +1,5 @@
-//! The messages that a companion sends on its own.
+//! Composes the MAVLink messages of a companion: heartbeat, message requests, STATUSTEXT in parts, velocity
+//! setpoints, LANDING_TARGET in the body or the local frame.
 
 use geometry::{Body, Ned, Point, Vector};
 use libm::atan2;

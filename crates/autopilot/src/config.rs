@@ -1,4 +1,5 @@
-//! The settings of a conversation with an autopilot.
+//! The settings of a conversation with an autopilot: system and component ids, heartbeat, timeouts,
+//! parameters to read, and the messages to request with their rates.
 
 use std::time::Duration;
 

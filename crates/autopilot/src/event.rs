@@ -1,4 +1,5 @@
-//! The events of a conversation with an autopilot.
+//! The events of a conversation with an autopilot: found, lost, restarted, a new attitude, position or state, another
+//! mode, a text.
 
 use std::time::Duration;
 

@@ -1,4 +1,5 @@
-//! A link to an autopilot or a ground station over UDP, TCP or a serial line.
+//! Sends and receives MAVLink packets over UDP, TCP or a serial line, to an autopilot or a ground station: bounded queues,
+//! reconnection, signatures, and errors in words.
 //!
 //! A permanent problem (a port used by another program) is an error at once; a temporary one (no device yet,
 //! no reply, a cable pulled) is retried for ever. Slow readers and slow lines block nothing: queues are

@@ -1,4 +1,5 @@
-//! Firmware and flight mode.
+//! Firmware (ArduPilot, PX4) of a heartbeat, and flight modes by name and custom number: those that follow
+//! setpoints, land, or land on a target.
 
 use std::fmt;
 

@@ -1,4 +1,5 @@
-//! Whom a listening link talks to, of all that send to its port.
+//! Chooses among the senders to a listening UDP port the autopilot or ground station that the link talks to, splits each
+//! one's datagrams into packets, and replaces a silent one.
 
 use std::net::{IpAddr, SocketAddr};
 use std::time::{Duration, Instant};

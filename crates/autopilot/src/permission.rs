@@ -1,4 +1,5 @@
-//! What a ground station may send to the autopilot.
+//! Which packets of a ground station may go to the autopilot: everything, nothing that starts or stops motors, or only what
+//! changes nothing.
 
 use std::fmt;
 use std::str::FromStr;

@@ -1,4 +1,5 @@
-//! What PX4 tells in EVENT messages: why it does not arm, failsafes and the like.
+//! Decodes PX4's EVENT messages, numbers with arguments, into texts: failing checks, why it does not arm, failsafes, modes, take-off
+//! and landing.
 //!
 //! PX4 sends texts (STATUSTEXT) only over links on which it hears a ground station; events it sends over all of them, as numbers with
 //! arguments (<https://mavlink.io/en/services/events.html>). The texts here are of the metadata that PX4 v1.17.0-alpha1 is built

@@ -1,4 +1,5 @@
-//! What a PX4 has told in its events so far: the checks that fail now, and which events are heard again.
+//! Follows a PX4's events: which arming checks fail now, which events are repetitions, and when a report of all checks is requested
+//! again.
 //!
 //! Whenever one check changes PX4 sends all that fail, between two summaries. It sends a check that does not prevent arming as
 //! one that fails in all modes (`HealthAndArmingChecks/Common.cpp: reportedModes`), like one that prevents it in all: what tells

@@ -1,4 +1,5 @@
-//! The vehicle's state, as it reports it.
+//! The vehicle's state from MAVLink messages: attitude, position and velocity, range, battery, landed state,
+//! readiness to arm, each with its stamp.
 //!
 //! A stamp is in nanoseconds of the caller's clock: the time of the measurement where the autopilot's clock
 //! is known ([`crate::clock`]), else that of its reception. `boot_ms` is the autopilot's own clock.

@@ -1,5 +1,6 @@
-//! The take-off. ArduPilot: wait until ready, GUIDED, arm, climb. PX4: wait until ready, arm, climb in its
-//! own takeoff mode, OFFBOARD.
+//! The take-off, step by step with time limits: retries of arming, the reasons of a refusal, real vehicles only where they are
+//! allowed. ArduPilot: wait until ready, GUIDED, arm, climb. PX4: wait until ready, arm, climb in its own takeoff mode,
+//! OFFBOARD.
 
 use std::fmt;
 use std::time::Duration;

@@ -1,4 +1,5 @@
-//! The client against a scripted autopilot: lost and refused commands, restarts, silence, other senders.
+//! The client against a scripted ArduPilot: streams and rates, lost and refused commands, restarts, silence,
+//! other senders on the link, setpoints and take-offs.
 
 #![allow(
     clippy::unwrap_used,

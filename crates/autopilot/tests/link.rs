@@ -1,4 +1,5 @@
-//! Links over the loopback: who is answered, what is retried, what is an error at once.
+//! Links over UDP and TCP on the loopback and a serial pseudo-terminal: which sender is answered, packets cut in
+//! two, reconnection, signatures, and errors at once.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "helpers of tests may fail like tests")]
 

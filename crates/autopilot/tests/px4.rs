@@ -1,8 +1,5 @@
-//! The client against a PX4 that keeps the rules of its documentation
-//! (<https://docs.px4.io/main/en/flight_modes/offboard.html>,
-//! <https://docs.px4.io/main/en/advanced_features/precland.html>): OFFBOARD needs a second of setpoints
-//! before and goes on only with them, a takeoff goes to an altitude over the sea, and the estimator tells of
-//! itself in ESTIMATOR_STATUS.
+//! The client against a PX4 scripted by its documentation: EVENT messages and failing checks, take-off to an altitude over
+//! the sea, modes, OFFBOARD only with a stream of setpoints.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests may fail like tests")]
 

@@ -1,4 +1,5 @@
-//! The result: a camera, how sure it is, and what that means.
+//! The result of a calibration from a board: camera, covariance, residuals of each view, maps of residuals and of uncertainty,
+//! and by how much markers' poses are off.
 
 use geometry::{Board, Camera, CameraModel, Pixel, Point, Transform};
 use libm::{fmax, hypot};

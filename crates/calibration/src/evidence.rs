@@ -1,4 +1,5 @@
-//! What speaks for and against a set of views: how the board was shown, and what the fit leaves unexplained.
+//! How a board was shown (tilt, distances, cells of the image covered) and what the fit leaves: residuals by tag and place,
+//! flaws of the print, structures beyond noise.
 
 use geometry::CameraModel;
 use libm::{acos, fmax, fmin, hypot};

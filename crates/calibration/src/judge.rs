@@ -1,4 +1,5 @@
-//! Which sets of views are believed.
+//! Calibrates a camera from views of a board: checks the views, solves, and refuses sets that are mirrored, noisy,
+//! hardly tilted, at one distance, or whose halves contradict each other.
 
 use libm::{fmax, fmin};
 

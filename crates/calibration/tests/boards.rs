@@ -1,5 +1,5 @@
-//! Calibrations of synthetic cameras against their truth; `examples/boards.rs` and `examples/judged.rs` do the same by the
-//! hundred.
+//! The calibration from simulated views of boards, bent and noisy, against each camera's truth, its stated uncertainty,
+//! and bad sets of views that are refused. `examples/boards.rs` and `examples/judged.rs` do the same by the hundred.
 #![allow(clippy::panic, reason = "a calibration that is refused fails the test")]
 
 mod synthetic;

@@ -1,4 +1,5 @@
-//! Flights whose truth is known: what is estimated of the camera, and whether its deviations are honest.
+//! The calibration from simulated flights, telemetry and markers of cameras whose truth is known: time offset, mount and
+//! focal length with honest deviations, and flights that are refused.
 
 use calibration::flight::{MIN_MARKERS, QUANTITIES, calibrate_flight};
 use calibration::{

@@ -1,4 +1,5 @@
-//! Solves the markers of one pad together.
+//! The pose of a pad with its covariance, from all of its markers found in an image: their corners and ring centres solved as
+//! points of one plane.
 //!
 //! Their corners are points of one plane, so far markers give the tilt that near ones cannot, and only the covariance
 //! changes when one of them leaves the view. Rings look the same in any rotation: beside other markers their centre is a

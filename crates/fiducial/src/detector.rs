@@ -1,4 +1,5 @@
-//! The detector: markers in, observations out. It runs the families' detectors and knows none of them.
+//! The detector of all families: runs each family's detector and the fallback passes on an image, or reads one marker at its
+//! prediction, and joins the observations. It knows none of the families.
 
 use geometry::CameraModel;
 use imaging::{GrayImage, GrayView};

@@ -1,4 +1,5 @@
-//! What the detector reports of a marker.
+//! A marker as the detector reports it: name, centre with covariance, corners, size in pixels, wrong bits, confidence, pose and its
+//! alternative, the camera's response.
 
 use geometry::{Camera, Marker as MarkerFrame, Pixel, Roi, Transform};
 use markers::Family;

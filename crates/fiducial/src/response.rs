@@ -1,4 +1,5 @@
-//! What is known of how a camera shows light, from image to image.
+//! The tone curve and the sharpening of a camera, estimated from the markers of the last images with their deviations, or fixed
+//! by a setting.
 //!
 //! Every marker tells the tone curve and the sharpening of the camera that shows it, a small one badly. Those of a stream are the
 //! same camera's, so the mean of the last markers is what the next fit starts from, held to it as strongly as they agreed.

@@ -1,4 +1,5 @@
-//! How well the marker is found in renderings of the thesis' camera, at both its binnings.
+//! Centre and range of the three-ring marker in renderings of the thesis' camera at both binnings against truth, range by range,
+//! and against the stated covariances.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 

@@ -1,4 +1,5 @@
-//! Images that are hard: close up, in odd light, tilted, bent by the lens.
+//! The three-ring marker in hard rendered images, from 7 cm to 30 m: cut, tilted, dim, blurred, in shadow,
+//! through a lens, covered, inverted; and rings of others that are no marker.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 

@@ -1,4 +1,5 @@
-//! Markers as cameras show them that process their frames for people: a tone curve, sharpening, JPEG.
+//! Rings, square markers and STags in frames with tone curve, sharpening and JPEG, also under the edge of a shadow: how many
+//! are found, their errors, and the estimated response.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 

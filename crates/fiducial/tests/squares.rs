@@ -1,4 +1,5 @@
-//! Square markers as printed boards and cheap cameras show them.
+//! Square markers drawn pixel by pixel: borders of two cells, tags seen from the side, calibration grids, scratched, covered, sharpened and
+//! small ones, boards of hundreds.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 
 use fiducial::{Detector, Observation, Settings};

@@ -1,4 +1,4 @@
-//! What Foxglove shows of messages: pictures and what was found in them, poses, a map, a log; and what is kept as files
+//! Turns messages into Foxglove's types: pictures, markers found in them, coordinate frames, poses, a map and a log; and into files
 //! within the recording.
 
 use std::collections::{BTreeMap, BTreeSet};

@@ -1,4 +1,5 @@
-//! Reads a recording as far as it is whole.
+//! Reads the messages, facts and files in an MCAP recording as far as it is whole, names its damage, and puts the
+//! files of one recording in order.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;

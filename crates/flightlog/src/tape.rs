@@ -1,4 +1,5 @@
-//! The controllers' tapes in recordings.
+//! Gathers the controllers' tapes from the messages of a recording, or of several files of one flight: parts in order, those that
+//! are missing, damaged or twice noted.
 
 use std::collections::BTreeMap;
 

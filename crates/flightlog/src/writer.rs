@@ -1,4 +1,5 @@
-//! A recording's file: MCAP, append-only.
+//! Writes a recording's MCAP file, append-only: schemas, channels, messages as they came, as JSON and as Foxglove shows them,
+//! frames, and counts of what was lost.
 //!
 //! Chunks are gathered in memory and written whole, so a killed writer loses what came after the last
 //! [`Writer::flush`] and nothing before it.

@@ -1,4 +1,5 @@
-//! Border following in binary images.
+//! Follows the borders between white and black pixels of a binary image (Suzuki and Abe), for the thesis'
+//! detector: the points of each, and whether it is that of a hole.
 
 use crate::view::GrayView;
 

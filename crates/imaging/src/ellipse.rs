@@ -1,4 +1,5 @@
-//! Ellipses fitted to points.
+//! Fits an ellipse to points by least squares; its axes, area, eccentricity, points along it and distance in
+//! units of it.
 
 use std::f64::consts::PI;
 

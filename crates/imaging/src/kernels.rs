@@ -1,4 +1,5 @@
-//! The loops over all pixels, eight to sixty-four at a time where the processor can.
+//! The innermost loops over rows of pixels, for AVX2, NEON and plain Rust: extremes of tiles, halving, sharpening, comparison
+//! with thresholds to bits.
 //!
 //! Each kernel exists three times, for AVX2, for NEON and in plain Rust, with the same result to the bit. The plain one
 //! also serves the ends of rows, and processors with neither.

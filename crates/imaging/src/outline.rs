@@ -1,4 +1,5 @@
-//! Outlines of dark and of bright regions, on all levels of an image pyramid.
+//! Finds the outlines of dark and of bright regions on the levels of an image pyramid: settings of size and contrast, thresholds, and the list
+//! of closed outlines.
 
 mod follow;
 

@@ -1,4 +1,5 @@
-//! Straight edge segments, from the gradient.
+//! Finds straight edge segments in an image: pixels of the strongest gradient chained along the edge, split
+//! where the chain bends, fitted with lines.
 //!
 //! Where a threshold fails (the edge of a shadow, glare, an occluder), edges are still there, in pieces. Edge
 //! pixels are those of the strongest gradient across the edge; a chain follows them while the gradient keeps

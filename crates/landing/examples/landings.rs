@@ -1,4 +1,5 @@
-//! Many modelled landings, as tables: `cargo run --release -p landing --example landings [FLIGHTS [CASE]]`.
+//! Flies every named case of modelled landings by the hundred and prints a row of errors and speeds for each:
+//! `cargo run --release -p landing --example landings [FLIGHTS [CASE]]`.
 //!
 //! FLIGHTS is the number of flights of each row (100), ten times as many for the last; CASE is a part of the
 //! names of the rows that are flown. A row's flights are those of the seeds from 0 on.

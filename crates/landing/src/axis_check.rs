@@ -1,4 +1,5 @@
-//! Are the axes of camera and autopilot consistent? Decided from natural motion, before the descent.
+//! Checks before the descent whether the axes of camera and autopilot match, by the scatter of the pad's
+//! place under the configured mount beside that under turned and mirrored ones.
 //!
 //! A pad that does not move has one place whatever the vehicle does, if attitude, position and camera mount
 //! are as configured. If the camera is turned about the vertical, its image is mirrored, or roll or pitch has

@@ -1,4 +1,5 @@
-//! Every number the lander uses, with its default, unit and range.
+//! The lander's configuration: estimator, phases, envelope, checks, guidance, and what an abort or an alarm leads to,
+//! each number with default, unit and range.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,4 +1,5 @@
-//! The lander's decisions, with their reasons.
+//! What the lander returns for an event: phase, action (velocity, GUIDED, LAND, disarm), reason, target estimate,
+//! and why a detection was rejected.
 
 use std::fmt;
 

@@ -1,4 +1,5 @@
-//! The last check of every setpoint, and the fence.
+//! Clamps each velocity setpoint: finite, within speed limits, no descent unless it is allowed, and not out
+//! of the fence, to the side or upwards.
 
 use geometry::{Ned, Point, Vector};
 use libm::{fmax, hypot};

@@ -1,4 +1,5 @@
-//! The estimator: where the landing point is, how it moves, and how well that is known.
+//! The estimator of the landing point's place and motion: fuses each detection at its own stamp, also late
+//! ones, and refuses outliers by their innovation.
 //!
 //! It runs the `filter` in the odometry frame, the autopilot's local frame without its jumps
 //! ([`crate::history::Motion::odometry`]). There the autopilot's motion needs no integration between

@@ -1,4 +1,5 @@
-//! The events that the lander reacts to.
+//! What the lander takes: vehicle state and status, frames with their marker, operator's commands, alarms,
+//! delay of the link, the autopilot's limits, disputes of detectors, ticks.
 
 use std::fmt;
 

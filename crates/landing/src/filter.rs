@@ -1,4 +1,5 @@
-//! The extended Kalman filter of the pad: state, prediction and update.
+//! The extended Kalman filter of the pad's position, velocity, tilt error and time offset: prediction with adaptive process noise, innovation,
+//! update.
 //!
 //! | state | unit | why |
 //! |---|---|---|

@@ -1,4 +1,5 @@
-//! The vehicle's recent motion.
+//! The vehicle's last states in the order of their stamps, and its motion (pose, velocity, turn rate, place in the odometry frame)
+//! interpolated at any time.
 
 use std::collections::VecDeque;
 

@@ -1,4 +1,5 @@
-//! The landing decision as one function of time and events.
+//! The lander: each event with its time goes through plausibility, estimator, checks, state machine, guidance and envelope to one
+//! decision.
 
 mod aborted;
 mod lost;

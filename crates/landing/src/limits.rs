@@ -1,4 +1,5 @@
-//! Settings with their defaults and limits, each written once.
+//! The macro that declares a section of the lander's settings with each default and range, and the error that
+//! names a key out of range.
 
 use std::fmt;
 use std::ops::RangeInclusive;

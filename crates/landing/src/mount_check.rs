@@ -1,5 +1,5 @@
-//! How far are the camera's mount and focal length from what is configured? Measured from natural motion, all
-//! the flight.
+//! Measures in flight by how much the camera's mount, its focal length and the marker's size are off, from the apparent motion of a pad that
+//! stands still.
 //!
 //! A pad that does not move has one place. Under a mount that is off by `θ` it moves by `θ` times the height as
 //! the height changes; under a focal length that is off it moves as the vehicle tilts, under a marker of another

@@ -1,5 +1,5 @@
-//! A camera that repeats its last picture with new stamps, as a frame grabber, a player at a constant rate or a video decoder does
-//! when nothing comes any more.
+//! Recognises a picture that a grabber, a player or a decoder repeats with new stamps, by a marker that stays fixed to the vehicle while
+//! that moves.
 //!
 //! The marker then stays where it is relative to the vehicle, however that moves: the pad seems to move along, and to sink before a
 //! vehicle that goes down. No two pictures of a camera are alike, as its noise differs, and no vehicle holds its place over a marker

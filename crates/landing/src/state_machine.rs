@@ -1,4 +1,5 @@
-//! The phases of a landing: an explicit state machine over plain inputs.
+//! The phases of a landing as an explicit state machine: visible marker, progress of the guidance, vehicle, commands, alarms and timeouts in; phase
+//! and reason out.
 //!
 //! ```mermaid
 //! stateDiagram-v2

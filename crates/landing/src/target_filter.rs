@@ -1,4 +1,5 @@
-//! The estimate of the landing point by the filter that the guidance needs, and how often the marker was seen.
+//! The target of a landing by the filter of its guidance (the estimator, or the mean of the thesis'), and the stamps of
+//! the markers that were used or refused.
 
 use geometry::{Ned, Point};
 

@@ -1,4 +1,5 @@
-//! What a camera shows of the ground.
+//! Whether a marker at a place on the ground is in the field of view of a frame's camera, given the vehicle's
+//! motion.
 
 use geometry::{Body, Camera, Odometry, Point, Rotation, Vector};
 use libm::{atan, atan2};

@@ -1,4 +1,5 @@
-//! What a lander believes of the autopilot's reports, of the ground and of its own setpoints.
+//! A lander fed one event after the other: which reports of ground, mode and position it believes, and how searches, retries, aborts and
+//! disputes of detectors climb, below the fence.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 

@@ -1,4 +1,5 @@
-//! Whole landings in the modelled world.
+//! Landings of the lander in the modelled world, one or a few seeds each, with metric and thesis guidance: error, time,
+//! wind, latency, lost targets, disputes, pilot, operator, LAND refused.
 
 mod scene;
 

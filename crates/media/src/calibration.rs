@@ -1,4 +1,5 @@
-//! Calibration files of other programs: their intrinsics as a camera model, and back.
+//! Reads calibration files of ROS, Kalibr and OpenCV as a camera model, for images of the calibrated size or of another mode
+//! of the sensor (binned, cropped).
 //!
 //! Three formats are read and distinguished by their keys: ROS `camera_info` (`camera_matrix` or `K`, with
 //! `image_width`), Kalibr's camera chain (`cam0` with `intrinsics`), and OpenCV's `FileStorage` as YAML, XML or JSON

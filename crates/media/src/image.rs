@@ -1,4 +1,5 @@
-//! Image files (PNG and JPEG): found in folders, and decoded to grey.
+//! Image files (PNG and JPEG): found in folders in order, decoded to 8-bit grey oriented by Exif, or to a
+//! frame's samples, within a limit of pixels, and refused when damaged.
 
 use std::io::Cursor;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,5 @@
-//! Images as a camera without distortion would have taken them.
+//! Resamples a camera's grey images as one without lens distortion would have taken them, of the same size, focal lengths and
+//! principal point.
 
 use geometry::{CameraModel, Distortion, Pixel, Point};
 use imaging::GrayView;

@@ -1,4 +1,5 @@
-//! What a camera publishes: frame headers, its calibration, and how it is exposed.
+//! Messages of a camera: the header of a frame with its parts, the acknowledgement of one, camera information (lens, mount), and how the
+//! exposure is set.
 
 use libm::fmax;
 use serde::{Deserialize, Serialize};

@@ -1,4 +1,5 @@
-//! What the controller publishes, and the commands it takes.
+//! Messages of the controller: status with phase, reason, setpoint and detectors, the target estimate; and the commands to it with
+//! their replies.
 
 use std::fmt;
 

@@ -1,4 +1,5 @@
-//! Between wire types and the types of `geometry` and `imaging`.
+//! Converts transforms, covariances, lens and camera models, Bayer patterns and pixel formats between
+//! messages and the types of `geometry` and `imaging`.
 
 use geometry::{Body, Camera, CameraModel, Distortion, Frame, Point, Rotation, Transform};
 use imaging::SampleFormat;

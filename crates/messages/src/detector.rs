@@ -1,4 +1,4 @@
-//! What a detector publishes, and the commands it takes.
+//! Messages of a detector: detections with poses and stage times, refused candidates, its information; and the commands to it.
 
 use serde::{Deserialize, Serialize};
 

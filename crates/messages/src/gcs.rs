@@ -1,4 +1,4 @@
-//! What the bridge to the ground station publishes.
+//! Messages of the bridge: the ground stations heard, what of their packets is refused, and whether packets are signed.
 
 use std::fmt;
 

@@ -1,4 +1,5 @@
-//! What every service publishes: its health and its configuration.
+//! Messages of every service: its health of the last second (rates, latencies, drops, errors) and its
+//! configuration.
 
 use serde::{Deserialize, Serialize};
 

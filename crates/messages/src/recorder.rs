@@ -1,4 +1,4 @@
-//! What a recorder publishes.
+//! Message of a recorder: file, messages kept, lost or never come by key, and its problem.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,4 +1,5 @@
-//! The controller's tape: what it handled, in the order in which it did, and what came out of it.
+//! The controller's tape on the wire: records of events (packets, detections, commands, ticks) with their times, decisions and
+//! packets out of them, and a running hash.
 //!
 //! A [`Tape`] holds some records. Each record is an event with the time at which it was handled, what came out of it,
 //! and a running hash over all of this and the hash before (XXH3 of 64 bits, seeded with that): a bit that was flipped, and

@@ -1,4 +1,5 @@
-//! The bytes on the wire: they change only with a version.
+//! The encoding of every message type against its golden bytes, which change only with a version and stand in
+//! the documentation; and decoding of arbitrary bytes.
 
 use std::borrow::Cow;
 

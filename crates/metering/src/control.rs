@@ -1,4 +1,5 @@
-//! The next exposure time and gain, and why.
+//! The exposure loop: from the levels of the pad's white in a frame, its motion and the camera's limits to the next exposure time and
+//! gain, with the reason.
 
 use messages::ExposureReason;
 

@@ -1,4 +1,5 @@
-//! What others are told of a camera's exposure, and how often.
+//! When a camera's exposure (setting, limits, levels, who sets it) is published again as `CameraControl`: changes at once,
+//! what stays at intervals.
 
 use messages::{CameraControl, ExposureLimits, ExposureReason, ExposureSetting, MarkerLevels};
 

@@ -1,4 +1,5 @@
-//! Who may connect to a relay, and what each may say.
+//! The holders of certificates (`ROLE.NAME@VEHICLE`), a relay's list of them with who is revoked, and Zenoh's access
+//! control made of that list: which keys each may publish.
 //!
 //! The common name of a certificate is `ROLE@VEHICLE` or `ROLE.NAME@VEHICLE`. A relay lets in whom its list of
 //! holders names, of its own vehicle and not revoked; a detector may publish as itself only. Zenoh compares

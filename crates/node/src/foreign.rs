@@ -1,5 +1,6 @@
-//! Whether a program that is none of ours answers where a session connects. Zenoh tries such an address again for ever, without a word.
-//! A tool, which ends soon, is refused. A service goes on: it meets the others once the right program is there.
+//! Probes the addresses where a session connects by Zenoh's greeting: a tool is refused where another program answers, a service logs
+//! it and goes on. Zenoh tries such an address again for ever, without a word; the service meets the others once the right program is
+//! there.
 
 use std::io;
 use std::net::SocketAddr;

@@ -1,4 +1,5 @@
-//! Frames in shared memory, without a copy.
+//! Publishes a camera's frames in shared memory without a copy (loaned buffers, header attached), and
+//! receives them, always the latest, with header and length checked.
 //!
 //! On one host a frame is never copied between camera and detector: the camera borrows a buffer
 //! ([`FramePublisher::loan`]), writes into it and publishes it; a subscriber reads the same memory. Without

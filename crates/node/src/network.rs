@@ -1,4 +1,5 @@
-//! The network that a process joins: a built-in configuration and the settings of a site.
+//! The Zenoh configuration of a process: its role's built-in JSON5 with the site's vehicle name, addresses and keys filled in;
+//! access rules, key files and ports checked.
 //!
 //! The JSON5 file of a role configures how its processes connect; the vehicle's name, addresses and keys
 //! differ from site to site and are filled in here, so that no site needs files of its own.

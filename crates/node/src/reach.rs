@@ -1,4 +1,6 @@
-//! Why nobody answers a tool: Zenoh tries an address again for ever without a word, and a relay says nothing to whom it shuts out.
+//! Explains to a tool why it sees no process of the vehicle, by TCP and TLS connections of its own: a name or address unknown,
+//! nobody listening, its key refused. Zenoh tries an address again for ever without a word, and a relay says nothing to whom it
+//! shuts out.
 
 use std::io;
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};

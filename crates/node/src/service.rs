@@ -1,4 +1,5 @@
-//! A service from start to shutdown.
+//! Runs a service from its start (logging, session, presence) to an orderly shutdown on a signal, with its health report
+//! each second.
 
 use std::future::Future;
 use std::io::IsTerminal;

@@ -1,4 +1,5 @@
-//! A service on the network: its session, its unique name, its presence and that of others.
+//! A process on Zenoh's network: opens the session, claims a unique name, declares its presence, or that of services whose recording
+//! is played, and follows that of others.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};

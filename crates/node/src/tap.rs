@@ -1,4 +1,5 @@
-//! Messages of many topics as they came, for who keeps them all.
+//! Receives every message of many topics as bytes, for a recorder, in one queue of bounded size, and counts by key
+//! what did not fit.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};

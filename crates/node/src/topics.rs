@@ -1,4 +1,5 @@
-//! Typed publishers, subscribers and commands: the topic table on the network.
+//! Typed publishers, subscribers with a ring as mailbox, last values for late subscribers, and commands with their replies
+//! and deadlines, on the keys of the topic table.
 //!
 //! Every mailbox is a ring: a slow reader loses the oldest messages, and never blocks a publisher.
 //!

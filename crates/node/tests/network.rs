@@ -1,4 +1,5 @@
-//! Sessions with the local configuration, on a port of the test's own.
+//! Zenoh sessions with the local configuration on a free port: frames in shared memory, unique names, presence, last values, commands
+//! answered, late or refused.
 
 use std::time::Duration;
 

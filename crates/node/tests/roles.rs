@@ -1,4 +1,5 @@
-//! Two hosts: the processes on the drone, its relay, and the ground.
+//! Zenoh sessions of drone and ground through one relay or two, with the configuration of each role: who
+//! receives from whom, and what an operator who cannot connect reads.
 
 mod common;
 

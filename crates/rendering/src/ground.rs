@@ -1,4 +1,5 @@
-//! Textures of the ground, which repeat, each with its own period and resolution.
+//! Generates the textures of the ground (asphalt, grass, tiles, plain) from a seed: mipmapped grain and patches
+//! metres wide, and their reflectance along a row of pixels.
 //!
 //! Coarse and fine grain are tiles of 8-bit texels with mipmaps. Patches metres across hide the repetition from
 //! heights at which a tile's period fits into the image.

@@ -1,5 +1,4 @@
-//! What a camera does to light before anybody sees a frame: lens, colour mosaic, denoising, tone curve,
-//! sharpening, compression.
+//! What a camera does to a rendered frame, stage by stage: lens, colour mosaic, denoising, tone curve, sharpening, JPEG, H.264.
 //!
 //! The stages are those of an ordinary camera, in its order: `lens` and `unsteady` (on the light behind the
 //! Gaussian blur that the renderer draws with), vignetting, exposure and noise (the sensor's), then `mosaic` (colour filters, interpolation), `denoise`, `local_tone`, `tone` (from

@@ -1,4 +1,5 @@
-//! Renders a scene as the camera on a vehicle sees it.
+//! Renders a frame of a scene (ground, pads, painted marks) as the camera on a vehicle sees it at its poses during the exposure,
+//! one row of tiles after the other.
 //!
 //! Projection is exact. Markers are averaged over each pixel's area, the lens blur and the exposure; the
 //! ground is a texture sampled at the size of a pixel. A frame depends on the seed, its index and the poses

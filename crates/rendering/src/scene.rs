@@ -1,4 +1,5 @@
-//! What is rendered: the scene and the camera.
+//! What is rendered: light, ground, pads (drawing, pose, paper) and painted marks; and the camera's model, mount,
+//! exposure, gain, noise, blur and processing.
 
 use geometry::{Body, Camera, CameraModel, Marker as MarkerFrame, Ned, Point, Rotation, Transform};
 use markers::{Drawing, Marker};

@@ -1,4 +1,5 @@
-//! The camera against geometry, brute force and statistics.
+//! The renderer against ray casting, the projection of the camera model and the statistics of noise: pixels,
+//! seams, lenses, rolling shutter, occluders, any pose and size.
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,

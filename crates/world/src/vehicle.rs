@@ -1,4 +1,5 @@
-//! The vehicle: a multirotor with its attitude loops, the air around it and the ground under it.
+//! The simulated multirotor: lags of attitude and thrust, drag in the wind, ground effect, and its contact
+//! with ground or pad; the autopilot's demand in, the true motion out.
 //!
 //! Above the attitude loops everything is the autopilot's; below them the measured response of the real
 //! vehicle is kept as lags. The thrust points where the body points, so the vehicle tilts exactly as much as

@@ -1,4 +1,5 @@
-//! The simulated autopilot against what was measured of the real one, row by row.
+//! The simulated autopilot against what was measured of ArduPilot Copter 4.5.4: intervals, acknowledgements,
+//! arming, modes, take-off, velocity setpoints, landings and their times.
 
 #![allow(clippy::unwrap_used, reason = "a test says where it fails")]
 #![allow(deprecated, reason = "what real programs send is tested, superseded or not")]

@@ -1,4 +1,5 @@
-//! The project's own client flies the simulated autopilot, packet by packet.
+//! The client of the crate `autopilot` against the simulated autopilot, packet by packet: finds it, takes
+//! off, flies by setpoints and lands; clocks, and PX4's commands and events.
 
 #![allow(
     clippy::unwrap_used,

@@ -1,5 +1,5 @@
-//! The specification of a rendered frame (scene, camera, pose, occlusion), its ground truth, and its
-//! rendering.
+//! One frame of the marker experiment: marker or clutter, camera and path of poses, surface, light, occluder, print and binning;
+//! rendered to pixels, with centre, corners and pose as truth.
 
 use std::collections::HashMap;
 use std::sync::Arc;

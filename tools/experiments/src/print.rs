@@ -1,4 +1,5 @@
-//! Prints that are not sharp and flat: of few dots, or out of their plane.
+//! Prints that are not sharp or not flat: a marker's drawing made of dots, or cut into flat pieces of a bent, folded or wavy
+//! sheet.
 
 use geometry::{Marker as MarkerFrame, Point, Rotation, Transform};
 use markers::{Drawing, Ink, Layer, Shape};

@@ -1,6 +1,7 @@
-//! The folder with the results of landings or faults. It is claimed before the first flight: hours of flying are neither lost to
-//! a folder that cannot be written, nor mixed with the results of another run. What it has of an earlier run is kept until the
-//! first of the new results is written: there may be none.
+//! The output folder of an experiment with landings or faults: its report, tables, recordings and logs, written whole in the place of
+//! an earlier run's. It is claimed before the first flight: hours of flying are neither lost to a folder that cannot be written, nor
+//! mixed with the results of another run. What it has of an earlier run is kept until the first of the new results is written: there
+//! may be none.
 
 use std::collections::BTreeSet;
 use std::fs::DirEntry;

@@ -1,4 +1,5 @@
-//! Flights with faults: repeatable to the bit, and each kind does what it says.
+//! Flights of the campaign with faults, in lock-step: the same to the bit for a seed, slow touchdowns
+//! whatever the kind, and a landing once a fault is over.
 
 use experiments::faults::flight::fly;
 use experiments::faults::kind::Kind;

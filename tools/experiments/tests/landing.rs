@@ -1,5 +1,5 @@
-//! Landings in lock-step: repeatable to the bit, alike with rendered and with modelled vision, and safe
-//! whatever goes wrong.
+//! Flights of the landing experiment in lock-step: the same to the bit for a seed, with modelled vision as with
+//! rendered frames, and no unsafe touchdown under any named fault.
 
 use std::fs::File;
 use std::io::BufWriter;

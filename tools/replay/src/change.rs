@@ -1,4 +1,5 @@
-//! What another configuration would have decided on the same events.
+//! The phases and setpoints that another configuration of the controller would have decided on a tape's events,
+//! and how far they are from the recorded ones.
 //!
 //! The vehicle flies as it flew: the events after a decision are those of the flight that was recorded.
 

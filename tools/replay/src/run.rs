@@ -1,4 +1,5 @@
-//! Gives a tape to a flight that begins anew.
+//! Replays a tape: a new flight with the recorded configuration, or some settings over it, handles each recorded
+//! event, and what comes out is handed on.
 
 use std::fmt;
 use std::ops::ControlFlow;

@@ -1,4 +1,5 @@
-//! Recorded frames, searched again: the same when nothing is changed, and told when something is.
+//! The second search of a recording's frames, on pictures drawn here: the same detections for the same search, what
+//! another detector does not find, compressed and missing pictures.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 

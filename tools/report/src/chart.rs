@@ -1,4 +1,5 @@
-//! A chart as SVG, in colours that the page's style changes for dark and light.
+//! Draws a chart as SVG: layers of lines, steps and dots with axes, and bands for phases, in inks that the page's style changes for dark
+//! and light.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;

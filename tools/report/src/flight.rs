@@ -1,4 +1,5 @@
-//! A flight as its recording has it.
+//! Reads a recording for the report: statuses, targets, vehicle states, truth, detections, frames, light, health, settings, packets and
+//! tapes of a flight, each with its time.
 
 use std::collections::BTreeMap;
 use std::ops::Range;

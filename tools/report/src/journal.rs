@@ -1,4 +1,5 @@
-//! What was said during a flight, with reasons, in order.
+//! The log of the report, in order of time: phases with reasons, commands, detector changes, the autopilot's texts,
+//! warnings, failures and changed settings.
 
 use std::collections::BTreeSet;
 

@@ -1,4 +1,4 @@
-//! What the autopilot's packets say beside the vehicle's state: parameters, battery, texts.
+//! Collects from the recorded packets of the autopilot its parameters, battery, texts and arrival times.
 
 use std::collections::BTreeMap;
 

@@ -1,4 +1,5 @@
-//! The page: one file of HTML that needs nothing else.
+//! The report as one file of HTML that needs nothing else: title and outcome, numbers, sections; of one
+//! flight, or of two side by side with what they differ in.
 
 use std::fmt::Write as _;
 

@@ -1,4 +1,6 @@
-//! The charts of a flight. Those of two flights are the same, one by one, so that their axes can be shared.
+//! The charts of the report, over time or from above: path over the pad, height, velocity against setpoints, frames by
+//! fate, light, latency, wind, battery, and the thesis' figures. Those of two flights are the same, one by one, so that
+//! their axes can be shared.
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;

@@ -1,4 +1,5 @@
-//! The sections of the page: what each says of a flight, and what was not recorded.
+//! The sections of the report, from landing, phases and height to losses, wind and log: the charts and tables of each for
+//! one flight, or why it was not recorded.
 
 use std::collections::{BTreeMap, BTreeSet};
 

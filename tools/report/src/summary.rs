@@ -1,4 +1,5 @@
-//! A flight in numbers, and in one line.
+//! Computes a flight's summary for the report: how it ended, touchdown error and speed, times, frames used
+//! and refused, losses, wind, battery, latency; and one line of it.
 
 use messages::{LandedState, Phase, Touchdown, topic};
 use node::stats::quantile;

@@ -1,4 +1,5 @@
-//! A flight with what is computed from it for the page.
+//! A flight with what the report computes from it: frames, track, setpoints, phases as bands, and curves over
+//! time with gaps.
 
 use std::ops::Range;
 

@@ -1,4 +1,5 @@
-//! Pages of recordings of flights in lock-step: whole, damaged, without a tape, and of two side by side.
+//! The report's page, document and numbers of recordings flown in lock-step: all sections, topics left out,
+//! damaged files, several landings, other versions and clocks, two flights side by side.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 

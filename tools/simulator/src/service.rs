@@ -1,4 +1,5 @@
-//! The service: a simulation in real time, its autopilot on a MAVLink link, its camera on the topics.
+//! The simulator's service: steps the world in real time, or follows a real autopilot's vehicle, exchanges MAVLink packets, renders the
+//! camera's frames, and publishes them with the truth.
 //!
 //! The simulation advances on a task of its own. The camera renders on a thread of its own, named `camera`,
 //! from the recent history of the simulation, so that neither blocks the other for longer than it takes to

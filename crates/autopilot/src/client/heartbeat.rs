@@ -1,4 +1,5 @@
-//! The heartbeat: which vehicle it is, its mode and its motors.
+//! The client's part for HEARTBEAT and PX4's CURRENT_MODE: finds the vehicle and its firmware, and follows its flight mode, motors
+//! and contact with the ground.
 
 use super::{Autopilot, Vehicle};
 use crate::boot::BootClock;

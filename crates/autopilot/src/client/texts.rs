@@ -1,4 +1,4 @@
-//! What the autopilot says in texts, and PX4 in events.
+//! The client's part for STATUSTEXT and PX4's EVENT: reports texts as events, and explains a refusal to arm by the checks that fail.
 
 use super::Autopilot;
 use crate::command::{Command, CommandError};

@@ -1,4 +1,5 @@
-//! What the camera sees of the pad, by all that is unknown.
+//! Predicts where the camera sees the pad, from the vehicle's motion and all unknowns (mount, focal length, time offset, drift),
+//! linearised for each marker.
 
 use geometry::{
     Body, Camera, CameraModel, Distortion, Ned, Pixel, Point, Rotation, Transform, Vector,

@@ -1,4 +1,5 @@
-//! What is estimated of a camera.
+//! The quantities that a flight gives of a camera (time offset, roll, pitch and yaw of the mount, focal length, k1), and the
+//! deviation up to which each counts.
 
 /// Where the quantities are among the parameters.
 pub(super) const OFFSET: usize = 0;

@@ -1,4 +1,5 @@
-//! Quads, the candidates for square markers, from closed outlines.
+//! Finds quads, the candidates for square markers, in closed outlines: four corners between straight sides; their lengths, area, middle
+//! and pyramid level.
 
 use geometry::Pixel;
 use imaging::Outline;

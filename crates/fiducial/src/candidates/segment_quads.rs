@@ -1,4 +1,5 @@
-//! Quads from edge segments, for markers whose outline is not closed.
+//! Joins straight edge segments into quads where the outline of a square marker is broken by shadow, glare, an object or the frame,
+//! with hidden corners and sides added.
 //!
 //! The edge of a shadow, glare or an object in front interrupts the outline of a marker, and the frame cuts
 //! it. Its sides are still straight, dark on the inside, and meet at corners. So sides are joined across

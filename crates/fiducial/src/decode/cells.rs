@@ -1,4 +1,5 @@
-//! Reads the cells of a quad.
+//! Solves for the bits of a square marker from all pixels of a quad together, by least squares through the blur, and for how well a
+//! codeword explains them.
 //!
 //! Where cells are hardly wider than a pixel, a pixel shows several of them. So all cells are solved for
 //! together: a pixel is the sum of the cells' values, weighted by their shares of it through the blur. Border

@@ -1,4 +1,5 @@
-//! Reads markers of which a part is in shadow, washed out, covered or outside of the image.
+//! Reads a square marker with hidden parts: each sampled cell is black, white or an erasure by the light on border and quiet
+//! zone, and the codeword is matched by the rest.
 //!
 //! Border and quiet zone determine the illumination. Cells that are neither black nor white by it are
 //! erasures, as are those beside a border cell of the wrong colour. The codeword is matched by the other

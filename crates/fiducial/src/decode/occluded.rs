@@ -1,4 +1,5 @@
-//! Markers that are partly in shadow, washed out, covered or beyond the frame, among quads of edge segments.
+//! Searches quads of edge segments for markers partly in shadow, washed out, covered or beyond the frame, and
+//! keeps the best reading of each place.
 
 use imaging::GrayView;
 use markers::SquareCode;

@@ -1,4 +1,5 @@
-//! Reads the dots of an STag.
+//! Solves for the 48 dots of an STag from all pixels of a quad together, by least squares through the blur, and for how well a
+//! codeword explains them.
 //!
 //! Where a dot is hardly wider than a pixel, a pixel shows several of them. So all dots are solved for
 //! together: a pixel is the sum of the dots' values, weighted by their shares of it through the blur. All

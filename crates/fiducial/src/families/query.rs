@@ -1,4 +1,5 @@
-//! What every family of square markers is asked for, and what it answers.
+//! Which ids of a family of square markers are looked for and still missing, the image and the expected marker to search,
+//! and how a decoded quad becomes an observation.
 
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Pyramid};

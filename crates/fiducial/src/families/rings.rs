@@ -1,4 +1,5 @@
-//! The detector of the three-ring marker.
+//! The detector of the three-ring marker: candidate ellipses, their radial profile, a pose by edges or by grey values, and the
+//! checks that it is one, pass by pass.
 //!
 //! Ellipses among the outlines of dark regions ([`imaging::Outlines`], no threshold needed), complete or in
 //! arcs, may be any of the marker's circles. The radial profile around an ellipse decides: a single ring is

@@ -1,4 +1,5 @@
-//! The thesis' detector of the three-ring marker: section 3.1, Algorithms 1 to 15, to the letter.
+//! The thesis' detector of the three-ring marker to the letter (section 3.1, Algorithms 1 to 15): bilateral
+//! filter, threshold, contours, valid ellipses, rings of equal orientation.
 //!
 //! Kept as a baseline. Its weakness is [`two_have_equal_orientation`]: seen head-on the ellipses are circles,
 //! whose orientation is noise. Choices that the thesis leaves open are documented where they are made.

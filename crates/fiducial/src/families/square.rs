@@ -1,4 +1,5 @@
-//! Square markers: AprilTag and ArUco families.
+//! The detector of AprilTag and ArUco markers: quads, their cells, the codeword with its false-positive rate, refined corners and pose;
+//! fallbacks for hidden, small and neighbouring ones.
 //!
 //! For each quad the cells are solved for, the codeword is matched, and its false-positive rate is weighed.
 //! Then the corners are refined and give the pose. Fallbacks read quads of segments, of which a part may be

@@ -1,5 +1,6 @@
-//! STag markers: a black square with a white disc in it, and 48 dots in the disc (Benligiray, Topal, Akinlar:
-//! "STag: A stable fiducial marker system", Image and Vision Computing 89, 2019).
+//! The detector of STags (a black square, a white disc in it, 48 dots in that): quads, their dots sampled or solved for, the codeword,
+//! the refined square and its pose. STags are those of Benligiray, Topal, Akinlar: "STag: A stable fiducial marker system", Image and
+//! Vision Computing 89, 2019.
 //!
 //! The dots of large and clearly visible quads are sampled one by one. Those of others are solved for
 //! together, and the codeword that explains the pixels best is taken. Fallbacks sample quads of segments,

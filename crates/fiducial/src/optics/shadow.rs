@@ -1,4 +1,5 @@
-//! The straight edge of a shadow, and an image without that shadow.
+//! Finds the straight edge of a shadow in an image by the same rise of the grey values' logarithm all along it, and makes the image without
+//! that shadow.
 //!
 //! Whatever lies on the ground, a shadow takes the same share of its light all along the edge (the shadows of intrinsic
 //! images: Barrow and Tenenbaum, 1978; Finlayson, Hordley, Lu and Drew, 2006). So the edge is a line along which the logarithm of

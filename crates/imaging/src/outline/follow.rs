@@ -1,4 +1,5 @@
-//! Following the outlines of one kind of region on one level.
+//! Follows the outlines of dark or of bright regions on one pyramid level, pixel edge by pixel edge from the top of each, within
+//! limits of size and contrast.
 
 use super::Settings;
 use crate::binary::{Binarizer, BitImage};

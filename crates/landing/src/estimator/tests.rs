@@ -1,4 +1,5 @@
-//! The estimator on a modelled flight.
+//! The estimator on a modelled descent with a noisy detector: innovations and errors against the covariance, late frames, outliers,
+//! moving pads, an autopilot whose position wanders or jumps.
 
 use super::*;
 use crate::event::{Landed, Mode, VehicleState};

@@ -1,4 +1,5 @@
-//! The interface of a guidance: its input, its progress and the trait.
+//! The trait of a guidance, with its input (vehicle, target and its age, limits, link delay) and its progress: may it
+//! descend, has it a target, which velocity and yaw rate.
 
 use geometry::{Ned, Vector};
 

@@ -1,4 +1,4 @@
-//! The thesis' guidance: a pixel PI controller (its section 3.2, Algorithms 16 to 18).
+//! The thesis' guidance: a PI controller from the marker's pixels and the altitude to a velocity, with wind noise (section 3.2, Algorithms 16 to 18).
 //!
 //! # Where the text leaves a choice, and which reading was taken
 //!

@@ -1,4 +1,5 @@
-//! A marker that is out of view, lost, or seen where it is not expected, and a pad that is to be remembered over a silence.
+//! What a lander does while the marker is out of view or lost: where a retry climbs to, and the pad's place to remember over a
+//! silence.
 
 use geometry::Vector;
 

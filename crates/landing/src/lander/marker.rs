@@ -1,4 +1,4 @@
-//! A marker in a frame: whether it is one of now, and used.
+//! How the lander takes the marker in a frame: its measurement fused into the target, or the reason for which it is rejected.
 
 use super::Lander;
 use crate::decision::Rejection;

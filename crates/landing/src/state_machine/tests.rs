@@ -1,4 +1,5 @@
-//! Single transitions, and all of them.
+//! The state machine step by step: starts refused, each phase's transitions and timeouts, the pilot, holds
+//! and aborts, alarms, LAND refused, touchdown.
 
 use super::*;
 

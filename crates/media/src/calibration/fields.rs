@@ -1,4 +1,5 @@
-//! The keys of the three formats, and the camera that their values describe.
+//! From the keys and values of a calibration file of ROS, Kalibr or OpenCV to a camera model and sensor mode, or the key
+//! that is wrong.
 
 use geometry::{CameraModel, Distortion};
 use serde_yaml_ng::Value;

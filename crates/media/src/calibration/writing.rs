@@ -1,4 +1,5 @@
-//! Writes calibration files as other programs read them.
+//! Writes a camera model as a calibration file of ROS, Kalibr or OpenCV (YAML, XML or JSON), with its mode on the sensor and
+//! a note of how it was calibrated.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,5 @@
-//! What H.264 loses on the way from a camera that streams.
+//! What H.264 loses of rendered frames: each macroblock predicted with a motion vector or from its neighbours, its residual transformed and
+//! quantised, the edges deblocked.
 //!
 //! A picture is predicted from the one before, macroblock by macroblock with a motion vector of its own, and of the residual only what is
 //! larger than the quantiser's step is sent. So parts of a picture stay as they were, move with their surroundings, or are drawn anew,

@@ -1,4 +1,5 @@
-//! From pixels to directions, and the blur of the lens and of a pixel's area.
+//! The direction of each pixel for the renderer, exact or from a table for a distorting lens, linear about a
+//! tile; and the blur of lens and pixel area.
 
 use geometry::{CameraModel, Distortion, Pixel};
 

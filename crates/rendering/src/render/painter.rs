@@ -1,4 +1,5 @@
-//! Paints the tiles that contain edges: subsamples, weighted with the blur.
+//! Paints the image tiles through which edges of a marker go: coverage of subsamples by its outlines, moved over the exposure and
+//! weighted with lens blur and pixel area.
 
 use super::exposure::GROUP;
 use super::lens::{Blur, Lens, Linear, PROFILE_WIDTH};

@@ -1,4 +1,5 @@
-//! Planar vector drawings in the scene, and what a tile of pixels shows of them: one paint, or edges.
+//! A drawing of shapes on a plane in the scene, as the camera of one instant sees it, and what a tile of
+//! pixels shows of it: one paint, or edges.
 
 use geometry::{Camera, CameraModel, Distortion, Marker, Ned, Point, Transform};
 

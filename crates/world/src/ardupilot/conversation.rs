@@ -1,4 +1,5 @@
-//! The autopilot's reactions to received packets.
+//! The simulated autopilot's handling of received MAVLink packets: commands and their acknowledgements, modes,
+//! arming, intervals, parameters, setpoints, landing targets.
 
 use autopilot::dialect::{
     LANDING_TARGET_DATA, MavCmd, MavFrame, MavMessage, MavModeFlag, MavResult, MavSeverity,

@@ -1,4 +1,5 @@
-//! The autopilot's state estimate: the truth with the errors of a state estimator.
+//! The simulated autopilot's estimate of the motion: the truth with slow errors of position, height, velocity,
+//! tilt and heading, a wandering tilt, GNSS drift and jumps.
 
 use rand_chacha::ChaCha8Rng;
 

@@ -1,4 +1,5 @@
-//! The autopilot's decisions: modes, arming, takeoff, velocity setpoints, landing.
+//! The simulated autopilot's decisions: flight modes, arming and disarming, take-off, velocity setpoints and
+//! their timeout, LAND, contact with the ground.
 
 use rand_chacha::ChaCha8Rng;
 

@@ -1,5 +1,5 @@
-//! From a commanded motion to tilt, thrust and heading: ArduPilot's position controller (`AC_PosControl`)
-//! with its default gains.
+//! The simulated autopilot's position controller (ArduPilot's `AC_PosControl` with its default gains): from a
+//! commanded motion to tilt, thrust and heading.
 
 use std::f64::consts::TAU;
 

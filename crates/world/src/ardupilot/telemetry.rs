@@ -1,4 +1,5 @@
-//! The autopilot's telemetry: each message at the requested interval.
+//! The simulated autopilot's MAVLink messages (attitude, positions, battery, estimator status, true state), each composed when
+//! it is due at its requested interval.
 
 use autopilot::FlightMode;
 use autopilot::dialect::{

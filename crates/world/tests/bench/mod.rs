@@ -1,4 +1,5 @@
-//! A person at the link of the simulated autopilot: sends commands, reads what comes back.
+//! For the tests of `world`: a simulated autopilot and the other end of its link, at which commands are sent,
+//! time is let pass and the received messages are read.
 
 #![allow(dead_code, reason = "each test file uses its part of the bench")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test says where it fails")]

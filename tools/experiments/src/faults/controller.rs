@@ -1,4 +1,5 @@
-//! The controller's process: it lives, stands still or is dead, and what arrives for it waits or is lost.
+//! The controller's process in lock-step: it runs, is stopped or killed and started again, and the packets,
+//! detections and ticks for it wait or are lost meanwhile.
 
 use std::collections::VecDeque;
 

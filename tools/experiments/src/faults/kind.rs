@@ -1,4 +1,5 @@
-//! The kinds of faults: what dies, lies or falls silent.
+//! The kinds of faults of a campaign, by name: processes killed or stopped, links that delay or damage, false
+//! messages of autopilots, detectors and cameras, no memory or disk left.
 
 use std::str::FromStr;
 

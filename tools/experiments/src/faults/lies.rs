@@ -1,4 +1,5 @@
-//! What a lying autopilot says: its own packets, changed.
+//! Falsifies a simulated autopilot's packets: position, attitude, mode, contact with the ground, or time,
+//! changed or kept back while a fault of that kind lasts.
 
 use autopilot::Packet;
 use autopilot::dialect::{LOCAL_POSITION_NED_DATA, MavLandedState, MavMessage, MavModeFlag};

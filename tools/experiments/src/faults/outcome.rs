@@ -1,4 +1,5 @@
-//! The result of a flight with faults, and the bar it is counted against.
+//! The result row of a flight with faults: its touches of the ground with their speeds, how it ended, and
+//! whether it was faster than the bar allows.
 
 use serde::Serialize;
 

@@ -1,4 +1,5 @@
-//! What is flown: each seed draws its faults, the height at which they begin, how long they last, and the wind.
+//! Plans a campaign of flights with faults: each seed draws one fault or two, the height at which they begin, how
+//! long they last, and the wind.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,5 @@
-//! The files of a campaign: every flight as CSV and JSON lines, and the table of the worst touchdowns.
+//! Writes the files of a campaign with faults: every flight as CSV and JSON lines, the worst touchdowns by kind of fault, unsafe
+//! flights with the command that repeats each.
 
 use std::fmt::Write as _;
 

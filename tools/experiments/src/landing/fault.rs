@@ -1,4 +1,5 @@
-//! Faults and other named circumstances of a flight.
+//! The named circumstances of the landing experiment (lost frames, latency, stamps, GNSS, mount, gusts, occluders, moving
+//! pads), as settings of simulator, controller and modelled detector.
 
 use std::f64::consts::TAU;
 use std::str::FromStr;

@@ -1,4 +1,5 @@
-//! The result of a flight.
+//! The result row of a flight of the landing experiment: how it ended, times, touchdown error and speeds, and whether that
+//! was unsafe.
 
 use messages::Touchdown;
 use serde::Serialize;

@@ -1,4 +1,5 @@
-//! The flights: every combination of the listed values, with several seeds each.
+//! Plans the flights of the landing experiment: every combination of wind, turbulence, latency, height, offset
+//! and fault, with several seeds each, as settings of simulator and controller.
 
 use std::borrow::Cow;
 use std::ops::RangeInclusive;

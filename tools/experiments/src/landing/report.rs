@@ -1,5 +1,5 @@
-//! The files of results: every flight as CSV and JSON lines, plots, the thesis' figures of one flight, and
-//! the report.
+//! Writes the files of the landing experiment: every flight as CSV and JSON lines, plots, the thesis' figures of one
+//! flight, recordings of the worst flights flown again, and the report.
 
 use std::fmt::Write as _;
 use std::fs::File;

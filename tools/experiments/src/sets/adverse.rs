@@ -1,4 +1,5 @@
-//! Adverse conditions in which people see the marker at once.
+//! Frames of markers under one adverse condition each: shadow, glare, occlusion, haze, noise, defocus,
+//! inverted colours, cut by the frame.
 
 use std::f64::consts::{FRAC_PI_4, TAU};
 

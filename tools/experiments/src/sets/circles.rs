@@ -1,4 +1,5 @@
-//! Circles that people make: what a ring marker may be taken for. No marker of ours is among them.
+//! Frames without a marker, of circles that people make: manholes, washers, wheels, helipads, traffic signs,
+//! archery targets, discs. No marker of ours is among them.
 
 use std::f64::consts::TAU;
 

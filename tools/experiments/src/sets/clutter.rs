@@ -1,4 +1,5 @@
-//! Scenes without a marker, with shapes that resemble one.
+//! Frames without a marker, of shapes like one: squares, circles, nested rings, black frames, text,
+//! checkerboards and random grids.
 
 use std::f64::consts::TAU;
 

@@ -1,5 +1,5 @@
-//! Ground, print and lens as they are outdoors: what lies on the marker, how it is printed, what the light does, what is
-//! on the lens. At least half of the marker is plain to see.
+//! Frames of markers outdoors: grass, dirt, snow, rope or a hand on them, wet, faded, dotted or bent prints, low sun,
+//! night, and things on the lens. At least half of the marker is plain to see.
 
 use std::f64::consts::TAU;
 

@@ -1,4 +1,5 @@
-//! Sweeps of one parameter.
+//! Frames in which one parameter grows step by step: tilt, motion blur, noise, light, or the motion under a
+//! rolling shutter.
 
 use std::f64::consts::TAU;
 

@@ -1,4 +1,5 @@
-//! The marker as a landing sees it.
+//! Frames of a marker as a landing sees it: the thesis' positions, far off, on the way down, on textured
+//! ground, and in sequences for tracking.
 
 use std::f64::consts::{PI, TAU};
 

@@ -1,4 +1,5 @@
-//! Pose of concentric circles: a first one from an ellipse, the best one from edge points.
+//! The pose of concentric circles: two in closed form from an ellipse, the best by least squares from edge points, with covariance,
+//! tilt and its mirrored twin.
 
 use std::f64::consts::{PI, TAU};
 use std::ops::AddAssign;

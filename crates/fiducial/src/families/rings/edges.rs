@@ -1,4 +1,5 @@
-//! The six edges of the marker, located where a pose predicts them.
+//! Locates the six edges of the three-ring marker in the image where a pose predicts them, and counts how much of each circle
+//! is visible, found or missed.
 
 use std::f64::consts::{PI, TAU};
 

@@ -1,4 +1,5 @@
-//! From one circle to the marker: its pose, and whether it is one.
+//! From a candidate circle to the three-ring marker or a refusal: its pose by edges or by grey values, the mirrored pose, covariance, and how it
+//! differs from targets and clutter.
 
 use markers::RingKind;
 use nalgebra::Matrix6;

@@ -1,4 +1,5 @@
-//! Pose of a marker from its grey values.
+//! Fits a small three-ring marker to its grey values: pose, blur, black and white, and where it helps motion blur, tone
+//! curve, sharpening or a colour mosaic.
 //!
 //! Where rings are a few pixels wide, the blur of one edge reaches the next, and edges located one by one
 //! come out too far apart. Here pose, blur and exposure are fitted together, to minimise the difference

@@ -1,4 +1,5 @@
-//! The metric guidance on modelled states.
+//! The metric guidance on modelled vehicle states: the observed velocity bias, the end of waiting, a retry, sinking onto the pad,
+//! gusts and wrong heights near the ground.
 
 use super::*;
 use crate::event::{Landed, Mode, VehicleState};

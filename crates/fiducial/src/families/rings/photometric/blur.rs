@@ -1,4 +1,5 @@
-//! What one pixel sees of the marker through the blur of the lens and of motion.
+//! The whiteness of one pixel of the three-ring marker through the blur of lens, motion and mosaic, from the distribution of
+//! radii about it, with derivatives.
 
 use nalgebra::Vector3;
 

@@ -1,4 +1,5 @@
-//! The pixels to which the model is fitted.
+//! Gathers the pixels in and around a three-ring marker, or along its edges, to which the photometric model is fitted, and
+//! the mosaics they may come from.
 
 use std::f64::consts::TAU;
 

@@ -1,4 +1,4 @@
-//! How well a fitted model explains the image.
+//! Scores a photometric fit of the three-ring marker: residual beside those of a plain disc, of rings of free grey values and of free radii.
 
 use nalgebra::{SMatrix, SVector};
 

@@ -1,4 +1,5 @@
-//! The model of a marker's image, and its fit to the samples.
+//! The model of a three-ring marker's grey values (pose, blur, exposure, camera response) and its least-squares fit to pixel
+//! samples.
 
 use nalgebra::{SMatrix, SVector};
 
