@@ -39,7 +39,7 @@
 //! `land_height_m`, and only from a vehicle that hardly moves sideways.
 
 use geometry::{Ned, Point, Vector, squared};
-use libm::{fmax, fmin, tan};
+use libm::{exp, fmax, fmin, tan};
 
 use crate::config::MetricConfig;
 use crate::decision::{Reason, TargetEstimate};
@@ -83,6 +83,10 @@ const TOUCHDOWN_PER_HEIGHT: f64 = 0.4;
 const TOUCHDOWN_WAIT_S: f64 = 1.0;
 const TOUCHDOWN_PATIENCE_M_S2: f64 = 0.1;
 const MAX_TOUCHDOWN_M_S: f64 = 0.3;
+
+/// Share of a gust that is expected to end before the touchdown. Of 3000 modelled flights with one gust of 5 m/s (seeds from 880001, up to 8 m/s of
+/// wind), 16 touch faster than 0.3 m/s sideways without it, 2 to 4 with 0.35 to 1, all in the same time.
+const GUST_SHARE: f64 = 0.6;
 
 /// Minimum descent speed at touchdown on a heaving pad, in m/s.
 const MIN_TOUCHDOWN_M_S: f64 = 0.3;
@@ -412,7 +416,24 @@ impl Metric {
             + TOUCHDOWN_PER_HEIGHT * height_m
             + TOUCHDOWN_PATIENCE_M_S2 * fmax(self.waited_s(situation) - TOUCHDOWN_WAIT_S, 0.0);
         let share = fmax(gentleness(extra_delay_s(situation)), MIN_TOUCHDOWN_SHARE);
-        self.closing(situation, target).norm() / (fmin(max_m_s, MAX_TOUCHDOWN_M_S) * share)
+        self.touchdown_velocity(situation, target).norm()
+            / (fmin(max_m_s, MAX_TOUCHDOWN_M_S) * share)
+    }
+
+    /// The horizontal velocity over the pad with which the vehicle touches the ground, in m/s, should a gust end on the way: a vehicle leans
+    /// against wind by following a path that is faster than the vehicle itself, and gets up to the path's speed once the wind is gone.
+    fn touchdown_velocity(
+        &self,
+        situation: &Situation<'_>,
+        target: &TargetEstimate,
+    ) -> Vector<Ned> {
+        let closing = self.closing(situation, target);
+        let Some(observer) = self.observer else { return closing };
+        let leaning = horizontal(observer.path.velocity() - situation.vehicle.velocity);
+        let descent_m_s = fmax(sinking_m_s(situation, target), self.config.touchdown_descend_m_s);
+        let until_touch_s = fmax(self.height_m(target), 0.0) / descent_m_s;
+        let gained = 1.0 - exp(-until_touch_s / time_constant_s(&situation.limits));
+        closing + leaning * (GUST_SHARE * gained)
     }
 
     /// Notes since when the vehicle is low, since when it stands still although commanded down, and whether it is bound to

@@ -349,3 +349,24 @@ fn a_gust_that_lifts_a_vehicle_near_the_ground_leaves_it_steered_and_free_to_cli
         }
     }
 }
+
+#[test]
+fn what_leans_against_a_gust_waits_above_the_ground_and_touches_down_where_it_is_about_to() {
+    let descent = |path_m_s: f64, height_m: f64| {
+        let vehicle = sinking(0.0, 0.0, height_m, 0.3);
+        let situation = situation(&vehicle);
+        let mut metric = Metric::new(MetricConfig::default());
+        let mut observer = Observer::new(&situation);
+        // Faster than the vehicle, which stands still over the pad.
+        observer.path = Path::new(Vector::new(path_m_s, 0.0, 0.0));
+        metric.observer = Some(observer);
+        metric.descent(&situation, &situation.target.unwrap())
+    };
+    for (path_m_s, height_m, descends) in
+        [(0.0, 0.3, true), (0.2, 0.3, true), (0.8, 0.3, false), (0.8, 0.05, true)]
+    {
+        let (descent_m_s, why) = descent(path_m_s, height_m);
+        assert_eq!(descent_m_s > 0.1, descends, "{path_m_s} m/s, {height_m} m: {descent_m_s} m/s");
+        assert_eq!(why == Reason::Settling, !descends, "{path_m_s} m/s, {height_m} m: {why:?}");
+    }
+}
