@@ -1,10 +1,10 @@
 //! The list of source files in ARCHITECTURE.md: each with the first sentence of its own documentation and what it defines.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// Maximum number of names that are listed of a file.
-const MAX_NAMES: usize = 16;
+const MAX_NAMES: usize = 24;
 /// Folders of a room, in the order of the list. The package `tests` is a room that is one folder.
 const FOLDERS: [&str; 4] = ["src", "tests", "examples", "benches"];
 
@@ -45,36 +45,46 @@ fn place(file: &str) -> Option<(&str, usize, &str)> {
     })
 }
 
-/// What a file defines, but for its tests: types, then functions, in their order; the first of them.
+/// What a file defines, but for its tests: types, functions, methods that are no trait's, then constants; the first of them.
 fn names(text: &str) -> String {
     let before_tests = text.split("\nmod tests {").next().unwrap_or_default();
-    let mut is_test = false;
-    let helpers = before_tests.lines().filter(|line| {
+    let (mut is_test, mut of_trait) = (false, false);
+    let (mut types, mut functions, mut methods, mut constants) = (vec![], vec![], vec![], vec![]);
+    for line in before_tests.lines() {
         let was_test = is_test;
         is_test = line.starts_with("#[test]")
             || line.starts_with("#[tokio::test")
             || (is_test && line.starts_with("#["));
-        !was_test
-    });
-    let helpers: Vec<&str> = helpers.collect();
-    let defines = |keywords: &[&str]| -> Vec<String> {
-        let name_of = |line: &str| {
-            let line = line.strip_prefix("pub(crate) ").unwrap_or(line);
-            let line = line.strip_prefix("pub(super) ").unwrap_or(line);
-            let line = line.strip_prefix("pub ").unwrap_or(line);
-            let line =
-                line.strip_prefix("const fn ").map_or(line.to_owned(), |it| format!("fn {it}"));
-            let line = line.strip_prefix("async ").unwrap_or(&line);
-            let rest = keywords.iter().find_map(|keyword| line.strip_prefix(keyword))?;
-            let end = rest.find(|c: char| !c.is_alphanumeric() && c != '_')?;
-            Some(format!("`{}`", &rest[..end]))
-        };
-        helpers.iter().copied().filter_map(name_of).collect()
-    };
-    let mut names = defines(&["struct ", "enum ", "trait ", "union "]);
-    names.extend(defines(&["fn "]));
-    names.truncate(MAX_NAMES);
+        if line.starts_with("impl") {
+            of_trait = line.contains(" for ");
+        }
+        if let Some(inner) = line.strip_prefix("    ") {
+            methods.extend(defined(inner, &["fn "]).filter(|name| !of_trait && *name != "new"));
+        } else if !was_test {
+            types.extend(defined(line, &["struct ", "enum ", "trait ", "union ", "type "]));
+            functions.extend(defined(line, &["fn ", "macro_rules! "]));
+            constants.extend(defined(line, &["const ", "static "]));
+        }
+    }
+    let mut seen = BTreeSet::new();
+    let names = [types, functions, methods, constants].into_iter().flatten();
+    let names = names.filter(|name| seen.insert(*name));
+    let names: Vec<String> = names.take(MAX_NAMES).map(|name| format!("`{name}`")).collect();
     if names.is_empty() { String::new() } else { format!(" ({})", names.join(", ")) }
+}
+
+/// What a line defines with one of these keywords, public or not.
+fn defined<'a>(line: &'a str, keywords: &[&str]) -> Option<&'a str> {
+    let line = ["pub(crate) ", "pub(super) ", "pub "]
+        .iter()
+        .find_map(|public| line.strip_prefix(public))
+        .unwrap_or(line);
+    let is_function = line.starts_with("const fn ");
+    let line = if is_function { &line["const ".len()..] } else { line };
+    let line = line.strip_prefix("async ").unwrap_or(line);
+    let rest = keywords.iter().find_map(|keyword| line.strip_prefix(keyword))?;
+    let end = rest.find(|c: char| !c.is_alphanumeric() && c != '_')?;
+    Some(&rest[..end]).filter(|name| !name.is_empty() && *name != "_")
 }
 
 /// A module stands before those of its folder, and a library before its modules.
