@@ -416,24 +416,21 @@ impl Metric {
             + TOUCHDOWN_PER_HEIGHT * height_m
             + TOUCHDOWN_PATIENCE_M_S2 * fmax(self.waited_s(situation) - TOUCHDOWN_WAIT_S, 0.0);
         let share = fmax(gentleness(extra_delay_s(situation)), MIN_TOUCHDOWN_SHARE);
-        self.touchdown_velocity(situation, target).norm()
-            / (fmin(max_m_s, MAX_TOUCHDOWN_M_S) * share)
+        self.touchdown_slide_m_s(situation, target) / (fmin(max_m_s, MAX_TOUCHDOWN_M_S) * share)
     }
 
-    /// The horizontal velocity over the pad with which the vehicle touches the ground, in m/s, should a gust end on the way: a vehicle leans
-    /// against wind by following a path that is faster than the vehicle itself, and gets up to the path's speed once the wind is gone.
-    fn touchdown_velocity(
-        &self,
-        situation: &Situation<'_>,
-        target: &TargetEstimate,
-    ) -> Vector<Ned> {
+    /// The horizontal speed over the pad with which the vehicle touches the ground, in m/s: that of now or, should a gust end on the way, that
+    /// of then. A vehicle leans against wind by following a path that is faster than the vehicle itself, and gets up to the path's speed once
+    /// the wind is gone.
+    fn touchdown_slide_m_s(&self, situation: &Situation<'_>, target: &TargetEstimate) -> f64 {
         let closing = self.closing(situation, target);
-        let Some(observer) = self.observer else { return closing };
-        let leaning = horizontal(observer.path.velocity() - situation.vehicle.velocity);
+        let leaning = self.observer.map_or(Vector::zero(), |observer| {
+            horizontal(observer.path.velocity() - situation.vehicle.velocity)
+        });
         let descent_m_s = fmax(sinking_m_s(situation, target), self.config.touchdown_descend_m_s);
         let until_touch_s = fmax(self.height_m(target), 0.0) / descent_m_s;
         let gained = 1.0 - exp(-until_touch_s / time_constant_s(&situation.limits));
-        closing + leaning * (GUST_SHARE * gained)
+        fmax(closing.norm(), (closing + leaning * (GUST_SHARE * gained)).norm())
     }
 
     /// Notes since when the vehicle is low, since when it stands still although commanded down, and whether it is bound to
