@@ -1,5 +1,5 @@
-//! Checks ARCHITECTURE.md against the tree: dependencies of the rooms, paths and names, topics, list of files; and
-//! rules of the code, as what algorithms leave out and how long files are.
+//! Checks the documents against the tree (paths, names, topics, list of files), and the tree against rules: which
+//! crate may need which, what algorithms do without, how long files are.
 
 #[path = "architecture/circles.rs"]
 mod circles;

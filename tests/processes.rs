@@ -1,7 +1,8 @@
-//! `alight land` as processes: landings beside other programs, controllers and detectors killed in flight, aborts, two
-//! landings at once, ports that are taken, wrong settings.
+//! `alight land` as processes: landings beside other programs, controllers, detectors and the landing itself killed in
+//! flight, aborts, two landings at once, ports that are taken, wrong settings.
 //!
-//! Each test flies `alight land` in real time, beside one other at most, and joins its network as one more process.
+//! A test that flies waits until the machine has time for it, flies `alight land` in real time, and joins its network
+//! as one more process.
 
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};

@@ -1,8 +1,7 @@
-//! `alight doctor`: checks this machine, its site, devices, the services on the network with their clocks and links, and serial
-//! ports; prints a verdict, a finding and a remedy for each.
+//! `alight doctor`: checks this machine, its site with keys and devices, the services on the network with their clocks and links,
+//! serial ports and ports it connects to; prints verdict, finding and remedy.
 //!
-//! First the machine, the site, its keys and devices; then the network: services, `cameras`, clocks, links; then the serial ports,
-//! which controllers hold that run.
+//! Serial ports come after the network, as controllers that run hold them.
 
 mod cameras;
 mod focus;

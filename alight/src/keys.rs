@@ -1,5 +1,5 @@
 //! `alight keys`: makes a development certificate authority, issues and revokes a certificate and private key for each role,
-//! and keeps the list of holders.
+//! keeps the list of holders, and makes passphrases for signed MAVLink packets.
 //!
 //! The common name of a certificate is its role with its vehicle, and of a detector its name
 //! (`crates/node/src/access.rs`); `zenoh-config/secured.json5` has the rights of each role. The list of holders

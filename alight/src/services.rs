@@ -1,4 +1,4 @@
-//! The services by name, from camera-pub to the dashboard: the effective configuration of each, and running one in
+//! The services by name, from camera-pub to the simulator: the effective configuration of each, and running one in
 //! this process until it is stopped.
 
 use std::future::Future;

@@ -1,5 +1,5 @@
 //! A site: one TOML file that lists the processes of every machine, read into jobs with program, settings, key and network, and
-//! checked, as for two detectors of one id.
+//! checked, so that no two detectors have one id.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -1,10 +1,9 @@
-//! `alight swap`: starts a new detector beside the one in use, compares the detections of both, has the controller change over in
-//! flight without a gap, and stops the old one.
+//! `alight swap`: starts a new detector beside the one in use, waits until by the controller's comparison both agree, has the
+//! controller change over in flight without a gap, and stops the old one.
 //!
-//! The new detector is started as a process that outlives this one. It runs in shadow until it agrees with
-//! the active one, becomes the active one, and only then the old one is stopped. On any failure before that,
-//! the old one stays in use, the operator's preference is what it was, and the new one is
-//! stopped, unless the old one has gone meanwhile and no other is left.
+//! The new detector is started as a process that outlives this one. On any failure before the old one is stopped, the old one
+//! stays in use, the operator's preference is what it was, and the new one is stopped, unless the old one has gone meanwhile and
+//! no other is left.
 
 mod comparison;
 

@@ -1,5 +1,5 @@
 //! `alight up ROLE`: supervises the processes that a site has for one machine: starts them in order, restarts each that exits after a
-//! growing pause, and stops them in order.
+//! growing pause, and stops them in reverse order.
 
 use std::collections::VecDeque;
 use std::io::ErrorKind;

@@ -1,5 +1,5 @@
-//! The program `alight calibrate` on boards printed by it and rendered through a lens whose truth is known: the
-//! calibration file, its error in pixels, and refusals.
+//! The program `alight calibrate` on pictures of its board, rendered through a lens whose truth is known, and
+//! on the board that it prints: the calibration file, its error in pixels, and refusals.
 
 use std::path::Path;
 use std::process::{Command, Output};

@@ -1,8 +1,8 @@
 //! Finds cameras on MAVLink by their heartbeats, requests CAMERA_INFORMATION and VIDEO_STREAM_INFORMATION, and lists the
 //! addresses of their video.
 //!
-//! Messages and commands are those of <https://mavlink.io/en/services/camera.html>: whoever sends a heartbeat is asked for
-//! CAMERA_INFORMATION and for VIDEO_STREAM_INFORMATION of all its streams, in the new and in the old form.
+//! Messages and commands are those of <https://mavlink.io/en/services/camera.html>; each is requested in the new and in
+//! the old form.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;

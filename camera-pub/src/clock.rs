@@ -1,5 +1,5 @@
-//! From stamps of a camera's own clock to the host's by the quickest arrivals, learnt anew where that clock was set; and arrival
-//! times told in UTC.
+//! Turns stamps of a camera's own clock into times of the host's by the quickest arrivals, learnt anew where that clock was set;
+//! and arrivals that are told in UTC.
 
 /// Time in which the quickest frame is looked for, in nanoseconds. Clocks that go apart by 50 in a million move by half a
 /// millisecond in two of these.

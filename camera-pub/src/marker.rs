@@ -1,5 +1,5 @@
-//! Sets a camera's exposure for the marker frame by frame: where detections have it, the levels there, the next exposure
-//! time and gain or the camera's own metering, and what is published.
+//! Decides frame by frame how a camera is exposed for the marker: where detections have it, the levels there, the next
+//! exposure time and gain or the camera's own metering, and what is published of it.
 
 use imaging::GrayView;
 use messages::{

@@ -1,11 +1,11 @@
 //! Pairs each frame of a camera's program with its own record of metadata by arrival, number and delay, for its stamp; one whose
 //! record is in doubt stays without.
 //!
-//! A program writes a frame and then, at once, its metadata, on two channels. Three things must agree before a record
-//! stamps a frame: the record arrived after the frame began and before the next one did; both have the same number,
-//! counted since the start; and the time from the record's stamp to the frame's arrival is that of the frames before.
-//! Once that time is known, a frame's record is found by it also where lines were lost or doubled, and where it changes for good, as
-//! with a busy processor, it is learnt anew from records with their frames' numbers. A frame whose record is in doubt is not stamped.
+//! A program writes a frame and then, at once, its metadata, on two channels. Three things must agree before a record stamps a frame:
+//! the record arrived after the frame began and before the next one did; both have the same number, counted since the start; and the
+//! time from the record's stamp to the frame's arrival is that of the frames before. Once that time is known, a frame's record is
+//! found by it also where lines were lost or doubled, and where it changes for good, as with a busy processor, it is learnt anew from
+//! records with their frames' numbers.
 
 use crate::exposure::{Exposure, Shutter};
 use crate::metadata::{Metadata, Record};

@@ -1,5 +1,5 @@
-//! Alarms of a landing, each raised once: a low or critical battery, silence of the operator, silence of the autopilot's link;
-//! and why a battery is too empty for a flight.
+//! Alarms of a landing: a low or critical battery, raised once, and silence of the operator or of the autopilot's link, raised
+//! once for each silence; and why a battery is too empty for a flight.
 
 use autopilot::Battery;
 use landing::Alarm;

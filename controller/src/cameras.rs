@@ -1,5 +1,5 @@
-//! The information (calibration, mount) of up to 16 cameras: added, refused while another is being repeated
-//! or in flight, and looked up for a frame.
+//! The information (calibration, mount) of up to 16 cameras: added, replaced or refused, and looked up for
+//! a frame.
 //!
 //! Who may publish is not known here, so a camera's calibration is not replaced by another one while it is
 //! being repeated, and never in flight; and cameras that nobody uses give way.

@@ -1,5 +1,5 @@
-//! One vehicle's flight, an event loop without input and output: packets, detections, camera information, commands and ticks in;
-//! setpoints, mode requests, status, alarms and warnings out.
+//! One vehicle's flight, a state machine without input and output: packets, detections, camera information, commands and ticks
+//! in; setpoints, mode requests, landing targets, status and warnings out.
 //!
 //! The service feeds it packets, detections, commands and the time, and sends what [`Flight::poll_outgoing`]
 //! returns.

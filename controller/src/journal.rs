@@ -1,5 +1,5 @@
-//! Logs a flight's phases, alarms, warnings and detector changes, and counts its setpoints, rejected
-//! detections and the latency from a frame's stamp to the setpoint for the health report.
+//! Logs a flight's phases, alarms, warnings and detector changes, and counts setpoints and rejected
+//! detections for the health report, with the latency from a frame's stamp to the setpoint.
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! The mission around a landing: waiting, take-off, the change of a PX4 to OFFBOARD, what triggers the landing or refuses its start,
+//! The mission around a landing: waiting, take-off, the change of a PX4 to OFFBOARD, what triggers the landing or keeps it waiting,
 //! and its end after the motors have stopped.
 
 use autopilot::{

@@ -1,5 +1,5 @@
-//! Counts refusals by their reason over time (detections, camera information, messages of another version),
-//! and warns the operator of those that last.
+//! Follows what is refused, by its reason (detections, camera information, messages of another version),
+//! and warns the operator of what lasts.
 
 /// Time for which something must be refused before it is told, in nanoseconds: a single one means little.
 const MIN_LASTING_NS: i64 = 1_000_000_000;

@@ -1,5 +1,5 @@
-//! Selects the active detector by the operator's preference, then by health: rate, latency, silence, failures and agreement with
-//! others on where the marker is.
+//! Selects the active detector: of the healthy ones (rate, latency, silence, agreement with others on where the marker is)
+//! the one that the operator prefers; one that fails often is trusted again more slowly.
 //!
 //! A function of time and of the messages received. Another detector becomes the active one when the active
 //! one is gone, silent, late or slow and the other is not, or when the operator prefers the other and it has

@@ -1,5 +1,5 @@
-//! The controller's service: topics and the autopilot's link joined to the flight, which gets detections, commands and packets;
-//! publishes status, tape and the packets for the ground station.
+//! The controller's service: joins topics and the autopilot's link to the flight, hands it detections, commands and packets,
+//! and publishes status, target, vehicle state, tape and the autopilot's packets.
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -1,5 +1,6 @@
 //! The list of checks before a flight: a verdict, a finding and what to do for controller, autopilot, camera,
-//! calibration, detector, mount, link, battery, recording and keys. It turns green by itself.
+//! calibration, clock, detector, marker, mount, link, battery, recording, keys and warnings. It turns green
+//! by itself.
 
 use messages::{CameraInfo, ControllerStatus, Detections, RecorderStatus, VehicleState};
 use serde::Serialize;

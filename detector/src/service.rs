@@ -1,5 +1,5 @@
-//! The detector's service: the newest frame in, detections and refused candidates out, by one thread `detect`;
-//! camera information and changed parameters take effect between two frames.
+//! The detector's service: the newest frame in; detections, refused candidates and debug images out; camera
+//! information and changed parameters take effect between two frames.
 //!
 //! The image work runs on one thread of its own, named `detect`, so that no message ever waits for it. The thread
 //! takes a frame only when it is free, and its inbox keeps only the newest.

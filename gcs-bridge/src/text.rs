@@ -1,5 +1,5 @@
-//! The controller's phases, warnings and answers as STATUSTEXT packets for the ground station, each change once and at a
-//! bounded rate.
+//! The controller's phases, detector changes and warnings, each once, and answers to the ground station's requests, as
+//! STATUSTEXT packets at a bounded rate.
 
 use autopilot::compose::status_text;
 use autopilot::dialect::{MavMessage, MavSeverity};

@@ -1,5 +1,5 @@
-//! The recorder's service: takes messages and frames of the topics, writes them to a recording and the next one, counts by key what is
-//! kept, lost or never came, publishes its status.
+//! The recorder's service: writes messages and frames of the topics to a recording and, when that is full or fails, to the next one,
+//! offers them to viewers, counts what is kept, lost or never came by key.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,5 +1,5 @@
-//! Landings with the detector on the ground behind an emulated radio link, beside one onboard: errors, ages of the
-//! frames used, and what cuts of the link do.
+//! Landings with the detector onboard, on the ground behind an emulated radio link, or with both while the link is
+//! cut: errors, ages of the frames used, and what the cut does.
 
 use std::time::Duration;
 

@@ -1,5 +1,5 @@
 //! What a calibration from a flight changes of camera-pub's configuration: each TOML key (delay, mount, focal
-//! length) with its value before and after, for people and as tables.
+//! length, distortion) with its value before and after, for people and as tables.
 
 use calibration::flight::QUANTITIES;
 use calibration::{FlightCalibration, Quantity};

@@ -1,5 +1,5 @@
-//! `alight calibrate`: prints the board, or solves for a camera's intrinsics from images of it and writes the calibration file;
-//! the result or the refusal is printed as text or JSON.
+//! `alight calibrate`: `board` prints the board, or solves for a camera's intrinsics from images of it and writes the
+//! calibration file; the result or refusal is printed as text or JSON. `flight` is in `flight.rs`.
 
 mod args;
 mod corrected;

@@ -1,5 +1,5 @@
-//! `alight detect`: finds markers and pads in image files and videos, with poses by a calibration file, a focal length or none, and
-//! warns where images and camera do not fit.
+//! `alight detect`: finds markers and pads in image files and videos, with poses where a calibration file or a focal length is
+//! given, and warns where images and camera do not fit.
 
 mod args;
 mod picture;

@@ -1,5 +1,5 @@
-//! Lays out the sheet of paper to print: a marker, pad or calibration board at its centre, cut marks, a ruler
-//! of 100 mm and lines of text, in millimetres.
+//! Lays out the sheet of paper to print: a marker or pad at its centre with cut marks, or a calibration
+//! board, and below a ruler of 100 mm and lines of text, in millimetres.
 
 use clap::ValueEnum;
 use markers::{Board, Drawing, Ink, Marker, Pad, Shape};

@@ -1,5 +1,5 @@
-//! Opens a GenICam camera with Aravis, sets its region, format, rate and exposure, and takes its buffers with stamps, counting
-//! those that were not delivered.
+//! Opens a GenICam camera with Aravis, sets its region, format, rate and features, and takes its buffers with stamps and
+//! exposure time, counting those that were not delivered.
 #![allow(unsafe_code, reason = "the bytes of a buffer are behind a pointer; nothing else is here")]
 
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,5 +1,4 @@
-//! Decodes PX4's EVENT messages, numbers with arguments, into texts: failing checks, why it does not arm, failsafes, modes, take-off
-//! and landing.
+//! Decodes PX4's EVENT messages into texts: failing checks, why it does not arm, failsafes, modes, take-off and landing.
 //!
 //! PX4 sends texts (STATUSTEXT) only over links on which it hears a ground station; events it sends over all of them, as numbers with
 //! arguments (<https://mavlink.io/en/services/events.html>). The texts here are of the metadata that PX4 v1.17.0-alpha1 is built

@@ -1,5 +1,5 @@
-//! The vehicle's state from MAVLink messages: attitude, position and velocity, range, battery, landed state,
-//! readiness to arm, each with its stamp.
+//! The vehicle's state from MAVLink messages: attitude, position, velocity and range with their stamps,
+//! battery, landed state, and readiness to arm with what is missing.
 //!
 //! A stamp is in nanoseconds of the caller's clock: the time of the measurement where the autopilot's clock
 //! is known ([`crate::clock`]), else that of its reception. `boot_ms` is the autopilot's own clock.

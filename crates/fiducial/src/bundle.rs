@@ -1,9 +1,9 @@
-//! The pose of a pad with its covariance, from all of its markers found in an image: their corners and ring centres solved as
-//! points of one plane.
+//! The pose of a pad with its covariance, from its markers found in an image, but for those that contradict the others: their
+//! corners and ring centres solved as points of one plane.
 //!
-//! Their corners are points of one plane, so far markers give the tilt that near ones cannot, and only the covariance
-//! changes when one of them leaves the view. Rings look the same in any rotation: beside other markers their centre is a
-//! point of the plane; alone they give the pad's pose only when they lie at the landing point.
+//! Far markers give the tilt that near ones cannot, and only the covariance changes when one of them leaves the view. Rings
+//! look the same in any rotation: beside other markers their centre is a point of the plane; alone they give the pad's pose
+//! only when they lie at the landing point.
 
 use geometry::{
     Camera, CameraModel, Distortion, Marker as MarkerFrame, Pad as PadFrame, Pixel, Point,

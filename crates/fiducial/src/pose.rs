@@ -2,9 +2,9 @@
 //! form, refined to the smallest reprojection error, with covariance.
 //!
 //! Four or more points of a plane leave two poses: the plane tilted one way, and tilted the other way about
-//! the line of sight. Both come in closed form (Collins and Bartoli, "Infinitesimal plane-based pose
-//! estimation", IJCV 2014). Both are then refined: Levenberg-Marquardt minimises the reprojection error,
-//! weighted by the points' covariance.
+//! the line of sight. The closed form is that of Collins and Bartoli ("Infinitesimal plane-based pose
+//! estimation", IJCV 2014). Levenberg-Marquardt then minimises the reprojection error, weighted by the
+//! points' covariance.
 
 use geometry::{Camera, CameraModel, Marker as MarkerFrame, Pixel, Point, Rotation, Transform};
 use nalgebra::{

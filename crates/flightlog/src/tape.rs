@@ -1,5 +1,5 @@
-//! Gathers the controllers' tapes from the messages of a recording, or of several files of one flight: parts in order, those that
-//! are missing, damaged or twice noted.
+//! Gathers the controllers' tapes from the messages of a recording, or of several files of one flight: parts in order, each once,
+//! and what could not be read.
 
 use std::collections::BTreeMap;
 

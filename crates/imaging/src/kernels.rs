@@ -1,8 +1,7 @@
 //! The innermost loops over rows of pixels, for AVX2, NEON and plain Rust: extremes of tiles, halving, sharpening, comparison
 //! with thresholds to bits.
 //!
-//! Each kernel exists three times, for AVX2, for NEON and in plain Rust, with the same result to the bit. The plain one
-//! also serves the ends of rows, and processors with neither.
+//! The three give the same result to the bit. The plain one also serves the ends of rows, and processors with neither.
 #![allow(unsafe_code, reason = "vector instructions; each is tested against its plain twin")]
 #![cfg_attr(
     not(any(target_arch = "x86_64", all(target_arch = "aarch64", target_feature = "neon"))),

@@ -1,9 +1,8 @@
 //! Finds straight edge segments in an image: pixels of the strongest gradient chained along the edge, split
 //! where the chain bends, fitted with lines.
 //!
-//! Where a threshold fails (the edge of a shadow, glare, an occluder), edges are still there, in pieces. Edge
-//! pixels are those of the strongest gradient across the edge; a chain follows them while the gradient keeps
-//! its direction, is split where it bends, and each part is fitted with a line, to a fraction of a pixel.
+//! Where a threshold fails (the edge of a shadow, glare, an occluder), edges are still there, in pieces. A
+//! chain goes on while the gradient keeps its direction, and the lines are exact to a fraction of a pixel.
 //! This is edge drawing (Topal and Akinlar, 2012), with the direction of the gradient in place of its
 //! routing.
 

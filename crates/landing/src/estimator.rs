@@ -7,10 +7,10 @@
 //! the reported position moved against the truth by 0.010 m over 2 s, the sum of the reported velocity by
 //! 0.032 m.
 //!
-//! A detection is fused at its own stamp: the last [`MEMORY`] detections are kept with the state after each;
-//! a late one is inserted between them, and those after it are fused again. A detection whose normalised
-//! innovation squared (NIS) exceeds the gate is an outlier, and may start a competing hypothesis
-//! (`hypotheses.rs`). An estimate without a detection for `forget_after_s` is discarded.
+//! The last [`MEMORY`] detections are kept with the state after each; a late one is inserted between them,
+//! and those after it are fused again. A detection whose normalised innovation squared (NIS) exceeds the
+//! gate is an outlier, and may start a competing hypothesis (`hypotheses.rs`). An estimate without a
+//! detection for `forget_after_s` is discarded.
 
 use std::collections::VecDeque;
 

@@ -1,5 +1,5 @@
 //! What the lander takes: vehicle state and status, frames with their marker, operator's commands, alarms,
-//! delay of the link, the autopilot's limits, disputes of detectors, ticks.
+//! delay of the link, the autopilot's limits, detectors that are alive or disagree, ticks.
 
 use std::fmt;
 

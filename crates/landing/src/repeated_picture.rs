@@ -1,10 +1,10 @@
 //! Recognises a picture that a grabber, a player or a decoder repeats with new stamps, by a marker that stays fixed to the vehicle while
 //! that moves.
 //!
-//! The marker then stays where it is relative to the vehicle, however that moves: the pad seems to move along, and to sink before a
-//! vehicle that goes down. No two pictures of a camera are alike, as its noise differs, and no vehicle holds its place over a marker
-//! to a fraction of a millimetre. So a marker that stays, while the autopilot's position and attitude change, is an old one. Where a link
-//! codes the picture anew for each frame it stays less exactly, and must seem to move further.
+//! The pad then seems to move along, and to sink before a vehicle that goes down. No two pictures of a camera are alike, as its noise
+//! differs, and no vehicle holds its place over a marker to a fraction of a millimetre. So a marker that stays, while the autopilot's
+//! position and attitude change, is an old one. Where a link codes the picture anew for each frame it stays less exactly, and must seem
+//! to move further.
 
 use geometry::{Body, Camera, Pixel, Point, Rotation, Vector};
 use libm::hypot;

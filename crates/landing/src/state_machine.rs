@@ -1,5 +1,5 @@
-//! The phases of a landing as an explicit state machine: visible marker, progress of the guidance, vehicle, commands, alarms and timeouts in; phase
-//! and reason out.
+//! The phases of a landing as an explicit state machine: visible marker, progress of the guidance, vehicle, commands, alarms and time in;
+//! phase and reason out.
 //!
 //! ```mermaid
 //! stateDiagram-v2

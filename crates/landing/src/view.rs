@@ -1,5 +1,5 @@
-//! Whether a marker at a place on the ground is in the field of view of a frame's camera, given the vehicle's
-//! motion.
+//! Whether a marker at a place on the ground is in the field of view of a frame's camera, by the vehicle's
+//! pose.
 
 use geometry::{Body, Camera, Odometry, Point, Rotation, Vector};
 use libm::{atan, atan2};

@@ -1,4 +1,5 @@
-//! Messages of a detector: detections with poses and stage times, refused candidates, its information; and the commands to it.
+//! Messages of a detector: detections with poses and stage times, refused candidates, its information, the camera's response;
+//! and the commands to it.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,5 +1,5 @@
-//! Messages of every service: its health of the last second (rates, latencies, drops, errors) and its
-//! configuration.
+//! Messages of every service: its health (rates of the last second, latencies of the last seconds,
+//! drops and errors since its start) and its configuration.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,9 +1,9 @@
 //! The controller's tape on the wire: records of events (packets, detections, commands, ticks) with their times, decisions and
 //! packets out of them, and a running hash.
 //!
-//! A [`Tape`] holds some records. Each record is an event with the time at which it was handled, what came out of it,
-//! and a running hash over all of this and the hash before (XXH3 of 64 bits, seeded with that): a bit that was flipped, and
-//! a record that is missing, is found at once. What a tape says is enough to fly the same flight again.
+//! A [`Tape`] holds some records. The hash of each is over its event, time and output and the hash before (XXH3 of 64 bits,
+//! seeded with that): a bit that was flipped, and a record that is missing, is found at once. What a tape says is enough to
+//! fly the same flight again.
 
 use std::borrow::Cow;
 

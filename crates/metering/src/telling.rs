@@ -1,5 +1,5 @@
-//! When a camera's exposure (setting, limits, levels, who sets it) is published again as `CameraControl`: changes at once,
-//! what stays at intervals.
+//! When a camera's exposure is published again as `CameraControl`: a change of setting, reason, refusal or who sets it at
+//! once; what stays, with levels and limits that differ in each frame, at intervals.
 
 use messages::{CameraControl, ExposureLimits, ExposureReason, ExposureSetting, MarkerLevels};
 

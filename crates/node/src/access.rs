@@ -1,5 +1,5 @@
-//! The holders of certificates (`ROLE.NAME@VEHICLE`), a relay's list of them with who is revoked, and Zenoh's access
-//! control made of that list: which keys each may publish.
+//! The holders of certificates, a relay's list of them with who is revoked, and Zenoh's access control made of that
+//! list and of the rules of the roles: on which keys each may publish, subscribe and query.
 //!
 //! The common name of a certificate is `ROLE@VEHICLE` or `ROLE.NAME@VEHICLE`. A relay lets in whom its list of
 //! holders names, of its own vehicle and not revoked; a detector may publish as itself only. Zenoh compares

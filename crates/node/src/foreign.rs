@@ -1,6 +1,6 @@
-//! Probes the addresses where a session connects by Zenoh's greeting: a tool is refused where another program answers, a service logs
-//! it and goes on. Zenoh tries such an address again for ever, without a word; the service meets the others once the right program is
-//! there.
+//! Probes, with Zenoh's greeting, the unencrypted addresses to which a session connects: a tool is refused where only other programs
+//! answer, a service logs it and goes on. Zenoh tries such an address again for ever, without a word; the service meets the others
+//! once the right program is there.
 
 use std::io;
 use std::net::SocketAddr;

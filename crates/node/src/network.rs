@@ -1,8 +1,8 @@
-//! The Zenoh configuration of a process: its role's built-in JSON5 with the site's vehicle name, addresses and keys filled in;
-//! access rules, key files and ports checked.
+//! The Zenoh configuration of a process: its role's JSON5, built in or of a file, with the site's vehicle name, addresses and
+//! keys filled in; access rules, key files and ports checked.
 //!
-//! The JSON5 file of a role configures how its processes connect; the vehicle's name, addresses and keys
-//! differ from site to site and are filled in here, so that no site needs files of its own.
+//! How the processes of a role connect is the same at every site; what differs is filled in here, so that no site needs files
+//! of its own.
 
 use std::ffi::OsString;
 use std::io;

@@ -1,5 +1,5 @@
-//! Runs a service from its start (logging, session, presence) to an orderly shutdown on a signal, with its health report
-//! each second.
+//! Runs a service from its start (logging, Zenoh's threads, session) to an orderly shutdown on a signal, with its health
+//! report each second.
 
 use std::future::Future;
 use std::io::IsTerminal;

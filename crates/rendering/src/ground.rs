@@ -1,5 +1,5 @@
-//! Generates the textures of the ground (asphalt, grass, tiles, plain) from a seed: mipmapped grain and patches
-//! metres wide, and their reflectance along a row of pixels.
+//! Generates the ground (asphalt, grass, tiles, plain) from a seed, and gives its reflectance: patches at a
+//! point, grain along a row of pixels.
 //!
 //! Coarse and fine grain are tiles of 8-bit texels with mipmaps. Patches metres across hide the repetition from
 //! heights at which a tile's period fits into the image.

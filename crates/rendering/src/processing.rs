@@ -1,10 +1,10 @@
-//! What a camera does to a rendered frame, stage by stage: lens, colour mosaic, denoising, tone curve, sharpening, JPEG, H.264.
+//! What a camera does to a rendered frame, from the flaws of its lens to the losses of JPEG or H.264: the settings of each stage with their
+//! limits, and the processing of a single frame.
 //!
-//! The stages are those of an ordinary camera, in its order: `lens` and `unsteady` (on the light behind the
-//! Gaussian blur that the renderer draws with), vignetting, exposure and noise (the sensor's), then `mosaic` (colour filters, interpolation), `denoise`, `local_tone`, `tone` (from
-//! linear to the grey levels of the file), `sharpen`, `jpeg_quality`, `video`. Everything is grey: a neutral scene is
-//! grey behind white balance, and the luma of a JPEG with subsampled chroma (YCbCr 4:2:0) is the JPEG of its
-//! luma.
+//! The stages are those of an ordinary camera, in its order: `lens` and `unsteady` (on the light behind the Gaussian blur that the renderer
+//! draws with), vignetting, exposure and noise (the sensor's), then `mosaic` (colour filters, interpolation), `denoise`, `local_tone`,
+//! `tone` (from linear to the grey levels of the file), `sharpen`, `jpeg_quality`, `video`. Everything is grey: a neutral scene is grey
+//! behind white balance, and the luma of a JPEG with subsampled chroma (YCbCr 4:2:0) is the JPEG of its luma.
 
 mod develop;
 mod filters;

@@ -1,9 +1,9 @@
 //! Renders a frame of a scene (ground, pads, painted marks) as the camera on a vehicle sees it at its poses during the exposure,
 //! one row of tiles after the other.
 //!
-//! Projection is exact. Markers are averaged over each pixel's area, the lens blur and the exposure; the
-//! ground is a texture sampled at the size of a pixel. A frame depends on the seed, its index and the poses
-//! only.
+//! Projection is exact. Markers are averaged over each pixel's area, the lens blur and the exposure; the ground is a texture
+//! sampled at the size of a pixel. A frame depends on the seed, its index and the poses only, with H.264 on those before it as
+//! well.
 //!
 //! Modules in reading order: `exposure` has the camera's poses while the shutter is open, `lens` the
 //! direction of each pixel, `painting` what a tile of the image shows of a marker, `scenery` the paintings of

@@ -1,4 +1,4 @@
-//! The simulated world, vehicle, wind, pad and autopilot together in steps of one fixed length, the same for the same seed and
+//! The simulated world: vehicle, wind, pad and autopilot together in steps of one fixed length, the same for the same seed and
 //! packets.
 
 use std::collections::VecDeque;

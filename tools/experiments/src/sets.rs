@@ -1,5 +1,5 @@
 //! The frames of a set of the marker experiment, by its name, a marker and a variant (seed, processing, share
-//! of the frames), alike for every marker.
+//! of the frames).
 //!
 //! A set has the same views, grounds and lights for every marker, so that results of different markers are
 //! comparable.

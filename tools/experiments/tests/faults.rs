@@ -1,5 +1,6 @@
-//! Flights of the campaign with faults, in lock-step: the same to the bit for a seed, slow touchdowns
-//! whatever the kind, and a landing once a fault is over.
+//! Flights of the campaign with faults, in lock-step: the same to the bit for a seed, a landing once
+//! a fault is over, and slow touchdowns or none when processes die, links fall silent or the
+//! autopilot lies.
 
 use experiments::faults::flight::fly;
 use experiments::faults::kind::Kind;

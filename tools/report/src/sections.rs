@@ -1,5 +1,5 @@
-//! The sections of the report, from landing, phases and height to losses, wind and log: the charts and tables of each for
-//! one flight, or why it was not recorded.
+//! The sections of the report, from landing, phases and height to log, configuration and recording: the charts and tables
+//! of each for one flight, and what of it was not recorded.
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -1,11 +1,9 @@
 //! Joins straight edge segments into quads where the outline of a square marker is broken by shadow, glare, an object or the frame,
 //! with hidden corners and sides added.
 //!
-//! The edge of a shadow, glare or an object in front interrupts the outline of a marker, and the frame cuts
-//! it. Its sides are still straight, dark on the inside, and meet at corners. So sides are joined across
-//! gaps; a corner is where one side ends and another begins with a turn to the right; a quad goes around two,
-//! three or four sides. A hidden corner lies where its sides would meet; a hidden side joins the ends of its
-//! neighbours.
+//! The sides of such a marker are still straight, dark on the inside, and meet at corners. So sides are joined across gaps; a
+//! corner is where one side ends and another begins with a turn to the right; a quad goes around two, three or four sides. A hidden
+//! corner lies where its sides would meet; a hidden side joins the ends of its neighbours.
 
 use geometry::Pixel;
 use imaging::pyramid::to_level_0;

@@ -1,9 +1,8 @@
 //! Reads a square marker with hidden parts: each sampled cell is black, white or an erasure by the light on border and quiet
 //! zone, and the codeword is matched by the rest.
 //!
-//! Border and quiet zone determine the illumination. Cells that are neither black nor white by it are
-//! erasures, as are those beside a border cell of the wrong colour. The codeword is matched by the other
-//! bits, and counts only with a low false-positive rate.
+//! Cells beside a border cell of the wrong colour are erasures as well. The codeword counts only with a low false-positive
+//! rate.
 
 use imaging::GrayView;
 use markers::SquareCode;

@@ -1,11 +1,9 @@
 //! Solves for the 48 dots of an STag from all pixels of a quad together, by least squares through the blur, and for how well a
 //! codeword explains them.
 //!
-//! Where a dot is hardly wider than a pixel, a pixel shows several of them. So all dots are solved for
-//! together: a pixel is the sum of the dots' values, weighted by their shares of it through the blur. All
-//! that is always black is one more unknown, all that is always white another. The least-squares solution
-//! gives the dots; the same sums tell how well any codeword explains the pixels, also where no dot can be
-//! told from its neighbours.
+//! Where a dot is hardly wider than a pixel, a pixel shows several of them: the sum of the dots' values, weighted by their
+//! shares of it through the blur. All that is always black is one more unknown, all that is always white another. The sums of
+//! the solution also tell how well any codeword explains the pixels, also where no dot can be told from its neighbours.
 
 use imaging::GrayView;
 use markers::stag_code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET_ZONE};

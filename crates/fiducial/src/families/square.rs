@@ -1,9 +1,8 @@
-//! The detector of AprilTag and ArUco markers: quads, their cells, the codeword with its false-positive rate, refined corners and pose;
-//! fallbacks for hidden, small and neighbouring ones.
+//! The detector of AprilTag and ArUco markers: quads, also of tags in a grid, their cells, the codeword with its false-positive rate,
+//! refined corners and pose; fallbacks for hidden and small ones.
 //!
-//! For each quad the cells are solved for, the codeword is matched, and its false-positive rate is weighed.
-//! Then the corners are refined and give the pose. Fallbacks read quads of segments, of which a part may be
-//! hidden, and the quiet zones of markers whose border blur or a tone curve breaks.
+//! Fallbacks read quads of segments, of which a part may be hidden, and the quiet zones of markers whose border blur or a tone curve
+//! breaks.
 
 mod grid;
 

@@ -1,5 +1,5 @@
-//! The metric guidance: from the target's position in metres to a velocity setpoint, by closing speed to the side, a funnel downwards, waiting,
-//! retries and the touchdown.
+//! The metric guidance: from the target's position in metres to a velocity setpoint, by closing speed to the side, a funnel downwards,
+//! waiting low over the pad, and the touchdown.
 //!
 //! Laterally, the commanded closing speed is proportional to the error that will be left when a setpoint
 //! takes effect, limited to the speed from which the vehicle can still brake before the target. The setpoint

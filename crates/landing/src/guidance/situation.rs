@@ -1,5 +1,5 @@
-//! The trait of a guidance, with its input (vehicle, target and its age, limits, link delay) and its progress: may it
-//! descend, has it a target, which velocity and yaw rate.
+//! The trait of a guidance (may it descend, has it a target, how far it is, which velocity and yaw rate), and its
+//! input: vehicle, target and its age, limits, link delay.
 
 use geometry::{Ned, Vector};
 

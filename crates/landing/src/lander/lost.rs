@@ -1,5 +1,5 @@
 //! What a lander does while the marker is out of view or lost: where a retry climbs to, and the pad's place to remember over a
-//! silence.
+//! silence of the autopilot.
 
 use geometry::Vector;
 

@@ -1,14 +1,13 @@
 //! What H.264 loses of rendered frames: each macroblock predicted with a motion vector or from its neighbours, its residual transformed and
 //! quantised, the edges deblocked.
 //!
-//! A picture is predicted from the one before, macroblock by macroblock with a motion vector of its own, and of the residual only what is
-//! larger than the quantiser's step is sent. So parts of a picture stay as they were, move with their surroundings, or are drawn anew,
-//! which no compression of single pictures shows. Motion compensation, the transform of 4 x 4 residuals, the quantiser and the deblocking filter
-//! are those of the format (ITU-T H.264); what an encoder is free to choose is chosen as fast ones do: one motion vector for each macroblock,
-//! found by descending the sum of absolute differences, intra prediction of whole macroblocks and of 4 x 4 blocks in five of its nine
-//! modes, and no blocks of single small levels. Left out are the coding of the numbers, which loses nothing, chroma, partitions, the
-//! transforms of 8 x 8 pixels and of the mean levels of a macroblock, the pixels above right of a block, and the control of the rate: the
-//! quantiser is the same everywhere. Fewer pixels stay as they were than with x264.
+//! Of the residual only what is larger than the quantiser's step is sent. So parts of a picture stay as they were, move with their
+//! surroundings, or are drawn anew, which no compression of single pictures shows. Motion compensation, the transform of 4 x 4 residuals,
+//! the quantiser and the deblocking filter are those of the format (ITU-T H.264); what an encoder is free to choose is chosen as fast ones
+//! do: one motion vector for each macroblock, found by descending the sum of absolute differences, intra prediction of whole macroblocks
+//! and of 4 x 4 blocks in five of its nine modes, and no blocks of single small levels. Left out are the coding of the numbers, which loses
+//! nothing, chroma, partitions, the transforms of 8 x 8 pixels and of the mean levels of a macroblock, the pixels above right of a block,
+//! and the control of the rate: the quantiser is the same everywhere. Fewer pixels stay as they were than with x264.
 
 mod deblock;
 mod plane;

@@ -1,5 +1,5 @@
-//! Paints the image tiles through which edges of a marker go: coverage of subsamples by its outlines, moved over the exposure and
-//! weighted with lens blur and pixel area.
+//! Paints the image tiles through which edges of a painting go: coverage of subsamples by its outlines, moved over the exposure
+//! and weighted with lens blur and pixel area.
 
 use super::exposure::GROUP;
 use super::lens::{Blur, Lens, Linear, PROFILE_WIDTH};

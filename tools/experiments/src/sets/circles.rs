@@ -1,5 +1,5 @@
-//! Frames without a marker, of circles that people make: manholes, washers, wheels, helipads, traffic signs,
-//! archery targets, discs. No marker of ours is among them.
+//! Frames without a marker of ours, of circles that people make: manholes, washers, wheels, helipads,
+//! traffic signs, archery targets, discs, and the markers of others (WhyCon, CCTag).
 
 use std::f64::consts::TAU;
 

@@ -1,4 +1,5 @@
-//! Scores a photometric fit of the three-ring marker: residual beside those of a plain disc, of rings of free grey values and of free radii.
+//! Scores a photometric fit of the three-ring marker: what it leaves, beside a plain disc, rings of free grey values, free radii and evenly
+//! wide rings; and its covariance.
 
 use nalgebra::{SMatrix, SVector};
 
