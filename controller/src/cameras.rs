@@ -51,8 +51,8 @@ impl Cameras {
             return known.hear(now_ns, info, is_flying);
         }
         if self.known.len() >= MAX_CAMERAS {
-            let oldest = self.known.iter().enumerate().min_by_key(|(_, known)| known.last_ns());
-            match oldest.filter(|(_, known)| !known.is_used(now_ns)) {
+            let unused = self.known.iter().enumerate().filter(|(_, it)| !it.is_used(now_ns));
+            match unused.min_by_key(|(_, known)| known.last_ns()) {
                 Some((index, _)) => drop(self.known.swap_remove(index)),
                 None => {
                     let text = format!(
@@ -164,5 +164,19 @@ mod tests {
             cameras.add(i, camera(&format!("more{i}"), 800.0), false);
         }
         assert!(cameras.of_frame(2000, "down").is_some());
+    }
+
+    #[test]
+    fn a_used_camera_that_fell_silent_keeps_its_place_and_takes_no_other_s() {
+        let mut cameras = Cameras::default();
+        cameras.add(0, camera("down", 800.0), false);
+        assert!(cameras.of_frame(0, "down").is_some());
+        for i in 1..MAX_CAMERAS {
+            cameras.add(S, camera(&format!("invented{i}"), 800.0), false);
+        }
+        assert_eq!(cameras.add(2 * S, camera("front", 800.0), false), Reception::Known);
+        assert!(
+            cameras.of_frame(2 * S, "down").is_some() && cameras.of_frame(2 * S, "front").is_some()
+        );
     }
 }
