@@ -222,6 +222,9 @@ impl State {
     }
 
     fn take_ground(&mut self, now_ns: i64, status: GcsStatus) {
+        if !has_room(&self.bridges, &status.bridge) {
+            return;
+        }
         let before = self.bridges.get(&status.bridge).map(|seen| &seen.value);
         let is_speaking = |stations: &[GroundStation], station: &GroundStation| {
             let id = |it: &GroundStation| (it.system, it.component);
@@ -265,6 +268,8 @@ impl State {
         self.services.retain(|_, service| is_recent(service.received_ns));
         self.found.retain(|_, found| is_recent(found.received_ns));
         self.detectors.retain(|_, info| is_recent(info.received_ns));
+        self.cameras.retain(|_, info| is_recent(info.received_ns));
+        self.recorders.retain(|_, status| is_recent(status.received_ns));
     }
 
     /// Notes how long a query to a service and its reply took, in milliseconds; `None` without a reply.
@@ -761,10 +766,30 @@ mod tests {
             state.take(0, Input::Detections(name.clone(), Box::new(Detections::sample())));
             let bridge = GcsStatus { bridge: name.clone(), ..GcsStatus::default() };
             state.take(0, Input::Ground(Box::new(bridge)));
-            state.take(0, Input::Recorder(name, Box::default()));
+            state.take(0, Input::Recorder(name.clone(), Box::default()));
+            state.take(0, Input::Camera(name, Box::new(CameraInfo::sample())));
             state.take(0, health(&format!("s{number}"), 1, "a", 0.0, 1.0));
         }
         assert_eq!((state.found.len(), state.recorders.len()), (MAX_NAMES, MAX_NAMES));
+        assert_eq!(state.cameras.len(), MAX_NAMES);
         assert_eq!((state.services.len(), state.bridges.len()), (MAX_NAMES, MAX_NAMES));
+        // What fell silent gives way to what comes.
+        state.every_second(1000 * SECOND);
+        assert_eq!((state.found.len(), state.recorders.len(), state.cameras.len()), (0, 0, 0));
+        state.take(1000 * SECOND, Input::Recorder("new".into(), Box::default()));
+        assert!(state.recorders.contains_key("new"));
+    }
+
+    #[test]
+    fn the_stations_of_one_bridge_too_many_are_not_told_with_each_status() {
+        let mut state = State::new("ours");
+        for number in 0..MAX_NAMES {
+            let bridge = GcsStatus { bridge: format!("n{number}"), ..GcsStatus::default() };
+            state.take(0, Input::Ground(Box::new(bridge)));
+        }
+        for _ in 0..5 {
+            state.take(0, ground(false));
+        }
+        assert_eq!(texts(&state), Vec::<String>::new());
     }
 }
