@@ -1,11 +1,9 @@
 //! The log of the report, in order of time: phases with reasons, commands, detector changes, the autopilot's texts,
 //! warnings, failures and changed settings.
 
-use std::collections::BTreeSet;
-
 use messages::TapeEvent;
 
-use crate::flight::{Change, Flight};
+use crate::flight::{Change, Flight, Process};
 use crate::phases;
 use crate::settings::Difference;
 
@@ -152,23 +150,19 @@ fn autopilot(flight: &Flight) -> Vec<Line> {
 }
 
 fn processes(flight: &Flight) -> Vec<Line> {
-    let mut said = BTreeSet::new();
-    let mut lines = Vec::new();
-    for (name, process) in &flight.processes {
-        if said.insert(name) {
-            let health = &process.first;
-            lines.push(Line {
-                time_s: flight.at_s(flight.vehicle_ns(process.first_ns)),
-                who: health.service.clone(),
-                is_warning: false,
-                text: format!(
-                    "{} is process {} on {}, alight {}",
-                    health.instance, health.pid, health.host, health.version
-                ),
-            });
+    let line = |process: &Process| {
+        let health = &process.first;
+        Line {
+            time_s: flight.at_s(flight.vehicle_ns(process.first_ns)),
+            who: health.service.clone(),
+            is_warning: false,
+            text: format!(
+                "{} is process {} on {}, alight {}",
+                health.instance, health.pid, health.host, health.version
+            ),
         }
-    }
-    lines
+    };
+    flight.processes.values().map(line).collect()
 }
 
 /// Settings that services changed.
