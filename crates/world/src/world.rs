@@ -92,8 +92,10 @@ impl World {
     fn warm_up(&mut self) {
         let start = self.vehicle.truth();
         self.autopilot.start_in_air(0.0, &start);
-        self.config.begin_height_m = f64::INFINITY;
+        // What is to begin at this height begins with the first step after it.
+        let begin_height_m = std::mem::replace(&mut self.config.begin_height_m, f64::INFINITY);
         self.advance_to(WARM_UP_S);
+        self.config.begin_height_m = begin_height_m;
         self.autopilot.carry(start.position - self.vehicle.truth().position);
         self.vehicle.put(start.position);
         self.past.clear();
@@ -218,6 +220,28 @@ impl World {
             z_m: pad.position.z(),
             velocity: pad.velocity + turning,
             turn_rad_s: pad.turn_rad_s,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_scenario_begins_with_the_first_step_of_a_vehicle_that_starts_above_its_height() {
+        for (start_height_m, has_begun) in [(10.0, true), (8.0, false), (0.0, false)] {
+            let vehicle = VehicleConfig { start_height_m, ..VehicleConfig::default() };
+            let config = WorldConfig { vehicle, begin_height_m: 9.0, ..WorldConfig::default() };
+            let mut world = World::new(&config, 1);
+            assert_eq!(world.since_begin_s(world.now_s()), None, "before the first step");
+            world.advance_to(world.now_s() + 1.0);
+            let since_s = world.since_begin_s(world.now_s());
+            assert_eq!(
+                since_s.is_some_and(|s| s > 0.9),
+                has_begun,
+                "{start_height_m} m: {since_s:?}"
+            );
         }
     }
 }

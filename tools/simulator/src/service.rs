@@ -107,15 +107,18 @@ enum VehicleSource {
 
 impl Simulation {
     fn new(config: &Config) -> Self {
-        let source = match config.vehicle {
+        let (source, passed_s) = match config.vehicle {
             VehicleKind::Simulated => {
-                VehicleSource::Simulated(Box::new(World::new(&config.world(), config.seed)))
+                let world = World::new(&config.world(), config.seed);
+                let passed_s = world.now_s();
+                (VehicleSource::Simulated(Box::new(world)), passed_s)
             }
-            VehicleKind::Reported => VehicleSource::Reported(ReportedVehicle::default()),
+            VehicleKind::Reported => (VehicleSource::Reported(ReportedVehicle::default()), 0.0),
         };
         Self {
             source: Mutex::new(source),
-            start_ns: now_ns(),
+            // A vehicle that starts in the air has hovered before.
+            start_ns: now_ns().saturating_sub((passed_s * 1e9).round() as i64),
             touchdown: Mutex::default(),
             pad: config.pad.config(),
             begin_height_m: config.begin_height_m,
@@ -643,6 +646,7 @@ impl Camera {
 mod tests {
     use super::*;
     use geometry::{Point, Vector};
+    use node::Layers;
     use world::vehicle::{Vehicle, VehicleConfig};
 
     #[test]
@@ -669,5 +673,17 @@ mod tests {
         assert!((touchdown.error_m - 0.1).abs() < 1e-9 && touchdown.stamp_ns == 5);
         assert!((touchdown.vertical_speed_m_s - 0.7).abs() < 1e-9);
         assert!((touchdown.lateral_speed_m_s - 0.1).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_vehicle_that_starts_in_the_air_moves_on_from_there() {
+        let set = vec!["start.height_m=10".to_owned()];
+        let config = Layers { file: None, set }.load::<Config>().unwrap().settings;
+        let simulation = Simulation::new(&config);
+        let VehicleSource::Simulated(world) = &*simulation.source() else {
+            panic!("a simulated vehicle")
+        };
+        let ahead_s = world.now_s() - simulation.now_s();
+        assert!(ahead_s <= 0.0, "the world is {ahead_s} s ahead of the clock");
     }
 }
