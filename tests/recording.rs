@@ -1,4 +1,5 @@
-//! Recordings of real landings: read by programs that are not ours, with recorders that are killed and disks that fail.
+//! Recordings of real landings: programs that are not ours find every channel and picture in them; recorders are killed, and
+//! disks fail.
 
 mod disks;
 mod played;

@@ -1,5 +1,5 @@
-//! `alight cameras`: lists the cameras of this machine and those that are announced over MAVLink, says how to configure each,
-//! and takes a picture.
+//! `alight cameras`: lists the cameras of this machine with formats and sizes, and those announced over MAVLink with their video's
+//! encoding and address, says how to configure each, and takes a picture.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;

@@ -1,5 +1,5 @@
-//! Lands by the autopilot's own precision landing: a LANDING_TARGET for each frame used, a request for LAND (PRECISION LAND on PX4),
-//! and the way back from it on an abort.
+//! Lands by the autopilot's own precision landing: a LANDING_TARGET of the marker's place in the body's frame for each frame used, a
+//! request for LAND (PRECISION LAND on PX4), and the way back from it on an abort.
 //!
 //! No setpoint is sent, but zeros to a PX4 that hovers in OFFBOARD, as after a take-off. Every frame that was used
 //! gives the autopilot a landing target; the pilot, a mission or our own start changes to LAND (PRECISION LAND on

@@ -1,5 +1,5 @@
-//! Makes JPEG pictures of the used camera's frames, with what the detector found or refused in each, for the browsers
-//! that look; while nobody looks, it makes none.
+//! Makes JPEG pictures of the used camera's frames, with the JSON of what the detector found or refused in each, for the
+//! browsers that look; while nobody looks, it makes none.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! The disk: a file that a thread of its own opens, appends to and syncs, so that nobody waits for it.
+//! The disk: a thread of its own opens a file under a name that is free, appends to it and syncs it, so that nobody waits for it.
 
 use std::collections::VecDeque;
 use std::fs::{File, OpenOptions};

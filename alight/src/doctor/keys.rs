@@ -1,5 +1,5 @@
-//! `alight doctor` on keys: certificates, private keys, authority and list of holders of the site's processes and of the operator,
-//! with validity, vehicle and file modes.
+//! `alight doctor` on keys: certificates, private keys, authority and list of holders of the site's processes and of the operator:
+//! missing, expired, of another vehicle, or readable by others.
 
 use std::collections::BTreeSet;
 use std::fs::File;

@@ -1,4 +1,4 @@
-//! Predicts the region of interest (ROI) of the next frame from the detections of the last ones.
+//! Predicts the region of interest (ROI) of the next frame from the sound detections of every marker in the last ones.
 //!
 //! Each marker's centre moves at constant velocity, from its last two detections; its size stays. Uncertainty
 //! of the motion widens the ROI. A track ends after two frames in which the detector that saw its marker last does not

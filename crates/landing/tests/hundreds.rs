@@ -1,5 +1,5 @@
-//! What must hold over many modelled flights. `examples/landings.rs` flies the same cases in thousands and
-//! prints the tables.
+//! Errors, speeds at the touchdown and times of hundreds of modelled landings, in calm air, wind and with faults.
+//! `examples/landings.rs` flies the same cases in thousands and prints the tables.
 
 mod scene;
 

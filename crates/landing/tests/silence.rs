@@ -1,4 +1,4 @@
-//! A lander that falls silent at any height, for ever or for a while: how the vehicle touches the ground then.
+//! A lander that falls silent at any height, for ever or for a while: a table of touchdowns, all of them soft.
 
 #![expect(clippy::print_stdout, reason = "the table of a passing run is for people to read")]
 

@@ -1,4 +1,4 @@
-//! Where the pad is in a frame, and how fast it moves there, from the detections of earlier frames.
+//! Where the pad is in a frame, to be metered there, and how fast it moves, from detections of its markers in earlier frames.
 
 use std::collections::VecDeque;
 

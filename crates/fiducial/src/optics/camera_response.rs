@@ -1,4 +1,5 @@
-//! How a camera shows light: in proportion to it, or with a tone curve and sharpened, as cameras do for people.
+//! How a camera shows light, in proportion to it or with a tone curve and sharpened: the whiteness shown for a share of white, with
+//! derivatives.
 //!
 //! After an unknown monotonic curve and a symmetric kernel a blurred edge has another shape and another place. Both are
 //! those of every other edge between the same black and white, so that a marker that is not small tells the two numbers itself.

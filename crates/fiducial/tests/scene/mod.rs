@@ -1,4 +1,4 @@
-//! Pictures of square markers whose edges lie where they should to a few thousandths of a pixel: along each of many
+//! An exact renderer for tests: pictures of square markers whose edges lie where they should to a few thousandths of a pixel: along each of many
 //! lines through a pixel the edges are found exactly, and the pixel's box and the lens' Gaussian are integrated in closed
 //! form.
 #![allow(dead_code, reason = "each test uses its own part of it")]
