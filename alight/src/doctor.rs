@@ -306,18 +306,11 @@ fn check_devices(findings: &mut Findings, job: &Job, service: Service, folder: &
 /// itself alone.
 fn check_serial_ports(findings: &mut Findings, jobs: &[Job], has_controller: bool) {
     for job in jobs.iter().filter(|job| job.service == Some(Service::Controller)) {
-        let Ok(config) = Service::Controller.effective_config(&job.layers) else { continue };
-        let address = config["autopilot"]["address"].as_str();
-        let serial = address.and_then(|address| address.strip_prefix("serial:"));
-        // The path of a device may contain colons: the speed is a number at the end.
-        let device = serial.map(|rest| match rest.rsplit_once(':') {
-            Some((device, baud)) if baud.bytes().all(|byte| byte.is_ascii_digit()) => device,
-            _ => rest,
-        });
-        if let Some(device) = device
-            && let Err(cause) = std::fs::OpenOptions::new().read(true).write(true).open(device)
+        let Ok(config) = job.layers.load::<controller::Config>() else { continue };
+        if let Some(device) = config.settings.serial_device()
+            && let Err(cause) = std::fs::OpenOptions::new().read(true).write(true).open(&device)
         {
-            tell_unopened(findings, device, &cause, has_controller);
+            tell_unopened(findings, &device, &cause, has_controller);
         }
     }
 }

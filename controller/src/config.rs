@@ -303,6 +303,14 @@ impl Config {
         if self.clock.is_empty() { clock_name() } else { &self.clock }
     }
 
+    /// The device of the autopilot's serial line; `None` of another link.
+    pub fn serial_device(&self) -> Option<String> {
+        match self.autopilot.address.parse() {
+            Ok(Address::Serial { device, .. }) => Some(device),
+            _ => None,
+        }
+    }
+
     /// The key of the packets between controller and autopilot, if they are signed.
     ///
     /// # Errors
@@ -424,6 +432,18 @@ mod tests {
         assert!(load(&["metric.turn_rad_s=0.3", "marker=rings-thesis"]).is_err());
         for marker in ["marker=aruco-4x4-50:7", "marker=pad:1"] {
             assert!(load(&["metric.turn_rad_s=0.3", marker]).is_ok(), "{marker}");
+        }
+    }
+
+    #[test]
+    fn the_device_of_a_serial_line_is_known_without_its_speed() {
+        for (address, device) in [
+            ("serial:/dev/ttyACM0:921600", Some("/dev/ttyACM0")),
+            ("serial:/dev/serial/by-path/usb-0:1.0", Some("/dev/serial/by-path/usb-0:1.0")),
+            ("udpin:0.0.0.0:14550", None),
+        ] {
+            let config = load(&[&format!("autopilot.address={address}")]).unwrap();
+            assert_eq!(config.serial_device().as_deref(), device, "{address}");
         }
     }
 
