@@ -38,8 +38,8 @@
 //! follows no target and drifts by a decimetre in a second of gusts, so it takes over only at
 //! `land_height_m`, and only from a vehicle that hardly moves sideways.
 
-use geometry::{Ned, Point, Vector, squared};
-use libm::{exp, fmax, fmin, tan};
+use geometry::{Body, Ned, Point, Vector, squared};
+use libm::{cos, exp, fmax, fmin, tan};
 
 use crate::config::MetricConfig;
 use crate::decision::{Reason, TargetEstimate};
@@ -108,6 +108,10 @@ const ROOM_GAIN: f64 = 2.0;
 /// from a climb.
 const PUSHING_M_S: f64 = 0.15;
 const STANDING_S: [f64; 2] = [0.4, 0.9];
+
+/// A vehicle that leans by more than this, in radians, does not stand: a gust holds it in the air. ArduPilot's levels within 0.2 s of its touch;
+/// PX4's simulated one keeps its tilt there, 0.15 in 5 m/s of wind.
+const MAX_STANDING_TILT_RAD: f64 = 0.3;
 
 /// Time for which a vehicle near the ground that is commanded down has not sunk until it is steered sideways no more, in seconds:
 /// one that stands, and whose reported velocity errs, would be commanded faster and faster, and slide.
@@ -441,7 +445,7 @@ impl Metric {
             self.waiting_since = None;
         }
         let is_still = sinking_m_s(situation, target) < 0.3 * PUSHING_M_S;
-        if self.is_pushed(target) && is_still && height_m <= LOW_M {
+        if self.is_pushed(target) && is_still && height_m <= LOW_M && !leans(situation) {
             self.standing_since.get_or_insert(situation.now);
         } else {
             self.standing_since = None;
@@ -476,6 +480,7 @@ impl Metric {
     /// counts as standing still.
     fn has_touched(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {
         self.touches_down(situation)
+            && !leans(situation)
             && self.is_pushed(target)
             && sinking_m_s(situation, target) < PUSHING_M_S
     }
@@ -619,6 +624,12 @@ fn sinking_m_s(situation: &Situation<'_>, target: &TargetEstimate) -> f64 {
 /// True when the vehicle rises as in a gust.
 fn rises(situation: &Situation<'_>, target: &TargetEstimate) -> bool {
     sinking_m_s(situation, target) < -MAX_RISING_M_S
+}
+
+/// True when the vehicle leans so far that it cannot stand on the ground.
+fn leans(situation: &Situation<'_>) -> bool {
+    let down = situation.vehicle.ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
+    down.z() < cos(MAX_STANDING_TILT_RAD)
 }
 
 /// The part of the link's delay that `dead_time_s` does not contain, in seconds.

@@ -370,3 +370,25 @@ fn what_leans_against_a_gust_waits_above_the_ground_and_touches_down_where_it_is
         assert_eq!(why == Reason::Settling, !descends, "{path_m_s} m/s, {height_m} m: {why:?}");
     }
 }
+
+#[test]
+fn a_vehicle_that_a_gust_holds_low_over_the_pad_is_neither_pushed_down_nor_taken_for_standing() {
+    for (tilt_rad, holds) in [(0.45, true), (0.1, false)] {
+        let mut metric = Metric::new(MetricConfig::default());
+        let (mut pushed, mut stands) = (0, false);
+        for i in 0..88u32 {
+            // It sinks to 0.25 m; there it stays, 0.17 m aside, at the edge of its funnel.
+            let s = f64::from(i) / 40.0;
+            let (height_m, down_m_s) = if s < 1.0 { (0.75 - 0.5 * s, 0.5) } else { (0.25, 0.0) };
+            let aside_m = if s < 1.0 { 0.0 } else { 0.17 };
+            let mut vehicle = sinking(s, aside_m, height_m, down_m_s);
+            vehicle.ned_from_body = Rotation::from_euler(0.0, tilt_rad, 0.0);
+            let situation = situation(&vehicle);
+            stands |= matches!(metric.progress(&situation), Progress::Ready(Reason::TouchedEarly));
+            let (setpoint, _) = metric.velocity(&situation);
+            // The touch that was to come is over.
+            pushed += u32::from(s > 1.5 && setpoint.z() > 0.1);
+        }
+        assert_eq!((pushed > 0, stands), (!holds, !holds), "{tilt_rad} rad: {pushed} times");
+    }
+}
