@@ -249,8 +249,8 @@ named! {
         AxisCheck = "axis-check", "checking camera/autopilot axis alignment before descending";
         /// The autopilot did not enter its LAND mode.
         LandRefused = "land-refused", "aborted: the autopilot did not enter LAND";
-        /// The autopilot did not reach the ground.
-        TouchdownOverdue = "touchdown-overdue", "aborted: no touchdown in the time allowed";
+        /// The autopilot did not report the ground.
+        TouchdownOverdue = "touchdown-overdue", "aborted: the autopilot reported no touchdown in the time allowed";
         /// The motors stopped during the landing.
         Disarmed = "disarmed", "aborted: disarmed before the touchdown";
         /// The flight mode was changed by somebody else.
