@@ -207,6 +207,9 @@ impl State {
     }
 
     fn take_recorder(&mut self, now_ns: i64, name: String, status: RecorderStatus) {
+        if !has_room(&self.recorders, &name) {
+            return;
+        }
         let had_problem =
             self.recorders.get(&name).is_some_and(|before| before.value.problem.is_some());
         match &status.problem {
@@ -781,14 +784,18 @@ mod tests {
     }
 
     #[test]
-    fn the_stations_of_one_bridge_too_many_are_not_told_with_each_status() {
+    fn what_one_bridge_or_recorder_too_many_says_is_not_told_with_each_status() {
         let mut state = State::new("ours");
         for number in 0..MAX_NAMES {
             let bridge = GcsStatus { bridge: format!("n{number}"), ..GcsStatus::default() };
             state.take(0, Input::Ground(Box::new(bridge)));
+            state.take(0, Input::Recorder(format!("n{number}"), Box::default()));
         }
+        let full =
+            RecorderStatus { problem: Some("the disk is full".into()), ..Default::default() };
         for _ in 0..5 {
             state.take(0, ground(false));
+            state.take(0, Input::Recorder("more".into(), Box::new(full.clone())));
         }
         assert_eq!(texts(&state), Vec::<String>::new());
     }

@@ -55,7 +55,7 @@ fn names(text: &str) -> String {
         is_test = line.starts_with("#[test]")
             || line.starts_with("#[tokio::test")
             || (is_test && line.starts_with("#["));
-        if line.starts_with("impl") {
+        if line.starts_with("impl") || line == "}" {
             of_trait = line.contains(" for ");
         }
         if let Some(inner) = line.strip_prefix("    ") {

@@ -110,8 +110,12 @@ const PUSHING_M_S: f64 = 0.15;
 const STANDING_S: [f64; 2] = [0.4, 0.9];
 
 /// A vehicle that leans by more than this, in radians, does not stand: a gust holds it in the air. ArduPilot's levels within 0.2 s of its touch;
-/// PX4's simulated one keeps its tilt there, 0.15 in 5 m/s of wind.
+/// PX4's simulated one keeps its tilt there, 0.15 in 5 m/s of wind with a drag (`SIH_KDV`) of 0.3.
 const MAX_STANDING_TILT_RAD: f64 = 0.3;
+/// Maximum speed over the pad, in m/s, of a vehicle near the ground that leans and yet stands, as on an edge, and how long it must be that still,
+/// in seconds.
+const MAX_RESTING_M_S: f64 = 0.1;
+const RESTING_S: f64 = 3.0;
 
 /// Time for which a vehicle near the ground that is commanded down has not sunk until it is steered sideways no more, in seconds:
 /// one that stands, and whose reported velocity errs, would be commanded faster and faster, and slide.
@@ -151,6 +155,8 @@ pub struct Metric {
     observer: Option<Observer>,
     waiting_since: Option<Timestamp>,
     standing_since: Option<Timestamp>,
+    /// Since when a vehicle that leans is still near the ground, whatever it is commanded.
+    resting_since: Option<Timestamp>,
     /// When it was last bound to touch the ground, or stayed there since.
     touching_at: Option<Timestamp>,
 }
@@ -292,6 +298,7 @@ impl Guidance for Metric {
         self.observer = None;
         self.waiting_since = None;
         self.standing_since = None;
+        self.resting_since = None;
         self.touching_at = None;
     }
 }
@@ -304,6 +311,7 @@ impl Metric {
             observer: None,
             waiting_since: None,
             standing_since: None,
+            resting_since: None,
             touching_at: None,
         }
     }
@@ -321,7 +329,7 @@ impl Metric {
             let height_m = self.height_m(&target);
             let patience = if height_m <= NEAR_M { COMMITTED } else { 1.0 };
             // A vehicle that presses on something does not climb before it is known to stand there.
-            let stands = self.standing_since.is_some() && height_m <= NEAR_M;
+            let stands = self.standing_since.or(self.resting_since).is_some() && height_m <= NEAR_M;
             height_m <= self.config.blind_height_m
                 && situation.age_s <= self.config.stale_target_s + self.config.blind_s
                 && (stands || target.deviation_m <= self.config.blind_deviation_m * patience)
@@ -421,12 +429,12 @@ impl Metric {
 
     /// The horizontal speed over the pad with which the vehicle touches the ground, in m/s: that of now or, should a gust end on the way, that
     /// of then. A vehicle leans against a gust by following a path that is faster than the vehicle itself, and gets up to the path's speed once
-    /// the gust is over. Of 3000 modelled flights with a gust of 5 m/s (seeds from 880001, up to 8 m/s of wind) 16 touch faster than 0.3 m/s
+    /// the gust is over. One that stands leans against nothing, whatever path it is to follow. Of 3000 modelled flights with a gust of 5 m/s (seeds from 880001, up to 8 m/s of wind) 16 touch faster than 0.3 m/s
     /// sideways by the speed of now alone, and 5 by this one.
     fn touchdown_slide_m_s(&self, situation: &Situation<'_>, target: &TargetEstimate) -> f64 {
         let closing = self.closing(situation, target);
-        let leaning = self.observer.map_or(Vector::zero(), |observer| {
-            horizontal(observer.path.velocity() - situation.vehicle.velocity)
+        let leaning = self.observer.filter(|_| leans(situation)).map_or(Vector::zero(), |it| {
+            horizontal(it.path.velocity() - situation.vehicle.velocity)
         });
         let gust = leaning - limited(leaning, MAX_STEADY_M_S);
         let descent_m_s = fmax(sinking_m_s(situation, target), self.config.touchdown_descend_m_s);
@@ -449,6 +457,12 @@ impl Metric {
             self.standing_since.get_or_insert(situation.now);
         } else {
             self.standing_since = None;
+        }
+        let rests = is_still && self.closing(situation, target).norm() <= MAX_RESTING_M_S;
+        if rests && leans(situation) && height_m.abs() <= NEAR_M {
+            self.resting_since.get_or_insert(situation.now);
+        } else {
+            self.resting_since = None;
         }
         if self.is_bound_to_touch(situation, target) || self.has_touched(situation, target) {
             self.touching_at = Some(situation.now);
@@ -495,10 +509,11 @@ impl Metric {
     fn stands(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {
         let height_m = self.height_m(target);
         let enough_s = STANDING_S[usize::from(height_m > NEAR_M)];
+        let lasts = |since: Option<Timestamp>, enough_s: f64| {
+            since.is_some_and(|since| situation.now.seconds_since(since) >= enough_s)
+        };
         height_m <= LOW_M
-            && self
-                .standing_since
-                .is_some_and(|since| situation.now.seconds_since(since) >= enough_s)
+            && (lasts(self.standing_since, enough_s) || lasts(self.resting_since, RESTING_S))
     }
 
     fn lateral(

@@ -352,8 +352,9 @@ fn a_gust_that_lifts_a_vehicle_near_the_ground_leaves_it_steered_and_free_to_cli
 
 #[test]
 fn what_leans_against_a_gust_waits_above_the_ground_and_touches_down_where_it_is_about_to() {
-    let descent = |path_m_s: f64, height_m: f64| {
-        let vehicle = sinking(0.0, 0.0, height_m, 0.3);
+    let descent = |tilt_rad: f64, path_m_s: f64, height_m: f64| {
+        let mut vehicle = sinking(0.0, 0.0, height_m, 0.3);
+        vehicle.ned_from_body = Rotation::from_euler(0.0, -tilt_rad, 0.0);
         let situation = situation(&vehicle);
         let mut metric = Metric::new(MetricConfig::default());
         let mut observer = Observer::new(&situation);
@@ -362,12 +363,43 @@ fn what_leans_against_a_gust_waits_above_the_ground_and_touches_down_where_it_is
         metric.observer = Some(observer);
         metric.descent(&situation, &situation.target.unwrap())
     };
-    for (path_m_s, height_m, descends) in
-        [(0.0, 0.3, true), (0.2, 0.3, true), (0.8, 0.3, false), (0.8, 0.05, true)]
-    {
-        let (descent_m_s, why) = descent(path_m_s, height_m);
-        assert_eq!(descent_m_s > 0.1, descends, "{path_m_s} m/s, {height_m} m: {descent_m_s} m/s");
-        assert_eq!(why == Reason::Settling, !descends, "{path_m_s} m/s, {height_m} m: {why:?}");
+    for (tilt_rad, path_m_s, height_m, descends) in [
+        (0.4, 0.0, 0.3, true),
+        (0.4, 0.2, 0.3, true),
+        (0.4, 0.8, 0.3, false),
+        (0.4, 0.8, 0.05, true),
+        // What is level leans against nothing.
+        (0.0, 0.8, 0.3, true),
+    ] {
+        let (descent_m_s, why) = descent(tilt_rad, path_m_s, height_m);
+        let case = format!("{tilt_rad} rad, {path_m_s} m/s, {height_m} m");
+        assert_eq!(descent_m_s > 0.1, descends, "{case}: {descent_m_s} m/s");
+        assert_eq!(why == Reason::Settling, !descends, "{case}: {why:?}");
+    }
+}
+
+#[test]
+fn a_vehicle_whose_path_goes_on_is_known_to_stand_where_its_height_reads_too_much() {
+    for (tilt_rad, after_s) in [(0.0, 0.3..1.0), (0.15, 0.3..1.0), (0.4, 2.9..3.6)] {
+        let mut metric = Metric::new(MetricConfig::default());
+        let mut stands = None;
+        for i in 0..200u32 {
+            // It touches at a reading of 0.2 m, 0.05 m aside, while its path goes at 0.8 m/s.
+            let s = f64::from(i) / 40.0;
+            let (height_m, down_m_s) = if s < 1.0 { (0.45 - 0.25 * s, 0.25) } else { (0.2, 0.0) };
+            let mut vehicle = sinking(s, 0.05, height_m, down_m_s);
+            vehicle.ned_from_body = Rotation::from_euler(0.0, -tilt_rad, 0.0);
+            let situation = situation(&vehicle);
+            if i == 40 {
+                let observer = metric.observer.as_mut().unwrap();
+                observer.path = Path::new(Vector::new(0.8, 0.0, 0.0));
+            }
+            if matches!(metric.progress(&situation), Progress::Ready(Reason::TouchedEarly)) {
+                stands.get_or_insert(s - 1.0);
+            }
+            let _ = metric.velocity(&situation);
+        }
+        assert!(stands.is_some_and(|s| after_s.contains(&s)), "{tilt_rad} rad: {stands:?} s");
     }
 }
 
