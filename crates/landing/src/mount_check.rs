@@ -101,7 +101,7 @@ const MIN_IN_A_ROW: u32 = 15;
 /// Length of a part of the flight whose estimate is compared with those of the others, in seconds, the smallest share of what
 /// is known that a part must bring to count, and the number of such parts without which roll, pitch, focal length and size are not told:
 /// with 3 for all, and a heading that swings less, four of ten landings in ArduPilot's simulation in 8 m/s of wind with turbulence 3 blamed mount or
-/// marker for a swing of the heading; one does so with these.
+/// marker for a swing of the heading; one of these does so with this, and two of five flown later.
 const PART_S: f64 = 1.0;
 const MIN_SHARE: f64 = 0.01;
 const MIN_PARTS: [u32; 4] = [6, 6, 3, 3];
