@@ -38,12 +38,12 @@
 //! follows no target and drifts by a decimetre in a second of gusts, so it takes over only at
 //! `land_height_m`, and only from a vehicle that hardly moves sideways.
 
-use geometry::{Body, Ned, Point, Vector, squared};
+use geometry::{Ned, Point, Vector, squared};
 use libm::{cos, exp, fmax, fmin, tan};
 
 use crate::config::MetricConfig;
 use crate::decision::{Reason, TargetEstimate};
-use crate::guidance::observer::{Observer, horizontal, limited};
+use crate::guidance::observer::{Observer, down_axis, horizontal, limited};
 use crate::guidance::path::{Path, time_constant_s};
 use crate::guidance::situation::{Guidance, Progress, Situation};
 use crate::time::Timestamp;
@@ -643,8 +643,7 @@ fn rises(situation: &Situation<'_>, target: &TargetEstimate) -> bool {
 
 /// True when the vehicle leans so far that it cannot stand on the ground.
 fn leans(situation: &Situation<'_>) -> bool {
-    let down = situation.vehicle.ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
-    down.z() < cos(MAX_STANDING_TILT_RAD)
+    down_axis(situation).z() < cos(MAX_STANDING_TILT_RAD)
 }
 
 /// The part of the link's delay that `dead_time_s` does not contain, in seconds.

@@ -104,9 +104,14 @@ impl Observer {
     }
 }
 
+/// The body's down axis.
+pub(super) fn down_axis(situation: &Situation<'_>) -> Vector<Ned> {
+    situation.vehicle.ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0)
+}
+
 /// Horizontal offset of the body's down axis per metre of height.
 fn tilt(situation: &Situation<'_>) -> Vector<Ned> {
-    let down = situation.vehicle.ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
+    let down = down_axis(situation);
     horizontal(down) * (1.0 / fmax(down.z(), 0.5))
 }
 
