@@ -5,9 +5,9 @@ use serde_json::{Value, json};
 
 use super::found::{BLURRED_PX, FoundImages};
 
-/// Columns and rows of the parts of the image in which points are counted for people.
-pub(super) const COLUMNS: usize = 8;
-pub(super) const ROWS: usize = 6;
+/// Columns and rows of the parts of the image in which points are counted for people: those that the solution counts.
+pub(super) const COLUMNS: usize = calibration::Coverage::PARTS[0];
+pub(super) const ROWS: usize = calibration::Coverage::PARTS[1];
 /// A good set: how many views, how tilted, by how much the farthest are farther than the nearest, how much of the image.
 const GOOD_VIEWS: usize = 20;
 const GOOD_TILT_DEG: f64 = 30.0;

@@ -34,7 +34,7 @@ pub struct Evidence {
 /// Where in the image points were seen.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Coverage {
-    /// The share of the image's parts (8 x 6 of them) in which there are any.
+    /// The share of the image's parts ([`Coverage::PARTS`]) in which there are any.
     pub covered: f64,
     /// The quarter of the image with fewest, for people.
     pub emptiest: &'static str,
@@ -49,9 +49,7 @@ pub struct Estimate {
     pub sigma: f64,
 }
 
-/// Columns and rows of the parts of the image of which [`Coverage`] counts those with points.
-const PARTS: [usize; 2] = [8, 6];
-/// The same for the residuals that depend on the place.
+/// Columns and rows of the parts of the image for the residuals that depend on the place.
 const CELLS: [usize; 2] = [10, 8];
 /// Tags without which a part of the image says nothing about the lens, and a view nothing about motion.
 const MIN_CELL_TAGS: usize = 4;
@@ -100,13 +98,16 @@ fn cell(seen: [f64; 2], size: ImageSize, parts: [usize; 2]) -> usize {
 }
 
 impl Coverage {
+    /// Columns and rows of the parts of the image of which those with points are counted.
+    pub const PARTS: [usize; 2] = [8, 6];
+
     pub(crate) fn new(views: &[Vec<BoardPoint>], size: ImageSize) -> Self {
         const QUARTERS: [&str; 4] =
             ["at the upper left", "at the upper right", "at the lower left", "at the lower right"];
-        let mut is_seen = [false; PARTS[0] * PARTS[1]];
+        let mut is_seen = [false; Self::PARTS[0] * Self::PARTS[1]];
         let mut quarters = [0_usize; 4];
         for point in views.iter().flatten() {
-            if let Some(seen) = is_seen.get_mut(cell(point.seen, size, PARTS)) {
+            if let Some(seen) = is_seen.get_mut(cell(point.seen, size, Self::PARTS)) {
                 *seen = true;
             }
             if let Some(quarter) = quarters.get_mut(cell(point.seen, size, [2, 2])) {
