@@ -22,7 +22,7 @@ use crate::history::History;
 use crate::limits::ConfigError;
 use crate::mount_check::{MountCheck, MountFindings};
 use crate::repeated_picture::RepeatedPicture;
-use crate::search;
+use crate::search::Square;
 use crate::standing::{
     MAX_STANDING_M_S, RememberedPad, Resumed, SeenPad, StandingHeight, may_stand,
     standing_height_m, to_remember,
@@ -114,16 +114,6 @@ pub struct Lander {
     limits: AutopilotLimits,
     /// Since when two detectors see the marker at two places.
     disputed: Option<Timestamp>,
-}
-
-/// An expanding square that is being flown.
-#[derive(Copy, Clone, Debug)]
-struct Square {
-    started: Timestamp,
-    /// Direction of the first leg, in radians from north to east.
-    first_leg_rad: f64,
-    /// Distance upwind before the first leg, in metres.
-    upwind_m: f64,
 }
 
 impl Lander {
@@ -705,7 +695,9 @@ impl Lander {
     /// Climbs to where the legs overlap in the camera's view, as far as the fence allows, and flies the
     /// expanding square.
     fn search(&mut self, now: Timestamp) -> Action {
-        let Some(vehicle) = self.history.newest() else { return Action::hover() };
+        let (Some(vehicle), Some(place)) = (self.history.newest(), self.place()) else {
+            return Action::hover();
+        };
         let phases = &self.config.phases;
         let look_s = if self.resumed.is_some() { MIN_RESUMED_LOOK_S } else { 0.0 };
         let delay_s = libm::fmax(phases.search_delay_s, look_s);
@@ -726,14 +718,13 @@ impl Lander {
         let wanted = if self.square.is_none() && is_low && up.z() < 0.0 {
             up
         } else {
-            let square = self.square.get_or_insert_with(|| Square {
-                started: now,
-                first_leg_rad: search::first_leg_rad(vehicle.ned_from_body),
-                upwind_m: search::upwind_m(phases, vehicle.ned_from_body, height_m),
+            let square = self.square.get_or_insert_with(|| {
+                Square::new(phases, now, place, vehicle.ned_from_body, height_m)
             });
-            let elapsed_s = now.seconds_since(square.started);
-            let legs = search::velocity(phases, elapsed_s, square.first_leg_rad, square.upwind_m);
-            envelope::clamp_to_fence(phases, vehicle.position, legs)
+            let legs = square.velocity(phases, place);
+            let wanted = envelope::clamp_to_fence(phases, vehicle.position, legs);
+            square.move_on(phases, now, place, wanted.horizontal_norm() < legs.horizontal_norm());
+            wanted
         };
         let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
         Action::Velocity { velocity, yaw_rate: 0.0 }

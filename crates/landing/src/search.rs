@@ -1,90 +1,236 @@
-//! The search for the marker: an expanding square about the place where the search started.
+//! The search for the marker: an expanding square about the place where the search started, flown along its
+//! lines over the ground whatever the wind does.
 //!
 //! A camera that is fixed to the vehicle looks downwind, because the vehicle tilts into the wind: a marker
 //! right below may be out of view, upwind of the image. So the first leg goes upwind.
 
-use geometry::{Body, Ned, Rotation, Vector};
+use geometry::{Body, Ned, Odometry, Point, Rotation, Vector};
 use libm::{atan2, fmax, fmin, sin, sincos};
 
 use crate::config::PhaseConfig;
+use crate::time::Timestamp;
 
 /// Minimum tilt that shows the direction of the wind, in radians.
 const MIN_TILT_RAD: f64 = 0.02;
 
+/// Velocity towards the square's line per metre beside it, in 1/s: slower than an autopilot's velocity loop, which it
+/// must not excite.
+const TRACKING_PER_S: f64 = 0.5;
+
+/// Lag behind the point that moves along the square from which that point slows down, and at which it would stand, in metres.
+const SLOW_LAG_M: f64 = 1.0;
+const MAX_LAG_M: f64 = 2.0;
+
+/// Minimum speed of that point, as a share of `search_speed_m_s`: a vehicle that does not get through the wind must see the other sides, too.
+const MIN_PACE: f64 = 0.25;
+
+/// Longest time over which that point moves on at once, in seconds.
+const MAX_STEP_S: f64 = 0.2;
+
+/// An expanding square that is being flown: `upwind_m` into the wind, then legs of 1, 1, 2, 2, 3, 3, ... spacings, each to the right of
+/// the one before. A point moves along it, which the vehicle follows.
+#[derive(Copy, Clone, Debug)]
+pub struct Square {
+    /// Direction of the first leg, in radians from north to east.
+    first_leg_rad: f64,
+    /// Distance upwind before the first leg, in metres.
+    upwind_m: f64,
+    /// Number of the leg of the point that moves along the square, 0 for the way upwind, and where that leg begins.
+    leg: u32,
+    corner: Point<Odometry>,
+    /// The way of that point along its leg, in metres.
+    along_m: f64,
+    /// When it was last moved on.
+    moved: Timestamp,
+}
+
+impl Square {
+    /// A square about `centre`, into the wind that the attitude shows.
+    pub fn new(
+        config: &PhaseConfig,
+        now: Timestamp,
+        centre: Point<Odometry>,
+        ned_from_body: Rotation<Ned, Body>,
+        height_m: f64,
+    ) -> Self {
+        Self {
+            first_leg_rad: first_leg_rad(ned_from_body),
+            upwind_m: upwind_m(config, ned_from_body, height_m),
+            leg: 0,
+            corner: centre,
+            along_m: 0.0,
+            moved: now,
+        }
+    }
+
+    /// The velocity of a vehicle at `place`, in m/s, at most twice `search_speed_m_s`; at the end of the last leg it stays there.
+    pub fn velocity(&self, config: &PhaseConfig, place: Point<Odometry>) -> Vector<Ned> {
+        let back = self.lag(place) * TRACKING_PER_S;
+        let back_m_s = back.horizontal_norm();
+        let scale = fmin(1.0, config.search_speed_m_s / fmax(back_m_s, f64::MIN_POSITIVE));
+        let onwards = match self.length_m(config) {
+            Some(_) => self.direction() * config.search_speed_m_s,
+            None => Vector::zero(),
+        };
+        let velocity = onwards + back * scale;
+        Vector::from_coords(velocity.coords)
+    }
+
+    /// Moves its point on until `now`, the slower the farther the vehicle is behind, but not for one whose fence keeps it from following.
+    pub fn move_on(
+        &mut self,
+        config: &PhaseConfig,
+        now: Timestamp,
+        place: Point<Odometry>,
+        is_fenced: bool,
+    ) {
+        let after_s = now.seconds_since(self.moved).clamp(0.0, MAX_STEP_S);
+        self.moved = now;
+        let behind_m = self.lag(place).horizontal_norm();
+        let pace = (MAX_LAG_M - behind_m) / (MAX_LAG_M - SLOW_LAG_M);
+        let pace = if is_fenced { 1.0 } else { pace.clamp(MIN_PACE, 1.0) };
+        self.along_m += config.search_speed_m_s * after_s * pace;
+        while let Some(length_m) = self.length_m(config)
+            && self.along_m >= length_m
+        {
+            self.corner = self.corner + self.direction() * length_m;
+            self.along_m -= length_m;
+            self.leg += 1;
+        }
+        if self.length_m(config).is_none() {
+            self.along_m = 0.0;
+        }
+    }
+
+    /// From the vehicle to the square's point, horizontally.
+    fn lag(&self, place: Point<Odometry>) -> Vector<Odometry> {
+        let offset = self.corner + self.direction() * self.along_m - place;
+        Vector::new(offset.x(), offset.y(), 0.0)
+    }
+
+    /// The direction of the present leg.
+    fn direction(&self) -> Vector<Odometry> {
+        let turns = f64::from(self.leg.saturating_sub(1) % 4);
+        let (east, north) = sincos(self.first_leg_rad + turns * std::f64::consts::FRAC_PI_2);
+        Vector::new(north, east, 0.0)
+    }
+
+    /// The length of the present leg in metres; `None` after the last.
+    fn length_m(&self, config: &PhaseConfig) -> Option<f64> {
+        if self.leg == 0 {
+            return Some(self.upwind_m);
+        }
+        // Four legs are one round, each round one spacing farther out; one more leg closes the last round.
+        let spacing_m = fmin(config.search_spacing_m, config.search_radius_m);
+        let rounds = (config.search_radius_m / spacing_m).floor() as u32;
+        if self.leg > 4 * rounds + 1 {
+            return None;
+        }
+        let spacings = if self.leg > 4 * rounds { 2 * rounds } else { self.leg.div_ceil(2) };
+        Some(spacing_m * f64::from(spacings))
+    }
+}
+
 /// The direction of the first leg, in radians from north to east: the one into which the vehicle tilts.
-pub fn first_leg_rad(ned_from_body: Rotation<Ned, Body>) -> f64 {
+fn first_leg_rad(ned_from_body: Rotation<Ned, Body>) -> f64 {
     let up = ned_from_body * Vector::<Body>::new(0.0, 0.0, -1.0);
     if up.horizontal_norm() < sin(MIN_TILT_RAD) { 0.0 } else { atan2(up.y(), up.x()) }
 }
 
 /// Distance upwind that the camera must fly to see the ground below the vehicle, in metres: the distance from
 /// that ground to the centre of the image, at most `search_radius_m`.
-pub fn upwind_m(config: &PhaseConfig, ned_from_body: Rotation<Ned, Body>, height_m: f64) -> f64 {
+fn upwind_m(config: &PhaseConfig, ned_from_body: Rotation<Ned, Body>, height_m: f64) -> f64 {
     let down = ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
     let offset_m = fmax(height_m, 0.0) * down.horizontal_norm() / fmax(down.z(), 0.5);
     if offset_m < MIN_TILT_RAD * height_m { 0.0 } else { fmin(offset_m, config.search_radius_m) }
 }
 
-/// The velocity at a time after the square started, in m/s: `upwind_m` along the first leg, then legs of 1,
-/// 1, 2, 2, 3, 3, ... spacings, each to the right of the one before; zero once the radius is reached.
-pub fn velocity(
-    config: &PhaseConfig,
-    elapsed_s: f64,
-    first_leg_rad: f64,
-    upwind_m: f64,
-) -> Vector<Ned> {
-    let mut flown_m = elapsed_s * config.search_speed_m_s;
-    if flown_m.is_nan() || flown_m < 0.0 {
-        return Vector::zero();
-    }
-    let (east, north) = sincos(first_leg_rad);
-    if flown_m < upwind_m {
-        return Vector::new(north, east, 0.0) * config.search_speed_m_s;
-    }
-    flown_m -= upwind_m;
-    // Four legs are one round, each round one spacing farther out; one more leg closes the last round.
-    let spacing_m = fmin(config.search_spacing_m, config.search_radius_m);
-    let rounds = (config.search_radius_m / spacing_m).floor() as u32;
-    for leg in 1..=4 * rounds + 1 {
-        let spacings = if leg > 4 * rounds { 2 * rounds } else { leg.div_ceil(2) };
-        let length_m = spacing_m * f64::from(spacings);
-        if flown_m < length_m {
-            let direction = first_leg_rad + f64::from(leg - 1) * std::f64::consts::FRAC_PI_2;
-            let (east, north) = sincos(direction);
-            return Vector::new(north, east, 0.0) * config.search_speed_m_s;
-        }
-        flown_m -= length_m;
-    }
-    Vector::zero()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use geometry::Point;
 
-    #[test]
-    fn the_square_covers_its_radius_and_does_not_leave_it() {
-        let config = PhaseConfig::default();
-        let (mut place, mut path) = (Point::<Ned>::origin(), Vec::new());
+    /// Flies the square from the origin, in a wind that carries the vehicle away at this velocity.
+    fn fly(config: &PhaseConfig, wind: Vector<Odometry>) -> Vec<Point<Odometry>> {
+        let begin = Timestamp::from_seconds(5.0);
+        let mut square = Square::new(config, begin, Point::origin(), Rotation::identity(), 5.0);
+        let (mut place, mut path) = (Point::origin(), Vec::new());
         let dt_s = 0.02;
         for i in 0..(config.search_timeout_s / dt_s) as u32 {
-            place = place + velocity(&config, f64::from(i) * dt_s, 0.7, 0.0) * dt_s;
+            let now = begin.plus_seconds(f64::from(i) * dt_s);
+            square.move_on(config, now, place, false);
+            let velocity = square.velocity(config, place);
+            assert!(velocity.norm() <= 2.0 * config.search_speed_m_s + 1e-9, "{velocity:?}");
+            place = place + (Vector::from_coords(velocity.coords) + wind) * dt_s;
             path.push(place);
         }
-        let farthest = path.iter().map(|p| p.x().hypot(p.y())).fold(0.0, f64::max);
-        assert!(farthest <= config.search_radius_m * std::f64::consts::SQRT_2 + 0.1, "{farthest}");
-        // Every point within the square is within the spacing of the path.
-        let reach = config.search_radius_m - 0.5 * config.search_spacing_m;
-        for (x, y) in
-            [(0.0, 0.0), (reach, 0.0), (0.0, reach), (-reach, 0.0), (0.0, -reach), (2.5, -3.5)]
-        {
-            let nearest =
-                path.iter().map(|p| (p.x() - x).hypot(p.y() - y)).fold(f64::MAX, f64::min);
-            assert!(nearest < config.search_spacing_m, "({x}, {y}) is {nearest} m from the path");
+        path
+    }
+
+    #[test]
+    fn the_square_covers_its_radius_and_does_not_leave_it_in_any_wind() {
+        let config = PhaseConfig::default();
+        let winds = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.1), (0.0, -0.3)];
+        for (north, east) in winds {
+            let path = fly(&config, Vector::new(north, east, 0.0));
+            let farthest = path.iter().map(|p| p.x().hypot(p.y())).fold(0.0, f64::max);
+            let limit = config.search_radius_m * std::f64::consts::SQRT_2 + 1.0;
+            assert!(farthest <= limit, "{farthest}");
+            // Every point within the square is within the spacing of the path.
+            let reach = config.search_radius_m - 0.5 * config.search_spacing_m;
+            for (x, y) in
+                [(0.0, 0.0), (reach, 0.0), (0.0, reach), (-reach, 0.0), (0.0, -reach), (2.5, -3.5)]
+            {
+                let nearest =
+                    path.iter().map(|p| (p.x() - x).hypot(p.y() - y)).fold(f64::MAX, f64::min);
+                assert!(
+                    nearest < config.search_spacing_m,
+                    "({x}, {y}) is {nearest} m from the path in wind of {north}, {east}"
+                );
+            }
         }
-        assert!(velocity(&config, 1e9, 0.0, 3.0).norm() < 1e-12, "it ends");
-        assert!(velocity(&config, f64::NAN, 0.0, 0.0).norm() < 1e-12);
+    }
+
+    #[test]
+    fn it_ends_where_its_last_leg_ends_and_stays() {
+        let config = PhaseConfig { search_timeout_s: 120.0, ..PhaseConfig::default() };
+        let path = fly(&config, Vector::zero());
+        let [before, last] = [path[path.len() - 500], path[path.len() - 1]];
+        assert!((last - before).norm() < 0.01, "{before:?} {last:?}");
+        let nowhere = PhaseConfig { search_radius_m: 0.0, ..config };
+        let path = fly(&nowhere, Vector::new(0.1, 0.0, 0.0));
+        assert!(path.iter().all(|place| (*place - Point::origin()).norm() < 0.3), "it holds");
+    }
+
+    #[test]
+    fn who_cannot_follow_still_sees_the_other_sides() {
+        let config = PhaseConfig::default();
+        let mut square = Square::new(
+            &config,
+            Timestamp::from_seconds(0.0),
+            Point::origin(),
+            Rotation::identity(),
+            5.0,
+        );
+        // The first leg goes north and the third south.
+        let goes_south = (1..6000).map(f64::from).find(|hundredths| {
+            let now = Timestamp::from_seconds(0.01 * hundredths);
+            square.move_on(&config, now, Point::new(-30.0, 0.0, 0.0), false);
+            square.leg >= 3
+        });
+        assert!(goes_south.is_some_and(|at| at < 2000.0), "{goes_south:?}");
+        let mut fenced = Square::new(
+            &config,
+            Timestamp::from_seconds(0.0),
+            Point::origin(),
+            Rotation::identity(),
+            5.0,
+        );
+        let goes_south = (1..6000).map(f64::from).find(|hundredths| {
+            let now = Timestamp::from_seconds(0.01 * hundredths);
+            fenced.move_on(&config, now, Point::new(-30.0, 0.0, 0.0), true);
+            fenced.leg >= 3
+        });
+        assert!(goes_south.is_some_and(|at| at < 500.0), "{goes_south:?}");
     }
 
     #[test]
