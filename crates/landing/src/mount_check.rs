@@ -23,7 +23,7 @@
 //! while detections show that the autopilot's position wanders, as in `filter.rs`, and with them the deviations.
 
 use geometry::{Body, Camera, Rotation, Vector, squared};
-use libm::{exp, fmax, fmin, hypot, log};
+use libm::{acos, exp, fmax, fmin, hypot, log};
 use nalgebra::{Matrix2, Matrix2x3, SMatrix, SVector, Vector2};
 
 use crate::config::EstimatorConfig;
@@ -101,10 +101,16 @@ const MIN_IN_A_ROW: u32 = 15;
 /// Length of a part of the flight whose estimate is compared with those of the others, in seconds, the smallest share of what
 /// is known that a part must bring to count, and the number of such parts without which roll, pitch, focal length and size are not told:
 /// with 3 for all, and a heading that swings less, four of ten landings in ArduPilot's simulation in 8 m/s of wind with turbulence 3 blamed mount or
-/// marker for a swing of the heading; one of these does so with this, and two of five flown later.
+/// marker for what its estimate wanders.
 const PART_S: f64 = 1.0;
 const MIN_SHARE: f64 = 0.01;
 const MIN_PARTS: [u32; 4] = [6, 6, 3, 3];
+/// Time constant with which the vehicle's lean is smoothed, in seconds, the lean above which the wind is strong, in radians, and by how many times more
+/// deviations per radian above it an angle must be off: in wind of 8 m/s, in which SITL's vehicle leans by 0.37 to 0.5 rad, the place of ArduPilot's
+/// estimate wanders by 0.1 m and its heading by 3 degrees within seconds, and a descent made roll errors of 4.4 deviations of that.
+const LEAN_S: f64 = 5.0;
+const STRONG_LEAN_RAD: f64 = 0.28;
+const STRICTER_PER_RAD: f64 = 6.0;
 /// Factor on the random walks above which nothing new is told: what moves the pad then is something else. It is smaller for
 /// focal length and size, which show in less motion than the mount.
 const MAX_TOLD_NOISE_SCALE: f64 = 3.0;
@@ -159,6 +165,8 @@ pub struct MountCheck {
     mean_pad_z: f64,
     newest: Option<Timestamp>,
     mount: Option<Rotation<Body, Camera>>,
+    /// The angle between the body's down axis and the vertical, smoothed, in radians.
+    lean_rad: f64,
     outliers: u32,
     roll: Suspicion,
     pitch: Suspicion,
@@ -199,6 +207,7 @@ impl Default for MountCheck {
             mean_pad_z: 0.0,
             newest: None,
             mount: None,
+            lean_rad: 0.0,
             outliers: 0,
             roll: Suspicion::default(),
             pitch: Suspicion::default(),
@@ -253,6 +262,7 @@ impl MountCheck {
         if self.newest.is_none() || after_s > MAX_GAP_S {
             self.place_anew(measurement);
         }
+        self.smooth_lean(motion, after_s);
         self.newest = Some(measurement.stamp);
         self.predict(fmin(after_s, MAX_GAP_S));
         self.smooth_depth(measurement.position.z, after_s);
@@ -310,6 +320,13 @@ impl MountCheck {
         }
         let share = fmax(1.0 / n, fmin(after_s / MEAN_S, 1.0));
         self.mean_pad_z += share * (measured_z - self.mean_pad_z);
+    }
+
+    fn smooth_lean(&mut self, motion: &Motion, after_s: f64) {
+        let down = motion.ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
+        let lean_rad = acos(down.z().clamp(-1.0, 1.0));
+        let share = if self.newest.is_none() { 1.0 } else { 1.0 - exp(-after_s / LEAN_S) };
+        self.lean_rad += share * (lean_rad - self.lean_rad);
     }
 
     /// The errors that are certain.
@@ -432,8 +449,9 @@ impl MountCheck {
         let is_calm = |max_scale: f64| self.log_noise_scale < log(max_scale);
         let is_calm_for_ratios = is_calm(MAX_TOLD_RATIO_NOISE_SCALE);
         let is_calm = is_calm(MAX_TOLD_NOISE_SCALE);
-        self.roll.follow(roll, MIN_DEVIATIONS, MIN_ANGLE_RAD, is_calm);
-        self.pitch.follow(pitch, MIN_DEVIATIONS, MIN_ANGLE_RAD, is_calm);
+        let stricter = 1.0 + STRICTER_PER_RAD * fmax(self.lean_rad - STRONG_LEAN_RAD, 0.0);
+        self.roll.follow(roll, stricter * MIN_DEVIATIONS, MIN_ANGLE_RAD, is_calm);
+        self.pitch.follow(pitch, stricter * MIN_DEVIATIONS, MIN_ANGLE_RAD, is_calm);
         self.focal.follow(focal, MIN_RATIO_DEVIATIONS, MIN_RATIO, is_calm_for_ratios);
         self.size.follow(size, MIN_RATIO_DEVIATIONS, MIN_SIZE_RATIO, is_calm_for_ratios);
     }
@@ -517,12 +535,24 @@ mod tests {
     /// Moves down and up again over a pad whose marker is seen by a camera that is pitched by this much more than
     /// configured.
     fn descend(check: &mut MountCheck, from_s: f64, mount: Rotation<Body, Camera>, pitch: f64) {
+        descend_leaning(check, from_s, mount, pitch, 0.0);
+    }
+
+    /// The same of a vehicle that leans sideways by `lean_rad` against its wind.
+    fn descend_leaning(
+        check: &mut MountCheck,
+        from_s: f64,
+        mount: Rotation<Body, Camera>,
+        pitch: f64,
+        lean_rad: f64,
+    ) {
         let off = Rotation::<Body, Body>::from_euler(0.0, pitch, 0.0);
         for i in 0..150 {
             let t = f64::from(i) / 15.0;
             let position =
                 Point::new((0.7 * t).sin(), (0.5 * t).cos(), -7.0 - 3.0 * (0.6 * t).cos());
-            let attitude = Rotation::<Ned, Body>::from_euler(0.05 * t.sin(), 0.05 * t.cos(), 0.3);
+            let attitude =
+                Rotation::<Ned, Body>::from_euler(0.05 * t.sin() + lean_rad, 0.05 * t.cos(), 0.3);
             let in_body = off.inverse() * (attitude.inverse() * (Point::origin() - position));
             let motion = Motion::still(attitude, position);
             see(check, &frame(from_s + t, mount), &motion, in_body);
@@ -567,6 +597,18 @@ mod tests {
                 found.is_some_and(|it| (it.value - larger).abs() < 0.05),
                 "{larger}: {found:?}"
             );
+        }
+    }
+
+    #[test]
+    fn who_leans_into_a_strong_wind_needs_more_to_blame_the_mount() {
+        for (lean_rad, off_rad, is_told) in
+            [(0.0, 0.035, true), (0.28, 0.035, true), (0.4, 0.035, false), (0.4, 0.06, true)]
+        {
+            let mut check = MountCheck::default();
+            descend_leaning(&mut check, 0.0, Rotation::identity(), off_rad, lean_rad);
+            let found = check.findings().pitch_rad;
+            assert_eq!(found.is_some(), is_told, "{lean_rad}: {found:?} {:?}", check.errors());
         }
     }
 
