@@ -180,7 +180,8 @@ settings! {
         search_height_m: f64 = 5.0, 0.0..=50.0;
         /// Speed of that climb, in m/s.
         search_climb_m_s: f64 = 1.0, 0.1..=3.0;
-        /// Speed of the search, in m/s; 0 hovers.
+        /// Speed of the search, in m/s; 0 hovers. A vehicle that the wind carried off its line flies back to it at up to
+        /// twice that.
         search_speed_m_s: f64 = 1.0, 0.0..=3.0;
         /// Distance between the legs of the expanding square, in m.
         search_spacing_m: f64 = 2.0, 0.5..=20.0;
