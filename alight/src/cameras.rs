@@ -8,10 +8,9 @@ use std::time::Duration;
 use anyhow::{Context, anyhow, bail};
 use camera_pub::{
     Announced, AnnouncedCamera, AnnouncedStream, Config, ConnectedDevice, DeviceDescription,
-    SizeDescription, announced_cameras, connected_devices, source_table, take_picture,
+    SizeDescription, announced_cameras, connected_devices, source_table,
 };
 use clap::Args;
-use imaging::GrayImage;
 use node::Layers;
 use serde::Serialize;
 
@@ -44,11 +43,11 @@ const MAX_SIZES: usize = 6;
 /// The arguments of `alight cameras`.
 #[derive(Args)]
 pub(crate) struct CamerasArgs {
-    /// Take a picture (PNG) with the camera that is listed first, with `--device`, or as `--config` says.
+    /// Take a picture (PNG), as a detector will get it, with the camera that is listed first, with `--device`, or as `--config`
+    /// says. Only while nothing else reads the camera.
     #[arg(long, value_name = "FILE.png", value_parser = png_file)]
     picture: Option<PathBuf>,
-    /// Take the picture as camera-pub does with this configuration: its source, size and exposure. Only while nothing else
-    /// reads the camera.
+    /// Take the picture as camera-pub does with this configuration: its source, size and exposure.
     #[arg(long, value_name = "FILE", requires = "picture", conflicts_with = "device")]
     config: Option<PathBuf>,
     /// One setting over that configuration: dotted key, TOML value. May be repeated.
@@ -91,7 +90,8 @@ struct Entry {
 /// Lists the cameras, or takes a picture.
 pub(crate) fn run(args: &CamerasArgs) -> anyhow::Result<ExitCode> {
     if let (Some(file), true) = (&args.picture, args.config.is_some() || !args.set.is_empty()) {
-        return save_published(args, file);
+        let layers = Layers { file: args.config.clone(), set: args.set.clone() };
+        return save_configured(&layers, file);
     }
     let folder = Path::new(DEVICES);
     let listing = listing(folder, args.device.as_deref());
@@ -106,7 +106,7 @@ pub(crate) fn run(args: &CamerasArgs) -> anyhow::Result<ExitCode> {
     };
     let listing = Listing { mavlink, ..listing };
     if let Some(file) = &args.picture {
-        return save_picture(&listing, file);
+        return save_suggested(&listing, file);
     }
     match args.format {
         Format::Json => print(&serde_json::to_string(&listing)?)?,
@@ -272,7 +272,8 @@ fn modes(description: &DeviceDescription) -> String {
     format!("{}  controls: {}\n", aligned(&rows), controls.join(", "))
 }
 
-fn save_picture(listing: &Listing, file: &Path) -> anyhow::Result<ExitCode> {
+/// Saves a picture of the first camera that can be read, in the mode that is suggested for it.
+fn save_suggested(listing: &Listing, file: &Path) -> anyhow::Result<ExitCode> {
     let entry = listing.devices.iter().find_map(|entry| Some((entry, entry.source.as_ref()?)));
     let Some((entry, source)) = entry else {
         bail!("there is no camera that can be read; `alight cameras` lists what there is");
@@ -286,20 +287,25 @@ fn save_picture(listing: &Listing, file: &Path) -> anyhow::Result<ExitCode> {
         .map(|line| format!("{line}\n"))
         .collect();
     std::fs::write(&path, table).with_context(|| format!("writing {path:?}"))?;
-    let config = Layers { file: Some(path), set: Vec::new() }.load::<Config>()?.settings;
-    let picture = take_picture(&config)?;
-    save(&picture, file, &entry.device.path.display().to_string())
+    let layers = Layers { file: Some(path), set: Vec::new() };
+    save(&layers, file, |_config| entry.device.path.display().to_string())
 }
 
-fn save_published(args: &CamerasArgs, file: &Path) -> anyhow::Result<ExitCode> {
+/// Saves a picture of the camera with this configuration.
+fn save_configured(layers: &Layers, file: &Path) -> anyhow::Result<ExitCode> {
+    save(layers, file, |config| format!("camera `{}`", config.instance()))
+}
+
+/// Saves a picture as camera-pub publishes it with a configuration, by which its camera is named.
+fn save(
+    layers: &Layers,
+    file: &Path,
+    name: impl Fn(&Config) -> String,
+) -> anyhow::Result<ExitCode> {
     node::start_logging("warn");
-    let layers = Layers { file: args.config.clone(), set: args.set.clone() };
     let config = layers.load::<Config>()?.settings;
-    let camera = format!("camera `{}`", config.instance());
-    save(&picture::published(config)?, file, &camera)
-}
-
-fn save(picture: &GrayImage, file: &Path, of: &str) -> anyhow::Result<ExitCode> {
+    let of = name(&config);
+    let picture = picture::published(config)?;
     let [width, height] = [picture.width() as u32, picture.height() as u32];
     image::save_buffer(file, picture.pixels(), width, height, image::ExtendedColorType::L8)
         .with_context(|| format!("writing the picture {file:?}"))?;
@@ -371,7 +377,7 @@ mod tests {
         let text = text(&listing);
         assert!(text.contains("No camera of Video4Linux: there is no /dev/video*"), "{text}");
         assert!(text.contains("rpicam-vid") && text.contains("`source.command`"), "{text}");
-        let problem = save_picture(&listing, Path::new("unused.png")).unwrap_err().to_string();
+        let problem = save_suggested(&listing, Path::new("unused.png")).unwrap_err().to_string();
         assert!(problem.contains("no camera that can be read"), "{problem}");
     }
 

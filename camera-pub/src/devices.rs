@@ -1,20 +1,13 @@
-//! The video devices of this machine: what they offer, how to configure them, and a picture of one.
+//! The video devices of this machine: what they offer, and how to configure them.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
-use anyhow::{Context, ensure};
-use imaging::GrayImage;
-use media::DecodedImage;
 use serde::Serialize;
 
-use crate::config::DeviceConfig;
-use crate::v4l2::abi::{CID_EXPOSURE_ABSOLUTE, CID_EXPOSURE_AUTO, Device, EXPOSURE_MANUAL};
-use crate::v4l2::capture::{Capture, Taken};
+use crate::v4l2::abi::{CID_EXPOSURE_ABSOLUTE, CID_EXPOSURE_AUTO, EXPOSURE_MANUAL};
 use crate::v4l2::describe::{DeviceDescription, FormatDescription, SizeDescription, describe};
-use crate::v4l2::kernel::{DevicePath, KernelDevice};
+use crate::v4l2::kernel::KernelDevice;
 use crate::v4l2::pixels::Pixels;
-use crate::v4l2::video::{Next, Port, Video};
 
 /// A video device of this machine.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -29,10 +22,6 @@ pub struct ConnectedDevice {
     pub problem: Option<String>,
 }
 
-/// Number of frames until a camera has found its exposure.
-const SETTLING_FRAMES: u32 = 15;
-/// Maximum time for a picture.
-const PICTURE_NS: i64 = 8_000_000_000;
 /// Exposure time that is suggested, in 100 us: it blurs by a pixel at a turn of 30 degrees per second and 1000 pixels of
 /// focal length.
 const SUGGESTED_EXPOSURE: i64 = 20;
@@ -131,71 +120,13 @@ fn suggested_rate_hz(size: &SizeDescription) -> f64 {
     fitting.or_else(|| size.rates_hz.iter().copied().reduce(f64::min)).unwrap_or(30.0)
 }
 
-/// Takes a picture with a device as a configuration says it, once its exposure has settled.
-///
-/// # Errors
-/// The configuration has no device, or that gives no picture.
-pub fn take_picture(config: &crate::Config) -> anyhow::Result<GrayImage> {
-    let device = config.device()?.context("`source.device` is empty")?;
-    let whose = || format!("taking a picture with {:?}", device.path);
-    picture(DevicePath(device.path.clone()), &device, config.max_pixels()).with_context(whose)
-}
-
-fn picture<P: Port>(port: P, config: &DeviceConfig, max_pixels: u64) -> anyhow::Result<GrayImage> {
-    let mut video = Video::start(port, config.wanted.clone())?;
-    let mut frames = 0;
-    let mut problem = "it gives no frames".to_owned();
-    while video.now_ns() < video.started_ns() + PICTURE_NS {
-        match video.next()? {
-            Next::Frame(taken) => {
-                frames += 1;
-                let Some(capture) = video.capture() else { continue };
-                let image = grey(capture, &taken, config, max_pixels);
-                capture.give_back(taken)?;
-                match image {
-                    Ok(image) if frames >= SETTLING_FRAMES => return Ok(image),
-                    Ok(_) => {}
-                    Err(cause) => problem = format!("{cause:#}"),
-                }
-            }
-            Next::Nothing => {}
-            Next::Wait(time) => std::thread::sleep(time.min(Duration::from_millis(50))),
-            Next::Lost(reason) => problem = reason.to_owned(),
-        }
-    }
-    anyhow::bail!("no picture within {} s: {problem}", PICTURE_NS / 1_000_000_000)
-}
-
-fn grey<D: Device>(
-    capture: &Capture<D>,
-    taken: &Taken,
-    config: &DeviceConfig,
-    max_pixels: u64,
-) -> anyhow::Result<GrayImage> {
-    let size = config.size;
-    let mut image = GrayImage::filled(size.width, size.height, 0);
-    if Pixels::of(&config.wanted.fourcc) == Some(Pixels::Mjpeg) {
-        let decoded = capture
-            .read(taken, |jpeg| DecodedImage::decode(Path::new("its frame"), jpeg, max_pixels))?;
-        let [width, height] = [decoded.width(), decoded.height()];
-        ensure!(
-            (width, height) == (size.width, size.height),
-            "its frames have {width} x {height} pixels"
-        );
-        decoded.write_grey(image.pixels_mut());
-    } else {
-        capture.copy_grey(taken, image.pixels_mut());
-    }
-    Ok(image)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::Config;
     use crate::v4l2::fake::{Fake, Stamps};
+    use crate::v4l2::video::Port;
     use node::Layers;
-    use std::rc::Rc;
 
     /// The configuration with this `[source]` table.
     fn config(table: &str) -> Config {
@@ -257,19 +188,6 @@ mod tests {
         );
         assert_eq!(of(&[("H264", 1280, 720, 30.0)]), None);
         assert_eq!(of(&[("YUYV", 4000, 3000, 5.0)]).unwrap(), "YUYV 4000");
-    }
-
-    #[test]
-    fn a_picture_shows_what_the_camera_sees() {
-        let fake = Fake::of("YUYV", Stamps::ExposureStart, 0);
-        let config = config(
-            "[source]\ndevice = \"/dev/video0\"\nfourcc = \"YUYV\"\nsize_px = [640, 480]\nrate_hz = 100\n",
-        );
-        let device = config.device().unwrap().unwrap();
-        let picture = picture(Rc::clone(&fake), &device, 1 << 20).unwrap();
-        let number = u32::from_le_bytes(picture.pixels()[..4].try_into().unwrap());
-        assert!((15..30).contains(&number), "frame {number}");
-        assert_eq!((fake.open_devices(), fake.mappings()), (0, 0));
     }
 
     #[test]

@@ -34,7 +34,7 @@ mod v4l2;
 
 pub use announced::{Announced, AnnouncedCamera, AnnouncedStream, announced_cameras};
 pub use config::Config;
-pub use devices::{ConnectedDevice, connected_devices, source_table, take_picture};
+pub use devices::{ConnectedDevice, connected_devices, source_table};
 #[cfg(feature = "genicam")]
 pub use genicam::{GenicamCamera, genicam_cameras};
 pub use service::run;

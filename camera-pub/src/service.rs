@@ -829,6 +829,7 @@ mod tests {
             result = stream.publish_device(Rc::clone(&fake), &device) => result.unwrap(),
             () = seeing => {}
         }
+        assert_eq!((fake.open_devices(), fake.mappings()), (0, 0), "it is closed");
         let health = camera.shared_health();
         // A session that is dropped instead of closed may wait ten seconds for the others of its process.
         drop((stream, frames));

@@ -1,12 +1,13 @@
 //! A picture as `camera-pub` publishes it, whatever its configuration reads: a device, a program, a stream or files.
 
+use std::pin::pin;
 use std::time::Duration;
 
 use anyhow::Context;
 use camera_pub::Config;
 use imaging::{Converter, GrayImage};
 use messages::topic;
-use node::{Identity, Node, Shutdown, ZenohSource};
+use node::{Identity, Node, Shutdown, ZenohSource, now_ns};
 
 use crate::grey::grey;
 use crate::runtime::block_on;
@@ -20,30 +21,34 @@ const NO_NETWORK: &str = r#"{
   scouting: { multicast: { enabled: false }, gossip: { enabled: false } },
 }"#;
 /// Number of frames in which a camera's own metering settles.
-const SETTLING_FRAMES: usize = 10;
+const SETTLING_FRAMES: usize = 15;
 /// Maximum time until there is a picture: programs of cameras take seconds to start.
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// A picture of the camera with this configuration, as a detector would get it: the tenth frame, or the last of fewer.
+/// A picture of the camera with this configuration, as a detector would get it: the fifteenth frame, or the last of as many as
+/// come within 20 s.
 ///
 /// # Errors
-/// When the camera cannot be read, or gives no frame in 20 s.
+/// When the camera cannot be read, or gives no frame in that time.
 pub(super) fn published(config: Config) -> anyhow::Result<GrayImage> {
-    let camera = config.instance().to_owned();
+    published_within(config, PATIENCE)
+}
+
+fn published_within(config: Config, patience: Duration) -> anyhow::Result<GrayImage> {
     block_on(async {
-        let identity = Identity { service: "camera-pub", instance: camera.clone() };
+        let identity = Identity { service: "camera-pub", instance: config.instance().to_owned() };
         let node = Node::open(identity, &ZenohSource::Text(NO_NETWORK.to_owned())).await?;
-        let taken = tokio::time::timeout(PATIENCE, take(&node, config)).await;
+        let taken = take(&node, config, patience).await;
         node.close().await;
-        taken.with_context(|| {
-            format!("camera `{camera}` gave no picture within {} s", PATIENCE.as_secs())
-        })?
+        taken
     })?
 }
 
-async fn take(node: &Node, config: Config) -> anyhow::Result<GrayImage> {
-    let frames = node.frame_subscriber(topic::FRAME, &[config.instance()]).await?;
+async fn take(node: &Node, config: Config, patience: Duration) -> anyhow::Result<GrayImage> {
+    let camera = config.instance().to_owned();
+    let frames = node.frame_subscriber(topic::FRAME, &[&*camera]).await?;
     let mut service = camera_pub::run(node.clone(), config, Shutdown::on_signals()?);
+    let mut late = pin!(tokio::time::sleep(patience));
     let mut converter = Converter::default();
     let mut newest = None;
     for _ in 0..SETTLING_FRAMES {
@@ -57,10 +62,54 @@ async fn take(node: &Node, config: Config) -> anyhow::Result<GrayImage> {
                 if newest.is_none() {
                     ended?;
                 }
-                break;
+                return newest.context("the camera ended before its first frame");
             }
+            () = &mut late => break,
         };
         newest = Some(grey(&frame, &mut converter)?);
     }
-    newest.context("the camera ended before its first frame")
+    newest.with_context(|| {
+        let seconds = patience.as_secs();
+        format!("camera `{camera}` gave no picture within {seconds} s{}", reasons(node))
+    })
+}
+
+/// What the camera's service has counted of frames that it did not publish.
+fn reasons(node: &Node) -> String {
+    let health = node.health().report(node.identity(), now_ns());
+    let counts = health.errors.iter().chain(&health.drops);
+    let reasons: Vec<_> =
+        counts.map(|count| format!("{} ({})", count.reason, count.count)).collect();
+    if reasons.is_empty() { String::new() } else { format!(": {}", reasons.join(", ")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The picture of a program that is run by a shell and writes JPEG files of 8 x 8 pixels.
+    fn of_script(script: &str, patience: Duration) -> anyhow::Result<GrayImage> {
+        let command = format!("source.command=[\"sh\", \"-c\", {script:?}]");
+        let set = [&*command, "source.pixels=mjpeg", "source.size_px=[8, 8]"];
+        let layers = node::Layers { file: None, set: set.map(str::to_owned).into() };
+        published_within(layers.load::<Config>()?.settings, patience)
+    }
+
+    #[test]
+    fn a_camera_without_a_picture_is_told_with_what_is_wrong_with_its_frames() {
+        let damaged = r"while sleep 0.05; do printf '\377\330\377\331'; done";
+        let problem = of_script(damaged, Duration::from_secs(2)).unwrap_err().to_string();
+        let said = "camera `down` gave no picture within 2 s: unreadable image (";
+        assert!(problem.starts_with(said), "{problem}");
+    }
+
+    #[test]
+    fn of_a_slow_camera_the_last_picture_in_time_is_taken() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("seen.jpg");
+        image::save_buffer(&file, &[200; 64], 8, 8, image::ExtendedColorType::L8).unwrap();
+        let script = format!("cat '{}'; exec sleep 60", file.display());
+        let picture = of_script(&script, Duration::from_secs(3)).unwrap();
+        assert!(picture.pixels().iter().all(|level| level.abs_diff(200) < 3), "{picture:?}");
+    }
 }

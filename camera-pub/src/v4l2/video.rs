@@ -47,7 +47,6 @@ pub(crate) struct Video<P: Port> {
     identity: Identity,
     /// Whether its stamps have been of the host's clock: then others end no service.
     has_clock: bool,
-    started_ns: i64,
     last_frame_ns: i64,
     retry_ns: i64,
     outage: Option<Outage>,
@@ -85,7 +84,6 @@ impl<P: Port> Video<P> {
             identity: capture.identity().clone(),
             capture: Some(capture),
             has_clock: false,
-            started_ns: now_ns,
             last_frame_ns: now_ns,
             retry_ns: now_ns,
             outage: None,
@@ -95,11 +93,6 @@ impl<P: Port> Video<P> {
     /// The host's clock.
     pub(crate) fn now_ns(&self) -> i64 {
         self.port.now_ns()
-    }
-
-    /// When it was opened first.
-    pub(crate) fn started_ns(&self) -> i64 {
-        self.started_ns
     }
 
     /// The open camera.
