@@ -126,7 +126,7 @@ fn the_printed_board_is_found_and_one_picture_of_it_is_refused() -> anyhow::Resu
     let done = alight(&args, folder.path())?;
     ensure!(done.status.code() == Some(1), "{done:?}");
     let said: Value = serde_json::from_slice(&done.stdout)?;
-    let counts = said["guidance"]["point_counts"].as_array().context("counts")?;
+    let counts = said["shown"]["point_counts"].as_array().context("counts")?;
     let points: i64 =
         counts.iter().flat_map(|row| row.as_array()).flatten().filter_map(Value::as_i64).sum();
     ensure!(points == 4 * 35, "{said}");

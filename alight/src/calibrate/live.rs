@@ -7,8 +7,8 @@ use messages::{FrameHeader, topic};
 use node::{Frame, Node, Shutdown};
 
 use super::args::BoardArgs;
-use super::coverage::Coverage;
 use super::found::{Finder, FoundImages, Origin, Picture};
+use super::shown::Shown;
 use crate::args::Format;
 use crate::grey::grey;
 use crate::runtime::with_node;
@@ -76,7 +76,7 @@ fn picture(frame: &Frame, converter: &mut Converter) -> anyhow::Result<Picture> 
 }
 
 /// Says what is missing, when there is something new; whether nothing is.
-fn say(found: &FoundImages, args: &BoardArgs, said: &mut Option<Coverage>) -> anyhow::Result<bool> {
+fn say(found: &FoundImages, args: &BoardArgs, said: &mut Option<Shown>) -> anyhow::Result<bool> {
     let views = found.views.len();
     if said.as_ref().is_some_and(|before| before.views == views) {
         return Ok(false);
@@ -85,16 +85,16 @@ fn say(found: &FoundImages, args: &BoardArgs, said: &mut Option<Coverage>) -> an
         .is_multiple_of(VIEWS_PER_SOLUTION)
         .then(|| calibrate_unjudged(&found.views, args.lens.model(), &args.options()).ok())
         .flatten();
-    let mut coverage = Coverage::new(found, first.as_ref());
-    let is_enough = first.is_some() && coverage.next.is_empty();
+    let mut shown = Shown::new(found, first.as_ref());
+    let is_enough = first.is_some() && shown.next.is_empty();
     if let (None, Some(before)) = (&first, said.as_ref()) {
-        (coverage.tilt_deg, coverage.distance_ratio) = (before.tilt_deg, before.distance_ratio);
-        coverage.next = coverage.advice();
+        (shown.tilt_deg, shown.distance_ratio) = (before.tilt_deg, before.distance_ratio);
+        shown.next = shown.advice();
     }
     match args.format {
-        Format::Text => write_error(&coverage.line()),
-        Format::Json => print(&serde_json::json!({ "guidance": coverage.json() }).to_string())?,
+        Format::Text => write_error(&shown.line()),
+        Format::Json => print(&serde_json::json!({ "shown": shown.json() }).to_string())?,
     }
-    *said = Some(coverage);
+    *said = Some(shown);
     Ok(is_enough)
 }

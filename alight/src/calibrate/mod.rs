@@ -3,13 +3,13 @@
 
 mod args;
 mod corrected;
-mod coverage;
 mod flight;
 mod found;
 mod live;
 mod recorded;
 mod report;
 mod sharpness;
+mod shown;
 
 use std::fs::OpenOptions;
 use std::path::Path;
@@ -25,10 +25,10 @@ use crate::args::Format;
 use crate::marker::Sheet;
 use crate::terminal::print;
 pub(crate) use args::BoardArgs;
-use coverage::Coverage;
 use flight::FlightArgs;
 use found::{Finder, FoundImages, find_boards};
 use live::watch_camera;
+use shown::Shown;
 
 /// How often images are looked at again with the lens that was found before. Behind a fisheye of 120 degrees the first time leaves
 /// errors of 0.77 px at the border, the second 0.38, the third 0.31.
@@ -114,17 +114,17 @@ fn board(args: &BoardArgs) -> anyhow::Result<ExitCode> {
         found.look_again(&mut finder, &camera);
         first = calibrate_unjudged(&found.views, lens, &options).ok().or(first);
     }
-    let coverage = Coverage::new(&found, first.as_ref());
+    let shown = Shown::new(&found, first.as_ref());
     match calibrate(&found.views, lens, &options) {
-        Ok(calibration) => accept(args, &found, &coverage, &calibration),
-        Err(refusal) => refuse(args, &found, &coverage, &refusal),
+        Ok(calibration) => accept(args, &found, &shown, &calibration),
+        Err(refusal) => refuse(args, &found, &shown, &refusal),
     }
 }
 
 fn accept(
     args: &BoardArgs,
     found: &FoundImages,
-    coverage: &Coverage,
+    shown: &Shown,
     calibration: &Calibration,
 ) -> anyhow::Result<ExitCode> {
     let note = CalibrationNote {
@@ -137,11 +137,11 @@ fn accept(
     // The result is told first: a file that cannot be written does not take it along.
     match args.format {
         Format::Text => {
-            print(report::found_text(found, coverage).trim_end())?;
-            print(report::shown_text(coverage).trim_end())?;
+            print(report::found_text(found, shown).trim_end())?;
+            print(report::shown_text(shown).trim_end())?;
             print(report::worth_text(calibration).trim_end())
         }
-        Format::Json => print(&report::json(found, coverage, Some(calibration), None).to_string()),
+        Format::Json => print(&report::json(found, shown, Some(calibration), None).to_string()),
     }
     .context("writing the result")?;
     let said = match &args.output {
@@ -164,16 +164,16 @@ fn accept(
 fn refuse(
     args: &BoardArgs,
     found: &FoundImages,
-    coverage: &Coverage,
+    shown: &Shown,
     refusal: &Refusal,
 ) -> anyhow::Result<ExitCode> {
     match args.format {
         Format::Text => {
-            print(report::found_text(found, coverage).trim_end())?;
-            print(report::shown_text(coverage).trim_end())?;
+            print(report::found_text(found, shown).trim_end())?;
+            print(report::shown_text(shown).trim_end())?;
             print(&format!("No calibration: {refusal}."))
         }
-        Format::Json => print(&report::json(found, coverage, None, Some(refusal)).to_string()),
+        Format::Json => print(&report::json(found, shown, None, Some(refusal)).to_string()),
     }
     .context("writing the result")?;
     Ok(ExitCode::FAILURE)

@@ -1,4 +1,4 @@
-//! A calibration from board images as text and JSON: images with the board, its coverage, focal lengths,
+//! A calibration from board images as text and JSON: images with the board, how it was shown, focal lengths,
 //! distortion, maps of residuals and of uncertainty, or the refusal.
 
 use std::fmt::Write as _;
@@ -7,8 +7,8 @@ use calibration::{Calibration, Refusal};
 use geometry::{CameraModel, Distortion};
 use serde_json::{Value, json};
 
-use super::coverage::Coverage;
 use super::found::{BLURRED_PX, FoundImages};
+use super::shown::Shown;
 
 /// The distance that errors are told at, in metres.
 const FAR_M: f64 = 5.0;
@@ -18,7 +18,7 @@ const MAP: [usize; 2] = [6, 4];
 const MAX_NAMES: usize = 5;
 
 /// Which images show the board, and where in the image it was.
-pub(super) fn found_text(found: &FoundImages, coverage: &Coverage) -> String {
+pub(super) fn found_text(found: &FoundImages, shown: &Shown) -> String {
     let points: usize = found.views.iter().map(|view| view.points.len()).sum();
     let mut text = format!(
         "images: {}, with the board: {}, its points: {points}\n",
@@ -53,7 +53,7 @@ pub(super) fn found_text(found: &FoundImages, coverage: &Coverage) -> String {
         return text;
     }
     text.push_str("where in the image the points are (#: 20 or more, +: some, .: none, show the board there):\n");
-    for row in coverage.point_counts {
+    for row in shown.point_counts {
         let sign = |count: &usize| match count {
             0 => '.',
             1..20 => '+',
@@ -69,18 +69,18 @@ fn blurred(found: &FoundImages) -> impl Iterator<Item = &str> {
 }
 
 /// How the board was shown, and what would help.
-pub(super) fn shown_text(coverage: &Coverage) -> String {
+pub(super) fn shown_text(shown: &Shown) -> String {
     let mut text = String::new();
-    if let (Some(tilt_deg), Some(ratio)) = (coverage.tilt_deg, coverage.distance_ratio) {
+    if let (Some(tilt_deg), Some(ratio)) = (shown.tilt_deg, shown.distance_ratio) {
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
             "tilt: up to {tilt_deg:.0} degrees; the farthest views are {ratio:.1} times as far as the nearest; points in {:.0} % \
              of the image",
-            100.0 * coverage.covered()
+            100.0 * shown.covered()
         );
     }
-    for next in &coverage.next {
+    for next in &shown.next {
         let _ = writeln!(text, "would help: {next}");
     }
     text
@@ -186,7 +186,7 @@ fn numbers(calibration: &Calibration) -> &[f64] {
 /// All of it for programs.
 pub(super) fn json(
     found: &FoundImages,
-    coverage: &Coverage,
+    shown: &Shown,
     calibration: Option<&Calibration>,
     refusal: Option<&Refusal>,
 ) -> Value {
@@ -204,7 +204,7 @@ pub(super) fn json(
         "blurred": blurred(found).collect::<Vec<_>>(),
         "edges": edges,
         "shaken": found.shaken,
-        "guidance": coverage.json(),
+        "shown": shown.json(),
         "refused": refusal.map(ToString::to_string),
         "calibration": calibration.map(calibration_json),
     })

@@ -1,4 +1,4 @@
-//! The cells (rows, columns) of the image that the calibration board has covered so far, and where and how to show it next.
+//! How the calibration board has been shown so far (views, parts of the image, tilt, distances), and where and how to show it next.
 
 use calibration::{Calibration, View};
 use serde_json::{Value, json};
@@ -16,9 +16,9 @@ const GOOD_COVERED: f64 = 0.95;
 /// Points without which a part of the image is said to lack them.
 const FEW_POINTS: usize = 8;
 
-/// What is good about the images and what is missing.
+/// How the board was shown, and what is still missing.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Coverage {
+pub(super) struct Shown {
     pub(super) views: usize,
     /// How many points lie in each part of the image, row by row.
     pub(super) point_counts: [[usize; COLUMNS]; ROWS],
@@ -32,10 +32,10 @@ pub(super) struct Coverage {
     pub(super) next: Vec<String>,
 }
 
-impl Coverage {
+impl Shown {
     /// Of the images, and a first solution of them where there is one.
     pub(super) fn new(found: &FoundImages, first: Option<&Calibration>) -> Self {
-        let mut coverage = Self {
+        let mut shown = Self {
             views: found.views.len(),
             point_counts: point_counts(&found.views),
             tilt_deg: first.map(|it| it.evidence.tilt.to_degrees()),
@@ -43,8 +43,8 @@ impl Coverage {
             blurred: found.edges.iter().filter(|edge| edge.width_px > BLURRED_PX).count(),
             next: Vec::new(),
         };
-        coverage.next = coverage.advice();
-        coverage
+        shown.next = shown.advice();
+        shown
     }
 
     /// The share of the image's parts in which there are points.
@@ -182,7 +182,7 @@ mod tests {
 
     #[test]
     fn the_part_of_the_image_that_lacks_points_is_named() {
-        let next = |found: &FoundImages| Coverage::new(found, None).next.join("; ");
+        let next = |found: &FoundImages| Shown::new(found, None).next.join("; ");
         let whole = next(&seen_in(|_, _| true));
         assert_eq!(whole, "take 19 more images");
         let no_right = next(&seen_in(|row, column| column < 6 || !(2..4).contains(&row)));
@@ -198,7 +198,7 @@ mod tests {
             let seen = Pixel::new(x, y);
             found.views[0].points.push(Sighting { tag: 0, place_m: [0.0; 2], seen });
         }
-        let counts = Coverage::new(&found, None).point_counts;
+        let counts = Shown::new(&found, None).point_counts;
         assert_eq!((counts[0][0], counts[ROWS - 1][COLUMNS - 1], counts[ROWS - 1][0]), (1, 1, 1));
     }
 }
