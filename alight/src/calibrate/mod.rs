@@ -46,9 +46,10 @@ enum What {
     /// A camera's intrinsics from images of a printed board: print it with --print, take 20 to 60 pictures (tilted by up to
     /// 45 degrees to all sides, near and far, in every corner of the image), then calibrate.
     Board(BoardArgs),
-    /// A camera's time offset, mount and focal length from the recording of a landing (`alight land --record`, `alight record`) on
-    /// a pad of known size that does not move. A landing with turns of the heading and swift moves to all sides shows
-    /// all of it; what a flight does not show stays as it was. Exit status 1 when it shows nothing.
+    /// A camera's time offset, mount, focal length and first radial coefficient (k1) from the recording of a landing
+    /// (`alight land --record`, `alight record`) on a pad of known size that does not move. A landing with turns of the heading
+    /// and swift moves to all sides shows all of it; what a flight does not show stays as it was. Exit status 1 when it shows
+    /// nothing.
     Flight(FlightArgs),
 }
 

@@ -1,10 +1,10 @@
-//! A camera's time offset, mount and focal length from a flight over a pad that stands still.
+//! A camera's time offset, mount, focal length and first radial coefficient (k1) from a flight over a pad that stands still.
 //!
 //! The pad has one place. Where the vehicle's attitude and position put it moves with the vehicle when the camera is not as
-//! configured: with the height and the heading under a mount that is off, with the tilt under a focal length that is off, with
-//! every turn under stamps that are early or late. What the autopilot errs by moves it, too, and slowly; that is solved for
-//! with the camera, and how large it is, is estimated from the flight itself, so that a deviation says what the flight has
-//! shown. Hovering shows nothing (Yang, Geneva, Eckenhoff, Huang, "Degenerate motion analysis for aided INS with online
+//! configured: with the height and the heading under a mount that is off, with the tilt under a focal length or a k1 that is
+//! off, with every turn under stamps that are early or late. What the autopilot errs by moves it, too, and slowly; that is
+//! solved for with the camera, and how large it is, is estimated from the flight itself, so that a deviation says what the
+//! flight has shown. Hovering shows nothing (Yang, Geneva, Eckenhoff, Huang, "Degenerate motion analysis for aided INS with online
 //! spatial and temporal sensor calibration", 2019).
 //!
 //! Stages in reading order: `sample` is what is given, `quantity` what is estimated; `motion` is the vehicle's pose at any time, `model` predicts what the camera sees,

@@ -1,4 +1,5 @@
-//! A camera's intrinsics from images of a board, and its mount and time offset from a flight, with what they are worth.
+//! A camera's intrinsics from images of a board, and its time offset, mount, focal length and k1 from a flight, with what they are
+//! worth.
 //!
 //! The way through it: one [`View`] for each image, with the board's points that were found in it, goes into
 //! [`calibrate`]. What comes out is a [`Calibration`] (the [`geometry::CameraModel`], its covariance, each view's pose and

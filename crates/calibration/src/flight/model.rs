@@ -1,5 +1,5 @@
-//! Predicts where the camera sees the pad, from the vehicle's motion and all unknowns (mount, focal length, time offset, drift),
-//! linearised for each marker.
+//! Predicts where the camera sees the pad, from the vehicle's motion and all unknowns (mount, focal length, k1, time offset,
+//! drift), linearised for each marker.
 
 use geometry::{
     Body, Camera, CameraModel, Distortion, Ned, Pixel, Point, Rotation, Transform, Vector,
