@@ -3,7 +3,6 @@
 //! The tilt accelerates the vehicle against a drag that grows with the airspeed `w = v - wind`, by the momentum that rotors
 //! take from the air (proportional to `|w|`) and by the body's shape (to its square): `dv/dt = tilt - (linear + quadratic |w|) w`.
 
-use geometry::{Body, Vector};
 use landing::VehicleState;
 use libm::{exp, fmax, hypot, sqrt};
 
@@ -54,7 +53,7 @@ struct Mean {
 impl WindEstimate {
     /// Updates the estimate with a state of the flying vehicle.
     pub fn update(&mut self, state: &VehicleState) {
-        let up = state.ned_from_body * Vector::<Body>::new(0.0, 0.0, -1.0);
+        let up = -state.ned_from_body.down_axis();
         let scale = GRAVITY_M_S2 / fmax(-up.z(), 0.5);
         let (now_s, velocity) = (state.stamp.seconds(), [state.velocity.x(), state.velocity.y()]);
         let tilt = [up.x() * scale, up.y() * scale];
@@ -89,7 +88,7 @@ impl WindEstimate {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use geometry::{Point, Rotation};
+    use geometry::{Point, Rotation, Vector};
     use landing::{Landed, Mode, Timestamp};
     use node::Layers;
     use world::vehicle::VehicleConfig;

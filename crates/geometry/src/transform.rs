@@ -5,7 +5,7 @@ use std::ops::{Add, Mul, Neg, Sub};
 
 use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
 
-use crate::frame::Frame;
+use crate::frame::{Body, Frame, Ned};
 
 /// A place, in metres, in frame `F`.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -186,6 +186,13 @@ impl<To: Frame, From: Frame> Rotation<To, From> {
     }
 }
 
+impl Rotation<Ned, Body> {
+    /// The direction of the body's down axis: straight down, (0, 0, 1), when the vehicle is level.
+    pub fn down_axis(&self) -> Vector<Ned> {
+        *self * Vector::<Body>::new(0.0, 0.0, 1.0)
+    }
+}
+
 impl<To: Frame, From: Frame> Transform<To, From> {
     /// From the rotation and from the origin of `From` as seen in `To`.
     pub fn new(rotation: Rotation<To, From>, origin_in_to: Point<To>) -> Self {
@@ -308,7 +315,7 @@ impl<F: Frame> Mul<f64> for Vector<F> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frame::{Body, Camera, Ned};
+    use crate::frame::Camera;
     use proptest::prelude::*;
 
     fn transform(r: [f64; 3], t: [f64; 3]) -> Transform<Ned, Body> {
@@ -334,6 +341,15 @@ mod tests {
             let again = Rotation::<Ned, Body>::from_wxyz(rotation.wxyz()).unwrap();
             prop_assert!((rotation.inverse() * Rotation::<Ned, Ned>::identity() * again).angle() < 1e-7);
         }
+    }
+
+    #[test]
+    fn a_vehicle_that_rolls_right_has_its_down_axis_to_the_left() {
+        let level = Rotation::<Ned, Body>::from_euler(0.0, 0.0, 0.7);
+        assert!((level.down_axis() - Vector::new(0.0, 0.0, 1.0)).norm() < 1e-12);
+        let rolled = Rotation::<Ned, Body>::from_euler(0.1, 0.0, 0.0);
+        let (sin, cos) = 0.1_f64.sin_cos();
+        assert!((rolled.down_axis() - Vector::new(0.0, -sin, cos)).norm() < 1e-12);
     }
 
     #[test]

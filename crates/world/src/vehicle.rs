@@ -147,8 +147,7 @@ pub struct VehicleTruth {
 impl VehicleTruth {
     /// Angle between the body's down axis and the vertical, in radians.
     pub fn tilt_rad(&self) -> f64 {
-        let down = self.ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
-        down.z().clamp(-1.0, 1.0).acos()
+        self.ned_from_body.down_axis().z().clamp(-1.0, 1.0).acos()
     }
 
     /// The state between this one and `next`, at `time_s`: on the straight line, and on the shortest arc of
