@@ -81,124 +81,72 @@ pub enum Family {
 }
 
 impl Family {
-    /// Every family, in the order in which they are listed to people.
-    pub const ALL: [Self; 36] = [
-        Self::AprilTag16h5,
-        Self::AprilTag25h9,
-        Self::AprilTag36h10,
-        Self::AprilTag36h11,
-        Self::AprilTagCircle21h7,
-        Self::AprilTagCircle49h12,
-        Self::AprilTagCustom48h12,
-        Self::AprilTagStandard41h12,
-        Self::AprilTagStandard52h13,
-        Self::Aruco4x4_50,
-        Self::Aruco4x4_100,
-        Self::Aruco4x4_250,
-        Self::Aruco4x4_1000,
-        Self::Aruco5x5_50,
-        Self::Aruco5x5_100,
-        Self::Aruco5x5_250,
-        Self::Aruco5x5_1000,
-        Self::Aruco6x6_50,
-        Self::Aruco6x6_100,
-        Self::Aruco6x6_250,
-        Self::Aruco6x6_1000,
-        Self::Aruco7x7_50,
-        Self::Aruco7x7_100,
-        Self::Aruco7x7_250,
-        Self::Aruco7x7_1000,
-        Self::ArucoOriginal,
-        Self::ArucoMip36h12,
-        Self::StagHd11,
-        Self::StagHd13,
-        Self::StagHd15,
-        Self::StagHd17,
-        Self::StagHd19,
-        Self::StagHd21,
-        Self::StagHd23,
-        Self::Rings,
-        Self::RingsThesis,
+    /// Each family in its order, with its name and the number of its ids.
+    const TABLE: [(Self, &'static str, Option<u32>); 36] = [
+        (Self::AprilTag16h5, "apriltag-16h5", Some(30)),
+        (Self::AprilTag25h9, "apriltag-25h9", Some(35)),
+        (Self::AprilTag36h10, "apriltag-36h10", Some(2320)),
+        (Self::AprilTag36h11, "apriltag-36h11", Some(587)),
+        (Self::AprilTagCircle21h7, "apriltag-circle21h7", Some(38)),
+        (Self::AprilTagCircle49h12, "apriltag-circle49h12", Some(65535)),
+        (Self::AprilTagCustom48h12, "apriltag-custom48h12", Some(42211)),
+        (Self::AprilTagStandard41h12, "apriltag-standard41h12", Some(2115)),
+        (Self::AprilTagStandard52h13, "apriltag-standard52h13", Some(48714)),
+        (Self::Aruco4x4_50, "aruco-4x4-50", Some(50)),
+        (Self::Aruco4x4_100, "aruco-4x4-100", Some(100)),
+        (Self::Aruco4x4_250, "aruco-4x4-250", Some(250)),
+        (Self::Aruco4x4_1000, "aruco-4x4-1000", Some(1000)),
+        (Self::Aruco5x5_50, "aruco-5x5-50", Some(50)),
+        (Self::Aruco5x5_100, "aruco-5x5-100", Some(100)),
+        (Self::Aruco5x5_250, "aruco-5x5-250", Some(250)),
+        (Self::Aruco5x5_1000, "aruco-5x5-1000", Some(1000)),
+        (Self::Aruco6x6_50, "aruco-6x6-50", Some(50)),
+        (Self::Aruco6x6_100, "aruco-6x6-100", Some(100)),
+        (Self::Aruco6x6_250, "aruco-6x6-250", Some(250)),
+        (Self::Aruco6x6_1000, "aruco-6x6-1000", Some(1000)),
+        (Self::Aruco7x7_50, "aruco-7x7-50", Some(50)),
+        (Self::Aruco7x7_100, "aruco-7x7-100", Some(100)),
+        (Self::Aruco7x7_250, "aruco-7x7-250", Some(250)),
+        (Self::Aruco7x7_1000, "aruco-7x7-1000", Some(1000)),
+        (Self::ArucoOriginal, "aruco-original", Some(1024)),
+        (Self::ArucoMip36h12, "aruco-mip-36h12", Some(250)),
+        (Self::StagHd11, "stag-hd11", Some(22309)),
+        (Self::StagHd13, "stag-hd13", Some(2884)),
+        (Self::StagHd15, "stag-hd15", Some(766)),
+        (Self::StagHd17, "stag-hd17", Some(157)),
+        (Self::StagHd19, "stag-hd19", Some(38)),
+        (Self::StagHd21, "stag-hd21", Some(12)),
+        (Self::StagHd23, "stag-hd23", Some(6)),
+        (Self::Rings, "rings", None),
+        (Self::RingsThesis, "rings-thesis", None),
     ];
+
+    /// Every family, in the order in which they are listed to people.
+    pub const ALL: [Self; 36] = {
+        let mut all = [Self::Rings; 36];
+        let mut place = 0;
+        while place < all.len() {
+            all[place] = Self::TABLE[place].0;
+            // A family finds its row by its place.
+            assert!(all[place] as usize == place);
+            place += 1;
+        }
+        all
+    };
+
+    /// The family of this name.
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|family| family.name() == name)
+    }
 
     /// The family's name as it is written in configuration, on the wire and on the command line.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::AprilTag16h5 => "apriltag-16h5",
-            Self::AprilTag25h9 => "apriltag-25h9",
-            Self::AprilTag36h10 => "apriltag-36h10",
-            Self::AprilTag36h11 => "apriltag-36h11",
-            Self::AprilTagCircle21h7 => "apriltag-circle21h7",
-            Self::AprilTagCircle49h12 => "apriltag-circle49h12",
-            Self::AprilTagCustom48h12 => "apriltag-custom48h12",
-            Self::AprilTagStandard41h12 => "apriltag-standard41h12",
-            Self::AprilTagStandard52h13 => "apriltag-standard52h13",
-            Self::Aruco4x4_50 => "aruco-4x4-50",
-            Self::Aruco4x4_100 => "aruco-4x4-100",
-            Self::Aruco4x4_250 => "aruco-4x4-250",
-            Self::Aruco4x4_1000 => "aruco-4x4-1000",
-            Self::Aruco5x5_50 => "aruco-5x5-50",
-            Self::Aruco5x5_100 => "aruco-5x5-100",
-            Self::Aruco5x5_250 => "aruco-5x5-250",
-            Self::Aruco5x5_1000 => "aruco-5x5-1000",
-            Self::Aruco6x6_50 => "aruco-6x6-50",
-            Self::Aruco6x6_100 => "aruco-6x6-100",
-            Self::Aruco6x6_250 => "aruco-6x6-250",
-            Self::Aruco6x6_1000 => "aruco-6x6-1000",
-            Self::Aruco7x7_50 => "aruco-7x7-50",
-            Self::Aruco7x7_100 => "aruco-7x7-100",
-            Self::Aruco7x7_250 => "aruco-7x7-250",
-            Self::Aruco7x7_1000 => "aruco-7x7-1000",
-            Self::ArucoOriginal => "aruco-original",
-            Self::ArucoMip36h12 => "aruco-mip-36h12",
-            Self::StagHd11 => "stag-hd11",
-            Self::StagHd13 => "stag-hd13",
-            Self::StagHd15 => "stag-hd15",
-            Self::StagHd17 => "stag-hd17",
-            Self::StagHd19 => "stag-hd19",
-            Self::StagHd21 => "stag-hd21",
-            Self::StagHd23 => "stag-hd23",
-            Self::Rings => "rings",
-            Self::RingsThesis => "rings-thesis",
-        }
+        Self::TABLE.get(self as usize).map_or("", |row| row.1)
     }
 
     /// Number of ids in the family; `None` for a family whose markers carry no id.
     pub fn id_count(self) -> Option<u32> {
-        match self {
-            Self::AprilTag16h5 => Some(30),
-            Self::AprilTag25h9 => Some(35),
-            Self::AprilTag36h10 => Some(2320),
-            Self::AprilTag36h11 => Some(587),
-            Self::AprilTagCircle21h7 | Self::StagHd19 => Some(38),
-            Self::AprilTagCircle49h12 => Some(65535),
-            Self::AprilTagCustom48h12 => Some(42211),
-            Self::AprilTagStandard41h12 => Some(2115),
-            Self::AprilTagStandard52h13 => Some(48714),
-            Self::Aruco4x4_50 | Self::Aruco5x5_50 | Self::Aruco6x6_50 | Self::Aruco7x7_50 => {
-                Some(50)
-            }
-            Self::Aruco4x4_100 | Self::Aruco5x5_100 | Self::Aruco6x6_100 | Self::Aruco7x7_100 => {
-                Some(100)
-            }
-            Self::Aruco4x4_250
-            | Self::Aruco5x5_250
-            | Self::Aruco6x6_250
-            | Self::Aruco7x7_250
-            | Self::ArucoMip36h12 => Some(250),
-            Self::Aruco4x4_1000
-            | Self::Aruco5x5_1000
-            | Self::Aruco6x6_1000
-            | Self::Aruco7x7_1000 => Some(1000),
-            Self::ArucoOriginal => Some(1024),
-            Self::StagHd11 => Some(22309),
-            Self::StagHd13 => Some(2884),
-            Self::StagHd15 => Some(766),
-            Self::StagHd17 => Some(157),
-            Self::StagHd21 => Some(12),
-            Self::StagHd23 => Some(6),
-            Self::Rings | Self::RingsThesis => None,
-        }
+        Self::TABLE.get(self as usize).and_then(|row| row.2)
     }
 }
 
@@ -277,14 +225,11 @@ impl FromStr for Marker {
     fn from_str(text: &str) -> Result<Self, MarkerError> {
         let mut parts = text.split(':');
         let name = parts.next().unwrap_or_default();
-        let family =
-            Family::ALL.into_iter().find(|family| family.name() == name).ok_or_else(|| {
-                MarkerError::Family {
-                    text: text.to_owned(),
-                    family: name.to_owned(),
-                    known: Family::ALL.map(Family::name).join(", "),
-                }
-            })?;
+        let family = Family::named(name).ok_or_else(|| MarkerError::Family {
+            text: text.to_owned(),
+            family: name.to_owned(),
+            known: Family::ALL.map(Family::name).join(", "),
+        })?;
         let id = match family.id_count() {
             Some(count) => parts.next().map_or(Ok(None), |id| parse_id(text, id, count))?,
             None => None,

@@ -256,7 +256,7 @@ fn run_photographs(folder: &Path, results: &Path, wanted: &[String]) -> anyhow::
         if !wanted.is_empty() && !wanted.iter().any(|wanted| wanted == name) {
             continue;
         }
-        if let Some(family) = Family::ALL.into_iter().find(|family| family.name() == name) {
+        if let Some(family) = Family::named(name) {
             let records = photographs::run(folder, family)?;
             record::write(&photographs_file(results, OURS, name), &records)?;
         }

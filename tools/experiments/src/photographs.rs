@@ -164,9 +164,7 @@ pub fn labelled(
 
 /// The families with labels.
 pub fn labelled_families() -> impl Iterator<Item = Family> {
-    FAMILIES
-        .iter()
-        .filter_map(|(_, name)| Family::ALL.into_iter().find(|family| family.name() == *name))
+    FAMILIES.iter().filter_map(|(_, name)| Family::named(name))
 }
 
 fn label_of(family: &str) -> Option<&'static str> {
@@ -215,8 +213,7 @@ pub fn recall(folder: &Path, family: &str, records: &[Record]) -> anyhow::Result
 
 /// The families to find in negatives: those of the experiment, and all.
 pub fn families_for_negatives() -> [(&'static str, Vec<Family>); 2] {
-    let thesis = crate::set::families()
-        .filter_map(|name| Family::ALL.into_iter().find(|family| family.name() == name));
+    let thesis = crate::set::families().filter_map(Family::named);
     let all = Family::ALL.into_iter().filter(|family| *family != Family::RingsThesis);
     [("experiment", thesis.collect()), ("all", all.collect())]
 }
