@@ -55,19 +55,24 @@ pub fn is_black(codeword: u64, k: usize) -> bool {
     codeword >> (DOTS - 1 - k) & 1 == 1
 }
 
+/// The smallest Hamming distance between two markers of a family of STags, in any rotation; `None` for other families.
+pub fn min_hamming(family: Family) -> Option<u8> {
+    match family {
+        Family::StagHd11 => Some(11),
+        Family::StagHd13 => Some(13),
+        Family::StagHd15 => Some(15),
+        Family::StagHd17 => Some(17),
+        Family::StagHd19 => Some(19),
+        Family::StagHd21 => Some(21),
+        Family::StagHd23 => Some(23),
+        _ => None,
+    }
+}
+
 /// The codebook of a family of STags; `None` for other families. Prepared at the first call.
 pub fn codebook(family: Family) -> Option<&'static Codebook> {
     static BOOKS: [OnceLock<Codebook>; 7] = [const { OnceLock::new() }; 7];
-    let slot = match family {
-        Family::StagHd11 => 0,
-        Family::StagHd13 => 1,
-        Family::StagHd15 => 2,
-        Family::StagHd17 => 3,
-        Family::StagHd19 => 4,
-        Family::StagHd21 => 5,
-        Family::StagHd23 => 6,
-        _ => return None,
-    };
+    let slot = usize::from(min_hamming(family)? - 11) / 2;
     // Counted from the next corner, clockwise, a dot is where the one a quarter turn behind it was.
     let quarter_turn: [u8; DOTS] = std::array::from_fn(|k| ((k + 3 * DOTS / 4) % DOTS) as u8);
     Some(BOOKS.get(slot)?.get_or_init(|| Codebook::new(tables::codewords(family), &quarter_turn)))

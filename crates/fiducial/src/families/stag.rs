@@ -11,7 +11,7 @@ use geometry::Pixel;
 use imaging::bilinear;
 use imaging::pyramid::from_level_0;
 use markers::stag_code::{self, DOTS, QUIET_ZONE};
-use markers::{Codebook, Family, Marker};
+use markers::{Codebook, Marker};
 
 use crate::candidates::evidence::{Needs, OutlineNeeds};
 use crate::candidates::overlap::Overlap;
@@ -555,25 +555,12 @@ impl StagQuery {
 
     /// The family's minimum Hamming distance, over all rotations.
     fn min_distance(&self) -> u32 {
-        match self.query.family {
-            Family::StagHd11 => 11,
-            Family::StagHd13 => 13,
-            Family::StagHd15 => 15,
-            Family::StagHd17 => 17,
-            Family::StagHd19 => 19,
-            Family::StagHd21 => 21,
-            _ => 23,
-        }
+        stag_code::min_hamming(self.query.family).map_or(0, u32::from)
     }
 
     /// Largest Hamming distance that is corrected; a random word is hardly ever that near to a codeword.
     fn max_hamming(&self) -> u8 {
-        match self.query.family {
-            Family::StagHd11 => 4,
-            Family::StagHd13 => 5,
-            Family::StagHd15 => 6,
-            _ => 7,
-        }
+        (self.min_distance().saturating_sub(3) / 2).min(7) as u8
     }
 }
 
