@@ -6,8 +6,9 @@ use std::str::FromStr;
 /// The name of the preferred detector that lies.
 pub const LIAR: &str = "liar";
 
-/// A kind of fault.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+/// A kind of fault. The order tells what it happens to: a process, the autopilot's link, detections and cameras, what the
+/// autopilot says, and last what only real processes show.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
     /// The controller's process ends; after the duration another one resumes the landing.
     ControllerKilled,
@@ -105,65 +106,55 @@ pub enum Kind {
     FullSharedMemory,
 }
 
-/// A kind, its name and its description.
-type Row = (Kind, &'static str, &'static str);
-
-const TABLE: [Row; 47] = [
-    (
-        Kind::ControllerKilled,
-        "controller-killed",
-        "its process ends; another one resumes after the duration",
-    ),
-    (Kind::ControllerStopped, "controller-stopped", "its process is stopped (SIGSTOP) and goes on"),
-    (Kind::DetectorKilled, "detector-killed", "its process ends; another one follows"),
-    (Kind::DetectorStopped, "detector-stopped", "its process is stopped and goes on"),
-    (Kind::CameraKilled, "camera-killed", "its process ends; another one follows"),
-    (Kind::CameraStopped, "camera-stopped", "its process is stopped and goes on"),
-    (Kind::SilenceFrom, "silence-from", "nothing arrives from the autopilot"),
-    (Kind::SilenceTo, "silence-to", "nothing arrives at the autopilot"),
-    (Kind::SilenceBoth, "silence-both", "nothing passes the autopilot's link"),
-    (Kind::LinkDelay, "link-delay", "the autopilot's packets are 50 to 500 ms late, each way"),
-    (Kind::LinkJitter, "link-jitter", "they are late by up to 50 to 500 ms, in order"),
-    (Kind::LinkLoss, "link-loss", "20 to 80 % of them never arrive"),
-    (Kind::LinkDuplication, "link-duplication", "30 % of them arrive again, up to 1 s later"),
-    (Kind::LinkReordering, "link-reordering", "30 % of them arrive up to 0.3 s later"),
-    (Kind::LinkCorruption, "link-corruption", "30 % of them have flipped bits"),
-    (Kind::FramesDelay, "frames-delay", "detections are 50 to 500 ms late"),
-    (Kind::FramesJitter, "frames-jitter", "they are late by up to 50 to 500 ms, in order"),
-    (Kind::FramesLoss, "frames-loss", "20 to 80 % of them never arrive"),
-    (Kind::FramesDuplication, "frames-duplication", "30 % of them arrive again, up to 1 s later"),
-    (Kind::FramesReordering, "frames-reordering", "30 % of them arrive up to 0.3 s later"),
-    (Kind::FramesCorruption, "frames-corruption", "30 % of them have flipped bits"),
-    (Kind::ClockStep, "clock-step", "frames' stamps are wrong by up to 2 s, either way"),
-    (
-        Kind::PictureRepeated,
-        "picture-repeated",
-        "the camera repeats its last picture, with new stamps",
-    ),
-    (Kind::PictureRecoded, "picture-recoded", "it does, and the link codes it anew each time"),
-    (Kind::LiarJumps, "liar-jumps", "a preferred detector is 1 m off, from one frame to the next"),
-    (Kind::LiarDrifts, "liar-drifts", "a preferred detector drifts by 5 cm/s"),
-    (Kind::PreferredIsBlind, "preferred-is-blind", "a preferred detector finds nothing"),
-    (Kind::DetectorBabbles, "detector-babbles", "the detector's poses are absurd"),
-    (Kind::Crowd, "crowd", "seventy strangers publish detections"),
-    (Kind::StrangeCamera, "strange-camera", "a stranger publishes another mount and focal length"),
-    (Kind::LandedUndefined, "landed-undefined", "the autopilot's landed state is undefined"),
-    (Kind::LandedTakingOff, "landed-taking-off", "it says \"taking off\""),
-    (Kind::LandedOnGround, "landed-on-ground", "it says \"on the ground\""),
-    (Kind::HeartbeatMissing, "heartbeat-missing", "the autopilot's heartbeats alone are missing"),
-    (Kind::ModeLie, "mode-lie", "its heartbeats claim that the pilot has taken another mode"),
-    (Kind::DisarmedLie, "disarmed-lie", "its heartbeats claim that the motors are off"),
-    (Kind::OldBootTime, "old-boot-time", "one packet has a boot time of long ago"),
-    (Kind::PositionFrozen, "position-frozen", "its position stays the same, with new stamps"),
-    (Kind::PositionNan, "position-nan", "its position is not a number"),
-    (Kind::PositionMissing, "position-missing", "its position is missing"),
-    (Kind::AttitudeMissing, "attitude-missing", "its attitude is missing"),
-    (Kind::BridgeKilled, "bridge-killed", "the ground station's bridge ends (real time only)"),
-    (Kind::BridgeStopped, "bridge-stopped", "the bridge is stopped and goes on (real time only)"),
-    (Kind::ControllerMemory, "controller-memory", "it gets no more memory (real time only)"),
-    (Kind::DetectorMemory, "detector-memory", "it gets no more memory (real time only)"),
-    (Kind::FullDisk, "full-disk", "no log can be written (real time only)"),
-    (Kind::FullSharedMemory, "full-shared-memory", "/dev/shm is full (real time only)"),
+/// The kinds, in their order, with their names.
+const TABLE: [(Kind, &str); 47] = [
+    (Kind::ControllerKilled, "controller-killed"),
+    (Kind::ControllerStopped, "controller-stopped"),
+    (Kind::DetectorKilled, "detector-killed"),
+    (Kind::DetectorStopped, "detector-stopped"),
+    (Kind::CameraKilled, "camera-killed"),
+    (Kind::CameraStopped, "camera-stopped"),
+    (Kind::SilenceFrom, "silence-from"),
+    (Kind::SilenceTo, "silence-to"),
+    (Kind::SilenceBoth, "silence-both"),
+    (Kind::LinkDelay, "link-delay"),
+    (Kind::LinkJitter, "link-jitter"),
+    (Kind::LinkLoss, "link-loss"),
+    (Kind::LinkDuplication, "link-duplication"),
+    (Kind::LinkReordering, "link-reordering"),
+    (Kind::LinkCorruption, "link-corruption"),
+    (Kind::FramesDelay, "frames-delay"),
+    (Kind::FramesJitter, "frames-jitter"),
+    (Kind::FramesLoss, "frames-loss"),
+    (Kind::FramesDuplication, "frames-duplication"),
+    (Kind::FramesReordering, "frames-reordering"),
+    (Kind::FramesCorruption, "frames-corruption"),
+    (Kind::ClockStep, "clock-step"),
+    (Kind::PictureRepeated, "picture-repeated"),
+    (Kind::PictureRecoded, "picture-recoded"),
+    (Kind::LiarJumps, "liar-jumps"),
+    (Kind::LiarDrifts, "liar-drifts"),
+    (Kind::PreferredIsBlind, "preferred-is-blind"),
+    (Kind::DetectorBabbles, "detector-babbles"),
+    (Kind::Crowd, "crowd"),
+    (Kind::StrangeCamera, "strange-camera"),
+    (Kind::LandedUndefined, "landed-undefined"),
+    (Kind::LandedTakingOff, "landed-taking-off"),
+    (Kind::LandedOnGround, "landed-on-ground"),
+    (Kind::HeartbeatMissing, "heartbeat-missing"),
+    (Kind::ModeLie, "mode-lie"),
+    (Kind::DisarmedLie, "disarmed-lie"),
+    (Kind::OldBootTime, "old-boot-time"),
+    (Kind::PositionFrozen, "position-frozen"),
+    (Kind::PositionNan, "position-nan"),
+    (Kind::PositionMissing, "position-missing"),
+    (Kind::AttitudeMissing, "attitude-missing"),
+    (Kind::BridgeKilled, "bridge-killed"),
+    (Kind::BridgeStopped, "bridge-stopped"),
+    (Kind::ControllerMemory, "controller-memory"),
+    (Kind::DetectorMemory, "detector-memory"),
+    (Kind::FullDisk, "full-disk"),
+    (Kind::FullSharedMemory, "full-shared-memory"),
 ];
 
 impl Kind {
@@ -185,63 +176,21 @@ impl Kind {
 
     /// True for what only real processes show.
     pub fn needs_processes(self) -> bool {
-        matches!(
-            self,
-            Self::BridgeKilled
-                | Self::BridgeStopped
-                | Self::ControllerMemory
-                | Self::DetectorMemory
-                | Self::FullDisk
-                | Self::FullSharedMemory
-        )
+        self >= Self::BridgeKilled
     }
 
     fn is_of_process(self) -> bool {
-        matches!(
-            self,
-            Self::ControllerKilled
-                | Self::ControllerStopped
-                | Self::DetectorKilled
-                | Self::DetectorStopped
-                | Self::CameraKilled
-                | Self::CameraStopped
-        )
+        self <= Self::CameraStopped
     }
 
     fn is_of_autopilot(self) -> bool {
-        matches!(
-            self,
-            Self::SilenceFrom
-                | Self::SilenceTo
-                | Self::SilenceBoth
-                | Self::LinkDelay
-                | Self::LinkJitter
-                | Self::LinkLoss
-                | Self::LinkDuplication
-                | Self::LinkReordering
-                | Self::LinkCorruption
-                | Self::LandedUndefined
-                | Self::LandedTakingOff
-                | Self::LandedOnGround
-                | Self::HeartbeatMissing
-                | Self::ModeLie
-                | Self::DisarmedLie
-                | Self::OldBootTime
-                | Self::PositionFrozen
-                | Self::PositionNan
-                | Self::PositionMissing
-                | Self::AttitudeMissing
-        )
+        (Self::SilenceFrom..=Self::LinkCorruption).contains(&self)
+            || (Self::LandedUndefined..=Self::AttitudeMissing).contains(&self)
     }
 
     /// Its name.
     pub fn name(self) -> &'static str {
         TABLE.iter().find(|row| row.0 == self).map_or("", |row| row.1)
-    }
-
-    /// Its description.
-    pub fn words(self) -> &'static str {
-        TABLE.iter().find(|row| row.0 == self).map_or("", |row| row.2)
     }
 
     /// True when a second detector, which lies, is preferred.
@@ -277,7 +226,6 @@ mod tests {
         assert_eq!((Kind::all().count(), Kind::in_lockstep().count()), (47, 41));
         for kind in Kind::all() {
             assert_eq!(kind.name().parse(), Ok(kind));
-            assert!(!kind.words().is_empty());
         }
         assert!("none".parse::<Kind>().unwrap_err().contains("`alight experiment landing`"));
         assert!("nothing".parse::<Kind>().unwrap_err().contains("controller-killed"));
