@@ -9,10 +9,8 @@ use fiducial::{Detector, Settings, Tracker, TrackingSettings};
 use geometry::{Body, Ned, Point, Rotation, Transform};
 use imaging::GrayView;
 use markers::Marker;
+use rendering::views::MARKERS;
 use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
-
-const MARKERS: [&str; 5] =
-    ["rings", "apriltag-16h5:0", "aruco-4x4-50:0", "stag-hd23:0", "apriltag-36h11:0"];
 
 /// A marker seen from this height.
 fn frame(marker: Option<Marker>, settings: &CameraSettings, height_m: f64) -> Vec<u8> {

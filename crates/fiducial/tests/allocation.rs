@@ -7,7 +7,7 @@ use fiducial::{Detector, Settings};
 use geometry::CameraModel;
 use imaging::GrayView;
 use markers::Marker;
-use rendering::views::{Binning, TestScene, View};
+use rendering::views::{Binning, MARKERS, TestScene, View};
 
 /// What a detector may allocate at first, in frames.
 const MAX_FRAMES: f64 = 8.0;
@@ -41,10 +41,9 @@ fn detect(detector: &mut Detector, camera: &CameraModel, pixels: &[u8]) -> Alloc
 fn nothing_is_allocated_per_frame() {
     let binning = Binning::TwoByTwo;
     let (camera, frames) = (binning.camera(), frames(binning));
-    let names = ["rings", "apriltag-16h5:0", "apriltag-36h11:0", "aruco-4x4-50:0", "stag-hd23:0"];
     let markers: Vec<Marker> =
-        names.iter().map(|name| format!("{name}:0.15341").parse().unwrap()).collect();
-    let each = names.iter().zip(&markers).map(|(name, marker)| (*name, vec![*marker]));
+        MARKERS.iter().map(|name| format!("{name}:0.15341").parse().unwrap()).collect();
+    let each = MARKERS.iter().zip(&markers).map(|(name, marker)| (*name, vec![*marker]));
     for (name, markers) in each.chain([("all", markers.clone())]) {
         let mut detector = Detector::new(&markers, Settings::default()).unwrap();
         let first = detect(&mut detector, &camera, &frames[0]);

@@ -13,6 +13,10 @@ use geometry::{Body, Camera, CameraModel, Marker, Ned, Pixel, Rotation, Transfor
 /// Outer diameter of the thesis' marker, in metres.
 pub const SIZE_M: f64 = 0.15341;
 
+/// The markers of the experiments, without their size: the four of the thesis, and the most widely used one.
+pub const MARKERS: [&str; 5] =
+    ["rings", "apriltag-16h5:0", "aruco-4x4-50:0", "stag-hd23:0", "apriltag-36h11:0"];
+
 /// Maximum height of the camera above the marker, in metres; the minimum is 1 m.
 pub const MAX_HEIGHT_M: u32 = 13;
 

@@ -1,11 +1,6 @@
 //! The sets of frames by name, and the markers of the experiment.
 
-/// Size of the thesis' markers, in metres.
-pub const SIZE_M: f64 = rendering::views::SIZE_M;
-
-/// The markers of the experiment: the four of the thesis, and the most widely used one.
-pub const MARKERS: [&str; 5] =
-    ["rings", "apriltag-16h5:0", "aruco-4x4-50:0", "stag-hd23:0", "apriltag-36h11:0"];
+pub use rendering::views::{MARKERS, SIZE_M};
 
 /// The families of [`MARKERS`], in their order.
 pub fn families() -> impl Iterator<Item = &'static str> {

@@ -7,7 +7,7 @@ use experiments::record::processor_ms;
 use fiducial::{Detector, Settings};
 use imaging::GrayView;
 use markers::Marker;
-use rendering::views::{Binning, TestScene, View};
+use rendering::views::{Binning, MARKERS, TestScene, View};
 
 /// Maximum time of any image relative to a normal frame of the same size.
 const MAX_RATIO: f64 = 20.0;
@@ -15,9 +15,8 @@ const MAX_RATIO: f64 = 20.0;
 const TRIES: usize = 4;
 
 fn detector() -> Detector {
-    let names = ["rings", "apriltag-16h5:0", "apriltag-36h11:0", "aruco-4x4-50:0", "stag-hd23:0"];
     let markers: Vec<Marker> =
-        names.iter().map(|name| format!("{name}:0.15341").parse().unwrap()).collect();
+        MARKERS.iter().map(|name| format!("{name}:0.15341").parse().unwrap()).collect();
     Detector::new(&markers, Settings::default()).unwrap()
 }
 
