@@ -351,11 +351,8 @@ mod tests {
             let status = std::fs::read_to_string(&status).unwrap_or_default();
             status.contains("State:") && !status.contains("State:\tZ")
         };
-        let began = Instant::now();
-        while is_running() && began.elapsed() < Duration::from_secs(20) {
-            tokio::time::sleep(Duration::from_millis(10)).await;
-        }
-        assert!(!is_running(), "process {left} goes on");
+        let ends = format!("process {left} ends");
+        testing::until(&ends, Duration::from_secs(20), async || !is_running()).await.unwrap();
     }
 
     #[tokio::test]

@@ -9,7 +9,7 @@ use camera_pub::Config;
 use image::{GrayImage, Luma, RgbImage};
 use messages::{BayerPattern, PixelFormat, topic};
 use node::{Identity, Layers, Node, Shutdown, ZenohSource, now_ns};
-use testing::ports;
+use testing::{ports, until};
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -264,14 +264,10 @@ async fn a_picture_that_is_repeated_is_published_once() -> anyhow::Result<()> {
         ensure!(frame.header.stamp_ns > stamp_ns, "its stamp is not newer");
         stamp_ns = frame.header.stamp_ns;
         if level > 1 {
-            let is_told = async {
-                while camera.health().failures("camera repeats one picture") + 1 < u64::from(level)
-                {
-                    tokio::time::sleep(Duration::from_millis(20)).await;
-                }
-            };
+            let told = || camera.health().failures("camera repeats one picture");
+            let is_told = async || told() + 1 >= u64::from(level);
             tokio::select! {
-                told = timeout(PATIENCE, is_told) => told?,
+                told = until("it is told", PATIENCE, is_told) => told?,
                 _ = frames.next() => bail!("the repeated picture {level} is published again"),
             }
         }

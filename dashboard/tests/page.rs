@@ -22,7 +22,7 @@ use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, ServerName};
 use rustls::{ClientConfig, RootCertStore};
 use serde_json::{Value, json};
-use testing::ports;
+use testing::{ports, until};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::task::JoinHandle;
@@ -66,12 +66,8 @@ impl Page {
         let shutdown = Shutdown::on_signals()?;
         let task = tokio::spawn(dashboard::run(node.clone(), config, shutdown));
         let address = SocketAddr::new("127.0.0.1".parse()?, port);
-        let reached = timeout(PATIENCE, async {
-            while TcpStream::connect(address).await.is_err() {
-                sleep(Duration::from_millis(20)).await;
-            }
-        });
-        reached.await.context("the page does not listen")?;
+        until("the page listens", PATIENCE, async || TcpStream::connect(address).await.is_ok())
+            .await?;
         Ok(Self { meet, address, node, task })
     }
 
@@ -531,12 +527,8 @@ async fn an_encrypted_page_is_commanded_from_elsewhere_while_its_token_is_there(
     let others = tempfile::tempdir()?;
     let [other, _] = certificate(others.path(), &[outward.to_string()])?;
     ensure!(encrypted(&trusting(&other)?, from).await.is_err());
-    let counted = timeout(PATIENCE, async {
-        while page.refused("no encrypted connection") != 1 {
-            sleep(Duration::from_millis(20)).await;
-        }
-    });
-    counted.await.context("a handshake that was given up is not counted")?;
+    let is_counted = async || page.refused("no encrypted connection") == 1;
+    until("a handshake that was given up is counted", PATIENCE, is_counted).await?;
     let connector = trusting(&pem)?;
     let mut stream = encrypted(&connector, from).await?;
     stream.write_all(log_in.as_bytes()).await?;

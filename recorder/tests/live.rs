@@ -13,7 +13,7 @@ use messages::{FrameHeader, PixelFormat, Wind, topic};
 use node::{Identity, Layers, Node, Shutdown, ZenohSource, now_ns};
 use recorder::Config;
 use serde_json::{Value, json};
-use testing::{ports, with_second_try};
+use testing::{ports, until, with_second_try};
 use tokio::net::{TcpSocket, TcpStream};
 use tokio::task::JoinHandle;
 use tokio::time::{sleep, timeout};
@@ -45,12 +45,8 @@ impl Served {
         let node = open("recorder", meet).await?;
         let task = tokio::spawn(recorder::run(node.clone(), config, Shutdown::on_signals()?));
         let address = SocketAddr::new("127.0.0.1".parse()?, port);
-        let reached = timeout(PATIENCE, async {
-            while TcpStream::connect(address).await.is_err() {
-                sleep(Duration::from_millis(20)).await;
-            }
-        });
-        reached.await.context("the recorder does not listen")?;
+        until("the recorder listens", PATIENCE, async || TcpStream::connect(address).await.is_ok())
+            .await?;
         Ok(Self { meet, address, node, task })
     }
 
@@ -222,21 +218,12 @@ async fn an_address_that_is_taken_costs_no_recording_and_is_tried_again() -> any
     let config = Layers { file: None, set }.load::<Config>()?.settings;
     let node = open("recorder", meet).await?;
     let task = tokio::spawn(recorder::run(node.clone(), config, Shutdown::on_signals()?));
-    let recorded = timeout(PATIENCE, async {
-        while !path.is_file() {
-            sleep(Duration::from_millis(20)).await;
-        }
-    });
-    recorded.await.context("the recorder makes no file")?;
+    until("the recorder makes a file", PATIENCE, async || path.is_file()).await?;
     let errors = node.health().report(node.identity(), 0).errors;
     ensure!(errors.iter().any(|it| it.reason.contains("viewers")), "{errors:?}");
     drop(taken);
-    let reached = timeout(PATIENCE, async {
-        while TcpStream::connect(("127.0.0.1", port)).await.is_err() {
-            sleep(Duration::from_millis(20)).await;
-        }
-    });
-    reached.await.context("the recorder does not listen")?;
+    let is_reached = async || TcpStream::connect(("127.0.0.1", port)).await.is_ok();
+    until("the recorder listens", PATIENCE, is_reached).await?;
     ensure!(!task.is_finished(), "the recorder ended");
     task.abort();
     Ok(())
@@ -287,12 +274,8 @@ async fn pages_of_other_sites_and_too_many_clients_are_refused() -> anyhow::Resu
     let second = served.client().await?;
     ensure!(served.refusal(served.request(SUBPROTOCOLS[0])?).await? == 503);
     drop(second);
-    let freed = timeout(PATIENCE, async {
-        while served.client().await.is_err() {
-            sleep(Duration::from_millis(50)).await;
-        }
-    });
-    freed.await.context("the place of a client that has gone is not free")?;
+    let is_free = async || served.client().await.is_ok();
+    until("the place of a client that has gone is free", PATIENCE, is_free).await?;
     for reason in ["other protocol", "wrong Origin", "too many clients"] {
         ensure!(served.dropped(reason) >= 1, "{reason}");
     }

@@ -3,13 +3,13 @@
 use std::path::Path;
 use std::time::Duration;
 
-use anyhow::{Context, ensure};
+use anyhow::ensure;
 use flightlog::{Entry, read};
 use messages::{FrameHeader, PixelFormat, Wind, decode, topic};
 use node::{Identity, Layers, Node, Shutdown, ZenohSource, now_ns};
 use recorder::Config;
-use testing::{ports, with_second_try};
-use tokio::time::{sleep, timeout};
+use testing::{ports, until, with_second_try};
+use tokio::time::sleep;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 /// Bytes of a frame, of which a file of 1 MB has eleven.
@@ -52,13 +52,9 @@ async fn is_whole() -> anyhow::Result<()> {
     let config = Layers { file: None, set }.load::<Config>()?.settings;
     let node = open("recorder", meet).await?;
     let task = tokio::spawn(recorder::run(node.clone(), config, Shutdown::on_signals()?));
-    let begun = timeout(PATIENCE, async {
-        while std::fs::read_dir(folder.path())?.next().is_none() {
-            sleep(Duration::from_millis(20)).await;
-        }
-        anyhow::Ok(())
-    });
-    begun.await.context("the recorder makes no file")??;
+    let is_begun =
+        async || std::fs::read_dir(folder.path()).is_ok_and(|mut files| files.next().is_some());
+    until("the recorder makes a file", PATIENCE, is_begun).await?;
     let source = open("simulator", meet).await?;
     let wind = source.publisher(topic::WIND, &[]).await?;
     let bytes = (EDGE * EDGE) as usize;

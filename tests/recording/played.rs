@@ -3,12 +3,11 @@
 use std::net::UdpSocket;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
-use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use messages::{ControllerStatus, Detections, Phase, topic};
 use node::{Identity, Node, Subscriber, ZenohSource, clock_name, now_ns};
-use tokio::time::{Instant, sleep, timeout};
+use tokio::time::{Instant, timeout};
 
 use crate::flight::{ALIGHT, Landing, PATIENCE, output_of};
 
@@ -123,10 +122,6 @@ async fn refuses_to_double_a_controller(node: &Node, file: &Path, meet: u16) -> 
 
 /// Waits until so many of a service are ready.
 async fn until(node: &Node, service: &str, count: usize) -> anyhow::Result<()> {
-    let began = Instant::now();
-    while node.alive(service, "*").await?.len() != count {
-        ensure!(began.elapsed() < PATIENCE / 4, "waiting for {count} of {service}");
-        sleep(Duration::from_millis(100)).await;
-    }
-    Ok(())
+    let are_ready = async || node.alive(service, "*").await.is_ok_and(|ready| ready.len() == count);
+    testing::until(&format!("{count} of {service} are ready"), PATIENCE / 4, are_ready).await
 }

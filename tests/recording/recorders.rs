@@ -14,8 +14,8 @@ use mcap::read::{LinearReader, Options};
 use mcap::records::Record;
 use messages::{ControllerCommand, Health, NEVER_CAME, Phase, decode, has_never_come, topic};
 use rustix::process::{Signal, kill_process};
-use testing::{python, python_passes};
-use tokio::time::{Instant, sleep};
+use testing::{python, python_passes, until};
+use tokio::time::sleep;
 
 use crate::flight::{LONG, Landing, PATIENCE};
 
@@ -255,10 +255,6 @@ pub(crate) async fn command(landing: &Landing, command: ControllerCommand) -> an
 /// Waits until a file has pictures.
 async fn has_grown(file: &Path) -> anyhow::Result<()> {
     const SOME_BYTES: u64 = 200_000;
-    let began = Instant::now();
-    while std::fs::metadata(file).map_or(0, |found| found.len()) < SOME_BYTES {
-        ensure!(began.elapsed() < PATIENCE, "nothing was recorded to {file:?}");
-        sleep(Duration::from_millis(20)).await;
-    }
-    Ok(())
+    let has_some = async || std::fs::metadata(file).is_ok_and(|found| found.len() >= SOME_BYTES);
+    until(&format!("something is recorded to {file:?}"), PATIENCE, has_some).await
 }

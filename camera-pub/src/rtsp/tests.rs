@@ -297,11 +297,8 @@ async fn what_ffmpeg_streams_is_what_ffmpeg_shows() {
         let pushing = ["-pix_fmt", "yuv420p", "-f", "rtsp", "-rtsp_transport", "tcp", &url];
         let mut pushes =
             ffmpeg(&[&["-re"], &SOURCE[..], &coding, &pushing].concat()).spawn().unwrap();
-        let begun = Instant::now();
-        while !camera.has_been_pushed_to() {
-            assert!(begun.elapsed() < Duration::from_secs(20), "ffmpeg pushes nothing");
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
+        let is_pushing = async || camera.has_been_pushed_to();
+        testing::until("ffmpeg pushes", Duration::from_secs(20), is_pushing).await.unwrap();
         let wanted = RtspConfig {
             size: FrameSize { width, height },
             rate_hz: 25.0,

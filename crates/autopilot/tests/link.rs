@@ -15,6 +15,7 @@ use autopilot::signing::{Refusal, Refusals, stamp};
 use autopilot::{
     Address, Autopilot, Config, Event, Firmware, Link, LinkEvent, Parser, Peering, SigningConfig,
 };
+use testing::until;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, UdpSocket};
 use tokio::time::{sleep, timeout};
@@ -397,14 +398,11 @@ async fn only_holders_of_the_key_are_heard_and_each_refusal_has_its_reason() {
     stranger.send(&packet::encode(AUTOPILOT, 1, &radio)).unwrap();
     stranger.send(&heartbeat(true)).unwrap();
     thief.send_when_connected(&heartbeat(true)).await;
-    let counted = async {
-        while vehicle.refusals().of(Refusal::WrongKey) == 0
-            || vehicle.refusals().of(Refusal::Unsigned) < 2
-        {
-            sleep(Duration::from_millis(5)).await;
-        }
+    let are_refused = async || {
+        let refusals = vehicle.refusals();
+        refusals.of(Refusal::WrongKey) > 0 && refusals.of(Refusal::Unsigned) >= 2
     };
-    timeout(PATIENCE, counted).await.expect("both are refused");
+    until("both are refused", PATIENCE, are_refused).await.unwrap();
     assert_eq!(vehicle.try_recv(), None);
 
     let mut holder = open_signed(to, signing("correct horse", 1)).await;
@@ -427,13 +425,11 @@ async fn a_peer_that_signs_is_noticed_without_a_key() {
     assert!(!keyless.lacks_key());
     drop(unsigned);
     let holder = open_signed(to, signing("correct horse", 1)).await;
-    let noticed = async {
-        while !keyless.lacks_key() {
-            holder.send_when_connected(&heartbeat(true)).await;
-            sleep(Duration::from_millis(20)).await;
-        }
+    let is_noticed = async || {
+        holder.send_when_connected(&heartbeat(true)).await;
+        keyless.lacks_key()
     };
-    timeout(PATIENCE, noticed).await.expect("the signature is noticed");
+    until("the signature is noticed", PATIENCE, is_noticed).await.unwrap();
 }
 
 /// `Link::send` as soon as there is a connection.
@@ -443,12 +439,8 @@ trait SendWhenConnected {
 
 impl SendWhenConnected for Link {
     async fn send_when_connected(&self, packet: &[u8]) {
-        let sending = async {
-            while self.send(packet).is_err() {
-                sleep(Duration::from_millis(5)).await;
-            }
-        };
-        timeout(PATIENCE, sending).await.expect("a connection");
+        let is_sent = async || self.send(packet).is_ok();
+        until("there is a connection", PATIENCE, is_sent).await.unwrap();
     }
 }
 

@@ -94,12 +94,8 @@ async fn a_pool_exhausted_by_dead_readers_is_replaced() -> anyhow::Result<()> {
     let shared = std::iter::repeat_with(|| publisher.loan(64 * 48)).take(8).filter(is_shared);
     let kept = shared.map(std::mem::forget).count();
     assert!((1..8).contains(&kept), "{kept} of 8 loans were in shared memory");
-    timeout(PATIENCE, async {
-        while !is_shared(&publisher.loan(64 * 48)) {
-            tokio::time::sleep(Duration::from_millis(50)).await;
-        }
-    })
-    .await?;
+    let is_replaced = async || is_shared(&publisher.loan(64 * 48));
+    testing::until("the pool is replaced", PATIENCE, is_replaced).await?;
     publisher.publish(&header(99), publisher.loan(64 * 48)).await;
     let received = timeout(PATIENCE, subscriber.next()).await?.context("a frame")?;
     assert_eq!(received.header.sequence, 99);

@@ -1,4 +1,5 @@
-//! What the tests of several crates share: skips that are seen, recordings, peers in Python and JavaScript, ffmpeg, free ports and second tries.
+//! What the tests of several crates share: skips that are seen, recordings, peers in Python and JavaScript, ffmpeg, free ports, second tries and
+//! waiting.
 //!
 //! It is a dev-dependency only, and knows no other crate of this workspace.
 
@@ -8,9 +9,11 @@ mod recordings;
 mod scripts;
 mod second_try;
 mod skip;
+mod waiting;
 
 pub use ffmpeg::has_x264;
 pub use recordings::recording;
 pub use scripts::{interpreter, node, node_passes, python, python_passes};
 pub use second_try::with_second_try;
 pub use skip::skip;
+pub use waiting::until;
