@@ -1,7 +1,8 @@
 //! Whether detectors see the marker at one place, judged on the frames that they have all searched.
 //!
-//! Two positions in one frame need no vehicle state and no estimate. Of two detectors that differ nobody can
-//! say which is right; of three or more the majority is believed.
+//! Two positions in one frame need no vehicle state and no estimate. Whether a pair agrees does not depend on which of the two is
+//! named first. Of two detectors that differ nobody can say which is right; of three or more the majority is believed: at least two
+//! that agree with each other and differ from the third.
 
 use std::collections::VecDeque;
 
@@ -11,6 +12,8 @@ use geometry::squared;
 const MIN_COMMON: u32 = 8;
 /// Latest frames with a marker from another detector in which one is looked for that sees nothing.
 const MAX_SEEN: u32 = 12;
+/// Detectors that outvote another one: one against one decides nothing.
+const MIN_MAJORITY: usize = 2;
 
 /// The marker as a detector sees it.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -38,6 +41,13 @@ pub struct Tolerance {
     pub base_m: f64,
     /// Growth per metre of range.
     pub per_m: f64,
+}
+
+impl Tolerance {
+    /// At a range in metres, in metres.
+    pub fn at(&self, range_m: f64) -> f64 {
+        self.base_m + self.per_m * range_m
+    }
 }
 
 /// Why a detector is not believed although it answers.
@@ -113,7 +123,7 @@ impl Common {
                 self.apart_m = apart_m;
             }
             self.both += 1;
-            self.apart += u32::from(!within(tolerance, first_m, apart_m));
+            self.apart += u32::from(!within(tolerance, first_m, second_m));
         }
     }
 
@@ -136,21 +146,15 @@ pub fn faults(voters: &[Voter<'_>], tolerance: Tolerance) -> Vec<Option<Fault>> 
     // Most of very many see nothing, and nothing follows from that.
     let sees: Vec<bool> =
         voters.iter().map(|voter| voter.sights.iter().any(|(_, sight)| sight.is_some())).collect();
-    let row = |first: &Voter<'_>| -> Vec<Common> {
-        let pair = |(second, sees): (&Voter<'_>, &bool)| match sees {
+    let row = |(own, first): (usize, &Voter<'_>)| -> Vec<Common> {
+        let pair = |(i, (second, sees)): (usize, (&Voter<'_>, &bool))| match i != own && *sees {
             true => Common::of(first.sights, second.sights, tolerance),
             false => Common::default(),
         };
-        voters.iter().zip(&sees).map(pair).collect()
+        voters.iter().zip(&sees).enumerate().map(pair).collect()
     };
-    let all: Vec<Vec<Common>> = voters.iter().map(row).collect();
-    // A detector agrees with itself.
-    let group = |row: &Vec<Common>, own: usize| {
-        1 + row.iter().enumerate().filter(|(i, c)| *i != own && c.agree()).count()
-    };
-    let groups: Vec<usize> = all.iter().enumerate().map(|(own, row)| group(row, own)).collect();
-    let outvoted: Vec<_> =
-        all.iter().zip(&groups).map(|(row, ours)| outvoted(row, *ours, &groups)).collect();
+    let all: Vec<Vec<Common>> = voters.iter().enumerate().map(row).collect();
+    let outvoted: Vec<_> = all.iter().map(|row| outvoted(row, &all)).collect();
     let seeing = |own: usize, row: &Vec<Common>| {
         let others = row.iter().zip(voters).zip(&outvoted).enumerate();
         let mut believed = others.filter(|(i, (_, fault))| *i != own && fault.is_none());
@@ -165,14 +169,21 @@ pub fn faults(voters: &[Voter<'_>], tolerance: Tolerance) -> Vec<Option<Fault>> 
         .collect()
 }
 
-/// The majority against a detector with `ours` of its opinion.
-fn outvoted(row: &[Common], ours: usize, groups: &[usize]) -> Option<Fault> {
-    let differing = row.iter().filter(|c| c.differ()).count();
-    let larger = row.iter().zip(groups).filter(|(common, theirs)| {
-        common.differ() && **theirs > ours && **theirs * 2 > ours + differing
-    });
-    let (common, by) = larger.max_by_key(|(_, theirs)| **theirs)?;
-    Some(Fault::Outvoted { by: *by, apart_m: common.apart_m })
+/// The majority against a detector, by its row of all pairs: the most of those that differ from it which agree with one of them. It
+/// is never one of these itself, nor is one that agrees with it.
+fn outvoted(row: &[Common], all: &[Vec<Common>]) -> Option<Fault> {
+    // It agrees with itself.
+    let ours = 1 + row.iter().filter(|common| common.agree()).count();
+    let differing = row.iter().filter(|common| common.differ()).count();
+    let groups =
+        row.iter().zip(all).filter(|(common, _)| common.differ()).map(|(common, theirs)| {
+            let others =
+                theirs.iter().zip(row).filter(|(theirs, own)| theirs.agree() && own.differ());
+            (common, 1 + others.count())
+        });
+    let is_majority = |by: usize| by >= MIN_MAJORITY && by > ours && by * 2 > ours + differing;
+    let (common, by) = groups.filter(|(_, by)| is_majority(*by)).max_by_key(|(_, by)| *by)?;
+    Some(Fault::Outvoted { by, apart_m: common.apart_m })
 }
 
 /// The detector that sees the marker farthest from where the active one does.
@@ -194,9 +205,14 @@ pub fn agree(first: Voter<'_>, second: Voter<'_>, tolerance: Tolerance) -> bool 
     Common::of(first.sights, second.sights, tolerance).agree()
 }
 
-/// True when positions so far apart agree, at the range of one of them.
-pub fn within(tolerance: Tolerance, position_m: [f64; 3], apart_m: f64) -> bool {
-    apart_m <= tolerance.base_m + tolerance.per_m * distance(position_m, [0.0; 3])
+/// True when two positions agree, in whatever order. The farther one gives the range, as the error of a position grows with it.
+pub fn within(tolerance: Tolerance, one_m: [f64; 3], other_m: [f64; 3]) -> bool {
+    distance(one_m, other_m) <= tolerance.at(range(one_m, other_m))
+}
+
+/// The range by which two positions are judged: the larger of theirs, in their unit.
+pub fn range(one: [f64; 3], other: [f64; 3]) -> f64 {
+    libm::fmax(distance(one, [0.0; 3]), distance(other, [0.0; 3]))
 }
 
 /// The distance of two points, in their unit.

@@ -742,9 +742,8 @@ impl Known {
         let agrees = match (active.position_m, ours.map(|ours| ours.position_m)) {
             (_, None) => false,
             (Some(active_m), Some(Some(ours_m))) => {
-                let apart_m = distance(active_m, ours_m);
-                self.disagreement_m = Some(apart_m);
-                within(limits.tolerance(), active_m, apart_m)
+                self.disagreement_m = Some(distance(active_m, ours_m));
+                within(limits.tolerance(), active_m, ours_m)
             }
             // Without poses there is no distance; both see the marker.
             (None, Some(None)) => true,

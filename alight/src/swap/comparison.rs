@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use controller::agreement::distance;
+use controller::agreement::{Tolerance, distance, range};
 use messages::{Configuration, Detections};
 
 /// Latest frames of each of the two that are kept: the later one may be half a second behind.
@@ -86,7 +86,9 @@ impl Comparison {
     pub(super) fn text(&self) -> Option<String> {
         let Difference { used_m, new_m } = self.latest?;
         let apart_m = distance(used_m, new_m);
-        let range_m = distance(used_m, [0.0; 3]);
+        // The controller judges by the farther of both, and a size by the one in use.
+        let range_m = range(used_m, new_m);
+        let used_range_m = distance(used_m, [0.0; 3]);
         let axis = |index: usize, words: [&str; 2]| {
             let by_m =
                 new_m.get(index).zip(used_m.get(index)).map_or(0.0, |(new, used)| new - used);
@@ -97,15 +99,15 @@ impl Comparison {
             |controller| {
                 let settings = &controller.detectors;
                 let (base_m, per_m) = (settings.tolerance_m, settings.tolerance_per_m);
-                let max_m = base_m + per_m * range_m;
+                let max_m = Tolerance { base_m, per_m }.at(range_m);
                 format!(
                     "at this range of {range_m:.2} m they agree up to {max_m:.3} m (`detectors.tolerance_m` of the controller, {base_m}, and \
                      `tolerance_per_m`, {per_m} of the range)"
                 )
             },
         );
-        let farther = distance(new_m, [0.0; 3]) / range_m - 1.0;
-        let hint = if (farther * range_m).abs() > IN_RANGE * apart_m && range_m > 0.0 {
+        let farther = distance(new_m, [0.0; 3]) / used_range_m - 1.0;
+        let hint = if (farther * used_range_m).abs() > IN_RANGE * apart_m && used_range_m > 0.0 {
             let percent = 100.0 * farther.abs();
             let size = if farther > 0.0 { "larger" } else { "smaller" };
             format!(
@@ -181,7 +183,7 @@ mod tests {
         });
         assert!(comparison.is_configured());
         let text = comparison.text().unwrap();
-        let limit = "at this range of 5.00 m they agree up to 0.350 m (`detectors.tolerance_m` of the controller, 0.2, and `tolerance_per_m`, 0.03 of the range)";
+        let limit = "at this range of 5.03 m they agree up to 0.351 m (`detectors.tolerance_m` of the controller, 0.2, and `tolerance_per_m`, 0.03 of the range)";
         assert!(text.ends_with(limit), "{text}");
     }
 
