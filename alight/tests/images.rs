@@ -39,6 +39,41 @@ fn a_marker_that_was_made_is_found_where_it_was_drawn() -> anyhow::Result<()> {
     Ok(())
 }
 
+/// A library that turns markers otherwise would turn a vehicle that follows their heading, and nothing else would show it.
+#[test]
+fn the_detector_in_python_begins_with_the_same_corner() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let detector = root.join("detector/examples/python/detector.py");
+    let picture = folder.path().join("a.png");
+    for marker in ["apriltag-36h11:3", "apriltag-16h5:5", "aruco-4x4-50:7"] {
+        let args = ["marker", marker, "--size", "0.15", "--dpi", "100", "-o", "a.png"];
+        let made = alight(&args, folder.path())?;
+        ensure!(made.status.success(), "{made:?}");
+        let found =
+            alight(&["detect", "--marker", marker, "--format", "jsonl", "a.png"], folder.path())?;
+        let line: Value = std::str::from_utf8(&found.stdout)?.trim().parse()?;
+        let sized = format!("{marker}:0.15");
+        let paths = [&detector, &picture].map(|path| path.to_str().context("a path"));
+        let [detector, picture] = paths;
+        let args = [detector?, &sized, picture?];
+        let Some(python) = testing::python("alight/tests/opencv/corners.py", &args) else {
+            return Ok(());
+        };
+        let output = python.wait_with_output()?;
+        if !testing::python_passes(&output)? {
+            return Ok(());
+        }
+        let theirs: Value = std::str::from_utf8(&output.stdout)?.trim().parse()?;
+        let corner = |of: &Value, i: usize, axis: usize| of[i][axis].as_f64().context("a corner");
+        for (i, axis) in (0..4).flat_map(|i| [(i, 0), (i, 1)]) {
+            let ours = corner(&line["detections"][0]["corners_px"], i, axis)?;
+            ensure!((corner(&theirs, i, axis)? - ours).abs() < 2.0, "{marker}: {theirs}, {line}");
+        }
+    }
+    Ok(())
+}
+
 #[test]
 fn a_reader_that_goes_away_is_no_error() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;

@@ -180,6 +180,8 @@ class Marker:
         if dictionary is None:
             raise argparse.ArgumentTypeError(f"OpenCV knows no family `{family}`")
         self.text, self.family, self.id, self.size_m = text, family, int(number), float(size)
+        # OpenCV turns AprilTags by half a turn against AprilTag 3, and begins with their bottom-right corner.
+        self.first_corner = 2 if family.startswith("apriltag-") else 0
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         # The default of 3 % of the frame's width is 39 pixels.
@@ -190,12 +192,13 @@ class Marker:
         self.corners_m = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
 
     def find(self, header, payload):
-        """The marker's corners in the frame's pixels, or None."""
+        """The marker's corners in the frame's pixels, its own top-left first, or None."""
         for pixels, left, top, scale in grey_parts(header, payload):
             corners, ids, _ = self.detector.detectMarkers(pixels)
             for found, number in zip(corners, [] if ids is None else ids.ravel()):
                 if number == self.id:
-                    return found.reshape(4, 2).astype(float) * scale + (left, top)
+                    corners = np.roll(found.reshape(4, 2), self.first_corner, axis=0)
+                    return corners.astype(float) * scale + (left, top)
         return None
 
     def poses(self, corners, camera):
