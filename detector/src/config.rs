@@ -2,7 +2,7 @@
 //! checks, and changes of it while the service runs.
 
 use fiducial::{Detector, ResponseSetting, TrackingSettings};
-use markers::{Marker, Pad};
+use markers::{Family, Marker, Pad};
 use messages::Place;
 use node::{Check, Settings, read_text};
 use serde::{Deserialize, Serialize};
@@ -180,6 +180,19 @@ impl Config {
         Ok(names)
     }
 
+    /// What a person should know of the families that are looked for, in sentences.
+    ///
+    /// # Errors
+    /// As [`Config::listed_markers`].
+    pub fn cautions(&self) -> Result<Vec<&'static str>, String> {
+        let (listed, pads) = (self.listed_markers()?, self.parsed_pads()?);
+        let on_pads = pads.iter().flat_map(Pad::markers).map(|placed| placed.marker.family);
+        let families = listed.iter().map(|marker| marker.family).chain(on_pads);
+        let mut cautions: Vec<_> = families.filter_map(Family::caution).collect();
+        cautions.dedup();
+        Ok(cautions)
+    }
+
     fn parsed_markers(&self) -> Result<Vec<Marker>, String> {
         self.markers.iter().map(|text| text.parse().map_err(|e| format!("{e}"))).collect()
     }
@@ -236,6 +249,14 @@ mod tests {
         let all = "markers=[\"rings:0.15341\", \"apriltag-36h11:*:0.1\", \"aruco-4x4-50:7:0.2\"]";
         let markers = load(all).unwrap().parsed_markers().unwrap();
         assert_eq!(markers.iter().map(|m| m.id).collect::<Vec<_>>(), [None, None, Some(7)]);
+    }
+
+    #[test]
+    fn a_family_for_comparison_is_cautioned_of_once() {
+        let cautions = |set: &str| load(set).unwrap().cautions().unwrap();
+        assert!(cautions("").is_empty());
+        let told = cautions("markers=[\"rings-thesis:0.15341\", \"rings:0.15341\"]");
+        assert!(matches!(told[..], [text] if text.contains("kept for comparison")), "{told:?}");
     }
 
     #[test]

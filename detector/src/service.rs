@@ -72,6 +72,8 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
         response: Arc::clone(&response),
     };
     infos_of_ours.publish(&live.info).await;
+    let cautions = live.config.cautions().map_err(anyhow::Error::msg)?;
+    cautions.iter().for_each(|caution| tracing::warn!("{caution}"));
     let (stopped, thread) = work.start()?;
     node.announce().await?;
     let follow_camera = async {
@@ -248,6 +250,10 @@ impl Live {
         let config = self.config.with(key, value)?;
         let search = Search::new(&config)?;
         self.info = info(&config)?;
+        let known = self.config.cautions()?;
+        let cautions = config.cautions()?;
+        let new = cautions.iter().filter(|caution| !known.contains(caution));
+        new.for_each(|caution| tracing::warn!("{caution}"));
         let mut change = lock(&self.change);
         *change = Some(Change { config: config.clone(), search });
         // What the search before knew is forgotten at once: of a camera that is gone there is no next frame.

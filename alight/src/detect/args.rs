@@ -9,8 +9,9 @@ use markers::Marker;
 /// The arguments of `alight detect`.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct DetectArgs {
-    /// Marker to find: `FAMILY:ID[:SIZE_M]`, `FAMILY:*[:SIZE_M]` for all ids, or `FAMILY[:SIZE_M]` for a family without ids (rings). May
-    /// be repeated.
+    /// Marker to find: `FAMILY:ID[:SIZE_M]`, `FAMILY:*[:SIZE_M]` for all ids, or `FAMILY[:SIZE_M]` for a family without ids (rings; the
+    /// thesis' own detection of them, `rings-thesis`, is kept for comparison and finds few of ordinary cameras). A wrong name lists all
+    /// families. May be repeated.
     #[arg(long = "marker", required_unless_present = "pads", value_name = "MARKER")]
     pub(super) markers: Vec<Marker>,
     /// Pad to find, whose markers are solved together: the built-in `a4`, or a TOML file. It needs a camera,

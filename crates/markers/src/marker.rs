@@ -150,6 +150,19 @@ impl Family {
     }
 }
 
+impl Family {
+    /// What a person should know before this family is used, as a sentence; nothing of most.
+    pub fn caution(self) -> Option<&'static str> {
+        match self {
+            Self::RingsThesis => Some(
+                "`rings-thesis` is the thesis' own detection of the marker `rings`, kept for comparison: in pictures of ordinary cameras it \
+                 finds few markers; land on `rings`",
+            ),
+            _ => None,
+        }
+    }
+}
+
 impl fmt::Display for Family {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())
@@ -228,7 +241,7 @@ impl FromStr for Marker {
         let family = Family::named(name).ok_or_else(|| MarkerError::Family {
             text: text.to_owned(),
             family: name.to_owned(),
-            known: Family::ALL.map(Family::name).join(", "),
+            known: Family::ALL.map(listed).join(", "),
         })?;
         let id = match family.id_count() {
             Some(count) => parts.next().map_or(Ok(None), |id| parse_id(text, id, count))?,
@@ -243,6 +256,12 @@ impl FromStr for Marker {
             None => Ok(Self { family, id, size_m }),
         }
     }
+}
+
+/// A family's name in a list of all.
+fn listed(family: Family) -> String {
+    let use_of_it = if family.caution().is_some() { " (for comparison only)" } else { "" };
+    format!("{family}{use_of_it}")
 }
 
 /// An id below `count`, or `None` for `*`.
@@ -305,6 +324,16 @@ mod tests {
         for family in Family::ALL {
             assert_eq!(family.name().parse::<Marker>().unwrap().family, family);
         }
+    }
+
+    #[test]
+    fn the_family_for_comparison_is_told_as_such() {
+        let cautions = Family::ALL.map(Family::caution);
+        assert_eq!(cautions.iter().flatten().count(), 1);
+        let caution = Family::RingsThesis.caution().unwrap();
+        assert!(caution.contains("kept for comparison") && caution.contains("finds few"));
+        let listed = "ring".parse::<Marker>().unwrap_err().to_string();
+        assert!(listed.ends_with("rings, rings-thesis (for comparison only)"), "{listed}");
     }
 
     #[test]
