@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use autopilot::Parser;
 use autopilot::dialect::MavMessage;
 use flightlog::RecordedTape;
-use messages::{Detections, LandedState, StageTime, TapeDecision, TapeEvent};
+use messages::{Detections, LandedState, StageTime, TapeDecision, TapeEvent, VehicleState};
 
 use crate::flight::{Flight, Found};
 
@@ -15,6 +15,8 @@ const SAME_FRAME_NS: i64 = 2_000;
 const MAX_LATER_NS: i64 = 30_000_000;
 /// Longest time from detections to the setpoint that uses them, in nanoseconds: the next one later has other reasons.
 const MAX_TO_SETPOINT_NS: i64 = 2_000_000_000;
+/// Greatest vertical speed of a vehicle that stands, by its autopilot's estimate, in m/s.
+const MAX_RESTING_M_S: f64 = 0.1;
 /// Phases in which nothing is landing.
 const OUTSIDE: [&str; 5] = ["idle", "takeoff", "landed", "aborted", "pilot-in-command"];
 
@@ -31,7 +33,7 @@ pub enum Fate {
     Standby,
     /// No landing was under way.
     NotNeeded,
-    /// The estimate did not use it, and the vehicle stood on the ground by then: at most a part of the marker is in view, level with it.
+    /// The estimate did not use it, and the vehicle had touched down by then: at most a part of the marker is in view, level with it.
     OnGround,
     /// The controller refused it before the estimate, or another frame had overtaken it.
     NotTaken,
@@ -62,7 +64,7 @@ impl Fate {
             Self::Refused(why) => refusal(why).to_owned(),
             Self::Standby => "another detector was in use".to_owned(),
             Self::NotNeeded => "no landing was under way".to_owned(),
-            Self::OnGround => "not used, as the vehicle stood on the ground by then".to_owned(),
+            Self::OnGround => "not used, as the vehicle had touched down by then".to_owned(),
             Self::NotTaken => "overtaken by another frame, or refused before the estimate: of another clock or camera, or by \
                                another detector's name (the controller's losses count those)"
                 .to_owned(),
@@ -161,10 +163,23 @@ impl Frames {
     }
 }
 
-/// Whether the vehicle stood on the ground at a time, by its autopilot.
+/// Whether the vehicle stood on the ground at a time, by the truth or by its autopilot.
 fn stands(flight: &Flight, at_ns: i64) -> bool {
-    newest(&flight.vehicle, at_ns, |it| it.stamp_ns)
-        .is_some_and(|it| it.landed == LandedState::OnGround)
+    let truth = newest(&flight.truth, at_ns, |it| it.stamp_ns);
+    truth.is_some_and(|it| it.on_ground) || rests(&flight.vehicle, at_ns)
+}
+
+/// Whether the autopilot says at a time that the vehicle stands, or the vehicle neither sinks nor climbs any more until it says so: an
+/// autopilot takes a second or two to be sure, and nothing comes from the air to the ground without sinking.
+fn rests(vehicle: &[VehicleState], at_ns: i64) -> bool {
+    let later = vehicle.partition_point(|it| it.stamp_ns <= at_ns);
+    let Some(now) = later.checked_sub(1) else { return false };
+    let rests = |it: &VehicleState| {
+        let [_, _, down_m_s] = it.velocity_ned_m_s;
+        it.landed != LandedState::OnGround && down_m_s.abs() <= MAX_RESTING_M_S
+    };
+    let mut until_told = vehicle.iter().skip(now).skip_while(|it| rests(it));
+    until_told.next().is_some_and(|it| it.landed == LandedState::OnGround)
 }
 
 /// The newest of some messages, in the order of their stamps, up to a time.
@@ -304,4 +319,63 @@ fn of_messages(flight: &Flight, marker: Option<&str>) -> Vec<Handled> {
         }
     };
     flight.found.iter().map(handled).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use messages::Truth;
+
+    fn state(stamp_ns: i64, down_m_s: f64, landed: LandedState) -> VehicleState {
+        VehicleState {
+            stamp_ns,
+            ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
+            position_ned_m: [0.0; 3],
+            velocity_ned_m_s: [0.5, 0.0, down_m_s],
+            mode: "LAND".to_owned(),
+            armed: true,
+            landed,
+            battery: None,
+        }
+    }
+
+    #[test]
+    fn a_vehicle_stands_from_when_it_rests_and_not_only_when_its_autopilot_says_so() {
+        use LandedState::{InAir, Landing, OnGround};
+        // It hovers, sinks, touches down at 3 on a pad that moves, and is told to stand at 5.
+        let speeds = [(0, 0.0, InAir), (1, 0.0, InAir), (2, 0.4, Landing), (3, 0.03, Landing)];
+        let mut vehicle: Vec<_> = speeds.map(|(at, down, landed)| state(at, down, landed)).into();
+        vehicle.push(state(4, -0.04, Landing));
+        let mut flight = Flight::default();
+        flight.vehicle = vehicle;
+        let standing =
+            |flight: &Flight| (-1..8).filter(|at| stands(flight, *at)).collect::<Vec<_>>();
+        // Nobody says yet that it stands.
+        assert!(standing(&flight).is_empty());
+        flight.vehicle.extend([state(5, 0.0, OnGround), state(6, 0.0, OnGround)]);
+        assert_eq!(standing(&flight), [3, 4, 5, 6, 7]);
+        // It takes off again.
+        flight.vehicle.push(state(7, -0.5, InAir));
+        assert_eq!(standing(&flight), [3, 4, 5, 6]);
+    }
+
+    #[test]
+    fn the_truth_says_first_that_a_vehicle_stands() {
+        let truth = |stamp_ns: i64, on_ground: bool| Truth {
+            stamp_ns,
+            ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
+            position_ned_m: [0.0; 3],
+            velocity_ned_m_s: [0.0; 3],
+            pad_ned_m: [0.0; 3],
+            on_ground,
+            touchdown: None,
+            max_tilt_rad: 0.0,
+            frames: 0,
+        };
+        let mut flight = Flight::default();
+        flight.truth = vec![truth(0, false), truth(2, true), truth(4, false)];
+        flight.vehicle = vec![state(0, 0.5, LandedState::Landing)];
+        let standing: Vec<_> = (-1..6).filter(|at| stands(&flight, *at)).collect();
+        assert_eq!(standing, [2, 3]);
+    }
 }

@@ -282,6 +282,12 @@ fn the_numbers_are_those_of_the_flight_itself() {
     let outside = [Fate::Standby, Fate::NotNeeded, Fate::OnGround].map(|it| frames.count(&it));
     assert!(outside[2] > 0, "no frame was searched on the ground");
     let outside: usize = outside.iter().sum();
+    // What no longer shows the marker as from above, once it has touched down, is nobody's refusal.
+    let touchdown = flight.truth.iter().find_map(|truth| truth.touchdown).unwrap();
+    let after = frames.all.iter().filter(|it| it.handled_ns > touchdown.stamp_ns + 20_000_000);
+    let unused =
+        |it: &&report::frames::Handled| matches!(it.fate, Fate::Refused(_) | Fate::NoMarker);
+    assert_eq!(after.filter(unused).count(), 0);
     assert_eq!(found.frames + outside, flight.found.len());
     // Latency: each frame's detections came a modelled time after its exposure.
     let times: Vec<f64> = flight
