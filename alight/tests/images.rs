@@ -39,6 +39,23 @@ fn a_marker_that_was_made_is_found_where_it_was_drawn() -> anyhow::Result<()> {
     Ok(())
 }
 
+#[test]
+fn markers_without_a_size_are_told_once() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    for name in ["a.png", "b.png"] {
+        let made = ["marker", "apriltag-36h11:3", "--size", "0.1", "--dpi", "60", "-o", name];
+        ensure!(alight(&made, folder.path())?.status.success(), "{name}");
+    }
+    let args = ["detect", "--marker", "apriltag-36h11:*", "--focal-px", "1818", "."];
+    let found = alight(&args, folder.path())?;
+    let told = String::from_utf8(found.stderr)?;
+    ensure!(
+        found.status.success() && told.matches("the marker has no size").count() == 1,
+        "{told}"
+    );
+    Ok(())
+}
+
 /// A library that turns markers otherwise would turn a vehicle that follows their heading, and nothing else would show it.
 #[test]
 fn the_detector_in_python_begins_with_the_same_corner() -> anyhow::Result<()> {

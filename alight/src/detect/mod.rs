@@ -55,6 +55,24 @@ enum Lens {
     Calibrated(CameraModel),
 }
 
+/// Why markers get no pose although the camera is known; `None` where all have a size.
+fn lack_of_sizes(markers: &[Marker], lens: &Lens) -> Option<String> {
+    if matches!(lens, Lens::Unknown) {
+        return None;
+    }
+    let without: Vec<_> = markers.iter().filter(|marker| marker.size_m.is_none()).collect();
+    let first = without.first()?;
+    let form = match first.family.id_count() {
+        Some(_) => "FAMILY:ID:SIZE_M",
+        None => "FAMILY:SIZE_M",
+    };
+    let whose = match without.len() == markers.len() {
+        true => String::new(),
+        false => format!(" of `{first}`"),
+    };
+    Some(format!("no poses{whose}: the marker has no size ({form})"))
+}
+
 /// Maximum number of images without a marker that are searched again without the camera.
 const MAX_LOOKS_WITHOUT_CAMERA: usize = 20;
 
@@ -95,6 +113,9 @@ impl Examiner {
             write_error(
                 "a pad as a whole is found only by a camera that is known: give --camera or --focal-px; now its markers are found one by one",
             );
+        }
+        if let Some(warning) = lack_of_sizes(&args.markers, &lens) {
+            write_error(&warning);
         }
         Ok(Self {
             markers,
@@ -430,6 +451,22 @@ mod tests {
         assert_eq!(totals, Totals { images: 1, detections: 1, unreadable: 0 });
         assert!(examiner.lacks_drawing.load(Ordering::Relaxed));
         assert_eq!(run(&args).unwrap(), ExitCode::FAILURE);
+    }
+
+    #[test]
+    fn markers_without_a_size_are_told_where_a_camera_would_give_poses() {
+        let told = |markers: &[&str], lens: &Lens| {
+            let markers: Vec<Marker> = markers.iter().map(|it| it.parse().unwrap()).collect();
+            lack_of_sizes(&markers, lens)
+        };
+        let ideal = Lens::Ideal { focal_px: 1818.0 };
+        let any = told(&["apriltag-36h11:*"], &ideal).unwrap();
+        assert_eq!(any, "no poses: the marker has no size (FAMILY:ID:SIZE_M)");
+        let rings = told(&["aruco-4x4-50:7:0.2", "rings"], &ideal).unwrap();
+        assert_eq!(rings, "no poses of `rings`: the marker has no size (FAMILY:SIZE_M)");
+        assert_eq!(told(&["apriltag-36h11:*:0.1", "rings:0.1"], &ideal), None);
+        assert_eq!(told(&["apriltag-36h11:*"], &Lens::Unknown), None);
+        assert_eq!(told(&[], &ideal), None);
     }
 
     #[test]
