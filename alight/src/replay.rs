@@ -3,6 +3,7 @@
 
 mod live;
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Instant;
@@ -12,7 +13,7 @@ use clap::{Args, ValueEnum};
 use flightlog::{RecordedTape, TapeReader};
 use messages::Phase;
 use node::stats::quantile;
-use replay::{Again, Begun, Change, End, Searched, change, search, verify};
+use replay::{Again, Begun, Change, End, Searched, change, of_unused_guidance, search, verify};
 
 use crate::args::{NetworkArgs, WrongUse};
 use crate::terminal::{aligned, print, write_error};
@@ -31,7 +32,7 @@ pub(crate) struct ReplayArgs {
     /// as it was recorded. `--verify` is from events.
     #[arg(long, value_enum, default_value_t)]
     from: From,
-    /// One setting of the controller over the recorded configuration; with `--from frames` also
+    /// One setting of the controller over the recorded configuration, as KEY=VALUE or controller.KEY=VALUE; with `--from frames` also
     /// detector.KEY=VALUE, one of the detector. May be repeated.
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -62,17 +63,39 @@ enum From {
     Frames,
 }
 
+/// What the keys of a service's settings begin with.
+const OF_CONTROLLER: &str = "controller.";
+const OF_DETECTOR: &str = "detector.";
+
 impl ReplayArgs {
     /// Whether its options go together.
     fn check(&self) -> Result<(), WrongUse> {
         let rule = if self.detector.is_some() && self.from != From::Frames {
             "`--detector` is for `--from frames`"
+        } else if self.from != From::Frames && self.set.iter().any(|it| it.starts_with(OF_DETECTOR))
+        {
+            "`--set detector.KEY=VALUE` is for `--from frames`: nothing else searches"
         } else if self.verify && self.from != From::Events {
             "`--verify` compares what comes out of the recorded events: without `--from`, or with `--from events`"
         } else {
             return Ok(());
         };
         Err(WrongUse(rule.to_owned()))
+    }
+
+    /// What is searched again, and with which settings of whom: those of the controller with its name before them, as `alight land`
+    /// takes them, or without.
+    fn again(&self) -> Again {
+        let mut again = Again { detector: self.detector.clone(), ..Again::default() };
+        for setting in &self.set {
+            if let Some(setting) = setting.strip_prefix(OF_DETECTOR) {
+                again.of_detector.push(setting.to_owned());
+            } else {
+                let setting = setting.strip_prefix(OF_CONTROLLER).unwrap_or(setting);
+                again.of_controller.push(setting.to_owned());
+            }
+        }
+        again
     }
 }
 
@@ -95,8 +118,12 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     damage.iter().for_each(|damage| write_error(damage));
     let mut is_whole = damage.is_empty();
     let tapes = reader.tapes();
+    let again = args.again();
+    let unused: BTreeSet<String> =
+        tapes.iter().filter_map(|tape| of_unused_guidance(tape, &again.of_controller)).collect();
+    unused.iter().for_each(|setting| write_error(setting));
     if args.from == From::Frames {
-        is_whole &= from_frames(&recordings, &tapes, args)?;
+        is_whole &= from_frames(&recordings, &tapes, &again)?;
         return Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE });
     }
     ensure!(
@@ -111,7 +138,7 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
         args.files
     );
     for tape in &tapes {
-        is_whole &= one(tape, args)?;
+        is_whole &= one(tape, args, &again.of_controller)?;
     }
     Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
@@ -120,16 +147,9 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
 fn from_frames(
     recordings: &[Vec<u8>],
     tapes: &[RecordedTape],
-    args: &ReplayArgs,
+    again: &Again,
 ) -> anyhow::Result<bool> {
-    let mut again = Again { detector: args.detector.clone(), ..Again::default() };
-    for setting in &args.set {
-        match setting.strip_prefix("detector.") {
-            Some(setting) => again.of_detector.push(setting.to_owned()),
-            None => again.of_controller.push(setting.clone()),
-        }
-    }
-    let searched = search(recordings, tapes, &again)?;
+    let searched = search(recordings, tapes, again)?;
     print(compared(&searched).trim_end())?;
     for change in &searched.changes {
         print(&told(change))?;
@@ -198,19 +218,19 @@ fn compared(searched: &Searched) -> String {
 }
 
 /// Replays one controller's tape; true when nothing is wrong with it.
-fn one(tape: &RecordedTape, args: &ReplayArgs) -> anyhow::Result<bool> {
+fn one(tape: &RecordedTape, args: &ReplayArgs, set: &[String]) -> anyhow::Result<bool> {
     let began = Instant::now();
     let mut other_state = None;
     let end = if args.verify {
-        let verdict = verify(tape, &args.set)?;
+        let verdict = verify(tape, set)?;
         other_state = verdict.other_state;
         verdict.end
     } else {
-        let change = change(tape, &args.set)?;
+        let change = change(tape, set)?;
         for begun in &change.phases {
             print(&format!("{:9.3} s  {:<16}  {}", begun.time_s, begun.phase, begun.why))?;
         }
-        if args.from != From::Events || !args.set.is_empty() {
+        if args.from != From::Events || !set.is_empty() {
             print(&told(&change))?;
             if change.other_phase > 0 && ends_with_pilot(&change.phases) {
                 print(RECORDED_MODES)?;
@@ -319,6 +339,27 @@ mod tests {
         }
         assert!(parsed(&["--verify", "--from", "frames"]).unwrap().check().is_err());
         assert!(parsed(&["--live"]).is_ok() && parsed(&["--live", "--from", "events"]).is_err());
+    }
+
+    #[test]
+    fn a_setting_may_have_its_services_name_before_it() {
+        let parsed = |words: &[&str]| {
+            let words = ["replay", "flight.mcap"].iter().chain(words);
+            Program::try_parse_from(words).unwrap().args
+        };
+        let all = ["--set", "controller.marker=rings", "--set", "metric.lateral_gain=1.2"];
+        let args = parsed(&all);
+        assert!(args.check().is_ok());
+        assert_eq!(args.again().of_controller, ["marker=rings", "metric.lateral_gain=1.2"]);
+        // Of the controller's own `detectors` as well.
+        let args = parsed(&["--set", "detectors.tolerance_m=0.2"]);
+        assert!(args.check().is_ok() && args.again().of_detector.is_empty());
+        let detector = ["--set", "detector.thorough=true"];
+        let problem = parsed(&detector).check().unwrap_err();
+        assert!(problem.to_string().contains("is for `--from frames`"), "{problem}");
+        let args = parsed(&[&detector[..], &["--from", "frames"]].concat());
+        assert!(args.check().is_ok());
+        assert_eq!(args.again().of_detector, ["thorough=true"]);
     }
 
     #[derive(Parser)]

@@ -149,6 +149,27 @@ impl ConfigError {
     }
 }
 
+impl ConfigError {
+    /// The same with what may be meant by an unknown key to which none beside it is similar: a key of such a name in another table of
+    /// `all`.
+    fn with_place(self, all: &Table, layer: &Table) -> Self {
+        match self {
+            Self::UnknownKey { source_name, key, hint } if hint.is_empty() => {
+                let is_meant = |path: &[&str]| {
+                    let whole = path.join(".");
+                    whole.strip_prefix(&key).is_some_and(|it| it.is_empty() || it.starts_with('.'))
+                };
+                let set = single_values(layer).into_iter().map(|(path, _)| path);
+                let name = set.filter(|path| is_meant(path)).find_map(|path| path.last().copied());
+                let near = name.and_then(|name| elsewhere(all, name));
+                let hint = near.map_or(hint, |near| format!("; did you mean `{near}`?"));
+                Self::UnknownKey { source_name, key, hint }
+            }
+            other => other,
+        }
+    }
+}
+
 /// A configuration as values and as TOML.
 #[derive(Clone, Debug)]
 pub struct Effective<T> {
@@ -223,7 +244,8 @@ pub fn from_toml<T: Settings>(
 fn effective<T: Settings>(mut table: Table, layers: &[Layer]) -> Result<Effective<T>, ConfigError> {
     let before = table.clone();
     for layer in layers {
-        lay_over(&mut table, &layer.table, &layer.name, &mut String::new())?;
+        lay_over(&mut table, &layer.table, &layer.name, &mut String::new())
+            .map_err(|problem| problem.with_place(&before, &layer.table))?;
     }
     let settings =
         T::from_table(table.clone()).map_err(|cause| refusal::<T>(before, layers, &cause))?;
@@ -411,6 +433,15 @@ fn similar<'a>(keys: impl Iterator<Item = &'a String>, wanted: &str) -> Option<&
         .filter(|(likeness, _)| *likeness > 0.75)
         .max_by(|a, b| a.0.total_cmp(&b.0))
         .map(|(_, key)| key)
+}
+
+/// The key of a table, at any depth, whose last part is most similar to a name.
+fn elsewhere(all: &Table, name: &str) -> Option<String> {
+    let paths = single_values(all).into_iter().map(|(path, _)| path);
+    let likeness =
+        paths.filter_map(|path| Some((strsim::jaro_winkler(path.last()?, name), path.join("."))));
+    let near = likeness.filter(|(likeness, _)| *likeness > 0.9);
+    near.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, key)| key)
 }
 
 /// The value of an enumeration that a text names.
@@ -640,6 +671,11 @@ mod tests {
             &["--set rate_hx=1", "no key `rate_hx`", "did you mean `rate_hz`"],
         );
         check(Some("[lens]\nfocal = 1.0"), &[], &[".toml", "`lens.focal`", "`lens.focal_px`?"]);
+        // In another table than the one where it is.
+        check(None, &["focal_px=900"], &["no key `focal_px`", "did you mean `lens.focal_px`?"]);
+        check(None, &["optics.focal_px=9"], &["`optics`", "did you mean `lens.focal_px`?"]);
+        check(Some("[optics]\nfocal_pixel = 9.0"), &[], &["did you mean `lens.focal_px`?"]);
+        assert!(!load(None, &["zoom=2"]).unwrap_err().contains("did you mean"));
         check(Some("rate_hz = 0"), &[], &[".toml", "`rate_hz` = 0", "from 0.1 to 1000"]);
         check(None, &["rate_hz=nan"], &["from 0.1 to 1000"]);
         check(

@@ -16,7 +16,7 @@ use messages::{
 };
 
 use crate::change::{Change, change_with};
-use crate::run::configured;
+use crate::run::{configuration, configured};
 use crate::truth::{Truths, is_in_picture};
 
 /// What is searched again, and how.
@@ -129,6 +129,12 @@ impl Facts {
     fn detector(&self, again: &Again) -> anyhow::Result<detector::Config> {
         let names = || self.detectors.keys().cloned().collect::<Vec<_>>().join(", ");
         let toml = match &again.detector {
+            Some(name) if !self.detectors.contains_key(name) && self.found.contains_key(name) => {
+                bail!(WrongDetector(format!(
+                    "only Alight's own detectors can search again: `{name}` is none, as it told no configuration; the recording has: {}",
+                    names()
+                )))
+            }
             Some(name) => self.detectors.get(name).ok_or_else(|| {
                 WrongDetector(format!(
                     "the recording has no configuration of a detector `{name}`; it has: {}",
@@ -157,14 +163,6 @@ impl Facts {
         let toml = toml.context("the recording has no configuration of a controller")?;
         let name = "the recorded configuration of the controller";
         Ok(configured::<controller::Config>(name, &toml, set)?.marker)
-    }
-}
-
-/// The controller's configuration at the begin of its tape.
-fn configuration(tape: &RecordedTape) -> Option<String> {
-    match tape.parts.first()?.records().next()?.ok()?.event {
-        TapeEvent::Begin { configuration, .. } => Some(configuration.into_owned()),
-        _ => None,
     }
 }
 

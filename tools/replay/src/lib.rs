@@ -21,5 +21,5 @@ pub use brightness::{Brightness, Meter};
 pub use change::{Begun, Change, change};
 pub use frames::{Again, Searched, WrongDetector, search};
 pub use restamp::Restamp;
-pub use run::{End, Replayed, Stop, run};
+pub use run::{End, Replayed, Stop, of_unused_guidance, run};
 pub use verify::{Verdict, verify};

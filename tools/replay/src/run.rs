@@ -6,6 +6,7 @@ use std::ops::ControlFlow;
 use std::sync::Arc;
 
 use anyhow::{Context, anyhow};
+use controller::config::GuidanceName;
 use controller::flight::Flight;
 use controller::tape::TapedFlight;
 use flightlog::RecordedTape;
@@ -209,6 +210,35 @@ pub fn run_with(
     Ok(end)
 }
 
+/// The controller's configuration at the begin of its tape.
+pub(crate) fn configuration(tape: &RecordedTape) -> Option<String> {
+    match tape.parts.first()?.records().next()?.ok()?.event {
+        TapeEvent::Begin { configuration, .. } => Some(configuration.into_owned()),
+        _ => None,
+    }
+}
+
+/// Says which settings `key=value` are of the guidance that a tape's landing is not flown with, under them; `None` where there are none
+/// and where the configuration cannot be read, which a replay tells.
+pub fn of_unused_guidance(tape: &RecordedTape, set: &[String]) -> Option<String> {
+    let config: controller::Config =
+        configured("the recorded configuration", &configuration(tape)?, set).ok()?;
+    let [used, other] = match config.guidance {
+        GuidanceName::Metric => ["metric", "thesis"],
+        GuidanceName::Thesis => ["thesis", "metric"],
+    };
+    let keys = set.iter().filter_map(|setting| Some(setting.split_once('=')?.0.trim()));
+    let is_of_other =
+        |key: &&str| key.strip_prefix(other).is_some_and(|rest| rest.starts_with('.'));
+    let unused: Vec<String> = keys.filter(is_of_other).map(|key| format!("`{key}`")).collect();
+    (!unused.is_empty()).then(|| {
+        format!(
+            "{} changes nothing: the guidance `{other}` is not in use, but `{used}` (`--set guidance={other}` flies the other one)",
+            unused.join(", ")
+        )
+    })
+}
+
 /// A recorded configuration with settings of now over it, which may mend it: it may name files of another machine.
 ///
 /// # Errors
@@ -257,6 +287,22 @@ mod tests {
             TapeEvent::Begin { program: "test".into(), build: "test".into(), configuration };
         tape.write(0, &begin, &messages::TapeOutput::default());
         RecordedTape { begun_ns: 0, parts: vec![tape.take().unwrap()] }
+    }
+
+    #[test]
+    fn a_setting_of_the_guidance_that_is_not_flown_is_told() {
+        let told = |configuration: &str, set: &[&str]| {
+            let set: Vec<String> = set.iter().map(|&it| it.to_owned()).collect();
+            of_unused_guidance(&tape(configuration), &set)
+        };
+        let thesis = "guidance = \"thesis\"";
+        let said = told(thesis, &["metric.lateral_gain=0.9", "marker=rings"]).unwrap();
+        assert!(said.contains("`metric.lateral_gain` changes nothing"), "{said}");
+        assert!(said.contains("`metric` is not in use, but `thesis`"), "{said}");
+        assert!(told("", &["thesis.tolerance_px=200"]).unwrap().contains("`thesis` is not in use"));
+        assert_eq!(told("", &["metric.lateral_gain=0.9"]), None);
+        assert_eq!(told(thesis, &["guidance=metric", "metric.lateral_gain=0.9"]), None);
+        assert_eq!(told(thesis, &["metric.no_such_key=1"]), None);
     }
 
     #[test]

@@ -253,6 +253,22 @@ fn what_a_recording_lacks_is_named() {
     let named = Again { detector: Some("other".to_owned()), ..Again::default() };
     let unknown = refusal(recording(pixels), &named);
     assert!(unknown.contains("`other`") && unknown.contains("it has: main"), "{unknown}");
+    // A detector of another make tells no configuration of Alight's.
+    let mut file = Vec::new();
+    let mut writer = Writer::new(&mut file, &About::default()).unwrap();
+    let found = Detections {
+        detector: "py".to_owned(),
+        header: header(0),
+        detections: Vec::new(),
+        stages: Vec::new(),
+    };
+    put(&mut writer, topic::DETECTIONS, "py", 0, &found);
+    writer.finish().unwrap();
+    let named = Again { detector: Some("py".to_owned()), ..Again::default() };
+    let other = search(&[recording(pixels), file], &[], &named).unwrap_err();
+    assert!(other.is::<replay::WrongDetector>(), "{other}");
+    let other = other.to_string();
+    assert!(other.contains("only Alight's own detectors") && other.contains("main"), "{other}");
     let wrong = Again { of_detector: vec!["markers=[]".to_owned()], ..Again::default() };
     let wrong = refusal(recording(pixels), &wrong);
     assert!(wrong.contains("at least one marker"), "{wrong}");
