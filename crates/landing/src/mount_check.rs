@@ -323,8 +323,7 @@ impl MountCheck {
     }
 
     fn smooth_lean(&mut self, motion: &Motion, after_s: f64) {
-        let down = motion.ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
-        let lean_rad = acos(down.z().clamp(-1.0, 1.0));
+        let lean_rad = acos(motion.ned_from_body.down_axis().z().clamp(-1.0, 1.0));
         let share = if self.newest.is_none() { 1.0 } else { 1.0 - exp(-after_s / LEAN_S) };
         self.lean_rad += share * (lean_rad - self.lean_rad);
     }

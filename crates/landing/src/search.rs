@@ -133,14 +133,14 @@ impl Square {
 
 /// The direction of the first leg, in radians from north to east: the one into which the vehicle tilts.
 fn first_leg_rad(ned_from_body: Rotation<Ned, Body>) -> f64 {
-    let up = ned_from_body * Vector::<Body>::new(0.0, 0.0, -1.0);
+    let up = -ned_from_body.down_axis();
     if up.horizontal_norm() < sin(MIN_TILT_RAD) { 0.0 } else { atan2(up.y(), up.x()) }
 }
 
 /// Distance upwind that the camera must fly to see the ground below the vehicle, in metres: the distance from
 /// that ground to the centre of the image, at most `search_radius_m`.
 fn upwind_m(config: &PhaseConfig, ned_from_body: Rotation<Ned, Body>, height_m: f64) -> f64 {
-    let down = ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
+    let down = ned_from_body.down_axis();
     let offset_m = fmax(height_m, 0.0) * down.horizontal_norm() / fmax(down.z(), 0.5);
     if offset_m < MIN_TILT_RAD * height_m { 0.0 } else { fmin(offset_m, config.search_radius_m) }
 }

@@ -43,7 +43,7 @@ use libm::{cos, exp, fmax, fmin, tan};
 
 use crate::config::MetricConfig;
 use crate::decision::{Reason, TargetEstimate};
-use crate::guidance::observer::{Observer, down_axis, horizontal, limited};
+use crate::guidance::observer::{Observer, horizontal, limited};
 use crate::guidance::path::{Path, time_constant_s};
 use crate::guidance::situation::{Guidance, Progress, Situation};
 use crate::time::Timestamp;
@@ -643,7 +643,7 @@ fn rises(situation: &Situation<'_>, target: &TargetEstimate) -> bool {
 
 /// True when the vehicle leans so far that it cannot stand on the ground.
 fn leans(situation: &Situation<'_>) -> bool {
-    down_axis(situation).z() < cos(MAX_STANDING_TILT_RAD)
+    situation.vehicle.ned_from_body.down_axis().z() < cos(MAX_STANDING_TILT_RAD)
 }
 
 /// The part of the link's delay that `dead_time_s` does not contain, in seconds.

@@ -1,7 +1,7 @@
 //! What the metric guidance observes of the vehicle's motion: the autopilot's path, the bias of its velocity,
 //! and the tilt against the wind.
 
-use geometry::{Body, Ned, Point, Vector, squared};
+use geometry::{Ned, Point, Vector, squared};
 use libm::{fmax, fmin};
 
 use crate::config::MetricConfig;
@@ -104,14 +104,9 @@ impl Observer {
     }
 }
 
-/// The body's down axis.
-pub(super) fn down_axis(situation: &Situation<'_>) -> Vector<Ned> {
-    situation.vehicle.ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0)
-}
-
 /// Horizontal offset of the body's down axis per metre of height.
 fn tilt(situation: &Situation<'_>) -> Vector<Ned> {
-    let down = down_axis(situation);
+    let down = situation.vehicle.ned_from_body.down_axis();
     horizontal(down) * (1.0 / fmax(down.z(), 0.5))
 }
 
