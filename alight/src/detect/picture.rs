@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use fiducial::Observation;
 use fiducial::overlay::canvas::{Colour, LINE, RgbImageBuf};
+use fiducial::overlay::font::METRES;
 use geometry::{CameraModel, Pixel, Point, Transform};
 use imaging::{GrayImage, GrayView};
 
@@ -191,7 +192,7 @@ impl Brush {
         let mut lines = vec![format!("{}{id}  {:.2}{wrong}", seen.family, seen.confidence)];
         if let Some(pose) = &seen.pose {
             let at = pose.camera_from_marker.origin();
-            lines.push(format!("{:.3}, {:.3}, {:.3} m", at.x(), at.y(), at.z()));
+            lines.push(format!("{:.3}, {:.3}, {:.3} {METRES}", at.x(), at.y(), at.z()));
         }
         let others = all.iter().filter(|other| other.centre != seen.centre);
         let room = others.map(|other| other.centre.distance(&seen.centre) * self.scale);

@@ -1,5 +1,8 @@
 //! A font of 5 x 7 dots for images.
 
+/// The sign of metres, which is small among letters that are drawn as upper case.
+pub const METRES: char = '\u{ff4d}';
+
 /// The seven rows of a letter, from the top; the lowest of five bits is its right column. Lower case is drawn as upper case,
 /// an unknown letter as a blank.
 pub fn rows(letter: char) -> [u8; 7] {
@@ -49,6 +52,7 @@ pub fn rows(letter: char) -> [u8; 7] {
         ')' => [0b01000, 0b00100, 0b00010, 0b00010, 0b00010, 0b00100, 0b01000],
         '/' => [0b00000, 0b00001, 0b00010, 0b00100, 0b01000, 0b10000, 0b00000],
         '+' => [0b00000, 0b00100, 0b00100, 0b11111, 0b00100, 0b00100, 0b00000],
+        METRES => [0b00000, 0b00000, 0b11010, 0b10101, 0b10101, 0b10101, 0b10101],
         '=' => [0b00000, 0b00000, 0b11111, 0b00000, 0b11111, 0b00000, 0b00000],
         _ => [0; 7],
     }
@@ -65,5 +69,6 @@ mod tests {
             assert!(rows(letter) != [0; 7], "{letter}");
         }
         assert_eq!(rows(' '), [0; 7]);
+        assert!(rows(METRES) != [0; 7] && rows(METRES) != rows('m'));
     }
 }
