@@ -39,11 +39,18 @@ pub fn text(text: impl Into<String>) -> Cell {
 /// A cell with a number of so many digits and its unit; `-` for none.
 pub fn number(value: Option<f64>, digits: usize, unit: &str) -> Cell {
     let value = value.filter(|value| value.is_finite());
-    Cell::Number(
-        value.map_or("-".to_owned(), |value| {
-            format!("{value:.digits$} {unit}").trim_end().to_owned()
-        }),
-    )
+    Cell::Number(value.map_or("-".to_owned(), |value| {
+        format!("{} {unit}", fixed(value, digits)).trim_end().to_owned()
+    }))
+}
+
+/// A number of so many digits, and nothing as 0 with a sign: the begin of a landing is at 0.0 s.
+pub fn fixed(value: f64, digits: usize) -> String {
+    let text = format!("{value:.digits$}");
+    match text.strip_prefix('-') {
+        Some(zero) if zero.chars().all(|letter| matches!(letter, '0' | '.')) => zero.to_owned(),
+        _ => text,
+    }
 }
 
 /// A cell with a count.
@@ -168,6 +175,12 @@ pub fn details(title: &str, block: Block) -> Block {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn nothing_has_no_sign() {
+        assert_eq!(number(Some(-0.04), 1, "s"), Cell::Number("0.0 s".to_owned()));
+        assert_eq!([-0.06, -12.0, 0.0].map(|value| fixed(value, 1)), ["-0.1", "-12.0", "0.0"]);
+    }
 
     #[test]
     fn what_a_recording_says_stays_text() {

@@ -6,7 +6,9 @@ use std::fmt::Write as _;
 use crate::chart::Chart;
 use crate::difference::{configurations, parameters, parameters_of_one};
 use crate::flight::Flight;
-use crate::html::{Block, Cell, all_as_html, escaped, missing, number, paragraph, table, text};
+use crate::html::{
+    Block, Cell, all_as_html, escaped, fixed, missing, number, paragraph, table, text,
+};
 use crate::plots::share_axes;
 use crate::sections::{self, Section};
 use crate::settings::Difference;
@@ -150,7 +152,7 @@ pub(crate) fn in_numbers(
     let none =
         if summary.landed == Some(true) || summary.phase.is_none() { "not recorded" } else { "-" };
     FIGURES.iter().map(move |Figure { name, of, digits, unit }| {
-        let value = of(summary).map(|value| format!("{value:.digits$} {unit}"));
+        let value = of(summary).map(|value| format!("{} {unit}", fixed(value, *digits)));
         (*name, value.ok_or(none))
     })
 }

@@ -74,7 +74,8 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
     above.push(layer("estimate", Ink::Blue, Shape::Line, from_above(&estimated)));
     above.push(layer("pad", Ink::Text, Shape::Crosses, [at(0.0, 0.0)]));
     let start = truth.first().or(estimated.first());
-    above.push(layer("start", Ink::Green, Shape::Dots, start.map(away)));
+    // Last and large: the vehicle's path begins there, and would cover it.
+    above.push(layer("start", Ink::Green, Shape::LargeDots, start.map(away)));
 
     // Seen across the way from the start to the pad.
     let (toward_north, toward_east) = match start {

@@ -251,6 +251,9 @@ fn circles_of_the_deviation_are_whole_and_the_large_ones_are_left_out_aloud() {
     }
     assert!(charts[0].note.contains("left out"), "{}", charts[0].note);
     assert_eq!(charts[1].note, "");
+    // Over the path that begins there, and larger than that is wide.
+    let last = charts[0].layers.last().unwrap();
+    assert_eq!((last.name.as_str(), last.shape), ("start", Shape::LargeDots));
 }
 
 #[test]
