@@ -6,7 +6,11 @@ use std::ops::Range;
 
 use flightlog::channel::{RAW_PREFIX, Received, split_raw};
 use flightlog::{About, Picture, Writer, repair};
-use messages::{FrameHeader, PixelFormat, Wind, encode};
+use messages::{
+    BayerPattern, DetectorState, ExposureReason, ExposureSetter, FrameHeader, LandedState,
+    LensModel, PacketSignature, Phase, PixelFormat, Place, RefusedShape, SigningState, Wind,
+    encode,
+};
 
 const MESSAGES: usize = 60;
 
@@ -143,4 +147,97 @@ fn chunks(recording: &[u8]) -> Vec<Range<usize>> {
         }
     }
     chunks
+}
+
+#[test]
+fn the_spellings_of_variants_in_json_are_those_of_the_documentation() {
+    fn spelled<T: serde::Serialize>(values: &[T]) -> Vec<String> {
+        values.iter().map(|value| serde_json::to_string(value).unwrap()).collect()
+    }
+    let formats = [
+        PixelFormat::Mono8,
+        PixelFormat::Jpeg,
+        PixelFormat::Mono10,
+        PixelFormat::Mono12,
+        PixelFormat::Mono16,
+        PixelFormat::Bayer8(BayerPattern::Rggb),
+        PixelFormat::Bayer10(BayerPattern::Grbg),
+        PixelFormat::Bayer12(BayerPattern::Gbrg),
+        PixelFormat::Bayer16(BayerPattern::Bggr),
+    ];
+    let landed = [
+        LandedState::Unknown,
+        LandedState::OnGround,
+        LandedState::TakingOff,
+        LandedState::InAir,
+        LandedState::Landing,
+    ];
+    let states = [
+        DetectorState::Active,
+        DetectorState::Shadow,
+        DetectorState::Stale,
+        DetectorState::Blind,
+        DetectorState::Outvoted,
+    ];
+    let setters = [ExposureSetter::Fixed, ExposureSetter::Camera, ExposureSetter::Marker];
+    let reasons = [
+        ExposureReason::Configured,
+        ExposureReason::NoMarker,
+        ExposureReason::LostSoon,
+        ExposureReason::TakenOver,
+        ExposureReason::Settling,
+        ExposureReason::NotInFrame,
+        ExposureReason::NoContrast,
+        ExposureReason::Good,
+        ExposureReason::Clipped,
+        ExposureReason::TooBright,
+        ExposureReason::TooDark,
+        ExposureReason::MotionBlur,
+        ExposureReason::LessNoise,
+        ExposureReason::AtLimits,
+    ];
+    let signatures =
+        [PacketSignature::Unsigned, PacketSignature::Unchecked, PacketSignature::Verified];
+    let signing =
+        [SigningState::Off, SigningState::NoKey, SigningState::Wanted, SigningState::InForce];
+    let phases = [
+        Phase::Idle,
+        Phase::Takeoff,
+        Phase::Search,
+        Phase::Approach,
+        Phase::Descend,
+        Phase::Retry,
+        Phase::Final,
+        Phase::Landed,
+        Phase::Hold,
+        Phase::Aborted,
+        Phase::PilotInCommand,
+        Phase::Failed,
+    ];
+    let told = include_str!("../../../docs/wire-format.md");
+    let (_, told) = told.split_once("## As JSON").unwrap();
+    for (row, spelled) in [
+        ("`format` of", spelled(&formats)),
+        ("`set_by` of", spelled(&setters)),
+        ("`why` of", spelled(&reasons)),
+        ("`place` of", spelled(&[Place::Onboard, Place::Ground])),
+        ("`phase` of", spelled(&phases)),
+        ("`state` of", spelled(&states)),
+        ("`landed` of", spelled(&landed)),
+        ("`signature` of", spelled(&signatures)),
+        ("`signing.state` of", spelled(&signing)),
+    ] {
+        let start = format!("| {row}");
+        let line = told.lines().find(|line| line.starts_with(&start)).unwrap();
+        let expected: Vec<String> = spelled.iter().map(|it| format!("`{it}`")).collect();
+        assert!(line.contains(&format!("| {} |", expected.join(", "))), "{line}: {expected:?}");
+    }
+    for (value, start) in [
+        (spelled(&[LensModel::Pinhole]), "\"Pinhole\""),
+        (spelled(&[LensModel::BrownConrady([0.0; 8])]), "{\"BrownConrady\":["),
+        (spelled(&[LensModel::KannalaBrandt([0.0; 4])]), "{\"KannalaBrandt\":["),
+        (spelled(&[RefusedShape::Quad([[0.0; 2]; 4])]), "{\"Quad\":["),
+    ] {
+        assert!(value[0].starts_with(start) && told.contains(start), "{value:?}");
+    }
 }
