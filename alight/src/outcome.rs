@@ -6,6 +6,7 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use messages::{ControllerStatus, Health, Phase, RecorderStatus, Touchdown, Truth};
+use node::health::LATENCIES_KEPT;
 use serde::Serialize;
 
 use crate::children::Exit;
@@ -404,11 +405,11 @@ impl Outcome {
         row("lateral speed at touchdown", self.touchdown_lateral_speed_m_s, "m/s", 2, "-");
         row("largest tilt", self.max_tilt_deg, "deg", 1, "-");
         let latency = self.latency_ms.as_ref();
-        row("stamp to setpoint, median", latency.map(|l| l.p50), "ms", 1, "-");
-        row("stamp to setpoint, 99 %", latency.map(|l| l.p99), "ms", 1, "-");
+        row("exposure to setpoint, median", latency.map(|l| l.p50), "ms", 1, "-");
+        row("exposure to setpoint, 99 %", latency.map(|l| l.p99), "ms", 1, "-");
         line(format_args!(
             "{:34} {:>14}",
-            "detections used of frames",
+            "detections used of all frames",
             format!("{} of {}", self.detections, self.frames)
         ));
         for process in &self.processes {
@@ -427,9 +428,18 @@ impl Outcome {
             let file = file.as_deref().unwrap_or("no file");
             line(format_args!("recorded {kept} messages, lost {dropped}{unseen}: {file}{problem}"));
         }
+        line(format_args!("{}", counted()));
         text.truncate(text.trim_end().len());
         text
     }
+}
+
+/// What the latency and the frames are counted of: not of the same as in the report of a recording.
+fn counted() -> String {
+    format!(
+        "Frames and detections count from the camera's first frame, the take-off's too; the latency is of the last {LATENCIES_KEPT} setpoints. \
+         `alight report` of a recording has both of the landing alone."
+    )
 }
 
 #[cfg(test)]
@@ -494,7 +504,11 @@ mod tests {
             (Some(15.0), Some(13.0))
         );
         assert_eq!(outcome.detections, 100);
-        assert!(outcome.table().contains("0.020 m        0.068 m"), "{}", outcome.table());
+        let table = outcome.table();
+        assert!(table.contains("0.020 m        0.068 m"), "{table}");
+        for told in ["of the last 512 setpoints", "the take-off's too", "of the landing alone"] {
+            assert!(table.contains(told), "{told} is not in: {table}");
+        }
     }
 
     /// The result of a landing that ended like this, and the distance from the pad at the touchdown.

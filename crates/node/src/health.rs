@@ -12,7 +12,7 @@ use crate::stats;
 use crate::version::version;
 
 /// Number of recent latencies over which percentiles are taken.
-const LATENCIES_KEPT: usize = 512;
+pub const LATENCIES_KEPT: usize = 512;
 
 /// Counters of a service, for all of its threads.
 #[derive(Debug, Default)]
