@@ -167,7 +167,7 @@ pub fn number(value: Option<f64>, digits: usize) -> String {
 fn append_summary(text: &mut String, runs: &[Run]) {
     let _ = writeln!(
         text,
-        "## All sets\n\nchi2 are medians: 1.39 (centre) and 0.45 (range) for a consistent covariance. Times are processor time.\n"
+        "## All sets\n\nchi2 are medians: 1.39 (centre) and 0.45 (range) for a consistent covariance. Times are processor time. In frames without a marker every detection is elsewhere.\n"
     );
     let _ = writeln!(
         text,
@@ -178,7 +178,8 @@ fn append_summary(text: &mut String, runs: &[Run]) {
         let found = if run.set.has_marker() {
             format!("{}/{}", s.found, s.frames)
         } else {
-            s.frames.to_string()
+            // There is none to find.
+            format!("none in {}", s.frames)
         };
         let _ = writeln!(
             text,
@@ -218,6 +219,9 @@ fn complete_to(heights: impl Iterator<Item = u32>, score_at: impl Fn(u32) -> Sco
 }
 
 fn append_positions(text: &mut String, runs: &[Run]) {
+    if runs.iter().all(|run| run.set != Set::Positions) {
+        return;
+    }
     let _ = writeln!(
         text,
         "\n## The thesis' positions\n\n| marker | detector | binning | frames found | every frame found to m | centre px median | p95 | range % median to 10 m | p95 | bias % | range % median at 13 m | bias mm |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
@@ -254,6 +258,9 @@ fn append_positions(text: &mut String, runs: &[Run]) {
 }
 
 fn append_farthest(text: &mut String, runs: &[Run]) {
+    if runs.iter().all(|run| run.set != Set::Far) {
+        return;
+    }
     let _ = writeln!(
         text,
         "\n## Farthest, 2x2\n\n| marker | detector | every frame found to m | found at 20 | 24 | 28 | 30 | 32 | 34 | 36 | 38 | 40 m |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
@@ -273,7 +280,6 @@ fn append_farthest(text: &mut String, runs: &[Run]) {
 }
 
 fn append_groups(text: &mut String, runs: &[Run]) {
-    let _ = writeln!(text, "\n## Groups: found of all, median centre px");
     let with_groups = [
         Set::Adverse,
         Set::Shade,
@@ -286,6 +292,10 @@ fn append_groups(text: &mut String, runs: &[Run]) {
         Set::Light,
         Set::Rolling,
     ];
+    if runs.iter().all(|run| !with_groups.contains(&run.set)) {
+        return;
+    }
+    let _ = writeln!(text, "\n## Groups: found of all, median centre px");
     for set in with_groups {
         let of_set: Vec<_> = runs.iter().filter(|run| run.set == set).collect();
         let Some(first) = of_set.first() else { continue };
@@ -313,7 +323,9 @@ fn append_groups(text: &mut String, runs: &[Run]) {
 }
 
 fn append_misses(text: &mut String, runs: &[Run]) {
-    let _ = writeln!(text, "\n## Our misses and false detections\n");
+    let heading = "\n## Our misses and false detections\n\n";
+    let before = text.len();
+    text.push_str(heading);
     for run in runs.iter().filter(|run| run.detector == OURS) {
         let score = Score::new(&run.answers);
         if run.set.has_marker() && !score.missed.is_empty() {
@@ -336,5 +348,44 @@ fn append_misses(text: &mut String, runs: &[Run]) {
                 score.false_in.join(" ")
             );
         }
+    }
+    if text.len() == before + heading.len() {
+        text.truncate(before);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::CameraLine;
+
+    fn run(set: Set) -> Run {
+        let camera = CameraLine {
+            width: 8,
+            height: 8,
+            fx: 8.0,
+            fy: 8.0,
+            cx: 4.0,
+            cy: 4.0,
+            distortion: Vec::new(),
+        };
+        let frame = StoredFrame {
+            image: "a.png".to_owned(),
+            set: set.name().to_owned(),
+            group: String::new(),
+            camera,
+            marker: None,
+        };
+        let record = Record { image: "a.png".to_owned(), ms: 1.0, found: Vec::new() };
+        let answers = vec![(frame, record)];
+        Run { set, family: "experiment".to_owned(), detector: OURS.to_owned(), answers }
+    }
+
+    #[test]
+    fn a_report_has_no_heading_without_a_content_and_no_marker_is_found_where_none_is() {
+        let told = text(&[run(Set::Negatives)]);
+        assert!(told.contains("| negatives | experiment | alight | none in 1 | 0 | 0 |"), "{told}");
+        let headings: Vec<&str> = told.lines().filter(|line| line.starts_with('#')).collect();
+        assert_eq!(headings, ["## All sets"]);
     }
 }
