@@ -1,9 +1,9 @@
-//! SVG plots of the landing experiment: error against wind with medians, touchdown points from above, success of each combination,
+//! SVG plots of the landing experiment: error against wind with medians for each fault, touchdown points from above, success of each combination,
 //! the share with a larger error.
 
 use anyhow::anyhow;
 use messages::Touchdown;
-use node::stats::quantile;
+use node::stats::interpolated_quantile as quantile;
 use plotters::coord::CoordTranslate;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
@@ -21,7 +21,10 @@ pub const COLOURS: [RGBColor; 6] = [
     RGBColor(255, 127, 14),
     RGBColor(23, 190, 207),
 ];
-const GREY: RGBColor = RGBColor(150, 150, 150);
+/// The font of a panel's caption.
+const FONT: (&str, u32) = ("sans-serif", 16);
+/// The colour of what is not a series.
+pub const GREY: RGBColor = RGBColor(150, 150, 150);
 
 /// Why a plot cannot be drawn.
 pub type DrawError = Box<dyn std::error::Error>;
@@ -34,15 +37,12 @@ pub type Chart<'a, 'b> =
 /// # Errors
 /// When one cannot be drawn.
 pub fn all(outcomes: &[Outcome]) -> anyhow::Result<Vec<(&'static str, String)>> {
-    let error: Column = |o| o.error_m.map(|error| 100.0 * error);
+    let error: Column = |o| o.error_m;
     let time: Column = |o| o.disarm_s;
+    let size = against_wind_size(outcomes);
     let plots = [
-        picture([900, 560], |area| {
-            against_wind(area, outcomes, error, "Touchdown error", "error, cm")
-        })?,
-        picture([900, 560], |area| {
-            against_wind(area, outcomes, time, "Time to disarm", "time, s")
-        })?,
+        picture(size, |area| against_wind(area, outcomes, error, "Touchdown error", "error, m"))?,
+        picture(size, |area| against_wind(area, outcomes, time, "Time to disarm", "time, s"))?,
         picture([700, 720], |area| touchdowns(area, outcomes))?,
         picture(success_size(outcomes), |area| success(area, outcomes))?,
         picture([900, 560], |area| worst(area, outcomes))?,
@@ -68,9 +68,40 @@ pub fn picture(
     Ok(svg)
 }
 
-type Area<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
+/// A part of a picture.
+pub type Area<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
 
-/// Every flight as a dot; for each 1 m/s of wind the median with its 95 % interval, and the 99th percentile.
+/// The flights of each fault, in the order in which they were flown.
+fn by_fault(outcomes: &[Outcome]) -> Vec<(&'static str, Vec<&Outcome>)> {
+    let mut faults: Vec<(&str, Vec<&Outcome>)> = Vec::new();
+    for outcome in outcomes {
+        match faults.iter_mut().find(|(name, _)| *name == outcome.fault) {
+            Some((_, members)) => members.push(outcome),
+            None => faults.push((outcome.fault, vec![outcome])),
+        }
+    }
+    faults
+}
+
+/// Columns and rows of panels, one for each fault.
+fn panels(outcomes: &[Outcome]) -> [usize; 2] {
+    let count = by_fault(outcomes).len().max(1);
+    let columns = count.min(3);
+    [columns, count.div_ceil(columns)]
+}
+
+/// Height of the heading over panels, in pixels.
+const HEADING_PX: u32 = 64;
+
+fn against_wind_size(outcomes: &[Outcome]) -> [u32; 2] {
+    match panels(outcomes) {
+        [1, 1] => [900, 620],
+        [columns, rows] => [480 * columns as u32, HEADING_PX + 360 * rows as u32],
+    }
+}
+
+/// A panel for each fault, all with the same axes: every flight that landed as a dot; for each 1 m/s of wind the median with the interval
+/// in which it lies, and the 99th percentile.
 fn against_wind(
     area: &Area<'_>,
     outcomes: &[Outcome],
@@ -78,21 +109,52 @@ fn against_wind(
     title: &str,
     axis: &str,
 ) -> Result<(), DrawError> {
-    let landed: Vec<&Outcome> = outcomes.iter().filter(|o| o.ending == Ending::Landed).collect();
+    let (heading, below) = area.split_vertically(HEADING_PX);
+    let title = format!("{title} against mean wind, {} flights", outcomes.len());
+    heading.draw(&Text::new(title, (16, 10), ("sans-serif", 20)))?;
+    // One key for all panels, in none of which it covers a flight.
+    heading.draw(&Circle::new((24, 46), 3, GREY.filled()))?;
+    heading.draw(&Text::new("a flight that landed", (36, 38), ("sans-serif", 13)))?;
+    let bar = "median; bar: 95 % interval of the median, not the spread (from six flights on)";
+    for (index, (x, text)) in [(190, bar), (760, "99 %")].into_iter().enumerate() {
+        let line = COLOURS[index].stroke_width(2);
+        heading.draw(&PathElement::new([(x, 46), (x + 16, 46)], line))?;
+        heading.draw(&Text::new(text, (x + 24, 38), ("sans-serif", 13)))?;
+    }
+    let all: Vec<&Outcome> = outcomes.iter().collect();
     let fastest = outcomes.iter().map(|o| o.wind_m_s).fold(1.0, f64::max);
-    let max = 1.15 * numbers(&landed, of).into_iter().fold(0.1, f64::max);
+    let reach = [fastest + 0.6, 1.15 * numbers(&all, of).into_iter().fold(1e-3, f64::max)];
+    let [columns, rows] = panels(outcomes);
+    let areas = below.split_evenly((rows, columns));
+    for (panel, (fault, members)) in areas.iter().zip(by_fault(outcomes)) {
+        one_fault(panel, fault, &members, of, axis, reach)?;
+    }
+    Ok(())
+}
+
+fn one_fault(
+    area: &Area<'_>,
+    fault: &str,
+    members: &[&Outcome],
+    of: Column,
+    axis: &str,
+    [fastest, max]: [f64; 2],
+) -> Result<(), DrawError> {
+    let landed: Vec<&Outcome> =
+        members.iter().copied().filter(|o| o.ending == Ending::Landed).collect();
+    let title = match fault {
+        "none" => "no fault".to_owned(),
+        name => name.to_owned(),
+    };
     let mut chart = ChartBuilder::on(area)
-        .caption(
-            format!("{title} against mean wind, {} flights", outcomes.len()),
-            ("sans-serif", 20),
-        )
+        .caption(format!("{title}, {} of {} landed", landed.len(), members.len()), FONT)
         .margin(12)
         .x_label_area_size(40)
         .y_label_area_size(56)
-        .build_cartesian_2d(-0.4..fastest + 0.6, 0.0..max)?;
-    chart.configure_mesh().x_desc("mean wind, m/s").y_desc(axis).draw()?;
-    let dots = landed.iter().filter_map(|o| Some((o.wind_m_s, of(o)?)));
-    chart.draw_series(dots.map(|at| Circle::new(at, 2, GREY.mix(0.5).filled())))?;
+        .build_cartesian_2d(-0.4..fastest, 0.0..max)?;
+    chart.configure_mesh().x_desc("mean wind, m/s").y_desc(axis).x_labels(8).y_labels(6).draw()?;
+    let dots: Vec<(f64, f64)> = landed.iter().filter_map(|o| Some((o.wind_m_s, of(o)?))).collect();
+    chart.draw_series(dots.into_iter().map(|at| Circle::new(at, 2, GREY.mix(0.7).filled())))?;
     let bins: Vec<(f64, Vec<f64>)> = (0..=fastest.ceil() as u32)
         .filter_map(|bin| {
             let near = |o: &&Outcome| (o.wind_m_s - f64::from(bin)).abs() <= 0.5;
@@ -104,21 +166,18 @@ fn against_wind(
     let curve = |part: f64| -> Vec<(f64, f64)> {
         bins.iter().filter_map(|(bin, values)| Some((*bin, quantile(values, part)?))).collect()
     };
-    for (index, (part, name)) in
-        [(0.5, "median, 95 % interval"), (0.99, "99 %")].into_iter().enumerate()
-    {
-        let colour = COLOURS[index];
-        chart
-            .draw_series(LineSeries::new(curve(part), colour.stroke_width(2)))?
-            .label(name)
-            .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
+    for (colour, part) in COLOURS.into_iter().zip([0.5, 0.99]) {
+        // A line through one wind alone has no length.
+        let points = curve(part).into_iter().map(move |at| Circle::new(at, 3, colour.filled()));
+        chart.draw_series(points)?;
+        chart.draw_series(LineSeries::new(curve(part), colour.stroke_width(2)))?;
     }
     for (bin, values) in &bins {
         if let Some([low, high]) = median_interval(values) {
             error_bar(&mut chart, *bin, [low, high], COLOURS[0])?;
         }
     }
-    legend(&mut chart, SeriesLabelPosition::UpperLeft)
+    Ok(())
 }
 
 fn error_bar(
@@ -248,23 +307,26 @@ fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     let distributions: Vec<(&str, Vec<f64>)> = cells
         .into_iter()
         .map(|(name, members)| {
-            let mut errors = numbers(&members, |o| o.error_m.map(|error| 100.0 * error));
+            let mut errors = numbers(&members, |o| o.error_m);
             errors.sort_by(f64::total_cmp);
             (name, errors)
         })
         .collect();
     let errors = || distributions.iter().flat_map(|(_, errors)| errors.iter().copied());
     let max_count = distributions.iter().map(|(_, errors)| errors.len()).max().unwrap_or(0).max(1);
-    let (max_cm, min_share) = (1.1 * errors().fold(1.0, f64::max), 0.7 / max_count as f64);
+    let (max_m, min_share) = (1.1 * errors().fold(0.01, f64::max), 0.7 / max_count as f64);
     let mut chart = ChartBuilder::on(area)
         .caption("Proportion of the landings with a larger error", ("sans-serif", 20))
         .margin(12)
         .x_label_area_size(40)
         .y_label_area_size(64)
-        .build_cartesian_2d(0.0..max_cm, (min_share..1.0).log_scale())?;
+        .build_cartesian_2d(
+            0.0..max_m,
+            (min_share..1.0).log_scale().with_key_points(share_ticks(min_share)),
+        )?;
     chart
         .configure_mesh()
-        .x_desc("touchdown error, cm")
+        .x_desc("touchdown error, m")
         .y_desc("proportion")
         .y_label_formatter(&|share| format!("{}", (share * 1e6).round() / 1e6))
         .draw()?;
@@ -276,6 +338,17 @@ fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
             .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
     }
     legend(&mut chart, SeriesLabelPosition::UpperRight)
+}
+
+/// The ticks of a logarithmic axis of proportions down to this one: 1, 0.5, 0.2, 0.1 and so on, where those are few also 0.7 and the like.
+fn share_ticks(min_share: f64) -> Vec<f64> {
+    let down_to = |steps: &[f64]| {
+        let decades = (0..9).map(|decade| 10f64.powi(-decade));
+        let ticks = decades.flat_map(|decade| steps.iter().map(move |step| step * decade));
+        ticks.filter(|tick| *tick >= min_share).collect::<Vec<f64>>()
+    };
+    let ticks = down_to(&[1.0, 0.5, 0.2]);
+    if ticks.len() < 3 { down_to(&[1.0, 0.9, 0.8, 0.7, 0.6, 0.5]) } else { ticks }
 }
 
 /// The proportion of ascending errors that are larger than each, as the corners of its steps; the last falls to `min_share`, where a
@@ -292,6 +365,41 @@ fn steps(errors: &[f64], min_share: f64) -> Vec<(f64, f64)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::landing::plan::Plan;
+
+    #[test]
+    fn an_axis_of_proportions_has_three_ticks_or_more() {
+        for (flights, at_least) in [(1, 3), (2, 3), (3, 3), (4, 3), (10, 4), (1000, 9)] {
+            let min_share = 0.7 / f64::from(flights);
+            let ticks = share_ticks(min_share);
+            assert!(ticks.len() >= at_least && ticks.len() < 12, "{flights}: {ticks:?}");
+            assert!(ticks.iter().all(|tick| (min_share..=1.0).contains(tick)), "{ticks:?}");
+        }
+    }
+
+    #[test]
+    fn each_fault_has_its_own_panel_and_the_bar_is_explained() {
+        let faults = ["none", "gust", "silence-2s", "lie"].map(|name| name.parse().unwrap());
+        let plan = Plan { faults: faults.to_vec(), ..Plan::default() };
+        let outcomes: Vec<Outcome> = plan
+            .flights()
+            .iter()
+            .map(|planned| Outcome {
+                ending: Ending::Landed,
+                error_m: Some(0.01),
+                disarm_s: Some(12.0),
+                ..Outcome::new(planned)
+            })
+            .collect();
+        let plots = all(&outcomes).unwrap();
+        for (name, svg) in plots.iter().take(2) {
+            for told in ["no fault, 80 of 80 landed", "gust, 80 of", "silence-2s, ", "lie, "] {
+                assert!(svg.contains(told), "{told} is not in {name}");
+            }
+            assert_eq!(svg.matches("mean wind, m/s").count(), 4, "{name}");
+            assert!(svg.contains("95 % interval of the median") && !svg.contains("cm\n"), "{name}");
+        }
+    }
 
     #[test]
     fn the_proportion_with_a_larger_error_falls_at_each_error() {

@@ -1,6 +1,6 @@
 //! Summaries of many flights, as tables.
 
-use node::stats::{interpolated_quantile, quantile};
+use node::stats::interpolated_quantile;
 
 use super::outcome::{Ending, HARD_M_S, Outcome, SLIDING_M_S, TILTED_DEG};
 
@@ -13,13 +13,34 @@ pub fn numbers(outcomes: &[&Outcome], of: Column) -> Vec<f64> {
     landed.filter_map(|outcome| of(outcome)).collect()
 }
 
-/// 95 % confidence interval of the median from order statistics (normal approximation of the binomial
-/// distribution).
+/// 95 % confidence interval of the median from order statistics, which is that of the sign test. `None` for fewer than six numbers,
+/// which are not enough for it.
 pub fn median_interval(numbers: &[f64]) -> Option<[f64; 2]> {
-    let count = numbers.len() as f64;
-    let reach = 0.98 * count.sqrt();
-    let at = |rank: f64| quantile(numbers, (rank / (count - 1.0).max(1.0)).clamp(0.0, 1.0));
-    Some([at((0.5 * count - reach - 0.5).floor())?, at((0.5 * count + reach - 0.5).ceil())?])
+    let mut sorted = numbers.to_vec();
+    sorted.sort_unstable_by(f64::total_cmp);
+    // How many on each side are as improbable as to be left out.
+    let left_out = heads(sorted.len()).take_while(|at_most| *at_most <= 0.025).count();
+    let low = left_out.checked_sub(1)?;
+    Some([*sorted.get(low)?, *sorted.get(sorted.len().checked_sub(left_out)?)?])
+}
+
+/// The probability of at most 0, 1, 2, ... heads in so many tosses of a coin.
+fn heads(tosses: usize) -> impl Iterator<Item = f64> {
+    let count = tosses as f64;
+    // The logarithm of the probability of each number, so that no number of tosses is too large.
+    let mut of_this = -count * std::f64::consts::LN_2;
+    let mut at_most = 0.0;
+    (0..=tosses).map(move |number| {
+        at_most += of_this.exp();
+        of_this += ((count - number as f64) / (number as f64 + 1.0)).ln();
+        at_most
+    })
+}
+
+/// Two-sided sign test: the probability of numbers as unequal as these or more so if both were equally probable.
+pub fn sign_test(some: usize, others: usize) -> f64 {
+    let at_most = heads(some + others).nth(some.min(others));
+    at_most.map_or(1.0, |at_most| (2.0 * at_most).min(1.0))
 }
 
 /// 95 % confidence interval of a proportion (Wilson, 1927).
@@ -92,12 +113,25 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_sign_test_is_that_of_a_fair_coin() {
+        assert_eq!((sign_test(0, 0), sign_test(3, 3)), (1.0, 1.0));
+        assert!((sign_test(0, 6) - 2.0 / 64.0).abs() < 1e-12);
+        assert!((sign_test(7, 1) - 18.0 / 256.0).abs() < 1e-12);
+        assert!(sign_test(0, 5000) < 1e-300);
+    }
+
+    #[test]
     fn intervals_contain_the_estimate_and_shrink_with_the_count() {
         let numbers: Vec<f64> = (0..101).map(f64::from).collect();
         let [low, high] = median_interval(&numbers).unwrap();
         assert!((38.0..=42.0).contains(&low) && (58.0..=62.0).contains(&high), "{low} {high}");
-        assert_eq!(median_interval(&[3.0]), Some([3.0, 3.0]));
+        // Of six coins, all show the same side in 2 of 64 tosses; of five in 2 of 32, which is more than 5 %.
+        assert_eq!(median_interval(&[6.0, 2.0, 3.0, 4.0, 5.0, 1.0]), Some([1.0, 6.0]));
+        assert_eq!(median_interval(&[1.0, 2.0, 3.0, 4.0, 5.0]), None);
         assert_eq!(median_interval(&[]), None);
+        let many: Vec<f64> = (0..100_001).map(f64::from).collect();
+        let [low, high] = median_interval(&many).unwrap();
+        assert!((49_650.0..49_720.0).contains(&low) && low + high == 100_000.0, "{low} {high}");
         let [low, high] = share_interval(1000, 1000);
         assert!(low > 0.996 && high == 1.0, "{low}");
         let [low, high] = share_interval(50, 100);
