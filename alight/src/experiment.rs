@@ -8,16 +8,19 @@ use std::process::ExitCode;
 use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
 use experiments::Preset;
+use experiments::comparison::pairs::{Comparison, Run};
+use experiments::comparison::report;
 use experiments::landing::fault::Fault;
 use experiments::landing::plan::{self, Plan, Values, Vision};
 use experiments::landing::{self, Watch};
-use experiments::markers::{self, Request, Step};
+use experiments::markers::{Request, Step, compared};
 use experiments::record::Ids;
 use experiments::results::Folder;
 use experiments::set::{Set, families};
 use experiments::sets::Variant;
+use markers::Marker;
 
-use crate::args::{WrongUse, flight_setting};
+use crate::args::{Format, WrongUse, flight_setting};
 use crate::children::this_command;
 use crate::faults::{self, FaultsArgs};
 use crate::interruption::{FLIGHTS_END, Interruption};
@@ -44,6 +47,10 @@ enum Experiment {
     /// the worst touchdowns, and the command that repeats each. Exit status 1 when one was unsafe or did not end. Ctrl-C ends
     /// it with the results of the flights that were flown, exit status 130 also when one of those was unsafe, which is said.
     Faults(FaultsArgs),
+    /// Put two finished runs of `alight experiment landing` side by side, for example of two guidances or markers: landed, touchdown error,
+    /// time and speeds of each, and the differences of the pairs of flights with the same circumstances and seed, with the interval of their
+    /// median and a sign test.
+    Compare(CompareArgs),
 }
 
 #[derive(Args)]
@@ -80,6 +87,11 @@ struct LandingArgs {
     /// Fault; `all` for each of them that has an effect with the vision. May be repeated. An unknown name lists all.
     #[arg(long = "fault", value_name = "NAME", default_value = "none", value_parser = faults_named)]
     faults: Vec<Faults>,
+    /// Marker to land on, of pad, detector and controller together: FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family without ids. A pad that
+    /// moves or heaves has it half as large again. Modelled vision has the errors of `rings` whatever the marker: compare markers with
+    /// `--vision rendered`.
+    #[arg(long, value_name = "MARKER", value_parser = sized_marker)]
+    marker: Option<Marker>,
     /// One further setting: simulator.KEY=VALUE or controller.KEY=VALUE. May be repeated.
     #[arg(long, value_name = "SERVICE.KEY=VALUE", value_parser = flight_setting)]
     set: Vec<String>,
@@ -93,6 +105,22 @@ struct LandingArgs {
     /// Seed of the first flight of each combination; the others follow.
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
+}
+
+#[derive(Args)]
+struct CompareArgs {
+    /// The folders of the two runs, A and B.
+    #[arg(value_name = "DIR", num_args = 2, required = true)]
+    runs: Vec<PathBuf>,
+    /// Write the report, `comparison.json` and `comparison.svg` into this folder as well.
+    #[arg(short, long, value_name = "DIR")]
+    output: Option<PathBuf>,
+    /// Replace the results of an experiment that are in the output folder; without it they are refused.
+    #[arg(long, requires = "output")]
+    replace: bool,
+    /// Format of what is printed: tables in Markdown, or one JSON object.
+    #[arg(long, value_enum, default_value_t)]
+    format: Format,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -146,6 +174,17 @@ pub(crate) fn run(args: ExperimentArgs) -> anyhow::Result<ExitCode> {
         Experiment::Markers(args) => run_markers(args),
         Experiment::Landing(args) => run_landing(args),
         Experiment::Faults(args) => faults::run(args),
+        Experiment::Compare(args) => run_compare(&args),
+    }
+}
+
+/// A marker that can be on a pad.
+fn sized_marker(text: &str) -> Result<Marker, String> {
+    let marker: Marker = text.parse().map_err(|problem| format!("{problem}"))?;
+    let is_any = marker.id.is_none() && marker.family.id_count().is_some();
+    match marker.size_m {
+        Some(_) if !is_any => Ok(marker),
+        _ => Err("write FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family without ids".to_owned()),
     }
 }
 
@@ -226,12 +265,14 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
             height: args.height,
             offset: args.offset,
             faults,
+            marker: args.marker,
             set: args.set,
         },
         jobs: args.jobs.unwrap_or_else(cores),
         recordings: args.recordings,
     };
     request.plan.check()?;
+    request.plan.check_marker().map_err(WrongUse)?;
     let mut folder = Folder::claim(&args.output, args.replace)?;
     let interruption = Interruption::on_signals(FLIGHTS_END)?;
     let steps = Steps::of_flights();
@@ -247,6 +288,30 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
         write_error(&format!("flights, plots and this report: {}", folder.path().display()));
     }
     Ok(interruption.exit_code())
+}
+
+fn run_compare(args: &CompareArgs) -> anyhow::Result<ExitCode> {
+    let [first, second] = args.runs.as_slice() else {
+        return Err(WrongUse("name the folders of two runs".to_owned()).into());
+    };
+    let comparison = Comparison::new(&Run::read(first)?, &Run::read(second)?)?;
+    let command = this_command();
+    if let Some(output) = &args.output {
+        // Replacing what is there would remove the flights that were read.
+        let output_is = |run: &PathBuf| run.canonicalize().ok() == output.canonicalize().ok();
+        if output.exists() && args.runs.iter().any(output_is) {
+            let rule = "`-o` is the folder of one of the runs; name another one";
+            return Err(WrongUse(rule.to_owned()).into());
+        }
+        let mut folder = Folder::claim(output, args.replace)?;
+        report::write(&mut folder, &comparison, &command)?;
+        write_error(&format!("this report, JSON and a plot: {}", folder.path().display()));
+    }
+    match args.format {
+        Format::Text => print(report::text(&comparison, &command).trim_end())?,
+        Format::Json => print(&serde_json::to_string(&comparison)?)?,
+    }
+    Ok(ExitCode::SUCCESS)
 }
 
 fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
@@ -288,7 +353,7 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
             steps.begins(&format!("{} {step}", request.variant.processing));
             ControlFlow::Continue(())
         };
-        let findings = markers::run(&request, &mut begins)
+        let findings = experiments::markers::run(&request, &mut begins)
             .with_context(|| format!("working in {}", args.output.display()))?;
         steps.beside(|| print(&findings.report))?;
         write_error(&format!("tables and figures: {}", request.results_in.display()));
@@ -299,7 +364,7 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
     }
     steps.finish();
     if done.len() > 1 {
-        print(&markers::compared(&done)?)?;
+        print(&compared(&done)?)?;
     }
     Ok(interruption.exit_code())
 }
@@ -339,6 +404,7 @@ mod tests {
             Experiment::Landing(args) => args.output,
             Experiment::Faults(args) => args.output,
             Experiment::Markers(args) => args.output,
+            Experiment::Compare(args) => args.output.unwrap_or_default(),
         }
     }
 
@@ -355,6 +421,16 @@ mod tests {
         assert_eq!(family_name("aruco-4x4-50").as_deref(), Ok("aruco-4x4-50"));
         for other in ["aruco", "apriltag-36h11:7", "bogus"] {
             assert!(family_name(other).unwrap_err().contains("stag-hd23"), "{other}");
+        }
+    }
+
+    #[test]
+    fn a_marker_that_no_pad_can_have_is_refused() {
+        assert!(sized_marker("apriltag-36h11:7:0.15").is_ok() && sized_marker("rings:0.3").is_ok());
+        for wrong in
+            ["apriltag-36h11", "apriltag-36h11:7", "apriltag-36h11:*:0.15", "rings", "x:1:1"]
+        {
+            assert!(sized_marker(wrong).is_err(), "{wrong}");
         }
     }
 

@@ -7,9 +7,10 @@
 //! one frame, whose marker may be a poor [`mod@print`]; [`set`] names the sets and [`sets`] has their frames; [`store`] keeps them on disk; [`record`]
 //! has a detector's results, and [`score`] their errors; [`photographs`] has the results on real images;
 //! [`report`] is the report, with the [`tables`] and [`figures`] of the [`thesis`]. [`landing`] is the
-//! experiment with landings, [`faults`] the campaign in which something dies, lies or falls silent; [`results`] is the folder of
+//! experiment with landings, of which [`comparison`] puts two runs side by side, [`faults`] the campaign in which something dies, lies or falls silent; [`results`] is the folder of
 //! their results.
 
+pub mod comparison;
 pub mod faults;
 pub mod figures;
 pub mod frame_spec;
@@ -20,6 +21,7 @@ pub mod print;
 pub mod record;
 pub mod report;
 pub mod results;
+mod rows;
 pub mod score;
 pub mod set;
 pub mod sets;

@@ -45,7 +45,7 @@ pub struct Found {
     pub centre_px: [f64; 2],
     /// Covariance of the centre: xx, xy, yy.
     #[serde(default)]
-    pub covariance_px2: Option<[f64; 3]>,
+    pub centre_covariance_px2: Option<[f64; 3]>,
     /// Its corners: its own top left first, then clockwise.
     #[serde(default)]
     pub corners_px: Option<[[f64; 2]; 4]>,
@@ -67,7 +67,11 @@ impl From<&Observation> for Found {
             family: seen.family.name().to_owned(),
             id: seen.id,
             centre_px: [seen.centre.x, seen.centre.y],
-            covariance_px2: Some([covariance[(0, 0)], covariance[(0, 1)], covariance[(1, 1)]]),
+            centre_covariance_px2: Some([
+                covariance[(0, 0)],
+                covariance[(0, 1)],
+                covariance[(1, 1)],
+            ]),
             corners_px: seen.corners.map(|corners| corners.map(|c| [c.x, c.y])),
             translation_m: seen.pose.map(|pose| {
                 let origin = pose.camera_from_marker.origin();

@@ -1,4 +1,4 @@
-//! The output folder of an experiment with landings or faults: its report, tables, recordings and logs, written whole in the place of
+//! The output folder of an experiment with landings or faults, or of a comparison: its report, tables, recordings and logs, written whole in the place of
 //! an earlier run's. It is claimed before the first flight: hours of flying are neither lost to a folder that cannot be written, nor
 //! mixed with the results of another run. What it has of an earlier run is kept until the first of the new results is written: there
 //! may be none.
@@ -20,6 +20,12 @@ pub const REPORT: &str = "report.md";
 pub const LANDINGS_HEADING: &str = "# Landings\n";
 /// See [`LANDINGS_HEADING`].
 pub const FAULTS_HEADING: &str = "# Faults\n";
+/// See [`LANDINGS_HEADING`].
+pub const COMPARISON_HEADING: &str = "# Two runs of landings\n";
+/// A comparison of two runs for programs.
+pub const COMPARISON_AS_JSON: &str = "comparison.json";
+/// Its plot.
+pub const COMPARISON_PLOT: &str = "comparison.svg";
 /// The paragraph of a report that says by which command and version it was made; nothing for an experiment that no command asked for.
 pub fn origin(command: &str) -> String {
     match command {
@@ -73,7 +79,7 @@ impl Folder {
         let report = path.join(REPORT);
         ensure!(
             !report.exists() || is_of_an_experiment(&report),
-            "{} is not the report of landings or faults, and would be overwritten; name another folder with `-o`",
+            "{} is not the report of landings, faults or a comparison, and would be overwritten; name another folder with `-o`",
             report.display()
         );
         let old = written(path)?;
@@ -213,7 +219,9 @@ fn remove(old: Vec<PathBuf>) -> anyhow::Result<()> {
 
 fn is_of_an_experiment(report: &Path) -> bool {
     let text = std::fs::read_to_string(report).unwrap_or_default();
-    [LANDINGS_HEADING, FAULTS_HEADING].iter().any(|heading| text.starts_with(heading))
+    [LANDINGS_HEADING, FAULTS_HEADING, COMPARISON_HEADING]
+        .iter()
+        .any(|heading| text.starts_with(heading))
 }
 
 /// Makes the folder for recordings of every flight; one that has recordings is refused.
@@ -248,7 +256,7 @@ fn names(folder: &Path) -> anyhow::Result<Vec<String>> {
 
 /// Whether it is a file that an experiment writes into its folder.
 fn is_result(name: &str) -> bool {
-    [FLIGHTS_AS_JSON, FLIGHTS_AS_CSV, REPORT].contains(&name)
+    [FLIGHTS_AS_JSON, FLIGHTS_AS_CSV, REPORT, COMPARISON_AS_JSON, COMPARISON_PLOT].contains(&name)
         || PLOTS.contains(&name)
         || FIGURES.contains(&name)
 }
@@ -313,8 +321,7 @@ mod tests {
 
     /// The names of the values in a row.
     fn names_of(row: &impl serde::Serialize) -> Vec<String> {
-        let row = serde_json::to_value(row).unwrap();
-        row.as_object().unwrap().keys().cloned().collect()
+        crate::rows::names(row).unwrap()
     }
 
     #[test]
@@ -326,7 +333,7 @@ mod tests {
             family: "rings".to_owned(),
             id: None,
             centre_px: [0.0; 2],
-            covariance_px2: None,
+            centre_covariance_px2: None,
             corners_px: None,
             translation_m: None,
             range_variance_m2: None,
@@ -342,8 +349,14 @@ mod tests {
             assert!(names.len() > 7, "{names:?}");
             let (_, section) = text.split_once(heading).unwrap();
             let section = section.split("\n## ").next().unwrap();
-            for name in names {
+            for name in &names {
                 assert!(section.contains(&format!("`{name}`")), "`{name}` is not in {heading}");
+            }
+            // Those of flights are columns, in the order of the documentation's table.
+            if heading != "## Markers\n" {
+                let (_, table) = section.split_once("|---|---|\n").unwrap();
+                let at = names.iter().map(|name| table.find(&format!("`{name}`")));
+                assert!(at.is_sorted(), "{heading}: {names:?}");
             }
         }
     }
@@ -373,7 +386,10 @@ mod tests {
         let folder = folder.path();
         write(folder, REPORT, "# My notes\n");
         for replaces in [false, true] {
-            assert!(refusal(folder, replaces).contains("not the report of landings or faults"));
+            assert!(
+                refusal(folder, replaces)
+                    .contains("not the report of landings, faults or a comparison")
+            );
         }
         write(folder, REPORT, &format!("{FAULTS_HEADING}\n"));
         assert!(refusal(folder, false).contains("--replace"));

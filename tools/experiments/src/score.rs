@@ -91,7 +91,7 @@ impl Score {
 
     fn measure(&mut self, found: &Found, truth: &MarkerLine) {
         self.centre_px.push(distance(found.centre_px, truth.centre_px));
-        if let Some(covariance_px2) = found.covariance_px2 {
+        if let Some(covariance_px2) = found.centre_covariance_px2 {
             let off_px = [0, 1].map(|i| found.centre_px[i] - truth.centre_px[i]);
             self.centre_chi2.push(normalised(off_px, covariance_px2));
         }

@@ -20,7 +20,7 @@ pub enum Ending {
     Unfinished,
 }
 
-/// The row of one flight.
+/// The row of one flight, in files with the names and the order of a landing's.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Outcome {
     /// Its seed.
@@ -33,6 +33,10 @@ pub struct Outcome {
     pub for_s: Vec<Option<f64>>,
     /// Mean wind, in m/s.
     pub wind_m_s: f64,
+    /// The guidance and the further settings.
+    pub settings: String,
+    /// The version of the program that flew it.
+    pub program: String,
     /// True when the height was reached.
     pub began: bool,
     /// How it ended.
@@ -46,10 +50,13 @@ pub struct Outcome {
     /// Number of touches of the ground.
     pub touches: u32,
     /// Greatest downward speed at a touch, in m/s.
+    #[serde(rename = "touchdown_speed_m_s")]
     pub sink_m_s: Option<f64>,
     /// Greatest horizontal speed at a touch, in m/s.
+    #[serde(rename = "touchdown_lateral_speed_m_s")]
     pub slide_m_s: Option<f64>,
     /// Horizontal distance from the pad at the last touch, in metres.
+    #[serde(rename = "touchdown_error_m")]
     pub error_m: Option<f64>,
     /// Greatest height over the place of the first touch, after it, in metres.
     pub hop_m: Option<f64>,
@@ -71,6 +78,8 @@ impl Outcome {
             height_m: planned.height_m,
             for_s: for_s.collect(),
             wind_m_s: planned.wind_m_s,
+            settings: planned.settings(),
+            program: node::version().to_owned(),
             began: false,
             ending: Ending::Unfinished,
             phase: String::new(),

@@ -8,7 +8,7 @@ use node::ConfigError;
 use super::kind::{Kind, LIAR};
 use crate::landing::configuration;
 use crate::landing::fault::{START_ANGLE, drawn, drawn_angle};
-use crate::landing::plan::{Swept, Values, set_option};
+use crate::landing::plan::{Swept, Values, set_option, told_settings};
 
 /// Durations that are drawn, in seconds; infinity is for ever.
 pub const DURATIONS_S: [f64; 4] = [0.5, 2.0, 5.0, f64::INFINITY];
@@ -246,6 +246,11 @@ impl Planned {
             (owner == service).then(|| rest.to_owned())
         };
         self.set.iter().filter_map(of_service).collect()
+    }
+
+    /// Its guidance and further settings, in a word for each.
+    pub fn settings(&self) -> String {
+        told_settings(None, &self.set)
     }
 
     /// Names of its faults.

@@ -6,8 +6,8 @@ use std::fmt::Write as _;
 use super::kind::Kind;
 use super::outcome::{Ending, Outcome};
 use crate::landing::outcome::{MAX_HOP_M, MAX_SINK_M_S, MAX_SLIDE_M_S};
-use crate::landing::report::{csv, json_lines};
 use crate::results::{self, FAULTS_HEADING, FLIGHTS_AS_CSV, FLIGHTS_AS_JSON, Folder, REPORT};
+use crate::rows::{csv, json_lines};
 
 /// Upper ends of the bands of height, in metres.
 const BANDS_M: [f64; 7] = [0.5, 1.0, 2.0, 3.0, 4.5, 6.0, f64::INFINITY];

@@ -153,6 +153,9 @@ fn occluder(kind: &str, part: f64) -> Change {
     simulator(&[&kind, &at, "occluder.strength=0.33", "occluder.for_s=2"])
 }
 
+/// How many times larger the marker of a moving pad is.
+const MOVING_MARKER_SCALE: f64 = 1.5;
+
 /// A moving pad, at twice the frame rate, with a controller configured for it.
 fn moving(speed_m_s: f64, heave_m: f64) -> Change {
     let speed = format!("pad.speed_m_s={speed_m_s}");
@@ -200,6 +203,11 @@ impl Fault {
     pub fn works_in(self, vision: Vision) -> bool {
         let only = ONE_VISION.iter().find(|(name, _)| *name == self.name());
         only.is_none_or(|(_, only)| *only == vision)
+    }
+
+    /// How many times larger than asked for the pad's marker is.
+    pub fn marker_scale(self) -> f64 {
+        if self.name().starts_with("pad-") { MOVING_MARKER_SCALE } else { 1.0 }
     }
 
     /// Its changes in the flight of a seed.

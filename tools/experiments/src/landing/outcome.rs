@@ -2,7 +2,7 @@
 //! was unsafe.
 
 use messages::Touchdown;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::plan::Planned;
 
@@ -34,7 +34,7 @@ pub(crate) fn greater(before: Option<f64>, value: Option<f64>) -> Option<f64> {
 }
 
 /// How it ended.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Ending {
     /// On the ground, disarmed.
@@ -45,7 +45,8 @@ pub enum Ending {
     Unfinished,
 }
 
-/// The row of one flight. Times are in seconds from the start of the landing.
+/// The row of one flight. Times are in seconds from the start of the landing. In files a value is named as `alight land --format json`
+/// and the report name it, and columns are in this order.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Outcome {
     /// The name of its cell.
@@ -66,6 +67,10 @@ pub struct Outcome {
     pub height_m: f64,
     /// Horizontal distance from the pad at the start, in metres.
     pub offset_m: f64,
+    /// The guidance, the marker where one was asked for, and the further settings.
+    pub settings: String,
+    /// The version of the program that flew it.
+    pub program: String,
     /// How it ended.
     pub ending: Ending,
     /// The controller's last phase.
@@ -73,26 +78,35 @@ pub struct Outcome {
     /// Its last reason.
     pub why: String,
     /// Horizontal distance from the pad at the touch, in metres; of several, at the last.
+    #[serde(rename = "touchdown_error_m")]
     pub error_m: Option<f64>,
     /// Its north component.
+    #[serde(rename = "touchdown_error_north_m")]
     pub error_north_m: Option<f64>,
     /// Its east component.
+    #[serde(rename = "touchdown_error_east_m")]
     pub error_east_m: Option<f64>,
     /// Downward speed at touchdown, relative to the pad, in m/s; of several, the greatest.
+    #[serde(rename = "touchdown_speed_m_s")]
     pub sink_m_s: Option<f64>,
     /// Horizontal speed at touchdown, relative to the pad, in m/s; of several, the greatest.
+    #[serde(rename = "touchdown_lateral_speed_m_s")]
     pub slide_m_s: Option<f64>,
     /// Greatest height over the pad after a touch, in metres.
     pub hop_m: Option<f64>,
     /// Tilt at touchdown, in degrees; of several, at the last.
+    #[serde(rename = "touchdown_tilt_deg")]
     pub touch_tilt_deg: Option<f64>,
     /// Maximum tilt during the landing, in degrees.
     pub max_tilt_deg: f64,
     /// Time until LAND.
+    #[serde(rename = "time_to_land_s")]
     pub land_s: Option<f64>,
     /// Time until touchdown; of several, the last.
+    #[serde(rename = "time_to_touchdown_s")]
     pub touchdown_s: Option<f64>,
     /// Time until disarmed.
+    #[serde(rename = "time_to_disarm_s")]
     pub disarm_s: Option<f64>,
     /// Number of frames.
     pub frames: u64,
@@ -115,6 +129,8 @@ impl Outcome {
             latency_ms: planned.latency_ms,
             height_m: planned.height_m,
             offset_m: planned.offset_m,
+            settings: planned.settings.clone(),
+            program: node::version().to_owned(),
             ending: Ending::Unfinished,
             phase: messages::Phase::default(),
             why: String::new(),

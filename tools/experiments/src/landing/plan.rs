@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use std::ops::RangeInclusive;
 use std::str::FromStr;
 
+use markers::Marker;
 use node::ConfigError;
 
 use super::configuration;
@@ -112,6 +113,8 @@ pub struct Plan {
     pub offset: Values,
     /// Faults.
     pub faults: Vec<Fault>,
+    /// The marker of pad, detector and controller, instead of the configured ones.
+    pub marker: Option<Marker>,
     /// Further settings, `simulator.KEY=VALUE` or `controller.KEY=VALUE`.
     pub set: Vec<String>,
 }
@@ -128,6 +131,7 @@ impl Default for Plan {
             height: Values::List(vec![10.0]),
             offset: Values::List(vec![2.12]),
             faults: vec![Fault::NONE],
+            marker: None,
             set: Vec::new(),
         }
     }
@@ -212,6 +216,8 @@ pub struct Planned {
     pub offset_m: f64,
     /// The fault.
     pub fault: Fault,
+    /// The guidance, the marker where one was asked for, and the further settings, in a word for each.
+    pub settings: String,
     /// All settings, and the faults of the modelled detector.
     pub change: Change,
 }
@@ -229,8 +235,41 @@ impl Plan {
         })
     }
 
+    /// Refuses flights whose controller looks for another marker than the pad has: none would land, and none would say why.
+    ///
+    /// # Errors
+    /// When there is such a flight, with what to do about it.
+    pub fn check_marker(&self) -> Result<(), String> {
+        let mut flights = self.flights();
+        flights.retain(|planned| planned.seed == self.seed);
+        flights.iter().try_for_each(|planned| {
+            let simulator =
+                configuration::<simulator::Config>("simulator", &planned.change.simulator);
+            let controller =
+                configuration::<controller::Config>("controller", &planned.change.controller);
+            let (Ok(simulator), Ok(controller)) = (simulator, controller) else { return Ok(()) };
+            let (pad, wanted) = (simulator.settings.pad, controller.settings.marker);
+            if !pad.markers.is_empty() {
+                return Err(format!(
+                    "`simulator.pad.markers` = {}: flights in lock-step have a pad of one marker; \
+                     take `alight land --pad` for one of several",
+                    pad.markers
+                ));
+            }
+            if is_of(&pad.marker, &wanted) {
+                return Ok(());
+            }
+            Err(format!(
+                "the pad has the marker {}, and the controller looks for {wanted}: \
+                 `--marker FAMILY:ID:SIZE_M` sets both",
+                pad.marker
+            ))
+        })
+    }
+
     /// Its flights, cell after cell.
     pub fn flights(&self) -> Vec<Planned> {
+        let settings = told_settings(self.marker.as_ref(), &self.set);
         let mut flights = Vec::new();
         let mut row = 0;
         for fault in without_repeats(&self.faults) {
@@ -238,7 +277,8 @@ impl Plan {
                 row += 1;
                 let axes = [&wind, &turbulence, &latency, &height, &offset];
                 for seed in (0..self.flights).map(|i| self.seed.wrapping_add(i)) {
-                    flights.push(Planned { row, ..self.flight(seed, *fault, axes) });
+                    let settings = settings.clone();
+                    flights.push(Planned { row, settings, ..self.flight(seed, *fault, axes) });
                 }
             }
         }
@@ -284,8 +324,12 @@ impl Plan {
             height_m: height.of(seed, 4),
             offset_m: offset.of(seed, 5),
             fault,
+            settings: String::new(),
             change: Change::default(),
         };
+        if let Some(marker) = &self.marker {
+            planned.options.push_str(&format!(" --marker {marker}"));
+        }
         for setting in &self.set {
             planned.options.push_str(&set_option(setting));
         }
@@ -316,6 +360,13 @@ impl Plan {
         simulator.extend(fault.simulator);
         let mut controller = vec!["start=airborne".to_owned()];
         controller.extend(fault.controller);
+        if let Some(mut marker) = self.marker {
+            // To a thousandth of a millimetre.
+            let scaled = |size_m: f64| (1e6 * size_m * planned.fault.marker_scale()).round() / 1e6;
+            marker.size_m = marker.size_m.map(scaled);
+            simulator.push(format!("pad.marker=\"{marker}\""));
+            controller.push(format!("marker=\"{}\"", marker.name()));
+        }
         for setting in &self.set {
             match setting.split_once('.') {
                 Some(("simulator", rest)) => simulator.push(rest.to_owned()),
@@ -337,6 +388,14 @@ impl Planned {
     }
 }
 
+/// Whether the pad's marker is the one that a controller looks for, `FAMILY` or `FAMILY:ID`.
+fn is_of(pad: &str, wanted: &str) -> bool {
+    let (Ok(pad), Ok((family, id))) = (pad.parse::<Marker>(), messages::marker_name(wanted)) else {
+        return false;
+    };
+    pad.family.name() == family && (id.is_none() || pad.id == id)
+}
+
 /// Each value once: the same flights again would count twice.
 fn without_repeats<T: PartialEq>(values: &[T]) -> impl Iterator<Item = &T> {
     let is_first = |at: usize, value: &T| values.iter().position(|it| it == value) == Some(at);
@@ -347,11 +406,35 @@ fn without_repeats<T: PartialEq>(values: &[T]) -> impl Iterator<Item = &T> {
         .map(|(_, value)| value)
 }
 
+/// The guidance, the marker where one was asked for, and the further settings, one word for each: by them the flights of two campaigns
+/// are told apart.
+pub(crate) fn told_settings(marker: Option<&Marker>, set: &[String]) -> String {
+    const GUIDANCE: &str = "controller.guidance";
+    let key_of = |setting: &String| setting.split('=').next().unwrap_or_default().trim().to_owned();
+    let of_controller: Vec<String> =
+        set.iter().filter_map(|it| it.strip_prefix("controller.")).map(str::to_owned).collect();
+    let controller = configuration::<controller::Config>("controller", &of_controller).ok();
+    let guidance = controller.as_ref().and_then(|it| it.table.get("guidance")?.as_str());
+    let guidance = guidance.map(|name| format!("{GUIDANCE}={name}"));
+    let marker = marker.map(|marker| format!("marker={marker}"));
+    let others = set.iter().filter(|setting| guidance.is_none() || key_of(setting) != GUIDANCE);
+    let words = guidance.iter().chain(&marker).chain(others);
+    let word = |it: &String| match it.contains(char::is_whitespace) {
+        true => quoted(it).into_owned(),
+        false => it.clone(),
+    };
+    words.map(word).collect::<Vec<_>>().join(" ")
+}
+
+/// A word, for a shell.
+fn quoted(word: &str) -> Cow<'_, str> {
+    // Only a zero byte cannot be quoted, and no argument has one.
+    shlex::try_quote(word).unwrap_or(Cow::Borrowed(word))
+}
+
 /// The option that sets this, for a shell.
 pub(crate) fn set_option(setting: &str) -> String {
-    // Only a zero byte cannot be quoted, and no argument has one.
-    let word = shlex::try_quote(setting).unwrap_or(Cow::Borrowed(setting));
-    format!(" --set {word}")
+    format!(" --set {}", quoted(setting))
 }
 
 #[cfg(test)]
@@ -406,6 +489,47 @@ mod tests {
         let command = Plan { set: set.clone(), ..Plan::default() }.flights()[0].command();
         let words = shlex::split(&command).unwrap();
         assert!(words.windows(2).any(|pair| pair == ["--set", &set[0]]), "{command}");
+    }
+
+    #[test]
+    fn flights_are_told_apart_by_guidance_marker_and_settings() {
+        let told = |plan: Plan| plan.flights()[0].settings.clone();
+        assert_eq!(told(Plan::default()), "controller.guidance=metric");
+        let set = ["controller.guidance=\"thesis\"", "simulator.camera.rate_hz=20"];
+        let set = set.map(str::to_owned).to_vec();
+        let marker = "apriltag-36h11:7:0.15".parse().ok();
+        assert_eq!(
+            told(Plan { set, marker, ..Plan::default() }),
+            "controller.guidance=thesis marker=apriltag-36h11:7:0.15 simulator.camera.rate_hz=20"
+        );
+    }
+
+    #[test]
+    fn a_marker_is_that_of_pad_and_controller_under_every_fault() {
+        let marker: Option<Marker> = "apriltag-36h11:7:0.2".parse().ok();
+        let plan = Plan { marker, faults: Fault::all().collect(), flights: 1, ..Plan::default() };
+        plan.check().unwrap();
+        assert_eq!(plan.check_marker(), Ok(()));
+        let command = plan.flights()[0].command();
+        assert!(command.contains(" --marker apriltag-36h11:7:0.2 "), "{command}");
+        let moving = plan.flights().into_iter().find(|it| it.fault.name() == "pad-heaves").unwrap();
+        let last = moving.change.simulator.iter().rfind(|it| it.starts_with("pad.marker="));
+        assert!(last.unwrap().contains("apriltag-36h11:7:0.3"), "{last:?}");
+    }
+
+    #[test]
+    fn a_pad_whose_marker_the_controller_does_not_look_for_is_refused() {
+        let told = |set: &[&str]| {
+            let set = set.iter().map(|&it| it.to_owned()).collect();
+            Plan { set, ..Plan::default() }.check_marker()
+        };
+        let alone = told(&["simulator.pad.marker=apriltag-36h11:7:0.15"]).unwrap_err();
+        assert!(alone.contains("looks for rings") && alone.contains("--marker"), "{alone}");
+        let both =
+            ["simulator.pad.marker=apriltag-36h11:7:0.15", "controller.marker=apriltag-36h11"];
+        assert_eq!(told(&both), Ok(()));
+        assert_eq!(told(&["simulator.pad.marker=rings:0.3"]), Ok(()));
+        assert!(told(&["simulator.pad.markers=a4"]).unwrap_err().contains("one marker"));
     }
 
     #[test]

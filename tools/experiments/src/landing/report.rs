@@ -7,8 +7,6 @@ use std::io::BufWriter;
 
 use anyhow::Context;
 use messages::Touchdown;
-use serde::Serialize;
-use serde_json::Value;
 
 use super::flight::{fly, fly_recorded};
 use super::outcome::{Ending, MAX_HOP_M, MAX_SINK_M_S, MAX_SLIDE_M_S, Outcome};
@@ -16,6 +14,7 @@ use super::plan::{Planned, Request};
 use super::table::{markdown, share_interval};
 use super::{in_parallel_until, plots, thesis_figures};
 use crate::results::{self, FLIGHTS_AS_CSV, FLIGHTS_AS_JSON, Folder, LANDINGS_HEADING, REPORT};
+use crate::rows::{csv, json_lines};
 
 /// Maximum number of failures in the report; the CSV has all.
 const MAX_LISTED: usize = 50;
@@ -187,59 +186,4 @@ fn recordings(
         let _ = writeln!(text, "- `{name}`: {error}, {}; {}", outcome.why, planned.cell);
     }
     Ok(text)
-}
-
-/// The flights as JSON, one per line.
-///
-/// # Errors
-/// When one cannot be written as JSON.
-pub fn json_lines(outcomes: &[impl Serialize]) -> anyhow::Result<String> {
-    let mut text = String::new();
-    for outcome in outcomes {
-        text.push_str(&serde_json::to_string(outcome)?);
-        text.push('\n');
-    }
-    Ok(text)
-}
-
-/// The flights as comma-separated values, with columns sorted by name.
-///
-/// # Errors
-/// When one cannot be written as JSON.
-pub fn csv(outcomes: &[impl Serialize]) -> anyhow::Result<String> {
-    let mut text = String::new();
-    for (index, outcome) in outcomes.iter().enumerate() {
-        let Value::Object(row) = serde_json::to_value(outcome)? else { continue };
-        if index == 0 {
-            text.push_str(&row.keys().cloned().collect::<Vec<_>>().join(","));
-            text.push('\n');
-        }
-        text.push_str(&row.values().map(cell).collect::<Vec<_>>().join(","));
-        text.push('\n');
-    }
-    Ok(text)
-}
-
-fn cell(value: &Value) -> String {
-    match value {
-        Value::Null => String::new(),
-        Value::String(text) => format!("\"{}\"", text.replace('"', "\"\"")),
-        Value::Array(values) => {
-            let texts: Vec<String> = values.iter().map(cell).collect();
-            format!("\"{}\"", texts.join(" ").replace('"', "\"\""))
-        }
-        other => other.to_string(),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn texts_are_quoted_and_missing_numbers_empty() {
-        assert_eq!(cell(&Value::String("a \"b\", c".into())), "\"a \"\"b\"\", c\"");
-        assert_eq!(cell(&Value::Null), "");
-        assert_eq!(cell(&serde_json::json!(0.5)), "0.5");
-    }
 }

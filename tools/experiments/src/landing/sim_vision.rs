@@ -4,8 +4,9 @@
 use anyhow::Context;
 use detector::wire;
 use fiducial::Detector;
-use geometry::{Camera, CameraModel, Marker, Transform, Vector};
+use geometry::{Camera, CameraModel, Transform, Vector};
 use imaging::GrayView;
+use markers::Marker;
 use messages::{CameraInfo, Detection, Detections, FrameHeader, MarkerPose, PixelFormat};
 use nalgebra::Matrix6;
 use node::{Layers, clock_name};
@@ -28,7 +29,7 @@ pub struct SimVision {
     info: CameraInfo,
     model: CameraModel,
     faults: VisionFaults,
-    family: &'static str,
+    marker: Marker,
 }
 
 enum SimDetector {
@@ -74,7 +75,7 @@ impl SimVision {
             }
         };
         let info = CameraInfo::new(&config.camera.name, &model, &settings.body_from_camera);
-        Ok(Self { camera, detector, info, model, faults, family: marker.family.name() })
+        Ok(Self { camera, detector, info, model, faults, marker })
     }
 
     /// The camera information for the controller.
@@ -170,16 +171,16 @@ impl SimVision {
         let seen = self.camera.camera_from_marker(truth, &pad);
         let low = seen.origin().z() < faults.blind_below_m;
         let found = vision.look(&seen, blur_px).filter(|_| !misses && !low);
-        found.map(|found| detection(self.family, &found)).into_iter().collect()
+        found.map(|found| detection(&self.marker, &found)).into_iter().collect()
     }
 }
 
-fn detection(family: &str, found: &Found) -> Detection {
+fn detection(marker: &Marker, found: &Found) -> Detection {
     let mut covariance = Matrix6::zeros();
     covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&found.covariance_m2);
     Detection {
-        family: family.to_owned(),
-        id: None,
+        family: marker.family.name().to_owned(),
+        id: marker.id,
         centre_px: [found.centre.x, found.centre.y],
         centre_covariance_px2: [0.0; 3],
         corners_px: None,
@@ -199,12 +200,13 @@ fn detection(family: &str, found: &Found) -> Detection {
 /// radians.
 pub fn errors(
     model: &CameraModel,
-    found: &Transform<Camera, Marker>,
-    truth: &Transform<Camera, Marker>,
+    found: &Transform<Camera, geometry::Marker>,
+    truth: &Transform<Camera, geometry::Marker>,
 ) -> Option<[f64; 4]> {
     let (seen, right) = (model.project(found.origin())?, model.project(truth.origin())?);
     let part = found.origin().z() / truth.origin().z() - 1.0;
-    let up = |pose: &Transform<Camera, Marker>| pose.rotation() * Vector::new(0.0, 0.0, 1.0);
+    let up =
+        |pose: &Transform<Camera, geometry::Marker>| pose.rotation() * Vector::new(0.0, 0.0, 1.0);
     let tilt = up(found).coords.dot(&up(truth).coords).clamp(-1.0, 1.0).acos();
     Some([seen.x - right.x, seen.y - right.y, part, tilt])
 }

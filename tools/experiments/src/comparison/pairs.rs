@@ -1,0 +1,482 @@
+//! Reads the flights of two runs, pairs them by circumstances and seed, and compares what landings are judged by: a summary of each run,
+//! the differences of the pairs, and a test of their sign.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, ensure};
+use messages::Touchdown;
+use node::stats::interpolated_quantile as quantile;
+use serde::{Deserialize, Serialize};
+
+use crate::landing::outcome::{Ending, is_too_fast};
+use crate::landing::table::{median_interval, sign_test};
+use crate::results::FLIGHTS_AS_JSON;
+
+/// A flight, as its row tells it.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Flight {
+    /// The name of its circumstances.
+    pub cell: String,
+    /// Its seed.
+    pub seed: u64,
+    /// Its vision.
+    pub vision: String,
+    /// Guidance, marker and further settings.
+    pub settings: String,
+    /// The version of the program that flew it.
+    pub program: String,
+    /// How it ended.
+    pub ending: Ending,
+    /// See the row of a landing.
+    pub touchdown_error_m: Option<f64>,
+    /// See the row of a landing.
+    pub touchdown_speed_m_s: Option<f64>,
+    /// See the row of a landing.
+    pub touchdown_lateral_speed_m_s: Option<f64>,
+    /// See the row of a landing.
+    pub time_to_disarm_s: Option<f64>,
+}
+
+/// A finished run.
+#[derive(Clone, Debug)]
+pub struct Run {
+    /// Its folder.
+    pub folder: PathBuf,
+    /// Its flights.
+    pub flights: Vec<Flight>,
+}
+
+/// What landings are judged by; the smaller, the better.
+#[derive(Debug)]
+pub struct Measure {
+    /// The name of its column.
+    pub name: &'static str,
+    /// In words, with its unit.
+    pub words: &'static str,
+    /// Digits that mean something.
+    pub digits: usize,
+    of: fn(&Flight) -> Option<f64>,
+}
+
+/// All of them, in the order of the tables.
+pub const MEASURES: [Measure; 4] = [
+    Measure {
+        name: "touchdown_error_m",
+        words: "touchdown error, m",
+        digits: 3,
+        of: |it| it.touchdown_error_m,
+    },
+    Measure {
+        name: "time_to_disarm_s",
+        words: "time to disarm, s",
+        digits: 1,
+        of: |it| it.time_to_disarm_s,
+    },
+    Measure {
+        name: "touchdown_speed_m_s",
+        words: "speed down at touchdown, m/s",
+        digits: 2,
+        of: |it| it.touchdown_speed_m_s,
+    },
+    Measure {
+        name: "touchdown_lateral_speed_m_s",
+        words: "speed sideways at touchdown, m/s",
+        digits: 2,
+        of: |it| it.touchdown_lateral_speed_m_s,
+    },
+];
+
+impl Measure {
+    /// Its value of a flight that landed.
+    pub fn of_landed(&self, flight: &Flight) -> Option<f64> {
+        (self.of)(flight).filter(|_| flight.is_landed())
+    }
+}
+
+impl Flight {
+    fn is_landed(&self) -> bool {
+        self.ending == Ending::Landed
+    }
+
+    fn is_within(&self, metres: f64) -> bool {
+        self.is_landed() && self.touchdown_error_m.is_some_and(|error_m| error_m <= metres)
+    }
+
+    /// As the landing experiment counts it.
+    fn is_unsafe(&self) -> bool {
+        let is_far = self.touchdown_error_m.is_some_and(|error_m| error_m > Touchdown::MAX_ERROR_M);
+        (is_far && self.ending != Ending::Aborted)
+            || is_too_fast(self.touchdown_speed_m_s, self.touchdown_lateral_speed_m_s)
+    }
+}
+
+impl Run {
+    /// Reads the run in a folder.
+    ///
+    /// # Errors
+    /// When it has no flights, or not those of landings.
+    pub fn read(folder: &Path) -> anyhow::Result<Self> {
+        let file = folder.join(FLIGHTS_AS_JSON);
+        let text = std::fs::read_to_string(&file).with_context(|| {
+            format!(
+                "reading {}; is that the folder of `alight experiment landing`?",
+                file.display()
+            )
+        })?;
+        let mut flights = Vec::new();
+        for (line, row) in text.lines().enumerate() {
+            flights.push(serde_json::from_str(row).with_context(|| {
+                format!(
+                    "line {} of {} is no flight of `alight experiment landing` of this version",
+                    line + 1,
+                    file.display()
+                )
+            })?);
+        }
+        ensure!(!flights.is_empty(), "{} has no flight", file.display());
+        Ok(Self { folder: folder.to_owned(), flights })
+    }
+}
+
+/// Median, 95th percentile and greatest.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize)]
+pub struct Spread {
+    /// Median.
+    pub median: f64,
+    /// 95th percentile.
+    pub p95: f64,
+    /// The greatest.
+    pub worst: f64,
+}
+
+/// One run.
+#[derive(Clone, Debug, Serialize)]
+pub struct Side {
+    /// Its folder.
+    pub folder: PathBuf,
+    /// The settings of its flights.
+    pub settings: Vec<String>,
+    /// The versions that flew them.
+    pub programs: Vec<String>,
+    /// Their vision.
+    pub visions: Vec<String>,
+    /// Flights that have no partner in the other run.
+    pub unpaired: usize,
+    /// What it gave.
+    #[serde(flatten)]
+    pub summary: Summary,
+}
+
+/// What some flights of a run gave.
+#[derive(Clone, Debug, Serialize)]
+pub struct Summary {
+    /// Number of flights.
+    pub flights: usize,
+    /// Those that landed.
+    pub landed: usize,
+    /// Those of them within 0.1 m.
+    pub within_100_mm: usize,
+    /// Those that were unsafe.
+    #[serde(rename = "unsafe")]
+    pub dangerous: usize,
+    /// Of those that landed, each measure by its name; `None` where none has it.
+    #[serde(flatten)]
+    pub measures: BTreeMap<&'static str, Option<Spread>>,
+}
+
+impl Summary {
+    fn new(flights: &[&Flight]) -> Self {
+        let count = |of: &dyn Fn(&Flight) -> bool| flights.iter().filter(|it| of(it)).count();
+        let measures = MEASURES.iter().map(|measure| {
+            let values: Vec<f64> =
+                flights.iter().filter_map(|flight| measure.of_landed(flight)).collect();
+            let part = |part| quantile(&values, part);
+            let spread =
+                || Some(Spread { median: part(0.5)?, p95: part(0.95)?, worst: part(1.0)? });
+            (measure.name, spread())
+        });
+        Self {
+            flights: flights.len(),
+            landed: count(&|it| it.is_landed()),
+            within_100_mm: count(&|it| it.is_within(0.1)),
+            dangerous: count(&|it| it.is_unsafe()),
+            measures: measures.collect(),
+        }
+    }
+}
+
+/// Two flights of the same circumstances and seed.
+#[derive(Copy, Clone, Debug)]
+struct Pair<'a> {
+    first: &'a Flight,
+    second: &'a Flight,
+}
+
+/// A measure of both flights of a pair.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Point {
+    /// Of the first run's flight.
+    pub first: f64,
+    /// Of the second run's flight.
+    pub second: f64,
+}
+
+/// The differences of pairs in one measure, the second run's value minus the first's.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Difference {
+    /// Number of pairs of which both have it.
+    pub pairs: usize,
+    /// Their median.
+    pub median: Option<f64>,
+    /// Its 95 % interval by order statistics; `None` for fewer than six pairs.
+    pub interval: Option<[f64; 2]>,
+    /// Pairs in which the second run's value is smaller.
+    pub smaller: usize,
+    /// Pairs in which it is larger.
+    pub larger: usize,
+    /// Two-sided sign test: how probable so unequal numbers are if neither run tended to the smaller value.
+    pub p: f64,
+}
+
+impl Difference {
+    fn new(values: &[Point]) -> Self {
+        let differences: Vec<f64> = values.iter().map(|it| it.second - it.first).collect();
+        let count = |is: fn(&f64) -> bool| differences.iter().filter(|it| is(it)).count();
+        let (smaller, larger) = (count(|it| *it < 0.0), count(|it| *it > 0.0));
+        Self {
+            pairs: values.len(),
+            median: quantile(&differences, 0.5),
+            interval: median_interval(&differences),
+            smaller,
+            larger,
+            p: sign_test(smaller, larger),
+        }
+    }
+}
+
+/// Which flights of pairs landed.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Landed {
+    /// Both.
+    pub both: usize,
+    /// That of the first run alone.
+    pub first_alone: usize,
+    /// That of the second run alone.
+    pub second_alone: usize,
+    /// Neither.
+    pub neither: usize,
+    /// Two-sided sign test of those that landed alone.
+    pub p: f64,
+}
+
+/// Pairs of some circumstances, or of all.
+#[derive(Clone, Debug, Serialize)]
+pub struct Pairs {
+    /// Number of pairs.
+    pub pairs: usize,
+    /// Which of them landed.
+    pub landed: Landed,
+    /// The differences of those of which both landed, by the measure's name.
+    pub differences: BTreeMap<&'static str, Difference>,
+}
+
+impl Pairs {
+    fn new(pairs: &[Pair<'_>]) -> Self {
+        let count = |first: bool, second: bool| {
+            let is =
+                |it: &&Pair<'_>| (it.first.is_landed(), it.second.is_landed()) == (first, second);
+            pairs.iter().filter(is).count()
+        };
+        let (first_alone, second_alone) = (count(true, false), count(false, true));
+        Self {
+            pairs: pairs.len(),
+            landed: Landed {
+                both: count(true, true),
+                first_alone,
+                second_alone,
+                neither: count(false, false),
+                p: sign_test(first_alone, second_alone),
+            },
+            differences: MEASURES
+                .iter()
+                .map(|measure| (measure.name, Difference::new(&values(measure, pairs))))
+                .collect(),
+        }
+    }
+}
+
+/// The values of a measure in pairs of which both landed.
+fn values(measure: &Measure, pairs: &[Pair<'_>]) -> Vec<Point> {
+    let both = |it: &Pair<'_>| {
+        let (first, second) = (measure.of_landed(it.first)?, measure.of_landed(it.second)?);
+        Some(Point { first, second })
+    };
+    pairs.iter().filter_map(both).collect()
+}
+
+/// The pairs of some circumstances, with what each run gave in them.
+#[derive(Clone, Debug, Serialize)]
+pub struct Cell {
+    /// The name of the circumstances.
+    pub cell: String,
+    /// What the paired flights of each run gave.
+    pub runs: [Summary; 2],
+    /// The pairs.
+    #[serde(flatten)]
+    pub pairs: Pairs,
+}
+
+/// Two runs, side by side.
+#[derive(Clone, Debug, Serialize)]
+pub struct Comparison {
+    /// The first and the second run, with all of their flights.
+    pub runs: [Side; 2],
+    /// All pairs.
+    #[serde(flatten)]
+    pub pairs: Pairs,
+    /// The pairs of each circumstances.
+    pub cells: Vec<Cell>,
+    /// The values of the pairs, for the plot, by measure.
+    #[serde(skip)]
+    pub points: BTreeMap<&'static str, Vec<Point>>,
+}
+
+impl Comparison {
+    /// Compares two runs.
+    ///
+    /// # Errors
+    /// When no flight of one has the circumstances and the seed of one of the other.
+    pub fn new(first: &Run, second: &Run) -> anyhow::Result<Self> {
+        let key = |flight: &Flight| (flight.cell.clone(), flight.seed);
+        let of_second: BTreeMap<_, &Flight> =
+            second.flights.iter().map(|flight| (key(flight), flight)).collect();
+        let pairs: Vec<Pair<'_>> = first
+            .flights
+            .iter()
+            .filter_map(|flight| Some(Pair { first: flight, second: of_second.get(&key(flight))? }))
+            .collect();
+        let example = |run: &Run| {
+            let flight = run.flights.first();
+            flight.map_or_else(String::new, |it| format!("seed {} of {}", it.seed, it.cell))
+        };
+        ensure!(
+            !pairs.is_empty(),
+            "no flight of one has the circumstances and the seed of one of the other, so they cannot be compared: {} has {}, {} has {}",
+            first.folder.display(),
+            example(first),
+            second.folder.display(),
+            example(second),
+        );
+        let mut cells: Vec<(&str, Vec<Pair<'_>>)> = Vec::new();
+        for pair in &pairs {
+            match cells.iter_mut().find(|(name, _)| *name == pair.first.cell) {
+                Some((_, members)) => members.push(*pair),
+                None => cells.push((&pair.first.cell, vec![*pair])),
+            }
+        }
+        let cells = cells.into_iter().map(|(name, members)| {
+            let (one, other): (Vec<&Flight>, Vec<&Flight>) =
+                members.iter().map(|pair| (pair.first, pair.second)).unzip();
+            Cell {
+                cell: name.to_owned(),
+                runs: [Summary::new(&one), Summary::new(&other)],
+                pairs: Pairs::new(&members),
+            }
+        });
+        Ok(Self {
+            runs: [side(first, pairs.len()), side(second, pairs.len())],
+            cells: cells.collect(),
+            points: MEASURES.iter().map(|it| (it.name, values(it, &pairs))).collect(),
+            pairs: Pairs::new(&pairs),
+        })
+    }
+}
+
+fn side(run: &Run, pairs: usize) -> Side {
+    let different = |of: fn(&Flight) -> &String| {
+        let texts: BTreeSet<&String> = run.flights.iter().map(of).collect();
+        texts.into_iter().cloned().collect()
+    };
+    Side {
+        folder: run.folder.clone(),
+        settings: different(|it| &it.settings),
+        programs: different(|it| &it.program),
+        visions: different(|it| &it.vision),
+        unpaired: run.flights.len().saturating_sub(pairs),
+        summary: Summary::new(&run.flights.iter().collect::<Vec<_>>()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn flight(cell: &str, seed: u64, error_m: Option<f64>) -> Flight {
+        Flight {
+            cell: cell.to_owned(),
+            seed,
+            vision: "modelled".to_owned(),
+            settings: "controller.guidance=metric".to_owned(),
+            program: "0.1.0".to_owned(),
+            ending: if error_m.is_some() { Ending::Landed } else { Ending::Aborted },
+            touchdown_error_m: error_m,
+            touchdown_speed_m_s: error_m.map(|_| 0.5),
+            touchdown_lateral_speed_m_s: error_m.map(|_| 0.1),
+            time_to_disarm_s: error_m.map(|_| 12.0),
+        }
+    }
+
+    fn run(flights: Vec<Flight>) -> Run {
+        Run { folder: PathBuf::from("run"), flights }
+    }
+
+    #[test]
+    fn flights_of_the_same_circumstances_and_seed_are_compared_and_no_others() {
+        let errors_m = [0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07];
+        let first = (1..).zip(errors_m).map(|(seed, error_m)| flight("calm", seed, Some(error_m)));
+        // The pairs differ by 0.02 m each, whatever the order of the rows, and one more has not landed.
+        let mut second: Vec<Flight> = (1..)
+            .zip(errors_m)
+            .map(|(seed, error_m)| flight("calm", seed, Some(error_m + 0.02)))
+            .collect();
+        second.reverse();
+        second.push(flight("calm", 8, None));
+        second.push(flight("windy", 1, Some(0.5)));
+        let first = run(first.chain([flight("calm", 8, Some(0.01))]).collect());
+        let comparison = Comparison::new(&first, &run(second)).unwrap();
+        let [a, b] = &comparison.runs;
+        assert_eq!((a.unpaired, b.unpaired, comparison.pairs.pairs), (0, 1, 8));
+        assert_eq!((a.summary.landed, b.summary.landed, b.summary.dangerous), (8, 8, 1));
+        let landed = &comparison.pairs.landed;
+        assert_eq!((landed.both, landed.first_alone, landed.second_alone), (7, 1, 0));
+        let error = &comparison.pairs.differences["touchdown_error_m"];
+        assert_eq!((error.pairs, error.smaller, error.larger), (7, 0, 7));
+        let [low, high] = error.interval.unwrap();
+        for value in [error.median.unwrap(), low, high] {
+            assert!((value - 0.02).abs() < 1e-9, "{value}");
+        }
+        assert!((error.p - 2.0 / 128.0).abs() < 1e-9, "{}", error.p);
+        let same = &comparison.pairs.differences["time_to_disarm_s"];
+        assert_eq!((same.smaller, same.larger, same.p), (0, 0, 1.0));
+        assert_eq!(comparison.cells.len(), 1);
+    }
+
+    #[test]
+    fn runs_without_a_pair_are_refused_with_what_they_have() {
+        let [one, other] = [1, 2].map(|seed| run(vec![flight("calm", seed, None)]));
+        let told = Comparison::new(&one, &other).unwrap_err().to_string();
+        assert!(told.contains("seed 1 of calm") && told.contains("seed 2 of calm"), "{told}");
+    }
+
+    #[test]
+    fn what_is_no_run_of_landings_is_refused_by_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let told = |folder: &Path| format!("{:#}", Run::read(folder).unwrap_err());
+        assert!(told(folder.path()).contains("alight experiment landing"));
+        std::fs::write(folder.path().join(FLIGHTS_AS_JSON), "{\"seed\":1}\n").unwrap();
+        assert!(told(folder.path()).contains("line 1 of"));
+        std::fs::write(folder.path().join(FLIGHTS_AS_JSON), "").unwrap();
+        assert!(told(folder.path()).contains("no flight"));
+    }
+}

@@ -1,0 +1,257 @@
+//! Tells a comparison: as tables in Markdown, as JSON, and as a plot with a point for each pair.
+
+use std::fmt::Write as _;
+
+use plotters::prelude::*;
+
+use super::pairs::{Comparison, Difference, MEASURES, Measure, Side, Spread, Summary};
+use crate::landing::outcome::{MAX_SINK_M_S, MAX_SLIDE_M_S};
+use crate::landing::plots::{Area, COLOURS, DrawError, GREY, picture};
+use crate::results::{
+    self, COMPARISON_AS_JSON, COMPARISON_HEADING, COMPARISON_PLOT, Folder, REPORT,
+};
+
+/// The letters by which the runs are named.
+const LETTERS: [char; 2] = ['A', 'B'];
+
+/// Writes the report, the JSON and the plot into a folder.
+///
+/// # Errors
+/// When a file cannot be written.
+pub fn write(folder: &mut Folder, comparison: &Comparison, command: &str) -> anyhow::Result<()> {
+    folder.put(COMPARISON_AS_JSON, &format!("{}\n", serde_json::to_string_pretty(comparison)?))?;
+    folder.put(COMPARISON_PLOT, &plot(comparison)?)?;
+    folder.put(REPORT, &text(comparison, command))
+}
+
+/// The report in Markdown.
+pub fn text(comparison: &Comparison, command: &str) -> String {
+    let mut text = format!("{COMPARISON_HEADING}\n{}", results::origin(command));
+    for (letter, side) in LETTERS.iter().zip(&comparison.runs) {
+        text.push_str(&head(*letter, side));
+    }
+    text.push_str(&differing(&comparison.runs));
+    text.push_str(&summaries(comparison));
+    if comparison.cells.len() > 1 {
+        text.push_str(&by_cell(comparison));
+    }
+    text
+}
+
+// Writing to a string cannot fail, so that the results of `writeln!` are ignored.
+
+fn head(letter: char, side: &Side) -> String {
+    let alone = match side.unpaired {
+        0 => String::new(),
+        count => format!("; {count} of its flights have no partner in the other"),
+    };
+    format!(
+        "- {letter}: `{}`, {}; alight {}, vision {}{alone}\n",
+        side.folder.display(),
+        side.settings.iter().map(|it| format!("`{it}`")).collect::<Vec<_>>().join(" and "),
+        side.programs.join(" and "),
+        side.visions.join(" and "),
+    )
+}
+
+/// What else than the settings differs, or that nothing does.
+fn differing([first, second]: &[Side; 2]) -> String {
+    let mut told = Vec::new();
+    if first.visions != second.visions {
+        told.push("The vision differs between them.");
+    }
+    if first.programs != second.programs {
+        told.push("The program differs between them.");
+    } else if first.settings == second.settings && first.visions == second.visions {
+        told.push("Settings, vision and program are the same.");
+    }
+    told.iter().map(|sentence| format!("\n{sentence}\n")).collect()
+}
+
+fn summaries(comparison: &Comparison) -> String {
+    let [first, second] = comparison.runs.each_ref().map(|side| &side.summary);
+    let (pairs, landed) = (&comparison.pairs, &comparison.pairs.landed);
+    let mut text = format!(
+        "\nPairs have the same circumstances and seed: {}, of which {} landed in both, {} in A alone, {} in B alone (sign test p = {}) and {} in neither. \
+         Errors, times and speeds are of flights that landed, differences (B - A: below 0 B is better) of pairs that landed in both. \
+         The interval is that of the median at 95 %, by order statistics (from six pairs on); p is of a two-sided sign test. \
+         Unsafe: faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways, or, without having given up, too far off.\n\n\
+         | | A | B | B - A, median | 95 % interval | B smaller, larger | p |\n|---|---|---|---|---|---|---|\n",
+        pairs.pairs,
+        landed.both,
+        landed.first_alone,
+        landed.second_alone,
+        p_value(landed.p),
+        landed.neither
+    );
+    let counts: [Named<Count>; 4] = [
+        ("flights", |it| it.flights),
+        ("landed", |it| it.landed),
+        ("within 0.1 m", |it| it.within_100_mm),
+        ("unsafe", |it| it.dangerous),
+    ];
+    for (name, of) in counts {
+        let _ = writeln!(text, "| {name} | {} | {} | | | | |", of(first), of(second));
+    }
+    for measure in &MEASURES {
+        let Some(difference) = pairs.differences.get(measure.name) else { continue };
+        let digits = measure.digits;
+        let _ = writeln!(
+            text,
+            "| {}: median | {} | {} | {} | {} | {}, {} of {} | {} |",
+            measure.words,
+            part(first, measure, |it| it.median),
+            part(second, measure, |it| it.median),
+            signed(difference.median, digits + 1),
+            interval(difference, digits + 1),
+            difference.smaller,
+            difference.larger,
+            difference.pairs,
+            p_value(difference.p),
+        );
+        for (name, of) in PARTS {
+            let (one, other) = (part(first, measure, of), part(second, measure, of));
+            let _ = writeln!(text, "| {}: {name} | {one} | {other} | | | | |", measure.words);
+        }
+    }
+    text
+}
+
+type Count = fn(&Summary) -> usize;
+type Part = fn(&Spread) -> f64;
+/// Something with its name in the table.
+type Named<T> = (&'static str, T);
+
+/// What else a spread has than its median.
+const PARTS: [Named<Part>; 2] = [("95 %", |it| it.p95), ("worst", |it| it.worst)];
+
+fn part(summary: &Summary, measure: &Measure, of: Part) -> String {
+    let spread = summary.measures.get(measure.name).copied().flatten();
+    spread.map_or_else(|| "-".to_owned(), |spread| format!("{:.*}", measure.digits, of(&spread)))
+}
+
+fn signed(value: Option<f64>, digits: usize) -> String {
+    let tens = 10f64.powi(digits as i32);
+    // Adding zero makes 0 of -0.
+    let rounded = value.map(|value| (value * tens).round() / tens + 0.0);
+    match rounded {
+        Some(0.0) => format!("{:.digits$}", 0.0),
+        Some(value) => format!("{value:+.digits$}"),
+        None => "-".to_owned(),
+    }
+}
+
+fn interval(difference: &Difference, digits: usize) -> String {
+    match difference.interval {
+        Some([low, high]) => {
+            format!("{} to {}", signed(Some(low), digits), signed(Some(high), digits))
+        }
+        None => "-".to_owned(),
+    }
+}
+
+fn p_value(p: f64) -> String {
+    if p < 0.001 { "< 0.001".to_owned() } else { format!("{p:.3}") }
+}
+
+fn by_cell(comparison: &Comparison) -> String {
+    let mut text = "\n## By circumstances\n\nOf pairs: the medians of A and B, then the median of B - A with its 95 % interval.\n\n| circumstances | pairs | landed A, B | touchdown error, m | B - A | time to disarm, s | B - A |\n|---|---|---|---|---|---|---|\n".to_owned();
+    for cell in &comparison.cells {
+        let [first, second] = &cell.runs;
+        let _ = write!(
+            text,
+            "| {} | {} | {}, {} |",
+            cell.cell, cell.pairs.pairs, first.landed, second.landed
+        );
+        for measure in MEASURES.iter().take(2) {
+            let Some(difference) = cell.pairs.differences.get(measure.name) else { continue };
+            let between = match difference.interval {
+                Some(_) => format!(" ({})", interval(difference, measure.digits + 1)),
+                None => String::new(),
+            };
+            let _ = write!(
+                text,
+                " {}, {} | {}{between} |",
+                part(first, measure, |it| it.median),
+                part(second, measure, |it| it.median),
+                signed(difference.median, measure.digits + 1),
+            );
+        }
+        text.push('\n');
+    }
+    text
+}
+
+/// A point for each pair, A to the right and B upwards, in a panel for each measure.
+///
+/// # Errors
+/// When it cannot be drawn.
+pub fn plot(comparison: &Comparison) -> anyhow::Result<String> {
+    picture([1000, 1100], |area| {
+        let (head, panels) = area.split_vertically(100);
+        let lines = LETTERS.iter().zip(&comparison.runs).map(|(letter, side)| {
+            format!("{letter}: {}, {}", side.folder.display(), side.settings.join(" and "))
+        });
+        let under = "below the line B is better";
+        let title = format!("Pairs of flights that landed in both; {under}");
+        head.draw(&Text::new(title, (16, 12), ("sans-serif", 20)))?;
+        for (row, line) in lines.enumerate() {
+            let short: String = line.chars().take(140).collect();
+            head.draw(&Text::new(short, (16, 44 + 22 * row as i32), ("sans-serif", 15)))?;
+        }
+        for (panel, measure) in panels.split_evenly((2, 2)).iter().zip(&MEASURES) {
+            scatter(panel, measure, comparison)?;
+        }
+        Ok(())
+    })
+}
+
+fn scatter(area: &Area<'_>, measure: &Measure, of: &Comparison) -> Result<(), DrawError> {
+    let points = of.points.get(measure.name).map(Vec::as_slice).unwrap_or_default();
+    let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
+    for at in points {
+        (low, high) = (low.min(at.first.min(at.second)), high.max(at.first.max(at.second)));
+    }
+    if low > high {
+        (low, high) = (0.0, 1.0);
+    }
+    // A little around all points, and never an empty range.
+    let margin = (0.06 * (high - low)).max(0.5 * 0.1f64.powi(measure.digits as i32));
+    let (low, high) = ((low - margin).max(0.0), high + margin);
+    let smaller = of.pairs.differences.get(measure.name).map_or(0, |it| it.smaller);
+    let title = format!("{}: B smaller in {smaller} of {}", measure.words, points.len());
+    let mut chart = ChartBuilder::on(area)
+        .caption(title, ("sans-serif", 16))
+        .margin(12)
+        .x_label_area_size(40)
+        .y_label_area_size(60)
+        .build_cartesian_2d(low..high, low..high)?;
+    let digits = measure.digits;
+    let label = |value: &f64| format!("{value:.digits$}");
+    chart
+        .configure_mesh()
+        .x_desc("A")
+        .y_desc("B")
+        .x_labels(6)
+        .y_labels(6)
+        .x_label_formatter(&label)
+        .y_label_formatter(&label)
+        .draw()?;
+    chart.draw_series(LineSeries::new([(low, low), (high, high)], GREY.stroke_width(2)))?;
+    let dots =
+        points.iter().map(|at| Circle::new((at.first, at.second), 4, COLOURS[0].mix(0.5).filled()));
+    chart.draw_series(dots)?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn differences_have_their_sign_and_zero_none() {
+        assert_eq!(signed(Some(0.0123), 3), "+0.012");
+        assert_eq!(signed(Some(-0.0001), 3), "0.000");
+        assert_eq!(signed(None, 3), "-");
+    }
+}
