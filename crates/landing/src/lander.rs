@@ -719,7 +719,7 @@ impl Lander {
             up
         } else {
             let square = self.square.get_or_insert_with(|| {
-                Square::new(phases, now, place, vehicle.ned_from_body, height_m)
+                Square::new(&self.config, now, place, vehicle.ned_from_body, height_m)
             });
             let legs = square.velocity(phases, place);
             let wanted = envelope::clamp_to_fence(phases, vehicle.position, legs);

@@ -7,7 +7,7 @@
 use geometry::{Body, Ned, Odometry, Point, Rotation, Vector};
 use libm::{atan2, fmax, fmin, sin, sincos};
 
-use crate::config::PhaseConfig;
+use crate::config::{Config, PhaseConfig};
 use crate::time::Timestamp;
 
 /// Minimum tilt that shows the direction of the wind, in radians.
@@ -17,11 +17,11 @@ const MIN_TILT_RAD: f64 = 0.02;
 /// must not excite.
 const TRACKING_PER_S: f64 = 0.5;
 
-/// Lag behind the point that moves along the square from which that point slows down, and at which it would stand, in metres.
+/// Distance of the vehicle from the point that moves along the square, from which that point slows down, and at which it would stand, in metres.
 const SLOW_LAG_M: f64 = 1.0;
 const MAX_LAG_M: f64 = 2.0;
 
-/// Minimum speed of that point, as a share of `search_speed_m_s`: a vehicle that does not get through the wind must see the other sides, too.
+/// Minimum speed of that point, as a share of the square's: a vehicle that does not get through the wind must see the other sides, too.
 const MIN_PACE: f64 = 0.25;
 
 /// Longest time over which that point moves on at once, in seconds.
@@ -31,6 +31,8 @@ const MAX_STEP_S: f64 = 0.2;
 /// the one before. A point moves along it, which the vehicle follows.
 #[derive(Copy, Clone, Debug)]
 pub struct Square {
+    /// Speed along it, in m/s.
+    speed_m_s: f64,
     /// Direction of the first leg, in radians from north to east.
     first_leg_rad: f64,
     /// Distance upwind before the first leg, in metres.
@@ -45,17 +47,18 @@ pub struct Square {
 }
 
 impl Square {
-    /// A square about `centre`, into the wind that the attitude shows.
+    /// A square about `centre`, into the wind that the attitude shows, at `search_speed_m_s` or the speed that the vehicle may have.
     pub fn new(
-        config: &PhaseConfig,
+        config: &Config,
         now: Timestamp,
         centre: Point<Odometry>,
         ned_from_body: Rotation<Ned, Body>,
         height_m: f64,
     ) -> Self {
         Self {
+            speed_m_s: fmin(config.phases.search_speed_m_s, config.envelope.horizontal_m_s),
             first_leg_rad: first_leg_rad(ned_from_body),
-            upwind_m: upwind_m(config, ned_from_body, height_m),
+            upwind_m: upwind_m(&config.phases, ned_from_body, height_m),
             leg: 0,
             corner: centre,
             along_m: 0.0,
@@ -63,20 +66,20 @@ impl Square {
         }
     }
 
-    /// The velocity of a vehicle at `place`, in m/s, at most twice `search_speed_m_s`; at the end of the last leg it stays there.
+    /// The velocity of a vehicle at `place`, in m/s, at most twice the speed along the square; at the end of the last leg it stays there.
     pub fn velocity(&self, config: &PhaseConfig, place: Point<Odometry>) -> Vector<Ned> {
         let back = self.lag(place) * TRACKING_PER_S;
         let back_m_s = back.horizontal_norm();
-        let scale = fmin(1.0, config.search_speed_m_s / fmax(back_m_s, f64::MIN_POSITIVE));
+        let scale = fmin(1.0, self.speed_m_s / fmax(back_m_s, f64::MIN_POSITIVE));
         let onwards = match self.length_m(config) {
-            Some(_) => self.direction() * config.search_speed_m_s,
+            Some(_) => self.direction() * (self.speed_m_s * self.pace(place)),
             None => Vector::zero(),
         };
         let velocity = onwards + back * scale;
         Vector::from_coords(velocity.coords)
     }
 
-    /// Moves its point on until `now`, the slower the farther the vehicle is behind, but not for one whose fence keeps it from following.
+    /// Moves its point on until `now`, the slower the farther the vehicle is from it, but not for one whose fence keeps it from following.
     pub fn move_on(
         &mut self,
         config: &PhaseConfig,
@@ -86,10 +89,8 @@ impl Square {
     ) {
         let after_s = now.seconds_since(self.moved).clamp(0.0, MAX_STEP_S);
         self.moved = now;
-        let behind_m = self.lag(place).horizontal_norm();
-        let pace = (MAX_LAG_M - behind_m) / (MAX_LAG_M - SLOW_LAG_M);
-        let pace = if is_fenced { 1.0 } else { pace.clamp(MIN_PACE, 1.0) };
-        self.along_m += config.search_speed_m_s * after_s * pace;
+        let pace = if is_fenced { 1.0 } else { self.pace(place) };
+        self.along_m += self.speed_m_s * after_s * pace;
         while let Some(length_m) = self.length_m(config)
             && self.along_m >= length_m
         {
@@ -100,6 +101,12 @@ impl Square {
         if self.length_m(config).is_none() {
             self.along_m = 0.0;
         }
+    }
+
+    /// The share of the speed at which the square's point moves for a vehicle at `place`.
+    fn pace(&self, place: Point<Odometry>) -> f64 {
+        let lag_m = self.lag(place).horizontal_norm();
+        ((MAX_LAG_M - lag_m) / (MAX_LAG_M - SLOW_LAG_M)).clamp(MIN_PACE, 1.0)
     }
 
     /// From the vehicle to the square's point, horizontally.
@@ -149,41 +156,47 @@ fn upwind_m(config: &PhaseConfig, ned_from_body: Rotation<Ned, Body>, height_m: 
 mod tests {
     use super::*;
 
-    /// Flies the square from the origin, in a wind that carries the vehicle away at this velocity.
-    fn fly(config: &PhaseConfig, wind: Vector<Odometry>) -> Vec<Point<Odometry>> {
-        let begin = Timestamp::from_seconds(5.0);
+    /// Flies the square from the origin in a wind that carries the vehicle away at this velocity; it takes half a second to fly as commanded.
+    fn fly(config: &Config, wind: Vector<Ned>) -> Vec<Point<Odometry>> {
+        let (begin, phases) = (Timestamp::from_seconds(5.0), &config.phases);
         let mut square = Square::new(config, begin, Point::origin(), Rotation::identity(), 5.0);
-        let (mut place, mut path) = (Point::origin(), Vec::new());
+        let (mut place, mut flown, mut path) = (Point::origin(), Vector::zero(), Vec::new());
         let dt_s = 0.02;
-        for i in 0..(config.search_timeout_s / dt_s) as u32 {
+        for i in 0..(phases.search_timeout_s / dt_s) as u32 {
             let now = begin.plus_seconds(f64::from(i) * dt_s);
-            square.move_on(config, now, place, false);
-            let velocity = square.velocity(config, place);
-            assert!(velocity.norm() <= 2.0 * config.search_speed_m_s + 1e-9, "{velocity:?}");
-            place = place + (Vector::from_coords(velocity.coords) + wind) * dt_s;
+            square.move_on(phases, now, place, false);
+            let velocity = square.velocity(phases, place);
+            assert!(velocity.norm() <= 2.0 * phases.search_speed_m_s + 1e-9, "{velocity:?}");
+            flown = flown + (velocity - flown) * (dt_s / 0.5);
+            place = place + Vector::from_coords((flown + wind).coords) * dt_s;
             path.push(place);
         }
         path
     }
 
+    /// The greatest distance from the origin, in metres.
+    fn farthest_m(path: &[Point<Odometry>]) -> f64 {
+        path.iter().map(|place| place.x().hypot(place.y())).fold(0.0, f64::max)
+    }
+
     #[test]
     fn the_square_covers_its_radius_and_does_not_leave_it_in_any_wind() {
-        let config = PhaseConfig::default();
-        let winds = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.1), (0.0, -0.3)];
-        for (north, east) in winds {
+        let config = Config::default();
+        let radius_m = config.phases.search_radius_m;
+        let spacing_m = config.phases.search_spacing_m;
+        for (north, east) in [(0.0, 0.0), (0.2, 0.0), (-0.3, 0.1), (0.0, -0.4), (0.3, 0.3)] {
             let path = fly(&config, Vector::new(north, east, 0.0));
-            let farthest = path.iter().map(|p| p.x().hypot(p.y())).fold(0.0, f64::max);
-            let limit = config.search_radius_m * std::f64::consts::SQRT_2 + 1.0;
-            assert!(farthest <= limit, "{farthest}");
+            let limit_m = radius_m * std::f64::consts::SQRT_2 + 1.0;
+            assert!(farthest_m(&path) <= limit_m, "{north} {east}: {}", farthest_m(&path));
             // Every point within the square is within the spacing of the path.
-            let reach = config.search_radius_m - 0.5 * config.search_spacing_m;
+            let reach = radius_m - 0.5 * spacing_m;
             for (x, y) in
                 [(0.0, 0.0), (reach, 0.0), (0.0, reach), (-reach, 0.0), (0.0, -reach), (2.5, -3.5)]
             {
                 let nearest =
                     path.iter().map(|p| (p.x() - x).hypot(p.y() - y)).fold(f64::MAX, f64::min);
                 assert!(
-                    nearest < config.search_spacing_m,
+                    nearest < spacing_m,
                     "({x}, {y}) is {nearest} m from the path in wind of {north}, {east}"
                 );
             }
@@ -191,46 +204,65 @@ mod tests {
     }
 
     #[test]
+    fn a_wind_that_is_nearly_as_fast_as_the_search_carries_nobody_away() {
+        let config = Config::default();
+        let limit_m = config.phases.search_radius_m * std::f64::consts::SQRT_2 + MAX_LAG_M;
+        for turn in 0..16 {
+            let (east, north) = sincos(f64::from(turn) * std::f64::consts::FRAC_PI_8);
+            for wind_m_s in [0.5, 0.7, 0.8] {
+                let path = fly(&config, Vector::new(north, east, 0.0) * wind_m_s);
+                let farthest_m = farthest_m(&path);
+                assert!(farthest_m <= limit_m, "{wind_m_s} m/s, {turn}: {farthest_m} m");
+            }
+        }
+    }
+
+    #[test]
+    fn a_vehicle_that_may_not_be_as_fast_flies_the_same_square_slower() {
+        let mut config = Config::default();
+        config.envelope.horizontal_m_s = 0.2;
+        config.phases.search_timeout_s = 400.0;
+        let mut slow = Square::new(
+            &config,
+            Timestamp::from_seconds(0.0),
+            Point::origin(),
+            Rotation::identity(),
+            5.0,
+        );
+        let velocity = slow.velocity(&config.phases, Point::origin());
+        assert!((velocity.norm() - 0.2).abs() < 1e-12, "{velocity:?}");
+        slow.move_on(&config.phases, Timestamp::from_seconds(0.1), Point::origin(), false);
+        assert!((slow.along_m - 0.02).abs() < 1e-12, "{}", slow.along_m);
+    }
+
+    #[test]
     fn it_ends_where_its_last_leg_ends_and_stays() {
-        let config = PhaseConfig { search_timeout_s: 120.0, ..PhaseConfig::default() };
+        let mut config = Config::default();
+        config.phases.search_timeout_s = 120.0;
         let path = fly(&config, Vector::zero());
         let [before, last] = [path[path.len() - 500], path[path.len() - 1]];
         assert!((last - before).norm() < 0.01, "{before:?} {last:?}");
-        let nowhere = PhaseConfig { search_radius_m: 0.0, ..config };
-        let path = fly(&nowhere, Vector::new(0.1, 0.0, 0.0));
+        config.phases.search_radius_m = 0.0;
+        let path = fly(&config, Vector::new(0.1, 0.0, 0.0));
         assert!(path.iter().all(|place| (*place - Point::origin()).norm() < 0.3), "it holds");
     }
 
     #[test]
     fn who_cannot_follow_still_sees_the_other_sides() {
-        let config = PhaseConfig::default();
-        let mut square = Square::new(
-            &config,
-            Timestamp::from_seconds(0.0),
-            Point::origin(),
-            Rotation::identity(),
-            5.0,
-        );
+        let config = Config::default();
         // The first leg goes north and the third south.
-        let goes_south = (1..6000).map(f64::from).find(|hundredths| {
-            let now = Timestamp::from_seconds(0.01 * hundredths);
-            square.move_on(&config, now, Point::new(-30.0, 0.0, 0.0), false);
-            square.leg >= 3
-        });
-        assert!(goes_south.is_some_and(|at| at < 2000.0), "{goes_south:?}");
-        let mut fenced = Square::new(
-            &config,
-            Timestamp::from_seconds(0.0),
-            Point::origin(),
-            Rotation::identity(),
-            5.0,
-        );
-        let goes_south = (1..6000).map(f64::from).find(|hundredths| {
-            let now = Timestamp::from_seconds(0.01 * hundredths);
-            fenced.move_on(&config, now, Point::new(-30.0, 0.0, 0.0), true);
-            fenced.leg >= 3
-        });
-        assert!(goes_south.is_some_and(|at| at < 500.0), "{goes_south:?}");
+        let goes_south_after_s = |is_fenced: bool| {
+            let begin = Timestamp::from_seconds(0.0);
+            let mut square =
+                Square::new(&config, begin, Point::origin(), Rotation::identity(), 5.0);
+            (1..6000).map(|hundredths| 0.01 * f64::from(hundredths)).find(|seconds| {
+                let now = Timestamp::from_seconds(*seconds);
+                square.move_on(&config.phases, now, Point::new(-30.0, 0.0, 0.0), is_fenced);
+                square.leg >= 3
+            })
+        };
+        assert!(goes_south_after_s(false).is_some_and(|seconds| seconds < 20.0));
+        assert!(goes_south_after_s(true).is_some_and(|seconds| seconds < 5.0));
     }
 
     #[test]
