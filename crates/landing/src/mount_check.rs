@@ -100,16 +100,16 @@ const MAX_DEVIATION: f64 = 0.5;
 const MIN_IN_A_ROW: u32 = 15;
 /// Length of a part of the flight whose estimate is compared with those of the others, in seconds, the smallest share of what
 /// is known that a part must bring to count, and the number of such parts without which roll, pitch, focal length and size are not told:
-/// with 3 for all, and a heading that swings less, four of ten landings in ArduPilot's simulation in 8 m/s of wind with turbulence 3 blamed mount or
-/// marker for what its estimate wanders.
+/// fewer blame the mount for the wandering of ArduPilot's estimate in 8 m/s of wind with turbulence 3.
 const PART_S: f64 = 1.0;
 const MIN_SHARE: f64 = 0.01;
 const MIN_PARTS: [u32; 4] = [6, 6, 3, 3];
-/// Time constant with which the vehicle's lean is smoothed, in seconds, the lean above which the wind is strong, in radians, and by how many times more
-/// deviations per radian above it an angle must be off: in wind of 8 m/s, in which SITL's vehicle leans by 0.37 to 0.5 rad, the place of ArduPilot's
-/// estimate wanders by 0.1 m and its heading by 3 degrees within seconds, and a descent made roll errors of 4.4 deviations of that.
+/// Time constant with which the vehicle's lean is smoothed, in seconds.
 const LEAN_S: f64 = 5.0;
+/// Lean above which the wind is strong, in radians. In 8 m/s of wind SITL's vehicle leans by 0.37 to 0.5 rad, and the place of ArduPilot's estimate
+/// wanders by 0.1 m, its heading by 3 degrees, within seconds: descents made roll errors of up to 4.4 deviations of that.
 const STRONG_LEAN_RAD: f64 = 0.28;
+/// By how many times more deviations an angle must be off to be told in such wind, per radian above that lean.
 const STRICTER_PER_RAD: f64 = 6.0;
 /// Factor on the random walks above which nothing new is told: what moves the pad then is something else. It is smaller for
 /// focal length and size, which show in less motion than the mount.
@@ -449,8 +449,11 @@ impl MountCheck {
         let is_calm_for_ratios = is_calm(MAX_TOLD_RATIO_NOISE_SCALE);
         let is_calm = is_calm(MAX_TOLD_NOISE_SCALE);
         let stricter = 1.0 + STRICTER_PER_RAD * fmax(self.lean_rad - STRONG_LEAN_RAD, 0.0);
-        self.roll.follow(roll, stricter * MIN_DEVIATIONS, MIN_ANGLE_RAD, is_calm);
-        self.pitch.follow(pitch, stricter * MIN_DEVIATIONS, MIN_ANGLE_RAD, is_calm);
+        for (suspicion, angle) in [(&mut self.roll, roll), (&mut self.pitch, pitch)] {
+            // What was found in calmer air stays found.
+            let stricter = if suspicion.is_told { 1.0 } else { stricter };
+            suspicion.follow(angle, stricter * MIN_DEVIATIONS, MIN_ANGLE_RAD, is_calm);
+        }
         self.focal.follow(focal, MIN_RATIO_DEVIATIONS, MIN_RATIO, is_calm_for_ratios);
         self.size.follow(size, MIN_RATIO_DEVIATIONS, MIN_SIZE_RATIO, is_calm_for_ratios);
     }
@@ -609,6 +612,16 @@ mod tests {
             let found = check.findings().pitch_rad;
             assert_eq!(found.is_some(), is_told, "{lean_rad}: {found:?} {:?}", check.errors());
         }
+    }
+
+    #[test]
+    fn what_was_found_in_calm_air_stays_found_in_a_strong_wind() {
+        let mut check = MountCheck::default();
+        let mount = Rotation::identity();
+        descend(&mut check, 0.0, mount, 0.035);
+        assert!(check.findings().pitch_rad.is_some());
+        descend_leaning(&mut check, 10.0, mount, 0.035, 0.6);
+        assert!(check.findings().pitch_rad.is_some(), "{:?}", check.errors());
     }
 
     #[test]
