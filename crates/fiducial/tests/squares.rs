@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 
 use fiducial::{Detector, Observation, Settings};
-use geometry::Pixel;
+use geometry::{CameraModel, Pixel};
 use imaging::GrayImage;
 use markers::SquareCode;
 use markers::{Family, Marker};
@@ -83,6 +83,48 @@ fn a_border_of_two_cells_is_read_and_its_outer_corners_are_found() {
             let off = (corner.x - truth[0]).hypot(corner.y - truth[1]);
             assert!(off < 0.15, "{cell_px} px: {off} px off");
         }
+    }
+}
+
+/// A drawing that was resized shows black, white, and at edges that are not between pixels one grey pixel: too little for a fit of the
+/// pixels, which the outline does not need. The side of a cell, and the place of the tag's top left corner, in pixels.
+#[test]
+fn a_drawing_without_noise_and_blur_has_a_pose_and_a_covariance_that_is_sane() {
+    const DRAWN: [f64; 2] = [0.0, 255.0];
+    let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
+    let (focal_px, size_m) = (800.0, 0.15);
+    let camera = CameraModel::pinhole(300, 300, focal_px);
+    for (cell_px, corner) in [
+        (26.95, [39.5, 39.5]),
+        (26.95, [39.6, 39.5]),
+        (20.1, [39.5, 39.5]),
+        (20.1, [39.5, 39.75]),
+        (15.05, [39.5, 39.75]),
+        (12.5, [39.6, 39.5]),
+    ] {
+        let name = format!("{cell_px} px at {corner:?}");
+        let image = picture([300, 300], 1.0, |at| {
+            let cell = [0, 1].map(|axis| (at[axis] - corner[axis]) / cell_px);
+            let is_within = cell.iter().all(|v| (0.0..8.0).contains(v));
+            DRAWN[usize::from(!is_within || is_white(code, 3, 1, cell))]
+        });
+        let markers = [format!("apriltag-36h11:3:{size_m}").parse::<Marker>().unwrap()];
+        let mut detector = Detector::new(&markers, Settings::default()).unwrap();
+        let found = detector.detect(image.view().unwrap(), Some(&camera), &mut ()).to_vec();
+        assert_eq!(found.len(), 1, "{name}");
+        let far = corner.map(|at| at + 8.0 * cell_px);
+        let truth = [corner, [far[0], corner[1]], far, [corner[0], far[1]]];
+        for (seen, [x, y]) in found[0].corners.unwrap().iter().zip(truth) {
+            assert!((seen.x - x).hypot(seen.y - y) < 0.4, "{name}: {seen:?}");
+        }
+        let variance_px2 = found[0].centre_covariance_px2.diagonal();
+        assert!(variance_px2.iter().all(|v| (1e-8..0.05).contains(v)), "{name}: {variance_px2}");
+        let pose = found[0].pose.unwrap();
+        assert!(pose.reprojection_rms_px < 0.4, "{name}: {} px", pose.reprojection_rms_px);
+        let range_m = focal_px * size_m / (8.0 * cell_px);
+        let off_m = pose.camera_from_marker.origin().z() - range_m;
+        let deviation_m = pose.covariance[(2, 2)].sqrt();
+        assert!(off_m.abs() < 5.0 * deviation_m, "{name}: {off_m} m, {deviation_m} m told");
     }
 }
 

@@ -5,7 +5,7 @@ use nalgebra::{SMatrix, SVector};
 
 use crate::optics::camera_response::{CameraResponse, SHARPENING_PX};
 use crate::optics::exposure::ClippedExposure;
-use crate::optics::homography::Homography;
+use crate::optics::homography::{CORNERS, Homography};
 use crate::optics::least_squares::{
     Damping, Influence, Next, NormalEquations, Problem, Review, Schedule, huber, minimise,
 };
@@ -51,6 +51,10 @@ const SAME_PIXELS_PX: f64 = 0.4;
 /// Limits of the blur, in pixels.
 const MIN_SPREAD_PX: f64 = 0.25;
 const MAX_SPREAD_PX: f64 = 4.0;
+/// Variance of a pixel that comes of whole grey levels, in square grey levels; no picture is better than that.
+const ROUNDING_VARIANCE: f64 = 1.0 / 12.0;
+/// Largest standard deviation of a corner where the sensor saturates in black and in white, in pixels.
+const MAX_BILEVEL_CORNER_PX: f64 = 0.3;
 /// Smallest contrast, in grey levels.
 const MIN_CONTRAST: f64 = 4.0;
 
@@ -295,8 +299,9 @@ struct Residuals {
     /// The same, weighted with each pixel's information on the marker's place as well.
     informative_squares: f64,
     information: f64,
-    /// Pixels at which the sensor is saturated.
+    /// Pixels at which the sensor is saturated, and those of them that are black.
     saturated: usize,
+    saturated_black: usize,
 }
 
 impl Residuals {
@@ -309,6 +314,19 @@ impl Residuals {
         } else {
             mean
         }
+    }
+
+    /// Counts a saturated pixel.
+    fn saturate(&mut self, is_black: bool) {
+        self.saturated += 1;
+        self.saturated_black += usize::from(is_black);
+    }
+
+    /// Whether most pixels are saturated, some black and some white, as in a drawing without light and blur: the few others, on the
+    /// edges, need not tell the square's place, its light and its blur together.
+    fn is_bilevel(&self) -> bool {
+        let is_both = self.saturated_black > 0 && self.saturated > self.saturated_black;
+        is_both && self.saturated as f64 > self.weight
     }
 }
 
@@ -398,8 +416,14 @@ impl State {
         if contrast < MIN_CONTRAST || freedom < 1.0 {
             return None;
         }
-        let variance = residuals.variance() * residuals.weight / freedom;
+        let variance = (residuals.variance() * residuals.weight / freedom).max(ROUNDING_VARIANCE);
         let inverse = inverse(&equations.matrix)?;
+        let covariance = SMatrix::<f64, 8, 8>::from_fn(|i, j| inverse[(i, j)]) * variance;
+        // What is not known better than by the outline alone is left to that.
+        let max_px2 = MAX_BILEVEL_CORNER_PX * MAX_BILEVEL_CORNER_PX;
+        if residuals.is_bilevel() && self.worst_corner_px2(&covariance) > max_px2 {
+            return None;
+        }
         let told = |index: usize, value: f64, known: Option<Measured>| {
             let variance = inverse.get((index, index))? * variance;
             Measured { value, deviation: variance.sqrt() }.without(known)
@@ -413,13 +437,22 @@ impl State {
         });
         Some(Fit {
             homography: self.homography,
-            covariance: SMatrix::<f64, 8, 8>::from_fn(|i, j| inverse[(i, j)]) * variance,
+            covariance,
             model: self.light,
             residual: variance.sqrt() / contrast,
             is_shift_known: true,
             shift_px: 0.0,
             response: response.flatten(),
         })
+    }
+
+    /// The largest variance of a corner in both directions together, in square pixels of the ideal image.
+    fn worst_corner_px2(&self, covariance: &SMatrix<f64, 8, 8>) -> f64 {
+        let variance = |place: [f64; 2]| {
+            let by_parameters = self.homography.project(place).parameter_jacobian();
+            (by_parameters * covariance * by_parameters.transpose()).trace()
+        };
+        CORNERS.map(variance).into_iter().fold(0.0, f64::max)
     }
 
     /// The same with a camera's processing, of which the model is not quite the camera's.
@@ -498,14 +531,14 @@ impl State {
             // A saturated pixel agrees with every prediction beyond it.
             if pixel.grey >= 255.0 && grey > 254.5 || pixel.grey <= 0.0 && grey < 0.5 {
                 pixel.residual = f64::NAN;
-                residuals.saturated += 1;
+                residuals.saturate(pixel.grey <= 0.0);
                 continue;
             }
             let shown = grey.clamp(0.0, 255.0);
             if N == UNKNOWNS_PROCESSED && shown != grey {
                 // Compression comes after saturation, so that such pixels differ a little and tell nothing.
                 pixel.residual = f64::NAN;
-                residuals.saturated += 1;
+                residuals.saturate(grey < 0.0);
                 total_cost += self.loss.influence(pixel.grey - shown).cost;
                 continue;
             }
@@ -586,8 +619,19 @@ mod tests {
             informative_squares: 10.0 * 50.0 * 9.0,
             information: 10.0 * 50.0,
             saturated,
+            saturated_black: 0,
         };
         assert!((residuals(0).variance() - 1.8).abs() < 1e-12);
         assert!((residuals(40).variance() - 9.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_picture_is_bilevel_where_most_is_saturated_in_black_and_in_white() {
+        let is_bilevel = |saturated: usize, saturated_black: usize| {
+            Residuals { weight: 100.0, saturated, saturated_black, ..Residuals::default() }
+                .is_bilevel()
+        };
+        assert!(is_bilevel(300, 100) && is_bilevel(101, 1));
+        assert!(!is_bilevel(300, 0) && !is_bilevel(300, 300) && !is_bilevel(99, 50));
     }
 }
