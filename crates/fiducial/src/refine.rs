@@ -1,6 +1,7 @@
 //! Sub-pixel corners with their covariance.
 
 pub mod corners;
+pub(crate) mod drawing;
 pub(crate) mod edges;
 pub mod fit;
 pub mod pattern;

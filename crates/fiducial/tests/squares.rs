@@ -115,16 +115,48 @@ fn a_drawing_without_noise_and_blur_has_a_pose_and_a_covariance_that_is_sane() {
         let far = corner.map(|at| at + 8.0 * cell_px);
         let truth = [corner, [far[0], corner[1]], far, [corner[0], far[1]]];
         for (seen, [x, y]) in found[0].corners.unwrap().iter().zip(truth) {
-            assert!((seen.x - x).hypot(seen.y - y) < 0.4, "{name}: {seen:?}");
+            assert!((seen.x - x).hypot(seen.y - y) < 0.15, "{name}: {seen:?}");
         }
         let variance_px2 = found[0].centre_covariance_px2.diagonal();
-        assert!(variance_px2.iter().all(|v| (1e-8..0.05).contains(v)), "{name}: {variance_px2}");
+        assert!(variance_px2.iter().all(|v| (1e-3..0.05).contains(v)), "{name}: {variance_px2}");
         let pose = found[0].pose.unwrap();
-        assert!(pose.reprojection_rms_px < 0.4, "{name}: {} px", pose.reprojection_rms_px);
+        assert!(pose.reprojection_rms_px < 0.15, "{name}: {} px", pose.reprojection_rms_px);
         let range_m = focal_px * size_m / (8.0 * cell_px);
         let off_m = pose.camera_from_marker.origin().z() - range_m;
         let deviation_m = pose.covariance[(2, 2)].sqrt();
-        assert!(off_m.abs() < 5.0 * deviation_m, "{name}: {off_m} m, {deviation_m} m told");
+        assert!(off_m.abs() < 3.0 * deviation_m, "{name}: {off_m} m, {deviation_m} m told");
+    }
+}
+
+/// A drawing in whole pixels, as one that was resized without a filter: sides are up to half a pixel off, which no pixel shows. The side of a
+/// cell in pixels, and the turn.
+#[test]
+fn where_a_drawing_is_in_whole_pixels_its_covariance_says_so() {
+    let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
+    let (focal_px, size_m) = (800.0, 0.15);
+    let camera = CameraModel::pinhole(300, 300, focal_px);
+    let markers = [format!("apriltag-36h11:3:{size_m}").parse::<Marker>().unwrap()];
+    let mut detector = Detector::new(&markers, Settings::default()).unwrap();
+    for (cell_px, angle) in [9.03, 12.45, 17.12, 20.11, 22.46].into_iter().flat_map(|cell_px| {
+        [(cell_px, 0.0), (cell_px, 0.3), (cell_px, 0.25 * std::f64::consts::PI)]
+    }) {
+        let name = format!("{cell_px} px, {angle} rad");
+        let middle = [149.7, 150.2];
+        let image = picture([300, 300], 0.0, |at| {
+            let cell = turned(at, middle, angle, cell_px).map(|v| v + 4.0);
+            let is_within = cell.iter().all(|v| (0.0..8.0).contains(v));
+            [0.0, 255.0][usize::from(!is_within || is_white(code, 3, 1, cell))]
+        });
+        let found = detector.detect(image.view().unwrap(), Some(&camera), &mut ()).to_vec();
+        assert_eq!(found.len(), 1, "{name}");
+        let off_px = (found[0].centre.x - middle[0]).hypot(found[0].centre.y - middle[1]);
+        let variance_px2 = found[0].centre_covariance_px2.trace();
+        assert!(off_px < 0.4 && off_px * off_px < 4.0 * variance_px2, "{name}: {off_px} px");
+        assert!(variance_px2 < 0.15, "{name}: {variance_px2}");
+        let pose = found[0].pose.unwrap();
+        let off_m = pose.camera_from_marker.origin().z() - focal_px * size_m / (8.0 * cell_px);
+        let variance_m2 = pose.covariance[(2, 2)];
+        assert!(off_m * off_m < 9.0 * variance_m2, "{name}: {off_m} m, {variance_m2} m2 told");
     }
 }
 

@@ -299,3 +299,22 @@ fn a_lens_out_of_focus_does_not_hide_a_marker() {
         }
     }
 }
+
+#[test]
+fn a_drawing_in_black_and_white_is_as_certain_as_its_sides() {
+    let mut detector = detector("stag-hd21:3:0.2");
+    for side_px in [60.0, 101.3, 124.7] {
+        for turn in [0.0, 0.02, 0.785] {
+            let shot = Shot { centre: MIDDLE, ..Shot::new(Family::StagHd21, 3, side_px, turn) };
+            let grey = shot.seen(LARGE, |_, light| if light < 60.0 { 30.0 } else { 210.0 });
+            let image: Vec<u8> = grey.iter().map(|it| if *it < 120 { 0 } else { 255 }).collect();
+            let found = detect(&mut detector, &image);
+            let [seen] = found.as_slice() else { panic!("{side_px} px, {turn} rad: {found:?}") };
+            let name = format!("{side_px} px, {turn} rad");
+            let off_px = (seen.centre.x - MIDDLE[0]).hypot(seen.centre.y - MIDDLE[1]);
+            let variance_px2 = seen.centre_covariance_px2.trace();
+            assert!(off_px < 0.4 && off_px * off_px < 4.0 * variance_px2, "{name}: {off_px} px");
+            assert!(variance_px2 < 0.15, "{name}: {variance_px2}");
+        }
+    }
+}

@@ -73,7 +73,7 @@ impl Refined {
 }
 
 /// Where the diagonals of a quad cross: the image of the square's centre.
-fn diagonals_crossing(corners: &[Pixel; 4]) -> Pixel {
+pub(crate) fn diagonals_crossing(corners: &[Pixel; 4]) -> Pixel {
     let [a, b, c, d] = corners;
     let (ux, uy) = (c.x - a.x, c.y - a.y);
     let (vx, vy) = (d.x - b.x, d.y - b.y);
