@@ -55,13 +55,18 @@ fn round(name: &str, value: &mut Value) {
     match value {
         Value::Array(values) => values.iter_mut().for_each(|value| round(name, value)),
         Value::Number(number) if number.is_f64() => {
-            let tens = 10f64.powi(*digits);
-            // Adding zero makes 0 of -0.
-            let rounded = number.as_f64().map(|it| (it * tens).round() / tens + 0.0);
+            let rounded = number.as_f64().map(|it| rounded(it, *digits));
             *value = rounded.map_or(Value::Null, Value::from);
         }
         _ => {}
     }
+}
+
+/// A number with so many digits after the point, and 0 without a sign.
+pub(crate) fn rounded(value: f64, digits: i32) -> f64 {
+    let tens = 10f64.powi(digits);
+    // Adding zero makes 0 of -0.
+    (value * tens).round() / tens + 0.0
 }
 
 /// The names of a row's columns, in their order.
@@ -141,6 +146,11 @@ mod tests {
         seed: u64::MAX,
         wind_m_s: -1e-9,
     };
+
+    #[test]
+    fn a_rounded_zero_has_no_sign() {
+        assert_eq!(format!("{} {}", rounded(-0.0004, 3), rounded(-0.0016, 3)), "0 -0.002");
+    }
 
     #[test]
     fn columns_are_in_their_order_and_numbers_have_the_digits_that_mean_something() {

@@ -5,11 +5,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
-use messages::Touchdown;
 use node::stats::interpolated_quantile as quantile;
 use serde::{Deserialize, Serialize};
 
-use crate::landing::outcome::{Ending, is_too_fast};
+use crate::landing::outcome::{self, Ending};
 use crate::landing::table::{median_interval, sign_test};
 use crate::results::FLIGHTS_AS_JSON;
 
@@ -100,14 +99,17 @@ impl Flight {
     }
 
     fn is_within(&self, metres: f64) -> bool {
-        self.is_landed() && self.touchdown_error_m.is_some_and(|error_m| error_m <= metres)
+        outcome::is_within(self.ending, self.touchdown_error_m, metres)
     }
 
     /// As the landing experiment counts it.
     fn is_unsafe(&self) -> bool {
-        let is_far = self.touchdown_error_m.is_some_and(|error_m| error_m > Touchdown::MAX_ERROR_M);
-        (is_far && self.ending != Ending::Aborted)
-            || is_too_fast(self.touchdown_speed_m_s, self.touchdown_lateral_speed_m_s)
+        outcome::is_unsafe(
+            self.ending,
+            self.touchdown_error_m,
+            self.touchdown_speed_m_s,
+            self.touchdown_lateral_speed_m_s,
+        )
     }
 }
 

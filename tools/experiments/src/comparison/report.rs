@@ -10,6 +10,7 @@ use crate::landing::plots::{Area, COLOURS, DrawError, GREY, picture};
 use crate::results::{
     self, COMPARISON_AS_JSON, COMPARISON_HEADING, COMPARISON_PLOT, Folder, REPORT,
 };
+use crate::rows::rounded;
 
 /// The letters by which the runs are named.
 const LETTERS: [char; 2] = ['A', 'B'];
@@ -131,10 +132,7 @@ fn part(summary: &Summary, measure: &Measure, of: Part) -> String {
 }
 
 fn signed(value: Option<f64>, digits: usize) -> String {
-    let tens = 10f64.powi(digits as i32);
-    // Adding zero makes 0 of -0.
-    let rounded = value.map(|value| (value * tens).round() / tens + 0.0);
-    match rounded {
+    match value.map(|value| rounded(value, digits as i32)) {
         Some(0.0) => format!("{:.digits$}", 0.0),
         Some(value) => format!("{value:+.digits$}"),
         None => "-".to_owned(),

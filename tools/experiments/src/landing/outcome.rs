@@ -24,6 +24,23 @@ pub(crate) fn is_too_fast(sink_m_s: Option<f64>, slide_m_s: Option<f64>) -> bool
     beyond(sink_m_s, MAX_SINK_M_S) || beyond(slide_m_s, MAX_SLIDE_M_S)
 }
 
+/// Whether a flight landed within so many metres of the pad's centre.
+pub(crate) fn is_within(ending: Ending, error_m: Option<f64>, metres: f64) -> bool {
+    ending == Ending::Landed && error_m.is_some_and(|error_m| error_m <= metres)
+}
+
+/// Whether a flight touched the ground faster than is safe, by its greatest speeds in m/s, or, without an abort, far from the pad.
+/// Where an aborted flight comes down is the pilot's affair.
+pub(crate) fn is_unsafe(
+    ending: Ending,
+    error_m: Option<f64>,
+    sink_m_s: Option<f64>,
+    slide_m_s: Option<f64>,
+) -> bool {
+    let is_far = ending != Ending::Aborted && beyond(error_m, Touchdown::MAX_ERROR_M);
+    is_far || is_too_fast(sink_m_s, slide_m_s)
+}
+
 fn beyond(value: Option<f64>, limit: f64) -> bool {
     value.is_some_and(|value| value > limit)
 }
@@ -153,14 +170,12 @@ impl Outcome {
 
     /// Whether it landed within this distance of the pad's centre.
     pub fn is_within(&self, metres: f64) -> bool {
-        self.ending == Ending::Landed && self.error_m.is_some_and(|error| error <= metres)
+        is_within(self.ending, self.error_m, metres)
     }
 
-    /// Whether it touched the ground dangerously fast, or, without an abort, far from the pad. Where an aborted flight comes
-    /// down is the pilot's affair.
+    /// Whether it touched the ground dangerously fast, or, without an abort, far from the pad.
     pub fn is_unsafe(&self) -> bool {
-        let is_far = self.ending != Ending::Aborted && beyond(self.error_m, Touchdown::MAX_ERROR_M);
-        is_far || self.is_too_fast()
+        is_unsafe(self.ending, self.error_m, self.sink_m_s, self.slide_m_s)
     }
 
     /// Whether it touched the ground faster than is safe.

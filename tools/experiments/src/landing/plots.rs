@@ -11,6 +11,7 @@ use plotters::prelude::*;
 use super::outcome::{Ending, Outcome};
 use super::table::{Column, cells, median_interval, numbers, share_interval};
 use crate::results::PLOTS;
+use crate::rows::rounded;
 
 /// The colours of curves.
 pub const COLOURS: [RGBColor; 6] = [
@@ -223,8 +224,7 @@ fn touchdowns(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
         .x_label_area_size(40)
         .y_label_area_size(56)
         .build_cartesian_2d(-reach..reach, -reach..reach)?;
-    // Adding zero makes 0 of -0.
-    let metres = |m: &f64| format!("{}", (m * 1e3).round() / 1e3 + 0.0);
+    let metres = |m: &f64| rounded(*m, 3).to_string();
     chart
         .configure_mesh()
         .x_desc("east, m")
