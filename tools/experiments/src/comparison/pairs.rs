@@ -1,5 +1,6 @@
 //! Reads the flights of two runs, pairs them by circumstances and seed, and compares what landings are judged by: a summary of each run,
-//! the differences of the pairs, and a test of their sign.
+//! the differences of the pairs, and a test of their sign. A seed draws the same wind, start and noise in all circumstances, so that its
+//! pairs are not independent: it counts as one.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -152,6 +153,14 @@ pub struct Spread {
     pub worst: f64,
 }
 
+impl Spread {
+    /// That of some values; `None` of none.
+    fn of(values: &[f64]) -> Option<Self> {
+        let part = |part| quantile(values, part);
+        Some(Self { median: part(0.5)?, p95: part(0.95)?, worst: part(1.0)? })
+    }
+}
+
 /// One run.
 #[derive(Clone, Debug, Serialize)]
 pub struct Side {
@@ -182,7 +191,7 @@ pub struct Summary {
     /// Those that were unsafe.
     #[serde(rename = "unsafe")]
     pub dangerous: usize,
-    /// Of those that landed, each measure by its name; `None` where none has it.
+    /// Of all those that landed, each measure by its name; `None` where none has it.
     #[serde(flatten)]
     pub measures: BTreeMap<&'static str, Option<Spread>>,
 }
@@ -193,10 +202,7 @@ impl Summary {
         let measures = MEASURES.iter().map(|measure| {
             let values: Vec<f64> =
                 flights.iter().filter_map(|flight| measure.of_landed(flight)).collect();
-            let part = |part| quantile(&values, part);
-            let spread =
-                || Some(Spread { median: part(0.5)?, p95: part(0.95)?, worst: part(1.0)? });
-            (measure.name, spread())
+            (measure.name, Spread::of(&values))
         });
         Self {
             flights: flights.len(),
@@ -218,24 +224,31 @@ struct Pair<'a> {
 /// A measure of both flights of a pair.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Point {
+    /// The seed of both.
+    pub seed: u64,
     /// Of the first run's flight.
     pub first: f64,
     /// Of the second run's flight.
     pub second: f64,
 }
 
-/// The differences of pairs in one measure, the second run's value minus the first's.
+/// Pairs of which both landed, in one measure: what each run gave, and the differences, the second run's value minus the first's. Of a
+/// seed with several pairs it is the median of its differences.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Difference {
     /// Number of pairs of which both have it.
     pub pairs: usize,
-    /// Their median.
+    /// Number of seeds that they have, each with one difference.
+    pub seeds: usize,
+    /// The values of the first and of the second run in the pairs; `None` where there is none.
+    pub runs: [Option<Spread>; 2],
+    /// Median of the seeds' differences.
     pub median: Option<f64>,
-    /// Its 95 % interval by order statistics; `None` for fewer than six pairs.
+    /// Its 95 % interval by order statistics; `None` for fewer than six seeds.
     pub interval: Option<[f64; 2]>,
-    /// Pairs in which the second run's value is smaller.
+    /// Seeds in which the second run's value is smaller.
     pub smaller: usize,
-    /// Pairs in which it is larger.
+    /// Seeds in which it is larger.
     pub larger: usize,
     /// Two-sided sign test: how probable so unequal numbers are if neither run tended to the smaller value.
     pub p: f64,
@@ -243,11 +256,19 @@ pub struct Difference {
 
 impl Difference {
     fn new(values: &[Point]) -> Self {
-        let differences: Vec<f64> = values.iter().map(|it| it.second - it.first).collect();
+        let spread = |of: fn(&Point) -> f64| Spread::of(&values.iter().map(of).collect::<Vec<_>>());
+        let mut of_seeds: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
+        for it in values {
+            of_seeds.entry(it.seed).or_default().push(it.second - it.first);
+        }
+        let differences: Vec<f64> =
+            of_seeds.values().filter_map(|of_seed| quantile(of_seed, 0.5)).collect();
         let count = |is: fn(&f64) -> bool| differences.iter().filter(|it| is(it)).count();
         let (smaller, larger) = (count(|it| *it < 0.0), count(|it| *it > 0.0));
         Self {
             pairs: values.len(),
+            seeds: differences.len(),
+            runs: [spread(|it| it.first), spread(|it| it.second)],
             median: quantile(&differences, 0.5),
             interval: median_interval(&differences),
             smaller,
@@ -268,11 +289,11 @@ pub struct Landed {
     pub second_alone: usize,
     /// Neither.
     pub neither: usize,
-    /// Two-sided sign test of those that landed alone.
+    /// Two-sided sign test of the seeds in which one run landed alone more often than the other.
     pub p: f64,
 }
 
-/// Pairs of some circumstances, or of all.
+/// Pairs of some circumstances, or of all; for tests and intervals a seed counts once.
 #[derive(Clone, Debug, Serialize)]
 pub struct Pairs {
     /// Number of pairs.
@@ -291,6 +312,12 @@ impl Pairs {
             pairs.iter().filter(is).count()
         };
         let (first_alone, second_alone) = (count(true, false), count(false, true));
+        let mut ahead: BTreeMap<u64, i64> = BTreeMap::new();
+        for it in pairs {
+            let by = i64::from(it.first.is_landed()) - i64::from(it.second.is_landed());
+            *ahead.entry(it.first.seed).or_default() += by;
+        }
+        let seeds = |sign: i64| ahead.values().filter(|by| by.signum() == sign).count();
         Self {
             pairs: pairs.len(),
             landed: Landed {
@@ -298,7 +325,7 @@ impl Pairs {
                 first_alone,
                 second_alone,
                 neither: count(false, false),
-                p: sign_test(first_alone, second_alone),
+                p: sign_test(seeds(1), seeds(-1)),
             },
             differences: MEASURES
                 .iter()
@@ -312,7 +339,7 @@ impl Pairs {
 fn values(measure: &Measure, pairs: &[Pair<'_>]) -> Vec<Point> {
     let both = |it: &Pair<'_>| {
         let (first, second) = (measure.of_landed(it.first)?, measure.of_landed(it.second)?);
-        Some(Point { first, second })
+        Some(Point { seed: it.first.seed, first, second })
     };
     pairs.iter().filter_map(both).collect()
 }
@@ -462,6 +489,50 @@ mod tests {
         let same = &comparison.pairs.differences["time_to_disarm_s"];
         assert_eq!((same.smaller, same.larger, same.p), (0, 0, 1.0));
         assert_eq!(comparison.cells.len(), 1);
+    }
+
+    #[test]
+    fn a_seed_counts_once_however_many_circumstances_it_is_flown_in() {
+        let cells = ["calm", "windy", "late"];
+        // Seed 7 does not land in the second run.
+        let flown = |errors_m: [f64; 3], of_last: [Option<f64>; 3]| {
+            let of_seed = |seed: u64| {
+                let errors_m = if seed == 7 { of_last } else { errors_m.map(Some) };
+                cells.into_iter().zip(errors_m).map(move |(cell, error)| flight(cell, seed, error))
+            };
+            run((1..=7).flat_map(of_seed).collect())
+        };
+        let first = flown([0.05, 0.05, 0.05], [Some(0.05); 3]);
+        let second = flown([0.04, 0.02, 0.09], [None; 3]);
+        let comparison = Comparison::new(&first, &second).unwrap();
+        let landed = &comparison.pairs.landed;
+        assert_eq!((landed.both, landed.first_alone, landed.second_alone), (18, 3, 0));
+        assert!((landed.p - 1.0).abs() < 1e-9, "{}", landed.p);
+        let error = &comparison.pairs.differences["touchdown_error_m"];
+        assert_eq!((error.pairs, error.seeds, error.smaller, error.larger), (18, 6, 6, 0));
+        // Not that of 12 and 6 pairs.
+        assert!((error.p - 2.0 / 64.0).abs() < 1e-9, "{}", error.p);
+        for value in [error.median.unwrap(), error.interval.unwrap()[0]] {
+            assert!((value + 0.01).abs() < 1e-9, "{value}");
+        }
+        let late = &comparison.cells[2].pairs.differences["touchdown_error_m"];
+        assert_eq!((late.pairs, late.seeds, late.smaller, late.larger), (6, 6, 0, 6));
+    }
+
+    #[test]
+    fn what_is_compared_is_of_the_same_pairs_on_both_sides() {
+        // The second run's flights without a partner that landed have large errors.
+        let first = [Some(0.01), Some(0.03), None];
+        let second = [Some(0.02), Some(0.04), Some(0.9)];
+        let of = |errors_m: [Option<f64>; 3]| {
+            run((1..).zip(errors_m).map(|(seed, error_m)| flight("calm", seed, error_m)).collect())
+        };
+        let comparison = Comparison::new(&of(first), &of(second)).unwrap();
+        let worst = |spread: Option<Spread>| spread.unwrap().worst;
+        let error = &comparison.pairs.differences["touchdown_error_m"];
+        assert_eq!(error.runs.map(worst), [0.03, 0.04]);
+        let of_all = comparison.runs.each_ref().map(|it| it.summary.measures["touchdown_error_m"]);
+        assert_eq!(of_all.map(worst), [0.03, 0.9]);
     }
 
     #[test]

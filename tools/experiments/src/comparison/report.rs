@@ -72,12 +72,20 @@ fn differing([first, second]: &[Side; 2]) -> String {
 fn summaries(comparison: &Comparison) -> String {
     let [first, second] = comparison.runs.each_ref().map(|side| &side.summary);
     let (pairs, landed) = (&comparison.pairs, &comparison.pairs.landed);
+    let once = match comparison.cells.len() {
+        0 | 1 => "",
+        _ => {
+            " A seed has the same draws in all circumstances, so its pairs are not independent: here it counts once, with the median of its \
+             differences, and for p of those that landed with the run that landed more often."
+        }
+    };
     let mut text = format!(
         "\nPairs have the same circumstances and seed: {}, of which {} landed in both, {} in A alone, {} in B alone (sign test p = {}) and {} in neither. \
-         Errors, times and speeds are of flights that landed, differences (B - A: below 0 B is better) of pairs that landed in both. \
-         The interval is that of the median at 95 %, by order statistics (from six pairs on); p is of a two-sided sign test. \
+         The numbers of flights are of all of each run; errors, times and speeds, and their differences (B - A: below 0 B is better), \
+         are of pairs that landed in both.{once} \
+         The interval is that of the median at 95 %, by order statistics (from six seeds on); p is of a two-sided sign test. \
          Unsafe: faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways, or, without having given up, too far off.\n\n\
-         | | A | B | B - A, median | 95 % interval | B smaller, larger | p |\n|---|---|---|---|---|---|---|\n",
+         | | A | B | B - A, median | 95 % interval | B smaller, larger in seeds | p |\n|---|---|---|---|---|---|---|\n",
         pairs.pairs,
         landed.both,
         landed.first_alone,
@@ -97,21 +105,20 @@ fn summaries(comparison: &Comparison) -> String {
     for measure in &MEASURES {
         let Some(difference) = pairs.differences.get(measure.name) else { continue };
         let digits = measure.digits;
+        let [one, other] = difference.runs.map(|spread| part(spread, digits, |it| it.median));
         let _ = writeln!(
             text,
-            "| {}: median | {} | {} | {} | {} | {}, {} of {} | {} |",
+            "| {}: median | {one} | {other} | {} | {} | {}, {} of {} | {} |",
             measure.words,
-            part(first, measure, |it| it.median),
-            part(second, measure, |it| it.median),
             signed(difference.median, digits + 1),
             interval(difference, digits + 1),
             difference.smaller,
             difference.larger,
-            difference.pairs,
+            difference.seeds,
             p_value(difference.p),
         );
         for (name, of) in PARTS {
-            let (one, other) = (part(first, measure, of), part(second, measure, of));
+            let [one, other] = difference.runs.map(|spread| part(spread, digits, of));
             let _ = writeln!(text, "| {}: {name} | {one} | {other} | | | | |", measure.words);
         }
     }
@@ -126,9 +133,8 @@ type Named<T> = (&'static str, T);
 /// What else a spread has than its median.
 const PARTS: [Named<Part>; 2] = [("95 %", |it| it.p95), ("worst", |it| it.worst)];
 
-fn part(summary: &Summary, measure: &Measure, of: Part) -> String {
-    let spread = summary.measures.get(measure.name).copied().flatten();
-    spread.map_or_else(|| "-".to_owned(), |spread| format!("{:.*}", measure.digits, of(&spread)))
+fn part(spread: Option<Spread>, digits: usize, of: Part) -> String {
+    spread.map_or_else(|| "-".to_owned(), |spread| format!("{:.digits$}", of(&spread)))
 }
 
 fn signed(value: Option<f64>, digits: usize) -> String {
@@ -153,7 +159,7 @@ fn p_value(p: f64) -> String {
 }
 
 fn by_cell(comparison: &Comparison) -> String {
-    let mut text = "\n## By circumstances\n\nOf pairs: the medians of A and B, then the median of B - A with its 95 % interval.\n\n| circumstances | pairs | landed A, B | touchdown error, m | B - A | time to disarm, s | B - A |\n|---|---|---|---|---|---|---|\n".to_owned();
+    let mut text = "\n## By circumstances\n\nOf pairs that landed in both: the medians of A and B, then the median of B - A with its 95 % interval.\n\n| circumstances | pairs | landed A, B | touchdown error, m | B - A | time to disarm, s | B - A |\n|---|---|---|---|---|---|---|\n".to_owned();
     for cell in &comparison.cells {
         let [first, second] = &cell.runs;
         let _ = write!(
@@ -167,11 +173,11 @@ fn by_cell(comparison: &Comparison) -> String {
                 Some(_) => format!(" ({})", interval(difference, measure.digits + 1)),
                 None => String::new(),
             };
+            let [one, other] =
+                difference.runs.map(|spread| part(spread, measure.digits, |it| it.median));
             let _ = write!(
                 text,
-                " {}, {} | {}{between} |",
-                part(first, measure, |it| it.median),
-                part(second, measure, |it| it.median),
+                " {one}, {other} | {}{between} |",
                 signed(difference.median, measure.digits + 1),
             );
         }
@@ -216,8 +222,8 @@ fn scatter(area: &Area<'_>, measure: &Measure, of: &Comparison) -> Result<(), Dr
     // A little around all points, and never an empty range.
     let margin = (0.06 * (high - low)).max(0.5 * 0.1f64.powi(measure.digits as i32));
     let (low, high) = ((low - margin).max(0.0), high + margin);
-    let smaller = of.pairs.differences.get(measure.name).map_or(0, |it| it.smaller);
-    let title = format!("{}: B smaller in {smaller} of {}", measure.words, points.len());
+    let smaller = points.iter().filter(|it| it.second < it.first).count();
+    let title = format!("{}: B smaller in {smaller} of {} pairs", measure.words, points.len());
     let mut chart = ChartBuilder::on(area)
         .caption(title, ("sans-serif", 16))
         .margin(12)
@@ -245,6 +251,46 @@ fn scatter(area: &Area<'_>, measure: &Measure, of: &Comparison) -> Result<(), Dr
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::comparison::pairs::{Flight, Run};
+    use crate::landing::outcome::Ending;
+
+    /// A run with these touchdown errors, cell by cell and seed by seed.
+    fn run(cells: &[(&str, [f64; 2])]) -> Run {
+        let mut flights: Vec<Flight> = Vec::new();
+        for (cell, errors_m) in cells {
+            for (seed, error_m) in (1..).zip(errors_m) {
+                flights.push(Flight {
+                    cell: (*cell).to_owned(),
+                    seed,
+                    vision: "modelled".to_owned(),
+                    settings: "controller.guidance=metric".to_owned(),
+                    program: "0.1.0".to_owned(),
+                    ending: Ending::Landed,
+                    touchdown_error_m: Some(*error_m),
+                    touchdown_speed_m_s: None,
+                    touchdown_lateral_speed_m_s: None,
+                    time_to_disarm_s: None,
+                });
+            }
+        }
+        Run { folder: "run".into(), flights }
+    }
+
+    #[test]
+    fn the_table_has_both_runs_of_the_same_pairs_and_counts_a_seed_once() {
+        let first = run(&[("calm", [0.01, 0.03]), ("windy", [0.01, 0.03])]);
+        let second = run(&[("calm", [0.02, 0.04]), ("windy", [0.02, 0.04]), ("late", [0.9, 0.9])]);
+        let told = text(&Comparison::new(&first, &second).unwrap(), "compare");
+        let row =
+            "| touchdown error, m: median | 0.020 | 0.030 | +0.0100 | - | 0, 2 of 2 | 0.500 |";
+        assert!(told.contains(row), "{told}");
+        assert!(told.contains("| touchdown error, m: worst | 0.030 | 0.040 |"), "{told}");
+        assert!(told.contains("here it counts once"), "{told}");
+        let [first, second] =
+            [&[("calm", [0.01, 0.03])], &[("calm", [0.02, 0.04])]].map(|it| run(it));
+        let told = text(&Comparison::new(&first, &second).unwrap(), "compare");
+        assert!(!told.contains("counts once"), "{told}");
+    }
 
     #[test]
     fn differences_have_their_sign_and_zero_none() {
