@@ -17,6 +17,10 @@ const MAX_LATER_NS: i64 = 30_000_000;
 const MAX_TO_SETPOINT_NS: i64 = 2_000_000_000;
 /// Greatest vertical speed of a vehicle that stands, by its autopilot's estimate, in m/s.
 const MAX_RESTING_M_S: f64 = 0.1;
+/// Shortest time without a vehicle state in which it may have flown, in nanoseconds.
+const GAP_NS: i64 = 1_000_000_000;
+/// How far the height of a vehicle that stands may be from that with which its autopilot says so, in metres.
+const MAX_RISE_M: f64 = 0.2;
 /// Phases in which nothing is landing.
 const OUTSIDE: [&str; 5] = ["idle", "takeoff", "landed", "aborted", "pilot-in-command"];
 
@@ -170,16 +174,26 @@ fn stands(flight: &Flight, at_ns: i64) -> bool {
 }
 
 /// Whether the autopilot says at a time that the vehicle stands, or the vehicle neither sinks nor climbs any more until it says so: an
-/// autopilot takes a second or two to be sure, and nothing comes from the air to the ground without sinking.
+/// autopilot takes a second or two to be sure, and nothing comes from the air to the ground without sinking. Where states are missing
+/// it may have sunk meanwhile, and another height tells that it has.
 fn rests(vehicle: &[VehicleState], at_ns: i64) -> bool {
     let later = vehicle.partition_point(|it| it.stamp_ns <= at_ns);
-    let Some(now) = later.checked_sub(1) else { return false };
+    let from_now = later.checked_sub(1).and_then(|now| vehicle.get(now..)).unwrap_or_default();
     let rests = |it: &VehicleState| {
         let [_, _, down_m_s] = it.velocity_ned_m_s;
         it.landed != LandedState::OnGround && down_m_s.abs() <= MAX_RESTING_M_S
     };
-    let mut until_told = vehicle.iter().skip(now).skip_while(|it| rests(it));
-    until_told.next().is_some_and(|it| it.landed == LandedState::OnGround)
+    let resting = from_now.iter().take_while(|it| rests(it)).count();
+    let told = from_now.get(resting).filter(|it| it.landed == LandedState::OnGround);
+    let (Some(told), Some(until_told)) = (told, from_now.get(..=resting)) else { return false };
+    let down_m = |it: &VehicleState| {
+        let [_, _, down_m] = it.position_ned_m;
+        down_m
+    };
+    let is_level = |it: &VehicleState| (down_m(it) - down_m(told)).abs() <= MAX_RISE_M;
+    let mut steps = until_told.iter().zip(until_told.iter().skip(1));
+    until_told.iter().all(is_level)
+        && steps.all(|(one, next)| next.stamp_ns.saturating_sub(one.stamp_ns) < GAP_NS)
 }
 
 /// The newest of some messages, in the order of their stamps, up to a time.
@@ -357,6 +371,23 @@ mod tests {
         // It takes off again.
         flight.vehicle.push(state(7, -0.5, InAir));
         assert_eq!(standing(&flight), [3, 4, 5, 6]);
+    }
+
+    #[test]
+    fn a_hover_before_lost_states_or_at_another_height_is_no_rest_on_the_ground() {
+        use LandedState::{Landing, OnGround};
+        let rest_at = |gap_ns: i64, down_m: f64| {
+            let mut vehicle: Vec<_> = [0, 500_000_000].map(|at| state(at, 0.0, Landing)).into();
+            for it in &mut vehicle {
+                it.position_ned_m = [0.0, 0.0, down_m];
+            }
+            vehicle.push(state(500_000_000 + gap_ns, 0.0, OnGround));
+            rests(&vehicle, 1)
+        };
+        assert!(rest_at(500_000_000, 0.0) && rest_at(999_999_999, -0.15));
+        assert!(!rest_at(1_000_000_000, 0.0));
+        assert!(!rest_at(500_000_000, -0.25) && !rest_at(500_000_000, 3.0));
+        assert!(!rest_at(500_000_000, f64::NAN));
     }
 
     #[test]
