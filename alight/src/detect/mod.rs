@@ -7,6 +7,7 @@ mod queue;
 mod report;
 mod source;
 
+use std::collections::BTreeSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -55,22 +56,31 @@ enum Lens {
     Calibrated(CameraModel),
 }
 
-/// Why markers get no pose although the camera is known; `None` where all have a size.
-fn lack_of_sizes(markers: &[Marker], lens: &Lens) -> Option<String> {
+/// Which markers get no pose although the camera is known, and why; `None` where all have a size. A pad gets its pose all the same.
+fn lack_of_sizes(markers: &[Marker], has_pad: bool, lens: &Lens) -> Option<String> {
     if matches!(lens, Lens::Unknown) {
         return None;
     }
     let without: Vec<_> = markers.iter().filter(|marker| marker.size_m.is_none()).collect();
-    let first = without.first()?;
-    let form = match first.family.id_count() {
+    let form = |marker: &&Marker| match marker.family.id_count() {
         Some(_) => "FAMILY:ID:SIZE_M",
         None => "FAMILY:SIZE_M",
     };
-    let whose = match without.len() == markers.len() {
+    let forms: BTreeSet<&str> = without.iter().map(form).collect();
+    let whose = match !has_pad && without.len() == markers.len() {
         true => String::new(),
-        false => format!(" of `{first}`"),
+        false => {
+            let names: Vec<String> = without.iter().map(|marker| format!("`{marker}`")).collect();
+            format!(" of {}", names.join(", "))
+        }
     };
-    Some(format!("no poses{whose}: the marker has no size ({form})"))
+    let what = match without.len() {
+        0 => return None,
+        1 => "the marker has no size",
+        _ => "the markers have no size",
+    };
+    let forms: Vec<&str> = forms.into_iter().collect();
+    Some(format!("no poses{whose}: {what} ({})", forms.join(", ")))
 }
 
 /// Maximum number of images without a marker that are searched again without the camera.
@@ -114,7 +124,7 @@ impl Examiner {
                 "a pad as a whole is found only by a camera that is known: give --camera or --focal-px; now its markers are found one by one",
             );
         }
-        if let Some(warning) = lack_of_sizes(&args.markers, &lens) {
+        if let Some(warning) = lack_of_sizes(&args.markers, !pads.is_empty(), &lens) {
             write_error(&warning);
         }
         Ok(Self {
@@ -455,15 +465,27 @@ mod tests {
 
     #[test]
     fn markers_without_a_size_are_told_where_a_camera_would_give_poses() {
-        let told = |markers: &[&str], lens: &Lens| {
+        let told_beside = |has_pad: bool, markers: &[&str], lens: &Lens| {
             let markers: Vec<Marker> = markers.iter().map(|it| it.parse().unwrap()).collect();
-            lack_of_sizes(&markers, lens)
+            lack_of_sizes(&markers, has_pad, lens)
         };
+        let told = |markers: &[&str], lens: &Lens| told_beside(false, markers, lens);
         let ideal = Lens::Ideal { focal_px: 1818.0 };
         let any = told(&["apriltag-36h11:*"], &ideal).unwrap();
         assert_eq!(any, "no poses: the marker has no size (FAMILY:ID:SIZE_M)");
         let rings = told(&["aruco-4x4-50:7:0.2", "rings"], &ideal).unwrap();
         assert_eq!(rings, "no poses of `rings`: the marker has no size (FAMILY:SIZE_M)");
+        let both = told(&["aruco-4x4-50:7:0.2", "rings", "stag-hd23:4"], &ideal).unwrap();
+        let forms = "(FAMILY:ID:SIZE_M, FAMILY:SIZE_M)";
+        assert_eq!(
+            both,
+            format!("no poses of `rings`, `stag-hd23:4`: the markers have no size {forms}")
+        );
+        let all = told(&["rings", "stag-hd23:4"], &ideal).unwrap();
+        assert_eq!(all, format!("no poses: the markers have no size {forms}"));
+        let beside_pad = told_beside(true, &["rings"], &ideal).unwrap();
+        assert_eq!(beside_pad, "no poses of `rings`: the marker has no size (FAMILY:SIZE_M)");
+        assert_eq!(told_beside(true, &[], &ideal), None);
         assert_eq!(told(&["apriltag-36h11:*:0.1", "rings:0.1"], &ideal), None);
         assert_eq!(told(&["apriltag-36h11:*"], &Lens::Unknown), None);
         assert_eq!(told(&[], &ideal), None);
