@@ -199,6 +199,7 @@ pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
     refuse_swept(&args.set, &SWEPT).map_err(WrongUse)?;
     let plan = args.plan().map_err(WrongUse)?;
     plan.check()?;
+    plan.check_marker().map_err(WrongUse)?;
     let request = Request { command: this_command(), plan, tapes_in, jobs };
     let mut folder = Folder::claim(&output, replaces)?;
     request.tapes_in.as_deref().map_or(Ok(()), results::claim_for_recordings)?;

@@ -8,7 +8,7 @@ use node::ConfigError;
 use super::kind::{Kind, LIAR};
 use crate::landing::configuration;
 use crate::landing::fault::{START_ANGLE, drawn, drawn_angle};
-use crate::landing::plan::{Swept, Values, set_option, told_settings};
+use crate::landing::plan::{Swept, Values, refuse_other_marker, set_option, told_settings};
 
 /// Durations that are drawn, in seconds; infinity is for ever.
 pub const DURATIONS_S: [f64; 4] = [0.5, 2.0, 5.0, f64::INFINITY];
@@ -143,6 +143,16 @@ impl Plan {
                 limit: format!("a fault cannot begin at {begins_m} m, over the start; choose a lower `--height`"),
             })
         })
+    }
+
+    /// Refuses flights whose controller looks for another marker than the pad has, which is the same in all.
+    ///
+    /// # Errors
+    /// When they are such flights, with what to do about it.
+    pub fn check_marker(&self) -> Result<(), String> {
+        let Planned { simulator, controller, .. } = self.flight(self.seed);
+        let remedy = "set both, `--set simulator.pad.marker=FAMILY:ID:SIZE_M` and `--set controller.marker=FAMILY:ID`";
+        refuse_other_marker(&simulator, &controller, remedy)
     }
 
     /// Its flights.
@@ -331,6 +341,22 @@ mod tests {
         names.sort_unstable();
         names.dedup();
         assert_eq!(names.len(), 39);
+    }
+
+    #[test]
+    fn a_pad_whose_marker_the_controller_does_not_look_for_is_refused() {
+        let told = |set: &[&str]| {
+            let set = set.iter().map(|&it| it.to_owned()).collect();
+            Plan { set, ..Plan::default() }.check_marker()
+        };
+        assert_eq!(told(&[]), Ok(()));
+        let pad = "simulator.pad.marker=apriltag-36h11:7:0.15";
+        let alone = told(&[pad]).unwrap_err();
+        assert!(alone.contains("looks for rings") && alone.contains("--set"), "{alone}");
+        let other = told(&["controller.marker=apriltag-36h11"]).unwrap_err();
+        assert!(other.contains("looks for apriltag-36h11"), "{other}");
+        assert_eq!(told(&[pad, "controller.marker=apriltag-36h11:7"]), Ok(()));
+        assert!(told(&["simulator.pad.markers=a4"]).unwrap_err().contains("one marker"));
     }
 
     #[test]

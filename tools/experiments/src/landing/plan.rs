@@ -243,27 +243,8 @@ impl Plan {
         let mut flights = self.flights();
         flights.retain(|planned| planned.seed == self.seed);
         flights.iter().try_for_each(|planned| {
-            let simulator =
-                configuration::<simulator::Config>("simulator", &planned.change.simulator);
-            let controller =
-                configuration::<controller::Config>("controller", &planned.change.controller);
-            let (Ok(simulator), Ok(controller)) = (simulator, controller) else { return Ok(()) };
-            let (pad, wanted) = (simulator.settings.pad, controller.settings.marker);
-            if !pad.markers.is_empty() {
-                return Err(format!(
-                    "`simulator.pad.markers` = {}: flights in lock-step have a pad of one marker; \
-                     take `alight land --pad` for one of several",
-                    pad.markers
-                ));
-            }
-            if is_of(&pad.marker, &wanted) {
-                return Ok(());
-            }
-            Err(format!(
-                "the pad has the marker {}, and the controller looks for {wanted}: \
-                 `--marker FAMILY:ID:SIZE_M` sets both",
-                pad.marker
-            ))
+            let Change { simulator, controller, .. } = &planned.change;
+            refuse_other_marker(simulator, controller, "`--marker FAMILY:ID:SIZE_M` sets both")
         })
     }
 
@@ -386,6 +367,33 @@ impl Planned {
             self.row, self.seed, self.options, self.seed
         )
     }
+}
+
+/// Refuses a flight with these settings if its controller looks for another marker than the pad has; `remedy` says how to set both. What
+/// a service refuses anyway is not told again.
+pub(crate) fn refuse_other_marker(
+    simulator: &[String],
+    controller: &[String],
+    remedy: &str,
+) -> Result<(), String> {
+    let simulator = configuration::<simulator::Config>("simulator", simulator);
+    let controller = configuration::<controller::Config>("controller", controller);
+    let (Ok(simulator), Ok(controller)) = (simulator, controller) else { return Ok(()) };
+    let (pad, wanted) = (simulator.settings.pad, controller.settings.marker);
+    if !pad.markers.is_empty() {
+        return Err(format!(
+            "`simulator.pad.markers` = {}: the flights of experiments have a pad of one marker; \
+             take `alight land --pad` for one of several",
+            pad.markers
+        ));
+    }
+    if is_of(&pad.marker, &wanted) {
+        return Ok(());
+    }
+    Err(format!(
+        "the pad has the marker {}, and the controller looks for {wanted}: {remedy}",
+        pad.marker
+    ))
 }
 
 /// Whether the pad's marker is the one that a controller looks for, `FAMILY` or `FAMILY:ID`.
