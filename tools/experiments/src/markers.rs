@@ -12,7 +12,7 @@ use markers::{Family, Marker};
 use crate::figures::{self, FIGURES};
 use crate::frame_spec::FrameRenderer;
 use crate::photographs;
-use crate::record::{self, ALL_AT_ONCE, FOLLOWING, Ids, OURS, Record};
+use crate::record::{self, ALL_AT_ONCE, FOLLOWING, Ids, OURS};
 use crate::report;
 use crate::results;
 use crate::set::{MARKERS, SIZE_M, Set};
@@ -266,9 +266,8 @@ fn run_photographs(folder: &Path, results: &Path, wanted: &[String]) -> anyhow::
         let detector = entry?.file_name().to_string_lossy().into_owned();
         for (_, name) in photographs::FAMILIES {
             let file = photographs_file(results, &detector, name);
-            let Ok(text) = std::fs::read_to_string(file) else { continue };
-            let records: Vec<Record> =
-                text.lines().map(serde_json::from_str).collect::<Result<_, _>>()?;
+            let Ok(text) = std::fs::read_to_string(&file) else { continue };
+            let records = record::parse(&file, &text)?;
             let recall = photographs::recall(folder, name, &records)?;
             recalls.entry(name.to_owned()).or_default().insert(detector.clone(), recall);
         }

@@ -25,6 +25,7 @@ pub const FOLLOWING: &str = "alight-following";
 
 /// The result for one frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Record {
     /// The frame's file.
     pub image: String,
@@ -36,6 +37,7 @@ pub struct Record {
 
 /// A detection.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Found {
     /// Its family.
     pub family: String,
@@ -222,6 +224,18 @@ pub fn write<'a>(path: &Path, records: impl IntoIterator<Item = &'a Record>) -> 
     std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))
 }
 
+/// The results in a file's text. A field of another name is refused: what it says would be missing without a word.
+///
+/// # Errors
+/// When a line is no result, with the file and the line.
+pub fn parse(path: &Path, text: &str) -> anyhow::Result<Vec<Record>> {
+    let parsed = |(at, line): (usize, &str)| {
+        let place = || format!("line {} of {}", at + 1, path.display());
+        serde_json::from_str(line).with_context(place)
+    };
+    text.lines().enumerate().map(parsed).collect()
+}
+
 /// The results of a detector with the frames of a folder; `None` if there are none.
 ///
 /// # Errors
@@ -229,9 +243,7 @@ pub fn write<'a>(path: &Path, records: impl IntoIterator<Item = &'a Record>) -> 
 pub fn join(path: &Path, folder: &Path) -> anyhow::Result<Option<Vec<(StoredFrame, Record)>>> {
     let Ok(text) = std::fs::read_to_string(path) else { return Ok(None) };
     let mut records = std::collections::HashMap::new();
-    for line in text.lines() {
-        let record: Record =
-            serde_json::from_str(line).with_context(|| path.display().to_string())?;
+    for record in parse(path, &text)? {
         records.insert(record.image.clone(), record);
     }
     let joined = store::frames(folder)?.into_iter().map(|frame| {
@@ -241,4 +253,28 @@ pub fn join(path: &Path, folder: &Path) -> anyhow::Result<Option<Vec<(StoredFram
         Ok((frame, record))
     });
     joined.collect::<anyhow::Result<_>>().map(Some)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_field_of_another_name_is_refused_with_its_name_and_place() {
+        let line = |name: &str| {
+            let found = format!(
+                "{{\"family\":\"rings\",\"id\":null,\"centre_px\":[1,2],\"{name}\":[1,0,1]}}"
+            );
+            format!("{{\"image\":\"a.png\",\"ms\":1.0,\"found\":[{found}]}}")
+        };
+        let path = Path::new("mine.jsonl");
+        let good = line("centre_covariance_px2");
+        let records = parse(path, &good).unwrap();
+        assert_eq!(records[0].found[0].centre_covariance_px2, Some([1.0, 0.0, 1.0]));
+        let text = format!("{good}\n{}\n", line("covariance_px2"));
+        let told = format!("{:#}", parse(path, &text).unwrap_err());
+        assert!(told.contains("line 2 of mine.jsonl"), "{told}");
+        assert!(told.contains("unknown field `covariance_px2`"), "{told}");
+        assert!(parse(path, "{\"image\":\"a.png\",\"ms\":1,\"found\":[],\"time_ms\":1}").is_err());
+    }
 }
