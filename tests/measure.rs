@@ -127,7 +127,7 @@ async fn table(names: &[String]) -> anyhow::Result<()> {
             print("onboard", trial::onboard(seed).await?);
         }
         if is_wanted("setpoint") {
-            print("frame to setpoint without the search", setpoint::run(GOOD, seed).await?);
+            print("exposure to setpoint without the search", setpoint::run(GOOD, seed).await?);
         }
         if is_wanted("good") {
             print("ground, 20 Mbit/s", trial::ground(GOOD, seed, camera).await?);

@@ -1,5 +1,5 @@
 //! Logs a flight's phases, alarms, warnings and detector changes, and counts setpoints and rejected
-//! detections for the health report, with the latency from a frame's stamp to the setpoint.
+//! detections for the health report, with the latency from a frame's exposure to the setpoint.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,8 +12,9 @@ use node::HealthCounters;
 
 use crate::refusals::Warning;
 
-/// The latency from a frame's stamp to the setpoint that used it, as health and status name it.
-const STAMP_TO_SETPOINT: &str = "stamp to setpoint";
+/// The latency from the middle of a frame's exposure, its stamp, to the setpoint that used it, as health, `alight land` and the report
+/// name it.
+const EXPOSURE_TO_SETPOINT: &str = "exposure to setpoint";
 
 /// Writes the log and counts what the health report shows.
 #[derive(Debug)]
@@ -102,12 +103,12 @@ impl Journal {
     /// Records the latency of a setpoint or landing target that used the frame with this stamp.
     pub fn used_frame(&self, now_ns: i64, stamp_ns: i64) {
         let age_ns = now_ns.saturating_sub(stamp_ns).max(0);
-        self.health.latency(STAMP_TO_SETPOINT, Duration::from_nanos(age_ns.unsigned_abs()));
+        self.health.latency(EXPOSURE_TO_SETPOINT, Duration::from_nanos(age_ns.unsigned_abs()));
     }
 
-    /// Median and 99th percentile from a frame's stamp to the setpoint that used it, in milliseconds.
+    /// Median and 99th percentile from a frame's exposure to the setpoint that used it, in milliseconds.
     pub fn latency_ms(&self) -> Option<[f64; 2]> {
-        self.health.percentiles(STAMP_TO_SETPOINT)
+        self.health.percentiles(EXPOSURE_TO_SETPOINT)
     }
 
     /// Counts a setpoint that was sent or refused.

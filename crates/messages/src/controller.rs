@@ -195,7 +195,7 @@ pub struct ControllerStatus {
     pub finished: bool,
     /// Detections of the marker that were used.
     pub detections_used: u64,
-    /// Median and 99th percentile from a frame's stamp to the setpoint that used it, in milliseconds.
+    /// Median and 99th percentile from a frame's exposure to the setpoint that used it, in milliseconds.
     pub latency_ms: Option<[f64; 2]>,
     /// Time after which the autopilot stops when setpoints stop, in seconds; none while it is not known.
     pub setpoint_timeout_s: Option<f64>,
