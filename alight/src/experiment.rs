@@ -1,5 +1,5 @@
 //! `alight experiment`: the options of its landings (wind, latency, height, vision, faults) and of its rendered markers (sets, families,
-//! processing), the run of either, and the report printed.
+//! processing), the run of either, the comparison of two runs of landings (`compare`), and the report printed.
 
 use std::ops::ControlFlow;
 use std::path::PathBuf;

@@ -38,7 +38,8 @@ pub(crate) struct LandArgs {
     #[arg(long, value_name = "SERVICE.KEY=VALUE")]
     set: Vec<String>,
     /// Marker to land on, on the simulated pad as well: FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family
-    /// without ids (rings; the thesis' own detection of them, `rings-thesis`, is kept for comparison and finds few of ordinary cameras).
+    /// without ids (rings; the thesis' own detection of them, `rings-thesis`, is kept for comparison and finds few markers in pictures of
+    /// ordinary cameras).
     #[arg(long, value_name = "MARKER")]
     marker: Option<Marker>,
     /// Pad of several markers to land on, in the simulator as well: the built-in `a4`, or a TOML file.

@@ -11,8 +11,8 @@ use markers::Marker;
 #[command(group(ArgGroup::new("what to find").args(["markers", "pads"]).required(true).multiple(true)))]
 pub(crate) struct DetectArgs {
     /// Marker to find: `FAMILY:ID[:SIZE_M]`, `FAMILY:*[:SIZE_M]` for all ids, or `FAMILY[:SIZE_M]` for a family without ids (rings; the
-    /// thesis' own detection of them, `rings-thesis`, is kept for comparison and finds few of ordinary cameras). A wrong name lists all
-    /// families. May be repeated. One of these or `--pad` is needed.
+    /// thesis' own detection of them, `rings-thesis`, is kept for comparison and finds few markers in pictures of ordinary cameras). A wrong
+    /// name lists all families. May be repeated. One of these or `--pad` is needed.
     #[arg(long = "marker", value_name = "MARKER")]
     pub(super) markers: Vec<Marker>,
     /// Pad to find, whose markers are solved together: the built-in `a4`, or a TOML file. It needs a camera,

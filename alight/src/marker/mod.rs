@@ -23,7 +23,8 @@ pub(crate) use sheet::{Paper, Sheet, SheetError};
 #[derive(Args, Clone, Debug)]
 pub(crate) struct MarkerArgs {
     /// The marker: FAMILY:ID, or FAMILY for a family without ids (rings). A wrong name lists all families; `rings-thesis` is the thesis' own
-    /// detection of the same rings, kept for comparison, and finds few markers of ordinary cameras.
+    /// detection of the same rings, kept for comparison, and finds few markers in pictures of ordinary
+    /// cameras.
     #[arg(required_unless_present = "pad")]
     marker: Option<Marker>,
     /// A pad of several markers instead of one marker: the built-in `a4`, or a TOML file.
