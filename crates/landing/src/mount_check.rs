@@ -109,7 +109,7 @@ const LEAN_S: f64 = 5.0;
 /// Lean above which the wind is strong, in radians. In 8 m/s of wind SITL's vehicle leans by 0.37 to 0.5 rad, and the place of ArduPilot's estimate
 /// wanders by 0.1 m, its heading by 3 degrees, within seconds: descents made roll errors of up to 4.4 deviations of that.
 const STRONG_LEAN_RAD: f64 = 0.28;
-/// By how many times more deviations an angle must be off to be told in such wind, per radian above that lean.
+/// By how many times more deviations an angle, focal length or size must be off to be told in such wind, per radian above that lean.
 const STRICTER_PER_RAD: f64 = 6.0;
 /// Factor on the random walks above which nothing new is told: what moves the pad then is something else. It is smaller for
 /// focal length and size, which show in less motion than the mount.
@@ -449,13 +449,19 @@ impl MountCheck {
         let is_calm_for_ratios = is_calm(MAX_TOLD_RATIO_NOISE_SCALE);
         let is_calm = is_calm(MAX_TOLD_NOISE_SCALE);
         let stricter = 1.0 + STRICTER_PER_RAD * fmax(self.lean_rad - STRONG_LEAN_RAD, 0.0);
-        for (suspicion, angle) in [(&mut self.roll, roll), (&mut self.pitch, pitch)] {
+        let deviations = |suspicion: &Suspicion, min: f64| {
             // What was found in calmer air stays found.
-            let stricter = if suspicion.is_told { 1.0 } else { stricter };
-            suspicion.follow(angle, stricter * MIN_DEVIATIONS, MIN_ANGLE_RAD, is_calm);
+            if suspicion.is_told { min } else { stricter * min }
+        };
+        for (suspicion, angle) in [(&mut self.roll, roll), (&mut self.pitch, pitch)] {
+            let min_deviations = deviations(suspicion, MIN_DEVIATIONS);
+            suspicion.follow(angle, min_deviations, MIN_ANGLE_RAD, is_calm);
         }
-        self.focal.follow(focal, MIN_RATIO_DEVIATIONS, MIN_RATIO, is_calm_for_ratios);
-        self.size.follow(size, MIN_RATIO_DEVIATIONS, MIN_SIZE_RATIO, is_calm_for_ratios);
+        let ratios = [(&mut self.focal, focal, MIN_RATIO), (&mut self.size, size, MIN_SIZE_RATIO)];
+        for (suspicion, ratio, min) in ratios {
+            let min_deviations = deviations(suspicion, MIN_RATIO_DEVIATIONS);
+            suspicion.follow(ratio, min_deviations, min, is_calm_for_ratios);
+        }
     }
 }
 
