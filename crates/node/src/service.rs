@@ -8,9 +8,10 @@ use std::path::PathBuf;
 use anyhow::Context;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
+use tracing_subscriber::Layer;
+use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
-use tracing_subscriber::{EnvFilter, Layer};
 
 use crate::config::Layers;
 use crate::denied::{DeniedCounter, DeniedFilter};
@@ -144,17 +145,21 @@ where
     result
 }
 
-/// Starts logging to standard error, at `default_level` unless `ALIGHT_LOG` sets another.
+/// What is logged of Zenoh. It warns about every failed attempt to listen at or connect to the rendezvous, which are expected here, and
+/// about messages in flight when their sender's session closes ("Route data with unknown scope", "Route query with unknown scope";
+/// eclipse-zenoh/zenoh issues 980 and 1050, pull request 2524). Such a query gets an empty reply, and a command without a recipient is
+/// sent again.
+const ZENOH_LEVELS: &str = "zenoh=error,zenoh::net::routing::dispatcher::pubsub=off,zenoh::net::routing::dispatcher::queries=off,zenoh::api::session=off,zenoh_transport=off,zenoh_link=error,zenoh_link_tls=error,zenoh_shm=error";
+
+/// Starts logging to standard error, at `default_level` unless `ALIGHT_LOG` sets another: a level (`debug`), or levels by module
+/// (`info,controller=debug`).
 pub fn start_logging(default_level: &str) {
-    let ours = std::env::var("ALIGHT_LOG").unwrap_or_else(|_| default_level.to_owned());
-    // Zenoh warns about every failed attempt to listen at or connect to the rendezvous, which are expected
-    // here. It also warns about messages in flight when their sender's session closes ("Route data with
-    // unknown scope", "Route query with unknown scope"; eclipse-zenoh/zenoh issues 980 and 1050, pull request
-    // 2524). Such a query gets an empty reply, and a command without a recipient is sent again.
-    let filter = EnvFilter::try_new(format!(
-        "zenoh=error,zenoh::net::routing::dispatcher::pubsub=off,zenoh::net::routing::dispatcher::queries=off,zenoh::api::session=off,zenoh_transport=off,zenoh_link=error,zenoh_link_tls=error,zenoh_shm=error,{ours}"
-    ))
-    .unwrap_or_else(|_| EnvFilter::new("info,zenoh=error,zenoh_transport=off"));
+    let wanted = std::env::var("ALIGHT_LOG").ok().filter(|level| !level.is_empty());
+    let level = wanted.as_deref().unwrap_or(default_level);
+    let (filter, problem) = match levels(level) {
+        Ok(filter) => (filter, None),
+        Err(problem) => (levels(default_level).unwrap_or_default(), Some(problem)),
+    };
     let log = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
@@ -165,6 +170,22 @@ pub fn start_logging(default_level: &str) {
     let denied = DeniedCounter.with_filter(DeniedFilter);
     // A subscriber that is installed already (by a test, say) stays.
     drop(tracing_subscriber::registry().with(log).with(denied).try_init());
+    if let Some(problem) = problem {
+        tracing::warn!(
+            ALIGHT_LOG = level,
+            %problem,
+            "Logging at {default_level:?}: what is set is no level (error, warn, info, debug, trace, off), nor levels by module (info,controller=debug)"
+        );
+    }
+}
+
+/// These levels over those of Zenoh.
+fn levels(ours: &str) -> anyhow::Result<Targets> {
+    // A word that is no level would be taken for a module of which all is logged, and nothing of the others.
+    for level in ours.split(',').filter(|entry| !entry.contains('=')) {
+        level.parse::<LevelFilter>().with_context(|| format!("{level:?}"))?;
+    }
+    Ok(format!("{ZENOH_LEVELS},{ours}").parse()?)
 }
 
 /// Sets the number of Zenoh's threads by re-executing this program with `ZENOH_RUNTIME` in its environment,
@@ -198,6 +219,22 @@ pub fn own_program() -> PathBuf {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn levels_are_set_by_module_over_those_of_zenoh() -> Result<(), Box<dyn std::error::Error>> {
+        use tracing::Level;
+        let info = levels("info")?;
+        assert!(info.would_enable("controller::service", &Level::INFO));
+        assert!(!info.would_enable("controller::service", &Level::DEBUG));
+        assert!(!info.would_enable("zenoh::net::runtime", &Level::WARN));
+        assert!(!info.would_enable("zenoh::api::session", &Level::ERROR));
+        let debug = levels("info,controller=debug,zenoh=warn")?;
+        assert!(debug.would_enable("controller::service", &Level::DEBUG));
+        assert!(!debug.would_enable("detector::service", &Level::DEBUG));
+        assert!(debug.would_enable("zenoh::net::runtime", &Level::WARN));
+        assert!(levels("loud").is_err() && levels("info,controller=loud").is_err());
+        Ok(())
+    }
 
     #[test]
     fn an_ignored_signal_is_told_from_the_status_of_the_process() {
