@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::builder::FalseyValueParser;
 use clap::{Args, ValueEnum};
+use markers::Marker;
 use node::network::variable;
 use node::{Network, ZenohSource};
 
@@ -144,6 +145,16 @@ pub(crate) fn flight_setting(text: &str) -> Result<String, String> {
         Ok(text.to_owned())
     } else {
         Err("write simulator.KEY=VALUE or controller.KEY=VALUE".to_owned())
+    }
+}
+
+/// A marker that can be on a pad.
+pub(crate) fn sized_marker(text: &str) -> Result<Marker, String> {
+    let marker: Marker = text.parse().map_err(|problem| format!("{problem}"))?;
+    let is_any = marker.id.is_none() && marker.family.id_count().is_some();
+    match marker.size_m {
+        Some(_) if !is_any => Ok(marker),
+        _ => Err("write FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family without ids".to_owned()),
     }
 }
 

@@ -20,7 +20,7 @@ use experiments::set::{Set, families};
 use experiments::sets::Variant;
 use markers::Marker;
 
-use crate::args::{Format, WrongUse, flight_setting};
+use crate::args::{Format, WrongUse, flight_setting, sized_marker};
 use crate::children::this_command;
 use crate::faults::{self, FaultsArgs};
 use crate::interruption::{FLIGHTS_END, Interruption};
@@ -175,16 +175,6 @@ pub(crate) fn run(args: ExperimentArgs) -> anyhow::Result<ExitCode> {
         Experiment::Landing(args) => run_landing(args),
         Experiment::Faults(args) => faults::run(args),
         Experiment::Compare(args) => run_compare(&args),
-    }
-}
-
-/// A marker that can be on a pad.
-fn sized_marker(text: &str) -> Result<Marker, String> {
-    let marker: Marker = text.parse().map_err(|problem| format!("{problem}"))?;
-    let is_any = marker.id.is_none() && marker.family.id_count().is_some();
-    match marker.size_m {
-        Some(_) if !is_any => Ok(marker),
-        _ => Err("write FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family without ids".to_owned()),
     }
 }
 

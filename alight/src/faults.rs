@@ -14,8 +14,9 @@ use experiments::faults::{self, Findings};
 use experiments::landing::Watch;
 use experiments::landing::plan::{Values, refuse_swept};
 use experiments::results::{self, Folder};
+use markers::Marker;
 
-use crate::args::{WrongUse, flight_setting};
+use crate::args::{WrongUse, flight_setting, sized_marker};
 use crate::children::this_command;
 use crate::interruption::{FLIGHTS_END, Interruption};
 use crate::progress::Steps;
@@ -55,6 +56,10 @@ pub(crate) struct FaultsArgs {
     /// A second fault at the same time: a kind, or `none` [default: any, in a fifth of the flights].
     #[arg(long, value_name = "NAME")]
     with: Option<String>,
+    /// Marker to land on, of pad, detector and controller together: FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family without ids. In
+    /// lock-step its detector has the errors of `rings` whatever the marker; with `--real-time` it is searched for in rendered frames.
+    #[arg(long, value_name = "MARKER", value_parser = sized_marker)]
+    marker: Option<Marker>,
     /// One further setting: simulator.KEY=VALUE or controller.KEY=VALUE. May be repeated.
     #[arg(long, value_name = "SERVICE.KEY=VALUE", value_parser = flight_setting)]
     set: Vec<String>,
@@ -118,6 +123,7 @@ impl FaultsArgs {
             durations_s: self.durations_s,
             winds_m_s: self.wind,
             second,
+            marker: self.marker,
             set: self.set,
             real_time: self.real_time,
         })

@@ -157,7 +157,7 @@ impl<'a> RealFlight<'a> {
         flight.start(Part::World, &world)?;
         for part in [Part::Camera, Part::Detector, Part::Controller, Part::Bridge] {
             if part != Part::Camera || flight.has_own_camera() {
-                flight.start(part, &flight.settings(part, false))?;
+                flight.start(part, &flight.settings(part, false)?)?;
             }
         }
         Ok(flight)
@@ -194,10 +194,10 @@ impl<'a> RealFlight<'a> {
         self.planned.faults.iter().any(|fault| is_it(fault.kind))
     }
 
-    fn settings(&self, part: Part, again: bool) -> Vec<String> {
+    fn settings(&self, part: Part, again: bool) -> anyhow::Result<Vec<String>> {
         let text =
             |settings: &[&str]| settings.iter().map(|&s| s.to_owned()).collect::<Vec<String>>();
-        match part {
+        Ok(match part {
             Part::World => Vec::new(),
             Part::Camera => {
                 let seed = format!("seed={}", self.planned.seed);
@@ -205,7 +205,7 @@ impl<'a> RealFlight<'a> {
                 settings.extend(text(&["id=camera", "vehicle=reported", &seed]));
                 settings
             }
-            Part::Detector => Vec::new(),
+            Part::Detector => self.planned.detector()?,
             Part::Controller => {
                 let mut settings = self.planned.controller.clone();
                 settings.push(format!("autopilot.address=udpin:127.0.0.1:{}", self.port));
@@ -213,7 +213,7 @@ impl<'a> RealFlight<'a> {
                 settings
             }
             Part::Bridge => text(&["ground=udpout:127.0.0.1:9"]),
-        }
+        })
     }
 
     fn start(&mut self, part: Part, settings: &[String]) -> anyhow::Result<()> {
@@ -366,7 +366,7 @@ impl<'a> RealFlight<'a> {
             | Kind::DetectorStopped
             | Kind::CameraStopped
             | Kind::BridgeStopped => self.signal(part, Signal::CONT),
-            _ => self.start(part, &self.settings(part, true)),
+            _ => self.start(part, &self.settings(part, true)?),
         }
     }
 
@@ -496,6 +496,7 @@ mod tests {
     use super::*;
     use experiments::faults::plan::Plan;
     use messages::Touchdown;
+    use node::Layers;
 
     #[test]
     fn a_process_that_ends_before_the_landing_is_told_with_its_last_words() {
@@ -518,6 +519,30 @@ mod tests {
         });
         let told = told.unwrap().unwrap();
         assert!(told.contains("controller ended") && told.contains("`nonsense`"), "{told}");
+    }
+
+    #[test]
+    fn every_process_has_the_marker_that_was_asked_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let name = "apriltag-36h11:7:0.2";
+        let marker = name.parse().ok();
+        let kinds = vec![Kind::CameraKilled];
+        let planned = Plan { flights: 1, marker, kinds, ..Plan::default() }.flights().remove(0);
+        let flown = crate::runtime::block_on(async {
+            let proxy = Proxy::start(1, 0, 9).await?;
+            let flight = RealFlight::waiting(&planned, folder.path(), [0; 3], proxy);
+            let of = |part| flight.settings(part, true);
+            anyhow::Ok([of(Part::Detector)?, of(Part::Camera)?, of(Part::Controller)?])
+        });
+        let [detector, camera, controller] = flown.unwrap().unwrap();
+        let detector = Layers { file: None, set: detector }.load::<detector::Config>().unwrap();
+        assert_eq!(detector.settings.markers, [name]);
+        for set in [camera, settings_of_world(&planned)] {
+            let simulator = Layers { file: None, set }.load::<simulator::Config>().unwrap();
+            assert_eq!(simulator.settings.pad.marker, name);
+        }
+        let controller = Layers { file: None, set: controller }.load::<controller::Config>();
+        assert_eq!(controller.unwrap().settings.marker, "apriltag-36h11:7");
     }
 
     #[test]

@@ -45,6 +45,17 @@ fn a_fault_that_is_over_leaves_a_landing() {
 }
 
 #[test]
+fn any_marker_is_landed_on() {
+    for name in ["apriltag-36h11:7:0.2", "aruco-4x4-50:3:0.2"] {
+        let marker = Some(name.parse().unwrap());
+        let outcome = &fly_all(&Plan { marker, ..one(Kind::DetectorKilled, 5.0, 0.5) })[0];
+        assert_eq!(outcome.ending, Ending::Landed, "{outcome:?}");
+        assert!(outcome.error_m.is_some_and(|error| error < 0.1), "{outcome:?}");
+        assert!(outcome.settings.contains(name) && outcome.command.contains(name), "{outcome:?}");
+    }
+}
+
+#[test]
 fn without_a_controller_the_vehicle_is_followed_to_its_rest() {
     let outcome = &fly_all(&one(Kind::ControllerKilled, 8.0, f64::INFINITY))[0];
     assert_eq!((outcome.ending, outcome.touches), (Ending::Hovers, 0), "{outcome:?}");

@@ -33,7 +33,7 @@ pub struct Outcome {
     pub for_s: Vec<Option<f64>>,
     /// Mean wind, in m/s.
     pub wind_m_s: f64,
-    /// The guidance and the further settings.
+    /// The guidance, the marker where one was asked for, and the further settings.
     pub settings: String,
     /// The version of the program that flew it.
     pub program: String,

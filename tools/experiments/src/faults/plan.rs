@@ -3,6 +3,7 @@
 
 use std::path::PathBuf;
 
+use markers::Marker;
 use node::ConfigError;
 
 use super::kind::{Kind, LIAR};
@@ -38,6 +39,8 @@ pub struct Plan {
     pub winds_m_s: Vec<f64>,
     /// The second fault.
     pub second: Second,
+    /// The marker of pad, detector and controller, instead of the configured ones.
+    pub marker: Option<Marker>,
     /// Further settings, `simulator.KEY=VALUE` or `controller.KEY=VALUE`.
     pub set: Vec<String>,
     /// True when it is flown with real processes.
@@ -65,6 +68,7 @@ impl Default for Plan {
             durations_s: Vec::new(),
             winds_m_s: Vec::new(),
             second: Second::Drawn,
+            marker: None,
             set: Vec::new(),
             real_time: false,
         }
@@ -116,6 +120,8 @@ pub struct Planned {
     pub simulator: Vec<String>,
     /// Settings of the controller.
     pub controller: Vec<String>,
+    /// The marker that was asked for.
+    marker: Option<Marker>,
     /// Further settings.
     set: Vec<String>,
     /// What its command needs beside what is drawn.
@@ -128,6 +134,8 @@ impl Plan {
     /// # Errors
     /// The first setting that a service refuses, or the start that is too low.
     pub fn check(&self) -> Result<(), ConfigError> {
+        // The pad is the same in all.
+        configuration::<detector::Config>("detector", &self.flight(self.seed).detector()?)?;
         self.flights().iter().try_for_each(|planned| {
             let simulated =
                 configuration::<simulator::Config>("simulator", &planned.simulator)?.settings;
@@ -151,8 +159,7 @@ impl Plan {
     /// When they are such flights, with what to do about it.
     pub fn check_marker(&self) -> Result<(), String> {
         let Planned { simulator, controller, .. } = self.flight(self.seed);
-        let remedy = "set both, `--set simulator.pad.marker=FAMILY:ID:SIZE_M` and `--set controller.marker=FAMILY:ID`";
-        refuse_other_marker(&simulator, &controller, remedy)
+        refuse_other_marker(&simulator, &controller)
     }
 
     /// Its flights.
@@ -195,6 +202,7 @@ impl Plan {
             faults: std::iter::once(first).chain(second).collect(),
             simulator: Vec::new(),
             controller: Vec::new(),
+            marker: self.marker,
             set: self.set.clone(),
             options: self.options(),
         };
@@ -210,6 +218,9 @@ impl Plan {
             let text = |s: &f64| if s.is_finite() { s.to_string() } else { "ever".to_owned() };
             let durations: Vec<String> = self.durations_s.iter().map(text).collect();
             options.push_str(&format!(" --for {}", durations.join(",")));
+        }
+        if let Some(marker) = &self.marker {
+            options.push_str(&format!(" --marker {marker}"));
         }
         for setting in &self.set {
             options.push_str(&set_option(setting));
@@ -249,18 +260,32 @@ impl Planned {
         self.controller.extend(self.given("controller"));
     }
 
-    /// The further settings of a service, which come after those that are drawn.
+    /// What was asked for of simulator or controller, which comes after what is drawn: the marker, then the further settings.
     pub fn given(&self, service: &str) -> Vec<String> {
+        let marker = self.marker.as_ref().and_then(|marker| match service {
+            "simulator" => Some(format!("pad.marker=\"{marker}\"")),
+            "controller" => Some(format!("marker=\"{}\"", marker.name())),
+            _ => None,
+        });
         let of_service = |setting: &String| {
             let (owner, rest) = setting.split_once('.')?;
             (owner == service).then(|| rest.to_owned())
         };
-        self.set.iter().filter_map(of_service).collect()
+        marker.into_iter().chain(self.set.iter().filter_map(of_service)).collect()
     }
 
-    /// Its guidance and further settings, in a word for each.
+    /// Settings of the detector: it looks for the marker that is on the pad, whichever option has put it there.
+    ///
+    /// # Errors
+    /// When a setting of the simulator is invalid.
+    pub fn detector(&self) -> Result<Vec<String>, ConfigError> {
+        let simulated = configuration::<simulator::Config>("simulator", &self.simulator)?.settings;
+        Ok(vec![format!("markers=[\"{}\"]", simulated.pad.marker)])
+    }
+
+    /// Its guidance, the marker where one was asked for, and the further settings, in a word for each.
     pub fn settings(&self) -> String {
-        told_settings(None, &self.set)
+        told_settings(self.marker.as_ref(), &self.set)
     }
 
     /// Names of its faults.
@@ -352,11 +377,42 @@ mod tests {
         assert_eq!(told(&[]), Ok(()));
         let pad = "simulator.pad.marker=apriltag-36h11:7:0.15";
         let alone = told(&[pad]).unwrap_err();
-        assert!(alone.contains("looks for rings") && alone.contains("--set"), "{alone}");
+        assert!(alone.contains("looks for rings") && alone.contains("--marker"), "{alone}");
         let other = told(&["controller.marker=apriltag-36h11"]).unwrap_err();
         assert!(other.contains("looks for apriltag-36h11"), "{other}");
         assert_eq!(told(&[pad, "controller.marker=apriltag-36h11:7"]), Ok(()));
         assert!(told(&["simulator.pad.markers=a4"]).unwrap_err().contains("one marker"));
+    }
+
+    #[test]
+    fn a_marker_is_that_of_pad_controller_and_detector() {
+        for (name, family) in [("apriltag-36h11:7:0.2", "apriltag-36h11:7"), ("rings:0.3", "rings")]
+        {
+            let plan = Plan { marker: name.parse().ok(), flights: 1, ..Plan::default() };
+            assert_eq!(plan.check_marker(), Ok(()));
+            assert!(plan.check().is_ok());
+            let planned = plan.flights().remove(0);
+            let pad = format!("pad.marker=\"{name}\"");
+            assert_eq!(planned.simulator.iter().filter(|it| **it == pad).count(), 1);
+            assert_eq!(planned.given("simulator"), [pad]);
+            assert_eq!(planned.given("controller"), [format!("marker=\"{family}\"")]);
+            assert!(planned.controller.ends_with(&planned.given("controller")));
+            assert_eq!(planned.detector().unwrap(), [format!("markers=[\"{name}\"]")]);
+            assert!(planned.command().contains(&format!(" --marker {name}")), "{planned:?}");
+            assert!(planned.settings().contains(&format!(" marker={name}")), "{planned:?}");
+        }
+    }
+
+    #[test]
+    fn a_detector_looks_for_the_marker_that_further_settings_put_on_the_pad() {
+        let set = ["simulator.pad.marker=aruco-4x4-50:3:0.2", "controller.marker=aruco-4x4-50:3"];
+        let plan = Plan { set: set.map(str::to_owned).to_vec(), ..Plan::default() };
+        let planned = plan.flights().remove(0);
+        assert_eq!(planned.detector().unwrap(), ["markers=[\"aruco-4x4-50:3:0.2\"]"]);
+        let usual = Plan::default().flights().remove(0).detector().unwrap();
+        let usual = configuration::<detector::Config>("detector", &usual).unwrap().settings;
+        let configured = configuration::<detector::Config>("detector", &[]).unwrap().settings;
+        assert_eq!(usual.markers, configured.markers);
     }
 
     #[test]

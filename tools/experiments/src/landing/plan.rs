@@ -244,7 +244,7 @@ impl Plan {
         flights.retain(|planned| planned.seed == self.seed);
         flights.iter().try_for_each(|planned| {
             let Change { simulator, controller, .. } = &planned.change;
-            refuse_other_marker(simulator, controller, "`--marker FAMILY:ID:SIZE_M` sets both")
+            refuse_other_marker(simulator, controller)
         })
     }
 
@@ -369,12 +369,11 @@ impl Planned {
     }
 }
 
-/// Refuses a flight with these settings if its controller looks for another marker than the pad has; `remedy` says how to set both. What
-/// a service refuses anyway is not told again.
+/// Refuses a flight with these settings if its controller looks for another marker than the pad has. What a service refuses anyway is not
+/// told again.
 pub(crate) fn refuse_other_marker(
     simulator: &[String],
     controller: &[String],
-    remedy: &str,
 ) -> Result<(), String> {
     let simulator = configuration::<simulator::Config>("simulator", simulator);
     let controller = configuration::<controller::Config>("controller", controller);
@@ -391,7 +390,7 @@ pub(crate) fn refuse_other_marker(
         return Ok(());
     }
     Err(format!(
-        "the pad has the marker {}, and the controller looks for {wanted}: {remedy}",
+        "the pad has the marker {}, and the controller looks for {wanted}: `--marker FAMILY:ID:SIZE_M` sets both",
         pad.marker
     ))
 }
