@@ -1,12 +1,14 @@
-//! Whether detectors see the marker at one place, judged on the frames that they have all searched.
+//! Whether detectors see the marker at one place, and turned the same way where the vehicle turns to it, judged on the frames that they
+//! have all searched.
 //!
-//! Two positions in one frame need no vehicle state and no estimate. Whether a pair agrees does not depend on which of the two is
+//! Two poses in one frame need no vehicle state and no estimate. Whether a pair agrees does not depend on which of the two is
 //! named first. Of two detectors that differ nobody can say which is right; of three or more the majority is believed: at least two
 //! that agree with each other and differ from the third.
 
 use std::collections::VecDeque;
 
-use geometry::squared;
+use geometry::{Body, Frame, Marker, Rotation, Transform, Vector, squared};
+use libm::{atan2, hypot};
 
 /// Frames that two detectors must both have searched for a conclusion.
 const MIN_COMMON: u32 = 8;
@@ -14,12 +16,30 @@ const MIN_COMMON: u32 = 8;
 const MAX_SEEN: u32 = 12;
 /// Detectors that outvote another one: one against one decides nothing.
 const MIN_MAJORITY: usize = 2;
+/// The difference up to which two headings agree, in radians: 15 degrees. Corners that are half a pixel off turn a marker of 12 pixels
+/// by 3 degrees, and corners in another order by 90 or 180.
+pub const HEADING_TOLERANCE_RAD: f64 = 15.0 * std::f64::consts::PI / 180.0;
+/// One more than the cosine of the tilt, below which a marker that is seen from behind has no heading.
+const MIN_UPRIGHT: f64 = 0.2;
 
 /// The marker as a detector sees it.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Sight {
     /// Its position in the vehicle's body frame, in metres; `None` without a pose.
     pub position_m: Option<[f64; 3]>,
+    /// Its heading about the body's down axis, in radians, from [`heading_rad`]; `None` without a pose. Of a marker without a heading it
+    /// means nothing.
+    pub heading_rad: Option<f64>,
+}
+
+impl Sight {
+    /// The marker with this pose, or without one.
+    pub fn new(body_from_marker: Option<Transform<Body, Marker>>) -> Self {
+        Self {
+            position_m: body_from_marker.map(|pose| pose.origin().coords.into()),
+            heading_rad: body_from_marker.and_then(|pose| heading_rad(pose.rotation())),
+        }
+    }
 }
 
 /// What a detector saw in its latest frames, by stamp, newest last.
@@ -34,17 +54,19 @@ pub struct Voter<'a> {
     pub sights: &'a Sights,
 }
 
-/// The distance up to which two positions agree.
+/// The differences up to which two sights agree.
 #[derive(Copy, Clone, Debug)]
 pub struct Tolerance {
     /// At range 0, in metres.
     pub base_m: f64,
     /// Growth per metre of range.
     pub per_m: f64,
+    /// Difference of two headings, in radians; `None` where they do not matter.
+    pub heading_rad: Option<f64>,
 }
 
 impl Tolerance {
-    /// At a range in metres, in metres.
+    /// The distance at a range in metres, in metres.
     pub fn at(&self, range_m: f64) -> f64 {
         self.base_m + self.per_m * range_m
     }
@@ -53,12 +75,14 @@ impl Tolerance {
 /// Why a detector is not believed although it answers.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Fault {
-    /// More detectors see the marker elsewhere, and at one place.
+    /// More detectors see the marker elsewhere or turned, and all of them the same.
     Outvoted {
         /// How many.
         by: usize,
         /// Its distance from one of them, in metres.
         apart_m: f64,
+        /// The angle between its heading and that one's where these differ, in radians.
+        turned_rad: Option<f64>,
     },
     /// It sees no marker in frames in which another one does.
     Blind {
@@ -67,7 +91,7 @@ pub enum Fault {
     },
 }
 
-/// Another detector that sees the marker elsewhere, while nobody says which of the two is right.
+/// Another detector that sees the marker elsewhere or turned, while nobody says which of the two is right.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Dispute {
     /// The active detector.
@@ -76,6 +100,8 @@ pub struct Dispute {
     pub other: String,
     /// The distance between both positions in the latest frame with both, in metres.
     pub apart_m: f64,
+    /// The angle between both headings in the latest frame in which they differ, in radians; `None` where they agree or do not matter.
+    pub turned_rad: Option<f64>,
 }
 
 /// The latest frames that two detectors have both searched.
@@ -83,10 +109,14 @@ pub struct Dispute {
 struct Common {
     /// Latest frames with a position from both; at most `MIN_COMMON`.
     both: u32,
-    /// Those in which the positions differ.
+    /// Those in which the positions or the headings differ.
     apart: u32,
     /// The distance in the latest of them, in metres.
     apart_m: f64,
+    /// Those in which the headings differ.
+    turned: u32,
+    /// The angle in the latest of these, in radians.
+    turned_rad: f64,
     /// Latest frames in which the second saw a marker; at most `MAX_SEEN`.
     second_saw: u32,
     /// Those in which the first saw none.
@@ -114,17 +144,30 @@ impl Common {
             self.second_saw += 1;
             self.first_missed += u32::from(first.is_none());
         }
-        let positions = first.and_then(|s| s.position_m).zip(second.and_then(|s| s.position_m));
-        if let Some((first_m, second_m)) = positions
+        if let Some((first, second)) = first.zip(second)
+            && let Some((first_m, second_m)) = first.position_m.zip(second.position_m)
             && self.both < MIN_COMMON
         {
             let apart_m = distance(first_m, second_m);
+            let turned_rad = turned(tolerance, first, second);
             if self.both == 0 {
                 self.apart_m = apart_m;
             }
             self.both += 1;
-            self.apart += u32::from(!within(tolerance, first_m, second_m));
+            if let Some(turned_rad) = turned_rad {
+                if self.turned == 0 {
+                    self.turned_rad = turned_rad;
+                }
+                self.turned += 1;
+            }
+            let is_within = within(tolerance, first_m, second_m);
+            self.apart += u32::from(!is_within || turned_rad.is_some());
         }
+    }
+
+    /// The angle between the headings where they differ in most frames, in radians.
+    fn turned_rad(&self) -> Option<f64> {
+        (self.turned * 2 > self.both).then_some(self.turned_rad)
     }
 
     fn differ(&self) -> bool {
@@ -183,10 +226,10 @@ fn outvoted(row: &[Common], all: &[Vec<Common>]) -> Option<Fault> {
         });
     let is_majority = |by: usize| by >= MIN_MAJORITY && by > ours && by * 2 > ours + differing;
     let (common, by) = groups.filter(|(_, by)| is_majority(*by)).max_by_key(|(_, by)| *by)?;
-    Some(Fault::Outvoted { by, apart_m: common.apart_m })
+    Some(Fault::Outvoted { by, apart_m: common.apart_m, turned_rad: common.turned_rad() })
 }
 
-/// The detector that sees the marker farthest from where the active one does.
+/// The detector that sees the marker farthest from where the active one does, of those that see it elsewhere or turned.
 pub fn dispute(active: Voter<'_>, others: &[Voter<'_>], tolerance: Tolerance) -> Option<Dispute> {
     others
         .iter()
@@ -197,10 +240,11 @@ pub fn dispute(active: Voter<'_>, others: &[Voter<'_>], tolerance: Tolerance) ->
             active: active.name.to_owned(),
             other: other.to_owned(),
             apart_m: common.apart_m,
+            turned_rad: common.turned_rad(),
         })
 }
 
-/// True when two detectors have seen the marker at one place in enough frames.
+/// True when two detectors have seen the marker at one place, and turned the same way where that matters, in enough frames.
 pub fn agree(first: Voter<'_>, second: Voter<'_>, tolerance: Tolerance) -> bool {
     Common::of(first.sights, second.sights, tolerance).agree()
 }
@@ -208,6 +252,33 @@ pub fn agree(first: Voter<'_>, second: Voter<'_>, tolerance: Tolerance) -> bool 
 /// True when two positions agree, in whatever order. The farther one gives the range, as the error of a position grows with it.
 pub fn within(tolerance: Tolerance, one_m: [f64; 3], other_m: [f64; 3]) -> bool {
     distance(one_m, other_m) <= tolerance.at(range(one_m, other_m))
+}
+
+/// The angle between the headings of two sights, in radians, where it is more than they may differ by; in whatever order.
+pub fn turned(tolerance: Tolerance, one: Sight, other: Sight) -> Option<f64> {
+    let max_rad = tolerance.heading_rad?;
+    let (one_rad, other_rad) = one.heading_rad.zip(other.heading_rad)?;
+    Some(angle_between(one_rad, other_rad)).filter(|rad| *rad > max_rad)
+}
+
+/// The angle between two headings in radians, from 0 to half a turn.
+pub fn angle_between(one_rad: f64, other_rad: f64) -> f64 {
+    let turn = std::f64::consts::TAU;
+    let difference = one_rad - other_rad;
+    (difference - turn * (difference / turn).round()).abs()
+}
+
+/// The heading of a marker's upper edge about the third axis of a frame that looks at it along that axis, in radians, clockwise seen against it.
+/// `None` where it is seen from behind.
+///
+/// Only the turn about that axis counts, without the tilt: of the two poses that a distant marker's corners fit both have the same
+/// heading, while their upper edges may point tens of degrees apart.
+pub fn heading_rad<F: Frame>(rotation: Rotation<F, Marker>) -> Option<f64> {
+    let right = rotation * Vector::<Marker>::new(1.0, 0.0, 0.0);
+    let up = rotation * Vector::<Marker>::new(0.0, 1.0, 0.0);
+    let (along, across) = (up.x() + right.y(), up.y() - right.x());
+    let is_upright = hypot(along, across) > MIN_UPRIGHT;
+    is_upright.then(|| atan2(across, along))
 }
 
 /// The range by which two positions are judged: the larger of theirs, in their unit.

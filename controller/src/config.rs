@@ -324,6 +324,12 @@ impl Config {
         SigningConfig::read(signing_key.as_ref(), *component_id, state_directory(), &name).map(Some)
     }
 
+    /// Whether the vehicle turns to the marker's heading: an autopilot that lands by itself does not.
+    pub fn turns_to_pad(&self) -> bool {
+        let is_flown = self.mode != Mode::LandingTarget && self.guidance == GuidanceName::Metric;
+        is_flown && self.metric.turn_rad_s > 0.0
+    }
+
     /// Whether the vehicle can turn to the marker's heading: rings look the same from all sides, so the upper edge that their pose has
     /// is the image's, and turns with the vehicle.
     fn turn(&self) -> Result<(), String> {

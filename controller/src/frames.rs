@@ -6,10 +6,10 @@ use std::collections::BTreeMap;
 use landing::{FrameObservation, Timestamp};
 use messages::{CameraInfo, Detections, Place};
 
-use crate::agreement::Sight;
+use crate::agreement::{HEADING_TOLERANCE_RAD, Sight};
 use crate::camera_watch::CameraWatch;
 use crate::cameras::{Cameras, Reception};
-use crate::config::{Config, DetectorSettings, PreferredPlace};
+use crate::config::{Config, PreferredPlace};
 use crate::refusals::{Refusals, Warning};
 use crate::selection::{Limits, MAX_DETECTORS, Preference, Selection};
 use crate::wire;
@@ -72,7 +72,7 @@ impl Frames {
             marker: config.marker.clone(),
             clock: config.clock().to_owned(),
             max_future_s: config.target.max_future_s,
-            selection: selection(&config.detectors),
+            selection: selection(config),
             newest: BTreeMap::new(),
             cameras: Cameras::default(),
             refusals: Refusals::default(),
@@ -148,9 +148,7 @@ impl Frames {
         }
         let marker =
             message.first_of(&self.marker).map(|detection| wire::marker_in_frame(detection, mount));
-        let sight = marker.as_ref().map(|marker| Sight {
-            position_m: marker.body_from_marker.map(|pose| pose.origin().coords.into()),
-        });
+        let sight = marker.as_ref().map(|marker| Sight::new(marker.body_from_marker));
         let focal_px = camera.and_then(|info| {
             let scale = f64::from(header.width) / f64::from(info.width.max(1));
             info.focal_px.map(|[fx, fy]| 0.5 * (fx + fy) * scale)
@@ -240,13 +238,15 @@ impl Frames {
 }
 
 /// The choice of the detector, as configured.
-fn selection(settings: &DetectorSettings) -> Selection {
+fn selection(config: &Config) -> Selection {
+    let settings = &config.detectors;
     let limits = Limits {
         max_age_s: settings.max_age_s,
         min_rate_hz: settings.min_rate_hz,
         return_after_s: settings.return_after_s,
         tolerance_m: settings.tolerance_m,
         tolerance_per_m: settings.tolerance_per_m,
+        tolerance_heading_rad: config.turns_to_pad().then_some(HEADING_TOLERANCE_RAD),
     };
     let detector = Some(settings.preferred.clone()).filter(|name| !name.is_empty());
     let place = match settings.place {

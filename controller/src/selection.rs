@@ -1,5 +1,5 @@
-//! Selects the active detector: of the healthy ones (rate, latency, silence, agreement with others on where the marker is)
-//! the one that the operator prefers; one that fails often is trusted again more slowly.
+//! Selects the active detector: of the healthy ones (rate, latency, silence, agreement with others on where the marker is, and its
+//! heading where the vehicle turns to it) the one that the operator prefers; one that fails often is trusted again more slowly.
 //!
 //! A function of time and of the messages received. Another detector becomes the active one when the active
 //! one is gone, silent, late or slow and the other is not, or when the operator prefers the other and it has
@@ -11,7 +11,9 @@ use std::collections::VecDeque;
 
 use messages::{Candidate, DetectorState, Place};
 
-use crate::agreement::{self, Dispute, Fault, Sight, Sights, Tolerance, Voter, distance, within};
+use crate::agreement::{
+    self, Dispute, Fault, Sight, Sights, Tolerance, Voter, distance, turned, within,
+};
 use crate::refusals::Warning;
 
 /// Silence after which a detector that has gone is forgotten, in nanoseconds.
@@ -66,11 +68,18 @@ pub struct Limits {
     pub tolerance_m: f64,
     /// Growth of that distance per metre of range.
     pub tolerance_per_m: f64,
+    /// Maximum difference of the marker headings of two detectors that agree, in radians; `None` where the vehicle does not turn to the
+    /// marker.
+    pub tolerance_heading_rad: Option<f64>,
 }
 
 impl Limits {
     fn tolerance(&self) -> Tolerance {
-        Tolerance { base_m: self.tolerance_m, per_m: self.tolerance_per_m }
+        Tolerance {
+            base_m: self.tolerance_m,
+            per_m: self.tolerance_per_m,
+            heading_rad: self.tolerance_heading_rad,
+        }
     }
 }
 
@@ -318,7 +327,7 @@ impl Selection {
         !self.known.iter().any(|known| known.alive)
     }
 
-    /// A detector that sees the marker elsewhere than the active one, while nobody says which is right.
+    /// A detector that sees the marker elsewhere than the active one or turned, while nobody says which is right.
     pub fn dispute(&self) -> Option<&Dispute> {
         self.dispute.as_ref()
     }
@@ -327,11 +336,12 @@ impl Selection {
     pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
         let mut warnings = Vec::new();
         let mut warn = |matter: String, text: String| warnings.push(Warning { matter, text });
-        if let Some(Dispute { active, other, apart_m }) = &self.dispute {
+        if let Some(Dispute { active, other, apart_m, turned_rad }) = &self.dispute {
+            let turned = said_turned(*turned_rad);
             warn(
                 format!("dispute {other}"),
                 format!(
-                    "detectors `{active}` (used) and `{other}` see the marker {apart_m:.2} m apart; stop the wrong one, or name the right one (`alight detectors use`)"
+                    "detectors `{active}` (used) and `{other}` see the marker {apart_m:.2} m apart{turned}; stop the wrong one, or name the right one (`alight detectors use`)"
                 ),
             );
         }
@@ -489,6 +499,7 @@ impl Selection {
             active: active.name.clone(),
             other: opponent.name.clone(),
             apart_m: last.apart_m,
+            turned_rad: last.turned_rad,
         })
     }
 
@@ -498,7 +509,7 @@ impl Selection {
         names.into_iter().flatten()
     }
 
-    /// Compares the marker positions in one frame: the active detector's with all others', or another's with
+    /// Compares the markers in one frame: the active detector's with all others', or another's with
     /// the active one's.
     fn compare(&mut self, name: &str, stamp_ns: i64, sight: Option<Sight>) {
         let limits = self.limits;
@@ -739,16 +750,17 @@ impl Known {
     /// active one there is no verdict.
     fn judge(&mut self, limits: &Limits, active: Option<Sight>, ours: Option<Sight>) {
         let Some(active) = active else { return };
-        let agrees = match (active.position_m, ours.map(|ours| ours.position_m)) {
-            (_, None) => false,
-            (Some(active_m), Some(Some(ours_m))) => {
+        let Some(ours) = ours else { return keep(&mut self.verdicts, false, MAX_VERDICTS) };
+        let agrees = match (active.position_m, ours.position_m) {
+            (Some(active_m), Some(ours_m)) => {
                 self.disagreement_m = Some(distance(active_m, ours_m));
-                within(limits.tolerance(), active_m, ours_m)
+                let tolerance = limits.tolerance();
+                within(tolerance, active_m, ours_m) && turned(tolerance, active, ours).is_none()
             }
             // Without poses there is no distance; both see the marker.
-            (None, Some(None)) => true,
-            (Some(_), Some(None)) => false,
-            (None, Some(Some(_))) => return,
+            (None, None) => true,
+            (Some(_), None) => false,
+            (None, Some(_)) => return,
         };
         keep(&mut self.verdicts, agrees, MAX_VERDICTS);
     }
@@ -781,9 +793,16 @@ fn median(values: &VecDeque<i64>) -> Option<i64> {
 /// A fault as text.
 fn said(fault: &Fault) -> String {
     match fault {
-        Fault::Outvoted { by, apart_m } => {
-            format!("{by} others see the marker {apart_m:.2} m from where it does")
+        Fault::Outvoted { by, apart_m, turned_rad } => {
+            let turned = said_turned(*turned_rad);
+            format!("{by} others see the marker {apart_m:.2} m from where it does{turned}")
         }
         Fault::Blind { seeing } => format!("it sees no marker where `{seeing}` sees one"),
     }
+}
+
+/// By how much headings differ, as the end of a clause on places.
+fn said_turned(turned_rad: Option<f64>) -> String {
+    turned_rad
+        .map_or_else(String::new, |rad| format!(" and turned by {:.0} degrees", rad.to_degrees()))
 }

@@ -3,18 +3,42 @@
 use std::collections::VecDeque;
 
 use controller::agreement::{
-    Fault, Sight, Sights, Tolerance, Voter, agree, dispute, faults, within,
+    Fault, HEADING_TOLERANCE_RAD, Sight, Sights, Tolerance, Voter, agree, angle_between, dispute,
+    faults, heading_rad, turned, within,
 };
+use geometry::{Body, Marker, Point, Rotation, Transform, Vector};
 use proptest::prelude::*;
 
-const TOLERANCE: Tolerance = Tolerance { base_m: 0.1, per_m: 0.03 };
+const TOLERANCE: Tolerance =
+    Tolerance { base_m: 0.1, per_m: 0.03, heading_rad: Some(HEADING_TOLERANCE_RAD) };
+/// Where the vehicle does not turn to the marker.
+const OF_PLACES: Tolerance = Tolerance { heading_rad: None, ..TOLERANCE };
 const NAMES: [&str; 6] = ["a", "b", "c", "d", "e", "f"];
 /// Frames, more than a conclusion takes.
 const FRAMES: i64 = 20;
 
-/// A detector that sees the marker at one place in all frames.
+/// A detector that sees the marker at one place in all frames, its upper edge forward.
 fn steady(position_m: [f64; 3]) -> Sights {
-    (0..FRAMES).map(|stamp| (stamp, Some(Sight { position_m: Some(position_m) }))).collect()
+    steadily(Sight { position_m: Some(position_m), heading_rad: Some(0.0) })
+}
+
+fn steadily(sight: Sight) -> Sights {
+    (0..FRAMES).map(|stamp| (stamp, Some(sight))).collect()
+}
+
+/// A marker 5 m below, its upper edge turned clockwise by this.
+fn turned_by(heading_deg: f64) -> Sights {
+    let heading_rad = Some(heading_deg.to_radians());
+    steadily(Sight { position_m: Some([0.0, 0.0, 5.0]), heading_rad })
+}
+
+/// The pose of a marker that lies flat under a level vehicle.
+fn flat(heading_deg: f64) -> Rotation<Body, Marker> {
+    let turned = Rotation::<Body, Body>::from_euler(0.0, 0.0, heading_deg.to_radians());
+    // With no turn its upper edge points forward, and what is printed on it up.
+    let right = std::f64::consts::FRAC_PI_2;
+    let to_body = Rotation::<Body, Marker>::from_euler(std::f64::consts::PI, 0.0, right);
+    turned * to_body
 }
 
 fn voters(all: &[Sights]) -> Vec<Voter<'_>> {
@@ -71,6 +95,57 @@ fn two_that_agree_outvote_a_third_and_not_one_that_agrees_with_either() {
     assert_eq!(faults(&voters(&all), TOLERANCE), [None, None, None, None]);
 }
 
+#[test]
+fn a_detector_whose_corners_are_in_another_order_is_outvoted_by_two_and_disputed_by_one() {
+    for wrong_deg in [90.0, 180.0, -90.0, 25.0] {
+        let all = [turned_by(170.0), turned_by(-179.0), turned_by(175.0 + wrong_deg)];
+        let all = voters(&all);
+        let found = faults(&all, TOLERANCE);
+        assert_eq!(found[..2], [None, None], "{wrong_deg}");
+        let Some(Fault::Outvoted { by: 2, turned_rad: Some(turned_rad), .. }) = found[2] else {
+            panic!("{wrong_deg}: {found:?}");
+        };
+        assert!((turned_rad.to_degrees() - f64::abs(wrong_deg)).abs() < 6.1, "{turned_rad}");
+        assert_eq!(faults(&all[1..], TOLERANCE), [None, None]);
+        let told = dispute(all[1], &all[2..], TOLERANCE).unwrap();
+        assert!(told.turned_rad.is_some() && told.apart_m == 0.0, "{told:?}");
+        assert!(!agree(all[1], all[2], TOLERANCE));
+        // Where the vehicle does not turn to the marker nothing comes of it.
+        assert_eq!(faults(&all, OF_PLACES), [None, None, None]);
+        assert_eq!(dispute(all[1], &all[2..], OF_PLACES), None);
+        assert!(agree(all[1], all[2], OF_PLACES));
+    }
+}
+
+#[test]
+fn of_two_that_differ_in_place_alone_no_turn_is_told() {
+    let all = [below(5.0), below(7.0)];
+    let all = voters(&all);
+    assert_eq!(dispute(all[0], &all[1..], TOLERANCE).unwrap().turned_rad, None);
+}
+
+#[test]
+fn a_heading_is_that_of_the_upper_edge_clockwise_from_above() {
+    for heading_deg in [-170.0_f64, -90.0, 0.0, 30.0, 90.0, 179.0] {
+        let up = flat(heading_deg) * Vector::<Marker>::new(0.0, 1.0, 0.0);
+        let right = flat(heading_deg) * Vector::<Marker>::new(1.0, 0.0, 0.0);
+        let out = flat(heading_deg) * Vector::<Marker>::new(0.0, 0.0, 1.0);
+        let (sin, cos) = heading_deg.to_radians().sin_cos();
+        assert!((up - Vector::new(cos, sin, 0.0)).norm() < 1e-9, "{up:?}");
+        assert!((right - Vector::new(-sin, cos, 0.0)).norm() < 1e-9, "{right:?}");
+        assert!((out - Vector::new(0.0, 0.0, -1.0)).norm() < 1e-9, "{out:?}");
+        let heading = heading_rad(flat(heading_deg)).unwrap();
+        assert!(angle_between(heading, heading_deg.to_radians()) < 1e-9, "{heading}");
+        let pose = Transform::new(flat(heading_deg), Point::new(0.1, 0.2, 3.0));
+        let sight = Sight::new(Some(pose));
+        assert_eq!(sight, Sight { position_m: Some([0.1, 0.2, 3.0]), heading_rad: Some(heading) });
+    }
+    // From behind, where it cannot be seen, it has none.
+    let behind = Rotation::<Body, Body>::from_euler(std::f64::consts::PI, 0.0, 0.0) * flat(10.0);
+    assert_eq!(heading_rad(behind), None);
+    assert_eq!(Sight::new(None), Sight { position_m: None, heading_rad: None });
+}
+
 fn position() -> impl Strategy<Value = [f64; 3]> {
     // Few directions and ranges near each other, so that some pairs agree only just.
     (0.2..15.0_f64, 0.9..1.1_f64, -0.3..0.3_f64)
@@ -81,11 +156,19 @@ fn near(range_m: f64) -> impl Strategy<Value = [f64; 3]> {
     (0.9..1.1_f64, -0.3..0.3_f64).prop_map(move |(factor, side_m)| [side_m, 0.0, range_m * factor])
 }
 
+/// A marker about a place with one of a few headings, of which some pairs agree only just, or with none.
+fn seen(range_m: f64) -> impl Strategy<Value = Sight> {
+    let heading_deg = prop::sample::select(vec![0.0, 10.0, 20.0, 90.0, 180.0, -175.0]);
+    let heading_rad = prop::option::weighted(0.9, heading_deg.prop_map(f64::to_radians));
+    (near(range_m), heading_rad)
+        .prop_map(|(position_m, heading_rad)| Sight { position_m: Some(position_m), heading_rad })
+}
+
 /// What a detector saw: the marker about a place, without a place, or nothing, in some of the frames.
 fn sights(range_m: f64) -> impl Strategy<Value = Sights> {
     let sight = prop_oneof![
-        6 => near(range_m).prop_map(|position_m| Some(Sight { position_m: Some(position_m) })),
-        1 => Just(Some(Sight { position_m: None })),
+        6 => seen(range_m).prop_map(Some),
+        1 => Just(Some(Sight { position_m: None, heading_rad: None })),
         1 => Just(None),
     ];
     prop::collection::vec((prop::bool::weighted(0.8), sight), FRAMES as usize).prop_map(|frames| {
@@ -96,7 +179,7 @@ fn sights(range_m: f64) -> impl Strategy<Value = Sights> {
 
 fn several() -> impl Strategy<Value = Vec<Sights>> {
     (0.2..15.0_f64).prop_flat_map(|range_m| {
-        let steady = near(range_m).prop_map(steady);
+        let steady = seen(range_m).prop_map(steadily);
         prop::collection::vec(prop_oneof![3 => steady, 1 => sights(range_m)], 2..=NAMES.len())
     })
 }
@@ -122,7 +205,9 @@ proptest! {
                 let both = [(*one, *other), (*other, *one)];
                 let [there, back] = both.map(|(a, b)| agree(a, b, TOLERANCE));
                 prop_assert_eq!(there, back);
-                let [there, back] = both.map(|(a, b)| dispute(a, &[b], TOLERANCE).map(|it| it.apart_m));
+                let [there, back] = both.map(|(a, b)| {
+                    dispute(a, &[b], TOLERANCE).map(|it| (it.apart_m, it.turned_rad))
+                });
                 prop_assert_eq!(there, back);
             }
         }
@@ -143,6 +228,39 @@ proptest! {
             prop_assert!(opponents.iter().any(|it| agrees(it) + 1 == *by), "{:?}", found);
         }
         prop_assert!(!found.iter().all(|it| is_outvoted(it.as_ref())), "{:?}", found);
+    }
+
+    #[test]
+    fn where_headings_do_not_matter_nothing_comes_of_them(all in several()) {
+        let mut without = all.clone();
+        let all_sights = without.iter_mut().flatten().filter_map(|(_, sight)| sight.as_mut());
+        all_sights.for_each(|sight| sight.heading_rad = None);
+        prop_assert_eq!(faults(&voters(&all), OF_PLACES), faults(&voters(&without), TOLERANCE));
+    }
+
+    #[test]
+    fn the_two_poses_of_a_tilt_that_cannot_be_told_have_one_heading(
+        heading_deg in -180.0..180.0_f64, other_deg in -180.0..180.0_f64,
+        aside in 0.0..0.7_f64, about in -3.2..3.2_f64,
+    ) {
+        // Seen from far away the depth of each point along the line of sight may as well be the opposite.
+        let ray = Vector::<Body>::new(aside.sin() * about.cos(), aside.sin() * about.sin(), aside.cos());
+        let flipped = |rotation: Rotation<Body, Marker>| {
+            let mirrored = |axis: Vector<Marker>| {
+                let axis = rotation * axis;
+                axis - ray * (2.0 * axis.coords.dot(&ray.coords))
+            };
+            let right = mirrored(Vector::new(1.0, 0.0, 0.0)).coords;
+            let up = mirrored(Vector::new(0.0, 1.0, 0.0)).coords;
+            let axes = nalgebra::Matrix3::from_columns(&[right, up, right.cross(&up)]);
+            let axes = nalgebra::Rotation3::from_matrix_unchecked(axes);
+            Rotation::<Body, Marker>::from_quaternion(nalgebra::UnitQuaternion::from_rotation_matrix(&axes))
+        };
+        let [one, other] = [heading_deg, other_deg].map(flat);
+        let sight = |rotation| Sight::new(Some(Transform::new(rotation, Point::new(0.0, 0.0, 5.0))));
+        prop_assert_eq!(turned(TOLERANCE, sight(one), sight(flipped(one))), None);
+        let is_turned = turned(TOLERANCE, sight(one), sight(other)).is_some();
+        prop_assert_eq!(turned(TOLERANCE, sight(one), sight(flipped(other))).is_some(), is_turned);
     }
 
     #[test]

@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 
-use controller::agreement::Sight;
+use controller::agreement::{HEADING_TOLERANCE_RAD, Sight};
 use controller::selection::{
     Limits, MAX_DETECTORS, MAX_SILENCE_NS, MAX_VERDICTS, MIN_SILENCE_NS, Preference, Selection,
 };
@@ -20,11 +20,22 @@ fn limits() -> Limits {
         return_after_s: 2.0,
         tolerance_m: 0.1,
         tolerance_per_m: 0.03,
+        tolerance_heading_rad: Some(HEADING_TOLERANCE_RAD),
     }
 }
 
 fn preferring(detector: Option<&str>, place: Option<Place>) -> Selection {
     Selection::new(limits(), Preference { detector: detector.map(Into::into), place })
+}
+
+/// The marker at a place, its upper edge forward.
+fn place(position_m: [f64; 3]) -> Sight {
+    turned(position_m, 0.0)
+}
+
+/// The marker at a place, its upper edge turned clockwise by this.
+fn turned(position_m: [f64; 3], heading_deg: f64) -> Sight {
+    Sight { position_m: Some(position_m), heading_rad: Some(f64::to_radians(heading_deg)) }
 }
 
 /// Detectors that answer to the frames of one camera, each with its latency, and what was used when.
@@ -59,7 +70,7 @@ impl Bench {
     /// Lets time pass up to a frame's stamp plus 66 ms: ticks every 25 ms, and the answers of those that
     /// answer.
     fn frame(&mut self, stamp_ns: i64, answers: &[(&str, i64)]) {
-        let sight = Some(Sight { position_m: Some([0.0, 0.0, 5.0]) });
+        let sight = Some(place([0.0, 0.0, 5.0]));
         let answers: Vec<_> = answers.iter().map(|(name, late)| (*name, *late, sight)).collect();
         self.frame_seen(stamp_ns, &answers);
     }
@@ -287,7 +298,7 @@ fn slow_and_late_ones_give_way_and_are_better_than_none() {
 fn one_that_sees_the_marker_elsewhere_is_not_taken_unless_it_is_named() {
     let mut bench = Bench::new(preferring(None, Some(Place::Ground)));
     bench.selection.set_place(0, "spare", Place::Ground);
-    let at = |x: f64| Some(Sight { position_m: Some([x, 0.0, 5.0]) });
+    let at = |x: f64| Some(place([x, 0.0, 5.0]));
     bench.frames(0..2, &BOTH[..1]);
     for i in 2..100 {
         bench.frame_seen(i * PERIOD, &[("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(0.8))]);
@@ -304,7 +315,7 @@ fn one_that_sees_the_marker_elsewhere_is_not_taken_unless_it_is_named() {
 #[test]
 fn where_the_active_one_sees_nothing_agreement_is_not_concluded() {
     let mut bench = Bench::new(preferring(None, None));
-    let seen = Some(Sight { position_m: None });
+    let seen = Some(Sight { position_m: None, heading_rad: None });
     for i in 0..20 {
         // Rarely enough that the active one is not passed over for it.
         let spare = seen.filter(|_| i % 4 == 0);
@@ -360,7 +371,7 @@ fn those_that_left_are_forgotten_and_a_flood_of_names_is_bounded() {
 
 /// The marker 5 m below, displaced to the north.
 fn at(north_m: f64) -> Option<Sight> {
-    Some(Sight { position_m: Some([north_m, 0.0, 5.0]) })
+    Some(place([north_m, 0.0, 5.0]))
 }
 
 /// The first time at which a warning of the detectors has this word, in milliseconds.
@@ -549,6 +560,70 @@ fn of_three_the_one_that_sees_the_marker_elsewhere_is_outvoted_even_if_it_is_pre
     assert_eq!((bench.selection.dispute(), bench.state("liar")), (None, DetectorState::Outvoted));
 }
 
+/// The marker straight below, its upper edge turned by a quarter.
+fn quarter_turned() -> Option<Sight> {
+    Some(turned([0.0, 0.0, 5.0], 90.0))
+}
+
+#[test]
+fn two_that_see_the_marker_turned_are_told_and_the_new_one_is_not_trusted() {
+    let mut bench = Bench::new(preferring(Some("turned"), None));
+    let answers = [("main", 30 * MS, at(0.0)), ("turned", 35 * MS, quarter_turned())];
+    let told = "0.00 m apart and turned by 90 degrees";
+    let took_ms = warned_ms(&mut bench, 0..30, &answers, told).unwrap();
+    assert!(took_ms < 1000, "{took_ms} ms");
+    let shadow = bench.selection.candidates(bench.now_ns);
+    let shadow = shadow.iter().find(|it| it.state == DetectorState::Shadow).unwrap();
+    assert!(shadow.compared >= 8 && shadow.agreed == 0, "{shadow:?}");
+    // The turn is told as long as the dispute lasts.
+    for i in 30..100 {
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, None), ("turned", 35 * MS, None)]);
+    }
+    let dispute = bench.selection.dispute().unwrap();
+    assert!((dispute.turned_rad.unwrap().to_degrees() - 90.0).abs() < 1e-9, "{dispute:?}");
+    for i in 100..130 {
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, at(0.0)), ("turned", 35 * MS, at(0.0))]);
+    }
+    assert_eq!(bench.selection.dispute(), None);
+}
+
+#[test]
+fn of_three_the_one_that_sees_the_marker_turned_is_outvoted_even_if_it_is_preferred() {
+    let mut bench = Bench::new(preferring(Some("turned"), None));
+    let answers = [
+        ("first", 30 * MS, at(0.0)),
+        ("second", 25 * MS, at(0.03)),
+        ("turned", 35 * MS, quarter_turned()),
+    ];
+    for i in 0..60 {
+        bench.frame_seen(i * PERIOD, &answers);
+    }
+    assert_ne!(bench.selection.active(), Some("turned"));
+    assert_eq!(bench.state("turned"), DetectorState::Outvoted);
+    assert_eq!(bench.selection.dispute(), None);
+    let warnings = bench.selection.warnings(bench.now_ns);
+    assert!(warnings[0].text.contains("where it does and turned by 90 degrees"), "{warnings:?}");
+}
+
+#[test]
+fn where_the_vehicle_does_not_turn_to_the_marker_its_heading_does_not_matter() {
+    let limits = Limits { tolerance_heading_rad: None, ..limits() };
+    let mut bench = Bench::new(Selection::new(limits, Preference::default()));
+    let answers = [
+        ("first", 30 * MS, at(0.0)),
+        ("second", 25 * MS, at(0.03)),
+        ("turned", 35 * MS, quarter_turned()),
+    ];
+    for i in 0..60 {
+        bench.frame_seen(i * PERIOD, &answers);
+    }
+    assert_eq!((bench.selection.dispute(), bench.state("turned")), (None, DetectorState::Shadow));
+    assert!(bench.selection.warnings(bench.now_ns).is_empty());
+    let turned = bench.selection.candidates(bench.now_ns);
+    let turned = turned.iter().find(|it| it.detector == "turned").unwrap();
+    assert_eq!(turned.agreed, turned.compared);
+}
+
 #[test]
 fn a_preferred_one_that_sees_nothing_is_passed_over_and_told() {
     let mut bench = Bench::new(preferring(Some("blind"), None));
@@ -645,7 +720,7 @@ proptest! {
             match what {
                 Step::Received { who, stamp_ago_ms, seen } => {
                     present[who] = true;
-                    let sight = seen.then_some(Sight { position_m: Some([0.0, 0.0, 3.0]) });
+                    let sight = seen.then_some(place([0.0, 0.0, 3.0]));
                     bench.selection.received(now, NAMES[who], now - stamp_ago_ms * MS, sight);
                 }
                 Step::Presence { who, alive } => {

@@ -99,7 +99,7 @@ impl Comparison {
             |controller| {
                 let settings = &controller.detectors;
                 let (base_m, per_m) = (settings.tolerance_m, settings.tolerance_per_m);
-                let max_m = Tolerance { base_m, per_m }.at(range_m);
+                let max_m = Tolerance { base_m, per_m, heading_rad: None }.at(range_m);
                 format!(
                     "at this range of {range_m:.2} m they agree up to {max_m:.3} m (`detectors.tolerance_m` of the controller, {base_m}, and \
                      `tolerance_per_m`, {per_m} of the range)"
