@@ -64,7 +64,7 @@ pub struct Flight {
     journal: Journal,
     /// The service ends: nothing but a stop is sent any more.
     is_ending: bool,
-    /// Two detectors see the marker at two places.
+    /// Two detectors see the marker at two places or with two headings.
     is_disputed: bool,
     /// Since when a take-off waits for a battery that is not empty.
     empty_since_ns: Option<i64>,

@@ -615,6 +615,52 @@ fn while_two_detectors_see_the_marker_at_two_places_nothing_descends_near_the_gr
 }
 
 #[test]
+fn a_detector_with_another_first_corner_counts_where_the_vehicle_turns_to_the_pad() {
+    let status_of = |set: &[&str]| {
+        let set: Vec<&str> = ["marker=aruco-4x4-50:7"].iter().chain(set).copied().collect();
+        let mut flight = flight_with("airborne", &set);
+        flight.camera(0, CameraInfo::sample());
+        flight.presence(0, "main", true);
+        receive(&mut flight, 0, &heartbeat(4, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        for ms in (20..3000).step_by(20) {
+            if ms % 1000 == 0 {
+                receive(&mut flight, ms * MS, &heartbeat(4, true));
+            }
+            pose_at(&mut flight, ms * MS, 2.0);
+            if ms % 60 == 0 {
+                // Facing the camera; the other one begins with the marker's second corner.
+                let quarter = std::f64::consts::FRAC_1_SQRT_2;
+                for (name, rotation_wxyz) in
+                    [("main", [0.0, 1.0, 0.0, 0.0]), ("other", [0.0, quarter, quarter, 0.0])]
+                {
+                    let mut seen = Detections { detector: name.into(), ..seen(ms * MS - 40 * MS) };
+                    let found = &mut seen.detections[0];
+                    (found.family, found.id) = ("aruco-4x4-50".into(), Some(7));
+                    let pose = &mut found.pose.as_mut().unwrap().camera_from_marker;
+                    (pose.translation_m, pose.rotation_wxyz) = ([0.0, 0.0, 2.0], rotation_wxyz);
+                    flight.detections(ms * MS + 2, name, &seen);
+                }
+            }
+            flight.tick(ms * MS + 3);
+        }
+        flight.status(3000 * MS)
+    };
+    let status = status_of(&["metric.turn_rad_s=0.3"]);
+    assert!(status.warnings[0].contains("0.00 m apart and turned by 90 degrees"), "{status:?}");
+    assert!(status.why.contains("at two places or turned"), "{status:?}");
+    for set in [
+        &[][..],
+        &["metric.turn_rad_s=0.3", "guidance=thesis"],
+        &["metric.turn_rad_s=0.3", "mode=landing-target"],
+    ] {
+        let status = status_of(set);
+        assert!(!status.warnings.iter().any(|it| it.contains("apart")), "{status:?}");
+        assert!(!status.why.contains("turned"), "{status:?}");
+    }
+}
+
+#[test]
 fn a_low_battery_leads_to_what_is_configured() {
     let set = ["phases.on_battery_low=\"hold\"", "alarms.battery_s=1"];
     let mut flight = flight_with("airborne", &set);

@@ -1,10 +1,13 @@
-//! In what a new detector differs from the one in use: the marker's position in the frames that both have searched, by axes, against what
-//! the controller lets differ.
+//! In what a new detector differs from the one in use: the marker's position in the frames that both have searched, by axes, and its heading
+//! where the vehicle turns to it, against what the controller lets differ.
 
 use std::collections::VecDeque;
 
-use controller::agreement::{Tolerance, distance, range};
-use messages::{Configuration, Detections};
+use controller::agreement::{
+    HEADING_TOLERANCE_RAD, Tolerance, angle_between, distance, heading_rad, range,
+};
+use geometry::Camera;
+use messages::{Configuration, Detections, Transform3};
 
 /// Latest frames of each of the two that are kept: the later one may be half a second behind.
 const MAX_FRAMES: usize = 32;
@@ -20,18 +23,19 @@ pub(super) struct Comparison {
     latest: Option<Difference>,
 }
 
-/// A detector's positions of the marker in the camera frame, by the stamp of the frame.
+/// A detector's poses of the marker in the camera frame, by the stamp of the frame.
 #[derive(Default)]
 struct Seen {
     detector: String,
-    at: VecDeque<(i64, [f64; 3])>,
+    at: VecDeque<(i64, Transform3)>,
 }
 
-/// The positions in one frame, in metres.
+/// The positions in one frame, in metres, and the angle between the headings, in radians.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Difference {
     used_m: [f64; 3],
     new_m: [f64; 3],
+    turned_rad: Option<f64>,
 }
 
 impl Comparison {
@@ -75,16 +79,19 @@ impl Comparison {
         if seen.at.len() == MAX_FRAMES {
             seen.at.pop_front();
         }
-        seen.at.push_back((stamp_ns, pose.camera_from_marker.translation_m));
+        seen.at.push_back((stamp_ns, pose.camera_from_marker));
         let at = |seen: &Seen| seen.at.iter().rev().find(|(at, _)| *at == stamp_ns).map(|it| it.1);
-        if let (Some(used_m), Some(new_m)) = (at(&self.used), at(&self.new)) {
-            self.latest = Some(Difference { used_m, new_m });
+        if let (Some(used), Some(new)) = (at(&self.used), at(&self.new)) {
+            let heading = |pose: &Transform3| heading_rad::<Camera>(pose.transform()?.rotation());
+            let turned_rad = heading(&used).zip(heading(&new)).map(|(a, b)| angle_between(a, b));
+            let (used_m, new_m) = (used.translation_m, new.translation_m);
+            self.latest = Some(Difference { used_m, new_m, turned_rad });
         }
     }
 
     /// The latest difference by its axes and the limit, for a person; `None` before there is one.
     pub(super) fn text(&self) -> Option<String> {
-        let Difference { used_m, new_m } = self.latest?;
+        let Difference { used_m, new_m, turned_rad } = self.latest?;
         let apart_m = distance(used_m, new_m);
         // The controller judges by the farther of both, and a size by the one in use.
         let range_m = range(used_m, new_m);
@@ -117,8 +124,17 @@ impl Comparison {
         } else {
             String::new()
         };
+        let turns = self.controller.as_ref().is_some_and(controller::Config::turns_to_pad);
+        let turned_rad = turned_rad.filter(|rad| turns && *rad > HEADING_TOLERANCE_RAD);
+        let turned = turned_rad.map_or_else(String::new, |rad| {
+            format!(
+                ". It sees the marker turned by {:.0} degrees, and they agree up to {:.0}: as where it begins with another corner",
+                rad.to_degrees(),
+                HEADING_TOLERANCE_RAD.to_degrees()
+            )
+        });
         Some(format!(
-            "in the latest frame it sees the marker {apart_m:.3} m from where `{}` does ({}, {}, {}, in the camera's view), and {limit}{hint}",
+            "in the latest frame it sees the marker {apart_m:.3} m from where `{}` does ({}, {}, {}, in the camera's view), and {limit}{hint}{turned}",
             self.used.detector,
             axis(0, ["to the right", "to the left"]),
             axis(1, ["down", "up"]),
@@ -185,6 +201,36 @@ mod tests {
         let text = comparison.text().unwrap();
         let limit = "at this range of 5.03 m they agree up to 0.351 m (`detectors.tolerance_m` of the controller, 0.2, and `tolerance_per_m`, 0.03 of the range)";
         assert!(text.ends_with(limit), "{text}");
+    }
+
+    #[test]
+    fn a_turned_marker_is_told_where_the_vehicle_turns_to_it() {
+        for (turn_rad_s, is_told) in [(0.0, false), (0.3, true)] {
+            let mut comparison = Comparison::default();
+            comparison.of(Some("main"), "new");
+            comparison.configured(&Configuration {
+                service: "controller".into(),
+                instance: "main".into(),
+                host: String::new(),
+                version: String::new(),
+                toml: format!(
+                    "marker = \"aruco-4x4-50:7\"\n[metric]\nturn_rad_s = {turn_rad_s:.1}"
+                ),
+            });
+            let half = std::f64::consts::FRAC_1_SQRT_2;
+            for (name, rotation_wxyz) in
+                [("main", [0.0, 1.0, 0.0, 0.0]), ("new", [0.0, half, half, 0.0])]
+            {
+                let mut message = found(name, 1, [0.0, 0.0, 5.0]);
+                let detection = &mut message.detections[0];
+                (detection.family, detection.id) = ("aruco-4x4-50".into(), Some(7));
+                let pose = detection.pose.as_mut().unwrap();
+                pose.camera_from_marker.rotation_wxyz = rotation_wxyz;
+                comparison.found(&message);
+            }
+            let text = comparison.text().unwrap();
+            assert_eq!(text.contains("turned by 90 degrees"), is_told, "{text}");
+        }
     }
 
     #[test]

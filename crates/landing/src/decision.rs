@@ -177,8 +177,8 @@ named! {
         TargetAging = "target-aging", "no recent detection that could be used, descent stopped";
         /// The marker is seen at two places, and it is undecided which is the pad.
         Ambiguous = "ambiguous", "the marker is seen at two places, descent stopped until one is seen in most frames";
-        /// Two detectors see the marker at two places, and nobody says which is right.
-        Disputed = "disputed", "detectors see the marker at two places, not descending near the ground until they agree";
+        /// Two detectors see the marker at two places, or with two headings where the vehicle turns to it, and nobody says which is right.
+        Disputed = "disputed", "detectors see the marker at two places or turned, not descending near the ground until they agree";
         /// Low over the marker, waiting for a small error and a small speed.
         Settling = "settling", "settling over the marker before the touchdown";
         /// Low over the marker and settled.

@@ -33,7 +33,7 @@ pub enum Event {
     LinkDelay(f64),
     /// How the autopilot follows setpoints has become known.
     Limits(AutopilotLimits),
-    /// Two detectors see the marker at two places, and nobody says which is right; or no longer.
+    /// Two detectors see the marker at two places or with two headings, and nobody says which is right; or no longer.
     Dispute(bool),
     /// Time has passed.
     Tick,
