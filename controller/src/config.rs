@@ -11,6 +11,7 @@ use landing::{
 use node::{Check, Settings, clock_name, state_directory};
 use serde::{Deserialize, Serialize};
 
+use crate::agreement::{HEADING_TOLERANCE_RAD, Tolerance};
 use crate::wind::Drag;
 
 /// Period of the flight's ticks.
@@ -324,10 +325,16 @@ impl Config {
         SigningConfig::read(signing_key.as_ref(), *component_id, state_directory(), &name).map(Some)
     }
 
-    /// Whether the vehicle turns to the marker's heading: an autopilot that lands by itself does not.
-    pub fn turns_to_pad(&self) -> bool {
+    /// The differences up to which two detectors agree: in heading where the vehicle turns to the marker's, which it does not where the
+    /// autopilot lands by itself.
+    pub fn tolerance(&self) -> Tolerance {
         let is_flown = self.mode != Mode::LandingTarget && self.guidance == GuidanceName::Metric;
-        is_flown && self.metric.turn_rad_s > 0.0
+        let turns = is_flown && self.metric.turn_rad_s > 0.0;
+        Tolerance {
+            base_m: self.detectors.tolerance_m,
+            per_m: self.detectors.tolerance_per_m,
+            heading_rad: turns.then_some(HEADING_TOLERANCE_RAD),
+        }
     }
 
     /// Whether the vehicle can turn to the marker's heading: rings look the same from all sides, so the upper edge that their pose has

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use landing::{FrameObservation, Timestamp};
 use messages::{CameraInfo, Detections, Place};
 
-use crate::agreement::{HEADING_TOLERANCE_RAD, Sight};
+use crate::agreement::Sight;
 use crate::camera_watch::CameraWatch;
 use crate::cameras::{Cameras, Reception};
 use crate::config::{Config, PreferredPlace};
@@ -244,9 +244,7 @@ fn selection(config: &Config) -> Selection {
         max_age_s: settings.max_age_s,
         min_rate_hz: settings.min_rate_hz,
         return_after_s: settings.return_after_s,
-        tolerance_m: settings.tolerance_m,
-        tolerance_per_m: settings.tolerance_per_m,
-        tolerance_heading_rad: config.turns_to_pad().then_some(HEADING_TOLERANCE_RAD),
+        tolerance: config.tolerance(),
     };
     let detector = Some(settings.preferred.clone()).filter(|name| !name.is_empty());
     let place = match settings.place {

@@ -64,23 +64,8 @@ pub struct Limits {
     pub min_rate_hz: f64,
     /// Time for which a preferred detector must have been healthy before it is used, in seconds.
     pub return_after_s: f64,
-    /// Maximum distance between the marker positions of two detectors that agree, in metres.
-    pub tolerance_m: f64,
-    /// Growth of that distance per metre of range.
-    pub tolerance_per_m: f64,
-    /// Maximum difference of the marker headings of two detectors that agree, in radians; `None` where the vehicle does not turn to the
-    /// marker.
-    pub tolerance_heading_rad: Option<f64>,
-}
-
-impl Limits {
-    fn tolerance(&self) -> Tolerance {
-        Tolerance {
-            base_m: self.tolerance_m,
-            per_m: self.tolerance_per_m,
-            heading_rad: self.tolerance_heading_rad,
-        }
-    }
+    /// Maximum differences between what two detectors see that agree.
+    pub tolerance: Tolerance,
 }
 
 /// What a detector is worth when there is no room for all; a better one takes the place of a worse one.
@@ -454,7 +439,7 @@ impl Selection {
 
     /// Compares what all detectors that answer saw in the same frames.
     fn compare_all(&mut self, now_ns: i64) {
-        let tolerance = self.limits.tolerance();
+        let tolerance = self.limits.tolerance;
         let answers: Vec<bool> = self.known.iter().map(|known| known.has_opinion(now_ns)).collect();
         let voters: Vec<Voter<'_>> = self
             .known
@@ -754,7 +739,7 @@ impl Known {
         let agrees = match (active.position_m, ours.position_m) {
             (Some(active_m), Some(ours_m)) => {
                 self.disagreement_m = Some(distance(active_m, ours_m));
-                let tolerance = limits.tolerance();
+                let tolerance = limits.tolerance;
                 within(tolerance, active_m, ours_m) && turned(tolerance, active, ours).is_none()
             }
             // Without poses there is no distance; both see the marker.

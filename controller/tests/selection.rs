@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 
-use controller::agreement::{HEADING_TOLERANCE_RAD, Sight};
+use controller::agreement::{HEADING_TOLERANCE_RAD, Sight, Tolerance};
 use controller::selection::{
     Limits, MAX_DETECTORS, MAX_SILENCE_NS, MAX_VERDICTS, MIN_SILENCE_NS, Preference, Selection,
 };
@@ -18,9 +18,7 @@ fn limits() -> Limits {
         max_age_s: 0.2,
         min_rate_hz: 3.0,
         return_after_s: 2.0,
-        tolerance_m: 0.1,
-        tolerance_per_m: 0.03,
-        tolerance_heading_rad: Some(HEADING_TOLERANCE_RAD),
+        tolerance: Tolerance { base_m: 0.1, per_m: 0.03, heading_rad: Some(HEADING_TOLERANCE_RAD) },
     }
 }
 
@@ -565,6 +563,20 @@ fn quarter_turned() -> Option<Sight> {
     Some(turned([0.0, 0.0, 5.0], 90.0))
 }
 
+impl Bench {
+    /// Two that see the marker at one place and a third one that sees it turned, for 60 frames.
+    fn two_and_one_turned(&mut self) {
+        let answers = [
+            ("first", 30 * MS, at(0.0)),
+            ("second", 25 * MS, at(0.03)),
+            ("turned", 35 * MS, quarter_turned()),
+        ];
+        for i in 0..60 {
+            self.frame_seen(i * PERIOD, &answers);
+        }
+    }
+}
+
 #[test]
 fn two_that_see_the_marker_turned_are_told_and_the_new_one_is_not_trusted() {
     let mut bench = Bench::new(preferring(Some("turned"), None));
@@ -590,14 +602,7 @@ fn two_that_see_the_marker_turned_are_told_and_the_new_one_is_not_trusted() {
 #[test]
 fn of_three_the_one_that_sees_the_marker_turned_is_outvoted_even_if_it_is_preferred() {
     let mut bench = Bench::new(preferring(Some("turned"), None));
-    let answers = [
-        ("first", 30 * MS, at(0.0)),
-        ("second", 25 * MS, at(0.03)),
-        ("turned", 35 * MS, quarter_turned()),
-    ];
-    for i in 0..60 {
-        bench.frame_seen(i * PERIOD, &answers);
-    }
+    bench.two_and_one_turned();
     assert_ne!(bench.selection.active(), Some("turned"));
     assert_eq!(bench.state("turned"), DetectorState::Outvoted);
     assert_eq!(bench.selection.dispute(), None);
@@ -607,16 +612,11 @@ fn of_three_the_one_that_sees_the_marker_turned_is_outvoted_even_if_it_is_prefer
 
 #[test]
 fn where_the_vehicle_does_not_turn_to_the_marker_its_heading_does_not_matter() {
-    let limits = Limits { tolerance_heading_rad: None, ..limits() };
+    let usual = limits();
+    let tolerance = Tolerance { heading_rad: None, ..usual.tolerance };
+    let limits = Limits { tolerance, ..usual };
     let mut bench = Bench::new(Selection::new(limits, Preference::default()));
-    let answers = [
-        ("first", 30 * MS, at(0.0)),
-        ("second", 25 * MS, at(0.03)),
-        ("turned", 35 * MS, quarter_turned()),
-    ];
-    for i in 0..60 {
-        bench.frame_seen(i * PERIOD, &answers);
-    }
+    bench.two_and_one_turned();
     assert_eq!((bench.selection.dispute(), bench.state("turned")), (None, DetectorState::Shadow));
     assert!(bench.selection.warnings(bench.now_ns).is_empty());
     let turned = bench.selection.candidates(bench.now_ns);

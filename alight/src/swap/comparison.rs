@@ -3,9 +3,7 @@
 
 use std::collections::VecDeque;
 
-use controller::agreement::{
-    HEADING_TOLERANCE_RAD, Tolerance, angle_between, distance, heading_rad, range,
-};
+use controller::agreement::{angle_between, distance, heading_rad, range};
 use geometry::Camera;
 use messages::{Configuration, Detections, Transform3};
 
@@ -101,15 +99,16 @@ impl Comparison {
                 new_m.get(index).zip(used_m.get(index)).map_or(0.0, |(new, used)| new - used);
             format!("{:.3} m {}", by_m.abs(), words[usize::from(by_m < 0.0)])
         };
-        let limit = self.controller.as_ref().map_or_else(
+        let tolerance = self.controller.as_ref().map(controller::Config::tolerance);
+        let limit = tolerance.map_or_else(
             || "more than `detectors.tolerance_m` and `tolerance_per_m` of the controller let them differ".to_owned(),
-            |controller| {
-                let settings = &controller.detectors;
-                let (base_m, per_m) = (settings.tolerance_m, settings.tolerance_per_m);
-                let max_m = Tolerance { base_m, per_m, heading_rad: None }.at(range_m);
+            |tolerance| {
                 format!(
-                    "at this range of {range_m:.2} m they agree up to {max_m:.3} m (`detectors.tolerance_m` of the controller, {base_m}, and \
-                     `tolerance_per_m`, {per_m} of the range)"
+                    "at this range of {range_m:.2} m they agree up to {:.3} m (`detectors.tolerance_m` of the controller, {}, and \
+                     `tolerance_per_m`, {} of the range)",
+                    tolerance.at(range_m),
+                    tolerance.base_m,
+                    tolerance.per_m
                 )
             },
         );
@@ -124,13 +123,13 @@ impl Comparison {
         } else {
             String::new()
         };
-        let turns = self.controller.as_ref().is_some_and(controller::Config::turns_to_pad);
-        let turned_rad = turned_rad.filter(|rad| turns && *rad > HEADING_TOLERANCE_RAD);
-        let turned = turned_rad.map_or_else(String::new, |rad| {
+        let max_rad = tolerance.and_then(|tolerance| tolerance.heading_rad);
+        let turned = turned_rad.zip(max_rad).filter(|(rad, max_rad)| rad > max_rad);
+        let turned = turned.map_or_else(String::new, |(rad, max_rad)| {
             format!(
                 ". It sees the marker turned by {:.0} degrees, and they agree up to {:.0}: as where it begins with another corner",
                 rad.to_degrees(),
-                HEADING_TOLERANCE_RAD.to_degrees()
+                max_rad.to_degrees()
             )
         });
         Some(format!(
