@@ -2,6 +2,7 @@
 //! decision.
 
 mod aborted;
+mod hovering;
 mod lost;
 mod marker;
 
@@ -19,6 +20,7 @@ use crate::event::{
 use crate::guidance::ActiveGuidance;
 use crate::guidance::situation::{Progress, Situation};
 use crate::history::History;
+use crate::hover::Hover;
 use crate::limits::ConfigError;
 use crate::mount_check::{MountCheck, MountFindings};
 use crate::repeated_picture::RepeatedPicture;
@@ -110,6 +112,8 @@ pub struct Lander {
     half_view_rad: Option<f64>,
     /// The expanding square that is being flown.
     square: Option<Square>,
+    /// The hover that goes on.
+    hover: Option<Hover>,
     /// How the autopilot follows setpoints.
     limits: AutopilotLimits,
     /// Since when two detectors see the marker at two places.
@@ -147,6 +151,7 @@ impl Lander {
             heard_since: None,
             half_view_rad: None,
             square: None,
+            hover: None,
             limits: AutopilotLimits::default(),
             disputed: None,
         })
@@ -219,6 +224,7 @@ impl Lander {
             self.start = self.place().unwrap_or(Point::origin());
         }
         let (action, why) = self.act(now);
+        let action = self.keep_place(now, action);
         Decision {
             phase: self.state_machine.phase(),
             action,
@@ -718,8 +724,10 @@ impl Lander {
         let wanted = if self.square.is_none() && is_low && up.z() < 0.0 {
             up
         } else {
+            // About where the search began, if the wind keeps the vehicle beside it.
+            let centre = self.hover.and_then(|hover| hover.place()).unwrap_or(place);
             let square = self.square.get_or_insert_with(|| {
-                Square::new(&self.config, now, place, vehicle.ned_from_body, height_m)
+                Square::new(&self.config, now, centre, vehicle.ned_from_body, height_m)
             });
             let legs = square.velocity(phases, place);
             let wanted = envelope::clamp_to_fence(phases, vehicle.position, legs);

@@ -14,7 +14,8 @@
 //! - [`history`]: the vehicle's recent motion, and the odometry frame.
 //! - `measurement`, `filter`, `view`, `hypotheses`, [`estimator`]: from detections to the landing point; [`mean_target`] for
 //!   the thesis' guidance; `target_filter` is the one that is needed.
-//! - [`guidance`]: from the target to a velocity. [`search`]: where to look for the marker.
+//! - [`guidance`]: from the target to a velocity. [`search`]: where to look for the marker. `hover`: how
+//!   to stay at a place.
 //! - [`axis_check`]: are the axes of camera and autopilot consistent? [`mount_check`]: by how much are they off?
 //!   `standing`: how high does the vehicle stand, and does it? `repeated_picture`: is what the camera shows an old picture?
 //! - [`state_machine`]: the phases. [`envelope`]: the last check of a setpoint.
@@ -31,6 +32,7 @@ pub mod event;
 mod filter;
 pub mod guidance;
 pub mod history;
+mod hover;
 mod hypotheses;
 pub mod lander;
 mod limits;

@@ -8,14 +8,11 @@ use geometry::{Body, Ned, Odometry, Point, Rotation, Vector};
 use libm::{atan2, fmax, fmin, sin, sincos};
 
 use crate::config::{Config, PhaseConfig};
+use crate::hover::back;
 use crate::time::Timestamp;
 
 /// Minimum tilt that shows the direction of the wind, in radians.
 const MIN_TILT_RAD: f64 = 0.02;
-
-/// Velocity towards the square's line per metre beside it, in 1/s: slower than an autopilot's velocity loop, which it
-/// must not excite.
-const TRACKING_PER_S: f64 = 0.5;
 
 /// Distance of the vehicle from the point that moves along the square, from which that point slows down, and at which it would stand, in metres.
 const SLOW_LAG_M: f64 = 1.0;
@@ -68,15 +65,11 @@ impl Square {
 
     /// The velocity of a vehicle at `place`, in m/s, at most twice the speed along the square; at the end of the last leg it stays there.
     pub fn velocity(&self, config: &PhaseConfig, place: Point<Odometry>) -> Vector<Ned> {
-        let back = self.lag(place) * TRACKING_PER_S;
-        let back_m_s = back.horizontal_norm();
-        let scale = fmin(1.0, self.speed_m_s / fmax(back_m_s, f64::MIN_POSITIVE));
         let onwards = match self.length_m(config) {
             Some(_) => self.direction() * (self.speed_m_s * self.pace(place)),
             None => Vector::zero(),
         };
-        let velocity = onwards + back * scale;
-        Vector::from_coords(velocity.coords)
+        Vector::from_coords(onwards.coords) + back(self.lag(place), self.speed_m_s)
     }
 
     /// Moves its point on until `now`, the slower the farther the vehicle is from it, but not for one whose fence keeps it from following.

@@ -14,7 +14,7 @@ const CLIMB_AWAY_S: f64 = 60.0;
 
 /// Height up to which a vehicle that is still may stand, in metres: it carries its sensors above the ground, and heights err by
 /// decimetres.
-const MIN_FLYING_M: f64 = 0.5;
+pub(super) const MIN_FLYING_M: f64 = 0.5;
 
 /// Height that may be missing from the one at which an aborted landing hovers, in metres.
 const HOVER_TOLERANCE_M: f64 = 0.1;
@@ -123,7 +123,7 @@ impl Lander {
 
     /// Whether the vehicle may stand: it is still over the pad, and so low as heights err, or at a height that is not known, or LAND was
     /// refused.
-    fn may_stand_after_abort(&self, now: Timestamp) -> bool {
+    pub(super) fn may_stand_after_abort(&self, now: Timestamp) -> bool {
         let pad = self.recent_target(now).map_or(Vector::zero(), |target| target.velocity);
         let is_still = self
             .history

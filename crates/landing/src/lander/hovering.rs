@@ -1,0 +1,61 @@
+//! What keeps a vehicle at its place that is commanded no velocity to the side: one that waits, holds, or climbs straight up.
+
+use geometry::Vector;
+
+use super::Lander;
+use super::aborted::MIN_FLYING_M;
+use crate::decision::{Action, Phase, Reason};
+use crate::envelope;
+use crate::event::Landed;
+use crate::hover::Hover;
+use crate::time::Timestamp;
+
+/// Depth under the pad, or the ground that the vehicle took off from, in metres, at which it is not taken for standing on it.
+const MAX_SUNK_M: f64 = 1.0;
+
+impl Lander {
+    /// The same action, but a vehicle that is to hover or to climb straight up is led back to where that began. A request of a mode
+    /// does not end a hover.
+    pub(super) fn keep_place(&mut self, now: Timestamp, action: Action) -> Action {
+        let Action::Velocity { velocity, yaw_rate } = action else {
+            if action == Action::None {
+                self.hover = None;
+            }
+            return action;
+        };
+        let before = self.hover.take();
+        let is_steered = velocity.horizontal_norm() > 0.0
+            || velocity.z() > 0.0
+            || matches!(self.phase(), Phase::Approach | Phase::Descend);
+        let (Some(vehicle), Some(place)) = (self.history.newest().copied(), self.place()) else {
+            return action;
+        };
+        let max_age_s = self.config.phases.stale_vehicle_s;
+        let is_known = now.seconds_since(vehicle.stamp) <= max_age_s && !self.is_link_slow;
+        if is_steered || !is_known || self.may_touch_ground(now) {
+            return action;
+        }
+        let mut hover = before.unwrap_or(Hover::new(vehicle.stamp));
+        let speed_m_s = vehicle.velocity.horizontal_norm();
+        let back = hover.velocity(vehicle.stamp, place, speed_m_s, max_age_s);
+        self.hover = Some(hover);
+        let wanted = Vector::new(back.x(), back.y(), velocity.z());
+        let wanted = envelope::clamp_to_fence(&self.config.phases, vehicle.position, wanted);
+        let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
+        self.guidance.on_setpoint_sent(velocity);
+        Action::Velocity { velocity, yaw_rate }
+    }
+
+    /// True where the vehicle may stand: what the autopilot's position drifts by is then no way that it has moved, and a velocity to the
+    /// side would tip it over.
+    fn may_touch_ground(&self, now: Timestamp) -> bool {
+        let is_low = self
+            .known_height_m(now)
+            .is_some_and(|height_m| (-MAX_SUNK_M..MIN_FLYING_M).contains(&height_m));
+        is_low
+            || self.landed(now) == Landed::OnGround
+            || self.state_machine.reason() == Reason::MayStand
+            || self.may_stand(now)
+            || self.phase() == Phase::Aborted && self.may_stand_after_abort(now)
+    }
+}
