@@ -4,6 +4,7 @@ use geometry::Vector;
 
 use super::Lander;
 use super::aborted::MIN_FLYING_M;
+use crate::config::GuidanceConfig;
 use crate::decision::{Action, Phase, Reason};
 use crate::envelope;
 use crate::event::Landed;
@@ -15,7 +16,7 @@ const MAX_SUNK_M: f64 = 1.0;
 
 impl Lander {
     /// The same action, but a vehicle that is to hover or to climb straight up is led back to where that began. A request of a mode
-    /// does not end a hover.
+    /// does not end a hover. The thesis' guidance hovers as the thesis' program did.
     pub(super) fn keep_place(&mut self, now: Timestamp, action: Action) -> Action {
         let Action::Velocity { velocity, yaw_rate } = action else {
             if action == Action::None {
@@ -24,7 +25,9 @@ impl Lander {
             return action;
         };
         let before = self.hover.take();
-        let is_steered = velocity.horizontal_norm() > 0.0
+        let is_thesis = matches!(self.config.guidance, GuidanceConfig::Thesis(_));
+        let is_steered = is_thesis
+            || velocity.horizontal_norm() > 0.0
             || velocity.z() > 0.0
             || matches!(self.phase(), Phase::Approach | Phase::Descend);
         let (Some(vehicle), Some(place)) = (self.history.newest().copied(), self.place()) else {
