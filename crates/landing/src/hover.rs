@@ -129,8 +129,8 @@ mod tests {
     fn it_stays_where_it_has_braked() {
         for speed_m_s in [0.2, 1.0, 2.0] {
             let path = fly(along(0, speed_m_s), Vector::zero(), 0.2);
-            let turn_m = path.iter().map(|place| place.x()).fold(0.0, f64::max);
-            let last_m = path.last().map_or(f64::NAN, |place| place.x());
+            let turn_m = path.iter().map(Point::x).fold(0.0, f64::max);
+            let last_m = path.last().map_or(f64::NAN, Point::x);
             assert!(turn_m - last_m < 0.2, "{speed_m_s} m/s: {turn_m} m, {last_m} m");
             assert!(last_m > 0.3 * speed_m_s - 0.1, "{speed_m_s} m/s: {last_m} m");
         }
