@@ -220,7 +220,7 @@ fn pass_up(
     if node.health().failed(&format!("packets of the ground station refused: {name}")) {
         tracing::warn!(
             %permission,
-            "Packet of a ground station refused: {name} (`autopilot.ground_may`; further ones are only counted)"
+            "Packet of a ground station refused: {name} (see `autopilot.ground_may`; further ones are only counted)"
         );
     }
     denials(&packets, flight.flight().system()).for_each(|answer| reports.pass_on(node, answer));
@@ -392,8 +392,20 @@ impl Reports {
 mod tests {
     use super::*;
     use autopilot::Sender;
-    use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage, MavResult};
+    use autopilot::dialect::{
+        COMMAND_LONG_DATA, MavCmd, MavMessage, MavResult, SETUP_SIGNING_DATA,
+    };
     use autopilot::packet::encode;
+
+    #[test]
+    fn no_key_of_signed_packets_goes_to_the_autopilot() {
+        let ground = Sender { system: 255, component: 190 };
+        let key = MavMessage::SETUP_SIGNING(SETUP_SIGNING_DATA::default());
+        let bytes = encode(ground, 0, &key);
+        let packets = Parser::new().push(&bytes);
+        let name = refused(Permission::Everything, &packets, bytes.len());
+        assert_eq!(name, Some("SETUP_SIGNING"));
+    }
 
     #[test]
     fn a_refused_command_is_answered_as_by_the_autopilot() {

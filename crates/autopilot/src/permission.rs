@@ -4,16 +4,16 @@
 use std::fmt;
 use std::str::FromStr;
 
-use crate::dialect::{MavCmd, MavMessage};
+use crate::dialect::{MavCmd, MavMessage, MavModeFlag, MessageData, SETUP_SIGNING_DATA};
 use crate::packet::Packet;
 
 /// What a ground station may send to the autopilot.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub enum Permission {
-    /// Everything.
+    /// Everything but the key of signed packets, which no permission lets pass.
     #[default]
     Everything,
-    /// Everything but what starts or stops motors: arming, disarming, ending the flight, restarting.
+    /// Everything but what starts or stops motors: arming, disarming, the safety switch, ending the flight, restarting.
     NoArming,
     /// Only what changes nothing: heartbeats, the time, questions for parameters, missions and messages.
     Monitor,
@@ -38,8 +38,12 @@ impl Permission {
 
     /// Why a packet may not be sent, as a short name for counters; `None` when it may.
     ///
-    /// What the dialect does not know may only be sent with [`Permission::Everything`]: it could be anything.
+    /// What the dialect does not know may only be sent with [`Permission::Everything`]: it could be anything. SETUP_SIGNING is
+    /// never sent: it has the key in clear text, and an autopilot that took it would refuse all that comes after it from here.
     pub fn refusal(self, packet: &Packet) -> Option<&'static str> {
+        if packet.message_id == SETUP_SIGNING_DATA::ID {
+            return Some("SETUP_SIGNING");
+        }
         if self == Self::Everything {
             return None;
         }
@@ -83,6 +87,7 @@ fn command(message: &MavMessage) -> Option<MavCmd> {
 /// A command to be carried out now, or by a mission.
 struct Order {
     command: MavCmd,
+    first_parameter: f32,
     /// The fifth, sixth and seventh parameters; a mission's place is none.
     last_parameters: [f32; 3],
 }
@@ -90,21 +95,27 @@ struct Order {
 impl Order {
     #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
     fn of(message: &MavMessage) -> Option<Self> {
-        let (command, last_parameters) = match message {
-            MavMessage::COMMAND_LONG(it) => (it.command, [it.param5, it.param6, it.param7]),
-            MavMessage::COMMAND_INT(it) => (it.command, [it.x as f32, it.y as f32, it.z]),
-            MavMessage::MISSION_ITEM(it) => (it.command, [0.0; 3]),
-            MavMessage::MISSION_ITEM_INT(it) => (it.command, [0.0; 3]),
+        let (command, first_parameter, last_parameters) = match message {
+            MavMessage::COMMAND_LONG(it) => {
+                (it.command, it.param1, [it.param5, it.param6, it.param7])
+            }
+            MavMessage::COMMAND_INT(it) => {
+                (it.command, it.param1, [it.x as f32, it.y as f32, it.z])
+            }
+            MavMessage::MISSION_ITEM(it) => (it.command, it.param1, [0.0; 3]),
+            MavMessage::MISSION_ITEM_INT(it) => (it.command, it.param1, [0.0; 3]),
             _ => return None,
         };
-        Some(Self { command, last_parameters })
+        Some(Self { command, first_parameter, last_parameters })
     }
 
     /// Some do so by a parameter: a calibration of the compass against the motors or of the speed controllers turns motors,
-    /// and one of the compass may restart the autopilot at its end.
+    /// one of the compass may restart the autopilot at its end, and a mode that is none of the firmware's own is the position of
+    /// ArduPilot's safety switch, which stops the motors in the air. A trap halts the autopilot, a new boot loader holds it up.
     fn starts_or_stops_motors(&self) -> bool {
         let [fifth, sixth, seventh] = self.last_parameters;
         match self.command {
+            MavCmd::MAV_CMD_DO_SET_MODE => !is_custom_mode(self.first_parameter),
             MavCmd::MAV_CMD_PREFLIGHT_CALIBRATION => sixth != 0.0 || seventh != 0.0,
             MavCmd::MAV_CMD_DO_START_MAG_CAL => fifth != 0.0,
             MavCmd::MAV_CMD_COMPONENT_ARM_DISARM
@@ -123,12 +134,23 @@ impl Order {
             | MavCmd::MAV_CMD_SOLO_BTN_FLY_HOLD
             | MavCmd::MAV_CMD_SOLO_BTN_PAUSE_CLICK
             | MavCmd::MAV_CMD_ACTUATOR_TEST
+            | MavCmd::MAV_CMD_CONFIGURE_ACTUATOR
+            | MavCmd::MAV_CMD_DO_SET_SAFETY_SWITCH_STATE
+            | MavCmd::MAV_CMD_DEBUG_TRAP
+            | MavCmd::MAV_CMD_FLASH_BOOTLOADER
+            | MavCmd::MAV_CMD_SCRIPTING
             | MavCmd::MAV_CMD_INJECT_FAILURE
             | MavCmd::MAV_CMD_CAN_FORWARD
             | MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN => true,
             _ => false,
         }
     }
+}
+
+/// Whether the flags of a mode say that it is one of the firmware's own. Ground stations set that bit, alone or with others.
+fn is_custom_mode(flags: f32) -> bool {
+    let is_byte = (0.0..=255.0).contains(&flags);
+    is_byte && flags as u8 & MavModeFlag::MAV_MODE_FLAG_CUSTOM_MODE_ENABLED.bits() != 0
 }
 
 /// SET_MODE counts as well: its flags can arm older autopilots. So do a script or a file that the autopilot would run, MAVLink
@@ -188,7 +210,7 @@ mod tests {
     use crate::dialect::{
         CAN_FRAME_DATA, COMMAND_INT_DATA, COMMAND_LONG_DATA, HEARTBEAT_DATA, MANUAL_CONTROL_DATA,
         MISSION_ITEM_INT_DATA, PARAM_REQUEST_LIST_DATA, PARAM_SET_DATA, RC_CHANNELS_OVERRIDE_DATA,
-        REQUEST_DATA_STREAM_DATA, SET_MODE_DATA,
+        REQUEST_DATA_STREAM_DATA, SET_MODE_DATA, SETUP_SIGNING_DATA,
     };
     use crate::packet::{Parser, Sender, encode};
 
@@ -208,6 +230,15 @@ mod tests {
     fn calibration(param6: f32) -> MavMessage {
         let command = MavCmd::MAV_CMD_PREFLIGHT_CALIBRATION;
         MavMessage::COMMAND_LONG(COMMAND_LONG_DATA { command, param6, ..Default::default() })
+    }
+
+    /// A mode with these flags, and ArduPilot's number of its position of the safety switch that stops the motors.
+    fn mode(flags: f32) -> [MavMessage; 2] {
+        let command = MavCmd::MAV_CMD_DO_SET_MODE;
+        let (param1, param2) = (flags, 1.0);
+        let long = COMMAND_LONG_DATA { command, param1, param2, ..Default::default() };
+        let int = COMMAND_INT_DATA { command, param1, param2, ..Default::default() };
+        [MavMessage::COMMAND_LONG(long), MavMessage::COMMAND_INT(int)]
     }
 
     /// Places of missions are not parameters.
@@ -247,6 +278,56 @@ mod tests {
             assert_eq!(Permission::Everything.refusal(&packet), None);
             assert_eq!(Permission::NoArming.refusal(&packet).is_none(), no_arming, "{message:?}");
             assert_eq!(Permission::Monitor.refusal(&packet).is_none(), monitor, "{message:?}");
+        }
+    }
+
+    #[test]
+    fn without_arming_a_mode_passes_only_as_one_of_the_firmwares_own() {
+        let passes =
+            |message: &MavMessage| Permission::NoArming.refusal(&packet(message)).is_none();
+        // As QGroundControl, MAVSDK and pymavlink set it: the bit alone, or with those that the vehicle shows.
+        for flags in [1.0, 1.0 + 128.0, 1.0 + 16.0 + 64.0] {
+            assert!(mode(flags).iter().all(passes), "{flags}");
+        }
+        // The last ones are this, or zero, in a byte of C++.
+        for flags in [128.0, 0.0, 4.0, 254.0, 384.0, 385.0, -128.0, -127.0, f32::NAN, f32::INFINITY]
+        {
+            assert!(!mode(flags).iter().any(passes), "{flags}");
+        }
+        let item = MISSION_ITEM_INT_DATA {
+            command: MavCmd::MAV_CMD_DO_SET_MODE,
+            param1: 128.0,
+            ..Default::default()
+        };
+        assert!(!passes(&MavMessage::MISSION_ITEM_INT(item)));
+    }
+
+    #[test]
+    fn without_arming_nothing_passes_that_halts_the_autopilot_or_its_motors() {
+        for command in [
+            MavCmd::MAV_CMD_DO_SET_SAFETY_SWITCH_STATE,
+            MavCmd::MAV_CMD_DEBUG_TRAP,
+            MavCmd::MAV_CMD_FLASH_BOOTLOADER,
+            MavCmd::MAV_CMD_SCRIPTING,
+            MavCmd::MAV_CMD_CONFIGURE_ACTUATOR,
+        ] {
+            for message in [long(command), int(command)] {
+                let packet = packet(&message);
+                assert_eq!(Permission::Everything.refusal(&packet), None);
+                assert!(Permission::NoArming.refusal(&packet).is_some(), "{message:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_key_of_signed_packets_never_passes() {
+        let key = packet(&MavMessage::SETUP_SIGNING(SETUP_SIGNING_DATA::default()));
+        for (permission, packet) in Permission::ALL.into_iter().zip([
+            key.clone(),
+            key.clone(),
+            Packet { message: None, ..key },
+        ]) {
+            assert_eq!(permission.refusal(&packet), Some("SETUP_SIGNING"), "{permission}");
         }
     }
 
