@@ -171,7 +171,7 @@ impl Port {
                         return Heard::Packets(vec![*packet], None);
                     }
                     LinkEvent::Disconnected { reason } => return Heard::Problem(reason),
-                    LinkEvent::Connected { .. } => {}
+                    LinkEvent::Connected { .. } | LinkEvent::OtherAutopilot { .. } => {}
                 }
             },
         }

@@ -518,6 +518,9 @@ impl Flight {
         if self.landing_target.is_some() {
             return self.start_landing_target(now_ns);
         }
+        if let Some(conflict) = self.autopilot.conflict(now_ns) {
+            return Err(format!("no landing was started: {conflict}"));
+        }
         if is_holding_px4(&self.autopilot) {
             self.mission.take_control(now_ns, &mut self.autopilot);
             return Ok(self.view().phase(now_ns).1);
@@ -590,6 +593,11 @@ impl Flight {
                 return Err("the vehicle is taking off; there is nothing to resume".to_owned());
             }
             let why = "aborted by the operator before the landing began; the vehicle is to hold its place";
+        // A vehicle that took off for us is ours.
+        let conflict = self.autopilot.conflict(now_ns).filter(|_| !self.mission.is_taking_off());
+        if let Some(conflict) = conflict {
+            return Err(format!("not landed here: {conflict}"));
+        }
             if self.mission.leave_offboard(now_ns, &mut self.autopilot, why) {
                 return Ok(why.to_owned());
             }
@@ -666,11 +674,14 @@ impl Flight {
             let age_s = Timestamp::from_nanos(now_ns).seconds_since(state.stamp);
             age_s <= self.config.phases.stale_vehicle_s
         });
-        // A landing that would see nothing waits; what it waits for stands in the status.
-        let obstacle = if is_fresh {
-            self.frames.obstacle(now_ns)
-        } else {
-            Some("waiting for attitude and position".to_owned())
+        // A landing that would see nothing waits; what it waits for stands in the status. One of a vehicle that another controller may
+        // fly, or that may be the wrong one, too; a vehicle that took off for us is ours.
+        let conflict = self.autopilot.conflict(now_ns);
+        let conflict = conflict.filter(|_| self.mission.is_awaiting_takeoff());
+        let obstacle = match conflict {
+            Some(conflict) => Some(conflict.to_string()),
+            None if is_fresh => self.frames.obstacle(now_ns),
+            None => Some("waiting for attitude and position".to_owned()),
         };
         let steers = self.landing_target.is_none();
         let obstacle = obstacle.as_deref();

@@ -148,10 +148,10 @@ impl Journal {
             }
             Event::OtherVehicle { system } => tracing::warn!(
                 system,
-                "Another vehicle is on the link and is ignored; pin ours with `autopilot.system_id`"
+                "Another vehicle is on the link; it is ignored, and no flight begins until ours is pinned with `autopilot.system_id`"
             ),
             Event::SameAddress { .. } => tracing::warn!(
-                "Another companion uses our system and component id; change `autopilot.component_id` on one of them"
+                "Another companion uses our system and component id, and no flight begins until it ends; change `autopilot.component_id` on one of them"
             ),
             Event::Lost { silence } => {
                 let silence = format_args!("{:.1} s", silence.as_secs_f64());

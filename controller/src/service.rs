@@ -110,6 +110,11 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                 }
                 LinkEvent::Connected { peer } => tracing::info!(peer, "Link to the autopilot is up"),
                 LinkEvent::Disconnected { reason } => {
+                // Not passed on: a ground station would take it for a vehicle that it can fly through us.
+                LinkEvent::OtherAutopilot { packet, received } => {
+                    let waited_ns = i64::try_from(received.elapsed().as_nanos()).unwrap_or(0);
+                    flight.packet(now_ns().saturating_sub(waited_ns), &packet);
+                }
                     node.health().failed("link");
                     tracing::warn!(reason, "Link to the autopilot is down; reconnecting");
                 }

@@ -110,6 +110,10 @@ impl View<'_> {
     /// What the operator should know.
     pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
         let mut warnings = self.frames.warnings(now_ns);
+        warnings.extend(self.autopilot.conflict(now_ns).map(|conflict| Warning {
+            matter: "conflict".to_owned(),
+            text: format!("no take-off and no landing begins: {conflict}"),
+        }));
         warnings.extend(mount::warnings(&self.lander.mount_findings()));
         let configured_m = self.config.metric.standing_height_m;
         let is_metric = self.config.guidance == GuidanceName::Metric;
@@ -141,7 +145,9 @@ impl View<'_> {
                 (Phase::Idle, "waiting for the autopilot's heartbeat".to_owned())
             }
             (State::AwaitingTakeoff, None) => {
-                (Phase::Idle, "waiting for the vehicle to fly in GUIDED".to_owned())
+                let waits = "waiting for the vehicle to fly in GUIDED".to_owned();
+                let conflict = self.autopilot.conflict(now_ns).map(|it| it.to_string());
+                (Phase::Idle, conflict.unwrap_or(waits))
             }
             (State::TakingOff { why, .. }, _) => (Phase::Takeoff, why.clone()),
             (State::TakingControl { .. }, _) => {

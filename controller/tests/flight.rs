@@ -6,8 +6,10 @@
 mod packets;
 
 use autopilot::dialect::{
-    ATTITUDE_DATA, MavLandedState, MavMessage, PARAM_VALUE_DATA, SYS_STATUS_DATA,
+    ATTITUDE_DATA, HEARTBEAT_DATA, MavAutopilot, MavLandedState, MavMessage, MavType,
+    PARAM_VALUE_DATA, SYS_STATUS_DATA, TIMESYNC_DATA,
 };
+use autopilot::{Parser, Sender};
 use controller::flight::Flight;
 use controller::pad_note::PadNote;
 use messages::{
@@ -16,8 +18,8 @@ use messages::{
 };
 use node::clock_name;
 use packets::{
-    MS, Sent, attitude, contact, flight, flight_with, header, heartbeat, hover, in_flight, pose,
-    pose_at, position, receive, seen, sent,
+    MS, Sent, attitude, contact, flight, flight_with, header, heartbeat, hover, in_flight,
+    in_flight_with, pose, pose_at, position, receive, receive_from, seen, sent,
 };
 
 #[test]
@@ -673,6 +675,68 @@ fn a_low_battery_leads_to_what_is_configured() {
     hover(&mut flight, 2000, 3500, 4);
     let status = flight.status(3500 * MS);
     assert_eq!((status.phase, status.why.as_str()), (Phase::Hold, "the battery is low"));
+}
+
+/// The heartbeats of a vehicle with another system id, and of a companion with our ids.
+fn others() -> [(Sender, MavMessage, &'static str); 2] {
+    let companion = MavMessage::HEARTBEAT(autopilot::compose::heartbeat());
+    [
+        (Sender { system: 2, component: 1 }, heartbeat(4, true), "system ids 1 and 2"),
+        (Sender { system: 1, component: 191 }, companion, "autopilot.component_id"),
+    ]
+}
+
+#[test]
+fn no_landing_begins_where_another_vehicle_or_another_controller_is_on_the_link() {
+    for (sender, message, told) in others() {
+        // By command.
+        let mut flight = in_flight("command");
+        receive_from(&mut flight, 2 * MS, sender, &message);
+        hover(&mut flight, 20, 3000, 4);
+        for command in [ControllerCommand::Start, ControllerCommand::LandHere] {
+            let reply = flight.command(3000 * MS, &command);
+            assert!(!reply.accepted && reply.reason.contains(told), "{reply:?}");
+        }
+        let status = flight.status(3001 * MS);
+        assert!(status.warnings.iter().any(|it| it.contains(told)), "{:?}", status.warnings);
+        assert_eq!(hover(&mut flight, 3020, 3500, 4).setpoints, 0);
+        // By itself.
+        for start in ["airborne", "resume", "takeoff"] {
+            let mut flight = in_flight(start);
+            receive_from(&mut flight, 2 * MS, sender, &message);
+            sent(&mut flight);
+            let asked = hover(&mut flight, 20, 3000, 4);
+            assert!(asked.setpoints == 0 && asked.modes.is_empty(), "{start}: {asked:?}");
+            let status = flight.status(3000 * MS);
+            assert!(matches!(status.phase, Phase::Idle | Phase::Failed), "{start}: {status:?}");
+            assert!(status.why.contains(told), "{start}: {}", status.why);
+        }
+    }
+    // A landing that goes on is not ended.
+    for (sender, message, _) in others() {
+        let mut flight = in_flight("airborne");
+        hover(&mut flight, 20, 3000, 4);
+        receive_from(&mut flight, 3000 * MS, sender, &message);
+        assert!(hover(&mut flight, 3000, 4000, 4).setpoints > 10);
+    }
+    // Nor does another vehicle keep the one from landing that is pinned.
+    let [(sender, message, _), _] = others();
+    let mut flight = flight_with("airborne", &["autopilot.system_id=1"]);
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    receive_from(&mut flight, 2 * MS, sender, &message);
+    assert!(hover(&mut flight, 20, 3000, 4).setpoints > 10);
+}
+
+#[test]
+fn a_landing_begins_once_the_other_controller_has_ended() {
+    let [_, (sender, message, _)] = others();
+    let mut flight = in_flight("airborne");
+    flight.presence(0, "main", true);
+    flight.camera(0, CameraInfo::sample());
+    receive_from(&mut flight, 2 * MS, sender, &message);
+    assert_eq!(hover(&mut flight, 20, 9000, 4).setpoints, 0);
+    assert!(hover(&mut flight, 9000, 12_000, 4).setpoints > 10);
 }
 
 #[test]

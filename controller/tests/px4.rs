@@ -267,7 +267,8 @@ fn a_px4_whose_state_is_not_known_in_offboard_gets_zeros_and_is_taken_back() {
 /// A PX4 that has taken off to 5 m, holds its place, and was asked for OFFBOARD at 5 s.
 fn px4_at_the_end_of_its_takeoff() -> Flight {
     const TAKEOFF: u32 = 0x0204_0000;
-    let mut flight = flight_with("takeoff", &["takeoff_height_m=5"]);
+    // Pinned, it need not listen for other vehicles.
+    let mut flight = flight_with("takeoff", &["takeoff_height_m=5", "autopilot.system_id=1"]);
     flight.camera(0, CameraInfo::sample());
     flight.presence(0, "main", true);
     receive(&mut flight, 0, &heartbeat(HOLD, false));

@@ -335,6 +335,8 @@ impl Bridge {
                 None
             }
             LinkEvent::Packet { packet, .. } => self.packet_from_ground(now_ns, *packet),
+            // Only a link to an autopilot has them.
+            LinkEvent::OtherAutopilot { .. } => None,
         }
     }
 

@@ -30,6 +30,13 @@ pub(crate) fn receive(flight: &mut Flight, now_ns: i64, message: &MavMessage) {
     }
 }
 
+/// The flight receives a packet of another sender on the autopilot's link.
+pub(crate) fn receive_from(flight: &mut Flight, now_ns: i64, from: Sender, message: &MavMessage) {
+    for packet in Parser::new().push(&autopilot::packet::encode(from, 0, message)) {
+        flight.packet(now_ns, &packet);
+    }
+}
+
 /// A heartbeat in a mode of ArduPilot, or of PX4, whose modes are two numbers in the upper half.
 pub(crate) fn heartbeat(mode: u32, armed: bool) -> MavMessage {
     let autopilot = match mode >> 16 {
@@ -103,7 +110,11 @@ pub(crate) fn sent(flight: &mut Flight) -> (usize, Vec<MavCmd>) {
 }
 
 pub(crate) fn in_flight(start: &str) -> Flight {
-    let mut flight = flight(start);
+    in_flight_with(start, &[])
+}
+
+pub(crate) fn in_flight_with(start: &str, set: &[&str]) -> Flight {
+    let mut flight = flight_with(start, set);
     receive(&mut flight, 0, &heartbeat(4, true));
     receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
     flight

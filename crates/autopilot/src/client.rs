@@ -22,6 +22,7 @@ use crate::command::{
 };
 use crate::compose;
 use crate::config::Config;
+use crate::conflict::Conflict;
 use crate::contact::Contact;
 use crate::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, TIMESYNC_DATA};
 use crate::event::Event;
@@ -45,6 +46,8 @@ const HEARTBEAT_NS: i64 = 1_000_000_000;
 const UNSTEADY: Duration = Duration::from_secs(1);
 /// Silence after which another companion with our ids counts as gone, in nanoseconds.
 const SAME_ADDRESS_NS: i64 = 10_000_000_000;
+/// Time in which another vehicle on the link is heard, in nanoseconds: two heartbeats, which come once a second, and a little.
+const LISTENS_NS: i64 = 2_500_000_000;
 /// Maximum age of a position whose vertical speed says whether the vehicle stands, in nanoseconds.
 const MAX_SPEED_AGE_NS: i64 = 500_000_000;
 
@@ -65,7 +68,8 @@ pub struct Autopilot {
     outgoing: VecDeque<Vec<u8>>,
     sequence: u8,
     heartbeat_due_ns: i64,
-    other_vehicle: bool,
+    /// The system id of the first other vehicle that was heard.
+    other_system: Option<u8>,
     /// When a packet of another companion with our ids came last.
     same_address_ns: Option<i64>,
     refused_numbers: u64,
@@ -83,6 +87,8 @@ struct Vehicle {
     /// When its mode was shown last.
     mode_ns: i64,
     /// When its mode was shown first, of the times that are not older than [`MODE_OF_NOW_NS`].
+    /// When it was found.
+    found_ns: i64,
     mode_since_ns: i64,
     /// The mode before the last change that CURRENT_MODE showed, and when it did.
     mode_before: Option<(FlightMode, i64)>,
@@ -116,7 +122,7 @@ impl Autopilot {
             outgoing: VecDeque::new(),
             sequence: 0,
             heartbeat_due_ns: i64::MIN,
-            other_vehicle: false,
+            other_system: None,
             same_address_ns: None,
             refused_numbers: 0,
             late: 0,
@@ -310,6 +316,23 @@ impl Autopilot {
     /// Number of messages refused because a number in them was not finite.
     pub fn refused_numbers(&self) -> u64 {
         self.refused_numbers
+    }
+
+    /// Why neither a take-off nor a landing may begin now: a second controller, or, where [`Config::system_id`] pins none, a second
+    /// vehicle that was ever heard.
+    pub fn conflict(&self, now_ns: i64) -> Option<Conflict> {
+        if self.shares_our_address(now_ns) {
+            return Some(Conflict::SameAddress { sender: self.our_address() });
+        }
+        let (system, other) = self.system().zip(self.other_system)?;
+        Some(Conflict::SeveralVehicles { system, other })
+    }
+
+    /// Whether another vehicle on the link would have been heard by now, or it would not matter as ours is pinned.
+    pub fn has_listened(&self, now_ns: i64) -> bool {
+        let found_ns = self.vehicle.as_ref().map(|vehicle| vehicle.found_ns);
+        self.config.system_id.is_some()
+            || found_ns.is_some_and(|found| now_ns.saturating_sub(found) >= LISTENS_NS)
     }
 
     /// Number of measurements left out because they came after newer ones or seconds late, because their time since the

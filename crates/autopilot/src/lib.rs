@@ -15,7 +15,7 @@
 //! [`state`] and [`parameter`] are what the vehicle reports, [`clock`] converts its time stamps, `boot` and
 //! `contact` say which of its reports are believed, `simulation` asks whether it is simulated, [`client`] is the
 //! conversation with it with the settings of [`config`], [`event`] its events, [`command`] is what can be requested
-//! and why it may fail, [`takeoff`] arms the vehicle and takes off, [`offboard_exit`] ends PX4's OFFBOARD, which needs the `setpoint_stream`, [`permission`] is what a ground station may send,
+//! and why it may fail, [`conflict`] says why neither a take-off nor a landing may begin, [`takeoff`] arms the vehicle and takes off, [`offboard_exit`] ends PX4's OFFBOARD, which needs the `setpoint_stream`, [`permission`] is what a ground station may send,
 //! [`compose`] makes the messages that a companion sends, and `given` the answer to a command that is not carried out.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
@@ -27,6 +27,7 @@ pub mod clock;
 pub mod command;
 pub mod compose;
 pub mod config;
+pub mod conflict;
 mod contact;
 pub mod event;
 mod gate;
@@ -60,6 +61,7 @@ pub use address::Address;
 pub use client::Autopilot;
 pub use command::{Command, CommandError, CommandId, CommandStatus};
 pub use config::Config;
+pub use conflict::Conflict;
 pub use event::Event;
 pub use given::GivenCommand;
 pub use key_file::{KeyFileError, SigningConfig};

@@ -95,6 +95,14 @@ pub enum LinkEvent {
         /// Time of reception of its last byte.
         received: Instant,
     },
+    /// The heartbeat of another autopilot than the one that the link talks to, at a listening UDP port where none is pinned; at most
+    /// one a second.
+    OtherAutopilot {
+        /// The heartbeat.
+        packet: Box<Packet>,
+        /// Time of its reception.
+        received: Instant,
+    },
 }
 
 /// Why a link cannot be opened.
@@ -167,8 +175,15 @@ impl Link {
         let (spare, outgoing_spare) = mpsc::channel(SPARE);
         let shared = Arc::new(Shared::new());
         let (gate, keeping) = signing.map_or((Gate::new(None), None), keyed);
-        let port =
-            Port { shared: Arc::clone(&shared), outgoing, outgoing_spare, peering, gate, keeping };
+        let port = Port {
+            shared: Arc::clone(&shared),
+            outgoing,
+            outgoing_spare,
+            peering,
+            first_autopilot: None,
+            gate,
+            keeping,
+        };
         let task = tokio::spawn(run(address, listener, port));
         let sender = LinkSender { shared: Arc::clone(&shared), queue, spare };
         Ok(Self { shared, sender, task, local })
@@ -386,6 +401,8 @@ impl Port {
         let received = Instant::now();
         for packet in packets {
             self.shared.push(LinkEvent::Packet { packet: Box::new(packet), received });
+    /// The system id of the first autopilot at a UDP port.
+    first_autopilot: Option<u8>,
         }
     }
 }
@@ -762,7 +779,7 @@ where
 /// Moves datagrams in both directions until the socket breaks; returns why. Without a `fixed` peer,
 /// the peer is whom [`Peering`] says: the sender of the autopilot's heartbeat, or the first ground station.
 async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr>) -> String {
-    let mut peers = Peers::new(fixed, port.peering.clone());
+    let mut peers = Peers::new(fixed, port.peering.clone(), port.first_autopilot);
     if let Some(peer) = fixed {
         port.connected(peer.to_string());
     }
@@ -828,6 +845,7 @@ struct Unsent {
     last: Instant,
 }
 
+                    port.first_autopilot = peers.first;
 impl Unsent {
     /// One more now.
     fn after(before: Option<Self>) -> Self {
@@ -835,6 +853,10 @@ impl Unsent {
         let first = before.filter(|it| it.last.elapsed() < SEND_LIMIT).map_or(last, |it| it.first);
         Self { first, last }
     }
+                    if let Some(packet) = taken.other_autopilot.map(Box::new) {
+                        let received = Instant::now();
+                        port.shared.push(LinkEvent::OtherAutopilot { packet, received });
+                    }
 }
 
 fn is_refusal(error: &io::Error) -> bool {
@@ -860,7 +882,9 @@ mod tests {
         let shared = Arc::new(Shared::new());
         let sender = LinkSender { shared: Arc::clone(&shared), queue, spare };
         let (peering, gate) = (Peering::default(), Gate::new(None));
-        let port = Port { shared, outgoing, outgoing_spare, peering, gate, keeping: None };
+        let (first_autopilot, keeping) = (None, None);
+        let port =
+            Port { shared, outgoing, outgoing_spare, peering, first_autopilot, gate, keeping };
         (sender, port)
     }
 

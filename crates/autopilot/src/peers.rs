@@ -11,15 +11,17 @@ use crate::packet::{Counters, Packet, Parser};
 pub(crate) const PACKET_GAP: Duration = Duration::from_millis(200);
 /// Silence after which an autopilot is replaced by another one.
 const PEER_SILENCE: Duration = Duration::from_secs(3);
+/// Minimum time between two heartbeats of other autopilots that are handed on: they tell that there are any.
+const OTHER_PAUSE: Duration = Duration::from_secs(1);
 /// Maximum number of known UDP peers.
 const MAX_PEERS: usize = 8;
 
 /// Whom a listening link talks to.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Peering {
-    /// An autopilot: the sender of its heartbeat, until that is silent for 3 s.
+    /// An autopilot: the sender of its heartbeat, until that is silent for 3 s and another address sends it.
     Autopilot {
-        /// Its system id; `None` takes any.
+        /// Its system id; `None` takes that of the first one for good.
         system: Option<u8>,
     },
     /// A ground station: the first one heard, until that is silent.
@@ -63,13 +65,6 @@ impl Peering {
             Self::GroundStation { silence, .. } => *silence,
         }
     }
-
-    /// True for the heartbeat of the autopilot, as opposed to another vehicle's.
-    fn is_heartbeat(&self, packet: &Packet) -> bool {
-        let Self::Autopilot { system } = self else { return false };
-        packet.is_heartbeat_of_autopilot()
-            && system.is_none_or(|system| system == packet.sender.system)
-    }
 }
 
 /// The senders to a UDP port, each with its own stream of packets.
@@ -77,6 +72,11 @@ pub(crate) struct Peers {
     known: Vec<Peer>,
     pub(crate) chosen: Option<SocketAddr>,
     peering: Peering,
+    /// The system id of the first autopilot, where none is pinned: a vehicle that is silent for a while must not be replaced by
+    /// another one, for which nothing was decided.
+    pub(crate) first: Option<u8>,
+    /// When the heartbeat of another autopilot was handed on last.
+    other_told: Option<Instant>,
 }
 
 /// What was in a datagram.
@@ -85,6 +85,8 @@ pub(crate) struct Taken {
     pub(crate) packets: Vec<Packet>,
     /// Number of packets of others, which were dropped.
     pub(crate) strangers: u64,
+    /// The heartbeat of an autopilot that is another one than the first, where none is pinned.
+    pub(crate) other_autopilot: Option<Packet>,
     pub(crate) counted: Counters,
 }
 
@@ -100,8 +102,9 @@ struct Peer {
 }
 
 impl Peers {
-    pub(crate) fn new(chosen: Option<SocketAddr>, peering: Peering) -> Self {
-        Self { known: Vec::new(), chosen, peering }
+    /// No sender is known; `first` is the autopilot's system id, if one was heard before.
+    pub(crate) fn new(chosen: Option<SocketAddr>, peering: Peering, first: Option<u8>) -> Self {
+        Self { known: Vec::new(), chosen, peering, first, other_told: None }
     }
 
     /// Parses a datagram and returns its packets if they come from the chosen peer and the gate lets them in;
@@ -116,7 +119,12 @@ impl Peers {
     ) -> Taken {
         if !self.peering.admits(from.ip()) {
             // One datagram is one packet, of almost everyone; a stranger's is not worth parsing.
-            return Taken { packets: Vec::new(), strangers: 1, counted: Counters::default() };
+            return Taken {
+                packets: Vec::new(),
+                strangers: 1,
+                other_autopilot: None,
+                counted: Counters::default(),
+            };
         }
         let peer = self.peer(from, now);
         if now.duration_since(peer.heard) > PACKET_GAP {
@@ -130,7 +138,7 @@ impl Peers {
             peer.active = Some(now);
         }
         let counted = peer.parser.take_counters();
-        let is_autopilot = packets.iter().any(|packet| self.peering.is_heartbeat(packet));
+        let is_autopilot = packets.iter().any(|packet| self.is_heartbeat(packet));
         if is_autopilot {
             self.peer(from, now).autopilot = Some(now);
         }
@@ -141,10 +149,32 @@ impl Peers {
         if admitted.is_behind && self.is_silent(now) {
             self.chosen = Some(from);
         }
-        match self.chosen == Some(from) {
-            true => Taken { packets, strangers: 0, counted },
-            false => Taken { strangers: packets.len() as u64, packets: Vec::new(), counted },
+        if self.chosen == Some(from) {
+            let heartbeat = packets.iter().find(|packet| self.is_heartbeat(packet));
+            self.first = self.first.or(heartbeat.map(|packet| packet.sender.system));
+            return Taken { packets, strangers: 0, other_autopilot: None, counted };
         }
+        let strangers = packets.len() as u64;
+        let other_autopilot = self.other_autopilot(packets, now);
+        Taken { packets: Vec::new(), strangers, other_autopilot, counted }
+    }
+
+    /// True for the heartbeat of the autopilot, as opposed to another vehicle's.
+    fn is_heartbeat(&self, packet: &Packet) -> bool {
+        let Peering::Autopilot { system } = self.peering else { return false };
+        packet.is_heartbeat_of_autopilot()
+            && system.or(self.first).is_none_or(|system| system == packet.sender.system)
+    }
+
+    /// The heartbeat of another autopilot among a stranger's packets, once a second.
+    fn other_autopilot(&mut self, packets: Vec<Packet>, now: Instant) -> Option<Packet> {
+        let Peering::Autopilot { system: None } = self.peering else { return None };
+        let first = self.first?;
+        let is_due = self.other_told.is_none_or(|told| now.duration_since(told) >= OTHER_PAUSE);
+        let is_other = |it: &Packet| it.is_heartbeat_of_autopilot() && it.sender.system != first;
+        let heartbeat = packets.into_iter().find(is_other).filter(|_| is_due)?;
+        self.other_told = Some(now);
+        Some(heartbeat)
     }
 
     /// Whether no packet was let in from the chosen peer lately.
@@ -220,7 +250,7 @@ mod tests {
 
     fn station(known: Vec<IpAddr>) -> Peers {
         let silence = Duration::from_secs(10);
-        Peers::new(None, Peering::GroundStation { known, silence })
+        Peers::new(None, Peering::GroundStation { known, silence }, None)
     }
 
     fn heartbeat(autopilot: MavAutopilot, sender: Sender) -> Vec<u8> {
@@ -275,17 +305,53 @@ mod tests {
         assert_eq!(peers.chosen, Some(at(3)));
     }
 
+    /// The heartbeat of the autopilot with this system id.
+    fn of(system: u8) -> Vec<u8> {
+        let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
+        heartbeat(autopilot, Sender { system, component: AUTOPILOT })
+    }
+
+    #[test]
+    fn an_autopilot_that_is_silent_is_not_replaced_by_another_vehicle() {
+        let mut peers = Peers::new(None, Peering::default(), None);
+        let began = Instant::now();
+        assert_eq!(peers.take_any(at(1), &of(1), began).packets.len(), 1);
+        for second in 1..60 {
+            let now = began + Duration::from_secs(second);
+            let taken = peers.take_any(at(2), &of(2), now);
+            assert_eq!((taken.packets.len(), taken.strangers), (0, 1), "after {second} s");
+            let other = taken.other_autopilot.map(|packet| packet.sender.system);
+            assert_eq!(other, Some(2), "it is told of, after {second} s");
+            assert_eq!(peers.take_any(at(2), &of(2), now).other_autopilot, None, "not so often");
+        }
+        let later = began + Duration::from_secs(60);
+        assert_eq!(peers.take_any(at(1), &of(1), later).packets.len(), 1, "it is back");
+        // On a new connection, too.
+        let mut peers = Peers::new(None, Peering::default(), peers.first);
+        peers.take_any(at(2), &of(2), later);
+        assert_eq!(peers.take_any(at(1), &of(1), later).packets.len(), 1);
+        assert_eq!(peers.take_any(at(2), &of(2), later).strangers, 1);
+    }
+
+    #[test]
+    fn an_autopilot_that_restarts_is_heard_from_another_port_once_the_old_one_is_silent() {
+        let mut peers = Peers::new(None, Peering::default(), None);
+        let began = Instant::now();
+        peers.take_any(at(1), &of(1), began);
+        let at_second = |second| began + Duration::from_secs(second);
+        assert!(peers.take_any(at(2), &of(1), at_second(1)).packets.is_empty());
+        let taken = peers.take_any(at(2), &of(1), at_second(4));
+        assert_eq!((taken.packets.len(), taken.other_autopilot), (1, None));
+        assert_eq!(peers.chosen, Some(at(2)));
+    }
+
     #[test]
     fn of_several_vehicles_at_one_port_the_pinned_one_is_heard() {
-        let mut peers = Peers::new(None, Peering::Autopilot { system: Some(2) });
+        let mut peers = Peers::new(None, Peering::Autopilot { system: Some(2) }, None);
         let began = Instant::now();
-        let of = |system| {
-            let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
-            heartbeat(autopilot, Sender { system, component: AUTOPILOT })
-        };
         for second in 0..20 {
             let now = began + Duration::from_secs(second);
-            peers.take_any(at(1), &of(1), now);
+            assert_eq!(peers.take_any(at(1), &of(1), now).other_autopilot, None);
             assert_eq!(peers.take_any(at(2), &of(2), now).packets.len(), 1, "after {second} s");
             assert_eq!(peers.chosen, Some(at(2)));
         }

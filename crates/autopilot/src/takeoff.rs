@@ -9,8 +9,8 @@ use libm::fmax;
 
 use crate::client::Autopilot;
 use crate::command::{Command, CommandError, CommandId, CommandStatus, ns};
+use crate::conflict::Conflict;
 use crate::mode::{Firmware, FlightMode};
-use crate::packet::Sender;
 use crate::state::{LandedState, VehicleState};
 
 /// Maximum height error at the end of the climb, in m.
@@ -60,6 +60,8 @@ pub struct Takeoff {
     found_armed: bool,
     /// It is asked only of a vehicle that says that it is a simulation.
     only_simulated: bool,
+    /// It would be armed, but another vehicle on the link might not have been heard yet.
+    is_listening: bool,
     /// The timeout of that question.
     simulation_until_ns: Option<i64>,
 }
@@ -109,17 +111,9 @@ pub enum TakeoffError {
         SIMULATION_LIMIT.as_secs()
     )]
     NotSimulated,
-    /// Another controller commands the vehicle.
-    #[error(
-        "no takeoff: another companion with our system and component id ({} and {}) is on the autopilot's link, probably a \
-         second controller of this vehicle, which may fly it. End that one, check the address of the autopilot, or change \
-         `autopilot.component_id` on one of them",
-        sender.system, sender.component
-    )]
-    SameAddress {
-        /// Our ids.
-        sender: Sender,
-    },
+    /// Another controller commands the vehicle, or it may be another vehicle.
+    #[error("no takeoff: {0}")]
+    Conflict(Conflict),
     /// It did not become ready.
     #[error("no takeoff: not ready after {} s: {}", after.as_secs(), reasons.join("; "))]
     NotReady {
@@ -190,6 +184,7 @@ impl Takeoff {
             risen: false,
             found_armed: false,
             only_simulated: false,
+            is_listening: false,
             simulation_until_ns: None,
         }
     }
@@ -221,6 +216,9 @@ impl Takeoff {
     fn advance(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> Result<(), TakeoffError> {
         if self.is_finished() {
             return Ok(());
+        }
+        if let (Part::Ready, Some(conflict)) = (&self.part, autopilot.conflict(now_ns)) {
+            return Err(TakeoffError::Conflict(conflict));
         }
         let state = autopilot.state().copied();
         if let Some(state) = &state {
@@ -276,9 +274,6 @@ impl Takeoff {
         autopilot: &mut Autopilot,
         state: Option<&VehicleState>,
     ) -> Result<(), TakeoffError> {
-        if autopilot.shares_our_address(now_ns) {
-            return Err(TakeoffError::SameAddress { sender: autopilot.our_address() });
-        }
         let connected = state.filter(|state| state.connected);
         if connected.is_some() && !self.may_be_flown(now_ns, autopilot)? {
             return Ok(());
@@ -291,7 +286,12 @@ impl Takeoff {
                 self.begin(now_ns, Part::Climb, self.climb_limit());
             }
             Some(state) if self.found_armed && !state.armed => return Err(TakeoffError::Disarmed),
-            Some(state) if state.ready && !state.armed && state.landed == LandedState::OnGround => {
+            Some(state)
+                if state.ready
+                    && !state.armed
+                    && state.landed == LandedState::OnGround
+                    && autopilot.has_listened(now_ns) =>
+            {
                 if autopilot.firmware() == Some(Firmware::Px4) {
                     self.begin_arming(now_ns, autopilot);
                 } else {
@@ -300,6 +300,7 @@ impl Takeoff {
                 }
             }
             _ => {
+                self.is_listening = !autopilot.has_listened(now_ns);
                 self.found_armed |= connected
                     .is_some_and(|state| state.armed && state.landed == LandedState::OnGround);
                 let until_ns =
@@ -447,6 +448,9 @@ impl Takeoff {
                 let mut reasons = reasons(autopilot);
                 if self.only_simulated && autopilot.is_connected() && !autopilot.is_simulated() {
                     reasons.insert(0, "waiting for it to say that it is a simulation".to_owned());
+                }
+                if self.is_listening && autopilot.is_connected() {
+                    reasons.push("listening whether another vehicle is on the link".to_owned());
                 }
                 TakeoffProgress::Waiting(reasons)
             }

@@ -19,7 +19,7 @@ use autopilot::dialect::{
 };
 use autopilot::packet::{self, Sender};
 use autopilot::{
-    Autopilot, Command, CommandError, CommandId, CommandStatus, Config, Event, Firmware,
+    Autopilot, Command, CommandError, CommandId, CommandStatus, Config, Conflict, Event, Firmware,
     FlightMode, LandedState, Parser, Takeoff, TakeoffError, TakeoffProgress,
 };
 use geometry::Vector;
@@ -854,7 +854,9 @@ fn a_vehicle_of_another_controller_with_our_ids_is_neither_lifted_nor_taken_over
         let companion = Sender { system: 1, component: 191 };
         world.receive(companion, &MavMessage::HEARTBEAT(autopilot::compose::heartbeat()));
         let (end, _) = world.take_off(&mut Takeoff::new(10.0), 5);
-        let TakeoffProgress::Failed(TakeoffError::SameAddress { sender }) = &end else {
+        let TakeoffProgress::Failed(TakeoffError::Conflict(Conflict::SameAddress { sender })) =
+            &end
+        else {
             panic!("{end:?}")
         };
         assert_eq!(*sender, companion);
@@ -863,6 +865,57 @@ fn a_vehicle_of_another_controller_with_our_ids_is_neither_lifted_nor_taken_over
             world.commands(MavCmd::MAV_CMD_DO_SET_MODE) == 0 && world.fake.velocities.is_empty()
         );
     }
+}
+
+/// The heartbeat of an autopilot that is not ours.
+fn of_another_vehicle() -> MavMessage {
+    MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+        mavtype: MavType::MAV_TYPE_QUADROTOR,
+        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        ..Default::default()
+    })
+}
+
+#[test]
+fn of_two_vehicles_on_the_link_none_is_armed_while_none_is_pinned() {
+    for mut world in [World::standing(), World::flying()] {
+        world.receive(Sender { system: 2, component: 1 }, &of_another_vehicle());
+        // It is not forgotten: the right one cannot be told.
+        world.run(60);
+        let (end, _) = world.take_off(&mut Takeoff::new(10.0), 5);
+        let conflict = Conflict::SeveralVehicles { system: 1, other: 2 };
+        assert_eq!(end, TakeoffProgress::Failed(TakeoffError::Conflict(conflict)));
+        let text = end.to_string();
+        let told = ["system ids 1 and 2", "autopilot.system_id"];
+        assert!(told.iter().all(|part| text.contains(part)), "{text}");
+        assert_eq!(world.commands(MavCmd::MAV_CMD_COMPONENT_ARM_DISARM), 0);
+    }
+}
+
+#[test]
+fn a_pinned_vehicle_takes_off_beside_another_one() {
+    let config = Config { system_id: Some(1), ..Config::default() };
+    let mut world = World::with(Fake::new(), config);
+    world.run(1);
+    world.receive(Sender { system: 2, component: 1 }, &of_another_vehicle());
+    assert_eq!(world.client.conflict(world.now), None);
+    let (end, _) = world.take_off(&mut Takeoff::new(10.0), 60);
+    assert_eq!(end, TakeoffProgress::Done);
+}
+
+#[test]
+fn a_vehicle_that_is_ready_at_once_is_armed_only_when_another_would_have_been_heard() {
+    let mut world = World::new();
+    let began = world.now;
+    let mut takeoff = Takeoff::new(10.0);
+    let mut waits = Vec::new();
+    while world.commands(MavCmd::MAV_CMD_DO_SET_MODE) == 0 {
+        world.step();
+        waits.push(takeoff.step(world.now, &mut world.client).to_string());
+        assert!(world.now - began < 20 * SECOND, "{waits:?}");
+    }
+    assert!(world.now - began >= 2 * SECOND, "after {} ns", world.now - began);
+    assert!(waits.iter().any(|wait| wait.contains("another vehicle")), "{waits:?}");
 }
 
 #[test]

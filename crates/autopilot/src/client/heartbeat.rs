@@ -25,7 +25,8 @@ impl Autopilot {
         match &self.vehicle {
             None => self.find(now_ns, system, heartbeat),
             Some(vehicle) if vehicle.system != system => {
-                if !std::mem::replace(&mut self.other_vehicle, true) {
+                if self.other_system.is_none() {
+                    self.other_system = Some(system);
                     self.push(Event::OtherVehicle { system });
                 }
                 return;
@@ -56,6 +57,7 @@ impl Autopilot {
             },
             readiness: Readiness::default(),
             simulation: Simulation::default(),
+            found_ns: now_ns,
             heartbeat_ns: now_ns,
             mode_ns: now_ns,
             mode_since_ns: now_ns,
