@@ -140,11 +140,19 @@ impl Flight {
 
     /// Handles a packet that the ground station sends to the autopilot through us.
     pub fn ground_packet(&mut self, now_ns: i64, packet: &Packet) {
-        if let Some(MavMessage::HEARTBEAT(heartbeat)) = &packet.message
-            && heartbeat.mavtype == MavType::MAV_TYPE_GCS
-        {
+        if self.is_of_ground_station(packet) {
             self.alarms.operator_active(now_ns);
         }
+    }
+
+    /// Whether a packet is a ground station's heartbeat. Programs on the vehicle may say that they are one, too, and go on when nobody is
+    /// there any more: they have the vehicle's system id, which a ground station never has.
+    fn is_of_ground_station(&self, packet: &Packet) -> bool {
+        let Some(MavMessage::HEARTBEAT(heartbeat)) = &packet.message else { return false };
+        let system = packet.sender.system;
+        let is_on_vehicle = system == self.autopilot.our_address().system
+            || Some(system) == self.autopilot.system();
+        heartbeat.mavtype == MavType::MAV_TYPE_GCS && !is_on_vehicle
     }
 
     /// Lets time pass; to be called at least 20 times a second.

@@ -677,6 +677,34 @@ fn a_low_battery_leads_to_what_is_configured() {
     assert_eq!((status.phase, status.why.as_str()), (Phase::Hold, "the battery is low"));
 }
 
+/// A ground station's heartbeat.
+fn of_ground_station() -> MavMessage {
+    MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+        mavtype: MavType::MAV_TYPE_GCS,
+        autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
+        ..Default::default()
+    })
+}
+
+#[test]
+fn an_operator_is_lost_while_a_program_on_the_vehicle_says_that_it_is_a_ground_station() {
+    let set = ["alarms.operator_lost_s=2", "phases.on_operator_lost=\"hold\""];
+    for (system, is_lost) in [(1, true), (254, false)] {
+        let mut flight = flight_with("airborne", &set);
+        receive(&mut flight, 0, &heartbeat(4, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        let operator = Sender { system: 255, component: 190 };
+        receive_from(&mut flight, 2 * MS, operator, &of_ground_station());
+        let program = Sender { system, component: 240 };
+        for ms in (0..6000).step_by(500) {
+            receive_from(&mut flight, ms * MS, program, &of_ground_station());
+            hover(&mut flight, ms + 20, ms + 520, 4);
+        }
+        let status = flight.status(6000 * MS);
+        assert_eq!(status.why.contains("operator"), is_lost, "{system}: {status:?}");
+    }
+}
+
 /// The heartbeats of a vehicle with another system id, and of a companion with our ids.
 fn others() -> [(Sender, MavMessage, &'static str); 2] {
     let companion = MavMessage::HEARTBEAT(autopilot::compose::heartbeat());
