@@ -17,6 +17,9 @@ use crate::wind::Drag;
 /// Period of the flight's ticks.
 pub(crate) const TICK: Duration = Duration::from_millis(25);
 /// Periods of the setpoints that the autopilot's setpoint timeout must last: with 2 of them one lost setpoint is survived.
+/// The delay of a link, both ways together, that never tells it, in seconds: that of a telemetry radio. A delay that is taken for none
+/// makes the vehicle swing over the pad, and one that is taken for longer than it is only makes the landing slower.
+pub(crate) const UNKNOWN_LINK_DELAY_S: f64 = 0.3;
 const MIN_TIMEOUT_PERIODS: f64 = 2.5;
 
 /// The keys of `controller.toml`, which has their meanings, units and ranges.

@@ -21,7 +21,7 @@ use node::HealthCounters;
 
 use crate::alarms::{self, Alarms};
 use crate::cameras::Reception;
-use crate::config::{Config, Mode, Start};
+use crate::config::{Config, Mode, Start, UNKNOWN_LINK_DELAY_S};
 use crate::control::{is_holding_px4, pilots_px4_mode};
 use crate::frames::{Arrival, Frames};
 use crate::journal::Journal;
@@ -170,7 +170,12 @@ impl Flight {
         self.follow_limits(now_ns);
         self.note_pad();
         self.check_alarms(now_ns);
-        let delay_s = self.autopilot.link_delay(now_ns).map_or(0.0, |delay| delay.as_secs_f64());
+        let delay_s = match self.autopilot.link_delay(now_ns) {
+            Some(delay) => delay.as_secs_f64(),
+            None if self.autopilot.lacks_link_delay(now_ns) => UNKNOWN_LINK_DELAY_S,
+            // Not known for a moment, or not any more: it is taken for what it was.
+            None => self.link_delay_s,
+        };
         if (delay_s - self.link_delay_s).abs() > LINK_DELAY_STEP_S {
             self.link_delay_s = delay_s;
             self.decide(now_ns, LanderEvent::LinkDelay(delay_s));
@@ -445,6 +450,11 @@ impl Flight {
     /// How many decisions there were; another number may come with the same decision.
     pub(crate) fn decisions(&self) -> u64 {
         self.decisions
+    }
+
+    /// The link's delay that the landing reckons with, both ways together, in seconds; 0 until it is known or given up.
+    pub fn link_delay_s(&self) -> f64 {
+        self.link_delay_s
     }
 
     /// The detector in use.

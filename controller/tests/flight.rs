@@ -483,7 +483,7 @@ fn a_vehicle_that_is_called_back_from_land_is_left_to_it_low_over_the_ground() {
 
 #[test]
 fn a_start_is_refused_while_all_detections_are_and_the_reason_is_told() {
-    let mut flight = in_flight("command");
+    let mut flight = in_flight_with("command", &["autopilot.timesync=false"]);
     flight.camera(0, CameraInfo::sample());
     let foreign = |stamp_ns| Detections {
         header: FrameHeader { clock: "monotonic/myhost".into(), ..header(stamp_ns) },
@@ -677,6 +677,62 @@ fn a_low_battery_leads_to_what_is_configured() {
     assert_eq!((status.phase, status.why.as_str()), (Phase::Hold, "the battery is low"));
 }
 
+#[test]
+fn a_link_whose_delay_is_not_known_counts_as_slow_and_is_told_of() {
+    for (set, is_told) in [("autopilot.timesync=true", true), ("autopilot.timesync=false", false)] {
+        let mut flight = flight_with("airborne", &[set]);
+        flight.presence(0, "main", true);
+        flight.camera(0, CameraInfo::sample());
+        receive(&mut flight, 0, &heartbeat(4, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        let warns = |flight: &Flight, ms: i64| {
+            let warnings = flight.status(ms * MS).warnings;
+            warnings.iter().any(|it| it.contains("TIMESYNC"))
+        };
+        hover(&mut flight, 20, 2500, 4);
+        assert!(!warns(&flight, 2500) && flight.link_delay_s() < 0.01, "it may still answer");
+        hover(&mut flight, 2500, 6000, 4);
+        assert_eq!(warns(&flight, 6000), is_told, "{set}");
+        assert!((flight.link_delay_s() - 0.3).abs() < 0.01, "{set}: {}", flight.link_delay_s());
+    }
+}
+
+#[test]
+fn a_delay_that_is_not_known_any_more_is_taken_for_what_it_was() {
+    let mut flight = flight("airborne");
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    // Each question is answered 200 ms later, for 5 s.
+    let mut questions = Vec::new();
+    for ms in (20..60_000).step_by(20) {
+        let now_ns = ms * MS;
+        if ms % 1000 == 0 {
+            receive(&mut flight, now_ns, &heartbeat(4, true));
+        }
+        pose(&mut flight, now_ns);
+        flight.tick(now_ns + 3);
+        while let Some(packet) = flight.poll_outgoing() {
+            for packet in Parser::new().push(&packet) {
+                if let Some(MavMessage::TIMESYNC(question)) = packet.message {
+                    questions.push((ms, question));
+                }
+            }
+        }
+        let (due, later) = questions.into_iter().partition(|(asked_ms, _)| ms - asked_ms >= 200);
+        questions = later;
+        let due: Vec<(i64, TIMESYNC_DATA)> = due;
+        for (asked_ms, question) in due.into_iter().filter(|(asked_ms, _)| *asked_ms < 5000) {
+            // Its clock is so far ahead that its positions are 100 ms old when they come.
+            let answer = TIMESYNC_DATA { tc1: (asked_ms + 200) * MS, ..question };
+            receive(&mut flight, now_ns, &MavMessage::TIMESYNC(answer));
+        }
+        if ms >= 5000 {
+            assert!(flight.link_delay_s() > 0.15, "after {ms} ms: {} s", flight.link_delay_s());
+        }
+    }
+    assert!(flight.status(60_000 * MS).warnings.iter().all(|it| !it.contains("TIMESYNC")));
+}
+
 /// A ground station's heartbeat.
 fn of_ground_station() -> MavMessage {
     MavMessage::HEARTBEAT(HEARTBEAT_DATA {
@@ -816,7 +872,7 @@ fn detector_info(detector: &str, camera: &str) -> DetectorInfo {
 
 #[test]
 fn a_camera_that_sends_nothing_is_told_of_and_its_detectors_are_not_said_to_have_gone() {
-    let mut flight = in_flight("airborne");
+    let mut flight = in_flight_with("airborne", &["autopilot.timesync=false"]);
     hover(&mut flight, 1000, 3000, 4);
     let info = detector_info("main", "down");
     let told = |status: &ControllerStatus| status.warnings.iter().any(|it| it.contains("no frame"));

@@ -72,6 +72,8 @@ pub struct Autopilot {
     other_system: Option<u8>,
     /// When a packet of another companion with our ids came last.
     same_address_ns: Option<i64>,
+    /// The link's delay was known once.
+    knew_link_delay: bool,
     refused_numbers: u64,
     late: u64,
 }
@@ -125,6 +127,7 @@ impl Autopilot {
             other_system: None,
             same_address_ns: None,
             refused_numbers: 0,
+            knew_link_delay: false,
             late: 0,
         }
     }
@@ -302,6 +305,14 @@ impl Autopilot {
 
     /// Whether another companion on this link uses our ids: probably a second controller of the same vehicle.
     pub fn shares_our_address(&self, now_ns: i64) -> bool {
+    /// Whether a connected vehicle has had time to tell how slow the link is, and never has: its clock is not asked for
+    /// ([`Config::timesync`]), or the link does not pass the questions or the answers.
+    pub fn lacks_link_delay(&self, now_ns: i64) -> bool {
+        let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.state.connected);
+        let heard_ns = vehicle.map_or(0, |vehicle| now_ns.saturating_sub(vehicle.found_ns));
+        !self.knew_link_delay && heard_ns >= LINK_DELAY_DUE_NS
+    }
+
         self.same_address_ns.is_some_and(|last| now_ns.saturating_sub(last) < SAME_ADDRESS_NS)
     }
 
@@ -542,6 +553,7 @@ impl Autopilot {
             self.clock.answered(now_ns, message.tc1, message.ts1);
         }
     }
+            self.knew_link_delay |= self.clock.link_delay_ns(now_ns).is_some();
 
     fn send_to_vehicle(&mut self, mut message: MavMessage) {
         if let (MavMessage::COMMAND_LONG(command), Some(vehicle)) = (&mut message, &self.vehicle) {
