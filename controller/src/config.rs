@@ -3,6 +3,7 @@
 
 use std::time::Duration;
 
+use autopilot::packet::setpoint_bytes;
 use autopilot::{Address, KeyFileError, Permission, SigningConfig, Takeoff};
 use landing::{
     EnvelopeConfig, EstimatorConfig, GuidanceConfig, MetricConfig, PhaseConfig, TargetConfig,
@@ -16,10 +17,14 @@ use crate::wind::Drag;
 
 /// Period of the flight's ticks.
 pub(crate) const TICK: Duration = Duration::from_millis(25);
-/// Periods of the setpoints that the autopilot's setpoint timeout must last: with 2 of them one lost setpoint is survived.
 /// The delay of a link, both ways together, that never tells it, in seconds: that of a telemetry radio. A delay that is taken for none
 /// makes the vehicle swing over the pad, and one that is taken for longer than it is only makes the landing slower.
 pub(crate) const UNKNOWN_LINK_DELAY_S: f64 = 0.3;
+/// Maximum part of a serial line that setpoints take: the rest is for those that follow detections, and for what else is sent.
+const MAX_SETPOINTS_SHARE: f64 = 0.5;
+/// Bits that a byte takes on a serial line.
+const BITS_PER_BYTE: f64 = 10.0;
+/// Periods of the setpoints that the autopilot's setpoint timeout must last: with 2 of them one lost setpoint is survived.
 const MIN_TIMEOUT_PERIODS: f64 = 2.5;
 
 /// The keys of `controller.toml`, which has their meanings, units and ranges.
@@ -172,6 +177,21 @@ impl AutopilotSettings {
         Drag { linear_per_s: self.drag_per_s, quadratic_per_m: self.drag_per_m }
     }
 
+    /// A line that is too slow for the setpoints would delay all that is sent more and more.
+    fn check_setpoint_rate(&self, check: &mut Check<'_>) {
+        let (key, rate_hz) = ("autopilot.setpoint_rate_hz", self.setpoint_rate_hz);
+        check.range(key, rate_hz, 5.0..=100.0);
+        let Ok(Address::Serial { device, baud }) = self.address.parse() else { return };
+        let bytes = setpoint_bytes(!self.signing_key.is_empty());
+        let max_hz = MAX_SETPOINTS_SHARE * f64::from(baud) / (BITS_PER_BYTE * bytes as f64);
+        let fits = rate_hz <= max_hz;
+        check.parses(key, fits.then_some(()).ok_or_else(|| {
+            format!(
+                "it must be at most {max_hz:.1} over {device} with {baud} baud (`autopilot.address`): a setpoint has {bytes} bytes, and setpoints may take half of what the line carries; lower it, or raise the baud rate here and at the autopilot"
+            )
+        }));
+    }
+
     /// The timeout must outlast a lost setpoint, or the vehicle stops between two of them.
     fn check_setpoint_timeout(&self, check: &mut Check<'_>) {
         let (timeout_s, rate_hz) = (self.setpoint_timeout_s, self.setpoint_rate_hz);
@@ -238,7 +258,7 @@ impl Settings for Config {
         check.parses("autopilot.ground_may", self.autopilot.ground_may.parse::<Permission>());
         check.range("autopilot.component_id", self.autopilot.component_id, 2..=255);
         check.range("autopilot.state_rate_hz", self.autopilot.state_rate_hz, 10.0..=200.0);
-        check.range("autopilot.setpoint_rate_hz", self.autopilot.setpoint_rate_hz, 5.0..=100.0);
+        self.autopilot.check_setpoint_rate(check);
         self.autopilot.check_setpoint_timeout(check);
         if !self.detectors.preferred.is_empty() {
             check.name("detectors.preferred", &self.detectors.preferred);
@@ -436,6 +456,42 @@ mod tests {
         ] {
             assert!(load(&set).is_ok(), "{set:?}");
         }
+    }
+
+    #[test]
+    fn setpoints_that_a_serial_line_cannot_carry_are_refused() {
+        let set = |rate_hz: u32, address: &str| {
+            load(&[
+                &format!("autopilot.setpoint_rate_hz={rate_hz}"),
+                &format!("autopilot.address={address}"),
+                "autopilot.setpoint_timeout_s=0",
+            ])
+        };
+        let problem = set(50, "serial:/dev/ttyAMA0").unwrap_err();
+        for part in [
+            "`autopilot.setpoint_rate_hz` = 50",
+            "at most 44.3 over /dev/ttyAMA0 with 57600 baud",
+            "65 bytes",
+            "half",
+        ] {
+            assert!(problem.contains(part), "`{part}` is not in: {problem}");
+        }
+        for (rate_hz, address) in [
+            (44, "serial:/dev/ttyAMA0:57600"),
+            (25, "serial:/dev/ttyAMA0:38400"),
+            (100, "serial:/dev/ttyAMA0:921600"),
+            (100, "udpin:0.0.0.0:14550"),
+        ] {
+            assert!(set(rate_hz, address).is_ok(), "{rate_hz} over {address}");
+        }
+        assert!(set(25, "serial:/dev/ttyAMA0:9600").is_err());
+        let signed = [
+            "autopilot.setpoint_rate_hz=44",
+            "autopilot.signing_key=key.txt",
+            "autopilot.address=serial:/dev/ttyAMA0",
+        ];
+        let problem = load(&signed).unwrap_err();
+        assert!(problem.contains("at most 36.9") && problem.contains("78 bytes"), "{problem}");
     }
 
     #[test]

@@ -518,6 +518,9 @@ impl Flight {
         if self.mission.is_taking_control() {
             return Err(format!("a start is under way: {}", self.view().phase(now_ns).1));
         }
+        if let Some(conflict) = self.autopilot.conflict(now_ns) {
+            return Err(format!("no landing was started: {conflict}"));
+        }
         if let Some(why) = self.mission.leaves_offboard_because() {
             return Err(format!("the vehicle is just being taken back to HOLD: {why}"));
         }
@@ -535,9 +538,6 @@ impl Flight {
         }
         if self.landing_target.is_some() {
             return self.start_landing_target(now_ns);
-        }
-        if let Some(conflict) = self.autopilot.conflict(now_ns) {
-            return Err(format!("no landing was started: {conflict}"));
         }
         if is_holding_px4(&self.autopilot) {
             self.mission.take_control(now_ns, &mut self.autopilot);
@@ -593,6 +593,11 @@ impl Flight {
         if self.mission.is_taking_off() && !is_flying_guided(&self.autopilot) {
             return Err("the vehicle is taking off; land it once it is up".to_owned());
         }
+        // A vehicle that took off for us is ours.
+        let conflict = self.autopilot.conflict(now_ns).filter(|_| !self.mission.is_taking_off());
+        if let Some(conflict) = conflict {
+            return Err(format!("not landed here: {conflict}"));
+        }
         let before = self.mission.clone();
         self.alarms.begin();
         self.mission.begin(now_ns, false);
@@ -611,11 +616,6 @@ impl Flight {
                 return Err("the vehicle is taking off; there is nothing to resume".to_owned());
             }
             let why = "aborted by the operator before the landing began; the vehicle is to hold its place";
-        // A vehicle that took off for us is ours.
-        let conflict = self.autopilot.conflict(now_ns).filter(|_| !self.mission.is_taking_off());
-        if let Some(conflict) = conflict {
-            return Err(format!("not landed here: {conflict}"));
-        }
             if self.mission.leave_offboard(now_ns, &mut self.autopilot, why) {
                 return Ok(why.to_owned());
             }

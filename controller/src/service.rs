@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use autopilot::packet::MAX_PACKET;
+use autopilot::packet::{MAX_PACKET, is_setpoint};
 use autopilot::signing::Refusals;
 use autopilot::{Address, GivenCommand, Link, LinkEvent, Packet, Parser, Peering, Permission};
 use messages::{
@@ -45,6 +45,8 @@ const TAPE_PATIENCE: Duration = Duration::from_millis(100);
 /// Pause between two parts of the tape while further ones wait: sent all at once, some would be dropped, and a recorder
 /// beyond an air link would take the room of its frames.
 const TAPE_PAUSE: Duration = Duration::from_millis(8);
+/// Time for the last packet to be put on the wire.
+const LAST_PACKET: Duration = Duration::from_millis(100);
 /// Time for what waits of the tape at the end.
 const TAPE_END: Duration = Duration::from_millis(200);
 
@@ -90,7 +92,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let mut tapes = Tapes::new(&node).await?;
     node.announce().await?;
 
-    let mut strangers = 0;
+    let (mut strangers, mut replaced) = (0, 0);
     let mut refusals = Refusals::default();
     let mut other_versions = 0;
     let mut standstill = Standstill::default();
@@ -108,13 +110,13 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                     flight.packet(now_ns().saturating_sub(waited_ns), &packet);
                     reports.pass_on(&node, packet.raw);
                 }
-                LinkEvent::Connected { peer } => tracing::info!(peer, "Link to the autopilot is up"),
-                LinkEvent::Disconnected { reason } => {
                 // Not passed on: a ground station would take it for a vehicle that it can fly through us.
                 LinkEvent::OtherAutopilot { packet, received } => {
                     let waited_ns = i64::try_from(received.elapsed().as_nanos()).unwrap_or(0);
                     flight.packet(now_ns().saturating_sub(waited_ns), &packet);
                 }
+                LinkEvent::Connected { peer } => tracing::info!(peer, "Link to the autopilot is up"),
+                LinkEvent::Disconnected { reason } => {
                     node.health().failed("link");
                     tracing::warn!(reason, "Link to the autopilot is down; reconnecting");
                 }
@@ -135,6 +137,11 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                 if more > 0 {
                     strangers += more;
                     node.health().failed_times("packets of an unknown sender at the autopilot's port", more);
+                }
+                let more = link.replaced().saturating_sub(replaced);
+                if more > 0 {
+                    replaced += more;
+                    node.health().dropped_times("setpoints: the line to the autopilot is too slow", more);
                 }
                 for (reason, more) in link.refusals().since(refusals) {
                     node.health().failed_times(&format!("from autopilot: refused: {reason}"), more);
@@ -186,8 +193,8 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     note_file.keep(flight.flight().note());
     send(&node, &link, &mut flight);
     tapes.end(&mut flight).await;
-    // The link's own task needs a moment to put the last packet on the wire.
-    sleep(TICK).await;
+    // The link's own task needs a moment to put the last packet on the wire, a setpoint on a slow line a little more.
+    sleep(LAST_PACKET).await;
     Ok(())
 }
 
@@ -249,7 +256,11 @@ fn denials(packets: &[Packet], system: Option<u8>) -> impl Iterator<Item = Vec<u
 /// Sends the flight's packets.
 fn send(node: &Node, link: &Link, flight: &mut TapedFlight) {
     while let Some(packet) = flight.poll_outgoing() {
-        if link.send(&packet).is_err() {
+        let sent = match is_setpoint(&packet) {
+            true => link.send_newest(&packet),
+            false => link.send(&packet),
+        };
+        if sent.is_err() {
             node.health().dropped("packets for the autopilot");
         }
     }

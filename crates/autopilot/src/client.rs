@@ -48,6 +48,8 @@ const UNSTEADY: Duration = Duration::from_secs(1);
 const SAME_ADDRESS_NS: i64 = 10_000_000_000;
 /// Time in which another vehicle on the link is heard, in nanoseconds: two heartbeats, which come once a second, and a little.
 const LISTENS_NS: i64 = 2_500_000_000;
+/// Time within which the clock's answers tell how slow the link is, in nanoseconds: it is asked for ten times a second.
+const LINK_DELAY_DUE_NS: i64 = 3_000_000_000;
 /// Maximum age of a position whose vertical speed says whether the vehicle stands, in nanoseconds.
 const MAX_SPEED_AGE_NS: i64 = 500_000_000;
 
@@ -70,10 +72,10 @@ pub struct Autopilot {
     heartbeat_due_ns: i64,
     /// The system id of the first other vehicle that was heard.
     other_system: Option<u8>,
-    /// When a packet of another companion with our ids came last.
-    same_address_ns: Option<i64>,
     /// The link's delay was known once.
     knew_link_delay: bool,
+    /// When a packet of another companion with our ids came last.
+    same_address_ns: Option<i64>,
     refused_numbers: u64,
     late: u64,
 }
@@ -85,12 +87,12 @@ struct Vehicle {
     state: VehicleState,
     readiness: Readiness,
     simulation: Simulation,
+    /// When it was found.
+    found_ns: i64,
     heartbeat_ns: i64,
     /// When its mode was shown last.
     mode_ns: i64,
     /// When its mode was shown first, of the times that are not older than [`MODE_OF_NOW_NS`].
-    /// When it was found.
-    found_ns: i64,
     mode_since_ns: i64,
     /// The mode before the last change that CURRENT_MODE showed, and when it did.
     mode_before: Option<(FlightMode, i64)>,
@@ -125,9 +127,9 @@ impl Autopilot {
             sequence: 0,
             heartbeat_due_ns: i64::MIN,
             other_system: None,
+            knew_link_delay: false,
             same_address_ns: None,
             refused_numbers: 0,
-            knew_link_delay: false,
             late: 0,
         }
     }
@@ -303,8 +305,6 @@ impl Autopilot {
         self.clock.link_delay_ns(now_ns).map(|ns| Duration::from_nanos(ns.max(0).unsigned_abs()))
     }
 
-    /// Whether another companion on this link uses our ids: probably a second controller of the same vehicle.
-    pub fn shares_our_address(&self, now_ns: i64) -> bool {
     /// Whether a connected vehicle has had time to tell how slow the link is, and never has: its clock is not asked for
     /// ([`Config::timesync`]), or the link does not pass the questions or the answers.
     pub fn lacks_link_delay(&self, now_ns: i64) -> bool {
@@ -313,20 +313,9 @@ impl Autopilot {
         !self.knew_link_delay && heard_ns >= LINK_DELAY_DUE_NS
     }
 
+    /// Whether another companion on this link uses our ids: probably a second controller of the same vehicle.
+    pub fn shares_our_address(&self, now_ns: i64) -> bool {
         self.same_address_ns.is_some_and(|last| now_ns.saturating_sub(last) < SAME_ADDRESS_NS)
-    }
-
-    /// Why the vehicle cannot be armed and flown yet, as texts; empty when it can.
-    pub fn not_ready_because(&self) -> Vec<String> {
-        match &self.vehicle {
-            None => vec!["waiting for the autopilot's heartbeat".to_owned()],
-            Some(vehicle) => vehicle.readiness.reasons(),
-        }
-    }
-
-    /// Number of messages refused because a number in them was not finite.
-    pub fn refused_numbers(&self) -> u64 {
-        self.refused_numbers
     }
 
     /// Why neither a take-off nor a landing may begin now: a second controller, or, where [`Config::system_id`] pins none, a second
@@ -344,6 +333,19 @@ impl Autopilot {
         let found_ns = self.vehicle.as_ref().map(|vehicle| vehicle.found_ns);
         self.config.system_id.is_some()
             || found_ns.is_some_and(|found| now_ns.saturating_sub(found) >= LISTENS_NS)
+    }
+
+    /// Why the vehicle cannot be armed and flown yet, as texts; empty when it can.
+    pub fn not_ready_because(&self) -> Vec<String> {
+        match &self.vehicle {
+            None => vec!["waiting for the autopilot's heartbeat".to_owned()],
+            Some(vehicle) => vehicle.readiness.reasons(),
+        }
+    }
+
+    /// Number of messages refused because a number in them was not finite.
+    pub fn refused_numbers(&self) -> u64 {
+        self.refused_numbers
     }
 
     /// Number of measurements left out because they came after newer ones or seconds late, because their time since the
@@ -551,9 +553,9 @@ impl Autopilot {
             self.send(&timesync(now_ns, message.ts1, from));
         } else if self.config.timesync {
             self.clock.answered(now_ns, message.tc1, message.ts1);
+            self.knew_link_delay |= self.clock.link_delay_ns(now_ns).is_some();
         }
     }
-            self.knew_link_delay |= self.clock.link_delay_ns(now_ns).is_some();
 
     fn send_to_vehicle(&mut self, mut message: MavMessage) {
         if let (MavMessage::COMMAND_LONG(command), Some(vehicle)) = (&mut message, &self.vehicle) {

@@ -136,6 +136,7 @@ fn angles(sight: Vector<Body>) -> Option<(f32, f32)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::packet::{encode, is_setpoint, setpoint_bytes};
     use crate::text::{Joiner, Text};
     use proptest::prelude::*;
 
@@ -153,6 +154,16 @@ mod tests {
             arrived.extend(joiner.tick(i64::MAX).map(|text| text.text));
             prop_assert!(text.len() > 450 || arrived == text.trim_end());
         }
+    }
+
+    #[test]
+    fn a_setpoint_has_the_length_that_is_reckoned_with() {
+        let ours = Sender { system: 1, component: 191 };
+        let setpoint = velocity(7, Vector::zero(), 0.0, Sender { system: 1, component: 1 });
+        let raw = encode(ours, 0, &setpoint);
+        assert_eq!(raw.len(), setpoint_bytes(false));
+        assert!(is_setpoint(&raw));
+        assert!(!is_setpoint(&encode(ours, 0, &MavMessage::HEARTBEAT(heartbeat()))));
     }
 
     #[test]

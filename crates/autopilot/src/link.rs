@@ -36,7 +36,7 @@ const INCOMING: usize = 1024;
 const OUTGOING: usize = 256;
 /// Maximum number of waiting packets of low priority, about a second of a slow line.
 const SPARE: usize = 16;
-/// Maximum time that a line needs for what it has still to send, when one of them is sent.
+/// Maximum time that a line needs for what it has still to send, when one of them or a setpoint is sent.
 const SPARE_BACKLOG: Duration = Duration::from_millis(50);
 /// Pause before it is looked again how much a line has still to send.
 const BACKLOG_PAUSE: Duration = Duration::from_millis(10);
@@ -214,6 +214,14 @@ impl Link {
         self.sender.send_spare(packet)
     }
 
+    /// Sends a setpoint without waiting; see [`LinkSender::send_newest`].
+    ///
+    /// # Errors
+    /// When there is no connection.
+    pub fn send_newest(&self, packet: &[u8]) -> Result<(), SendError> {
+        self.sender.send_newest(packet)
+    }
+
     /// A handle for sending over this link.
     pub fn sender(&self) -> LinkSender {
         self.sender.clone()
@@ -244,6 +252,11 @@ impl Link {
         *self.shared.refusals.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Number of setpoints that were not sent because a newer one came while they waited for a slow line.
+    pub fn replaced(&self) -> u64 {
+        self.shared.replaced.load(Ordering::Relaxed)
+    }
+
     /// Number of received packets that were dropped because they were not read in time.
     pub fn dropped(&self) -> u64 {
         self.shared.dropped.load(Ordering::Relaxed)
@@ -269,6 +282,22 @@ impl LinkSender {
         self.put(&self.spare, packet)
     }
 
+    /// Sends a packet that makes those like it before it useless: a setpoint. It waits until a serial line has little left to send, and
+    /// takes the place of one that still waits: a line that is too slow for all of them carries new ones instead of old ones.
+    ///
+    /// # Errors
+    /// When there is no connection.
+    pub fn send_newest(&self, packet: &[u8]) -> Result<(), SendError> {
+        if !self.shared.connected.load(Ordering::Acquire) || self.queue.is_closed() {
+            return Err(SendError::NotConnected);
+        }
+        if self.shared.newest().replace(packet.to_vec()).is_some() {
+            self.shared.replaced.fetch_add(1, Ordering::Relaxed);
+        }
+        self.shared.newest_waits.notify_one();
+        Ok(())
+    }
+
     fn put(&self, queue: &mpsc::Sender<Vec<u8>>, packet: &[u8]) -> Result<(), SendError> {
         if !self.shared.connected.load(Ordering::Acquire) {
             return Err(SendError::NotConnected);
@@ -284,8 +313,12 @@ impl LinkSender {
 struct Shared {
     events: Mutex<VecDeque<LinkEvent>>,
     arrived: Notify,
+    /// The setpoint that waits to be sent.
+    newest: Mutex<Option<Vec<u8>>>,
+    newest_waits: Notify,
     connected: AtomicBool,
     dropped: AtomicU64,
+    replaced: AtomicU64,
     strangers: AtomicU64,
     counters: Mutex<Counters>,
     refusals: Mutex<Refusals>,
@@ -300,8 +333,11 @@ impl Shared {
         Self {
             events: Mutex::new(VecDeque::with_capacity(INCOMING)),
             arrived: Notify::new(),
+            newest: Mutex::new(None),
+            newest_waits: Notify::new(),
             connected: AtomicBool::new(false),
             dropped: AtomicU64::new(0),
+            replaced: AtomicU64::new(0),
             strangers: AtomicU64::new(0),
             counters: Mutex::new(Counters::default()),
             refusals: Mutex::new(Refusals::default()),
@@ -313,6 +349,20 @@ impl Shared {
 
     fn events(&self) -> MutexGuard<'_, VecDeque<LinkEvent>> {
         self.events.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn newest(&self) -> MutexGuard<'_, Option<Vec<u8>>> {
+        self.newest.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Waits for a setpoint and takes it; may be cancelled without losing one.
+    async fn take_newest(&self) -> Vec<u8> {
+        loop {
+            if let Some(packet) = self.newest().take() {
+                return packet;
+            }
+            self.newest_waits.notified().await;
+        }
     }
 
     fn push(&self, event: LinkEvent) {
@@ -351,6 +401,8 @@ struct Port {
     /// Packets of low priority.
     outgoing_spare: mpsc::Receiver<Vec<u8>>,
     peering: Peering,
+    /// The system id of the first autopilot at a UDP port.
+    first_autopilot: Option<u8>,
     gate: Gate,
     keeping: Option<Keeping>,
 }
@@ -373,18 +425,20 @@ impl Port {
     fn connected(&mut self, peer: String) {
         while self.outgoing.try_recv().is_ok() {}
         while self.outgoing_spare.try_recv().is_ok() {}
+        drop(self.shared.newest().take());
         self.shared.mark_active();
         tracing::info!(%peer, "Link connected");
         self.shared.connected.store(true, Ordering::Release);
         self.shared.push(LinkEvent::Connected { peer });
     }
 
-    /// The next packet to send, one of low priority only when it may be; may be cancelled without losing one.
-    async fn next(&mut self, may_be_spare: bool) -> Option<Vec<u8>> {
+    /// The next packet to send, a setpoint or one of low priority only when the line has room; may be cancelled without losing one.
+    async fn next(&mut self, has_room: bool) -> Option<Vec<u8>> {
         tokio::select! {
             biased;
             packet = self.outgoing.recv() => packet,
-            packet = self.outgoing_spare.recv(), if may_be_spare => packet,
+            packet = self.shared.take_newest(), if has_room => Some(packet),
+            packet = self.outgoing_spare.recv(), if has_room => packet,
         }
     }
 
@@ -401,8 +455,6 @@ impl Port {
         let received = Instant::now();
         for packet in packets {
             self.shared.push(LinkEvent::Packet { packet: Box::new(packet), received });
-    /// The system id of the first autopilot at a UDP port.
-    first_autopilot: Option<u8>,
         }
     }
 }
@@ -793,6 +845,7 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
                     let datagram = bytes.get(..count).unwrap_or(&[]);
                     let stamp = port.stamp();
                     let taken = peers.take(from, datagram, Instant::now(), &mut port.gate, stamp);
+                    port.first_autopilot = peers.first;
                     if let Some(peer) = peers.chosen.filter(|_| peers.chosen != before) {
                         port.connected(peer.to_string());
                     }
@@ -800,6 +853,10 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
                         tracing::warn!(%from, "Packets of an unknown sender dropped (further ones are only counted)");
                     }
                     port.received(taken.packets, taken.counted);
+                    if let Some(packet) = taken.other_autopilot.map(Box::new) {
+                        let received = Instant::now();
+                        port.shared.push(LinkEvent::OtherAutopilot { packet, received });
+                    }
                 }
                 // A datagram of ours had no receiver: the other side is not running.
                 Err(error) if is_refusal(&error) => {}
@@ -845,7 +902,6 @@ struct Unsent {
     last: Instant,
 }
 
-                    port.first_autopilot = peers.first;
 impl Unsent {
     /// One more now.
     fn after(before: Option<Self>) -> Self {
@@ -853,10 +909,6 @@ impl Unsent {
         let first = before.filter(|it| it.last.elapsed() < SEND_LIMIT).map_or(last, |it| it.first);
         Self { first, last }
     }
-                    if let Some(packet) = taken.other_autopilot.map(Box::new) {
-                        let received = Instant::now();
-                        port.shared.push(LinkEvent::OtherAutopilot { packet, received });
-                    }
 }
 
 fn is_refusal(error: &io::Error) -> bool {
@@ -925,6 +977,43 @@ mod tests {
             is_slow.store(false, Ordering::Relaxed);
             let count = other_end.read(&mut bytes).await.unwrap();
             assert_eq!(&bytes[..count], b"packet");
+        };
+        tokio::select! {
+            () = sending => {}
+            reason = serve_stream(line, manner, &mut port) => panic!("{reason}"),
+        }
+    }
+
+    #[tokio::test]
+    async fn of_setpoints_that_wait_for_a_slow_line_only_the_newest_is_sent() {
+        let is_slow = AtomicBool::new(true);
+        let backlog = |_: &_| match is_slow.load(Ordering::Relaxed) {
+            true => SPARE_BACKLOG * 2,
+            false => SPARE_BACKLOG,
+        };
+        let manner = Manner { backlog, gap: PACKET_GAP, silence: None };
+        let (sender, mut port) = pair();
+        assert_eq!(sender.send_newest(b"setpoint"), Err(SendError::NotConnected));
+        port.connected("peer".into());
+        let (line, mut other_end) = tokio::io::duplex(4096);
+        let sending = async {
+            sender.send_spare(b"packet").unwrap();
+            let mut bytes = [0; 100];
+            for i in 0..100 {
+                sender.send_newest(format!("setpoint {i}").as_bytes()).unwrap();
+            }
+            sender.send(b"command").unwrap();
+            let count = other_end.read(&mut bytes).await.unwrap();
+            assert_eq!(&bytes[..count], b"command", "it does not wait for setpoints");
+            sleep(BACKLOG_PAUSE * 2).await;
+            is_slow.store(false, Ordering::Relaxed);
+            let mut sent = String::new();
+            while !sent.ends_with("packet") {
+                let count = other_end.read(&mut bytes).await.unwrap();
+                sent.push_str(std::str::from_utf8(&bytes[..count]).unwrap());
+            }
+            assert_eq!(sent, "setpoint 99packet");
+            assert_eq!(sender.shared.replaced.load(Ordering::Relaxed), 99);
         };
         tokio::select! {
             () = sending => {}

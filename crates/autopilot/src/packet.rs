@@ -4,9 +4,11 @@
 //! decoding are the `mavlink` crate's; the framing is not, because packets of unknown messages must pass byte
 //! for byte and a damaged packet must not hide the good one behind it.
 
-use mavlink::{MAVLinkV2MessageRaw, MavHeader, MavlinkVersion, Message, calculate_crc};
+use mavlink::{
+    MAVLinkV2MessageRaw, MavHeader, MavlinkVersion, Message, MessageData, calculate_crc,
+};
 
-use crate::dialect::{MavAutopilot, MavMessage, MavType};
+use crate::dialect::{MavAutopilot, MavMessage, MavType, SET_POSITION_TARGET_LOCAL_NED_DATA};
 
 const START_V1: u8 = 0xFE;
 const START_V2: u8 = 0xFD;
@@ -217,6 +219,18 @@ pub fn encode(sender: Sender, sequence: u8, message: &MavMessage) -> Vec<u8> {
     let mut raw = MAVLinkV2MessageRaw::new();
     raw.serialize_message(header, message);
     raw.raw_bytes().to_vec()
+}
+
+/// Length of a setpoint as it is sent, in bytes.
+pub fn setpoint_bytes(is_signed: bool) -> usize {
+    let signature = if is_signed { SIGNATURE } else { 0 };
+    HEADER_V2 + SET_POSITION_TARGET_LOCAL_NED_DATA::ENCODED_LEN + CHECKSUM + signature
+}
+
+/// Whether a packet is a setpoint.
+pub fn is_setpoint(raw: &[u8]) -> bool {
+    let packet = Packet::from_raw(raw);
+    packet.is_some_and(|packet| packet.message_id == SET_POSITION_TARGET_LOCAL_NED_DATA::ID)
 }
 
 /// The packet that is all of these bytes, as MAVLink 2 with these incompatibility flags, from start byte to checksum; `None`
