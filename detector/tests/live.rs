@@ -375,6 +375,13 @@ fn rings_m(message: &Detections) -> Option<f64> {
     Some(rings.pose.as_ref()?.camera_from_marker.translation_m[2])
 }
 
+/// A camera sends its next frame over the air link when the last one is acknowledged.
+#[test]
+fn the_detector_in_python_acknowledges_a_frame_before_it_looks_at_it() -> anyhow::Result<()> {
+    let Some(acks) = python("detector/tests/python/acks.py", &[]) else { return Ok(()) };
+    python_passes(&acks.wait_with_output()?).map(drop)
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_camera_in_python_is_searched_and_nobody_else_gives_its_calibration() -> anyhow::Result<()>
 {

@@ -288,6 +288,7 @@ class Detector:
     def __init__(self, session, prefix, args):
         self.session, self.prefix, self.args = session, prefix, args
         self.frames, self.camera, self.stopped = Newest(), None, threading.Event()
+        self.acks = None
         self.problems = set()
 
     def key(self, rest):
@@ -298,6 +299,18 @@ class Detector:
             self.camera = read_camera(sample.payload.to_bytes())
         except ValueError as problem:
             self.complain("camera info", problem)
+
+    def take_frame(self, sample):
+        """Acknowledges a JPEG frame as it arrives, on Zenoh's thread: a camera sends the next one over the air link then."""
+        if self.args.input == "jpeg":
+            try:
+                header = read_header(sample.attachment.to_bytes())
+                ack = Writer(FRAME_ACK).text(header["camera"]).unsigned(header["sequence"])
+                ack.signed(header["stamp_ns"]).text(header["clock"]).unsigned(len(sample.payload.to_bytes()))
+                self.acks.put(ack.bytes())
+            except (ValueError, AttributeError) as problem:
+                self.complain("frame", problem)
+        self.frames.put(sample)
 
     def complain(self, what, problem):
         """Once for each kind: a foreign message must not stop a detector, nor fill its log."""
@@ -331,14 +344,14 @@ class Detector:
         name, camera = self.args.id, self.args.camera
         urgent = {"priority": zenoh.Priority.REAL_TIME, "congestion_control": zenoh.CongestionControl.DROP}
         detections = self.session.declare_publisher(self.key(f"detector/{name}/detections"), **urgent)
-        acks = self.session.declare_publisher(self.key(f"detector/{name}/ack"), **urgent)
+        self.acks = self.session.declare_publisher(self.key(f"detector/{name}/ack"), **urgent)
         info_key = self.key(f"detector/{name}/info")
         topic = "frame" if self.args.input == "raw" else "jpeg"
         kept = [
             self.session.declare_queryable(info_key, lambda query: query.reply(info_key, self.info())),
             self.session.declare_queryable(self.key(f"detector/{name}/command"), self.obey),
             self.session.declare_subscriber(self.key(f"camera/{camera}/info"), self.take_camera),
-            self.session.declare_subscriber(self.key(f"camera/{camera}/{topic}"), self.frames.put),
+            self.session.declare_subscriber(self.key(f"camera/{camera}/{topic}"), self.take_frame),
         ]
         # Ready means: able to tell where a marker is. The camera keeps its last word for those who come late.
         for reply in self.session.get(self.key(f"camera/{camera}/info"), timeout=2.0):
@@ -352,18 +365,14 @@ class Detector:
                 self.session.put(info_key, self.info())
             sample = self.frames.take(0.2)
             if sample is not None:
-                self.search(sample, detections, acks)
+                self.search(sample, detections)
         time.sleep(0.1)
         return kept
 
-    def search(self, sample, detections, acks):
+    def search(self, sample, detections):
         try:
             header = read_header(sample.attachment.to_bytes())
             payload = sample.payload.to_bytes()
-            if self.args.input == "jpeg":
-                ack = Writer(FRAME_ACK).text(header["camera"]).unsigned(header["sequence"])
-                ack.signed(header["stamp_ns"]).text(header["clock"]).unsigned(len(payload))
-                acks.put(ack.bytes())
             began = time.monotonic()
             corners = self.args.marker.find(header, payload)
             stages = [("opencv", int((time.monotonic() - began) * 1e6))]
