@@ -8,8 +8,8 @@ use std::time::Duration;
 use clap::{Args, Subcommand, ValueEnum};
 use markers::{Marker, Pad};
 use messages::{
-    Candidate, Configuration, ControllerCommand, ControllerStatus, DetectorInfo, DetectorState,
-    Place, marker_name, topic,
+    Candidate, Configuration, ControllerCommand, ControllerStatus, Detection, DetectorInfo,
+    DetectorState, Place, marker_name, topic,
 };
 use node::Node;
 use serde::Serialize;
@@ -100,6 +100,7 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
     let configurations = node.subscriber(topic::CONFIGURATION, &["controller"]).await?;
     let (mut status, mut announced, mut marker) = (None, BTreeMap::new(), None);
     let mut published: BTreeMap<String, u32> = BTreeMap::new();
+    let mut found: BTreeMap<String, Vec<Detection>> = BTreeMap::new();
     let receive = async {
         loop {
             tokio::select! {
@@ -109,9 +110,12 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
                     let name = topic::DETECTOR_INFO.first_name(&key).unwrap_or_default();
                     announced.insert(name.to_owned(), info);
                 }
-                Some((key, _)) = detections.next_with_key() => {
+                Some((key, message)) = detections.next_with_key() => {
                     let name = topic::DETECTIONS.first_name(&key).unwrap_or_default();
                     *published.entry(name.to_owned()).or_default() += 1;
+                    if !message.detections.is_empty() {
+                        found.insert(name.to_owned(), message.detections);
+                    }
                 }
                 Some(configuration) = configurations.next() => marker = marker_of(&configuration),
                 else => return,
@@ -135,7 +139,17 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
         }
         (None, _) => Controller::Unread,
     };
-    Ok(Overview::new(controller, marker, &announced, &running))
+    let without_pose = without_pose(&found, marker.as_deref());
+    Ok(Overview::new(controller, marker, &announced, &running, &without_pose))
+}
+
+/// The detectors that found this marker, and gave no pose of it, in the latest frame in which they found any.
+fn without_pose(found: &BTreeMap<String, Vec<Detection>>, marker: Option<&str>) -> BTreeSet<String> {
+    let lacks_pose = |found: &Vec<Detection>| {
+        let wanted = found.iter().find(|it| marker.is_none_or(|marker| it.is_of(marker)));
+        wanted.is_some_and(|it| it.pose.is_none())
+    };
+    found.iter().filter(|(_, found)| lacks_pose(found)).map(|(name, _)| name.clone()).collect()
 }
 
 /// The marker of a controller's landing.
@@ -193,7 +207,7 @@ struct Overview {
 #[derive(Serialize)]
 struct Entry {
     id: String,
-    /// `active`, `shadow`, `stale`, `blind`, `outvoted`; `waiting` for one from which the controller has received nothing, and
+    /// `active`, `shadow`, `stale`, `blind`, `no-pose` for one that is blind because it gives no pose, `outvoted`; `waiting` for one from which the controller has received nothing, and
     /// `other-marker` for one that answers and never reports the marker of the landing. Where no controller's status is read,
     /// `publishing`, or `silent` for one of which nothing came.
     state: &'static str,
@@ -215,6 +229,7 @@ impl Overview {
         marker: Option<String>,
         announced: &BTreeMap<String, DetectorInfo>,
         running: &BTreeMap<String, f64>,
+        without_pose: &BTreeSet<String>,
     ) -> Self {
         let (controller, status_read, status) = match controller {
             Controller::Absent(detector_why) => {
@@ -230,7 +245,11 @@ impl Overview {
         let entry = |name: &str| {
             let (candidate, info) = (candidates.get(name).copied(), announced.get(name));
             let received_hz = running.get(name).copied().filter(|rate_hz| *rate_hz > 0.0);
-            Entry::new(name, candidate, info, marker.as_deref(), status_read, received_hz)
+            let entry = Entry::new(name, candidate, info, marker.as_deref(), status_read, received_hz);
+            match entry.state {
+                "blind" if without_pose.contains(name) => Entry { state: "no-pose", ..entry },
+                _ => entry,
+            }
         };
         let mut detectors: Vec<Entry> = names.into_iter().map(entry).collect();
         detectors.sort_by_key(|entry| entry.state != "active");
@@ -398,8 +417,9 @@ mod tests {
         };
         let announced = [("main".to_owned(), info)].into();
         let running = [("main".to_owned(), 10.0), ("late".to_owned(), 0.0)].into();
-        let table =
-            Overview::new(Controller::Read(Box::new(status)), None, &announced, &running).table();
+        let controller = Controller::Read(Box::new(status));
+        let none = BTreeSet::new();
+        let table = Overview::new(controller, None, &announced, &running, &none).table();
         let lines: Vec<&str> = table.lines().collect();
         assert!(lines[1].starts_with("main") && lines[1].contains("rings:0.15341"), "{table}");
         assert!(lines[2].contains("shadow") && lines[2].contains("29 of 30, 0.012 m"), "{table}");
@@ -407,7 +427,7 @@ mod tests {
         assert!(lines[4].contains("preferred: ground; 3 changes"), "{table}");
         assert!(lines[5].starts_with("Warning: detections of `late`"), "{table}");
         let absent = Controller::Absent("nobody listens at 10.0.0.1:7448".to_owned());
-        let nobody = Overview::new(absent, None, &announced, &running).table();
+        let nobody = Overview::new(absent, None, &announced, &running, &none).table();
         let lines: Vec<&str> = nobody.lines().collect();
         assert!(lines[1].starts_with("late") && lines[1].contains("silent"), "{nobody}");
         assert!(lines[2].contains("publishing") && lines[2].contains("10.0 Hz"), "{nobody}");
@@ -415,7 +435,7 @@ mod tests {
         assert!(nobody.contains("nobody listens at 10.0.0.1:7448"), "{nobody}");
         // As its configuration is read, whose version is the same.
         let marker = Some("rings".to_owned());
-        let unread = Overview::new(Controller::Unread, marker, &announced, &BTreeMap::new());
+        let unread = Overview::new(Controller::Unread, marker, &announced, &BTreeMap::new(), &none);
         assert!(unread.controller && !unread.status_read);
         let unread = unread.table();
         assert!(unread.contains("A controller is running") && !unread.contains("No controller"));
@@ -430,6 +450,7 @@ mod tests {
             ("late", DetectorState::Stale, "aruco-4x4-50:7:0.15"),
             ("liar", DetectorState::Outvoted, "rings:0.15341"),
             ("tag", DetectorState::Blind, "aruco-4x4-50:7:0.15"),
+            ("uncalibrated", DetectorState::Blind, "rings:0.15341"),
         ];
         let candidates = states.map(|(name, state, _)| Candidate {
             detector: name.into(),
@@ -455,8 +476,21 @@ mod tests {
             version: "0.1.0".into(),
             toml: "marker = \"rings\"".into(),
         });
+        let seen = |family: &str, has_pose: bool| {
+            let seen = Detection { family: family.into(), ..Detection::sample() };
+            let pose = seen.pose.filter(|_| has_pose);
+            vec![Detection { pose, ..seen }]
+        };
+        let found = [
+            ("blind", seen("rings", true)),
+            ("tag", seen("aruco-4x4-50", false)),
+            ("uncalibrated", seen("rings", false)),
+        ];
+        let found = found.map(|(name, found)| (name.to_owned(), found)).into();
+        let without_pose = without_pose(&found, marker.as_deref());
+        let controller = Controller::Read(Box::new(status));
         let overview =
-            Overview::new(Controller::Read(Box::new(status)), marker, &announced, &BTreeMap::new());
+            Overview::new(controller, marker, &announced, &BTreeMap::new(), &without_pose);
         let told: Vec<_> = overview.detectors.iter().map(|it| (it.id.as_str(), it.state)).collect();
         let expected = [
             ("main", "active"),
@@ -464,6 +498,7 @@ mod tests {
             ("late", "stale"),
             ("liar", "outvoted"),
             ("tag", "other-marker"),
+            ("uncalibrated", "no-pose"),
         ];
         assert_eq!(told, expected);
         let table = overview.table();

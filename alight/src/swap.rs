@@ -446,6 +446,9 @@ impl Swap<'_> {
     /// In what it differs.
     fn difference(&self, shadow: &Candidate) -> String {
         match (shadow.disagreement_m, self.comparison.text()) {
+            (None, _) if self.comparison.lacks_pose() => {
+                "; it sees the marker, and gives no pose of it".to_owned()
+            }
             (None, _) => "; it does not see the marker".to_owned(),
             (Some(_), Some(text)) => format!("; {text}"),
             (Some(apart_m), None) => {

@@ -30,12 +30,15 @@ pub struct Sight {
     /// Its heading about the body's down axis, in radians, from [`heading_rad`]; `None` without a pose. Of a marker without a heading it
     /// means nothing.
     pub heading_rad: Option<f64>,
+    /// Whether the detector gave a pose. With one there is no position either where the camera's mount is not known.
+    pub has_pose: bool,
 }
 
 impl Sight {
-    /// The marker with this pose, or without one.
-    pub fn new(body_from_marker: Option<Transform<Body, Marker>>) -> Self {
+    /// The marker as a detector gave it, with a pose or without one, and where that is in the body frame, if it is known.
+    pub fn new(has_pose: bool, body_from_marker: Option<Transform<Body, Marker>>) -> Self {
         Self {
+            has_pose,
             position_m: body_from_marker.map(|pose| pose.origin().coords.into()),
             heading_rad: body_from_marker.and_then(|pose| heading_rad(pose.rotation())),
         }
@@ -89,6 +92,8 @@ pub enum Fault {
         /// The other one.
         seeing: String,
     },
+    /// It gives no pose of the marker, and the landing needs one.
+    NoPose,
 }
 
 /// Another detector that sees the marker elsewhere or turned, while nobody says which of the two is right.
@@ -227,6 +232,15 @@ fn outvoted(row: &[Common], all: &[Vec<Common>]) -> Option<Fault> {
     let is_majority = |by: usize| by >= MIN_MAJORITY && by > ours && by * 2 > ours + differing;
     let (common, by) = groups.filter(|(_, by)| is_majority(*by)).max_by_key(|(_, by)| *by)?;
     Some(Fault::Outvoted { by, apart_m: common.apart_m, turned_rad: common.turned_rad() })
+}
+
+/// True where a detector gives no pose of the marker in at least three of four of the latest frames in which it sees it.
+pub fn gives_no_pose(sights: &Sights) -> bool {
+    let latest = sights.iter().rev().filter_map(|(_, sight)| *sight).take(MAX_SEEN as usize);
+    let (seen, without) = latest.fold((0_u32, 0_u32), |(seen, without), sight| {
+        (seen + 1, without + u32::from(!sight.has_pose))
+    });
+    seen >= MIN_COMMON && without * 4 >= seen * 3
 }
 
 /// The detector that sees the marker farthest from where the active one does, of those that see it elsewhere or turned.

@@ -348,6 +348,11 @@ impl Config {
         SigningConfig::read(signing_key.as_ref(), *component_id, state_directory(), &name).map(Some)
     }
 
+    /// Whether the landing is led by poses of the marker: the thesis' guidance goes by its place in the image.
+    pub fn needs_pose(&self) -> bool {
+        self.mode == Mode::LandingTarget || self.guidance == GuidanceName::Metric
+    }
+
     /// The differences up to which two detectors agree: in heading where the vehicle turns to the marker's, which it does not where the
     /// autopilot lands by itself.
     pub fn tolerance(&self) -> Tolerance {

@@ -533,7 +533,7 @@ impl Flight {
                     .to_owned(),
             );
         }
-        if let Some(obstacle) = self.frames.obstacle(now_ns) {
+        if let Some(obstacle) = self.frames.start_obstacle(now_ns) {
             return Err(format!("no landing was started: {obstacle}"));
         }
         if self.landing_target.is_some() {

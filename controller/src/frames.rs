@@ -146,9 +146,11 @@ impl Frames {
         } else {
             self.kept_ns = now_ns;
         }
-        let marker =
-            message.first_of(&self.marker).map(|detection| wire::marker_in_frame(detection, mount));
-        let sight = marker.as_ref().map(|marker| Sight::new(marker.body_from_marker));
+        let wanted = message.first_of(&self.marker);
+        let marker = wanted.map(|detection| wire::marker_in_frame(detection, mount));
+        let sight = wanted.zip(marker.as_ref()).map(|(detection, marker)| {
+            Sight::new(detection.pose.is_some(), marker.body_from_marker)
+        });
         let focal_px = camera.and_then(|info| {
             let scale = f64::from(header.width) / f64::from(info.width.max(1));
             info.focal_px.map(|[fx, fy]| 0.5 * (fx + fy) * scale)
@@ -210,6 +212,16 @@ impl Frames {
         lasting.find(|warning| blocks(&warning.matter)).map(|warning| warning.text)
     }
 
+    /// Why a landing that an operator starts would not be led to the marker.
+    pub fn start_obstacle(&self, now_ns: i64) -> Option<String> {
+        self.obstacle(now_ns).or_else(|| self.unseen_because())
+    }
+
+    /// Why the detector in use leads no landing to the marker although it searches frames.
+    pub fn unseen_because(&self) -> Option<String> {
+        self.selection.no_pose()
+    }
+
     /// The frame to be used now: the active detector's newest, if it is newer than all that were used.
     pub fn take_next(&mut self) -> Next {
         let next = self.selection.next_frame();
@@ -245,6 +257,7 @@ fn selection(config: &Config) -> Selection {
         min_rate_hz: settings.min_rate_hz,
         return_after_s: settings.return_after_s,
         tolerance: config.tolerance(),
+        needs_pose: config.needs_pose(),
     };
     let detector = Some(settings.preferred.clone()).filter(|name| !name.is_empty());
     let place = match settings.place {

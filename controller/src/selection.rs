@@ -66,6 +66,8 @@ pub struct Limits {
     pub return_after_s: f64,
     /// Maximum differences between what two detectors see that agree.
     pub tolerance: Tolerance,
+    /// Whether one without poses leads no landing.
+    pub needs_pose: bool,
 }
 
 /// What a detector is worth when there is no room for all; a better one takes the place of a worse one.
@@ -317,6 +319,12 @@ impl Selection {
         self.dispute.as_ref()
     }
 
+    /// That the detector in use gives no pose, without which nothing descends.
+    pub fn no_pose(&self) -> Option<String> {
+        let active = self.known_active().filter(|active| active.fault == Some(Fault::NoPose));
+        active.map(|active| without_pose(&active.name))
+    }
+
     /// What the operator should know of the detectors.
     pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
         let mut warnings = Vec::new();
@@ -344,6 +352,7 @@ impl Selection {
                     warn(format!("blind {name}"), text);
                 }
                 Fault::Blind { .. } => {}
+                Fault::NoPose => warn(format!("no pose {name}"), without_pose(name)),
             }
         }
         if self.crowded_ns.is_some_and(|at| now_ns.saturating_sub(at) < CROWDED_NS) {
@@ -371,7 +380,7 @@ impl Selection {
             detector: known.name.clone(),
             state: match (self.ailment(now_ns, known), &known.fault) {
                 (Some(_), _) => DetectorState::Stale,
-                (None, Some(Fault::Blind { .. })) => DetectorState::Blind,
+                (None, Some(Fault::Blind { .. } | Fault::NoPose)) => DetectorState::Blind,
                 (None, Some(Fault::Outvoted { .. })) => DetectorState::Outvoted,
                 (None, None) if self.active.as_ref() == Some(&known.name) => DetectorState::Active,
                 (None, None) => DetectorState::Shadow,
@@ -453,8 +462,10 @@ impl Selection {
             .iter()
             .map(|answers| if *answers { faults.next().flatten() } else { None })
             .collect();
-        for (known, fault) in self.known.iter_mut().zip(found) {
-            known.fault = fault;
+        let needs_pose = self.limits.needs_pose;
+        for ((known, fault), answers) in self.known.iter_mut().zip(found).zip(answers) {
+            let lacks_pose = answers && needs_pose && agreement::gives_no_pose(&known.sights);
+            known.fault = fault.or(lacks_pose.then_some(Fault::NoPose));
         }
         self.dispute = self.present_dispute(now_ns, tolerance);
     }
@@ -783,7 +794,16 @@ fn said(fault: &Fault) -> String {
             format!("{by} others see the marker {apart_m:.2} m from where it does{turned}")
         }
         Fault::Blind { seeing } => format!("it sees no marker where `{seeing}` sees one"),
+        Fault::NoPose => "it gives no pose of the marker".to_owned(),
     }
+}
+
+/// What is told of a detector that gives no pose.
+fn without_pose(name: &str) -> String {
+    format!(
+        "detector `{name}` gives no pose of the marker, only its place in the image, and the landing needs one: it lacks the marker's size, or the \
+         camera's calibration at this image size"
+    )
 }
 
 /// By how much headings differ, as the end of a clause on places.

@@ -197,6 +197,13 @@ impl View<'_> {
             (Some(reason), Some(no_frame)) if looks_for_marker(reason) => {
                 format!("{reason}: {no_frame}")
             }
+            (Some(reason), None) if looks_for_marker(reason) || is_refused(reason) => {
+                match self.frames.unseen_because() {
+                    Some(unseen) if looks_for_marker(reason) => format!("{reason}: {unseen}"),
+                    Some(unseen) => format!("nothing descends: {unseen}"),
+                    None => reason.to_string(),
+                }
+            }
             (reason, _) => reason.map_or_else(String::new, |reason| reason.to_string()),
         };
         if let Some(reason) = self.cause() {
@@ -288,6 +295,11 @@ fn unknown_link() -> Warning {
              landing is slower; see whether the link (a telemetry radio, a router) passes TIMESYNC in both directions"
         ),
     }
+}
+
+/// True for the reasons that say that the marker is seen, and not taken.
+fn is_refused(reason: Reason) -> bool {
+    matches!(reason, Reason::TargetRefused | Reason::RetryingRefused)
 }
 
 /// True for the reasons that say that the marker is not seen.

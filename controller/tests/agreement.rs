@@ -19,7 +19,7 @@ const FRAMES: i64 = 20;
 
 /// A detector that sees the marker at one place in all frames, its upper edge forward.
 fn steady(position_m: [f64; 3]) -> Sights {
-    steadily(Sight { position_m: Some(position_m), heading_rad: Some(0.0) })
+    steadily(Sight { position_m: Some(position_m), heading_rad: Some(0.0), has_pose: true })
 }
 
 fn steadily(sight: Sight) -> Sights {
@@ -29,7 +29,7 @@ fn steadily(sight: Sight) -> Sights {
 /// A marker 5 m below, its upper edge turned clockwise by this.
 fn turned_by(heading_deg: f64) -> Sights {
     let heading_rad = Some(heading_deg.to_radians());
-    steadily(Sight { position_m: Some([0.0, 0.0, 5.0]), heading_rad })
+    steadily(Sight { position_m: Some([0.0, 0.0, 5.0]), heading_rad, has_pose: true })
 }
 
 /// The pose of a marker that lies flat under a level vehicle.
@@ -137,13 +137,14 @@ fn a_heading_is_that_of_the_upper_edge_clockwise_from_above() {
         let heading = heading_rad(flat(heading_deg)).unwrap();
         assert!(angle_between(heading, heading_deg.to_radians()) < 1e-9, "{heading}");
         let pose = Transform::new(flat(heading_deg), Point::new(0.1, 0.2, 3.0));
-        let sight = Sight::new(Some(pose));
-        assert_eq!(sight, Sight { position_m: Some([0.1, 0.2, 3.0]), heading_rad: Some(heading) });
+        let sight = Sight::new(true, Some(pose));
+        assert_eq!(sight, Sight { position_m: Some([0.1, 0.2, 3.0]), heading_rad: Some(heading), has_pose: true });
     }
     // From behind, where it cannot be seen, it has none.
     let behind = Rotation::<Body, Body>::from_euler(std::f64::consts::PI, 0.0, 0.0) * flat(10.0);
     assert_eq!(heading_rad(behind), None);
-    assert_eq!(Sight::new(None), Sight { position_m: None, heading_rad: None });
+    let without = Sight { position_m: None, heading_rad: None, has_pose: false };
+    assert_eq!(Sight::new(false, None), without);
 }
 
 fn position() -> impl Strategy<Value = [f64; 3]> {
@@ -161,14 +162,14 @@ fn seen(range_m: f64) -> impl Strategy<Value = Sight> {
     let heading_deg = prop::sample::select(vec![0.0, 10.0, 20.0, 90.0, 180.0, -175.0]);
     let heading_rad = prop::option::weighted(0.9, heading_deg.prop_map(f64::to_radians));
     (near(range_m), heading_rad)
-        .prop_map(|(position_m, heading_rad)| Sight { position_m: Some(position_m), heading_rad })
+        .prop_map(|(position_m, heading_rad)| Sight { position_m: Some(position_m), heading_rad, has_pose: true })
 }
 
 /// What a detector saw: the marker about a place, without a place, or nothing, in some of the frames.
 fn sights(range_m: f64) -> impl Strategy<Value = Sights> {
     let sight = prop_oneof![
         6 => seen(range_m).prop_map(Some),
-        1 => Just(Some(Sight { position_m: None, heading_rad: None })),
+        1 => Just(Some(Sight { position_m: None, heading_rad: None, has_pose: true })),
         1 => Just(None),
     ];
     prop::collection::vec((prop::bool::weighted(0.8), sight), FRAMES as usize).prop_map(|frames| {
@@ -257,7 +258,7 @@ proptest! {
             Rotation::<Body, Marker>::from_quaternion(nalgebra::UnitQuaternion::from_rotation_matrix(&axes))
         };
         let [one, other] = [heading_deg, other_deg].map(flat);
-        let sight = |rotation| Sight::new(Some(Transform::new(rotation, Point::new(0.0, 0.0, 5.0))));
+        let sight = |rotation| Sight::new(true, Some(Transform::new(rotation, Point::new(0.0, 0.0, 5.0))));
         prop_assert_eq!(turned(TOLERANCE, sight(one), sight(flipped(one))), None);
         let is_turned = turned(TOLERANCE, sight(one), sight(other)).is_some();
         prop_assert_eq!(turned(TOLERANCE, sight(one), sight(flipped(other))).is_some(), is_turned);

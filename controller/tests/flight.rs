@@ -944,6 +944,42 @@ fn a_camera_that_sends_nothing_is_told_of_beside_one_that_does() {
 }
 
 #[test]
+fn a_landing_on_centres_without_poses_is_refused_with_its_reason_and_one_under_way_tells_it() {
+    for (start, guidance, is_told) in [
+        ("command", "metric", true),
+        ("airborne", "metric", true),
+        ("command", "thesis", false),
+    ] {
+        let mut flight = flight_with(start, &[&format!("guidance=\"{guidance}\"")]);
+        flight.camera(0, CameraInfo::sample());
+        receive(&mut flight, 0, &heartbeat(4, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        for ms in (20..3000).step_by(20) {
+            if ms % 1000 == 0 {
+                receive(&mut flight, ms * MS, &heartbeat(4, true));
+            }
+            pose(&mut flight, ms * MS);
+            if ms % 60 == 0 {
+                let mut seen = seen(ms * MS - 40 * MS);
+                seen.detections[0].pose = None;
+                flight.detections(ms * MS + 2, "main", &seen);
+            }
+            flight.tick(ms * MS + 3);
+        }
+        let now_ns = 3000 * MS;
+        let status = flight.status(now_ns);
+        let told = "`main` gives no pose";
+        assert_eq!(status.warnings.iter().any(|it| it.contains(told)), is_told, "{status:?}");
+        if start == "airborne" {
+            assert!(status.why.contains(told), "{}: {}", status.phase, status.why);
+        } else {
+            let reply = flight.command(now_ns, &ControllerCommand::Start);
+            assert_eq!(!reply.accepted && reply.reason.contains(told), is_told, "{reply:?}");
+        }
+    }
+}
+
+#[test]
 fn a_takeoff_with_a_battery_at_its_critical_limit_is_refused_before_the_motors_are_armed() {
     let off = "phases.on_battery_critical=ignore";
     // One reading decides nothing, nor does an alarm that is off.

@@ -19,6 +19,7 @@ fn limits() -> Limits {
         min_rate_hz: 3.0,
         return_after_s: 2.0,
         tolerance: Tolerance { base_m: 0.1, per_m: 0.03, heading_rad: Some(HEADING_TOLERANCE_RAD) },
+        needs_pose: true,
     }
 }
 
@@ -33,7 +34,11 @@ fn place(position_m: [f64; 3]) -> Sight {
 
 /// The marker at a place, its upper edge turned clockwise by this.
 fn turned(position_m: [f64; 3], heading_deg: f64) -> Sight {
-    Sight { position_m: Some(position_m), heading_rad: Some(f64::to_radians(heading_deg)) }
+    Sight {
+        position_m: Some(position_m),
+        heading_rad: Some(f64::to_radians(heading_deg)),
+        has_pose: true,
+    }
 }
 
 /// Detectors that answer to the frames of one camera, each with its latency, and what was used when.
@@ -313,7 +318,7 @@ fn one_that_sees_the_marker_elsewhere_is_not_taken_unless_it_is_named() {
 #[test]
 fn where_the_active_one_sees_nothing_agreement_is_not_concluded() {
     let mut bench = Bench::new(preferring(None, None));
-    let seen = Some(Sight { position_m: None, heading_rad: None });
+    let seen = Some(Sight { position_m: None, heading_rad: None, has_pose: true });
     for i in 0..20 {
         // Rarely enough that the active one is not passed over for it.
         let spare = seen.filter(|_| i % 4 == 0);
@@ -642,6 +647,54 @@ fn a_preferred_one_that_sees_nothing_is_passed_over_and_told() {
     }
     assert!(bench.selection.warnings(bench.now_ns).is_empty());
     assert_eq!(bench.selection.active(), Some("blind"));
+}
+
+/// Answers in which the first detector gives no pose, or gives one whose place in the body frame is not known.
+fn without_position(has_pose: bool) -> Option<Sight> {
+    Some(Sight { position_m: None, heading_rad: None, has_pose })
+}
+
+#[test]
+fn one_that_gives_no_pose_is_told_and_gives_way_to_one_that_does() {
+    for preferred in [None, Some("mine")] {
+        let mut bench = Bench::new(preferring(preferred, None));
+        let mine = ("mine", 20 * MS, without_position(false));
+        let took_ms = warned_ms(&mut bench, 0..40, &[mine], "`mine` gives no pose").unwrap();
+        assert!(took_ms < 1000, "{took_ms} ms");
+        assert!(bench.selection.no_pose().unwrap().contains("`mine` gives no pose"));
+        assert_eq!(bench.state("mine"), DetectorState::Blind);
+        assert_eq!(bench.selection.active(), Some("mine"), "there is no other");
+        for i in 40..60 {
+            bench.frame_seen(i * PERIOD, &[mine, ("main", 30 * MS, at(0.0))]);
+        }
+        assert_eq!(bench.selection.active(), Some("main"));
+        let why = bench.selection.why().to_owned();
+        assert!(why.contains("mine: it gives no pose"), "{why}");
+        assert_eq!((bench.selection.no_pose(), bench.selection.dispute()), (None, None));
+        let answer = bench.selection.prefer(bench.now_ns, "mine").unwrap();
+        assert!(answer.contains("as soon as it is healthy; now it gives no pose"), "{answer}");
+        // Its camera is calibrated now.
+        for i in 60..140 {
+            let answers = [("mine", 20 * MS, at(0.0)), ("main", 30 * MS, at(0.0))];
+            bench.frame_seen(i * PERIOD, &answers);
+        }
+        assert_eq!(bench.selection.active(), Some("mine"));
+        assert!(bench.selection.warnings(bench.now_ns).is_empty());
+    }
+}
+
+#[test]
+fn poses_are_missed_only_where_the_landing_needs_them_and_the_detector_gives_none() {
+    for (needs_pose, has_pose) in [(false, false), (true, true)] {
+        let limits = Limits { needs_pose, ..limits() };
+        let preference = Preference { detector: None, place: None };
+        let mut bench = Bench::new(Selection::new(limits, preference));
+        for i in 0..40 {
+            bench.frame_seen(i * PERIOD, &[("mine", 20 * MS, without_position(has_pose))]);
+        }
+        assert!(bench.selection.warnings(bench.now_ns).is_empty());
+        assert_eq!(bench.state("mine"), DetectorState::Active);
+    }
 }
 
 #[test]

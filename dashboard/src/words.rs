@@ -60,7 +60,7 @@ pub fn detector(state: DetectorState) -> &'static str {
         DetectorState::Active => "in use",
         DetectorState::Shadow => "standby",
         DetectorState::Stale => "silent or late",
-        DetectorState::Blind => "sees no marker",
+        DetectorState::Blind => "no marker or no pose",
         DetectorState::Outvoted => "outvoted",
     }
 }

@@ -19,6 +19,8 @@ pub(super) struct Comparison {
     used: Seen,
     new: Seen,
     latest: Option<Difference>,
+    /// Whether the new one gave no pose of the marker when it last saw it.
+    lacks_pose: bool,
 }
 
 /// A detector's poses of the marker in the camera frame, by the stamp of the frame.
@@ -63,16 +65,21 @@ impl Comparison {
 
     /// Takes what a detector found in a frame.
     pub(super) fn found(&mut self, message: &Detections) {
+        let detection = match &self.controller {
+            Some(controller) => message.first_of(&controller.marker),
+            None => message.detections.first(),
+        };
+        if let Some(detection) = detection
+            && message.detector == self.new.detector
+        {
+            self.lacks_pose = detection.pose.is_none();
+        }
+        let Some(pose) = detection.and_then(|detection| detection.pose.as_ref()) else { return };
         let seen = match &message.detector {
             name if *name == self.used.detector => &mut self.used,
             name if *name == self.new.detector => &mut self.new,
             _ => return,
         };
-        let detection = match &self.controller {
-            Some(controller) => message.first_of(&controller.marker),
-            None => message.detections.first(),
-        };
-        let Some(pose) = detection.and_then(|detection| detection.pose.as_ref()) else { return };
         let stamp_ns = message.header.stamp_ns;
         if seen.at.len() == MAX_FRAMES {
             seen.at.pop_front();
@@ -85,6 +92,11 @@ impl Comparison {
             let (used_m, new_m) = (used.translation_m, new.translation_m);
             self.latest = Some(Difference { used_m, new_m, turned_rad });
         }
+    }
+
+    /// Whether the new one saw the marker, and gave no pose of it.
+    pub(super) fn lacks_pose(&self) -> bool {
+        self.lacks_pose
     }
 
     /// The latest difference by its axes and the limit, for a person; `None` before there is one.
@@ -196,7 +208,13 @@ mod tests {
             version: String::new(),
             toml: "[detectors]\ntolerance_m = 0.2".into(),
         });
-        assert!(comparison.is_configured());
+        assert!(comparison.is_configured() && !comparison.lacks_pose());
+        let mut centre = found("new", 3, [0.0; 3]);
+        centre.detections[0].pose = None;
+        comparison.found(&Detections { detector: "main".into(), ..centre.clone() });
+        assert!(!comparison.lacks_pose());
+        comparison.found(&centre);
+        assert!(comparison.lacks_pose());
         let text = comparison.text().unwrap();
         let limit = "at this range of 5.03 m they agree up to 0.351 m (`detectors.tolerance_m` of the controller, 0.2, and `tolerance_per_m`, 0.03 of the range)";
         assert!(text.ends_with(limit), "{text}");

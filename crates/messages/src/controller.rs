@@ -90,7 +90,7 @@ pub enum DetectorState {
     Shadow,
     /// It is silent, late, slow or gone.
     Stale,
-    /// It answers in time, and sees no marker where another one sees it.
+    /// It answers in time, and sees no marker where another one sees it, or gives no pose of it where the landing needs one.
     Blind,
     /// It answers in time, and others see the marker elsewhere.
     Outvoted,
