@@ -144,7 +144,10 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
 }
 
 /// The detectors that found this marker, and gave no pose of it, in the latest frame in which they found any.
-fn without_pose(found: &BTreeMap<String, Vec<Detection>>, marker: Option<&str>) -> BTreeSet<String> {
+fn without_pose(
+    found: &BTreeMap<String, Vec<Detection>>,
+    marker: Option<&str>,
+) -> BTreeSet<String> {
     let lacks_pose = |found: &Vec<Detection>| {
         let wanted = found.iter().find(|it| marker.is_none_or(|marker| it.is_of(marker)));
         wanted.is_some_and(|it| it.pose.is_none())
@@ -245,7 +248,8 @@ impl Overview {
         let entry = |name: &str| {
             let (candidate, info) = (candidates.get(name).copied(), announced.get(name));
             let received_hz = running.get(name).copied().filter(|rate_hz| *rate_hz > 0.0);
-            let entry = Entry::new(name, candidate, info, marker.as_deref(), status_read, received_hz);
+            let entry =
+                Entry::new(name, candidate, info, marker.as_deref(), status_read, received_hz);
             match entry.state {
                 "blind" if without_pose.contains(name) => Entry { state: "no-pose", ..entry },
                 _ => entry,

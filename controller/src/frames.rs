@@ -134,6 +134,13 @@ impl Frames {
                 )
             });
         }
+        let wanted = message.first_of(&self.marker);
+        if let Some(why) = wanted.and_then(wire::impossible_because) {
+            self.refusals.add_of(now_ns, "impossible-marker", publisher, || {
+                format!("detections of `{publisher}` are refused: {why}")
+            });
+            return Arrival::Refused("impossible-marker");
+        }
         let camera = self.cameras.of_frame(now_ns, &header.camera);
         let mount = camera.and_then(wire::body_from_camera);
         if mount.is_none() && message.detections.iter().any(|detection| detection.pose.is_some()) {
@@ -146,7 +153,6 @@ impl Frames {
         } else {
             self.kept_ns = now_ns;
         }
-        let wanted = message.first_of(&self.marker);
         let marker = wanted.map(|detection| wire::marker_in_frame(detection, mount));
         let sight = wanted.zip(marker.as_ref()).map(|(detection, marker)| {
             Sight::new(detection.pose.is_some(), marker.body_from_marker)

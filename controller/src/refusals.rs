@@ -26,6 +26,8 @@ pub struct Refusals {
 #[derive(Debug)]
 struct Matter {
     reason: &'static str,
+    /// Whose, where several may have the same trouble; otherwise empty.
+    whose: String,
     text: String,
     since_ns: i64,
     last_ns: i64,
@@ -34,20 +36,31 @@ struct Matter {
 impl Refusals {
     /// Something was refused, for a reason (a short name for programs) that `text` explains.
     pub fn add(&mut self, now_ns: i64, reason: &'static str, text: impl FnOnce() -> String) {
+        self.add_of(now_ns, reason, "", text);
+    }
+
+    /// The same, of one of several that may be refused for one reason.
+    pub fn add_of(
+        &mut self,
+        now_ns: i64,
+        reason: &'static str,
+        whose: &str,
+        text: impl FnOnce() -> String,
+    ) {
         self.forget(now_ns);
-        if let Some(matter) = self.matters.iter_mut().find(|matter| matter.reason == reason) {
+        let is_same = |matter: &&mut Matter| matter.reason == reason && matter.whose == whose;
+        if let Some(matter) = self.matters.iter_mut().find(is_same) {
             matter.last_ns = now_ns;
         } else if self.matters.len() < MAX_MATTERS {
-            let text = text();
-            self.matters.push(Matter { reason, text, since_ns: now_ns, last_ns: now_ns });
+            let (whose, text) = (whose.to_owned(), text());
+            self.matters.push(Matter { reason, whose, text, since_ns: now_ns, last_ns: now_ns });
         }
     }
 
     /// What has been refused for a while and still is.
     pub fn lasting(&self, now_ns: i64) -> impl Iterator<Item = Warning> {
         let lasting = self.matters.iter().filter(move |matter| matter.is_lasting(now_ns));
-        lasting
-            .map(|matter| Warning { matter: matter.reason.to_owned(), text: matter.text.clone() })
+        lasting.map(|matter| Warning { matter: matter.name(), text: matter.text.clone() })
     }
 
     fn forget(&mut self, now_ns: i64) {
@@ -56,6 +69,13 @@ impl Refusals {
 }
 
 impl Matter {
+    fn name(&self) -> String {
+        match self.whose.as_str() {
+            "" => self.reason.to_owned(),
+            whose => format!("{} {whose}", self.reason),
+        }
+    }
+
     fn is_lasting(&self, now_ns: i64) -> bool {
         self.last_ns.saturating_sub(self.since_ns) >= MIN_LASTING_NS
             && now_ns.saturating_sub(self.last_ns) < OVER_NS
@@ -80,5 +100,18 @@ mod tests {
         assert_eq!(refusals.lasting(3 * S).count(), 0);
         refusals.add(3 * S, "another-clock", || "d".to_owned());
         assert_eq!(refusals.lasting(3 * S).count(), 0, "it begins anew");
+    }
+
+    #[test]
+    fn what_several_are_refused_for_is_told_of_each() {
+        let mut refusals = Refusals::default();
+        for at_ns in [0, S / 2, S] {
+            for whose in ["one", "other"] {
+                refusals.add_of(at_ns, "impossible-marker", whose, || whose.to_owned());
+            }
+        }
+        let told: Vec<_> = refusals.lasting(S).map(|it| (it.matter, it.text)).collect();
+        let of = |whose: &str| (format!("impossible-marker {whose}"), whose.to_owned());
+        assert_eq!(told, [of("one"), of("other")]);
     }
 }

@@ -10,6 +10,34 @@ use nalgebra::Matrix3;
 /// Maximum time between attitude and position, in nanoseconds: beyond it one of the two has stopped.
 const MAX_SKEW_NS: i64 = 300_000_000;
 
+/// Maximum distance of a marker from the camera, in metres: no lens shows one that is farther away.
+const MAX_RANGE_M: f64 = 1e3;
+
+/// Why a detection's numbers are not those of a marker that a camera sees, as the end of a sentence on its detector; `None` for sound ones.
+pub fn impossible_because(detection: &Detection) -> Option<String> {
+    let Detection { centre_px: [x, y], size_px, confidence, .. } = *detection;
+    if [x, y, size_px, confidence].iter().any(|number| !number.is_finite()) {
+        return Some(format!(
+            "a number is not finite: centre ({x}, {y}) px, size {size_px} px, confidence {confidence}"
+        ));
+    }
+    let pose = detection.pose.as_ref()?.camera_from_marker;
+    let [x, y, z] = pose.translation_m;
+    let place = format!("({x:.3}, {y:.3}, {z:.3}) m right, down and forward of the camera");
+    let range_m = libm::hypot(libm::hypot(x, y), z);
+    if !range_m.is_finite() {
+        return Some(format!("the marker's place is not finite, {place}"));
+    }
+    if pose.transform::<Camera, Marker>().is_none() {
+        return Some(format!("the marker's rotation is none: w, x, y, z {:?}", pose.rotation_wxyz));
+    }
+    if z <= 0.0 {
+        return Some(format!("the marker would be behind the camera, {place}"));
+    }
+    (range_m > MAX_RANGE_M)
+        .then(|| format!("the marker would be farther away than {MAX_RANGE_M} m, {place}"))
+}
+
 /// Where a camera is mounted.
 pub fn body_from_camera(info: &CameraInfo) -> Option<Transform<Body, Camera>> {
     info.body_from_camera.transform()
@@ -28,8 +56,10 @@ pub fn marker_in_frame(
     MarkerInFrame {
         centre: Pixel::new(x, y),
         body_from_marker: pose.and_then(|pose| in_body(&pose.camera_from_marker)),
+        // A second solution that cannot be is none.
         alternative: pose
             .and_then(|pose| pose.alternative.as_ref())
+            .filter(|other| other.camera_from_marker.translation_m[2] > 0.0)
             .and_then(|other| in_body(&other.camera_from_marker)),
         covariance_m2: mount.zip(pose).map(|(mount, pose)| covariance_in_body(&mount, pose)),
         size_px: Some(detection.size_px),
@@ -129,6 +159,45 @@ pub fn vehicle_message(state: &VehicleState) -> Option<messages::VehicleState> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn numbers_that_are_not_those_of_a_marker_in_view_are_told() {
+        assert_eq!(impossible_because(&Detection::sample()), None);
+        let with = |change: &dyn Fn(&mut Transform3)| {
+            let mut detection = Detection::sample();
+            change(&mut detection.pose.as_mut().unwrap().camera_from_marker);
+            impossible_because(&detection).unwrap()
+        };
+        let at = |place_m: [f64; 3]| with(&|pose| pose.translation_m = place_m);
+        for z in [0.0, -0.0, -5.0] {
+            let told = at([0.0, 1.0, z]);
+            assert!(told.contains("behind the camera") && told.contains("1.000"), "{told}");
+        }
+        for number in [f64::NAN, f64::INFINITY, -f64::INFINITY] {
+            assert!(at([number, 0.0, 5.0]).contains("place is not finite"), "{number}");
+            assert!(at([0.0, 0.0, number]).contains("place is not finite"), "{number}");
+            let centre = Detection { centre_px: [number, 0.0], ..Detection::sample() };
+            assert!(impossible_because(&centre).unwrap().contains("centre"), "{number}");
+        }
+        let far = at([0.0, 0.0, 1e9]);
+        assert!(far.contains("farther away than 1000 m") && far.contains("1000000000"), "{far}");
+        let none = with(&|pose| pose.rotation_wxyz = [0.0; 4]);
+        assert!(none.contains("rotation is none"), "{none}");
+    }
+
+    #[test]
+    fn a_second_solution_behind_the_camera_is_none() {
+        let mount = body_from_camera(&CameraInfo::sample());
+        for (z, is_taken) in [(5.0, true), (0.0, false), (-5.0, false)] {
+            let mut detection = Detection::sample();
+            let pose = detection.pose.as_mut().unwrap();
+            let camera_from_marker =
+                Transform3 { translation_m: [0.0, 0.0, z], ..pose.camera_from_marker };
+            pose.alternative =
+                Some(messages::AlternativePose { camera_from_marker, reprojection_rms_px: 0.1 });
+            assert_eq!(marker_in_frame(&detection, mount).alternative.is_some(), is_taken, "{z}");
+        }
+    }
 
     #[test]
     fn a_position_that_has_stopped_is_not_flown_on() {

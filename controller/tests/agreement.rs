@@ -138,7 +138,10 @@ fn a_heading_is_that_of_the_upper_edge_clockwise_from_above() {
         assert!(angle_between(heading, heading_deg.to_radians()) < 1e-9, "{heading}");
         let pose = Transform::new(flat(heading_deg), Point::new(0.1, 0.2, 3.0));
         let sight = Sight::new(true, Some(pose));
-        assert_eq!(sight, Sight { position_m: Some([0.1, 0.2, 3.0]), heading_rad: Some(heading), has_pose: true });
+        assert_eq!(
+            sight,
+            Sight { position_m: Some([0.1, 0.2, 3.0]), heading_rad: Some(heading), has_pose: true }
+        );
     }
     // From behind, where it cannot be seen, it has none.
     let behind = Rotation::<Body, Body>::from_euler(std::f64::consts::PI, 0.0, 0.0) * flat(10.0);
@@ -161,8 +164,11 @@ fn near(range_m: f64) -> impl Strategy<Value = [f64; 3]> {
 fn seen(range_m: f64) -> impl Strategy<Value = Sight> {
     let heading_deg = prop::sample::select(vec![0.0, 10.0, 20.0, 90.0, 180.0, -175.0]);
     let heading_rad = prop::option::weighted(0.9, heading_deg.prop_map(f64::to_radians));
-    (near(range_m), heading_rad)
-        .prop_map(|(position_m, heading_rad)| Sight { position_m: Some(position_m), heading_rad, has_pose: true })
+    (near(range_m), heading_rad).prop_map(|(position_m, heading_rad)| Sight {
+        position_m: Some(position_m),
+        heading_rad,
+        has_pose: true,
+    })
 }
 
 /// What a detector saw: the marker about a place, without a place, or nothing, in some of the frames.

@@ -5,6 +5,8 @@
 
 mod packets;
 
+use std::sync::Arc;
+
 use autopilot::dialect::{
     ATTITUDE_DATA, HEARTBEAT_DATA, MavAutopilot, MavLandedState, MavMessage, MavType,
     PARAM_VALUE_DATA, SYS_STATUS_DATA, TIMESYNC_DATA,
@@ -16,10 +18,10 @@ use messages::{
     CameraInfo, ControllerCommand, ControllerStatus, Detection, Detections, DetectorInfo,
     FrameHeader, Phase, Place,
 };
-use node::clock_name;
+use node::{HealthCounters, Identity, clock_name};
 use packets::{
-    MS, Sent, attitude, contact, flight, flight_with, header, heartbeat, hover, in_flight,
-    in_flight_with, pose, pose_at, position, receive, receive_from, seen, sent,
+    MS, Sent, attitude, contact, flight, flight_counting, flight_with, header, heartbeat, hover,
+    in_flight, in_flight_with, pose, pose_at, position, receive, receive_from, seen, sent,
 };
 
 #[test]
@@ -509,6 +511,42 @@ fn a_start_is_refused_while_all_detections_are_and_the_reason_is_told() {
 }
 
 #[test]
+fn a_detector_that_puts_the_marker_where_none_can_be_is_refused_told_and_passed_over() {
+    for place_m in [[0.0, 0.0, -5.0], [0.0, 0.0, 1e9], [f64::NAN, 0.0, 5.0]] {
+        let health = Arc::<HealthCounters>::default();
+        let mut flight = flight_counting("airborne", &["detectors.preferred=mine"], &health);
+        flight.camera(0, CameraInfo::sample());
+        receive(&mut flight, 0, &heartbeat(4, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        for ms in (20..4000).step_by(20) {
+            if ms % 1000 == 0 {
+                receive(&mut flight, ms * MS, &heartbeat(4, true));
+            }
+            pose(&mut flight, ms * MS);
+            if ms % 60 == 0 {
+                let stamp_ns = ms * MS - 40 * MS;
+                let mut mine = Detections { detector: "mine".into(), ..seen(stamp_ns) };
+                let pose = mine.detections[0].pose.as_mut().unwrap();
+                pose.camera_from_marker.translation_m = place_m;
+                flight.detections(ms * MS + 2, "mine", &mine);
+                flight.detections(ms * MS + 2, "main", &seen(stamp_ns));
+            }
+            flight.tick(ms * MS + 3);
+        }
+        let status = flight.status(4000 * MS);
+        assert_eq!(status.active_detector.as_deref(), Some("main"), "{status:?}");
+        assert!(matches!(status.phase, Phase::Approach | Phase::Descend), "{status:?}");
+        let value = format!("{:.3}", place_m[2]);
+        let is_it = |it: &String| it.contains("`mine` are refused") && it.contains(&value);
+        assert!(status.warnings.iter().any(is_it), "{:?}", status.warnings);
+        let identity = Identity { service: "controller", instance: "main".into() };
+        let drops = health.report(&identity, 0).drops;
+        let counted = drops.iter().find(|it| it.reason == "detection: impossible-marker");
+        assert!(counted.is_some_and(|it| it.count > 60), "{drops:?}");
+    }
+}
+
+#[test]
 fn landing_here_needs_neither_detections_nor_a_landing() {
     let land_here = |flight: &mut Flight, now_ms: i64| {
         sent(flight);
@@ -945,11 +983,9 @@ fn a_camera_that_sends_nothing_is_told_of_beside_one_that_does() {
 
 #[test]
 fn a_landing_on_centres_without_poses_is_refused_with_its_reason_and_one_under_way_tells_it() {
-    for (start, guidance, is_told) in [
-        ("command", "metric", true),
-        ("airborne", "metric", true),
-        ("command", "thesis", false),
-    ] {
+    for (start, guidance, is_told) in
+        [("command", "metric", true), ("airborne", "metric", true), ("command", "thesis", false)]
+    {
         let mut flight = flight_with(start, &[&format!("guidance=\"{guidance}\"")]);
         flight.camera(0, CameraInfo::sample());
         receive(&mut flight, 0, &heartbeat(4, true));

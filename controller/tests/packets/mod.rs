@@ -14,7 +14,7 @@ use autopilot::{Parser, Sender};
 use controller::Config;
 use controller::flight::Flight;
 use messages::{Detections, FrameHeader};
-use node::{Layers, clock_name};
+use node::{HealthCounters, Layers, clock_name};
 
 pub(crate) const MS: i64 = 1_000_000;
 
@@ -74,10 +74,15 @@ pub(crate) fn flight(start: &str) -> Flight {
 }
 
 pub(crate) fn flight_with(start: &str, set: &[&str]) -> Flight {
+    flight_counting(start, set, &Arc::default())
+}
+
+/// A flight that counts into `health`.
+pub(crate) fn flight_counting(start: &str, set: &[&str], health: &Arc<HealthCounters>) -> Flight {
     let mut all = vec![format!("start={start}"), "takeoff_real_vehicle=true".to_owned()];
     all.extend(set.iter().map(|s| (*s).to_owned()));
     let layers = Layers { file: None, set: all };
-    Flight::new(layers.load::<Config>().unwrap().settings, Arc::default()).unwrap()
+    Flight::new(layers.load::<Config>().unwrap().settings, Arc::clone(health)).unwrap()
 }
 
 /// Attitude and position 5 m over the origin.
