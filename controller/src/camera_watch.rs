@@ -111,7 +111,7 @@ impl CameraWatch {
 fn text(camera: &str, silence_ns: i64) -> String {
     let silence_s = silence_ns / 1_000_000_000;
     format!(
-        "no frame from camera `{camera}` for {silence_s} s: check the camera, and whether its detector hangs"
+        "no frame from camera `{camera}` for {silence_s} s: check the camera, and whether its detector hangs or sends what cannot be read"
     )
 }
 
@@ -135,8 +135,7 @@ mod tests {
         assert!(told(&watch, 3 * S).is_empty());
         watch.heard(6 * S, "main", "down");
         watch.heard(6 * S, "other", "down");
-        let silent =
-            "no frame from camera `down` for 3 s: check the camera, and whether its detector hangs";
+        let silent = "no frame from camera `down` for 3 s: check the camera, and whether its detector hangs or sends what cannot be read";
         assert_eq!(told(&watch, 6 * S), [silent]);
         assert_eq!(watch.no_frame(6 * S).as_deref(), Some(silent));
     }

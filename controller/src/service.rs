@@ -20,6 +20,7 @@ use crate::config::{Config, TICK};
 use crate::flight::Flight;
 use crate::note_file::{NoteFile, PadFile, remove_useless_pads};
 use crate::tape::TapedFlight;
+use crate::unreadable::UnreadableDetections;
 
 /// Longest wait at shutdown for the autopilot to confirm that its parameter is put back, and for the heartbeats, one a second, after
 /// which a PX4 is asked to hold its place, and which shows that it does.
@@ -95,6 +96,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let (mut strangers, mut replaced) = (0, 0);
     let mut refusals = Refusals::default();
     let mut other_versions = 0;
+    let mut unreadable = UnreadableDetections::default();
     let mut standstill = Standstill::default();
     let mut ticks = interval(TICK);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -133,6 +135,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                     flight.refused_version(now_ns());
                 }
                 flight.tick(now_ns());
+                unreadable.step(now_ns(), &node.health().unreadable());
                 let more = link.strangers().saturating_sub(strangers);
                 if more > 0 {
                     strangers += more;
@@ -181,7 +184,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
         pad_file.keep(flight.flight().pad_note());
         send(&node, &link, &mut flight);
         tapes.pass_on(&mut flight);
-        reports.publish(flight.flight()).await;
+        reports.publish(flight.flight(), &unreadable).await;
     }
     let deadline = tokio::time::Instant::now() + SHUTDOWN_TIMEOUT;
     while flight.shutdown(now_ns()) && tokio::time::Instant::now() < deadline {
@@ -379,7 +382,7 @@ impl Reports {
     }
 
     /// Publishes the vehicle at its rate, and the status when it changes or is due.
-    async fn publish(&mut self, flight: &Flight) {
+    async fn publish(&mut self, flight: &Flight, unreadable: &UnreadableDetections) {
         let now = now_ns();
         if now.saturating_sub(self.vehicle_ns) >= VEHICLE_PERIOD_NS
             && let Some(vehicle) = flight.vehicle()
@@ -391,7 +394,8 @@ impl Reports {
             return;
         }
         self.checked_ns = now;
-        let status = flight.status(now);
+        let mut status = flight.status(now);
+        unreadable.tell(now, &mut status);
         let is_due = self.last.as_ref().is_none_or(|last| {
             now - last.stamp_ns >= STATUS_PERIOD_NS
                 || (&last.phase, &last.active_detector, last.finished)

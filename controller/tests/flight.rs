@@ -929,7 +929,7 @@ fn a_camera_that_sends_nothing_is_told_of_and_its_detectors_are_not_said_to_have
         assert!(!status.detector_why.contains("gone"), "{status:?}");
         assert_eq!(told(&status), ms >= 4940, "after {ms} ms: {status:?}");
         if ms == 16_000 {
-            let text = "no frame from camera `down` for 13 s: check the camera, and whether its detector hangs";
+            let text = "no frame from camera `down` for 13 s: check the camera, and whether its detector hangs or sends what cannot be read";
             assert_eq!(status.warnings, [text]);
             assert!(status.why.ends_with(text), "{}", status.why);
         }
@@ -948,7 +948,7 @@ fn a_camera_that_sends_nothing_is_told_of_beside_one_that_does() {
     let (main, other) = (detector_info("main", "down"), detector_info("other", "wide"));
     let dead = |s: i64| {
         format!(
-            "no frame from camera `wide` for {s} s: check the camera, and whether its detector hangs"
+            "no frame from camera `wide` for {s} s: check the camera, and whether its detector hangs or sends what cannot be read"
         )
     };
     for s in 1..40 {

@@ -68,12 +68,14 @@ pub enum DecodeError {
         expected: &'static str,
     },
     /// Bytes that end too early or hold impossible values.
-    #[error("a {expected} of {len} bytes is truncated or damaged")]
+    #[error("a {expected} of {len} bytes is truncated or damaged: {cause}")]
     Damaged {
         /// Length in bytes.
         len: usize,
         /// The message that was expected.
         expected: &'static str,
+        /// What was found in it, in words.
+        cause: &'static str,
     },
     /// Bytes after the end of the message.
     #[error("a {expected} has {extra} bytes after its end")]
@@ -135,11 +137,26 @@ pub fn decode<M: Message>(bytes: &[u8]) -> Result<M, DecodeError> {
     if found_version != M::VERSION {
         return Err(DecodeError::Version { found: found_version, wanted: M::VERSION, expected });
     }
-    let (message, rest) = M::read_body(body)
-        .map_err(|_cause| DecodeError::Damaged { len: len.max(HEADER_LEN), expected })?;
+    let (message, rest) = M::read_body(body).map_err(|error| {
+        let cause = said(&error);
+        DecodeError::Damaged { len: len.max(HEADER_LEN), expected, cause }
+    })?;
     match rest.len() {
         0 => Ok(message),
         extra => Err(DecodeError::Trailing { extra, expected }),
+    }
+}
+
+/// Why postcard could not read a message, in words.
+fn said(error: &postcard::Error) -> &'static str {
+    use postcard::Error;
+    match error {
+        Error::DeserializeUnexpectedEnd => "it ends before its last field",
+        Error::DeserializeBadVarint => "a number in it has too many bytes",
+        Error::DeserializeBadBool => "a true or false in it is neither 0 nor 1",
+        Error::DeserializeBadUtf8 => "a string in it is not UTF-8",
+        Error::DeserializeBadOption => "an option in it is neither 0 nor 1",
+        _ => "a variant or another value in it does not exist",
     }
 }
 

@@ -310,7 +310,8 @@ impl FrameSubscriber {
         let attachment = sample.attachment().map(|a| a.to_bytes()).unwrap_or_default();
         match decode::<FrameHeader>(&attachment) {
             Err(problem) => {
-                report_refused(&self.health, sample.key_expr().as_str(), &problem);
+                let key = sample.key_expr().as_str();
+                report_refused(&self.health, key, attachment.len(), &problem);
                 None
             }
             Ok(header) if !has_length(&header, sample.payload().len()) => {

@@ -14,6 +14,27 @@ use crate::version::version;
 /// Number of recent latencies over which percentiles are taken.
 pub const LATENCIES_KEPT: usize = 512;
 
+/// Maximum number of keys whose unreadable payloads are counted each; those of further ones are counted together.
+const MAX_KEYS: usize = 64;
+/// The name of all further keys.
+const OTHER_KEYS: &str = "other keys";
+/// Minimum time between two lines of the log on what cannot be read of one key, in nanoseconds.
+const LOG_PERIOD_NS: i64 = 10_000_000_000;
+
+/// Payloads of one key that could not be read.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Unreadable {
+    /// The key.
+    pub key: String,
+    /// How many.
+    pub count: u64,
+    /// Why the newest of them could not be read, and of how many bytes it was.
+    pub why: String,
+    /// How many the log has told of, and when it did the last time, in nanoseconds.
+    logged: u64,
+    logged_ns: i64,
+}
+
 /// Counters of a service, for all of its threads.
 #[derive(Debug, Default)]
 pub struct HealthCounters {
@@ -26,6 +47,7 @@ struct Counters {
     latencies: BTreeMap<&'static str, VecDeque<f64>>,
     drops: BTreeMap<String, u64>,
     errors: BTreeMap<String, u64>,
+    unreadable: Vec<Unreadable>,
     last_report_ns: Option<i64>,
 }
 
@@ -76,6 +98,34 @@ impl HealthCounters {
         }
     }
 
+    /// Counts a payload that could not be read, by its key. Returns how many the log has not told of, when it is to tell again.
+    pub fn unreadable_payload(&self, now_ns: i64, key: &str, why: String) -> Option<u64> {
+        let mut counters = self.lock();
+        let all = &mut counters.unreadable;
+        let known = all.iter().position(|it| it.key == key);
+        let others = || all.iter().position(|it| it.key == OTHER_KEYS);
+        let index = known.or_else(|| others().filter(|_| all.len() > MAX_KEYS));
+        let index = index.unwrap_or_else(|| {
+            let key = if all.len() < MAX_KEYS { key } else { OTHER_KEYS }.to_owned();
+            let (count, logged) = (0, 0);
+            all.push(Unreadable { key, count, why: String::new(), logged, logged_ns: i64::MIN });
+            all.len() - 1
+        });
+        let refused = all.get_mut(index)?;
+        refused.count += 1;
+        refused.why = why;
+        if now_ns.saturating_sub(refused.logged_ns) < LOG_PERIOD_NS {
+            return None;
+        }
+        refused.logged_ns = now_ns;
+        Some(refused.count - std::mem::replace(&mut refused.logged, refused.count))
+    }
+
+    /// The payloads that could not be read so far, by key.
+    pub fn unreadable(&self) -> Vec<Unreadable> {
+        self.lock().unreadable.clone()
+    }
+
     /// Failures of this reason so far.
     pub fn failures(&self, reason: &str) -> u64 {
         self.lock().errors.get(reason).copied().unwrap_or(0)
@@ -109,6 +159,10 @@ impl HealthCounters {
                 Some(Latency { name: (*name).to_owned(), p50_ms, p99_ms })
             })
             .collect();
+        let unreadable = counters.unreadable.iter().map(|it| Count {
+            reason: format!("payload on {} that cannot be read", it.key),
+            count: it.count,
+        });
         Health {
             service: identity.service.to_owned(),
             instance: identity.instance.clone(),
@@ -122,7 +176,7 @@ impl HealthCounters {
             rates,
             latencies,
             drops: counts(&counters.drops),
-            errors: counts(&counters.errors),
+            errors: counts(&counters.errors).into_iter().chain(unreadable).collect(),
         }
     }
 
@@ -173,5 +227,30 @@ mod tests {
             (health.latencies[0].p50_ms - 51.0).abs() < 1.0 && health.latencies[0].p99_ms >= 98.0
         );
         assert!(counters.percentiles("none").is_none());
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_counted_by_key_and_logged_now_and_then() {
+        let counters = HealthCounters::default();
+        let mut logged = Vec::new();
+        for tenth in 0..250 {
+            let now_ns = tenth * 100_000_000;
+            let told = counters.unreadable_payload(now_ns, "detector/a/detections", "why".into());
+            logged.extend(told.map(|count| (tenth, count)));
+        }
+        assert_eq!(logged, [(0, 1), (100, 100), (200, 100)]);
+        let told = counters.unreadable_payload(1, "detector/b/detections", "cut".into());
+        assert_eq!(told, Some(1), "another key is told at once");
+        for i in 0..1000 {
+            counters.unreadable_payload(1, &format!("{i}"), String::new());
+        }
+        let all = counters.unreadable();
+        assert_eq!(all.len(), MAX_KEYS + 1);
+        assert_eq!((all[0].count, all[1].why.as_str()), (250, "cut"));
+        assert_eq!(all.last().map(|it| it.count), Some(1000 - MAX_KEYS as u64 + 2));
+        let identity = Identity { service: "controller", instance: "main".into() };
+        let errors = counters.report(&identity, 0).errors;
+        let reason = "payload on detector/a/detections that cannot be read";
+        assert!(errors.iter().any(|it| it.reason == reason && it.count == 250), "{errors:?}");
     }
 }

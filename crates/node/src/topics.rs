@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
-use messages::{Delivery, Message, Row, Topic, decode, encode};
+use messages::{DecodeError, Delivery, Message, Row, Topic, decode, encode};
 use zenoh::bytes::ZBytes;
 use zenoh::handlers::{RingChannel, RingChannelHandler};
 use zenoh::qos::{CongestionControl, Priority};
@@ -415,7 +415,12 @@ impl<M: Message> Commands<M> {
                     }
                 },
                 Err(problem) => {
-                    report_refused(&self.health, query.key_expr().as_str(), &problem);
+                    report_refused(
+                        &self.health,
+                        query.key_expr().as_str(),
+                        payload.len(),
+                        &problem,
+                    );
                     problem.to_string()
                 }
             };
@@ -559,14 +564,34 @@ impl<M: Message> Subscriber<M> {
 
     fn decode(&self, sample: &Sample) -> Option<M> {
         decode(&sample.payload().to_bytes())
-            .map_err(|problem| report_refused(&self.health, sample.key_expr().as_str(), &problem))
+            .map_err(|problem| {
+                let (key, bytes) = (sample.key_expr().as_str(), sample.payload().len());
+                report_refused(&self.health, key, bytes, &problem);
+            })
             .ok()
     }
 }
 
-/// Counts an invalid payload, and logs the first one of its reason.
-pub(crate) fn report_refused(health: &HealthCounters, key: &str, problem: &messages::DecodeError) {
-    if health.failed(&format!("payload: {}", problem.reason())) {
-        tracing::warn!(key, %problem, "Invalid payload (further ones are only counted)");
+/// Counts a payload of so many bytes that cannot be read, by its reason and by its key, and logs the first of each key, and then one now
+/// and then.
+pub(crate) fn report_refused(
+    health: &HealthCounters,
+    key: &str,
+    bytes: usize,
+    problem: &DecodeError,
+) {
+    health.failed(&format!("payload: {}", problem.reason()));
+    let why = match problem {
+        DecodeError::Foreign { .. } | DecodeError::Damaged { .. } => problem.to_string(),
+        _ => format!("{problem} ({bytes} bytes)"),
+    };
+    if let Some(count) = health.unreadable_payload(now_ns(), key, why) {
+        tracing::warn!(
+            key,
+            bytes,
+            count,
+            %problem,
+            "Payloads that cannot be read: the newest of those since the last such line (all are counted)"
+        );
     }
 }
