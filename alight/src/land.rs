@@ -11,7 +11,7 @@ use std::time::Duration;
 use anyhow::{Context, bail, ensure};
 use clap::Args;
 use markers::{Marker, Pad};
-use messages::topic;
+use messages::{ControllerStatus, topic};
 use node::network::variable;
 use node::{Layers, Network, Node, Shutdown, read_text};
 use tempfile::TempDir;
@@ -106,6 +106,9 @@ const GROUND_PORT: u16 = 14_550;
 
 /// Maximum delay of Ctrl-C in this process after its services.
 const SIGNAL_GRACE: Duration = Duration::from_millis(200);
+
+/// Time for a detector to tell about itself, which it does every second.
+const INFO_PATIENCE: Duration = Duration::from_millis(1500);
 
 /// Time after the landing for the last messages of the services.
 const AFTER_LANDING: Duration = Duration::from_millis(1200);
@@ -244,6 +247,12 @@ impl ServiceSettings {
         Ok(Some(OurRecorder { name: recorder.id, file: recorder.file }))
     }
 
+    /// The name of the detector that is started here.
+    fn detector(&self) -> anyhow::Result<String> {
+        let own = Layers { file: None, set: self.of(Service::Detector).to_vec() };
+        Ok(own.load::<detector::Config>()?.settings.id)
+    }
+
     /// The page of the landing, if it is to have one.
     fn page(&self) -> anyhow::Result<Option<dashboard::Config>> {
         let set = self.of(Service::Dashboard).to_vec();
@@ -364,11 +373,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         && let Ok(landing) = &watched
     {
         for left in node.alive("detector", "*").await.unwrap_or_default() {
-            let end = landing
-                .pid_of("detector", &left)
-                .map_or("Ctrl-C where it was started ends it".to_owned(), |pid| {
-                    format!("`kill {pid}` ends it")
-                });
+            let end = end_of(&node, landing, &left).await;
             progress.say(&format!(
                 "Detector {left} still runs, and will be in the network of the next landing; {end}"
             ));
@@ -445,7 +450,11 @@ async fn watch(
                             over = Some(Instant::now() + AFTER_LANDING);
                         }
                     }
-                    progress.say(&format!("{} exited: {exit}{}", service.name(), consequence(service)));
+                    let consequence = match service {
+                        Service::Detector => without_detector(&settings.detector()?, landing.last_status.as_ref()),
+                        _ => consequence(service).to_owned(),
+                    };
+                    progress.say(&format!("{} exited: {exit}{consequence}", service.name()));
                     if service == Service::Recorder {
                         landing.recording_ended_early(&exit);
                     }
@@ -501,22 +510,52 @@ async fn watch(
 
 /// Whether a detector other than the one started here is ready.
 async fn another_detector(node: &Node, settings: &ServiceSettings) -> anyhow::Result<bool> {
-    let own = Layers { file: None, set: settings.of(Service::Detector).to_vec() };
-    let own = own.load::<detector::Config>()?.settings.id;
+    let own = settings.detector()?;
     Ok(node.alive("detector", "*").await?.iter().any(|other| *other != own))
 }
 
-/// What the exit of a service means for the landing.
+/// What the exit of the detector that was started here means for the landing, by the controller's newest status.
+fn without_detector(own: &str, status: Option<&ControllerStatus>) -> String {
+    let candidates = status.map_or(&[][..], |status| &status.candidates);
+    let mut others = candidates.iter().filter(|it| it.alive && it.detector != own);
+    let used = status.and_then(|status| status.active_detector.as_deref());
+    match others.clone().find(|it| Some(it.detector.as_str()) == used).or_else(|| others.next()) {
+        Some(other) if Some(other.detector.as_str()) == used => {
+            format!("; `{}` is used", other.detector)
+        }
+        Some(other) => format!("; `{}` is there, and takes its place", other.detector),
+        None => "; another detector is used as soon as one is ready".to_owned(),
+    }
+}
+
+/// How a detector is ended that was left running.
+async fn end_of(node: &Node, landing: &LandingSummary, detector: &str) -> String {
+    if let Some(pid) = landing.pid_of("detector", detector) {
+        return format!("`kill {pid}` ends it");
+    }
+    // One of another program tells no health, and its process all the same.
+    let infos = node.subscriber(topic::DETECTOR_INFO, &[detector]).await;
+    let told = match &infos {
+        Ok(infos) => tokio::time::timeout(INFO_PATIENCE, infos.next()).await.ok().flatten(),
+        Err(_) => None,
+    };
+    match told {
+        Some(info) if info.host == node::host_name() => format!("`kill {}` ends it", info.pid),
+        Some(info) => format!("`kill {}` on {} ends it", info.pid, info.host),
+        None => "end it where it was started".to_owned(),
+    }
+}
+
+/// What the exit of another service means for the landing.
 fn consequence(service: Service) -> &'static str {
     match service {
-        Service::Detector => "; another detector is used as soon as one is ready",
         Service::Controller => {
             "; ArduPilot stops a vehicle that flies, PX4 does what its COM_OBL_RC_ACT says"
         }
         Service::GcsBridge => "; the landing continues without the ground station",
         Service::Recorder => "; the landing continues, and is recorded no more",
         Service::Dashboard => "; the landing continues without the page",
-        Service::Simulator | Service::CameraPub => "",
+        Service::Simulator | Service::CameraPub | Service::Detector => "",
     }
 }
 
@@ -585,7 +624,7 @@ pub(crate) fn free_port() -> anyhow::Result<(u16, UdpSocket)> {
 #[cfg(test)]
 mod tests {
     use clap::Parser;
-    use messages::{ControllerStatus, Phase, Touchdown, Truth};
+    use messages::{Candidate, DetectorInfo, Phase, Place, Touchdown, Truth};
     use node::ZenohSource;
 
     use super::*;
@@ -737,6 +776,58 @@ mod tests {
         let json = serde_json::to_string(&outcome)?;
         assert!(json.contains("\"outcome\":\"landed\""), "{json}");
         assert!(outcome.is_done());
+        Ok(())
+    }
+
+    #[test]
+    fn what_is_said_of_a_detector_that_exited_is_so() {
+        let candidate = |name: &str, alive: bool| Candidate {
+            detector: name.into(),
+            alive,
+            ..Candidate::sample()
+        };
+        let said = |active: Option<&str>, candidates: &[Candidate]| {
+            let status = ControllerStatus {
+                active_detector: active.map(Into::into),
+                candidates: candidates.to_vec(),
+                ..ControllerStatus::default()
+            };
+            without_detector("main", Some(&status))
+        };
+        let (main, spare) = (candidate("main", true), candidate("spare", true));
+        let both = [main.clone(), spare.clone(), candidate("new", true)];
+        assert_eq!(said(Some("new"), &both), "; `new` is used");
+        assert_eq!(said(Some("main"), &both), "; `spare` is there, and takes its place");
+        assert_eq!(said(None, &[spare]), "; `spare` is there, and takes its place");
+        let none = "; another detector is used as soon as one is ready";
+        assert_eq!(said(Some("main"), &[main, candidate("spare", false)]), none);
+        assert_eq!(without_detector("main", None), none);
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_detector_of_another_program_that_is_left_is_named_by_its_process()
+    -> anyhow::Result<()> {
+        let (port, _lock) = free_port()?;
+        let zenoh = ZenohSource::Text(node::session::local_config(port));
+        let node = Node::open(tool_identity("land"), &zenoh).await?;
+        let infos = node.publisher(topic::DETECTOR_INFO, &["python"]).await?;
+        let info = DetectorInfo {
+            detector: "python".into(),
+            host: node::host_name(),
+            place: Place::Onboard,
+            camera: "down".into(),
+            markers: Vec::new(),
+            version: "python".into(),
+            pid: 4711,
+        };
+        infos.publish(&info).await;
+        let landing = LandingSummary::default();
+        assert_eq!(end_of(&node, &landing, "python").await, "`kill 4711` ends it");
+        infos.publish(&DetectorInfo { host: "ground-station".into(), ..info }).await;
+        let elsewhere = end_of(&node, &landing, "python").await;
+        assert_eq!(elsewhere, "`kill 4711` on ground-station ends it");
+        assert_eq!(end_of(&node, &landing, "nobody").await, "end it where it was started");
+        node.close().await;
         Ok(())
     }
 

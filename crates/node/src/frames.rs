@@ -25,7 +25,7 @@ use zenoh::shm::{
 use crate::boxed::BoxFuture;
 use crate::health::HealthCounters;
 use crate::session::Node;
-use crate::topics::{SampleMailbox, report_refused};
+use crate::topics::{SampleMailbox, is_closed, report_refused};
 
 /// Capacity of the shared memory pool, in frames: one being written, one in flight, and one each for two slow
 /// readers. Small, because every subscriber keeps the whole pool mapped and locked.
@@ -230,7 +230,7 @@ impl FramePublisher {
                     _ => self.counted,
                 }),
                 Err(cause) => {
-                    if self.health.failed("publish frame") {
+                    if !is_closed(&cause) && self.health.failed("publish frame") {
                         tracing::warn!(%cause, "Frame not published");
                     }
                 }

@@ -240,6 +240,22 @@ async fn foreign_payloads_are_counted_and_skipped() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn what_is_published_after_the_session_was_closed_is_no_failure() -> anyhow::Result<()> {
+    let node = open("alight", "main", free_port()?).await?;
+    let winds = node.publisher(topic::WIND, &[]).await?;
+    let frames = node.frame_publisher(topic::FRAME, &["down"], 64 * 48).await?;
+    let health = node.shared_health();
+    let identity = node.identity().clone();
+    node.close().await;
+    winds.publish(&Wind { stamp_ns: 7, velocity_ned_m_s: [1.0, 2.0, 3.0] }).await;
+    let pixels = frames.loan(64 * 48);
+    frames.publish(&header(1), pixels).await;
+    let errors = health.report(&identity, now_ns()).errors;
+    assert!(errors.is_empty(), "{errors:?}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_command_is_answered_and_without_a_controller_the_error_says_so() -> anyhow::Result<()> {
     let port = free_port()?;
     let operator = open("alight", "main", port).await?;
