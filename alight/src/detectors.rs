@@ -316,7 +316,10 @@ impl Overview {
                 cell(&entry.version),
             ]);
         }
-        let mut text = aligned(&rows);
+        let mut text = match self.detectors.is_empty() {
+            true => "No detector is there: none is alive, and none publishes detections. Start one: `alight detector`, `alight up`.\n".to_owned(),
+            false => aligned(&rows),
+        };
         let summary = match (self.controller, &self.active) {
             (false, _) => format!("No controller answers, so none is in use: {}", self.why),
             (true, _) if !self.status_read => {
@@ -442,6 +445,8 @@ mod tests {
         let unread = Overview::new(Controller::Unread, marker, &announced, &BTreeMap::new(), &none);
         assert!(unread.controller && !unread.status_read);
         let unread = unread.table();
+        assert!(unread.starts_with("No detector is there: none is alive"), "{unread}");
+        assert!(!unread.contains("LATENCY") && !nobody.contains("No detector is there"));
         assert!(unread.contains("A controller is running") && !unread.contains("No controller"));
         assert!(unread.contains("is it of another version"), "{unread}");
     }

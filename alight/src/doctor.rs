@@ -16,7 +16,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
-use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, Phase, topic};
+use messages::{CameraInfo, ControllerStatus, DetectorState, FrameHeader, Health, Phase, topic};
 use node::version::release;
 use node::{INSECURE, Node, clock_name, stats};
 use rustix::process::{Resource, getrlimit};
@@ -59,6 +59,9 @@ const ROUND_TRIPS: u32 = 10;
 const REPLY_TIMEOUT: Duration = Duration::from_millis(300);
 /// What to do about a network that is open to all.
 const MAKE_KEYS: &str = "make keys (`alight keys`, docs/deploy.md), and remove `insecure`";
+/// What to do where no detector is alive.
+const START_ONE: &str =
+    "start one (`alight up`, `alight detector`); the output of the one that ended says why it did";
 const OPEN_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The severity of a finding.
@@ -379,6 +382,11 @@ impl Seen {
         self.peers.iter().any(|(service, _)| service == "controller")
     }
 
+    /// Whether a detector is alive: it is ready, or heard by its detections or by what it tells of itself.
+    fn has_detector(&self) -> bool {
+        !self.detectors.is_empty() || self.peers.iter().any(|(service, _)| service == "detector")
+    }
+
     /// Whether the drone is there, by its relay.
     fn has_relay_of_drone(&self) -> bool {
         self.peers.iter().any(|(service, instance)| service == RELAY && instance == "drone")
@@ -690,11 +698,36 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
             "until then a landing may not be started or finished, or ends further from the marker",
         );
     }
+    check_used(findings, seen, status);
+}
+
+/// Checks that a detector is there, and that the controller uses one that is.
+fn check_used(findings: &mut Findings, seen: &Seen, status: &ControllerStatus) {
+    let state_of = |name: &str| status.candidates.iter().find(|it| it.detector == name);
     match &status.active_detector {
-        Some(detector) => findings.good("detector", format!("`{detector}` is in use")),
+        _ if !seen.has_detector() => findings.wrong(
+            "detector",
+            format!("none is alive, so a landing sees nothing: {}", status.detector_why),
+            START_ONE,
+        ),
+        Some(used) if state_of(used).is_some_and(|it| !it.alive) => findings.wrong(
+            "detector",
+            format!(
+                "`{used}` was in use and has left the network, and no other has taken its place"
+            ),
+            START_ONE,
+        ),
+        Some(used) => match state_of(used).map(|it| it.state) {
+            Some(DetectorState::Stale) => findings.doubtful(
+                "detector",
+                format!("`{used}` is in use, and is silent, late or slow; no other is better"),
+                "see the lines of the cameras above, its log, and `alight detectors`",
+            ),
+            _ => findings.good("detector", format!("`{used}` is in use")),
+        },
         None => findings.doubtful(
             "detector",
-            "the controller uses none".to_owned(),
+            format!("the controller uses none: {}", status.detector_why),
             "check that one runs and gets frames",
         ),
     }
@@ -703,6 +736,7 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use messages::Candidate;
 
     #[test]
     fn another_build_of_the_same_version_is_doubtful() {
@@ -737,6 +771,41 @@ mod tests {
             "{text}"
         );
         assert!(text.ends_with("0 wrong, 1 doubtful."), "{text}");
+    }
+
+    #[test]
+    fn a_controller_without_a_detector_that_is_alive_is_wrong() {
+        let candidate = |alive: bool, state: DetectorState| Candidate {
+            detector: "main".into(),
+            alive,
+            state,
+            ..Candidate::sample()
+        };
+        let told = |peers: &[&str], candidate: Option<Candidate>| {
+            let status = ControllerStatus {
+                active_detector: candidate.as_ref().map(|it| it.detector.clone()),
+                detector_why: "the last one has gone".into(),
+                candidates: candidate.into_iter().collect(),
+                ..ControllerStatus::default()
+            };
+            let peers = peers.iter().map(|service| ((*service).to_owned(), "main".to_owned()));
+            let seen = Seen { peers: peers.collect(), ..Seen::default() };
+            let mut findings = Findings::default();
+            check_used(&mut findings, &seen, &status);
+            findings.text()
+        };
+        let both = ["controller", "detector"];
+        let active = Some(candidate(true, DetectorState::Active));
+        assert!(told(&both, active.clone()).ends_with("Nothing is wrong."));
+        let none = told(&["controller"], None);
+        assert!(none.contains("WRONG  detector      none is alive"), "{none}");
+        assert!(none.contains("the last one has gone"), "{none}");
+        assert!(told(&["controller"], active).contains("none is alive"), "it is used no more");
+        let gone = told(&both, Some(candidate(false, DetectorState::Stale)));
+        assert!(gone.contains("WRONG") && gone.contains("`main` was in use"), "{gone}");
+        let late = told(&both, Some(candidate(true, DetectorState::Stale)));
+        assert!(late.ends_with("0 wrong, 1 doubtful."), "{late}");
+        assert!(told(&both, None).ends_with("0 wrong, 1 doubtful."));
     }
 
     #[test]
