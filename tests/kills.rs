@@ -9,7 +9,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail, ensure};
-use messages::{ControllerStatus, DetectorState, Phase, Truth, topic};
+use messages::{ControllerCommand, ControllerStatus, DetectorState, Phase, Truth, topic};
 use node::{Identity, Network, Node, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
 use testing::ports;
@@ -101,7 +101,7 @@ struct Flight {
     up: [Child; 2],
     picture: watch::Receiver<Picture>,
     truth: watch::Receiver<Option<Truth>>,
-    _nodes: [Node; 2],
+    nodes: [Node; 2],
 }
 
 /// The site: the drone's camera follows what the world's autopilot reports, as beside a real autopilot.
@@ -157,7 +157,7 @@ impl Flight {
         let aside = open(apart, "world").await?;
         let truth = watch_truth(&aside, sender).await?;
         let folder = folder.to_owned();
-        Ok(Self { folder, world, up, picture, truth, _nodes: [node, aside] })
+        Ok(Self { folder, world, up, picture, truth, nodes: [node, aside] })
     }
 
     /// Waits until something is seen; the answer is when, in seconds after a moment.
@@ -173,6 +173,13 @@ impl Flight {
         }
         let Picture { alive, status, .. } = self.picture.borrow().clone();
         Err(anyhow!("waiting until {what}; alive: {alive:?}; {status:?}"))
+    }
+
+    async fn command(&self, command: &ControllerCommand) -> anyhow::Result<()> {
+        let [node, _] = &self.nodes;
+        let reply = node.command(topic::COMMAND, &[], command).await?;
+        ensure!(reply.accepted, "{reply:?}");
+        Ok(())
     }
 
     fn is_over(&self) -> bool {
@@ -315,6 +322,36 @@ async fn watch_truth(
         }
     });
     Ok(truth)
+}
+
+/// Kills the controller of a landing that an operator holds: the next one must not descend.
+pub(crate) async fn kill_while_held() -> anyhow::Result<()> {
+    let _flight = time_for(2).await?;
+    let folder = tempfile::tempdir()?;
+    let mut flight = Flight::begin(folder.path(), 1).await?;
+    let descends = |picture: &Picture| picture.status.phase == Phase::Descend;
+    flight.until("it descends", now_ns(), descends).await?;
+    flight.command(&ControllerCommand::Hold).await?;
+    let is_held = |picture: &Picture| picture.status.waits_for_operator;
+    flight.until("it is held", now_ns(), is_held).await?;
+    // The supervisor hears it as late as this.
+    sleep(Duration::from_millis(300)).await;
+    kill_process(flight.process(DRONE, "controller")?, Signal::KILL)?;
+    let killed_ns = now_ns();
+    let is_back = |picture: &Picture| picture.status.stamp_ns > killed_ns + 2_000_000_000;
+    flight.until("another controller is there", killed_ns, is_back).await?;
+    let height_m = |flight: &Flight| {
+        flight.truth.borrow().as_ref().map(|truth| -truth.position_ned_m[2]).context("the truth")
+    };
+    let before_m = height_m(&flight)?;
+    sleep(Duration::from_secs(4)).await;
+    let (status, sunk_m) = (flight.picture.borrow().status.clone(), before_m - height_m(&flight)?);
+    let log = std::fs::read_to_string(folder.path().join(LOGS[DRONE]))?;
+    ensure!(status.started_ns.is_none() && sunk_m < 0.3, "{sunk_m} m lower: {status:?}\n{log}");
+    ensure!(log.contains("start = \"command\""), "{log}");
+    // The operator goes on.
+    flight.command(&ControllerCommand::Start).await?;
+    flight.lands().await.map(drop)
 }
 
 /// Numbers that are the same in each run.

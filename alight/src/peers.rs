@@ -234,7 +234,9 @@ struct LandingMonitor {
 impl LandingMonitor {
     /// When a landing was under way the last time; `None` when none is to be resumed.
     fn update(&mut self, status: &ControllerStatus, now: Instant) -> Option<Instant> {
-        let is_under_way = status.started_ns.is_some() && !status.finished;
+        // One that an operator has held or aborted is none: a controller that takes it up again would descend.
+        let is_under_way =
+            status.started_ns.is_some() && !status.finished && !status.waits_for_operator;
         // A restarted controller waits for a moment before it resumes a landing.
         let waits = status.started_ns.is_none() && !status.finished;
         if is_under_way {
@@ -355,6 +357,22 @@ mod tests {
         assert!(lands(status(Some(1), false), now));
         assert!(!lands(status(Some(1), true), now));
         assert!(!lands(status(None, false), now));
+    }
+
+    #[test]
+    fn a_landing_that_is_held_or_aborted_is_not_resumed_after_a_crash() {
+        let folder = tempfile::tempdir().unwrap();
+        let notes = crate::notes::Notes::kept_in(Some(folder.path()), "x");
+        let mut monitor = LandingMonitor { note: notes.landing.clone(), ..Default::default() };
+        let now = Instant::now();
+        let landing = ControllerStatus { started_ns: Some(1), ..ControllerStatus::default() };
+        let held = ControllerStatus { waits_for_operator: true, ..landing.clone() };
+        let restarted = ControllerStatus::default();
+        assert!(monitor.update(&landing, now).is_some() && notes.landing.is_there());
+        assert!(monitor.update(&held, now).is_none() && !notes.landing.is_there());
+        assert!(monitor.update(&restarted, now).is_none(), "nor while the next one waits");
+        // The operator goes on with it.
+        assert!(monitor.update(&landing, now).is_some() && notes.landing.is_there());
     }
 
     #[test]

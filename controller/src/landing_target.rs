@@ -280,6 +280,11 @@ impl LandingTargetMode {
         )
     }
 
+    /// True once a landing was aborted, or somebody took over.
+    pub fn is_aborted(&self) -> bool {
+        matches!(self.state, State::AbortedEarly(_) | State::Recalling(..) | State::Ended(_))
+    }
+
     /// True while the autopilot lands.
     pub fn is_landing(&self) -> bool {
         self.state == State::Landing

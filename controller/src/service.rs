@@ -398,8 +398,13 @@ impl Reports {
         unreadable.tell(now, &mut status);
         let is_due = self.last.as_ref().is_none_or(|last| {
             now - last.stamp_ns >= STATUS_PERIOD_NS
-                || (&last.phase, &last.active_detector, last.finished)
-                    != (&status.phase, &status.active_detector, status.finished)
+                || (&last.phase, &last.active_detector, last.finished, last.waits_for_operator)
+                    != (
+                        &status.phase,
+                        &status.active_detector,
+                        status.finished,
+                        status.waits_for_operator,
+                    )
         });
         if is_due {
             self.status.publish(&status).await;

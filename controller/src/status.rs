@@ -100,6 +100,7 @@ impl View<'_> {
             started_ns: self.mission.started_ns(),
             disarmed_ns: self.mission.disarmed_ns(),
             finished: self.is_finished(),
+            waits_for_operator: self.waits_for_operator(),
             detections_used: self.used.count,
             latency_ms: self.journal.latency_ms(),
             setpoint_timeout_s: limits::timeout_s(self.autopilot),
@@ -247,6 +248,15 @@ impl View<'_> {
             | State::TakingOff { .. }
             | State::TakingControl { .. }
             | State::LeavingOffboard { .. } => false,
+        }
+    }
+
+    /// True while a landing that began is held or aborted and goes on only by a command.
+    fn waits_for_operator(&self) -> bool {
+        match (self.mission.state(), self.landing_target) {
+            (State::Landing, _) => self.lander.waits_for_operator(),
+            (State::SendingLandingTarget, Some(landing_target)) => landing_target.is_aborted(),
+            _ => false,
         }
     }
 

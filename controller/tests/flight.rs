@@ -1298,11 +1298,37 @@ fn a_hold_is_taken_in_a_hold_of_another_reason() {
         sent(&mut flight);
     }
     let before = flight.status(62_000 * MS);
-    assert_eq!(before.phase, Phase::Hold);
+    assert_eq!((before.phase, before.waits_for_operator), (Phase::Hold, false));
     for _ in 0..2 {
         let reply = flight.command(62_000 * MS, &ControllerCommand::Hold);
         assert!(reply.accepted && reply.reason.contains("operator"), "{reply:?}");
     }
+    assert!(flight.status(62_000 * MS).waits_for_operator);
+}
+
+#[test]
+fn a_landing_that_was_held_or_aborted_is_told_to_wait_for_the_operator() {
+    let waits = |flight: &Flight, ms: i64| flight.status(ms * MS).waits_for_operator;
+    let mut flight = in_flight("airborne");
+    hover(&mut flight, 20, 1000, 4);
+    assert!(!waits(&flight, 1000));
+    for (ms, command, expected) in [
+        (1000, ControllerCommand::Hold, true),
+        (2000, ControllerCommand::Resume, false),
+        (3000, ControllerCommand::Abort, true),
+    ] {
+        let reply = flight.command(ms * MS, &command);
+        assert!(reply.accepted, "{command:?}: {reply:?}");
+        assert_eq!(waits(&flight, ms), expected, "{command:?}");
+        hover(&mut flight, ms + 20, ms + 1000, 4);
+        assert_eq!(waits(&flight, ms + 980), expected, "{command:?}");
+    }
+    // The autopilot's own landing.
+    let mut flight = landing_target("airborne");
+    hover(&mut flight, 20, 1000, 4);
+    assert!(!waits(&flight, 1000));
+    let reply = flight.command(1000 * MS, &ControllerCommand::Abort);
+    assert!(reply.accepted && waits(&flight, 1000), "{reply:?}");
 }
 
 #[test]

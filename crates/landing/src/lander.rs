@@ -260,6 +260,11 @@ impl Lander {
         self.state_machine.phase()
     }
 
+    /// True while a landing that began goes on only by a command: it was aborted, or held for a reason that does not pass by itself.
+    pub fn waits_for_operator(&self) -> bool {
+        self.state_machine.waits_for_operator()
+    }
+
     /// True while an aborted vehicle is being commanded from LAND back to GUIDED.
     pub fn is_recalling(&self) -> bool {
         self.state_machine.is_recalling()

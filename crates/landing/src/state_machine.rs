@@ -164,6 +164,21 @@ pub struct StateMachine {
     cause: Option<Reason>,
 }
 
+/// Whether a hold for this reason ends once the reason is gone.
+fn resumes_by_itself(reason: Reason) -> bool {
+    matches!(
+        reason,
+        Reason::TargetLost
+            | Reason::TargetRefused
+            | Reason::TargetNotFound
+            | Reason::VehicleStale
+            | Reason::ModeUnknown
+            | Reason::AutopilotLost
+            | Reason::LinkSlow
+            | Reason::Disputed
+    )
+}
+
 /// The configured reaction to an alarm, and the reason; `None` for any other event.
 pub(crate) fn reaction(phases: &PhaseConfig, event: Event) -> Option<(AlarmAction, Reason)> {
     let Event::Alarm(alarm) = event else { return None };
@@ -230,6 +245,15 @@ impl StateMachine {
     /// True while the aborted vehicle is being commanded from LAND back to GUIDED.
     pub fn is_recalling(&self) -> bool {
         self.is_recalling
+    }
+
+    /// True while a landing that began goes on only by a command: after an abort, and in a hold that does not end by itself.
+    pub fn waits_for_operator(&self) -> bool {
+        match self.phase {
+            Phase::Aborted => true,
+            Phase::Hold => !resumes_by_itself(self.reason),
+            _ => false,
+        }
     }
 
     /// Takes at most one transition; true when a landing has just started.

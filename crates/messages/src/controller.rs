@@ -10,7 +10,7 @@ use crate::detector::{Place, marker_name};
 
 wire! {
     TargetEstimate = 6 v 2;
-    ControllerStatus = 7 v 7;
+    ControllerStatus = 7 v 8;
     ControllerCommand = 8 v 3;
     CommandReply = 9 v 1;
 }
@@ -193,6 +193,9 @@ pub struct ControllerStatus {
     pub disarmed_ns: Option<i64>,
     /// True once nothing more happens without a command.
     pub finished: bool,
+    /// True while a landing that began is held or aborted and goes on only by a command: whoever restarts a controller must not have it
+    /// taken up again.
+    pub waits_for_operator: bool,
     /// Detections of the marker that were used.
     pub detections_used: u64,
     /// Median and 99th percentile from a frame's exposure to the setpoint that used it, in milliseconds.

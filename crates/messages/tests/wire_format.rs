@@ -411,6 +411,7 @@ fn controller_status() {
         started_ns: None,
         disarmed_ns: None,
         finished: false,
+        waits_for_operator: true,
         detections_used: 9,
         latency_ms: Some([1.0, 2.0]),
         setpoint_timeout_s: Some(0.5),
@@ -418,7 +419,7 @@ fn controller_status() {
     };
     check(
         &message,
-        "41070702040177066d65747269630572696e6773026f6b01046d61696e01790667726f756e640201046d61696e000100000000000000f03f00000000000000400000000000002e4001000f0e0000000100000000000000000000000000000000000000000000000000000000000000000000000901000000000000f03f000000000000004001000000000000e03f010178",
+        "41070802040177066d65747269630572696e6773026f6b01046d61696e01790667726f756e640201046d61696e000100000000000000f03f00000000000000400000000000002e4001000f0e000000010000000000000000000000000000000000000000000000000000000000000000000000010901000000000000f03f000000000000004001000000000000e03f010178",
     );
 }
 
@@ -486,7 +487,7 @@ fn truth() {
 #[test]
 fn tape() {
     let message = Tape { begun_ns: 1, first: 300, count: 2, records: vec![7, 0] };
-    check(&message, "41130502ac0202020700");
+    check(&message, "41130602ac0202020700");
 }
 
 /// A record with one event: its bytes without the hash, which the bytes give.
@@ -591,7 +592,7 @@ fn records_of_a_tape() {
     let state = TapeState { status, target };
     assert_eq!(
         record(&TapeEvent::State(Box::new(state)), &nothing),
-        "020c0008000000000000000000000000000000000000000002000001000000000000f03f000000000000000000000000"
+        "020c000800000000000000000000000000000000000000000002000001000000000000f03f000000000000000000000000"
     );
     let decision = TapeDecision {
         phase: "p",
@@ -779,6 +780,7 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
         started_ns: Some(300),
         disarmed_ns: None,
         finished: false,
+        waits_for_operator: false,
         detections_used: 300,
         latency_ms: Some([32.0, 64.0]),
         setpoint_timeout_s: Some(0.5),
