@@ -187,14 +187,21 @@ fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_sta
     assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
 }
 
-/// A controller that is ended sees OFFBOARD, and asks for HOLD until that shows.
+/// A controller goes on to end.
+fn goes_on_ending(flight: &mut Flight, from_ms: i64, to_ms: i64) {
+    (from_ms..to_ms).step_by(20).for_each(|ms| assert!(flight.shutdown(ms * MS), "at {ms} ms"));
+}
+
+/// A controller that is ended, since 400 ms, sees OFFBOARD, and asks for HOLD until that shows.
 fn ends_in_hold(flight: &mut Flight, from_ms: i64) {
+    goes_on_ending(flight, from_ms - 380, from_ms);
     receive(flight, from_ms * MS, &heartbeat(OFFBOARD, true));
     assert!(flight.shutdown((from_ms + 90) * MS));
     assert!(flight.shutdown((from_ms + 110) * MS));
     let mut sent = Sent::default();
     sent.take(flight);
     assert_eq!(sent.modes, [4.0], "{sent:?}");
+    goes_on_ending(flight, from_ms + 130, from_ms + 400);
     receive(flight, (from_ms + 400) * MS, &heartbeat(HOLD, true));
     assert!(!flight.shutdown((from_ms + 410) * MS));
 }
@@ -316,7 +323,7 @@ fn a_px4_that_was_asked_for_offboard_after_its_takeoff_is_not_left_there() {
         assert!(status.phase == Phase::Failed && status.why.contains("aborted"), "{status:?}");
         // The controller is ended.
         let mut flight = px4_at_the_end_of_its_takeoff();
-        assert!(flight.shutdown(5100 * MS));
+        goes_on_ending(&mut flight, 5100, 5500);
         receive(&mut flight, 5500 * MS, &heartbeat(mode, true));
         for ms in (5520..5600).step_by(20) {
             assert_eq!(flight.shutdown(ms * MS), mode == OFFBOARD);
@@ -336,7 +343,7 @@ fn a_px4_called_back_from_land_is_not_left_in_offboard_by_a_controller_that_ends
     let sent = hover(&mut flight, 4000, 4100, LAND);
     assert_eq!(sent.modes, [6.0], "just after the heartbeat of 4 s: {sent:?}");
     assert!(flight.shutdown(4100 * MS), "it may be in OFFBOARD");
-    ends_in_hold(&mut flight, 4400);
+    ends_in_hold(&mut flight, 4500);
 }
 
 #[test]

@@ -32,6 +32,7 @@ use crate::parameter::{Parameter, Parameters};
 use crate::px4_listener::Listener;
 use crate::setpoint_stream::SetpointStream;
 use crate::simulation::Simulation;
+use crate::standstill::Standstill;
 use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
 use crate::stream::Streams;
 use crate::text::Joiner;
@@ -64,6 +65,7 @@ pub struct Autopilot {
     offboard_sent_ns: Option<i64>,
     streams: Streams,
     requests: Vec<Request>,
+    standstill: Standstill,
     outcomes: VecDeque<(CommandId, CommandStatus)>,
     next_id: u64,
     events: VecDeque<Event>,
@@ -120,6 +122,7 @@ impl Autopilot {
             config,
             vehicle: None,
             requests: Vec::new(),
+            standstill: Standstill::default(),
             outcomes: VecDeque::new(),
             next_id: 1,
             events: VecDeque::new(),
@@ -179,7 +182,7 @@ impl Autopilot {
             }
             _ => self.take_state(now_ns, message),
         }
-        self.step_requests(now_ns);
+        self.step_requests(now_ns, false);
     }
 
     /// Lets time pass: to be called at 20 Hz or more, also when nothing is received.
@@ -208,7 +211,8 @@ impl Autopilot {
             self.ask_for_checks(now_ns);
         }
         self.prove_setpoints(now_ns);
-        self.step_requests(now_ns);
+        self.standstill.tick(now_ns);
+        self.step_requests(now_ns, !self.standstill.is_mode_old());
     }
 
     /// The next event, until there is none.
@@ -795,13 +799,15 @@ impl Autopilot {
         Some(CommandError::Invalid { command, problem })
     }
 
-    fn step_requests(&mut self, now_ns: i64) {
+    /// Advances what is requested. Only a tick may send: what a packet was received before it may have waited for this process, and so may
+    /// a later one with the mode that a pilot has chosen.
+    fn step_requests(&mut self, now_ns: i64, may_send: bool) {
         let Some(state) = self.state().copied() else { return };
         let is_of_now = self.shows_mode_of_now(now_ns);
         let timeouts = self.config.timeouts;
         let mut index = 0;
         while let Some(request) = self.requests.get_mut(index) {
-            match request.step(now_ns, &state, is_of_now, &timeouts) {
+            match request.step(now_ns, &state, is_of_now, may_send, &timeouts) {
                 Step::Wait => index += 1,
                 Step::Send(command, attempt) => {
                     index += 1;

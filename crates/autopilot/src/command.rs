@@ -411,12 +411,14 @@ impl Request {
         };
     }
 
-    /// The next step, where `is_of_now` says that the state's mode has just been shown.
+    /// The next step, where `is_of_now` says that the state's mode has just been shown. Nothing is sent, and nothing is given up, unless it
+    /// `may_send`.
     pub(crate) fn step(
         &mut self,
         now_ns: i64,
         state: &VehicleState,
         is_of_now: bool,
+        may_send: bool,
         timeouts: &Timeouts,
     ) -> Step {
         let command = self.command;
@@ -429,6 +431,7 @@ impl Request {
             return Step::Finish(Err(CommandError::Withdrawn { command }));
         }
         match self.phase {
+            Phase::Due(_) | Phase::Sent(_) if !may_send => Step::Wait,
             Phase::Due(at) if now_ns >= at && !waits => self.send(now_ns, timeouts),
             Phase::Sent(until) if now_ns >= until => {
                 if self.attempts < timeouts.attempts {

@@ -13,7 +13,7 @@
 //! [`peers`] chooses whom a listening one talks to, [`packet`] finds MAVLink packets in them, [`signing`] signs and verifies
 //! them, `gate` is where a link does so, with the files of [`key_file`], [`mode`],
 //! [`state`] and [`parameter`] are what the vehicle reports, [`clock`] converts its time stamps, `boot` and
-//! `contact` say which of its reports are believed, `simulation` asks whether it is simulated, [`client`] is the
+//! `contact` say which of its reports are believed, `standstill` whether its mode is of after a pause of this process, `simulation` asks whether it is simulated, [`client`] is the
 //! conversation with it with the settings of [`config`], [`event`] its events, [`command`] is what can be requested
 //! and why it may fail, [`conflict`] says why neither a take-off nor a landing may begin, [`takeoff`] arms the vehicle and takes off, [`offboard_exit`] ends PX4's OFFBOARD, which needs the `setpoint_stream`, [`permission`] is what a ground station may send,
 //! [`compose`] makes the messages that a companion sends, and `given` the answer to a command that is not carried out.
@@ -45,6 +45,7 @@ mod px4_listener;
 mod setpoint_stream;
 pub mod signing;
 mod simulation;
+mod standstill;
 pub mod state;
 mod stream;
 pub mod takeoff;

@@ -994,6 +994,42 @@ fn a_lost_command_is_not_repeated_against_the_pilot() {
 }
 
 #[test]
+fn after_a_standstill_the_pilots_switch_is_read_before_a_request_is_sent_again() {
+    for pilots in [Some(5), None] {
+        let mut world = World::flying();
+        world.fake.lose_commands = 1;
+        let id = world.client.request(world.now, Command::SetMode(FlightMode::Land));
+        world.step();
+        // This process stands still, and packets wait.
+        let mut waiting = Vec::new();
+        for step in 0..3 * SECOND / STEP {
+            world.now += STEP;
+            if step == 2 * SECOND / STEP {
+                world.fake.mode = pilots.unwrap_or(world.fake.mode);
+            }
+            waiting.extend(world.fake.step(world.now));
+        }
+        // As it goes on, half of them are read before a tick.
+        for (number, message) in waiting.iter().enumerate() {
+            world.receive(AUTOPILOT, message);
+            if number == waiting.len() / 2 {
+                world.client.tick(world.now);
+            }
+        }
+        let sent = std::iter::from_fn(|| world.client.poll_outgoing());
+        sent.for_each(|packet| world.fake.receive(&packet));
+        assert_eq!(world.commands(MavCmd::MAV_CMD_DO_SET_MODE), 0);
+        if pilots.is_some() {
+            world.client.withdraw();
+            world.run(5);
+            assert_eq!((world.commands(MavCmd::MAV_CMD_DO_SET_MODE), world.fake.mode), (0, 5));
+        } else {
+            assert_eq!(world.outcome(id), Ok(()), "it is sent later");
+        }
+    }
+}
+
+#[test]
 fn a_vehicle_found_standing_with_armed_motors_is_not_lifted() {
     let found = |landed| {
         let mut world =

@@ -34,7 +34,7 @@ impl Autopilot {
             Some(_) => {}
         }
         self.follow_heartbeat(now_ns, heartbeat);
-        self.step_requests(now_ns);
+        self.step_requests(now_ns, false);
     }
 
     fn find(&mut self, now_ns: i64, system: u8, heartbeat: &HEARTBEAT_DATA) {
@@ -133,6 +133,11 @@ impl Autopilot {
     fn take_mode(&mut self, now_ns: i64, number: u32) -> bool {
         let Some(vehicle) = &mut self.vehicle else { return false };
         vehicle.mode_ns = now_ns;
+        let [attitude_ns, position_ns] = [
+            vehicle.state.attitude.map(|it| it.stamp_ns),
+            vehicle.state.position.map(|it| it.stamp_ns),
+        ];
+        self.standstill.mode_shown(now_ns, attitude_ns.max(position_ns));
         let to = FlightMode::of(vehicle.firmware, number);
         let from = std::mem::replace(&mut vehicle.state.mode, to);
         if from != to || now_ns.saturating_sub(vehicle.mode_since_ns) >= MODE_OF_NOW_NS {

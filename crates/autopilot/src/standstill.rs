@@ -1,0 +1,80 @@
+//! Whether the mode that is known is of after a standstill of this process.
+//!
+//! A process that was stopped, swapped out or starved goes on with what lies in its socket, oldest first: a pilot's switch may lie behind
+//! much of before. A request that is sent before that is read would take the vehicle from the pilot.
+
+/// Shortest pause between two ticks that is a standstill, in nanoseconds: they are 25 ms apart.
+const MIN_PAUSE_NS: i64 = 300_000_000;
+/// Time in which what lay in the socket is read, in nanoseconds.
+const BACKLOG_NS: i64 = 300_000_000;
+/// Longest wait for the mode, in nanoseconds: heartbeats come each second, and one may be lost.
+const MAX_WAIT_NS: i64 = 2_500_000_000;
+
+/// The last standstill, until the mode of after it is known.
+#[derive(Copy, Clone, Debug, Default)]
+pub(crate) struct Standstill {
+    ticked_ns: Option<i64>,
+    ended_ns: Option<i64>,
+}
+
+impl Standstill {
+    /// Time goes on.
+    pub(crate) fn tick(&mut self, now_ns: i64) {
+        let before_ns = self.ticked_ns.unwrap_or(now_ns);
+        self.ticked_ns = Some(before_ns.max(now_ns));
+        if now_ns.saturating_sub(before_ns) > MIN_PAUSE_NS {
+            self.ended_ns = Some(now_ns);
+        }
+        self.ended_ns.take_if(|ended_ns| now_ns.saturating_sub(*ended_ns) > MAX_WAIT_NS);
+    }
+
+    /// The vehicle's mode was received; `measured_ns` is when the newest measurement before it was made, if there is one.
+    pub(crate) fn mode_shown(&mut self, now_ns: i64, measured_ns: Option<i64>) {
+        self.ended_ns.take_if(|ended_ns| {
+            let is_read = now_ns.saturating_sub(*ended_ns) >= BACKLOG_NS;
+            is_read && measured_ns.is_none_or(|measured_ns| measured_ns >= *ended_ns)
+        });
+    }
+
+    /// Whether the mode that is known may be of before.
+    pub(crate) fn is_mode_old(&self) -> bool {
+        self.ended_ns.is_some()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: i64 = 1_000_000;
+
+    fn frozen() -> Standstill {
+        let mut standstill = Standstill::default();
+        standstill.tick(0);
+        standstill.tick(25 * MS);
+        assert!(!standstill.is_mode_old());
+        standstill.tick(1000 * MS);
+        standstill
+    }
+
+    #[test]
+    fn after_a_standstill_the_mode_is_waited_for_behind_what_lay_in_the_socket() {
+        let mut standstill = frozen();
+        standstill.mode_shown(1100 * MS, None);
+        standstill.mode_shown(1400 * MS, Some(990 * MS));
+        assert!(standstill.is_mode_old(), "at once, and behind measurements of before");
+        standstill.mode_shown(1400 * MS, Some(1390 * MS));
+        assert!(!standstill.is_mode_old());
+    }
+
+    #[test]
+    fn the_wait_is_bounded() {
+        let mut standstill = frozen();
+        for ms in (1025..3500).step_by(25) {
+            standstill.tick(ms * MS);
+            assert!(standstill.is_mode_old(), "{ms} ms");
+        }
+        standstill.tick(3525 * MS);
+        assert!(!standstill.is_mode_old());
+    }
+}
