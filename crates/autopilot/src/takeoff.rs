@@ -17,6 +17,8 @@ use crate::state::{LandedState, VehicleState};
 const MAX_HEIGHT_ERROR_M: f64 = 0.5;
 /// Maximum vertical speed at the end of the climb, in m/s.
 const MAX_CLIMB_M_S: f64 = 0.3;
+/// How far below its height PX4 ends its climb by itself, in m, at most: it is there within 0.8 m (`NAV_MC_ALT_RAD`), and heights err.
+const MAX_MISSING_M: f64 = 1.5;
 /// Pause between two attempts to arm.
 const ARM_RETRY: Duration = Duration::from_secs(2);
 /// Time within which a simulated vehicle says that it is one.
@@ -54,6 +56,8 @@ pub struct Takeoff {
     /// The vertical position before the climb, in m downwards from the origin.
     ground_z: Option<f64>,
     guided: bool,
+    /// PX4 has shown its own takeoff mode.
+    has_lifted: bool,
     /// It has reached its height.
     risen: bool,
     /// Its motors were armed before the first request.
@@ -181,6 +185,7 @@ impl Takeoff {
             until_ns: None,
             ground_z: None,
             guided: false,
+            has_lifted: false,
             risen: false,
             found_armed: false,
             only_simulated: false,
@@ -241,8 +246,14 @@ impl Takeoff {
             return if waiting { Ok(()) } else { Err(TakeoffError::Lost) };
         }
         // PX4 passes through modes of its own from the command to rise on; before it, while it is armed, they are the pilot's.
-        let rises = !matches!(self.part, Part::Ready | Part::Arm(_))
-            && [FlightMode::AUTO_TAKEOFF, FlightMode::AUTO_HOLD].contains(&state.mode);
+        let may_rise = !matches!(self.part, Part::Ready | Part::Arm(_));
+        self.has_lifted |= may_rise && state.mode == FlightMode::AUTO_TAKEOFF;
+        let rises = may_rise
+            && match state.mode {
+                FlightMode::AUTO_TAKEOFF => true,
+                FlightMode::AUTO_HOLD => !self.is_held_by_pilot(state),
+                _ => false,
+            };
         let guided = state.mode.is_guided() || rises;
         self.guided |= guided;
         let taken = match &self.part {
@@ -266,6 +277,13 @@ impl Takeoff {
             return Err(TakeoffError::Disarmed);
         }
         Ok(())
+    }
+
+    /// Whether a pilot has ended PX4's climb in HOLD: it does so itself only at its height. Where that is not known it is the pilot.
+    fn is_held_by_pilot(&self, state: &VehicleState) -> bool {
+        let climbs = matches!(self.part, Part::Lift(_) | Part::Climb);
+        let is_low = self.height(state) < self.height_m - MAX_MISSING_M;
+        climbs && self.has_lifted && (is_low || self.ground_z.is_none())
     }
 
     fn wait_until_ready(

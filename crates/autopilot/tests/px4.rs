@@ -754,6 +754,24 @@ fn the_pilots_mode_change_ends_the_takeoff() {
 }
 
 #[test]
+fn hold_below_the_height_of_the_takeoff_is_the_pilots() {
+    let mut world = World::new();
+    let mut takeoff = Takeoff::new(10.0);
+    for _ in 0..20 * SECOND / STEP {
+        world.step();
+        takeoff.step(world.now, &mut world.client);
+        if world.px4.mode == FlightMode::AUTO_TAKEOFF && world.px4.height_m > 5.0 {
+            (world.px4.mode, world.px4.climbs_to_m) = (FlightMode::AUTO_HOLD, None);
+        }
+    }
+    let TakeoffProgress::Failed(problem) = takeoff.step(world.now, &mut world.client) else {
+        panic!("it goes on");
+    };
+    assert!(problem.to_string().contains("PX4 HOLD"), "{problem}");
+    assert_eq!((world.px4.mode_requests, world.px4.mode), (0, FlightMode::AUTO_HOLD));
+}
+
+#[test]
 fn a_pilot_who_arms_or_changes_the_mode_while_arming_is_refused_ends_the_takeoff() {
     let (position, manual) = (FlightMode::Px4(3 << 16), FlightMode::Px4(1 << 16));
     // The mode in which it stands, whether the pilot arms it there, and else the mode that the pilot chooses.
