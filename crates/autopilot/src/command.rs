@@ -286,6 +286,8 @@ pub(crate) struct Request {
     from: Option<FlightMode>,
     phase: Phase,
     attempts: u32,
+    /// When it was sent last.
+    sent_ns: i64,
     began_ns: i64,
     texts: Vec<String>,
 }
@@ -354,6 +356,7 @@ impl Request {
             from,
             phase: Phase::Due(now_ns),
             attempts: 0,
+            sent_ns: now_ns,
             began_ns: now_ns,
             texts: Vec::new(),
         }
@@ -450,6 +453,13 @@ impl Request {
                 };
                 Step::Finish(Err(CommandError::NotConfirmed { command, seen, waited }))
             }
+            Phase::Accepted(_)
+                if may_send && is_of_now && self.is_mode_missing(now_ns, state, timeouts) =>
+            {
+                self.attempts += 1;
+                self.sent_ns = now_ns;
+                Step::Send(command, self.attempts)
+            }
             Phase::Refused(result, until) if now_ns >= until => {
                 let texts = std::mem::take(&mut self.texts);
                 Step::Finish(Err(CommandError::Refused { command, result, texts }))
@@ -471,8 +481,20 @@ impl Request {
         self.from.is_none_or(|from| mode == from || rises.contains(&mode) && rises.contains(&from))
     }
 
+    /// Whether a mode that was accepted a while ago is sent again. All modes have the same acknowledgement, which may be a late one of
+    /// another mode that was asked for before, and this one lost. It is sent only just after a message that shows the mode of before, or it
+    /// could undo a pilot's switch.
+    fn is_mode_missing(&self, now_ns: i64, state: &VehicleState, timeouts: &Timeouts) -> bool {
+        let is_late = now_ns.saturating_sub(self.sent_ns) >= ns(timeouts.acknowledgement);
+        matches!(self.command, Command::SetMode(_))
+            && is_late
+            && self.attempts < timeouts.attempts
+            && self.is_wanted_in(state.mode)
+    }
+
     fn send(&mut self, now_ns: i64, timeouts: &Timeouts) -> Step {
         self.attempts += 1;
+        self.sent_ns = now_ns;
         self.phase = Phase::Sent(now_ns.saturating_add(ns(timeouts.acknowledgement)));
         Step::Send(self.command, self.attempts)
     }

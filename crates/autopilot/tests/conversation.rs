@@ -561,6 +561,36 @@ fn a_later_command_replaces_an_earlier_one() {
 }
 
 #[test]
+fn a_late_acknowledgement_of_another_mode_does_not_keep_a_mode_from_being_sent_again() {
+    for pilots in [None, Some(5)] {
+        let mut world = World::flying();
+        world.fake.lose_acks = 1;
+        assert_eq!(world.request(Command::SetMode(FlightMode::Land)), Ok(()));
+        world.fake.lose_commands = 1;
+        let (began, sent) = (world.now, world.commands(MavCmd::MAV_CMD_DO_SET_MODE));
+        let id = world.client.request(world.now, Command::SetMode(FlightMode::Guided));
+        world.step();
+        let late = COMMAND_ACK_DATA {
+            command: MavCmd::MAV_CMD_DO_SET_MODE,
+            result: MavResult::MAV_RESULT_ACCEPTED,
+            target_system: 1,
+            target_component: 191,
+            ..Default::default()
+        };
+        world.receive(AUTOPILOT, &MavMessage::COMMAND_ACK(late));
+        if let Some(mode) = pilots {
+            // It is not sent against a pilot.
+            world.fake.mode = mode;
+            assert!(world.outcome(id).is_err());
+            assert_eq!(world.commands(MavCmd::MAV_CMD_DO_SET_MODE), sent);
+        } else {
+            assert_eq!(world.outcome(id), Ok(()));
+            assert!(world.now - began <= 5 * SECOND / 2, "{} ns", world.now - began);
+        }
+    }
+}
+
+#[test]
 fn a_repeated_request_without_acknowledgement_is_sent_at_once() {
     let mut world = World::standing();
     world.fake.lose_commands = 1;
