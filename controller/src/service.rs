@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
+use autopilot::dialect::MavMessage;
 use autopilot::packet::{MAX_PACKET, is_setpoint};
 use autopilot::signing::Refusals;
 use autopilot::{Address, GivenCommand, Link, LinkEvent, Packet, Parser, Peering, Permission};
@@ -172,10 +173,10 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                 // An arming or a mode that waited while this process was frozen is not wanted any more.
                 if standstill.step(now_ns()).is_some() {
                     node.health().dropped("packets of the ground station: too late");
-                } else if pass_up(&node, &mut flight, &reports, permission, &message.packet)
-                    && link.send_spare(&message.packet).is_err()
+                } else if let Some(kind) =
+                    pass_up(&node, &mut flight, &reports, permission, &message.packet)
                 {
-                    node.health().dropped("packets of the ground station");
+                    send_up(&node, &link, kind, &message.packet);
                 }
             }
         }
@@ -213,17 +214,57 @@ fn late_because(
     ))
 }
 
-/// Whether a packet of a ground station goes to the autopilot; the flight hears it before.
+/// What a packet of a ground station is.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum FromGround {
+    /// A command, or a change of mode.
+    Command,
+    /// Anything else.
+    Other,
+}
+
+impl FromGround {
+    #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+    fn of(packets: &[Packet]) -> Self {
+        let is_command = packets.iter().any(|packet| {
+            let is_mode = matches!(packet.message, Some(MavMessage::SET_MODE(_)));
+            is_mode || GivenCommand::of(packet).is_some()
+        });
+        if is_command { Self::Command } else { Self::Other }
+    }
+}
+
+/// Sends a packet of a ground station to the autopilot, behind all of ours.
+fn send_up(node: &Node, link: &Link, kind: FromGround, packet: &[u8]) {
+    let sent = match kind {
+        FromGround::Command => link.send_command(packet),
+        FromGround::Other => link.send_spare(packet),
+    };
+    match (sent, kind) {
+        (Ok(()), _) => {}
+        (Err(_), FromGround::Other) => node.health().dropped("packets of the ground station"),
+        (Err(problem), FromGround::Command) => {
+            if node.health().failed("commands of the ground station: not sent") {
+                tracing::warn!(
+                    %problem,
+                    "A command of a ground station was dropped, and has no answer (further ones are only counted)"
+                );
+            }
+        }
+    }
+}
+
+/// What a packet of a ground station is that goes to the autopilot, and `None` if it does not; the flight hears it before.
 fn pass_up(
     node: &Node,
     flight: &mut TapedFlight,
     reports: &Reports,
     permission: Permission,
     bytes: &[u8],
-) -> bool {
+) -> Option<FromGround> {
     if !(1..=MAX_PACKET).contains(&bytes.len()) {
         node.health().dropped("packets of the ground station");
-        return false;
+        return None;
     }
     let mut parser = Parser::new();
     let mut packets = parser.push(bytes);
@@ -231,7 +272,9 @@ fn pass_up(
     for packet in &packets {
         flight.ground_packet(now_ns(), packet);
     }
-    let Some(name) = refused(permission, &packets, bytes.len()) else { return true };
+    let Some(name) = refused(permission, &packets, bytes.len()) else {
+        return Some(FromGround::of(&packets));
+    };
     if node.health().failed(&format!("packets of the ground station refused: {name}")) {
         tracing::warn!(
             %permission,
@@ -239,7 +282,7 @@ fn pass_up(
         );
     }
     denials(&packets, flight.flight().system()).for_each(|answer| reports.pass_on(node, answer));
-    false
+    None
 }
 
 /// What is refused of the packets in so many bytes, if anything is.
@@ -418,7 +461,8 @@ mod tests {
     use super::*;
     use autopilot::Sender;
     use autopilot::dialect::{
-        COMMAND_LONG_DATA, MavCmd, MavMessage, MavResult, SETUP_SIGNING_DATA,
+        COMMAND_INT_DATA, COMMAND_LONG_DATA, MavCmd, MavResult, PARAM_SET_DATA, SET_MODE_DATA,
+        SETUP_SIGNING_DATA,
     };
     use autopilot::packet::encode;
 
@@ -452,5 +496,23 @@ mod tests {
         assert_eq!(answer.command, MavCmd::MAV_CMD_COMPONENT_ARM_DISARM);
         assert_eq!(answer.result, MavResult::MAV_RESULT_DENIED);
         assert_eq!((answer.target_system, answer.target_component), (255, 190));
+    }
+
+    #[test]
+    #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+    fn commands_and_modes_of_a_ground_station_are_told_from_its_other_packets() {
+        let kind = |message: &MavMessage| {
+            let bytes = encode(Sender { system: 255, component: 190 }, 0, message);
+            FromGround::of(&Parser::new().push(&bytes))
+        };
+        for command in [
+            MavMessage::COMMAND_LONG(COMMAND_LONG_DATA::default()),
+            MavMessage::COMMAND_INT(COMMAND_INT_DATA::default()),
+            MavMessage::SET_MODE(SET_MODE_DATA::default()),
+        ] {
+            assert_eq!(kind(&command), FromGround::Command, "{command:?}");
+        }
+        let other = MavMessage::PARAM_SET(PARAM_SET_DATA::default());
+        assert_eq!(kind(&other), FromGround::Other);
     }
 }

@@ -36,6 +36,8 @@ const INCOMING: usize = 1024;
 const OUTGOING: usize = 256;
 /// Maximum number of waiting packets of low priority, about a second of a slow line.
 const SPARE: usize = 16;
+/// Room behind them that only commands of low priority have.
+const COMMANDS: usize = 16;
 /// Maximum time that a line needs for what it has still to send, when one of them or a setpoint is sent.
 const SPARE_BACKLOG: Duration = Duration::from_millis(50);
 /// Pause before it is looked again how much a line has still to send.
@@ -172,7 +174,7 @@ impl Link {
             Listener::None => None,
         };
         let (queue, outgoing) = mpsc::channel(OUTGOING);
-        let (spare, outgoing_spare) = mpsc::channel(SPARE);
+        let (spare, outgoing_spare) = mpsc::channel(SPARE + COMMANDS);
         let shared = Arc::new(Shared::new());
         let (gate, keeping) = signing.map_or((Gate::new(None), None), keyed);
         let port = Port {
@@ -220,6 +222,11 @@ impl Link {
     /// When there is no connection.
     pub fn send_newest(&self, packet: &[u8]) -> Result<(), SendError> {
         self.sender.send_newest(packet)
+    }
+
+    /// Sends a command of low priority without waiting; see [`LinkSender::send_command`].
+    pub fn send_command(&self, packet: &[u8]) -> Result<(), SendError> {
+        self.sender.send_command(packet)
     }
 
     /// A handle for sending over this link.
@@ -279,6 +286,15 @@ impl LinkSender {
     /// Sends a packet when no other one waits and a serial line has little left to send, so that heavy traffic (a ground
     /// station that sends corrections or files over a slow line) hardly delays the setpoints. Few such packets wait.
     pub fn send_spare(&self, packet: &[u8]) -> Result<(), SendError> {
+        let is_full = self.spare.capacity() <= COMMANDS;
+        if is_full && self.shared.connected.load(Ordering::Acquire) {
+            return Err(SendError::Full);
+        }
+        self.put(&self.spare, packet)
+    }
+
+    /// The same for a command, in its order behind what waits: there is room for it where other packets are refused.
+    pub fn send_command(&self, packet: &[u8]) -> Result<(), SendError> {
         self.put(&self.spare, packet)
     }
 
@@ -930,7 +946,7 @@ mod tests {
     /// A link's two sides, connected.
     fn pair() -> (LinkSender, Port) {
         let (queue, outgoing) = mpsc::channel(OUTGOING);
-        let (spare, outgoing_spare) = mpsc::channel(SPARE);
+        let (spare, outgoing_spare) = mpsc::channel(SPARE + COMMANDS);
         let shared = Arc::new(Shared::new());
         let sender = LinkSender { shared: Arc::clone(&shared), queue, spare };
         let (peering, gate) = (Peering::default(), Gate::new(None));
@@ -952,6 +968,22 @@ mod tests {
         assert_eq!(port.next(true).await.unwrap(), b"setpoint", "and goes first");
         assert_eq!(port.next(true).await.unwrap(), b"packet");
         assert_eq!(sender.send_spare(b"packet"), Ok(()));
+    }
+
+    #[tokio::test]
+    async fn a_command_of_a_ground_station_has_room_behind_its_bulk_traffic() {
+        let (sender, mut port) = pair();
+        assert_eq!(sender.send_command(b"command"), Err(SendError::NotConnected));
+        port.connected("peer".into());
+        assert_eq!((0..100).take_while(|_| sender.send_spare(b"bulk").is_ok()).count(), SPARE);
+        let sent = (0..100).take_while(|_| sender.send_command(b"command").is_ok()).count();
+        assert_eq!(sent, COMMANDS);
+        assert_eq!(sender.send_command(b"command"), Err(SendError::Full));
+        for number in 0..SPARE + COMMANDS {
+            let expected: &[u8] = if number < SPARE { b"bulk" } else { b"command" };
+            assert_eq!(port.next(true).await.unwrap(), expected, "in order");
+        }
+        assert_eq!(sender.send_spare(b"bulk"), Ok(()));
     }
 
     #[tokio::test]
