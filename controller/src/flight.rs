@@ -202,6 +202,7 @@ impl Flight {
         }
         self.mission.is_taking_off()
             || self.mission.is_taking_control()
+            || self.mission.is_asking_for_land()
             || self.mission.leaves_offboard_because().is_some()
             || self.landing_target.as_ref().is_some_and(LandingTargetMode::is_active)
     }
@@ -518,15 +519,13 @@ impl Flight {
         if self.mission.is_taking_control() {
             return Err(format!("a start is under way: {}", self.view().phase(now_ns).1));
         }
+        if self.mission.is_asking_for_land() {
+            return Err("the vehicle is asked to land here".to_owned());
+        }
         if let Some(conflict) = self.autopilot.conflict(now_ns) {
             return Err(format!("no landing was started: {conflict}"));
         }
-        if let Some(why) = self.mission.leaves_offboard_because() {
-            return Err(format!("the vehicle is just being taken back to HOLD: {why}"));
-        }
-        if self.offboard.is_leading_out() {
-            return Err("the vehicle is just being taken back to HOLD".to_owned());
-        }
+        self.check_way_out()?;
         if self.autopilot.state().and_then(wire::vehicle).is_none() {
             return Err(
                 "no landing was started: attitude and position of the vehicle are not known"
@@ -556,6 +555,16 @@ impl Flight {
             return Err(format!("no landing was started: {why}"));
         }
         Ok(format!("in phase `{phase}`: {why}"))
+    }
+
+    /// Refuses while a PX4 is taken back to HOLD.
+    fn check_way_out(&self) -> Result<(), String> {
+        let refusal = "the vehicle is just being taken back to HOLD";
+        match self.mission.leaves_offboard_because() {
+            Some(why) => Err(format!("{refusal}: {why}")),
+            None if self.offboard.is_leading_out() => Err(refusal.to_owned()),
+            None => Ok(()),
+        }
     }
 
     fn start_landing_target(&mut self, now_ns: i64) -> Result<String, String> {
@@ -598,6 +607,16 @@ impl Flight {
         if let Some(conflict) = conflict {
             return Err(format!("not landed here: {conflict}"));
         }
+        if is_holding_px4(&self.autopilot) {
+            self.check_way_out()?;
+            self.mission.ask_for_land(now_ns, &mut self.autopilot);
+            let (phase, why) = self.view().phase(now_ns);
+            return Ok(format!("in phase `{phase}`: {why}"));
+        }
+        self.begin_here(now_ns)
+    }
+
+    fn begin_here(&mut self, now_ns: i64) -> Result<String, String> {
         let before = self.mission.clone();
         self.alarms.begin();
         self.mission.begin(now_ns, false);
@@ -629,6 +648,14 @@ impl Flight {
             }
             let why = "ended by the operator before the vehicle followed setpoints";
             self.mission.leave_offboard(now_ns, &mut self.autopilot, why);
+            return Ok(why.to_owned());
+        }
+        if self.mission.is_asking_for_land() {
+            if command == OperatorCommand::Resume {
+                return Err("the vehicle is asked to land; there is nothing to resume".to_owned());
+            }
+            let why = "ended by the operator before the vehicle landed";
+            self.mission.fail(&mut self.autopilot, why.to_owned());
             return Ok(why.to_owned());
         }
         if !self.is_landing() {
@@ -705,6 +732,12 @@ impl Flight {
         let obstacle = obstacle.as_deref();
         let trigger = self.mission.step(now_ns, &mut self.autopilot, is_fresh, obstacle, steers);
         let Some(trigger) = trigger else { return };
+        if trigger == Trigger::LandsHere {
+            if let Err(why) = self.begin_here(now_ns) {
+                self.mission.fail(&mut self.autopilot, why);
+            }
+            return;
+        }
         let before = (trigger == Trigger::InControl).then(|| self.mission.clone());
         if trigger == Trigger::InFlight && self.config.start == Start::Resume {
             let address = &self.config.autopilot.address;

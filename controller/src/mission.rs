@@ -2,7 +2,8 @@
 //! and its end after the motors have stopped.
 
 use autopilot::{
-    Autopilot, FlightMode, LandedState, OffboardExit, Takeoff, TakeoffError, TakeoffProgress,
+    Autopilot, Command, CommandId, CommandStatus, FlightMode, LandedState, OffboardExit, Takeoff,
+    TakeoffError, TakeoffProgress,
 };
 
 use crate::config::Start;
@@ -57,6 +58,11 @@ pub enum State {
         /// As before.
         awaits_takeoff: bool,
     },
+    /// A PX4 that holds its place is asked for LAND there.
+    AskingForLand {
+        /// The request.
+        request: CommandId,
+    },
     /// The lander decides.
     Landing,
     /// The autopilot's own precision landing decides; it gets the landing target.
@@ -79,6 +85,8 @@ pub enum Trigger {
     TakenOff,
     /// The vehicle follows setpoints, as was asked of it.
     InControl,
+    /// The vehicle lands where it is, or follows setpoints, as was asked of it.
+    LandsHere,
     /// The vehicle was found in LAND instead: the end of a landing that an earlier controller began.
     LandInsteadOfTakeoff,
 }
@@ -141,6 +149,45 @@ impl Mission {
         self.goes_on_until_ns = None;
         let control = TakingControl::begin(now_ns, autopilot);
         self.state = State::TakingControl { control, awaits_takeoff };
+    }
+
+    /// Asks a PX4 that holds its place to land there. The lander follows once it does.
+    pub fn ask_for_land(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
+        self.goes_on_until_ns = None;
+        self.awaits_next_flight = false;
+        self.started_ns = None;
+        let request = autopilot.request(now_ns, Command::SetMode(FlightMode::AUTO_LAND));
+        self.state = State::AskingForLand { request };
+    }
+
+    /// True while a PX4 that holds its place is asked for LAND there.
+    pub fn is_asking_for_land(&self) -> bool {
+        matches!(self.state, State::AskingForLand { .. })
+    }
+
+    /// Advances the request for LAND. A change to OFFBOARD that was asked for before may be carried out in between.
+    fn advance_land(
+        &mut self,
+        now_ns: i64,
+        autopilot: &mut Autopilot,
+        is_fresh: bool,
+    ) -> Option<Trigger> {
+        let State::AskingForLand { request } = self.state else { return None };
+        hover_in_offboard(now_ns, autopilot);
+        let state = autopilot.state()?;
+        let end = match (state.armed, state.mode) {
+            (false, _) => "the motors were stopped".to_owned(),
+            (true, mode) if mode.is_landing() || mode.is_guided() => {
+                return is_fresh.then_some(Trigger::LandsHere);
+            }
+            (true, FlightMode::AUTO_HOLD) => match autopilot.status(request) {
+                CommandStatus::Failed(problem) => problem.to_string(),
+                _ => return None,
+            },
+            (true, mode) => format!("the pilot took over, in {mode}"),
+        };
+        self.fail(autopilot, format!("not landed here: {end}"));
+        None
     }
 
     /// Why a PX4 that may be in OFFBOARD is taken back to HOLD; `None` when it is not.
@@ -329,6 +376,7 @@ impl Mission {
                 }
             }
             State::TakingControl { .. } => self.advance_control(now_ns, autopilot, is_fresh),
+            State::AskingForLand { .. } => self.advance_land(now_ns, autopilot, is_fresh),
             State::LeavingOffboard { .. } => {
                 self.advance_exit(now_ns, autopilot);
                 None

@@ -161,6 +161,7 @@ impl View<'_> {
                 (Phase::Idle, waits.to_owned())
             }
             (State::LeavingOffboard { why, .. }, _) => (Phase::Idle, why.clone()),
+            (State::AskingForLand { .. }, _) => (Phase::Final, Reason::OperatorLand.to_string()),
             (State::Failed { why }, _) => (Phase::Failed, why.clone()),
             (State::Landing, _) => (wire::phase(self.lander.phase()), self.reason(now_ns)),
         }
@@ -247,7 +248,8 @@ impl View<'_> {
             | State::AwaitingTakeoff
             | State::TakingOff { .. }
             | State::TakingControl { .. }
-            | State::LeavingOffboard { .. } => false,
+            | State::LeavingOffboard { .. }
+            | State::AskingForLand { .. } => false,
         }
     }
 

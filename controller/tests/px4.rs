@@ -187,6 +187,66 @@ fn a_px4_that_holds_its_place_is_asked_to_follow_setpoints_when_a_landing_is_sta
     assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
 }
 
+#[test]
+fn a_px4_that_holds_its_place_lands_there_by_command() {
+    let asked = |flight: &mut Flight, now_ms: i64| {
+        let reply = flight.command(now_ms * MS, &ControllerCommand::LandHere);
+        assert!(reply.accepted, "{reply:?}");
+        assert_eq!(flight.status(now_ms * MS).phase, Phase::Final);
+    };
+    // Before a landing, and after an abort, which ends in HOLD.
+    for is_aborted in [false, true] {
+        let mut flight = if is_aborted {
+            let mut flight = px4_in(OFFBOARD, "command", &[]);
+            assert!(flight.command(1000 * MS, &ControllerCommand::Start).accepted);
+            hover(&mut flight, 1020, 2000, OFFBOARD);
+            assert!(flight.command(2000 * MS, &ControllerCommand::Abort).accepted);
+            hover(&mut flight, 2020, 9900, OFFBOARD);
+            hover(&mut flight, 10_000, 11_000, HOLD);
+            flight
+        } else {
+            let mut flight = px4_in(HOLD, "command", &[]);
+            hover(&mut flight, 1000, 11_000, HOLD);
+            flight
+        };
+        asked(&mut flight, 11_000);
+        assert!(!flight.command(11_010 * MS, &ControllerCommand::Start).accepted);
+        let sent = hover(&mut flight, 11_020, 11_500, HOLD);
+        assert_eq!((sent.modes.as_slice(), sent.setpoints), (&[4.0][..], 0), "{sent:?}");
+        receive(&mut flight, 11_500 * MS, &heartbeat(LAND, true));
+        hover(&mut flight, 11_520, 13_000, LAND);
+        let status = flight.status(13_000 * MS);
+        assert!(status.phase == Phase::Final && status.started_ns.is_some(), "{status:?}");
+        assert!(status.why.contains("command to land here"), "{status:?}");
+        receive(&mut flight, 13_000 * MS, &heartbeat(LAND, false));
+        flight.tick(13_010 * MS);
+        assert_eq!(flight.status(13_010 * MS).phase, Phase::Landed);
+    }
+    // The pilot takes over, or the operator thinks better of it: nothing is sent any more.
+    for (mode, command) in [(POSITION, None), (HOLD, Some(ControllerCommand::Abort))] {
+        let mut flight = px4_in(HOLD, "command", &[]);
+        asked(&mut flight, 1000);
+        hover(&mut flight, 1020, 1100, HOLD);
+        if let Some(command) = command {
+            assert!(flight.command(1100 * MS, &command).accepted);
+        }
+        receive(&mut flight, 1200 * MS, &heartbeat(mode, true));
+        let sent = hover(&mut flight, 1220, 9000, mode);
+        assert!(sent.modes.is_empty() && sent.setpoints == 0, "{sent:?}");
+        assert_eq!(flight.status(9000 * MS).phase, Phase::Failed);
+    }
+    // A change to OFFBOARD that was asked for before is carried out in between.
+    let mut flight = px4_asked_for_offboard("command");
+    asked(&mut flight, 3100);
+    receive(&mut flight, 3200 * MS, &heartbeat(OFFBOARD, true));
+    let sent = hover(&mut flight, 3220, 3900, OFFBOARD);
+    assert!(sent.modes.contains(&4.0) && sent.setpoints > 5, "{sent:?}");
+    assert_eq!(flight.status(3900 * MS).phase, Phase::Final);
+    // A pilot's mode is not ours to end.
+    let mut flight = px4_in(POSITION, "command", &[]);
+    assert!(!flight.command(1000 * MS, &ControllerCommand::LandHere).accepted);
+}
+
 /// A controller goes on to end.
 fn goes_on_ending(flight: &mut Flight, from_ms: i64, to_ms: i64) {
     (from_ms..to_ms).step_by(20).for_each(|ms| assert!(flight.shutdown(ms * MS), "at {ms} ms"));
