@@ -429,6 +429,10 @@ impl Flight {
         }
         let why = "the controller was ended";
         let leaves = self.mission.leave_offboard(now_ns, &mut self.autopilot, why);
+        if self.mission.is_taking_off() {
+            // Nothing that it has asked for may start the motors now.
+            self.mission.fail(&mut self.autopilot, why.to_owned());
+        }
         let waits = self.setpoints.end(now_ns, &mut self.autopilot);
         // A landing that is not over has been ended by its setpoints.
         let is_over = !self.mission.is_landing() || self.lander.phase().is_terminal();

@@ -8,8 +8,8 @@ mod packets;
 use std::sync::Arc;
 
 use autopilot::dialect::{
-    ATTITUDE_DATA, HEARTBEAT_DATA, MavAutopilot, MavLandedState, MavMessage, MavType,
-    PARAM_VALUE_DATA, SYS_STATUS_DATA, TIMESYNC_DATA,
+    ATTITUDE_DATA, EKF_STATUS_REPORT_DATA, EkfStatusFlags, HEARTBEAT_DATA, MavAutopilot, MavCmd,
+    MavLandedState, MavMessage, MavType, PARAM_VALUE_DATA, SYS_STATUS_DATA, TIMESYNC_DATA,
 };
 use autopilot::{Parser, Sender};
 use controller::flight::Flight;
@@ -1052,6 +1052,36 @@ fn a_takeoff_with_a_battery_at_its_critical_limit_is_refused_before_the_motors_a
         assert_eq!(status.phase == Phase::Failed && status.finished, is_refused, "{status:?}");
         let names = ["13.0 V", "critical at 13 V", "alarms.battery_critical_v"];
         assert_eq!(names.iter().all(|name| status.why.contains(name)), is_refused, "{status:?}");
+    }
+}
+
+#[test]
+fn a_controller_that_ends_arms_no_motors_any_more() {
+    let mut flight = flight_with("takeoff", &[]);
+    receive(&mut flight, 0, &heartbeat(4, false));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+    let ready = EkfStatusFlags::from_bits_retain(831);
+    let mut asked = false;
+    let mut ms = 20;
+    while !asked {
+        assert!(ms < 5000, "{:?}", flight.status(ms * MS));
+        let ekf = EKF_STATUS_REPORT_DATA { flags: ready, ..Default::default() };
+        receive(&mut flight, ms * MS, &MavMessage::EKF_STATUS_REPORT(ekf));
+        if ms % 1000 == 0 {
+            receive(&mut flight, ms * MS, &heartbeat(4, false));
+        }
+        pose_at(&mut flight, ms * MS, 0.0);
+        flight.tick(ms * MS + 3);
+        asked = sent(&mut flight).1.contains(&MavCmd::MAV_CMD_COMPONENT_ARM_DISARM);
+        ms += 20;
+    }
+    // It has no answer.
+    for ms in (ms..ms + 2900).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(&mut flight, ms * MS, &heartbeat(4, false));
+        }
+        flight.shutdown(ms * MS);
+        assert_eq!(sent(&mut flight).1, [], "at {ms} ms");
     }
 }
 
