@@ -6,10 +6,9 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
-use markers::{Marker, Pad};
 use messages::{
     Candidate, Configuration, ControllerCommand, ControllerStatus, Detection, DetectorInfo,
-    DetectorState, Place, marker_name, topic,
+    DetectorState, Place, looks_for_others, topic,
 };
 use node::Node;
 use serde::Serialize;
@@ -159,24 +158,6 @@ fn without_pose(
 fn marker_of(controller: &Configuration) -> Option<String> {
     let table: toml::Table = controller.toml.parse().ok()?;
     table.get("marker")?.as_str().map(str::to_owned)
-}
-
-/// Whether a detector with these markers (`FAMILY:ID:SIZE_M`, `pad:ID`) surely never reports the one that is wanted, `FAMILY` or
-/// `FAMILY:ID`.
-fn looks_for_others(markers: &[String], wanted: &str) -> bool {
-    let Ok((family, id)) = marker_name(wanted) else { return false };
-    let is_other = |text: &String| match text.split_once(':') {
-        Some((Pad::FAMILY, number)) if family == Pad::FAMILY => {
-            id.is_some_and(|id| number != id.to_string())
-        }
-        // It may have the marker on it.
-        Some((Pad::FAMILY, _)) => false,
-        _ => text.parse::<Marker>().is_ok_and(|marker| {
-            let is_other_id = marker.id.zip(id).is_some_and(|(one, other)| one != other);
-            marker.family.name() != family || is_other_id
-        }),
-    };
-    !markers.is_empty() && markers.iter().all(is_other)
 }
 
 /// What is known of the controller.
@@ -515,27 +496,5 @@ mod tests {
             "Warning: detector `tag` looks for aruco-4x4-50:7:0.15, and the landing is on rings;";
         assert!(table.contains(said), "{table}");
         assert!(!table.contains("detector `main` looks"), "{table}");
-    }
-
-    #[test]
-    fn another_marker_is_one_that_the_landing_never_takes() {
-        for (markers, wanted, is_other) in [
-            (&["rings:0.15"][..], "rings", false),
-            (&["rings:0.15"], "aruco-4x4-50:7", true),
-            (&["aruco-4x4-50:7:0.1"], "aruco-4x4-50", false),
-            (&["aruco-4x4-50:7:0.1"], "aruco-4x4-50:8", true),
-            (&["aruco-4x4-50:*:0.1"], "aruco-4x4-50:8", false),
-            (&["aruco-4x4-50:7:0.1", "rings:0.2"], "rings", false),
-            (&["pad:1"], "pad:1", false),
-            (&["pad:1"], "pad:2", true),
-            (&["rings:0.15"], "pad:1", true),
-            // What is on a pad, or a detector of another program calls its markers, is not known.
-            (&["pad:1"], "rings", false),
-            (&["my marker"], "rings", false),
-            (&[], "rings", false),
-        ] {
-            let markers: Vec<String> = markers.iter().map(|it| (*it).to_owned()).collect();
-            assert_eq!(looks_for_others(&markers, wanted), is_other, "{markers:?} for {wanted}");
-        }
     }
 }

@@ -394,8 +394,7 @@ impl Flight {
             self.refuse(publisher, "another-detectors-name");
             return;
         }
-        self.frames.camera_watch.heard(now_ns, publisher, &info.camera);
-        self.frames.selection.set_place(now_ns, publisher, info.place);
+        self.frames.told(now_ns, publisher, info);
         self.use_newest(now_ns);
     }
 
@@ -714,7 +713,8 @@ impl Flight {
             // Somebody else began it; it is followed like our own.
             self.mission.begin(now_ns, true);
         }
-        if self.offboard.is_leading_out() || self.waits_for_battery(now_ns) {
+        let is_leading_out = self.offboard.is_leading_out();
+        if is_leading_out || self.waits_for_battery(now_ns) || self.waits_for_detector() {
             return;
         }
         // The lander refuses a start without a fresh state, and the mission would not try again.
@@ -785,6 +785,14 @@ impl Flight {
             self.mission.fail(&mut self.autopilot, why);
         }
         true
+    }
+
+    /// A take-off does not begin while no detector looks for the marker. True while it waits for one.
+    fn waits_for_detector(&mut self) -> bool {
+        let stands = self.autopilot.state().is_some_and(|state| !state.armed);
+        let why = self.frames.nobody_looks_for_marker();
+        let why = why.filter(|_| stands && self.mission.is_taking_off());
+        why.is_some_and(|why| self.mission.wait(why))
     }
 
     fn handle_autopilot_events(&mut self, now_ns: i64) {

@@ -4,9 +4,10 @@
 use std::collections::BTreeMap;
 
 use landing::{FrameObservation, Timestamp};
-use messages::{CameraInfo, Detections, Place};
+use messages::{CameraInfo, Detections, DetectorInfo, Place};
 
 use crate::agreement::Sight;
+use crate::announced::Announced;
 use crate::camera_watch::CameraWatch;
 use crate::cameras::{Cameras, Reception};
 use crate::config::{Config, PreferredPlace};
@@ -29,6 +30,8 @@ pub struct Frames {
     pub selection: Selection,
     /// The cameras whose detectors get no frames.
     pub camera_watch: CameraWatch,
+    /// What detectors look for, and see beside the landing's marker.
+    announced: Announced,
     /// The newest frame of each detector, to be used when it becomes the active one.
     newest: BTreeMap<String, FrameObservation>,
     cameras: Cameras,
@@ -73,6 +76,7 @@ impl Frames {
             clock: config.clock().to_owned(),
             max_future_s: config.target.max_future_s,
             selection: selection(config),
+            announced: Announced::default(),
             newest: BTreeMap::new(),
             cameras: Cameras::default(),
             refusals: Refusals::default(),
@@ -90,6 +94,13 @@ impl Frames {
         if !alive {
             self.camera_watch.ended(detector);
         }
+    }
+
+    /// A detector told about itself on its own key.
+    pub fn told(&mut self, now_ns: i64, detector: &str, info: &DetectorInfo) {
+        self.camera_watch.heard(now_ns, detector, &info.camera);
+        self.selection.set_place(now_ns, detector, info.place);
+        self.announced.told(detector, &info.markers);
     }
 
     /// Adds a camera's calibration and mount, or refuses them; `is_flying` says that a landing is active.
@@ -134,6 +145,7 @@ impl Frames {
                 )
             });
         }
+        self.announced.searched(now_ns, publisher, message, &self.marker);
         let wanted = message.first_of(&self.marker);
         if let Some(why) = wanted.and_then(wire::impossible_because) {
             self.refusals.add_of(now_ns, "impossible-marker", publisher, || {
@@ -205,6 +217,7 @@ impl Frames {
     pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
         let mut warnings: Vec<_> = self.refusals.lasting(now_ns).collect();
         warnings.extend(self.selection.warnings(now_ns));
+        warnings.extend(self.announced.warnings(now_ns, &self.marker, &self.selection));
         warnings.extend(self.camera_watch.warnings(now_ns));
         warnings
     }
@@ -220,12 +233,22 @@ impl Frames {
 
     /// Why a landing that an operator starts would not be led to the marker.
     pub fn start_obstacle(&self, now_ns: i64) -> Option<String> {
-        self.obstacle(now_ns).or_else(|| self.unseen_because())
+        let others = self.obstacle(now_ns).or_else(|| self.selection.no_pose());
+        others.or_else(|| self.nobody_looks_for_marker())
+    }
+
+    /// That no detector which is there looks for the landing's marker, if that is so.
+    pub fn nobody_looks_for_marker(&self) -> Option<String> {
+        self.announced.nobody_looks_for(&self.marker, &self.selection)
     }
 
     /// Why the detector in use leads no landing to the marker although it searches frames.
-    pub fn unseen_because(&self) -> Option<String> {
-        self.selection.no_pose()
+    pub fn unseen_because(&self, now_ns: i64) -> Option<String> {
+        let instead = || {
+            let active = self.selection.active()?;
+            self.announced.seen_instead(now_ns, active, &self.marker)
+        };
+        self.selection.no_pose().or_else(|| self.nobody_looks_for_marker()).or_else(instead)
     }
 
     /// The frame to be used now: the active detector's newest, if it is newer than all that were used.
@@ -247,6 +270,7 @@ impl Frames {
     pub fn tick(&mut self, now_ns: i64) {
         self.selection.tick(now_ns);
         self.newest.retain(|name, _| self.selection.knows(name));
+        self.announced.forget(&self.selection);
     }
 
     /// Age of the newest frame that was used, in seconds.

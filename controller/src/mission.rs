@@ -143,6 +143,13 @@ impl Mission {
         matches!(self.state, State::TakingControl { .. })
     }
 
+    /// A take-off waits for this reason, which is told; true where there is one.
+    pub fn wait(&mut self, reason: String) -> bool {
+        let State::TakingOff { why, .. } = &mut self.state else { return false };
+        *why = reason;
+        true
+    }
+
     /// Asks a PX4 that holds its place to follow setpoints. The landing begins once it does.
     pub fn take_control(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
         let awaits_takeoff = self.is_awaiting_takeoff();

@@ -369,6 +369,14 @@ impl Selection {
         self.known.iter().any(|known| known.name == name)
     }
 
+    /// The detectors that are alive, and whether each has seen the marker lately.
+    pub fn alive(&self) -> impl Iterator<Item = (&str, bool)> {
+        let alive = self.known.iter().filter(|known| known.alive);
+        alive.map(|known| {
+            (known.name.as_str(), known.sights.iter().any(|(_, sight)| sight.is_some()))
+        })
+    }
+
     /// True when a detector has a newer frame than the last one used.
     pub fn has_newer(&self) -> bool {
         self.known.iter().any(|known| known.alive && known.stamp_ns > self.newest_used_ns)

@@ -200,7 +200,7 @@ impl View<'_> {
                 format!("{reason}: {no_frame}")
             }
             (Some(reason), None) if looks_for_marker(reason) || is_refused(reason) => {
-                match self.frames.unseen_because() {
+                match self.frames.unseen_because(now_ns) {
                     Some(unseen) if looks_for_marker(reason) => format!("{reason}: {unseen}"),
                     Some(unseen) => format!("nothing descends: {unseen}"),
                     None => reason.to_string(),

@@ -9,7 +9,8 @@ use std::sync::Arc;
 
 use autopilot::dialect::{
     ATTITUDE_DATA, EKF_STATUS_REPORT_DATA, EkfStatusFlags, HEARTBEAT_DATA, MavAutopilot, MavCmd,
-    MavLandedState, MavMessage, MavType, PARAM_VALUE_DATA, SYS_STATUS_DATA, TIMESYNC_DATA,
+    MavLandedState, MavMessage, MavSysStatusSensor, MavType, PARAM_VALUE_DATA, SYS_STATUS_DATA,
+    TIMESYNC_DATA,
 };
 use autopilot::{Parser, Sender};
 use controller::flight::Flight;
@@ -1011,6 +1012,118 @@ fn a_landing_on_centres_without_poses_is_refused_with_its_reason_and_one_under_w
         } else {
             let reply = flight.command(now_ns, &ControllerCommand::Start);
             assert_eq!(!reply.accepted && reply.reason.contains(told), is_told, "{reply:?}");
+        }
+    }
+}
+
+/// What a detector tells that looks for these markers.
+fn looking_for(detector: &str, markers: &[&str]) -> DetectorInfo {
+    let markers = markers.iter().map(|it| (*it).to_owned()).collect();
+    DetectorInfo { markers, ..detector_info(detector, "down") }
+}
+
+#[test]
+fn a_landing_on_a_marker_that_no_detector_looks_for_is_refused_and_no_motor_started() {
+    let other = ["aruco-4x4-50:7:0.15"];
+    let told = "no detector looks for the landing's marker rings: `main` looks for aruco-4x4-50:7";
+    let start = |infos: &[DetectorInfo], sees: bool| {
+        let mut flight = in_flight("command");
+        flight.camera(0, CameraInfo::sample());
+        flight.presence(0, "main", true);
+        for info in infos {
+            flight.on_detector_info(2 * MS, &info.detector, info);
+        }
+        for ms in (20..1000).step_by(20) {
+            pose(&mut flight, ms * MS);
+            let seen = seen(ms * MS - 10 * MS);
+            let none = Detections { detections: Vec::new(), ..seen.clone() };
+            flight.detections(ms * MS + 2, "main", if sees { &seen } else { &none });
+            flight.tick(ms * MS + 3);
+        }
+        let warned = flight.status(1000 * MS).warnings.iter().any(|it| it.contains(told));
+        let reply = flight.command(1000 * MS, &ControllerCommand::Start);
+        assert_eq!(!reply.accepted, warned, "{reply:?}");
+        assert!(reply.accepted || reply.reason.contains(told), "{reply:?}");
+        reply.accepted
+    };
+    let main = looking_for("main", &other);
+    assert!(!start(std::slice::from_ref(&main), false));
+    assert!(!start(&[main.clone(), looking_for("spare", &other)], false));
+    assert!(start(&[main.clone(), looking_for("spare", &["rings:0.15"])], false));
+    assert!(start(&[main.clone(), looking_for("mine", &[])], false), "one tells nothing");
+    assert!(start(&[], false), "it tells nothing of itself");
+    assert!(start(std::slice::from_ref(&main), true), "it sees the marker all the same");
+
+    for (markers, is_armed) in [(&other, false), (&["rings:0.15341"], true)] {
+        let mut flight = flight("takeoff");
+        let mut commands = Vec::new();
+        for ms in (0..20_000).step_by(20) {
+            let now_ns = ms * MS;
+            if ms % 1000 == 0 {
+                receive(&mut flight, now_ns, &heartbeat(4, false));
+                let on_ground = MavLandedState::MAV_LANDED_STATE_ON_GROUND;
+                receive(&mut flight, now_ns, &contact(on_ground));
+                let ready = MavSysStatusSensor::MAV_SYS_STATUS_PREARM_CHECK;
+                let ready = SYS_STATUS_DATA {
+                    onboard_control_sensors_present: ready,
+                    onboard_control_sensors_enabled: ready,
+                    onboard_control_sensors_health: ready,
+                    battery_remaining: -1,
+                    ..Default::default()
+                };
+                receive(&mut flight, now_ns, &MavMessage::SYS_STATUS(ready));
+                let flags = EkfStatusFlags::EKF_ATTITUDE
+                    | EkfStatusFlags::EKF_VELOCITY_HORIZ
+                    | EkfStatusFlags::EKF_VELOCITY_VERT
+                    | EkfStatusFlags::EKF_POS_VERT_ABS
+                    | EkfStatusFlags::EKF_POS_HORIZ_ABS;
+                let estimate = EKF_STATUS_REPORT_DATA { flags, ..Default::default() };
+                receive(&mut flight, now_ns, &MavMessage::EKF_STATUS_REPORT(estimate));
+                flight.on_detector_info(now_ns, "main", &looking_for("main", markers));
+            }
+            pose_at(&mut flight, now_ns, 0.0);
+            flight.tick(now_ns + 3);
+            commands.extend(sent(&mut flight).1);
+        }
+        let arms = commands.contains(&MavCmd::MAV_CMD_COMPONENT_ARM_DISARM);
+        let status = flight.status(20_000 * MS);
+        assert_eq!(arms, is_armed, "{commands:?}, {}", status.why);
+        assert_eq!((status.phase, status.why.contains(told)), (Phase::Takeoff, !is_armed));
+    }
+}
+
+#[test]
+fn other_markers_that_are_seen_instead_of_the_landings_are_named() {
+    let told = "`main` sees aruco-4x4-50:3, pad:2 and not the landing's marker aruco-4x4-50:7";
+    let seen_as = |ms: i64, id: u32| {
+        let mut seen = seen(ms * MS - 40 * MS);
+        let found = seen.detections.remove(0);
+        let tag = Detection { family: "aruco-4x4-50".into(), id: Some(id), ..found.clone() };
+        let pad = Detection { family: "pad".into(), id: Some(2), ..found };
+        seen.detections.extend([tag, pad]);
+        seen
+    };
+    let mut flight = flight_with("airborne", &["marker=aruco-4x4-50:7"]);
+    flight.camera(0, CameraInfo::sample());
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    for ms in (20..8000).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(&mut flight, ms * MS, &heartbeat(4, true));
+        }
+        pose(&mut flight, ms * MS);
+        if ms % 60 == 0 {
+            flight.detections(ms * MS + 2, "main", &seen_as(ms, if ms < 4000 { 3 } else { 7 }));
+        }
+        flight.tick(ms * MS + 3);
+        let status = flight.status(ms * MS + 3);
+        let is_told = status.warnings.iter().any(|it| it.contains(told));
+        let says_why = status.why.contains(told);
+        match ms {
+            ..2000 => assert!(!is_told && !says_why, "{ms}: {status:?}"),
+            2200..4000 => assert!(is_told && says_why, "{ms}: {status:?}"),
+            4100.. => assert!(!is_told && !says_why, "{ms}: {status:?}"),
+            _ => {}
         }
     }
 }

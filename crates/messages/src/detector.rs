@@ -234,6 +234,43 @@ impl Detection {
     }
 }
 
+impl Detection {
+    /// The name of its marker, `FAMILY` or `FAMILY:ID`.
+    pub fn name(&self) -> String {
+        match self.id {
+            Some(id) => format!("{}:{id}", self.family),
+            None => self.family.clone(),
+        }
+    }
+
+    /// Whether it is surely of another marker than that of this name, nor of one that may stand on a pad of that name.
+    pub fn is_other_than(&self, marker: &str) -> bool {
+        !self.is_of(marker) && (self.family == PAD_FAMILY || !self.may_be_of(marker))
+    }
+}
+
+/// Whether a detector that tells that it looks for these markers (`FAMILY:ID:SIZE_M`, `FAMILY:SIZE_M`, `pad:ID`) surely never reports the one
+/// that is wanted, `FAMILY` or `FAMILY:ID`. Of what is written otherwise nothing is known.
+pub fn looks_for_others(markers: &[String], wanted: &str) -> bool {
+    let Ok((family, id)) = marker_name(wanted) else { return false };
+    let is_other = |text: &String| {
+        let parts: Vec<&str> = text.split(':').collect();
+        let (of, number) = match parts[..] {
+            [PAD_FAMILY, number] if family == PAD_FAMILY => {
+                return id.is_some_and(|id| number != id.to_string());
+            }
+            // The marker may stand on the pad.
+            [PAD_FAMILY, _] => return false,
+            [of, number, size] if size.parse::<f64>().is_ok() => (of, number),
+            [of, number] if number.parse::<f64>().is_ok() => (of, number),
+            _ => return false,
+        };
+        let number = number.parse::<u32>().ok();
+        of != family || number.zip(id).is_some_and(|(one, other)| one != other)
+    };
+    !markers.is_empty() && markers.iter().all(is_other)
+}
+
 impl Detections {
     /// The first detection of the marker of this name, `FAMILY` or `FAMILY:ID`; none for an invalid one.
     pub fn first_of(&self, marker: &str) -> Option<&Detection> {
@@ -261,5 +298,44 @@ mod tests {
         assert_eq!(id("aruco-4x4-50"), Some(Some(3)));
         assert_eq!(id("stag-hd23:0"), None);
         assert_eq!(id("aruco-4x4-50:x7"), None, "an id that is not a number is refused");
+    }
+
+    #[test]
+    fn a_marker_is_another_one_unless_it_may_stand_on_the_pad() {
+        let detection =
+            |family: &str, id| Detection { family: family.into(), id, ..Detection::sample() };
+        let (tag, rings) = (detection("aruco-4x4-50", Some(3)), detection("rings", None));
+        assert_eq!((tag.name().as_str(), rings.name().as_str()), ("aruco-4x4-50:3", "rings"));
+        for (wanted, is_other) in
+            [("aruco-4x4-50:3", false), ("aruco-4x4-50", false), ("aruco-4x4-50:7", true)]
+        {
+            assert_eq!(tag.is_other_than(wanted), is_other, "{wanted}");
+        }
+        assert!(rings.is_other_than("aruco-4x4-50:3") && !rings.is_other_than("pad:1"));
+        assert!(detection("pad", Some(2)).is_other_than("pad:1"));
+    }
+
+    #[test]
+    fn another_marker_is_one_that_the_landing_never_takes() {
+        for (markers, wanted, is_other) in [
+            (&["rings:0.15"][..], "rings", false),
+            (&["rings:0.15"], "aruco-4x4-50:7", true),
+            (&["aruco-4x4-50:7:0.1"], "aruco-4x4-50", false),
+            (&["aruco-4x4-50:7:0.1"], "aruco-4x4-50:8", true),
+            (&["aruco-4x4-50:7"], "aruco-4x4-50:8", true),
+            (&["aruco-4x4-50:*:0.1"], "aruco-4x4-50:8", false),
+            (&["aruco-4x4-50:7:0.1", "rings:0.2"], "rings", false),
+            (&["pad:1"], "pad:1", false),
+            (&["pad:1"], "pad:2", true),
+            (&["rings:0.15"], "pad:1", true),
+            // What is on a pad, or a detector of another program calls its markers, is not known.
+            (&["pad:1"], "rings", false),
+            (&["my marker"], "rings", false),
+            (&["mine:big"], "rings", false),
+            (&[], "rings", false),
+        ] {
+            let markers: Vec<String> = markers.iter().map(|it| (*it).to_owned()).collect();
+            assert_eq!(looks_for_others(&markers, wanted), is_other, "{markers:?} for {wanted}");
+        }
     }
 }

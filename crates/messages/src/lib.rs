@@ -36,7 +36,8 @@ pub use controller::{
 };
 pub use detector::{
     AlternativePose, CameraResponse, Detection, Detections, DetectorCommand, DetectorInfo,
-    EllipsePx, MarkerPose, Place, Refusal, Refusals, RefusedShape, StageTime, marker_name,
+    EllipsePx, MarkerPose, Place, Refusal, Refusals, RefusedShape, StageTime, looks_for_others,
+    marker_name,
 };
 pub use gcs::{GcsSigning, GcsStatus, GroundStation, PacketSignature, SigningState};
 pub use health::{Configuration, Count, Health, Latency, Rate};
