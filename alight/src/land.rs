@@ -432,7 +432,7 @@ async fn watch(
             Some(recorder) = recorders.next() => landing.recorder(recorder),
             Some(event) = children.next() => match event {
                 ChildEvent::Line(service, line) => {
-                    progress.say(&format!("{}: {line}", service.name()));
+                    progress.line(service, &line);
                 }
                 ChildEvent::Exited(service, exit) => {
                     children.remove(&service);

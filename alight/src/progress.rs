@@ -1,6 +1,7 @@
 //! Progress on standard error: a landing's phase, detector in use, height and the controller's warnings, each once; flights
 //! and steps of experiments; redrawn on a terminal, else a line for each change.
 
+use std::collections::VecDeque;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -9,6 +10,7 @@ use messages::{ControllerStatus, Phase};
 
 use crate::args::Format;
 use crate::outcome::LandingSummary;
+use crate::services::Service;
 use crate::terminal::write_error;
 
 /// The display of a landing.
@@ -19,8 +21,67 @@ pub(crate) struct Progress {
     /// The last reason of the phase that was shown, without digits.
     why: String,
     active_detector: Option<String>,
-    /// The warnings that were shown and still hold, without digits.
-    warnings: Vec<String>,
+    warnings: Warnings,
+}
+
+/// Time for which a warning that ends and begins again is not shown once more, nor what was shown in other words.
+const QUIET: Duration = Duration::from_secs(5);
+/// Maximum number of lines and of warnings that are remembered.
+const MAX_REMEMBERED: usize = 32;
+
+/// The warnings of a controller, in its status and on its standard error.
+#[derive(Default)]
+struct Warnings {
+    /// Those that hold, without digits.
+    present: Vec<String>,
+    /// Those that were shown, without digits, and when; the oldest first.
+    shown: VecDeque<(String, Instant)>,
+    /// The lines that were shown, likewise.
+    lines: VecDeque<(String, Instant)>,
+}
+
+impl Warnings {
+    /// Which of these, which hold now, are to be shown.
+    fn take<'a>(&mut self, now: Instant, texts: &'a [String]) -> Vec<&'a String> {
+        let matters: Vec<String> = texts.iter().map(|text| matter(text)).collect();
+        let mut new = Vec::new();
+        for (text, matter) in texts.iter().zip(&matters) {
+            let is_told = was_shown(&self.shown, now, |shown| shown == matter)
+                || was_shown(&self.lines, now, |line| line.contains(matter));
+            if !self.present.contains(matter) && !is_told {
+                remember(&mut self.shown, now, matter.clone());
+                new.push(text);
+            }
+        }
+        self.present = matters;
+        new
+    }
+
+    /// Whether a line of the controller's standard error is to be shown: not one with a warning that was shown a moment ago.
+    fn is_new_line(&mut self, now: Instant, line: &str) -> bool {
+        let line = matter(line);
+        let is_new = !was_shown(&self.shown, now, |shown| line.contains(shown));
+        if is_new {
+            remember(&mut self.lines, now, line);
+        }
+        is_new
+    }
+}
+
+fn was_shown(
+    all: &VecDeque<(String, Instant)>,
+    now: Instant,
+    is_it: impl Fn(&str) -> bool,
+) -> bool {
+    let is_recent = |at: Instant| now.saturating_duration_since(at) < QUIET;
+    all.iter().any(|(shown, at)| is_recent(*at) && is_it(shown))
+}
+
+fn remember(all: &mut VecDeque<(String, Instant)>, now: Instant, matter: String) {
+    if all.len() >= MAX_REMEMBERED {
+        all.pop_front();
+    }
+    all.push_back((matter, now));
 }
 
 impl Progress {
@@ -37,7 +98,13 @@ impl Progress {
             bar.enable_steady_tick(Duration::from_millis(200));
             bar
         });
-        Self { live, phase: None, why: String::new(), active_detector: None, warnings: Vec::new() }
+        Self {
+            live,
+            phase: None,
+            why: String::new(),
+            active_detector: None,
+            warnings: Warnings::default(),
+        }
     }
 
     /// Shows a line that stays.
@@ -71,13 +138,16 @@ impl Progress {
             let name = status.active_detector.as_deref().unwrap_or("none");
             self.say(&format!("active detector: {name}: {}", status.detector_why));
         }
-        let matters: Vec<String> = status.warnings.iter().map(|text| matter(text)).collect();
-        for (text, matter) in status.warnings.iter().zip(&matters) {
-            if !self.warnings.contains(matter) {
-                self.say(&format!("warning: {text}"));
-            }
+        for text in self.warnings.take(Instant::now(), &status.warnings) {
+            self.say(&format!("warning: {text}"));
         }
-        self.warnings = matters;
+    }
+
+    /// Shows a line of a service's standard error; one of the controller's not, where its status has said that.
+    pub(crate) fn line(&mut self, service: Service, line: &str) {
+        if service != Service::Controller || self.warnings.is_new_line(Instant::now(), line) {
+            self.say(&format!("{}: {line}", service.name()));
+        }
     }
 
     /// Redraws the live view.
@@ -227,6 +297,30 @@ mod tests {
             |camera: &str, s: u32| matter(&format!("no frame from camera `{camera}` for {s} s"));
         assert_eq!(silent("cam1", 2), silent("cam1", 13));
         assert_ne!(silent("cam1", 2), silent("cam2", 2));
+    }
+
+    #[test]
+    fn a_warning_that_comes_and_goes_is_shown_every_few_seconds_and_once_of_status_and_log() {
+        let (began, mut warnings) = (Instant::now(), Warnings::default());
+        let said = |apart: f64| {
+            format!("detectors `main` (used) and `python` see the marker {apart:.2} m apart")
+        };
+        let mut shown = Vec::new();
+        for i in 0..60_u32 {
+            let now = began + Duration::from_millis(200) * i;
+            let texts = if i % 2 == 0 { vec![said(f64::from(i))] } else { Vec::new() };
+            if !warnings.take(now, &texts).is_empty() {
+                shown.push(i);
+            }
+            let line = format!("2026-11-30T08:00:{i:02} WARN controller: {}", said(0.5));
+            assert!(!warnings.is_new_line(now, &line), "{line}");
+        }
+        assert_eq!(shown, [0, 26, 52], "every five seconds");
+        // The log is sometimes the first, and other lines are shown each.
+        let later = began + Duration::from_secs(60);
+        assert!(warnings.is_new_line(later, &format!("WARN controller: {}", said(0.7))));
+        assert!(warnings.take(later, &[said(0.7)]).is_empty());
+        assert!(warnings.is_new_line(later, "WARN controller: Autopilot heartbeat lost"));
     }
 
     #[test]

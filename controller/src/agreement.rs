@@ -183,6 +183,12 @@ impl Common {
         self.both >= MIN_COMMON && self.apart * 2 <= self.both
     }
 
+    /// They agree in at least three of four frames: where they are about as far apart as the tolerance allows, what has begun does not end
+    /// and begin again with every frame.
+    fn agree_clearly(&self) -> bool {
+        self.both >= MIN_COMMON && self.apart * 4 <= self.both
+    }
+
     /// The first saw nothing in at least three of four frames in which the second saw the marker.
     fn first_is_blind(&self) -> bool {
         self.second_saw >= MIN_COMMON && self.first_missed * 4 >= self.second_saw * 3
@@ -261,6 +267,11 @@ pub fn dispute(active: Voter<'_>, others: &[Voter<'_>], tolerance: Tolerance) ->
 /// True when two detectors have seen the marker at one place, and turned the same way where that matters, in enough frames.
 pub fn agree(first: Voter<'_>, second: Voter<'_>, tolerance: Tolerance) -> bool {
     Common::of(first.sights, second.sights, tolerance).agree()
+}
+
+/// True when two detectors that disagreed do so no more: they agree in most of the latest frames.
+pub fn agree_again(first: Voter<'_>, second: Voter<'_>, tolerance: Tolerance) -> bool {
+    Common::of(first.sights, second.sights, tolerance).agree_clearly()
 }
 
 /// True when two positions agree, in whatever order. The farther one gives the range, as the error of a position grows with it.

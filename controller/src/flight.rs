@@ -245,7 +245,7 @@ impl Flight {
     /// Logs what the operator should know, and tells the lander of a dispute between detectors.
     fn follow_warnings(&mut self, now_ns: i64) {
         let warnings = self.view().warnings(now_ns);
-        self.journal.warnings(&warnings);
+        self.journal.warnings(now_ns, &warnings);
         let is_disputed = self.frames.selection.dispute().is_some();
         if is_disputed != self.is_disputed {
             self.is_disputed = is_disputed;

@@ -23,8 +23,21 @@ pub struct Journal {
     /// Why the latest detection of the detector in use was rejected, if it was.
     rejection: Option<String>,
     /// The matters of which the log has told.
-    told: Vec<String>,
+    told: Vec<Told>,
 }
+
+/// A matter of which the log has told.
+#[derive(Debug)]
+struct Told {
+    matter: String,
+    /// When, in nanoseconds.
+    at_ns: i64,
+    /// Since when it is over, in nanoseconds; `None` while it lasts.
+    over_ns: Option<i64>,
+}
+
+/// Minimum time between two lines on one matter that ends and begins again, and for which it must be over before that is told, in nanoseconds.
+const QUIET_NS: i64 = 5_000_000_000;
 
 impl Journal {
     /// A journal that counts into `health`.
@@ -32,19 +45,30 @@ impl Journal {
         Self { health, rejection: None, told: Vec::new() }
     }
 
-    /// Logs what the operator should know when it begins and when it ends.
-    pub fn warnings(&mut self, warnings: &[Warning]) {
+    /// Logs what the operator should know when it begins and when it is over, and not every time that it comes and goes.
+    pub fn warnings(&mut self, now_ns: i64, warnings: &[Warning]) {
         for Warning { matter, text } in warnings {
-            if !self.told.contains(matter) {
+            let Some(told) = self.told.iter_mut().find(|told| told.matter == *matter) else {
                 tracing::warn!("{text}");
+                self.told.push(Told { matter: matter.clone(), at_ns: now_ns, over_ns: None });
+                continue;
+            };
+            if told.over_ns.take().is_some() && now_ns.saturating_sub(told.at_ns) >= QUIET_NS {
+                tracing::warn!("{text}");
+                told.at_ns = now_ns;
             }
         }
-        let over = |told: &String| !warnings.iter().any(|warning| warning.matter == *told);
-        for matter in self.told.iter().filter(|told| over(told)) {
-            tracing::info!(matter, "Over");
-        }
-        self.told.clear();
-        self.told.extend(warnings.iter().map(|warning| warning.matter.clone()));
+        self.told.retain_mut(|told| {
+            if warnings.iter().any(|warning| warning.matter == told.matter) {
+                return true;
+            }
+            let over_ns = *told.over_ns.get_or_insert(now_ns);
+            let is_over = now_ns.saturating_sub(over_ns) >= QUIET_NS;
+            if is_over {
+                tracing::info!(matter = told.matter, "Over");
+            }
+            !is_over
+        });
     }
 
     /// Counts a camera's information that was refused, for a reason that is a short name for programs.
@@ -236,8 +260,8 @@ mod tests {
         }
     }
 
-    #[test]
-    fn the_log_says_it_as_people_write_it() {
+    /// What is logged meanwhile.
+    fn logged(run: impl FnOnce()) -> String {
         let log = Log::default();
         let writer = log.clone();
         let subscriber = tracing_subscriber::fmt()
@@ -245,7 +269,33 @@ mod tests {
             .without_time()
             .with_writer(move || writer.clone())
             .finish();
-        tracing::subscriber::with_default(subscriber, || {
+        tracing::subscriber::with_default(subscriber, run);
+        let told = log.0.lock().unwrap_or_else(PoisonError::into_inner);
+        std::str::from_utf8(&told).unwrap().to_owned()
+    }
+
+    #[test]
+    fn a_matter_that_comes_and_goes_is_told_every_few_seconds_and_its_end_once() {
+        let warning = Warning { matter: "dispute a b".into(), text: "they differ".into() };
+        let told = logged(|| {
+            let mut journal = Journal::new(Arc::default());
+            // It is there in every other call for twelve seconds.
+            for i in 0..480_i64 {
+                let warnings = std::slice::from_ref(&warning);
+                let warnings = if i % 2 == 0 { warnings } else { &[] };
+                journal.warnings(i * 25_000_000, warnings);
+            }
+            for i in 480..800_i64 {
+                journal.warnings(i * 25_000_000, &[]);
+            }
+        });
+        assert_eq!(told.matches("they differ").count(), 3, "{told}");
+        assert_eq!(told.matches("Over").count(), 1, "{told}");
+    }
+
+    #[test]
+    fn the_log_says_it_as_people_write_it() {
+        let told = logged(|| {
             let journal = Journal::new(Arc::default());
             journal.alarm(Alarm::AutopilotLost);
             journal.autopilot(&Event::ModeChanged { from: None, to: FlightMode::Guided });
@@ -259,8 +309,6 @@ mod tests {
             journal.autopilot(&Event::Text { severity, text: "Low".to_owned() });
             journal.autopilot(&Event::Lost { silence: Duration::from_millis(3003) });
         });
-        let told = log.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let told = std::str::from_utf8(&told).unwrap();
         for wanted in [
             "Alarm alarm=the link to the autopilot is lost",
             "Flight mode mode=GUIDED",

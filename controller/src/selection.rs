@@ -331,8 +331,10 @@ impl Selection {
         let mut warn = |matter: String, text: String| warnings.push(Warning { matter, text });
         if let Some(Dispute { active, other, apart_m, turned_rad }) = &self.dispute {
             let turned = said_turned(*turned_rad);
+            // The same pair, whichever of the two is used.
+            let [first, second] = [active.min(other), active.max(other)];
             warn(
-                format!("dispute {other}"),
+                format!("dispute {first} {second}"),
                 format!(
                     "detectors `{active}` (used) and `{other}` see the marker {apart_m:.2} m apart{turned}; stop the wrong one, or name the right one (`alight detectors use`)"
                 ),
@@ -497,7 +499,7 @@ impl Selection {
         let other = if last.active == active.name { &last.other } else { &last.active };
         let opponent = self.known.iter().filter(is_opponent).find(|known| known.name == *other)?;
         let is_over = opponent.fault.is_some()
-            || agreement::agree(active.voter(), opponent.voter(), tolerance)
+            || agreement::agree_again(active.voter(), opponent.voter(), tolerance)
             || ![&last.active, &last.other].contains(&&active.name);
         (!is_over).then(|| Dispute {
             active: active.name.clone(),

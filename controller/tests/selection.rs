@@ -418,6 +418,26 @@ fn two_that_disagree_are_told_within_a_second_and_until_they_agree_again() {
     assert!(bench.selection.warnings(bench.now_ns).is_empty());
 }
 
+/// About as far apart as the tolerance allows, noise would end and begin a disagreement with every frame.
+#[test]
+fn two_that_disagree_in_every_other_frame_do_so_until_they_agree_clearly() {
+    let mut bench = Bench::new(preferring(None, None));
+    let mut changes = 0;
+    let mut is_disputed = false;
+    for i in 0..300 {
+        let differs = if i < 20 { true } else { (i / 4) % 2 == 0 };
+        let other = at(if differs { 0.3 } else { 0.2 });
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, at(0.0)), ("other", 35 * MS, other)]);
+        let now = bench.selection.dispute().is_some();
+        changes += u32::from(std::mem::replace(&mut is_disputed, now) != now);
+    }
+    assert_eq!((changes, is_disputed), (1, true));
+    for i in 300..340 {
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, at(0.0)), ("other", 35 * MS, at(0.2))]);
+    }
+    assert_eq!(bench.selection.dispute(), None);
+}
+
 #[test]
 fn a_dispute_lasts_while_both_are_late_or_see_nothing() {
     let mut bench = Bench::new(preferring(None, None));
