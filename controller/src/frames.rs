@@ -13,6 +13,7 @@ use crate::cameras::{Cameras, Reception};
 use crate::config::{Config, PreferredPlace};
 use crate::refusals::{Refusals, Warning};
 use crate::selection::{Limits, MAX_DETECTORS, Preference, Selection};
+use crate::stamps::Stamps;
 use crate::wire;
 
 /// Time without detections that can be used after which a refusal is taken for their absence, in
@@ -32,6 +33,8 @@ pub struct Frames {
     pub camera_watch: CameraWatch,
     /// What detectors look for, and see beside the landing's marker.
     announced: Announced,
+    /// The stamps that they pass on.
+    stamps: Stamps,
     /// The newest frame of each detector, to be used when it becomes the active one.
     newest: BTreeMap<String, FrameObservation>,
     cameras: Cameras,
@@ -77,6 +80,7 @@ impl Frames {
             max_future_s: config.target.max_future_s,
             selection: selection(config),
             announced: Announced::default(),
+            stamps: Stamps::default(),
             newest: BTreeMap::new(),
             cameras: Cameras::default(),
             refusals: Refusals::default(),
@@ -93,6 +97,7 @@ impl Frames {
         self.selection.presence(now_ns, detector, alive);
         if !alive {
             self.camera_watch.ended(detector);
+            self.stamps.ended(detector);
         }
     }
 
@@ -146,6 +151,7 @@ impl Frames {
             });
         }
         self.announced.searched(now_ns, publisher, message, &self.marker);
+        self.stamps.searched(now_ns, publisher, header);
         let wanted = message.first_of(&self.marker);
         if let Some(why) = wanted.and_then(wire::impossible_because) {
             self.refusals.add_of(now_ns, "impossible-marker", publisher, || {
@@ -218,6 +224,7 @@ impl Frames {
         let mut warnings: Vec<_> = self.refusals.lasting(now_ns).collect();
         warnings.extend(self.selection.warnings(now_ns));
         warnings.extend(self.announced.warnings(now_ns, &self.marker, &self.selection));
+        warnings.extend(self.stamps.warnings(now_ns));
         warnings.extend(self.camera_watch.warnings(now_ns));
         warnings
     }

@@ -6,7 +6,7 @@
 //!
 //! Modules in reading order: [`config`] has the settings; [`service`] joins network and link to the
 //! [`flight`] with its [`tape`], an event loop over [`frames`] (detections in, the lander's next frame out, with [`selection`]
-//! of the detector by health and [`agreement`], what they have [`announced`], the [`cameras`], and the [`refusals`] that last; [`unreadable`] ones never come so far), [`mount`] (what is said of a camera that is not as configured), [`mission`]
+//! of the detector by health and [`agreement`], what they have [`announced`], the [`stamps`] that they pass on, the [`cameras`], and the [`refusals`] that last; [`unreadable`] ones never come so far), [`mount`] (what is said of a camera that is not as configured), [`mission`]
 //! (when a landing begins), [`setpoints`] (the lander's actions to the autopilot), [`control`] (how a PX4 comes to follow setpoints) and [`offboard_watch`] (that it is not left so), [`landing_target`] (the
 //! other way to land, by the autopilot's own precision landing), [`limits`] (the autopilot's parameters for
 //! setpoints), [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is logged and
@@ -36,6 +36,7 @@ pub mod refusals;
 pub mod selection;
 pub mod service;
 pub mod setpoints;
+pub mod stamps;
 pub mod status;
 pub mod tape;
 pub mod unreadable;
