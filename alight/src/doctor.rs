@@ -15,6 +15,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
+use anyhow::bail;
 use clap::Args;
 use messages::{CameraInfo, ControllerStatus, DetectorState, FrameHeader, Health, Phase, topic};
 use node::version::release;
@@ -25,7 +26,7 @@ use tokio::time::timeout;
 
 use self::focus::Focus;
 use self::keys::Checked;
-use crate::args::{Format, NetworkArgs, OPERATOR};
+use crate::args::{Format, NetworkArgs, OPERATOR, WrongUse};
 use crate::programs::{missing, missing_of_service};
 use crate::runtime::{block_on, tool_identity};
 use crate::services::{RELAY, Service};
@@ -36,7 +37,7 @@ use crate::terminal::print;
 #[derive(Args, Clone)]
 pub(crate) struct DoctorArgs {
     /// Role of this machine.
-    #[arg(value_enum, requires = "config")]
+    #[arg(value_enum)]
     role: Option<Role>,
     /// The site (TOML), as for `alight up`.
     #[arg(long, value_name = "FILE", requires = "role")]
@@ -142,6 +143,9 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     let mut checked = Checked::default();
     // On the drone what is asked stays on the machine, and needs no key.
     let mut needs_key = true;
+    if let (Some(role), None) = (args.role, &args.config) {
+        bail!(WrongUse(without_site(role)));
+    }
     let site = args.config.as_ref().map(|file| Site::read(file)).transpose()?;
     if let (Some(role), Some(file), Some(site)) = (args.role, &args.config, &site) {
         network = site.network(role);
@@ -149,6 +153,9 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
         match site.jobs(role) {
             Ok(jobs) => {
                 check_site(&mut findings, &mut checked, role, &site.folder, &jobs);
+                if let Some(problem) = site.marker_problem(role) {
+                    findings.wrong("marker", problem, "`alight up ... --dry-run` reports the same");
+                }
                 expected = jobs;
             }
             Err(problem) => findings.wrong(
@@ -207,6 +214,15 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
         Format::Json => serde_json::to_string(&findings)?,
     })?;
     Ok(ExitCode::from(u8::from(findings.count(Verdict::Wrong) > 0)))
+}
+
+/// What to say to a role without the site in which its processes stand.
+fn without_site(role: Role) -> String {
+    let role = role.name();
+    format!(
+        "`alight doctor {role}` needs the site whose processes it compares: `alight doctor {role} --config site.toml`; without a role, \
+         `alight doctor` checks this machine and what runs on it"
+    )
 }
 
 fn check_machine(findings: &mut Findings) {
@@ -736,7 +752,24 @@ fn check_used(findings: &mut Findings, seen: &Seen, status: &ControllerStatus) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::Parser;
     use messages::Candidate;
+
+    #[derive(Parser)]
+    struct Tool {
+        #[command(flatten)]
+        doctor: DoctorArgs,
+    }
+
+    #[test]
+    fn a_role_without_its_site_is_answered_with_the_command_that_is_right() {
+        let args = |words: &[&str]| Tool::try_parse_from(words).unwrap().doctor;
+        let problem = run(&args(&["alight", "local"])).unwrap_err();
+        assert!(problem.is::<WrongUse>());
+        let told = problem.to_string();
+        assert!(told.contains("`alight doctor local --config site.toml`"), "{told}");
+        assert!(told.contains("without a role, `alight doctor` checks this machine"), "{told}");
+    }
 
     #[test]
     fn another_build_of_the_same_version_is_doubtful() {

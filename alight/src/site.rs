@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use clap::ValueEnum;
+use messages::looks_for_others;
 use node::access::key_name;
 use node::network::{Address, NO_KEYS_OVER_IPV6};
 use node::{ConfigError, Layers, Network};
@@ -216,13 +217,11 @@ impl Site {
 
     /// Refuses two detectors with one id, of which the second would not run: on this machine and on those that it reaches.
     fn check_detectors(&self, role: Role) -> anyhow::Result<()> {
-        let connected = [Role::Drone, Role::Relay, Role::Ground];
-        let together = if role == Role::Local { &[Role::Local][..] } else { &connected };
         let mut taken = BTreeMap::new();
-        for role in together {
-            for (number, entry) in self.entries(*role).iter().enumerate() {
+        for role in self.together(role) {
+            for (number, entry) in self.entries(role).iter().enumerate() {
                 // The files of another machine's services may be missing here.
-                let job = self.job(*role, entry).ok();
+                let job = self.job(role, entry).ok();
                 let Some(job) = job.filter(|job| job.service == Some(Service::Detector)) else {
                     continue;
                 };
@@ -236,6 +235,52 @@ impl Site {
             }
         }
         Ok(())
+    }
+
+    /// That no detector of the site looks for the marker of its controller; `None` where one may: by its configuration, or as another program
+    /// or a service whose files are not here. `role` is one of the machines of which that is asked.
+    pub(crate) fn marker_problem(&self, role: Role) -> Option<String> {
+        let mut detectors = Vec::new();
+        let mut controller = None;
+        for (number, entry) in self.together(role).flat_map(|role| {
+            self.entries(role).iter().enumerate().map(move |(i, entry)| ((role, i + 1), entry))
+        }) {
+            let job = self.job(number.0, entry).ok()?;
+            let place = || format!("[[{}]] number {}", number.0.name(), number.1);
+            match job.service {
+                Some(Service::Controller) => {
+                    let marker = job.layers.load::<controller::Config>().ok()?.settings.marker;
+                    controller = Some((place(), marker));
+                }
+                Some(Service::Detector) => {
+                    let config = job.layers.load::<detector::Config>().ok()?.settings;
+                    detectors.push((place(), config.looked_for().ok()?));
+                }
+                // It may be a detector.
+                None => return None,
+                Some(_) => {}
+            }
+        }
+        let (at, marker) = controller?;
+        let is_other = |markers: &Vec<String>| looks_for_others(markers, &marker);
+        if detectors.is_empty() || !detectors.iter().all(|(_, markers)| is_other(markers)) {
+            return None;
+        }
+        let told = detectors
+            .iter()
+            .map(|(place, markers)| format!("{place} looks for {}", markers.join(" ")));
+        let told: Vec<String> = told.collect();
+        Some(format!(
+            "the controller, {at}, lands on {marker}, and no detector looks for that: {}; correct its `marker`, or their `markers`",
+            told.join(", ")
+        ))
+    }
+
+    /// The machines whose processes meet in one network with those of a role.
+    fn together(&self, role: Role) -> impl Iterator<Item = Role> + use<> {
+        let connected = [Role::Drone, Role::Relay, Role::Ground];
+        let together = if role == Role::Local { &[Role::Local][..] } else { &connected };
+        together.to_vec().into_iter()
     }
 
     fn relay_job(&self, role: Role) -> anyhow::Result<Option<Job>> {
@@ -486,6 +531,37 @@ mod tests {
             let told = problem(&apart, role);
             assert!(told.contains("[[drone]] number 1 and [[ground]] number 2"), "{told}");
         }
+    }
+
+    #[test]
+    fn a_controller_whose_marker_no_detector_of_the_site_looks_for_is_told() {
+        let of = |drone: &str, ground: &str, role: Role| {
+            let text = format!(
+                "address = '10.0.0.1'\ninsecure = true\ndrone = [{drone}]\nground = [{ground}]"
+            );
+            site(&text).marker_problem(role)
+        };
+        let controller = "{ run = 'controller', set = ['marker=\"aruco-4x4-50:7\"'] }";
+        let detector =
+            |markers: &str| format!("{{ run = 'detector', set = ['markers={markers}'] }}");
+        let (rings, tag) = (detector("[\"rings:0.15\"]"), detector("[\"aruco-4x4-50:*:0.1\"]"));
+        let wrong = format!("{controller}, {rings}");
+        let dashboard = "{ run = 'dashboard' }";
+        for role in [Role::Drone, Role::Ground] {
+            let told = of(&wrong, dashboard, role).unwrap();
+            assert!(told.contains("[[drone]] number 1, lands on aruco-4x4-50:7"), "{told}");
+            assert!(told.contains("[[drone]] number 2 looks for rings:0.15"), "{told}");
+            assert_eq!(of(&wrong, &tag, role), None, "one on the ground does");
+        }
+        assert_eq!(of(&wrong, dashboard, Role::Local), None, "it has no process here");
+        assert_eq!(
+            of(&format!("{wrong}, {{ command = ['./mine'] }}"), dashboard, Role::Drone),
+            None
+        );
+        let unread = "{ run = 'detector', config = 'not-here.toml' }";
+        assert_eq!(of(&format!("{wrong}, {unread}"), dashboard, Role::Drone), None);
+        assert_eq!(of(controller, dashboard, Role::Drone), None, "none is named");
+        assert_eq!(of(&format!("{controller}, {tag}"), dashboard, Role::Drone), None);
     }
 
     #[test]

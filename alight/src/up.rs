@@ -9,12 +9,13 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::{Context, anyhow, bail};
+use anyhow::{Context, anyhow, bail, ensure};
 use clap::Args;
 use node::Shutdown;
 use tokio::process::Command;
 use tokio::time::Instant;
 
+use crate::args::WrongUse;
 use crate::children::{ChildEvent, Children, Exit, Reach, for_shell, without_network, word};
 use crate::notes::{Note, Notes};
 use crate::peers::{Peers, Replacement, STALE_AFTER};
@@ -33,7 +34,8 @@ pub(crate) struct UpArgs {
     /// The site: which processes run on which machine (TOML, `docs/deploy.md`).
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Print the processes without starting them; a program that is not found is an error, also one that reads a camera.
+    /// Print the processes without starting them; a program that is not found is an error, also one that reads a camera, and so is a
+    /// controller whose marker no detector of the site looks for.
     #[arg(long)]
     dry_run: bool,
 }
@@ -74,6 +76,11 @@ pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
         if let Some(problem) = missing.or_else(of_service) {
             bail!(problem);
         }
+    }
+    if let Some(problem) = site.marker_problem(args.role) {
+        // Another detector may be started by hand, and a landing that finds none is refused.
+        ensure!(!args.dry_run, WrongUse(problem));
+        say(&format!("warning: {problem}"));
     }
     if args.dry_run {
         return Ok(ExitCode::SUCCESS);
