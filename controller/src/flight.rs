@@ -371,7 +371,7 @@ impl Flight {
             Reception::Replaced(difference) => {
                 self.journal.camera_replaced(&camera, &difference);
                 // It may be mounted rightly now.
-                self.lander.repeat_axis_check();
+                self.lander.repeat_checks();
             }
             Reception::Refused(reason, _) => self.journal.reject_camera(reason),
         }
@@ -580,9 +580,9 @@ impl Flight {
                     .into(),
             );
         }
-        if let Some(mismatch) = self.lander.axis_mismatch() {
+        if let Some(mismatch) = self.lander.mismatch() {
             // As after a hold for it, the operator who goes on has it looked at again.
-            self.lander.repeat_axis_check();
+            self.lander.repeat_checks();
             return Err(format!("no landing was started: {mismatch}; a second start begins it"));
         }
         self.begin(now_ns);

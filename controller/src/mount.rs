@@ -8,8 +8,17 @@ use crate::refusals::Warning;
 /// the measurement (`landing`'s module `standing`).
 const MAX_STANDING_ERROR_M: f64 = 0.15;
 
-/// The warnings of what was measured in flight.
-pub fn warnings(found: &MountFindings) -> Vec<Warning> {
+/// The warnings of what was measured in flight. A marker that is so many times as large as configured makes all other errors, so it alone
+/// is told.
+pub fn warnings(found: &MountFindings, size_ratio: Option<f64>) -> Vec<Warning> {
+    if let Some(times) = size_ratio {
+        return vec![Warning {
+            matter: "marker-size".to_owned(),
+            text: format!(
+                "the marker seems {times:.1} times as large as configured: check the marker's size, the printed one and that of the detectors' `markers`"
+            ),
+        }];
+    }
     let degrees = |angle: Measured| {
         let [value, deviation] = [angle.value.abs(), angle.deviation].map(f64::to_degrees);
         format!("{value:.1} +- {deviation:.1} degrees")
@@ -54,9 +63,15 @@ pub fn warnings(found: &MountFindings) -> Vec<Warning> {
     .collect()
 }
 
-/// What is said of a vehicle that stands higher over the pad than configured; both in metres.
-pub fn standing_warning(measured_m: f64, configured_m: f64) -> Option<Warning> {
-    (measured_m - configured_m > MAX_STANDING_ERROR_M).then(|| Warning {
+/// What is said of a vehicle that stands higher over the pad than configured; both in metres. Nothing where the marker's size is wrong, by
+/// which the height was measured.
+pub fn standing_warning(
+    measured_m: f64,
+    configured_m: f64,
+    size_ratio: Option<f64>,
+) -> Option<Warning> {
+    let is_told = size_ratio.is_none() && measured_m - configured_m > MAX_STANDING_ERROR_M;
+    is_told.then(|| Warning {
         matter: "standing-height".to_owned(),
         text: format!(
             "the vehicle stood about {measured_m:.1} m over the pad, not {configured_m:.2} m: measure how high the autopilot sits over the ground, and write it into `metric.standing_height_m`"
@@ -70,20 +85,31 @@ mod tests {
 
     #[test]
     fn a_vehicle_that_stands_higher_than_configured_is_told() {
-        assert!(standing_warning(0.25, 0.2).is_none());
-        let text = standing_warning(0.25, 0.0).unwrap().text;
+        assert!(standing_warning(0.25, 0.2, None).is_none());
+        let text = standing_warning(0.25, 0.0, None).unwrap().text;
         assert!(text.contains("about 0.2 m") && text.contains("0.00 m"), "{text}");
     }
 
     #[test]
+    fn of_a_marker_of_another_size_nothing_is_told_that_was_measured_by_it() {
+        let pitch_rad = Some(Measured { value: 0.2, deviation: 0.01 });
+        let found = MountFindings { pitch_rad, ..MountFindings::default() };
+        let told = warnings(&found, Some(2.04));
+        let [warning] = told.as_slice() else { unreachable!("{told:?}") };
+        assert!(warning.text.starts_with("the marker seems 2.0 times as large as configured"));
+        assert!(standing_warning(0.5, 0.0, Some(2.04)).is_none());
+    }
+
+    #[test]
     fn angles_are_told_in_degrees_and_ratios_in_percent() {
-        assert!(warnings(&MountFindings::default()).is_empty());
+        assert!(warnings(&MountFindings::default(), None).is_empty());
         let found = MountFindings {
             pitch_rad: Some(Measured { value: -0.0541, deviation: 0.007 }),
             focal_ratio: Some(Measured { value: 0.05, deviation: 0.004 }),
             ..MountFindings::default()
         };
-        let texts: Vec<String> = warnings(&found).into_iter().map(|warning| warning.text).collect();
+        let texts: Vec<String> =
+            warnings(&found, None).into_iter().map(|warning| warning.text).collect();
         assert!(
             texts[0].contains("3.1 +- 0.4 degrees off in pitch, it looks further backward"),
             "{texts:?}"

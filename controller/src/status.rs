@@ -119,11 +119,14 @@ impl View<'_> {
         if is_asked && self.autopilot.lacks_link_delay(now_ns) {
             warnings.push(unknown_link());
         }
-        warnings.extend(mount::warnings(&self.lander.mount_findings()));
+        let size_ratio = self.lander.marker_size_ratio();
+        warnings.extend(mount::warnings(&self.lander.mount_findings(), size_ratio));
         let configured_m = self.config.metric.standing_height_m;
         let is_metric = self.config.guidance == GuidanceName::Metric;
         let measured_m = self.lander.standing_height_m().filter(|_| is_metric);
-        warnings.extend(measured_m.and_then(|it| mount::standing_warning(it, configured_m)));
+        warnings.extend(
+            measured_m.and_then(|it| mount::standing_warning(it, configured_m, size_ratio)),
+        );
         warnings
     }
 
@@ -175,7 +178,7 @@ impl View<'_> {
         let target = self.decision.and_then(|decision| decision.target);
         let is_ambiguous = target.is_some_and(|target| target.ambiguous);
         let dispute = is_disputed.then_some(Reason::Disputed);
-        self.lander.axis_mismatch().or(dispute).or(is_ambiguous.then_some(Reason::Ambiguous))
+        self.lander.mismatch().or(dispute).or(is_ambiguous.then_some(Reason::Ambiguous))
     }
 
     /// Whether a landing was to be resumed, and the motors of a vehicle run that is said to stand.

@@ -656,6 +656,38 @@ fn while_two_detectors_see_the_marker_at_two_places_nothing_descends_near_the_gr
 }
 
 #[test]
+fn a_marker_of_another_size_than_configured_is_told_and_holds() {
+    for (size, is_told) in [(1.0, false), (2.0, true)] {
+        let mut flight = flight("airborne");
+        flight.camera(0, CameraInfo::sample());
+        flight.presence(0, "main", true);
+        receive(&mut flight, 0, &heartbeat(4, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        for ms in (20..6000).step_by(20) {
+            if ms % 1000 == 0 {
+                receive(&mut flight, ms * MS, &heartbeat(4, true));
+            }
+            let height_at = |ms: i64| 10.0 - (ms as f32 / 1000.0 - 2.0).clamp(0.0, 3.0);
+            pose_at(&mut flight, ms * MS, height_at(ms));
+            if ms % 60 == 0 {
+                let mut seen = seen(ms * MS - 40 * MS);
+                let pose = seen.detections[0].pose.as_mut().unwrap();
+                let depth_m = f64::from(height_at(ms - 40)) / size;
+                pose.camera_from_marker.translation_m = [0.0, 0.0, depth_m];
+                flight.detections(ms * MS + 2, "main", &seen);
+            }
+            flight.tick(ms * MS + 3);
+        }
+        let status = flight.status(6000 * MS);
+        let text = "the marker seems 2.0 times as large as configured";
+        let is_warned = status.warnings.iter().any(|warning| warning.contains(text));
+        assert_eq!(is_warned, is_told, "{status:?}");
+        assert_eq!(status.phase == Phase::Hold, is_told, "{status:?}");
+        assert_eq!(status.why.contains("check the size of the printed marker"), is_told);
+    }
+}
+
+#[test]
 fn a_detector_with_another_first_corner_counts_where_the_vehicle_turns_to_the_pad() {
     let status_of = |set: &[&str]| {
         let set: Vec<&str> = ["marker=aruco-4x4-50:7"].iter().chain(set).copied().collect();

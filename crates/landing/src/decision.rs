@@ -245,6 +245,8 @@ named! {
         ImageMirrored = "image-mirrored", "the camera's image moves as if it were mirrored, holding: check the camera's settings";
         /// As above.
         AttitudeSign = "attitude-sign", "the camera's image moves as if roll or pitch had the wrong sign, holding: check mount and autopilot";
+        /// The marker does not come nearer as one of the configured size does.
+        MarkerSize = "marker-size", "the marker does not come nearer as one of the configured size does, holding: check the size of the printed marker and the one configured";
         /// The descent waits for motion that shows whether the axes of camera and autopilot match.
         AxisCheck = "axis-check", "checking camera/autopilot axis alignment before descending";
         /// The autopilot did not enter its LAND mode.

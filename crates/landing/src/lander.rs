@@ -2,6 +2,7 @@
 //! decision.
 
 mod aborted;
+mod checks;
 mod hovering;
 mod lost;
 mod marker;
@@ -9,8 +10,8 @@ mod marker;
 use aborted::AbortClimb;
 use geometry::{Ned, Odometry, Point, Vector};
 
-use crate::axis_check::{AxisConsistencyCheck, AxisError, Verdict};
-use crate::config::{AlarmAction, Config, GuidanceConfig};
+use crate::axis_check::AxisConsistencyCheck;
+use crate::config::{AlarmAction, Config};
 use crate::decision::{Action, Decision, Phase, Reason, Rejection, TargetEstimate};
 use crate::envelope;
 use crate::event::{
@@ -25,6 +26,7 @@ use crate::limits::ConfigError;
 use crate::mount_check::{MountCheck, MountFindings};
 use crate::repeated_picture::RepeatedPicture;
 use crate::search::Square;
+use crate::size_check::SizeCheck;
 use crate::standing::{
     MAX_STANDING_M_S, RememberedPad, Resumed, SeenPad, StandingHeight, may_stand,
     standing_height_m, to_remember,
@@ -98,6 +100,7 @@ pub struct Lander {
     guidance: ActiveGuidance,
     axis_check: AxisConsistencyCheck,
     mount_check: MountCheck,
+    size_check: SizeCheck,
     /// Stamp of the landing's first marker.
     first_seen: Option<Timestamp>,
     state_machine: StateMachine,
@@ -143,6 +146,7 @@ impl Lander {
             guidance: ActiveGuidance::new(config.guidance),
             axis_check: AxisConsistencyCheck::default(),
             mount_check: MountCheck::default(),
+            size_check: SizeCheck::default(),
             first_seen: None,
             state_machine: StateMachine::new(config.phases),
             land_requested: None,
@@ -191,7 +195,7 @@ impl Lander {
             operator.or_else(|| self.is_dispute_over().then_some(OperatorCommand::Resume));
         let alarm = reaction(&self.config.phases, event).or_else(|| self.dispute_alarm(now));
         if operator == Some(OperatorCommand::Resume) {
-            self.repeat_axis_check();
+            self.repeat_checks();
         }
         let inputs = Inputs {
             now,
@@ -204,7 +208,7 @@ impl Lander {
             target_known: self.has_target(now),
             target_refused: self.sightings.is_refused(now, self.config.phases.stale_target_s),
             progress: self.progress(now),
-            axis_mismatch: self.axis_mismatch(),
+            mismatch: self.mismatch(),
             may_descend: self.is_axis_check_done(now),
             is_link_slow: self.is_link_slow,
             may_stand: self.may_stand(now),
@@ -217,10 +221,8 @@ impl Lander {
         if has_started {
             self.guidance = ActiveGuidance::new(self.config.guidance);
             self.standing_height = StandingHeight::default();
+            self.repeat_checks();
             self.first_seen = None;
-            if self.axis_mismatch().is_some() {
-                self.axis_check = AxisConsistencyCheck::default();
-            }
             self.start = self.place().unwrap_or(Point::origin());
         }
         let (action, why) = self.act(now);
@@ -252,6 +254,7 @@ impl Lander {
     pub fn stand_down(&mut self) {
         self.state_machine.stand_down(self.now.unwrap_or_default());
         self.target_filter = TargetFilter::new(&self.config);
+        self.size_check.interrupt();
         (self.resumed, self.ground) = (None, None);
     }
 
@@ -468,41 +471,6 @@ impl Lander {
     fn pad_moves(&self) -> bool {
         let estimator = &self.config.estimator;
         estimator.pad_speed_m_s > 0.0 || estimator.pad_heave_m_s > 0.0
-    }
-
-    /// A moving pad shows nothing of the mount, and the thesis' guidance has no such check.
-    fn checks_axes(&self) -> bool {
-        let is_metric = matches!(self.config.guidance, GuidanceConfig::Metric(_));
-        is_metric
-            && self.config.phases.axis_check_s > 0.0
-            && self.config.estimator.pad_speed_m_s == 0.0
-    }
-
-    /// How the axes of camera and autopilot differ, once that is certain.
-    pub fn axis_mismatch(&self) -> Option<Reason> {
-        match self.axis_check.verdict() {
-            Verdict::Mismatch(error) if self.checks_axes() => Some(match error {
-                AxisError::Turned(_) => Reason::CameraTurned,
-                AxisError::Mirrored(_) => Reason::ImageMirrored,
-                AxisError::RollSign | AxisError::PitchSign => Reason::AttitudeSign,
-            }),
-            _ => None,
-        }
-    }
-
-    /// A vehicle that holds because of the axes and is told to go on looks at them again.
-    pub fn repeat_axis_check(&mut self) {
-        if self.axis_mismatch().is_some() {
-            self.axis_check = AxisConsistencyCheck::default();
-            self.first_seen = None;
-        }
-    }
-
-    /// True once the axes are consistent, or the time allowed for the check is over.
-    fn is_axis_check_done(&self, now: Timestamp) -> bool {
-        let waited_s = self.first_seen.map_or(0.0, |seen| now.seconds_since(seen));
-        let is_over = waited_s > self.config.phases.axis_check_s;
-        !self.checks_axes() || is_over || self.axis_check.verdict() == Verdict::Consistent
     }
 
     fn has_target(&self, now: Timestamp) -> bool {

@@ -17,7 +17,8 @@
 //! - [`guidance`]: from the target to a velocity. [`search`]: where to look for the marker. `hover`: how
 //!   to stay at a place.
 //! - [`axis_check`]: are the axes of camera and autopilot consistent? [`mount_check`]: by how much are they off?
-//!   `standing`: how high does the vehicle stand, and does it? `repeated_picture`: is what the camera shows an old picture?
+//!   `size_check`: is the marker as large as configured? `standing`: how high does the vehicle stand, and does it?
+//!   `repeated_picture`: is what the camera shows an old picture?
 //! - [`state_machine`]: the phases. [`envelope`]: the last check of a setpoint.
 //! - [`lander`] joins them.
 
@@ -41,6 +42,7 @@ mod measurement;
 pub mod mount_check;
 mod repeated_picture;
 pub mod search;
+mod size_check;
 mod standing;
 pub mod state_machine;
 mod target_filter;

@@ -34,7 +34,7 @@
 //! | the operator's abort | Aborted; in LAND only above `no_return_height_m`, back to GUIDED |
 //! | `landing_timeout_s` over | Aborted; not in Final |
 //! | the operator's hold | Hold; ignored in LAND and while it is asked for |
-//! | the axes of camera and autopilot do not match | Hold |
+//! | the axes of camera and autopilot, or the marker's size, are not as configured | Hold |
 //! | the vehicle's state is stale, or its mode not known | Hold; Final waits |
 //! | the link to the autopilot is slow | Hold |
 //! | a mode that is neither GUIDED nor the requested LAND; GUIDED again in LAND, `MAX_OVERTAKEN_S` after it began | PilotInCommand |
@@ -105,9 +105,9 @@ pub struct Inputs {
     pub target_refused: bool,
     /// The progress of the guidance.
     pub progress: Progress,
-    /// How the axes of camera and autopilot differ; `None` while nothing shows it.
-    pub axis_mismatch: Option<Reason>,
-    /// False while that check is still running.
+    /// What shows that the axes of the camera or the marker's size are not as configured; `None` while nothing does.
+    pub mismatch: Option<Reason>,
+    /// False while the check of the axes is still running.
     pub may_descend: bool,
     /// The link to the autopilot is too slow to steer over it.
     pub is_link_slow: bool,
@@ -475,7 +475,7 @@ impl StateMachine {
         }
         let is_moving =
             matches!(self.phase, Phase::Search | Phase::Approach | Phase::Descend | Phase::Retry);
-        if let Some(reason) = inputs.axis_mismatch.filter(|_| is_moving) {
+        if let Some(reason) = inputs.mismatch.filter(|_| is_moving) {
             return Some((Phase::Hold, reason));
         }
         let on_ground = inputs.vehicle.is_some_and(|vehicle| vehicle.landed == Landed::OnGround);
@@ -648,6 +648,7 @@ impl StateMachine {
                 | Reason::BatteryCritical
                 | Reason::OperatorLost
                 | Reason::Disputed
+                | Reason::MarkerSize
         );
         let timeout_s = if by_operator {
             self.config.operator_hold_timeout_s

@@ -26,6 +26,11 @@ impl Lander {
                 self.sightings.forget_since(since);
                 return Err(Rejection::RepeatedPicture);
             }
+            if stands {
+                self.size_check.interrupt();
+            } else {
+                self.size_check.observe(&self.config.estimator, frame, marker, &self.history);
+            }
             if let Some(pose) = marker.body_from_marker {
                 self.axis_check.add(frame.stamp, &motion, pose.origin());
             }

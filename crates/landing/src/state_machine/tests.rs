@@ -28,7 +28,7 @@ fn at(seconds: f64) -> Inputs {
         target_known: false,
         target_refused: false,
         progress: Progress::Unchanged,
-        axis_mismatch: None,
+        mismatch: None,
         may_descend: true,
         is_link_slow: false,
         may_stand: false,
@@ -411,7 +411,7 @@ fn an_abort_before_the_vehicle_shows_land_calls_it_back_all_the_same() {
 fn an_axis_mismatch_holds_and_a_running_check_delays_the_descent() {
     let open = Inputs { may_descend: false, ..seen(2.0, Progress::Descending) };
     check(&[start(), seen(1.0, Progress::Unchanged), open], Phase::Approach, Reason::Aligning);
-    let turned = Inputs { axis_mismatch: Some(Reason::CameraTurned), ..open };
+    let turned = Inputs { mismatch: Some(Reason::CameraTurned), ..open };
     let all = [start(), seen(1.0, Progress::Unchanged), turned, turned];
     check(&all, Phase::Hold, Reason::CameraTurned);
     check(&[all[0], all[1], all[2], at(63.0)], Phase::Aborted, Reason::HeldTooLong);

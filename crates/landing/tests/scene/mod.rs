@@ -113,6 +113,8 @@ pub(crate) struct Sample {
     pub(crate) pad: Point<Ned>,
     /// What is certain of the camera's mount.
     pub(crate) mount: MountFindings,
+    /// How many times as large as configured the marker is told to be.
+    pub(crate) size: Option<f64>,
     /// For how long it has been on the ground, in seconds.
     pub(crate) on_ground_s: f64,
 }
@@ -249,7 +251,7 @@ impl Scene {
             for event in run.events(step).into_iter().filter(|_| !is_silent) {
                 let decision = lander.step(Timestamp::from_seconds(run.seconds()), event);
                 run.obey(decision, matches!(event, Event::Frame(_)));
-                flight.note(&run, decision, lander.mount_findings());
+                flight.note(&run, decision, &lander);
             }
             flight.watch(&run, &before);
             step += 1;
@@ -282,13 +284,14 @@ impl Flight {
         }
     }
 
-    fn note(&mut self, run: &Run<'_>, decision: Decision, mount: MountFindings) {
+    fn note(&mut self, run: &Run<'_>, decision: Decision, lander: &Lander) {
+        let (mount, size) = (lander.mount_findings(), lander.marker_size_ratio());
         self.aborted |= decision.phase == Phase::Aborted && self.touchdown.is_none();
         let position = run.world.truth().position;
         let pad = run.world.pad_at(run.world.now_s()).position;
         let seconds = run.seconds();
         let on_ground_s = self.on_ground_since_s.map_or(0.0, |since_s| seconds - since_s);
-        self.samples.push(Sample { seconds, position, decision, pad, mount, on_ground_s });
+        self.samples.push(Sample { seconds, position, decision, pad, mount, size, on_ground_s });
     }
 
     fn watch(&mut self, run: &Run<'_>, before: &VehicleTruth) {

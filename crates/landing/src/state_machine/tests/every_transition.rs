@@ -133,7 +133,7 @@ fn alphabet() -> Vec<Inputs> {
                             target_known,
                             target_refused: false,
                             progress,
-                            axis_mismatch: None,
+                            mismatch: None,
                             may_descend: true,
                             is_link_slow: false,
                             may_stand: false,
@@ -148,7 +148,7 @@ fn alphabet() -> Vec<Inputs> {
     all.push(Inputs { target_refused: true, target_known: true, now: now(), ..at(0.0) });
     all.push(Inputs { may_stand: true, now: now(), ..at(0.0) });
     all.push(Inputs { may_stand: true, target_known: true, now: now(), ..at(0.0) });
-    all.push(Inputs { axis_mismatch: turned, may_descend: false, now: now(), ..at(0.0) });
+    all.push(Inputs { mismatch: turned, may_descend: false, now: now(), ..at(0.0) });
     all
 }
 

@@ -1,0 +1,60 @@
+//! What the lander checks of camera and marker before and while it descends: whether the axes of camera and autopilot agree, and whether
+//! the marker is as large as configured.
+
+use super::Lander;
+use crate::axis_check::{AxisConsistencyCheck, AxisError, Verdict};
+use crate::config::GuidanceConfig;
+use crate::decision::Reason;
+use crate::size_check::SizeCheck;
+use crate::time::Timestamp;
+
+impl Lander {
+    /// What shows that camera or marker are not as configured, once that is certain: nothing may descend.
+    pub fn mismatch(&self) -> Option<Reason> {
+        let size = self.size_check.is_refused().then_some(Reason::MarkerSize);
+        self.axis_mismatch().or(size)
+    }
+
+    /// How many times as large as configured the marker is, once that is certain and far from one.
+    pub fn marker_size_ratio(&self) -> Option<f64> {
+        self.size_check.ratio()
+    }
+
+    /// A vehicle that holds because of a mismatch and is told to go on looks at it again.
+    pub fn repeat_checks(&mut self) {
+        if self.axis_mismatch().is_some() {
+            self.axis_check = AxisConsistencyCheck::default();
+            self.first_seen = None;
+        }
+        if self.size_check.is_refused() {
+            self.size_check = SizeCheck::default();
+        }
+    }
+
+    /// A moving pad shows nothing of the mount, and the thesis' guidance has no such check.
+    fn checks_axes(&self) -> bool {
+        let is_metric = matches!(self.config.guidance, GuidanceConfig::Metric(_));
+        is_metric
+            && self.config.phases.axis_check_s > 0.0
+            && self.config.estimator.pad_speed_m_s == 0.0
+    }
+
+    /// How the axes of camera and autopilot differ.
+    fn axis_mismatch(&self) -> Option<Reason> {
+        match self.axis_check.verdict() {
+            Verdict::Mismatch(error) if self.checks_axes() => Some(match error {
+                AxisError::Turned(_) => Reason::CameraTurned,
+                AxisError::Mirrored(_) => Reason::ImageMirrored,
+                AxisError::RollSign | AxisError::PitchSign => Reason::AttitudeSign,
+            }),
+            _ => None,
+        }
+    }
+
+    /// True once the axes are consistent, or the time allowed for the check is over.
+    pub(super) fn is_axis_check_done(&self, now: Timestamp) -> bool {
+        let waited_s = self.first_seen.map_or(0.0, |seen| now.seconds_since(seen));
+        let is_over = waited_s > self.config.phases.axis_check_s;
+        !self.checks_axes() || is_over || self.axis_check.verdict() == Verdict::Consistent
+    }
+}
