@@ -67,7 +67,8 @@ pub fn run(
 async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name("*").await?;
     let address: Address = config.autopilot.address.parse()?;
-    let peering = Peering::Autopilot { system: config.system_id() };
+    let wanted = config.system_id();
+    let peering = Peering::Autopilot { system: wanted };
     let permission: Permission = config.autopilot.ground_may.parse()?;
     let mut link = Link::open_for(address, peering, config.signing()?)
         .await
@@ -185,7 +186,8 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
         pad_file.keep(flight.flight().pad_note());
         send(&node, &link, &mut flight);
         tapes.pass_on(&mut flight);
-        reports.publish(flight.flight(), &unreadable).await;
+        let instead = || link.heard().instead(wanted);
+        reports.publish(flight.flight(), &unreadable, instead).await;
     }
     let deadline = tokio::time::Instant::now() + SHUTDOWN_TIMEOUT;
     while flight.shutdown(now_ns()) && tokio::time::Instant::now() < deadline {
@@ -424,8 +426,14 @@ impl Reports {
         }
     }
 
-    /// Publishes the vehicle at its rate, and the status when it changes or is due.
-    async fn publish(&mut self, flight: &Flight, unreadable: &UnreadableDetections) {
+    /// Publishes the vehicle at its rate, and the status when it changes or is due, with what could not be read, and with what came
+    /// over the link before the first heartbeat.
+    async fn publish(
+        &mut self,
+        flight: &Flight,
+        unreadable: &UnreadableDetections,
+        instead: impl FnOnce() -> String,
+    ) {
         let now = now_ns();
         if now.saturating_sub(self.vehicle_ns) >= VEHICLE_PERIOD_NS
             && let Some(vehicle) = flight.vehicle()
@@ -439,6 +447,9 @@ impl Reports {
         self.checked_ns = now;
         let mut status = flight.status(now);
         unreadable.tell(now, &mut status);
+        if flight.system().is_none() {
+            status.autopilot = instead();
+        }
         let is_due = self.last.as_ref().is_none_or(|last| {
             now - last.stamp_ns >= STATUS_PERIOD_NS
                 || (&last.phase, &last.active_detector, last.finished, last.waits_for_operator)

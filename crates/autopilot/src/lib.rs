@@ -32,6 +32,7 @@ mod contact;
 pub mod event;
 mod gate;
 mod given;
+pub mod heard;
 pub mod key_file;
 pub mod link;
 pub mod mode;

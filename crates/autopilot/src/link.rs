@@ -6,7 +6,7 @@
 //! bounded, the oldest received packet is dropped, and a packet that cannot be sent is refused, because a
 //! late command is a wrong one.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::future::poll_fn;
 use std::io;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -25,6 +25,7 @@ use tokio_serial::{SerialPort, SerialPortBuilderExt, SerialStream};
 
 use crate::address::{Address, Endpoint};
 use crate::gate::{Admitted, Gate};
+use crate::heard::{Heard, note_systems};
 use crate::key_file::{SigningConfig, StampFile};
 use crate::packet::{Counters, Packet, Parser};
 use crate::peers::{PACKET_GAP, Peering, Peers};
@@ -244,6 +245,11 @@ impl Link {
         *self.shared.counters.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// What was heard since the link was opened.
+    pub fn heard(&self) -> Heard {
+        Heard::new(self.shared.systems().clone(), self.counters())
+    }
+
     /// Number of packets and connections of others than the peer, which were dropped.
     pub fn strangers(&self) -> u64 {
         self.shared.strangers.load(Ordering::Relaxed)
@@ -337,6 +343,8 @@ struct Shared {
     replaced: AtomicU64,
     strangers: AtomicU64,
     counters: Mutex<Counters>,
+    /// Systems whose autopilots sent a heartbeat.
+    systems: Mutex<BTreeSet<u8>>,
     refusals: Mutex<Refusals>,
     peer_signs: AtomicBool,
     opened: Instant,
@@ -356,6 +364,7 @@ impl Shared {
             replaced: AtomicU64::new(0),
             strangers: AtomicU64::new(0),
             counters: Mutex::new(Counters::default()),
+            systems: Mutex::new(BTreeSet::new()),
             refusals: Mutex::new(Refusals::default()),
             peer_signs: AtomicBool::new(false),
             opened: Instant::now(),
@@ -379,6 +388,10 @@ impl Shared {
             }
             self.newest_waits.notified().await;
         }
+    }
+
+    fn systems(&self) -> MutexGuard<'_, BTreeSet<u8>> {
+        self.systems.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn push(&self, event: LinkEvent) {
@@ -468,6 +481,7 @@ impl Port {
         self.keep_stamps();
         self.count_refusals();
         self.note_signatures(&packets);
+        note_systems(&mut self.shared.systems(), &packets);
         let received = Instant::now();
         for packet in packets {
             self.shared.push(LinkEvent::Packet { packet: Box::new(packet), received });

@@ -344,6 +344,42 @@ async fn a_serial_line_carries_packets_both_ways_and_its_end_is_noticed() {
 }
 
 #[tokio::test]
+async fn what_comes_instead_of_the_heartbeat_is_told() {
+    let peering = Peering::Autopilot { system: Some(7) };
+    let address = "udpin:127.0.0.1:0".parse().unwrap();
+    let mut link = Link::open_for(address, peering, None).await.unwrap();
+    let at = link.local_address().unwrap();
+    assert!(link.heard().instead(Some(7)).ends_with("nothing came"));
+    let autopilot = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    autopilot.send_to(&heartbeat(true), at).await.unwrap();
+    packet(&mut link).await;
+    let told = link.heard().instead(Some(7));
+    assert!(told.contains("no heartbeat of system 7 yet, but of 1"), "{told}");
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn bytes_at_another_speed_are_told_as_such() {
+    use tokio_serial::SerialPort;
+    let (mut autopilot, end) = tokio_serial::SerialStream::pair().unwrap();
+    let device = end.name().unwrap();
+    let mut link = open(format!("serial:{device}:115200")).await;
+    peer(&mut link).await;
+    autopilot.write_all(&[0x55; 400]).await.unwrap();
+    let told = timeout(PATIENCE, async {
+        loop {
+            let told = link.heard().instead(None);
+            if told.contains("no MAVLink packet") {
+                return told;
+            }
+            sleep(Duration::from_millis(10)).await;
+        }
+    });
+    let told = told.await.expect("the bytes are told of");
+    assert!(told.contains("speed (baud)"), "{told}");
+}
+
+#[tokio::test]
 async fn a_reader_that_sleeps_gets_the_newest_packets() {
     let mut link = open("udpin:127.0.0.1:0".into()).await;
     let at = link.local_address().unwrap();
