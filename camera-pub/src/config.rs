@@ -233,6 +233,14 @@ struct MountConfig {
     rotation_wxyz: [f64; 4],
 }
 
+/// Maximum distance of a camera from the vehicle's origin along each axis, in metres.
+const MAX_MOUNT_M: f64 = 5.0;
+/// The values of `mount.roll_pitch_yaw_deg` and `mount.rotation_wxyz` in `camera-pub.toml`, which say nothing.
+const UNUSED_DEG: [f64; 3] = [0.0, 0.0, 90.0];
+const UNUSED_WXYZ: [f64; 4] = [1.0, 0.0, 0.0, 0.0];
+/// By how much of an eighth of a turn an angle in radians may be rounded: 1.57 is.
+const MAX_RADIANS_OFF: f64 = 3e-3;
+
 /// Frame rates that a source may have, in Hz.
 pub(crate) const RATES_HZ: std::ops::RangeInclusive<f64> = 0.01..=1000.0;
 
@@ -667,7 +675,10 @@ impl MountConfig {
         let within = |values: &[f64], max: f64| values.iter().all(|v| (-max..=max).contains(v));
         check.parses(
             "mount.translation_m",
-            holds(within(&self.translation_m, 100.0), "each must be from -100 to 100"),
+            holds(
+                within(&self.translation_m, MAX_MOUNT_M),
+                "each must be from -5 to 5: it is in metres, from the autopilot to the camera",
+            ),
         );
         check.one_of(
             "mount.orientation",
@@ -677,6 +688,27 @@ impl MountConfig {
         check.parses(
             "mount.roll_pitch_yaw_deg",
             holds(within(&self.roll_pitch_yaw_deg, 360.0), "each must be from -360 to 360"),
+        );
+        check.parses(
+            "mount.roll_pitch_yaw_deg",
+            holds(
+                !self.roll_pitch_yaw_deg.iter().any(|&angle| is_radians(angle)),
+                "these look like radians: write degrees, 90 for a quarter turn",
+            ),
+        );
+        check.parses(
+            "mount.roll_pitch_yaw_deg",
+            holds(
+                self.orientation == "angles" || self.roll_pitch_yaw_deg == UNUSED_DEG,
+                "it has no effect with this `mount.orientation`: set that to angles, or leave this out",
+            ),
+        );
+        check.parses(
+            "mount.rotation_wxyz",
+            holds(
+                self.orientation == "quaternion" || self.rotation_wxyz == UNUSED_WXYZ,
+                "it has no effect with this `mount.orientation`: set that to quaternion, or leave this out",
+            ),
         );
         check.parses(
             "mount.rotation_wxyz",
@@ -696,6 +728,13 @@ impl MountConfig {
             _ => Some(Rotation::from_euler(0.0, 0.0, std::f64::consts::FRAC_PI_2)),
         }
     }
+}
+
+/// Whether an angle of a mount is an eighth of a turn or a multiple of it in radians: in degrees no mount is made to such digits.
+fn is_radians(angle: f64) -> bool {
+    let eighths = angle / std::f64::consts::FRAC_PI_4;
+    let nearest = eighths.round();
+    (1.0..=8.0).contains(&nearest.abs()) && (eighths - nearest).abs() < MAX_RADIANS_OFF
 }
 
 fn holds(holds: bool, otherwise: &'static str) -> Result<(), &'static str> {
@@ -737,6 +776,8 @@ mod tests {
     #[test]
     fn angles_and_quaternions_agree() {
         let down = load(&[]).unwrap().body_from_camera();
+        let straight = ["mount.orientation=angles", "mount.roll_pitch_yaw_deg=[0, 1.5, -90]"];
+        assert!(load(&straight).is_ok());
         let angles = load(&["mount.orientation=angles"]).unwrap().body_from_camera();
         let quaternion =
             load(&["mount.orientation=quaternion", "mount.rotation_wxyz=[1, 0, 0, 1]"]).unwrap();
@@ -822,7 +863,14 @@ mod tests {
         check(&["calibration.distortion=[1]"], "`calibration.lens`");
         check(&["calibration.lens=kannala-brandt"], "4 coefficients");
         check(&["mount.orientation=up"], "down, forward");
-        check(&["mount.translation_m=[0, 0, 1000]"], "-100 to 100");
+        check(&["mount.translation_m=[0, 0, 12]"], "-5 to 5: it is in metres");
+        let angles =
+            |deg: &'static str, part: &str| check(&["mount.orientation=angles", deg], part);
+        angles("mount.roll_pitch_yaw_deg=[0, 0, 1.5708]", "look like radians");
+        angles("mount.roll_pitch_yaw_deg=[0.02, -0.78539816, 1.57]", "look like radians");
+        check(&["mount.roll_pitch_yaw_deg=[0, 0, 180]"], "set that to angles");
+        check(&["mount.rotation_wxyz=[0, 0, 0, 1]"], "set that to quaternion");
+        check(&["mount.roll_pitch_yaw_rad=[0, 0, 1.5]"], "did you mean `mount.roll_pitch_yaw_deg`");
         check(&["mount.orientation=quaternion", "mount.rotation_wxyz=[0,0,0,0]"], "a quaternion");
         check(&["source.path='x'"], "did you mean `source.paths`");
         check(&["source.command=['cat']"], "`source.size_px` is [0, 0]");

@@ -112,6 +112,10 @@ pub(super) fn changes(flight: &RecordedFlight, result: &FlightCalibration) -> Ch
     if turns.into_iter().any(|quantity| correction(quantity).is_some()) {
         let [w, x, y, z] = result.camera.body_from_camera.rotation().wxyz();
         set("mount", "orientation", "\"quaternion\"".to_owned());
+        // Angles that have no effect any more are refused.
+        if matches!(before(flight, "mount", "roll_pitch_yaw_deg"), Before::Was(_)) {
+            set("mount", "roll_pitch_yaw_deg", "[0.0, 0.0, 90.0]".to_owned());
+        }
         set("mount", "rotation_wxyz", format!("[{w:.9}, {x:.9}, {y:.9}, {z:.9}]"));
     }
     Changes { advice, ..changes }
