@@ -70,7 +70,11 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let infos = node.publisher(topic::CAMERA_INFO, &[config.instance()]).await?;
     infos.publish(&info).await;
     let stream = Stream::new(&node, &config, &found).await?;
-    node.announce().await?;
+    // Images were found and can be read. A camera may be away yet, or not have begun.
+    match found.source {
+        Source::Images(_) => node.announce().await?,
+        _ => node.announce_as("Present, waiting for the first frame").await?,
+    }
     tokio::select! {
         result = on_own_thread(stream, found.source, shutdown) => result,
         never = republish(&infos, &info) => match never {},
@@ -733,6 +737,10 @@ impl Stream {
             self.rect.offer(&header, grey);
         }
         self.frames.publish(&header, frame.pixels).await;
+        if self.sequence == 0 {
+            let instance = self.config.instance();
+            tracing::info!(instance, "Ready, the first frame is published");
+        }
         self.sequence += 1;
     }
 }

@@ -302,13 +302,21 @@ impl Node {
     /// # Errors
     /// When the session is closed.
     pub fn announce(&self) -> BoxFuture<'_, anyhow::Result<()>> {
+        self.announce_as("Ready")
+    }
+
+    /// Announces that the service is there, and logs what it is or waits for: one that says more later logs that itself.
+    ///
+    /// # Errors
+    /// When the session is closed.
+    pub fn announce_as<'a>(&'a self, what: &'a str) -> BoxFuture<'a, anyhow::Result<()>> {
         Box::pin(async move {
             let key = topic::alive_key(self.identity.service, &self.identity.instance);
             let token = self.declare(&key).await?;
             *self.token.lock().unwrap_or_else(PoisonError::into_inner) = Some(token);
             // The announcement replaces the claim.
             drop(self.claim.lock().unwrap_or_else(PoisonError::into_inner).take());
-            tracing::info!(service = self.identity.service, instance = %self.identity.instance, "Ready");
+            tracing::info!(service = self.identity.service, instance = %self.identity.instance, "{what}");
             Ok(())
         })
     }
