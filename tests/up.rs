@@ -425,10 +425,53 @@ fn a_dry_run_says_what_would_be_run_and_a_mistake_is_named() -> anyhow::Result<(
     let text = String::from_utf8_lossy(&output.stderr);
     let named = "camera-pub: there is no program `no-such-camera` in the PATH";
     ensure!(output.status.code() == Some(1) && text.contains(named), "{output:?}");
+    let port =
+        "[[local]]\nrun = 'controller'\nset = ['autopilot.address=serial:/dev/no-such:921600']\n";
+    let device = "[[local]]\nrun = 'camera-pub'\nset = ['source.device=/dev/no-video', 'source.size_px=[64, 48]']\n";
+    std::fs::write(folder.path().join("site.toml"), format!("{port}{device}"))?;
+    let output = alight(folder.path(), &["up", "local", "--dry-run"])?;
+    let text = String::from_utf8_lossy(&output.stderr);
+    let are_named =
+        text.contains("no device /dev/no-such") && text.contains("no device /dev/no-video");
+    ensure!(output.status.code() == Some(1) && are_named, "{output:?}");
+    ensure!(String::from_utf8_lossy(&output.stdout).lines().count() == 2, "{output:?}");
     std::fs::write(folder.path().join("site.toml"), "[[drone]]\nrun = 'detectr'\n")?;
     let output = alight(folder.path(), &["up", "drone", "--dry-run"])?;
     let text = String::from_utf8_lossy(&output.stderr);
     ensure!(output.status.code() == Some(2) && text.contains("detectr"), "{output:?}");
+    Ok(())
+}
+
+#[test]
+fn a_camera_is_ready_once_its_first_frame_is_there() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let ([meet], _, _) = ports::free()?;
+    let frames = "while [ ! -e go ]; do sleep 0.05; done; while :; do head -c 3072 /dev/urandom; sleep 0.1; done";
+    let mut camera = Command::new(ALIGHT)
+        .args(["camera-pub", "--set", &format!("source.command=['sh', '-c', '{frames}']")])
+        .args(["--set", "source.size_px=[64, 48]", "--set", "source.rate_hz=10"])
+        .args(["--set", "source.timeout_s=60", "--meet", &meet.to_string()])
+        .current_dir(folder.path())
+        .env("ALIGHT_LOG", "info")
+        .stdin(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()?;
+    let said = BufReader::new(camera.stderr.take().context("standard error")?).lines();
+    let mut has_waited = false;
+    let mut is_ready = false;
+    for line in said.map_while(Result::ok) {
+        println!("{line}");
+        if line.contains("waiting for the first frame") {
+            has_waited = true;
+            std::fs::write(folder.path().join("go"), "")?;
+        } else if line.contains("Ready") {
+            is_ready = true;
+            break;
+        }
+    }
+    camera.kill()?;
+    camera.wait()?;
+    ensure!(has_waited && is_ready, "waited: {has_waited}, ready: {is_ready}");
     Ok(())
 }
 

@@ -29,6 +29,43 @@ pub(crate) fn missing_of_service(job: &Job, folder: &Path, search: &OsStr) -> Op
     })
 }
 
+/// The devices and files that a service reads and that are not there, with what to do: the autopilot's serial port, a camera, images, a
+/// calibration.
+pub(crate) fn missing_devices(job: &Job, folder: &Path) -> Vec<String> {
+    let Some(config) = job.service.and_then(|it| it.effective_config(&job.layers).ok()) else {
+        return Vec::new();
+    };
+    let text = |table: &str, key: &str| {
+        let value = config.get(table).and_then(|table| table.get(key));
+        value.and_then(toml::Value::as_str).filter(|text| !text.is_empty())
+    };
+    let mut wanted: Vec<(String, &str, &str)> = Vec::new();
+    match job.service {
+        Some(Service::Controller) => {
+            let settings = job.layers.load::<controller::Config>().map(|it| it.settings);
+            let device = settings.ok().and_then(|it| it.serial_device());
+            let advice = "connect the autopilot, or correct `autopilot.address`";
+            wanted.extend(device.map(|device| (device, "device", advice)));
+        }
+        Some(Service::CameraPub) => {
+            let device = text("source", "device").map(str::to_owned);
+            let advice = "connect the camera (`alight cameras` lists those that are there), or correct `source.device`";
+            wanted.extend(device.map(|device| (device, "device", advice)));
+            let paths = config.get("source").and_then(|it| it.get("paths")?.as_array());
+            let paths = paths.into_iter().flatten().filter_map(toml::Value::as_str);
+            wanted.extend(paths.map(|path| (path.to_owned(), "file", "correct `source.paths`")));
+            let file = text("calibration", "file").map(str::to_owned);
+            let advice =
+                "calibrate the camera (`alight calibrate board`), or correct `calibration.file`";
+            wanted.extend(file.map(|file| (file, "file", advice)));
+        }
+        _ => {}
+    }
+    wanted.retain(|(path, _, _)| std::fs::metadata(folder.join(path)).is_err());
+    let told = |(path, what, advice)| format!("{}: there is no {what} {path}; {advice}", job.name);
+    wanted.into_iter().map(told).collect()
+}
+
 fn absent(program: &str, folder: &Path, search: &OsStr) -> Option<String> {
     let is_program = |path: PathBuf| {
         let found = std::fs::metadata(path);
@@ -87,6 +124,30 @@ mod tests {
         }
         std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o644)).unwrap();
         assert!(told("there").is_some(), "it may not be run");
+    }
+
+    #[test]
+    fn devices_and_files_that_are_not_there_are_named() {
+        let folder = folder();
+        let told = |service, set: &[&str]| missing_devices(&job(service, &[], set), folder.path());
+        let line = told(Service::Controller, &["autopilot.address=serial:/dev/no-such:57600"]);
+        assert!(
+            line[0].contains("controller: there is no device /dev/no-such; connect"),
+            "{line:?}"
+        );
+        let line = told(Service::Controller, &["autopilot.address=udpin:0.0.0.0:14550"]);
+        assert_eq!(line, Vec::<String>::new());
+        let size = "source.size_px=[64, 48]";
+        let camera = told(
+            Service::CameraPub,
+            &["source.device=/dev/video-no", size, "calibration.file=c.yaml"],
+        );
+        assert!(
+            camera[0].contains("no device /dev/video-no") && camera[1].contains("no file c.yaml"),
+            "{camera:?}"
+        );
+        assert_eq!(told(Service::CameraPub, &["source.paths=['there']"]), Vec::<String>::new());
+        assert_eq!(told(Service::CameraPub, &["source.paths=['not-there']"]).len(), 1);
     }
 
     #[test]

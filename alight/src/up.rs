@@ -2,24 +2,24 @@
 //! growing pause, and stops them in reverse order.
 
 use std::collections::VecDeque;
+use std::ffi::OsStr;
 use std::io::ErrorKind;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::{Context, anyhow, bail, ensure};
+use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use node::Shutdown;
 use tokio::process::Command;
 use tokio::time::Instant;
 
-use crate::args::WrongUse;
 use crate::children::{ChildEvent, Children, Exit, Reach, for_shell, without_network, word};
 use crate::notes::{Note, Notes};
 use crate::peers::{Peers, Replacement, STALE_AFTER};
-use crate::programs::{OWN_PROGRAM, missing, missing_of_service};
+use crate::programs::{OWN_PROGRAM, missing, missing_devices, missing_of_service};
 use crate::runtime::block_on;
 use crate::services::Service;
 use crate::site::{Job, Role, Site};
@@ -34,8 +34,8 @@ pub(crate) struct UpArgs {
     /// The site: which processes run on which machine (TOML, `docs/deploy.md`).
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Print the processes without starting them; a program that is not found is an error, also one that reads a camera, and so is a
-    /// controller whose marker no detector of the site looks for.
+    /// Print the processes without starting them. What is not there is named, with exit status 1: a program (also one that reads a
+    /// camera), the autopilot's serial port, a camera's device, images, a calibration, a detector that looks for the controller's marker.
     #[arg(long)]
     dry_run: bool,
 }
@@ -69,25 +69,44 @@ pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
         }
     }
     let search = std::env::var_os("PATH").unwrap_or_default();
-    for job in &jobs {
-        let missing = missing(job, &site.folder, &search);
-        // In the air the others go on without a camera; its publisher tells what it lacks, and is started again.
-        let of_service = || missing_of_service(job, &site.folder, &search).filter(|_| args.dry_run);
-        if let Some(problem) = missing.or_else(of_service) {
-            bail!(problem);
-        }
+    let marker_problem = site.marker_problem(args.role);
+    if args.dry_run {
+        return tell_missing(&jobs, &site.folder, &search, marker_problem);
     }
-    if let Some(problem) = site.marker_problem(args.role) {
-        // Another detector may be started by hand, and a landing that finds none is refused.
-        ensure!(!args.dry_run, WrongUse(problem));
+    // Another detector may be started by hand, and a landing that finds none is refused.
+    if let Some(problem) = marker_problem {
         say(&format!("warning: {problem}"));
     }
-    if args.dry_run {
-        return Ok(ExitCode::SUCCESS);
+    // In the air the others go on without a camera; its publisher tells what it lacks, and is started again.
+    if let Some(problem) = jobs.iter().find_map(|job| missing(job, &site.folder, &search)) {
+        bail!(problem);
     }
     let _only = only_supervisor(&site.instance(args.role))?;
     node::start_logging("warn");
     block_on(supervise(&site, args.role, jobs))?
+}
+
+/// Tells all that the processes lack on this machine, and that their controller lacks a detector of its marker.
+fn tell_missing(
+    jobs: &[Job],
+    folder: &Path,
+    search: &OsStr,
+    marker_problem: Option<String>,
+) -> anyhow::Result<ExitCode> {
+    let of_job = |job: &Job| {
+        let programs = [missing(job, folder, search), missing_of_service(job, folder, search)];
+        programs.into_iter().flatten().chain(missing_devices(job, folder)).collect::<Vec<_>>()
+    };
+    let lacking: Vec<String> = jobs.iter().flat_map(of_job).chain(marker_problem).collect();
+    match lacking.split_last() {
+        None => Ok(ExitCode::SUCCESS),
+        Some((last, [])) => bail!(last.clone()),
+        Some(_) => bail!(
+            "{} things are missing on this machine:\n  {}",
+            lacking.len(),
+            lacking.join("\n  ")
+        ),
+    }
 }
 
 /// Takes the place of the only supervisor with this name, until what is returned is dropped: a second one would start every process
