@@ -8,7 +8,7 @@ mod focus;
 mod keys;
 mod ports;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 use std::io::{Error, ErrorKind};
 use std::path::{Path, PathBuf};
@@ -372,6 +372,8 @@ struct Seen {
     status: Option<ControllerStatus>,
     /// What came of each detector's detections, by its name; some detectors tell no health.
     detectors: BTreeMap<String, Searched>,
+    /// The cameras whose frames they search.
+    searched: BTreeSet<String>,
     /// The time at the end of the watch, in nanoseconds.
     ended_ns: i64,
     /// As JPEG.
@@ -391,6 +393,11 @@ impl Seen {
             }
             _ => false,
         }
+    }
+
+    /// Whether a detector searches the frames of a camera.
+    fn is_searched(&self, camera: &str) -> bool {
+        self.searched.contains(camera)
     }
 
     /// Whether a controller is ready.
@@ -495,8 +502,12 @@ async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result
                     keep(&mut seen.cameras, camera, |a, b| a.camera == b.camera);
                 }
                 Some(status) = statuses.next() => seen.status = Some(status),
-                Some(info) = infos.next() => drop(seen.detectors.entry(info.detector).or_default()),
+                Some(info) = infos.next() => {
+                    seen.searched.insert(info.camera);
+                    seen.detectors.entry(info.detector).or_default();
+                }
                 Some(found) = detections.next() => {
+                    seen.searched.insert(found.header.camera);
                     let searched = seen.detectors.entry(found.detector).or_default();
                     searched.frames += 1;
                     searched.found += u32::from(!found.detections.is_empty());
@@ -692,7 +703,10 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
         findings.wrong(
             "autopilot",
             format!("the controller does not hear it: {link}"),
-            "no landing starts without it: check that it is on, its cable and baud rate, and `autopilot.address`",
+            match link.contains(": ") {
+                true => "no landing starts without it: do as the controller says above",
+                false => "no landing starts without it: check that it is on, its cable, and `autopilot.address`",
+            },
         );
     }
     match status.setpoint_timeout_s {
@@ -787,6 +801,26 @@ mod tests {
         assert_eq!(told("0.1.0 (1a2b3c4d5, 2026-11-27, changed)"), (1, 0));
         assert_eq!(told("0.1.0"), (1, 0));
         assert_eq!(told("0.2.0 (1a2b3c4d5, 2026-11-27)"), (0, 1));
+    }
+
+    #[test]
+    fn what_came_instead_of_the_autopilots_heartbeat_is_told() {
+        let told = |autopilot: &str| {
+            let status =
+                ControllerStatus { autopilot: autopilot.into(), ..ControllerStatus::default() };
+            let mut findings = Findings::default();
+            check_landing(&mut findings, &Seen { status: Some(status), ..Seen::default() });
+            findings.text()
+        };
+        let other = told(
+            "no heartbeat of system 7 yet, but of 1: set `autopilot.system_id` to the vehicle's",
+        );
+        assert!(
+            other.contains("but of 1: set") && other.contains("do as the controller says"),
+            "{other}"
+        );
+        let silent = told("no heartbeat yet, nothing came");
+        assert!(silent.contains("nothing came") && silent.contains("its cable"), "{silent}");
     }
 
     #[test]

@@ -30,11 +30,16 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_
     for info in &seen.cameras {
         let camera = &info.camera;
         let Some([fx, fy]) = info.focal_px else {
-            findings.doubtful(
-                "calibration",
-                format!("camera `{camera}` is not calibrated, so distances are unknown"),
-                "calibrate it, and set `calibration.file` of camera-pub",
-            );
+            let text = format!("camera `{camera}` is not calibrated, so distances are unknown");
+            let advice =
+                "calibrate it (`alight calibrate board`), and set `calibration.file` of camera-pub";
+            // What is searched for markers is to be landed by.
+            match seen.is_searched(camera) {
+                true => {
+                    findings.wrong("calibration", format!("{text} and no landing starts"), advice)
+                }
+                false => findings.doubtful("calibration", text, advice),
+            }
             continue;
         };
         let problem = implausible(info, [fx, fy]);
@@ -398,6 +403,27 @@ mod tests {
             other.contains("calibrated at 1280 x 480 pixels, but its frames have 640 x 480"),
             "{other}"
         );
+    }
+
+    #[test]
+    fn a_camera_without_a_calibration_is_wrong_where_a_detector_searches_its_frames() {
+        let model = geometry::CameraModel::pinhole(640, 480, 1800.0);
+        let info = CameraInfo::new("down", &model, &geometry::Transform::identity());
+        let told = |searched: &str| {
+            let mut findings = Findings::default();
+            let watched = Watched { duration: Duration::from_secs(3), has_raw_frames: true };
+            let seen = Seen {
+                cameras: vec![CameraInfo { focal_px: None, ..info.clone() }],
+                searched: [searched.to_owned()].into(),
+                ..Seen::default()
+            };
+            check(&mut findings, &seen, watched, false);
+            findings.text()
+        };
+        let needed = told("down");
+        assert!(needed.contains("no landing starts") && needed.contains("1 wrong"), "{needed}");
+        let beside = told("front");
+        assert!(beside.contains("not calibrated") && beside.contains("0 wrong"), "{beside}");
     }
 
     #[test]
