@@ -262,7 +262,15 @@ function row(body, key, cells) {
   if (!found) {
     found = document.createElement('tr');
     found.dataset.key = key;
-    for (let n = 0; n < cells; n += 1) found.append(document.createElement('td'));
+    found.setAttribute('role', 'row');
+    // Where a row is a card, each cell says its column.
+    const columns = [...(body.closest('table')?.querySelectorAll('th') ?? [])];
+    for (let n = 0; n < cells; n += 1) {
+      const cell = document.createElement('td');
+      cell.setAttribute('role', 'cell');
+      cell.dataset.column = columns[n]?.textContent ?? '';
+      found.append(cell);
+    }
     body.append(found);
   }
   return found;

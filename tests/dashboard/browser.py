@@ -316,6 +316,15 @@ def main():
         assert width <= 360, f"a telephone would have to scroll sideways: {width} px"
         boxes = [panel.bounding_box() for panel in page.locator(".panel").all()]
         assert len(boxes) > 10 and all(box["x"] >= 0 and box["x"] + box["width"] <= 360 and box["height"] > 40 for box in boxes), boxes
+        # Nothing of a table is cut off, and what is to be looked at before the flight comes before what is for later.
+        page.set_viewport_size({"width": 390, "height": 844})
+        time.sleep(0.5)
+        for table in page.locator(".scroll").all():
+            cut = table.evaluate("(it) => it.scrollWidth - it.clientWidth")
+            assert cut <= 0, f"{cut} px of a table are cut off"
+        assert page.locator("#services td").first.evaluate("(it) => getComputedStyle(it, '::before').content") == '"Process"'
+        tops = [page.locator(it).bounding_box()["y"] for it in ["#commands-title", "#checks-title", "#strips-title", "#detectors-title"]]
+        assert tops == sorted(tops), tops
         page.screenshot(path=FOLDER / "telephone.png", full_page=True)
         page.set_viewport_size({"width": 1440, "height": 1150})
         page.locator("#theme").click()
