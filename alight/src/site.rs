@@ -497,6 +497,24 @@ mod tests {
     }
 
     #[test]
+    fn the_examples_of_one_machine_are_valid_and_need_no_keys() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy");
+        for (name, services) in [
+            ("rehearsal.toml", "simulator detector controller gcs-bridge dashboard"),
+            ("pi5-usb.toml", "recorder camera-pub detector controller"),
+        ] {
+            let jobs = Site::read(&folder.join(name)).unwrap().jobs(Role::Local).unwrap();
+            let names: Vec<&str> =
+                jobs.iter().filter_map(|job| job.service).map(Service::name).collect();
+            assert_eq!(names.join(" "), services, "{name}");
+            for job in jobs {
+                // What an example names is known, and what it leaves out stays as it is.
+                job.service.unwrap().effective_config(&job.layers).unwrap();
+            }
+        }
+    }
+
+    #[test]
     fn without_keys_the_example_runs_only_when_it_says_that_it_is_insecure() {
         let (_home, without) = example_with_keys(|text| text.replace("\nkeys = ", "\n# keys = "));
         for role in [Role::Drone, Role::Relay] {
