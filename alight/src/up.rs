@@ -102,7 +102,7 @@ fn tell_missing(
         None => Ok(ExitCode::SUCCESS),
         Some((last, [])) => bail!(last.clone()),
         Some(_) => bail!(
-            "{} things are missing on this machine:\n  {}",
+            "{} things are missing or wrong on this machine:\n  {}",
             lacking.len(),
             lacking.join("\n  ")
         ),
