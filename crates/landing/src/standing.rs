@@ -7,7 +7,8 @@
 //!
 //! And whether a vehicle may stand on the pad already, although its autopilot does not say so. A lander that takes over the
 //! landing of another one has not seen the pad: it is told where that one saw it, or, where nobody knows, a vehicle that is
-//! quite still at the height of the local origin, near which it was armed, may stand.
+//! quite still at the height of the local origin, near which it was armed, may stand: near the origin, and elsewhere only where its
+//! autopilot does not say that it flies, as the ground has another height there.
 
 use std::ops::RangeInclusive;
 
@@ -15,7 +16,7 @@ use geometry::{Ned, Point, Vector};
 
 use crate::config::{Config, GuidanceConfig};
 use crate::decision::TargetEstimate;
-use crate::event::VehicleState;
+use crate::event::{Landed, VehicleState};
 use crate::guidance::situation::Situation;
 use crate::time::Timestamp;
 
@@ -40,6 +41,9 @@ const MAX_REMEMBERED_S: f64 = 60.0;
 const MAX_STILL_M_S: f64 = 0.1;
 const MIN_STILL_S: f64 = 1.0;
 const MAX_STILL_HEIGHT_M: f64 = 0.5;
+/// Maximum distance from the local origin, in metres, at which the autopilot's report that such a vehicle flies counts for nothing: it
+/// comes seconds late.
+const MAX_ORIGIN_M: f64 = 3.0;
 /// Maximum time after taking over within which that is assumed, in seconds: an autopilot says by then that it stands.
 const MAX_UNTOLD_S: f64 = 10.0;
 /// Maximum distance from the pad of such a vehicle that stands beside it, in metres.
@@ -135,7 +139,11 @@ impl Resumed {
         let Some(pad) = self.pad.filter(is_valid) else {
             let height_m = -vehicle.position.z() - standing_height_m(config);
             let known_s = self.first.map_or(0.0, |first| vehicle.stamp.seconds_since(first));
-            return is_still && height_m.abs() <= MAX_STILL_HEIGHT_M && known_s <= MAX_UNTOLD_S;
+            let from_origin_m = (vehicle.position - Point::origin()).horizontal_norm();
+            return is_still
+                && height_m.abs() <= MAX_STILL_HEIGHT_M
+                && known_s <= MAX_UNTOLD_S
+                && (from_origin_m <= MAX_ORIGIN_M || vehicle.landed != Landed::InAir);
         };
         let to_pad = pad.position - vehicle.position;
         let below = Below {
@@ -253,6 +261,32 @@ mod tests {
             let may_stand =
                 |is_steered| may_stand(&situation(&vehicle), &Config::default(), is_steered);
             assert_eq!((may_stand(true), may_stand(false)), (steered, unsteered), "{height_m} m");
+        }
+    }
+
+    /// Where nobody knows the pad, a vehicle that hovers low beside a hill must not be landed there.
+    #[test]
+    fn a_vehicle_that_is_said_to_fly_far_from_the_origin_does_not_stand() {
+        for (north_m, landed, expected) in [
+            (0.0, Landed::InAir, true),
+            (2.5, Landed::InAir, true),
+            (40.0, Landed::InAir, false),
+            (40.0, Landed::Unknown, true),
+            (40.0, Landed::OnGround, true),
+        ] {
+            let vehicle = VehicleState {
+                position: Point::new(north_m, 0.0, -0.3),
+                landed,
+                ..sinking(0.0, 0.0, 0.3, 0.0)
+            };
+            let mut resumed = Resumed::new(None);
+            let seconds = vehicle.stamp.nanos() as f64 * 1e-9;
+            for step in 0..=20 {
+                let stamp = Timestamp::from_seconds(seconds - 2.0 + 0.1 * f64::from(step));
+                resumed.observe(&VehicleState { stamp, ..vehicle });
+            }
+            let may_stand = resumed.may_stand(&situation(&vehicle), &Config::default());
+            assert_eq!(may_stand, expected, "{north_m} m from the origin, {landed:?}");
         }
     }
 }
