@@ -149,6 +149,35 @@ async fn a_packet_cut_over_datagrams_survives_another_sender_in_between() {
 }
 
 #[tokio::test]
+async fn another_vehicle_at_the_port_is_told_of_and_takes_nobodys_place() {
+    let mut link = open("udpin:127.0.0.1:0".into()).await;
+    let at = link.local_address().unwrap();
+    let ours = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    let other = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    ours.send_to(&heartbeat(true), at).await.unwrap();
+    assert_eq!(packet(&mut link).await, heartbeat(true));
+    // Ours is silent for longer than a link waits for it.
+    sleep(Duration::from_millis(3100)).await;
+    let theirs = packet::encode(
+        Sender { system: 2, component: 1 },
+        0,
+        &MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+            autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+            ..Default::default()
+        }),
+    );
+    other.send_to(&theirs, at).await.unwrap();
+    let LinkEvent::OtherAutopilot { packet: told, .. } = next(&mut link).await else {
+        panic!("it is not told of");
+    };
+    assert_eq!(told.raw, theirs);
+    ours.send_to(&time(), at).await.unwrap();
+    assert_eq!(packet(&mut link).await, time());
+    link.send(&heartbeat(false)).unwrap();
+    assert_eq!(datagram(&ours).await.0, heartbeat(false));
+}
+
+#[tokio::test]
 async fn a_port_in_use_is_an_error_at_once_that_says_what_to_do() {
     let holder = UdpSocket::bind("127.0.0.1:0").await.unwrap();
     let port = holder.local_addr().unwrap().port();
