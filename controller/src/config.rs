@@ -17,9 +17,6 @@ use crate::wind::Drag;
 
 /// Period of the flight's ticks.
 pub(crate) const TICK: Duration = Duration::from_millis(25);
-/// The delay of a link, both ways together, that never tells it, in seconds: that of a telemetry radio. A delay that is taken for none
-/// makes the vehicle swing over the pad, and one that is taken for longer than it is only makes the landing slower.
-pub(crate) const UNKNOWN_LINK_DELAY_S: f64 = 0.3;
 /// Maximum part of a serial line that setpoints take: the rest is for those that follow detections, and for what else is sent.
 const MAX_SETPOINTS_SHARE: f64 = 0.5;
 /// Bits that a byte takes on a serial line.

@@ -21,12 +21,13 @@ use node::HealthCounters;
 
 use crate::alarms::{self, Alarms};
 use crate::cameras::Reception;
-use crate::config::{Config, Mode, Start, UNKNOWN_LINK_DELAY_S};
+use crate::config::{Config, Mode, Start};
 use crate::control::{is_holding_px4, pilots_px4_mode};
 use crate::frames::{Arrival, Frames};
 use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
 use crate::limits::{Limits, Note};
+use crate::link_delay::LinkDelay;
 use crate::mission::{Mission, Trigger, is_flying_guided};
 use crate::offboard_watch::OffboardWatch;
 use crate::pad_note::{PadNote, PadNotes};
@@ -34,9 +35,6 @@ use crate::setpoints::Setpoints;
 use crate::status::{Used, View};
 use crate::wind::WindEstimate;
 use crate::wire;
-
-/// Change of the link's delay that the lander is told of, in seconds.
-const LINK_DELAY_STEP_S: f64 = 0.01;
 
 /// A flight.
 pub struct Flight {
@@ -48,8 +46,7 @@ pub struct Flight {
     decisions: u64,
     /// What the lander was told of the detectors last.
     detectors_alive: bool,
-    /// The link's delay that the lander was told last, in seconds.
-    link_delay_s: f64,
+    link_delay: LinkDelay,
     mission: Mission,
     frames: Frames,
     used: Used,
@@ -94,7 +91,7 @@ impl Flight {
             decision: None,
             decisions: 0,
             detectors_alive: true,
-            link_delay_s: 0.0,
+            link_delay: LinkDelay::default(),
             mission: Mission::new(config.start, config.takeoff()),
             frames: Frames::new(&config),
             used: Used::default(),
@@ -170,14 +167,7 @@ impl Flight {
         self.follow_limits(now_ns);
         self.note_pad();
         self.check_alarms(now_ns);
-        let delay_s = match self.autopilot.link_delay(now_ns) {
-            Some(delay) => delay.as_secs_f64(),
-            None if self.autopilot.lacks_link_delay(now_ns) => UNKNOWN_LINK_DELAY_S,
-            // Not known for a moment, or not any more: it is taken for what it was.
-            None => self.link_delay_s,
-        };
-        if (delay_s - self.link_delay_s).abs() > LINK_DELAY_STEP_S {
-            self.link_delay_s = delay_s;
+        if let Some(delay_s) = self.link_delay.step(now_ns, &self.autopilot) {
             self.decide(now_ns, LanderEvent::LinkDelay(delay_s));
         }
         self.decide(now_ns, LanderEvent::Tick);
@@ -458,7 +448,7 @@ impl Flight {
 
     /// The link's delay that the landing reckons with, both ways together, in seconds; 0 until it is known or given up.
     pub fn link_delay_s(&self) -> f64 {
-        self.link_delay_s
+        self.link_delay.seconds()
     }
 
     /// The detector in use.

@@ -9,7 +9,7 @@
 //! of the detector by health and [`agreement`], what they have [`announced`], the [`stamps`] that they pass on, the [`cameras`], and the [`refusals`] that last; [`unreadable`] ones never come so far), [`mount`] (what is said of a camera that is not as configured), [`mission`]
 //! (when a landing begins), [`setpoints`] (the lander's actions to the autopilot), [`control`] (how a PX4 comes to follow setpoints) and [`offboard_watch`] (that it is not left so), [`landing_target`] (the
 //! other way to land, by the autopilot's own precision landing), [`limits`] (the autopilot's parameters for
-//! setpoints), [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is logged and
+//! setpoints), [`link_delay`] (how slow the link is), [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is logged and
 //! counted, [`pad_note`] where the pad is, for the controller that is started next, [`note_file`] what must survive a crash, [`wire`] converts messages into the lander's types and
 //! back.
 
@@ -27,6 +27,7 @@ pub mod frames;
 pub mod journal;
 pub mod landing_target;
 pub mod limits;
+pub mod link_delay;
 pub mod mission;
 pub mod mount;
 pub mod note_file;

@@ -5,11 +5,12 @@ use autopilot::{Autopilot, LandedState};
 use landing::{Action, Decision, Lander, Reason};
 use messages::{ControllerStatus, Phase, Setpoint, TargetEstimate};
 
-use crate::config::{Config, GuidanceName, Mode, Start, UNKNOWN_LINK_DELAY_S};
+use crate::config::{Config, GuidanceName, Mode, Start};
 use crate::frames::Frames;
 use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
 use crate::limits;
+use crate::link_delay;
 use crate::mission::{Mission, State};
 use crate::mount;
 use crate::refusals::Warning;
@@ -115,9 +116,8 @@ impl View<'_> {
             matter: "conflict".to_owned(),
             text: format!("no take-off and no landing begins: {conflict}"),
         }));
-        let is_asked = self.config.autopilot.timesync;
-        if is_asked && self.autopilot.lacks_link_delay(now_ns) {
-            warnings.push(unknown_link());
+        if self.config.autopilot.timesync {
+            warnings.extend(link_delay::warning(now_ns, self.autopilot));
         }
         let size_ratio = self.lander.marker_size_ratio();
         warnings.extend(mount::warnings(&self.lander.mount_findings(), size_ratio));
@@ -298,17 +298,6 @@ impl View<'_> {
 
     fn detection_age_ms(&self, now_ns: i64) -> Option<f64> {
         self.used.stamp_ns.map(|stamp| now_ns.saturating_sub(stamp) as f64 * 1e-6)
-    }
-}
-
-/// That nothing tells how slow the autopilot's link is.
-fn unknown_link() -> Warning {
-    Warning {
-        matter: "link-delay".to_owned(),
-        text: format!(
-            "the autopilot does not answer TIMESYNC, so the delay of its link is not known: {UNKNOWN_LINK_DELAY_S} s are assumed, and the \
-             landing is slower; see whether the link (a telemetry radio, a router) passes TIMESYNC in both directions"
-        ),
     }
 }
 

@@ -9,7 +9,7 @@
 //! monotonic clock) and does no input or output. The crate knows nothing of markers, of landing or of other
 //! processes.
 //!
-//! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it and
+//! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it, of setpoints only the `newest`, and
 //! [`peers`] chooses whom a listening one talks to, [`packet`] finds MAVLink packets in them, [`signing`] signs and verifies
 //! them, `gate` is where a link does so, with the files of [`key_file`], [`mode`],
 //! [`state`] and [`parameter`] are what the vehicle reports, [`clock`] converts its time stamps, `boot` and
@@ -36,6 +36,7 @@ pub mod heard;
 pub mod key_file;
 pub mod link;
 pub mod mode;
+mod newest;
 pub mod offboard_exit;
 pub mod packet;
 pub mod parameter;

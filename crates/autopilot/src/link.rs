@@ -27,6 +27,7 @@ use crate::address::{Address, Endpoint};
 use crate::gate::{Admitted, Gate};
 use crate::heard::{Heard, note_systems};
 use crate::key_file::{SigningConfig, StampFile};
+use crate::newest::Newest;
 use crate::packet::{Counters, Packet, Parser};
 use crate::peers::{PACKET_GAP, Peering, Peers};
 use crate::signing::{Refusals, Signing, stamp};
@@ -267,7 +268,7 @@ impl Link {
 
     /// Number of setpoints that were not sent because a newer one came while they waited for a slow line.
     pub fn replaced(&self) -> u64 {
-        self.shared.replaced.load(Ordering::Relaxed)
+        self.shared.newest.replaced()
     }
 
     /// Number of received packets that were dropped because they were not read in time.
@@ -313,10 +314,7 @@ impl LinkSender {
         if !self.shared.connected.load(Ordering::Acquire) || self.queue.is_closed() {
             return Err(SendError::NotConnected);
         }
-        if self.shared.newest().replace(packet.to_vec()).is_some() {
-            self.shared.replaced.fetch_add(1, Ordering::Relaxed);
-        }
-        self.shared.newest_waits.notify_one();
+        self.shared.newest.put(packet.to_vec());
         Ok(())
     }
 
@@ -336,11 +334,9 @@ struct Shared {
     events: Mutex<VecDeque<LinkEvent>>,
     arrived: Notify,
     /// The setpoint that waits to be sent.
-    newest: Mutex<Option<Vec<u8>>>,
-    newest_waits: Notify,
+    newest: Newest,
     connected: AtomicBool,
     dropped: AtomicU64,
-    replaced: AtomicU64,
     strangers: AtomicU64,
     counters: Mutex<Counters>,
     /// Systems whose autopilots sent a heartbeat.
@@ -357,11 +353,9 @@ impl Shared {
         Self {
             events: Mutex::new(VecDeque::with_capacity(INCOMING)),
             arrived: Notify::new(),
-            newest: Mutex::new(None),
-            newest_waits: Notify::new(),
+            newest: Newest::default(),
             connected: AtomicBool::new(false),
             dropped: AtomicU64::new(0),
-            replaced: AtomicU64::new(0),
             strangers: AtomicU64::new(0),
             counters: Mutex::new(Counters::default()),
             systems: Mutex::new(BTreeSet::new()),
@@ -374,20 +368,6 @@ impl Shared {
 
     fn events(&self) -> MutexGuard<'_, VecDeque<LinkEvent>> {
         self.events.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn newest(&self) -> MutexGuard<'_, Option<Vec<u8>>> {
-        self.newest.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Waits for a setpoint and takes it; may be cancelled without losing one.
-    async fn take_newest(&self) -> Vec<u8> {
-        loop {
-            if let Some(packet) = self.newest().take() {
-                return packet;
-            }
-            self.newest_waits.notified().await;
-        }
     }
 
     fn systems(&self) -> MutexGuard<'_, BTreeSet<u8>> {
@@ -454,7 +434,7 @@ impl Port {
     fn connected(&mut self, peer: String) {
         while self.outgoing.try_recv().is_ok() {}
         while self.outgoing_spare.try_recv().is_ok() {}
-        drop(self.shared.newest().take());
+        self.shared.newest.forget();
         self.shared.mark_active();
         tracing::info!(%peer, "Link connected");
         self.shared.connected.store(true, Ordering::Release);
@@ -466,7 +446,7 @@ impl Port {
         tokio::select! {
             biased;
             packet = self.outgoing.recv() => packet,
-            packet = self.shared.take_newest(), if has_room => Some(packet),
+            packet = self.shared.newest.take(), if has_room => Some(packet),
             packet = self.outgoing_spare.recv(), if has_room => packet,
         }
     }
@@ -1059,7 +1039,7 @@ mod tests {
                 sent.push_str(std::str::from_utf8(&bytes[..count]).unwrap());
             }
             assert_eq!(sent, "setpoint 99packet");
-            assert_eq!(sender.shared.replaced.load(Ordering::Relaxed), 99);
+            assert_eq!(sender.shared.newest.replaced(), 99);
         };
         tokio::select! {
             () = sending => {}
