@@ -687,6 +687,37 @@ fn a_marker_of_another_size_than_configured_is_told_and_holds() {
     }
 }
 
+/// What was seen of it while the pilot flew counts.
+#[test]
+fn a_landing_on_a_marker_that_was_seen_to_be_of_another_size_does_not_descend() {
+    let mut flight = flight("command");
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    for ms in (20..7000).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(&mut flight, ms * MS, &heartbeat(4, true));
+        }
+        if ms == 6000 {
+            let reply = flight.command(ms * MS, &ControllerCommand::Start);
+            assert!(reply.accepted, "{reply:?}");
+        }
+        let height_at = |ms: i64| 5.0 + (ms as f32 / 1000.0 - 2.0).clamp(0.0, 3.0);
+        pose_at(&mut flight, ms * MS, height_at(ms));
+        if ms % 60 == 0 {
+            let mut seen = seen(ms * MS - 40 * MS);
+            let pose = seen.detections[0].pose.as_mut().unwrap();
+            pose.camera_from_marker.translation_m = [0.0, 0.0, f64::from(height_at(ms - 40)) / 2.0];
+            flight.detections(ms * MS + 2, "main", &seen);
+        }
+        flight.tick(ms * MS + 3);
+    }
+    let status = flight.status(7000 * MS);
+    assert!(status.phase == Phase::Hold, "{status:?}");
+    assert!(status.why.contains("check the size of the printed marker"), "{status:?}");
+}
+
 #[test]
 fn a_detector_with_another_first_corner_counts_where_the_vehicle_turns_to_the_pad() {
     let status_of = |set: &[&str]| {

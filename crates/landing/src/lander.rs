@@ -217,12 +217,12 @@ impl Lander {
         let has_started = self.state_machine.advance(&inputs);
         if was_active && self.phase().is_terminal() {
             self.resumed = None;
+            self.repeat_size_check();
         }
         if has_started {
             self.guidance = ActiveGuidance::new(self.config.guidance);
             self.standing_height = StandingHeight::default();
-            self.repeat_checks();
-            self.first_seen = None;
+            self.begin_checks();
             self.start = self.place().unwrap_or(Point::origin());
         }
         let (action, why) = self.act(now);

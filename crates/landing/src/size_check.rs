@@ -113,6 +113,11 @@ impl SizeCheck {
         self.fit = Fit::default();
     }
 
+    /// Looks anew whether a landing on it is safe; what was told of it stays until then.
+    pub(crate) fn look_again(&mut self) {
+        *self = Self { mount: self.mount, told: self.told, ..Self::default() };
+    }
+
     /// How many times as large as configured the marker is, once that is certain and far from one.
     pub(crate) fn ratio(&self) -> Option<f64> {
         self.told

@@ -5,7 +5,6 @@ use super::Lander;
 use crate::axis_check::{AxisConsistencyCheck, AxisError, Verdict};
 use crate::config::GuidanceConfig;
 use crate::decision::Reason;
-use crate::size_check::SizeCheck;
 use crate::time::Timestamp;
 
 impl Lander {
@@ -26,9 +25,23 @@ impl Lander {
             self.axis_check = AxisConsistencyCheck::default();
             self.first_seen = None;
         }
+        self.repeat_size_check();
+    }
+
+    /// Looks at the size again after a landing that it has ended. What is seen of it before a landing, as in a take-off over the pad, counts
+    /// in that.
+    pub(super) fn repeat_size_check(&mut self) {
         if self.size_check.is_refused() {
-            self.size_check = SizeCheck::default();
+            self.size_check.look_again();
         }
+    }
+
+    /// Looks at the axes anew for a landing that has just started.
+    pub(super) fn begin_checks(&mut self) {
+        if self.axis_mismatch().is_some() {
+            self.axis_check = AxisConsistencyCheck::default();
+        }
+        self.first_seen = None;
     }
 
     /// A moving pad shows nothing of the mount, and the thesis' guidance has no such check.
