@@ -2,6 +2,8 @@
 //! the touchdown and that all come back. The world is apart from both; the relay and the supervisors are killed
 //! (`kill -9`) as well.
 
+#![allow(dead_code, reason = "each program uses its part")]
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{File, OpenOptions};
 use std::path::{Path, PathBuf};

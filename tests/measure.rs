@@ -22,7 +22,6 @@ mod crowd;
 mod film;
 mod flight;
 mod freezes;
-#[allow(dead_code, reason = "a held landing's controller is also killed elsewhere")]
 mod kills;
 #[path = "link/mod.rs"]
 mod link;

@@ -278,9 +278,11 @@ impl Site {
 
     /// The machines whose processes meet in one network with those of a role.
     fn together(&self, role: Role) -> impl Iterator<Item = Role> + use<> {
-        let connected = [Role::Drone, Role::Relay, Role::Ground];
-        let together = if role == Role::Local { &[Role::Local][..] } else { &connected };
-        together.to_vec().into_iter()
+        let together: &'static [Role] = match role {
+            Role::Local => &[Role::Local],
+            Role::Drone | Role::Relay | Role::Ground => &[Role::Drone, Role::Relay, Role::Ground],
+        };
+        together.iter().copied()
     }
 
     fn relay_job(&self, role: Role) -> anyhow::Result<Option<Job>> {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use messages::{Detections, looks_for_others};
+use messages::{Detection, Detections, looks_for_others};
 
 use crate::refusals::Warning;
 use crate::selection::{MAX_DETECTORS, Selection};
@@ -47,7 +47,7 @@ impl Announced {
             return;
         }
         let others = message.detections.iter().filter(|it| it.is_other_than(marker));
-        let mut names: Vec<String> = others.map(|it| it.name()).take(MAX_NAMED).collect();
+        let mut names: Vec<String> = others.map(Detection::name).take(MAX_NAMED).collect();
         names.dedup();
         if names.is_empty() {
             return;

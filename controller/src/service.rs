@@ -468,6 +468,7 @@ impl Reports {
 }
 
 #[cfg(test)]
+#[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
 mod tests {
     use super::*;
     use autopilot::Sender;
@@ -510,7 +511,6 @@ mod tests {
     }
 
     #[test]
-    #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
     fn commands_and_modes_of_a_ground_station_are_told_from_its_other_packets() {
         let kind = |message: &MavMessage| {
             let bytes = encode(Sender { system: 255, component: 190 }, 0, message);

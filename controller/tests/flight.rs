@@ -1151,7 +1151,8 @@ fn a_landing_on_a_marker_that_no_detector_looks_for_is_refused_and_no_motor_star
         let arms = commands.contains(&MavCmd::MAV_CMD_COMPONENT_ARM_DISARM);
         let status = flight.status(20_000 * MS);
         assert_eq!(arms, is_armed, "{commands:?}, {}", status.why);
-        assert_eq!((status.phase, status.why.contains(told)), (Phase::Takeoff, !is_armed));
+        assert_eq!(status.why.contains(told), !is_armed, "{status:?}");
+        assert!(is_armed || status.phase == Phase::Takeoff, "{status:?}");
     }
 }
 

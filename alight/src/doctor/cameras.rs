@@ -34,11 +34,10 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_
             let advice =
                 "calibrate it (`alight calibrate board`), and set `calibration.file` of camera-pub";
             // What is searched for markers is to be landed by.
-            match seen.is_searched(camera) {
-                true => {
-                    findings.wrong("calibration", format!("{text} and no landing starts"), advice)
-                }
-                false => findings.doubtful("calibration", text, advice),
+            if seen.is_searched(camera) {
+                findings.wrong("calibration", format!("{text} and no landing starts"), advice);
+            } else {
+                findings.doubtful("calibration", text, advice);
             }
             continue;
         };

@@ -799,8 +799,8 @@ impl Autopilot {
         Some(CommandError::Invalid { command, problem })
     }
 
-    /// Advances what is requested. Only a tick may send: what a packet was received before it may have waited for this process, and so may
-    /// a later one with the mode that a pilot has chosen.
+    /// Advances what is requested. Only a tick may send, as the packet that is read may have waited for this process, and one that shows a
+    /// pilot's mode may still wait behind it.
     fn step_requests(&mut self, now_ns: i64, may_send: bool) {
         let Some(state) = self.state().copied() else { return };
         let is_of_now = self.shows_mode_of_now(now_ns);
