@@ -235,13 +235,9 @@ mod tests {
     fn depths_that_do_not_change_or_jump_show_no_size() {
         let frozen = descend(7.0, |_, _| 6.0);
         assert!(frozen.ratio().is_none(), "{frozen:?}");
-        let in_turn =
-            descend(
-                7.0,
-                |height_m, seconds| {
-                    if (4.0 * seconds) as u32 % 2 == 0 { height_m } else { height_m - 3.0 }
-                },
-            );
+        let in_turn = descend(7.0, |height_m, seconds| {
+            if ((4.0 * seconds) as u32).is_multiple_of(2) { height_m } else { height_m - 3.0 }
+        });
         assert!(!in_turn.is_refused(), "{in_turn:?}");
     }
 
