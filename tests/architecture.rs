@@ -90,7 +90,7 @@ const ALIGHT: [&str; 9] = [
 
 /// Crates of algorithms but for these modules, which have the threads, the clock and the network.
 const WITH_THREADS: [(&str, &[&str]); 2] =
-    [("autopilot", &["link", "newest", "peers", "key_file"]), ("airlink", &["sender"])];
+    [("autopilot", &["connect", "link", "newest", "peers", "key_file"]), ("airlink", &["sender"])];
 
 /// What an algorithm does without.
 const OUTSIDE: [&str; 17] = [

@@ -5,7 +5,7 @@
 //! errors. ArduPilot Copter and PX4 multicopters are supported; both were flown in their own simulators (PX4
 //! 1.17).
 //!
-//! Everything but [`link`] with its `newest` and [`key_file`] is a pure state machine that takes the time as an argument (nanoseconds of any
+//! Everything but [`link`] with its `connect` and `newest`, and [`key_file`] is a pure state machine that takes the time as an argument (nanoseconds of any
 //! monotonic clock) and does no input or output. The crate knows nothing of markers, of landing or of other
 //! processes.
 //!
@@ -28,6 +28,7 @@ pub mod command;
 pub mod compose;
 pub mod config;
 pub mod conflict;
+mod connect;
 mod contact;
 pub mod event;
 mod gate;

@@ -9,7 +9,7 @@
 use std::collections::{BTreeSet, VecDeque};
 use std::future::poll_fn;
 use std::io;
-use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -17,13 +17,17 @@ use std::task::{Context, Poll};
 use std::time::{Duration, Instant, SystemTime};
 
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::{TcpListener, TcpStream, UdpSocket, lookup_host};
+use tokio::net::{TcpListener, TcpStream, UdpSocket};
 use tokio::sync::{Notify, mpsc};
 use tokio::task::JoinHandle;
-use tokio::time::{sleep, sleep_until, timeout};
-use tokio_serial::{SerialPort, SerialPortBuilderExt, SerialStream};
+use tokio::time::{sleep, sleep_until};
+use tokio_serial::{SerialPort, SerialStream};
 
 use crate::address::{Address, Endpoint};
+use crate::connect::{
+    call_tcp, call_udp, connect_udp, explain_serial, explain_socket, listen_tcp, listen_udp,
+    open_serial,
+};
 use crate::gate::{Admitted, Gate};
 use crate::heard::{Heard, note_systems};
 use crate::key_file::{SigningConfig, StampFile};
@@ -48,8 +52,6 @@ const BACKLOG_PAUSE: Duration = Duration::from_millis(10);
 const FIRST_RETRY: Duration = Duration::from_millis(200);
 /// Maximum pause between two retries.
 const LAST_RETRY: Duration = Duration::from_secs(2);
-/// Timeout of opening a connection.
-const CONNECT_LIMIT: Duration = Duration::from_secs(3);
 /// Timeout of writing one packet.
 const WRITE_LIMIT: Duration = Duration::from_secs(2);
 /// Time without a datagram that could be sent, after which it is looked whether a UDP connection would have another address.
@@ -546,27 +548,6 @@ async fn listen(address: &Address) -> Result<Listener, LinkError> {
     })
 }
 
-async fn listen_udp(at: &Endpoint) -> io::Result<UdpSocket> {
-    UdpSocket::bind(local(at).await?).await
-}
-
-async fn listen_tcp(at: &Endpoint) -> io::Result<TcpListener> {
-    TcpListener::bind(local(at).await?).await
-}
-
-/// The address to listen on. Not each of the host's in turn, or a second program would get the next one where the port is in use.
-async fn local(at: &Endpoint) -> io::Result<SocketAddr> {
-    let found = lookup_host((at.host.as_str(), at.port)).await?;
-    in_order(found).first().copied().ok_or_else(|| io::ErrorKind::AddrNotAvailable.into())
-}
-
-/// The addresses of a host with those of IPv4 first, which autopilots and ground stations speak; a socket has either IPv4 or IPv6.
-fn in_order(found: impl Iterator<Item = SocketAddr>) -> Vec<SocketAddr> {
-    let mut found: Vec<_> = found.collect();
-    found.sort_by_key(SocketAddr::is_ipv6);
-    found
-}
-
 /// Serves one connection after the other, with a pause that grows while nothing works.
 async fn run(address: Address, mut listener: Listener, mut port: Port) {
     let mut pause = FIRST_RETRY;
@@ -625,64 +606,6 @@ async fn serve(address: &Address, listener: &mut Listener, port: &mut Port) -> (
             }
             Err(error) => (false, explain_serial(device, &error)),
         },
-    }
-}
-
-async fn call_udp(to: &Endpoint) -> io::Result<(UdpSocket, SocketAddr)> {
-    let mut result = Err(io::ErrorKind::HostUnreachable.into());
-    for peer in in_order(lookup_host((to.host.as_str(), to.port)).await?) {
-        result = connect_udp(peer).await.map(|socket| (socket, peer));
-        if result.is_ok() {
-            break;
-        }
-    }
-    result
-}
-
-async fn connect_udp(peer: SocketAddr) -> io::Result<UdpSocket> {
-    let local: SocketAddr = match peer {
-        SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
-        SocketAddr::V6(_) => (Ipv6Addr::UNSPECIFIED, 0).into(),
-    };
-    let socket = UdpSocket::bind(local).await?;
-    socket.connect(peer).await?;
-    Ok(socket)
-}
-
-async fn call_tcp(to: &Endpoint) -> io::Result<TcpStream> {
-    let connecting = TcpStream::connect((to.host.as_str(), to.port));
-    let stream =
-        timeout(CONNECT_LIMIT, connecting).await.map_err(|_| io::ErrorKind::TimedOut)??;
-    stream.set_nodelay(true)?;
-    Ok(stream)
-}
-
-fn open_serial(device: &str, baud: u32) -> tokio_serial::Result<SerialStream> {
-    tokio_serial::new(device, baud).open_native_async()
-}
-
-fn explain_socket(error: &io::Error, other_side: &str) -> String {
-    match error.kind() {
-        io::ErrorKind::ConnectionRefused => {
-            format!("connection refused; is the {other_side} running?")
-        }
-        io::ErrorKind::TimedOut => {
-            format!("no reply; is the {other_side} there and in reach?")
-        }
-        _ => format!("cannot reach it: {error}"),
-    }
-}
-
-fn explain_serial(device: &str, error: &tokio_serial::Error) -> String {
-    use tokio_serial::ErrorKind;
-    match error.kind() {
-        ErrorKind::NoDevice | ErrorKind::Io(io::ErrorKind::NotFound) => {
-            format!("no device {device}; is the cable plugged in and the other side switched on?")
-        }
-        ErrorKind::Io(io::ErrorKind::PermissionDenied) => format!(
-            "no permission to open {device}; on most systems the group `dialout` has it (then log in again)"
-        ),
-        _ => format!("cannot open {device} (another program may hold it): {error}"),
     }
 }
 
@@ -929,13 +852,6 @@ fn is_refusal(error: &io::Error) -> bool {
 mod tests {
     use super::*;
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
-
-    #[test]
-    fn a_host_with_addresses_of_both_kinds_is_spoken_to_by_ipv4() {
-        let [v6, v4] = ["[::1]:14550", "127.0.0.1:14550"].map(|text| text.parse().unwrap());
-        assert_eq!(in_order([v6, v4].into_iter()), [v4, v6]);
-        assert_eq!(in_order([v6].into_iter()), [v6]);
-    }
 
     /// A link's two sides, connected.
     fn pair() -> (LinkSender, Port) {

@@ -1,0 +1,199 @@
+//! The operator's commands to a flight: start, hold, resume, abort and land here, carried out or refused with the reason.
+
+use landing::{Event as LanderEvent, OperatorCommand, Phase};
+
+use super::Flight;
+use crate::control::{is_holding_px4, pilots_px4_mode};
+use crate::landing_target;
+use crate::mission::is_flying_guided;
+use crate::wire;
+
+impl Flight {
+    pub(super) fn start(&mut self, now_ns: i64) -> Result<String, String> {
+        if self.is_landing() {
+            let (phase, _) = self.view().phase(now_ns);
+            return Err(format!("a landing is active, in phase `{phase}`"));
+        }
+        if self.mission.is_taking_off() {
+            return Err("the vehicle is taking off; the landing begins by itself".to_owned());
+        }
+        if self.mission.is_taking_control() {
+            return Err(format!("a start is under way: {}", self.view().phase(now_ns).1));
+        }
+        if self.mission.is_asking_for_land() {
+            return Err("the vehicle is asked to land here".to_owned());
+        }
+        if let Some(conflict) = self.autopilot.conflict(now_ns) {
+            return Err(format!("no landing was started: {conflict}"));
+        }
+        self.check_way_out()?;
+        if self.autopilot.state().and_then(wire::vehicle).is_none() {
+            return Err(
+                "no landing was started: attitude and position of the vehicle are not known"
+                    .to_owned(),
+            );
+        }
+        if let Some(obstacle) = self.frames.start_obstacle(now_ns) {
+            return Err(format!("no landing was started: {obstacle}"));
+        }
+        if self.landing_target.is_some() {
+            return self.start_landing_target(now_ns);
+        }
+        if is_holding_px4(&self.autopilot) {
+            self.mission.take_control(now_ns, &mut self.autopilot);
+            return Ok(self.view().phase(now_ns).1);
+        }
+        if let Some(mode) = pilots_px4_mode(&self.autopilot) {
+            return Err(format!(
+                "no landing was started: the vehicle is in {mode}; change to HOLD, from which it is asked to follow setpoints"
+            ));
+        }
+        let before = self.mission.clone();
+        self.begin(now_ns);
+        let (why, phase) = (self.why(), self.lander.phase());
+        if phase.is_terminal() {
+            self.mission = before;
+            return Err(format!("no landing was started: {why}"));
+        }
+        Ok(format!("in phase `{phase}`: {why}"))
+    }
+
+    /// Refuses while a PX4 is taken back to HOLD.
+    fn check_way_out(&self) -> Result<(), String> {
+        let refusal = "the vehicle is just being taken back to HOLD";
+        match self.mission.leaves_offboard_because() {
+            Some(why) => Err(format!("{refusal}: {why}")),
+            None if self.offboard.is_leading_out() => Err(refusal.to_owned()),
+            None => Ok(()),
+        }
+    }
+
+    fn start_landing_target(&mut self, now_ns: i64) -> Result<String, String> {
+        if let Some(problem) = landing_target::problem(&self.autopilot) {
+            return Err(problem);
+        }
+        if !is_flying_guided(&self.autopilot) && !is_holding_px4(&self.autopilot) {
+            return Err(
+                "the vehicle does not fly in a mode from which LAND may be requested (GUIDED; PX4: HOLD or OFFBOARD)"
+                    .into(),
+            );
+        }
+        if let Some(mismatch) = self.lander.mismatch() {
+            // As after a hold for it, the operator who goes on has it looked at again.
+            self.lander.repeat_checks();
+            return Err(format!("no landing was started: {mismatch}; a second start begins it"));
+        }
+        self.begin(now_ns);
+        let (phase, why) = self.view().phase(now_ns);
+        Ok(format!("in phase `{phase}`: {why}"))
+    }
+
+    /// Lands where the vehicle is. Without a landing, too: it needs no marker and no detector.
+    pub(super) fn land_here(&mut self, now_ns: i64) -> Result<String, String> {
+        if self.landing_target.is_some() {
+            return Err(
+                "the autopilot steers to the marker; abort, and land it by its own mode LAND"
+                    .to_owned(),
+            );
+        }
+        if self.is_landing() {
+            return self.operator(now_ns, OperatorCommand::LandHere);
+        }
+        // PX4 climbs in a mode of its own.
+        if self.mission.is_taking_off() && !is_flying_guided(&self.autopilot) {
+            return Err("the vehicle is taking off; land it once it is up".to_owned());
+        }
+        // A vehicle that took off for us is ours.
+        let conflict = self.autopilot.conflict(now_ns).filter(|_| !self.mission.is_taking_off());
+        if let Some(conflict) = conflict {
+            return Err(format!("not landed here: {conflict}"));
+        }
+        if is_holding_px4(&self.autopilot) {
+            self.check_way_out()?;
+            self.mission.ask_for_land(now_ns, &mut self.autopilot);
+            let (phase, why) = self.view().phase(now_ns);
+            return Ok(format!("in phase `{phase}`: {why}"));
+        }
+        self.begin_here(now_ns)
+    }
+
+    pub(super) fn begin_here(&mut self, now_ns: i64) -> Result<String, String> {
+        let before = self.mission.clone();
+        self.alarms.begin();
+        self.mission.begin(now_ns, false);
+        self.decide(now_ns, LanderEvent::Operator(OperatorCommand::LandHere));
+        let (why, phase) = (self.why(), self.lander.phase());
+        if phase.is_terminal() {
+            self.mission = before;
+            return Err(format!("not landed here: {why}"));
+        }
+        Ok(format!("in phase `{phase}`: {why}"))
+    }
+
+    pub(super) fn operator(
+        &mut self,
+        now_ns: i64,
+        command: OperatorCommand,
+    ) -> Result<String, String> {
+        if self.mission.is_taking_off() {
+            if command == OperatorCommand::Resume {
+                return Err("the vehicle is taking off; there is nothing to resume".to_owned());
+            }
+            let why = "aborted by the operator before the landing began; the vehicle is to hold its place";
+            if self.mission.leave_offboard(now_ns, &mut self.autopilot, why) {
+                return Ok(why.to_owned());
+            }
+            let why = "aborted by the operator; the autopilot completes the take-off".to_owned();
+            self.mission.fail(&mut self.autopilot, why.clone());
+            return Ok(why);
+        }
+        if self.mission.is_taking_control() {
+            if command == OperatorCommand::Resume {
+                return Err("the landing has not begun; there is nothing to resume".to_owned());
+            }
+            let why = "ended by the operator before the vehicle followed setpoints";
+            self.mission.leave_offboard(now_ns, &mut self.autopilot, why);
+            return Ok(why.to_owned());
+        }
+        if self.mission.is_asking_for_land() {
+            if command == OperatorCommand::Resume {
+                return Err("the vehicle is asked to land; there is nothing to resume".to_owned());
+            }
+            let why = "ended by the operator before the vehicle landed";
+            self.mission.fail(&mut self.autopilot, why.to_owned());
+            return Ok(why.to_owned());
+        }
+        if !self.is_landing() {
+            let (phase, _) = self.view().phase(now_ns);
+            let start = match command {
+                OperatorCommand::Resume => "; `start` begins one",
+                _ => "",
+            };
+            return Err(format!("no landing is active (phase `{phase}`){start}"));
+        }
+        let no_return_m = self.config.phases.no_return_height_m;
+        if let Some(landing_target) = &mut self.landing_target
+            && self.mission.is_sending_landing_target()
+        {
+            if command == OperatorCommand::Resume {
+                return Err("the autopilot steers; there is nothing to resume".to_owned());
+            }
+            let may_recall = self.lander.may_recall();
+            return landing_target.abort(now_ns, may_recall, no_return_m, &mut self.autopilot);
+        }
+        let before = self.lander.phase();
+        self.decide(now_ns, LanderEvent::Operator(command));
+        let (why, after) = (self.why(), self.lander.phase());
+        if before == after && command == OperatorCommand::Abort {
+            return Err(format!(
+                "the autopilot's landing is not interrupted: the vehicle is below {no_return_m} m, or an abort would land as well"
+            ));
+        }
+        // Held already for another reason, it is held by the operator.
+        let is_held = command == OperatorCommand::Hold && after == Phase::Hold;
+        if before == after && !is_held {
+            return Err(format!("no effect in phase `{after}`: {why}"));
+        }
+        Ok(format!("in phase `{after}`: {why}"))
+    }
+}
