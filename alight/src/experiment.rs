@@ -88,8 +88,8 @@ struct LandingArgs {
     #[arg(long = "fault", value_name = "NAME", default_value = "none", value_parser = faults_named)]
     faults: Vec<Faults>,
     /// Marker to land on, of pad, detector and controller together: FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family without ids. A pad that
-    /// moves or heaves has it half as large again. Modelled vision has the errors of `rings` whatever the marker: compare markers with
-    /// `--vision rendered`.
+    /// moves or heaves has it half as large again. Modelled vision has the errors of `rings` whatever the marker, of which only the size
+    /// counts, and a warning says so: compare markers with `--vision rendered`.
     #[arg(long, value_name = "MARKER", value_parser = sized_marker)]
     marker: Option<Marker>,
     /// One further setting: simulator.KEY=VALUE or controller.KEY=VALUE. May be repeated.
@@ -264,6 +264,10 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
     request.plan.check()?;
     request.plan.check_marker().map_err(WrongUse)?;
     let mut folder = Folder::claim(&args.output, args.replace)?;
+    faults::tell_only_size_counts(
+        vision,
+        &plan::told_settings(request.plan.marker.as_ref(), &request.plan.set),
+    );
     let interruption = Interruption::on_signals(FLIGHTS_END)?;
     let steps = Steps::of_flights();
     let watch = Watch {

@@ -12,7 +12,9 @@ use experiments::faults::plan::{Plan, Request, SWEPT, Second};
 use experiments::faults::report;
 use experiments::faults::{self, Findings};
 use experiments::landing::Watch;
-use experiments::landing::plan::{Values, refuse_swept};
+use experiments::landing::plan::{
+    ONLY_SIZE_COUNTS, Values, Vision, only_size_counts, refuse_swept, told_settings,
+};
 use experiments::results::{self, Folder};
 use markers::Marker;
 
@@ -209,6 +211,11 @@ pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
     let request = Request { command: this_command(), plan, tapes_in, jobs };
     let mut folder = Folder::claim(&output, replaces)?;
     request.tapes_in.as_deref().map_or(Ok(()), results::claim_for_recordings)?;
+    if !real_time {
+        let plan = &request.plan;
+        let settings = told_settings(plan.marker.as_ref(), &plan.set);
+        tell_only_size_counts(Vision::Modelled, &settings);
+    }
     let interruption = Interruption::on_signals(match real_time {
         true => "the flight under way does not count, and those before it are kept",
         false => FLIGHTS_END,
@@ -230,6 +237,13 @@ pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
     }
     let is_good = told_of_bad(&findings.outcomes).is_none();
     Ok(if is_good { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// Warns before the flights that another marker would give the same ones.
+pub(crate) fn tell_only_size_counts(vision: Vision, settings: &str) {
+    if only_size_counts(vision.name(), settings) {
+        write_error(&format!("warning: {}", ONLY_SIZE_COUNTS));
+    }
 }
 
 /// What must not be, of the flights that were flown; `None` when nothing was unsafe and every flight ended.

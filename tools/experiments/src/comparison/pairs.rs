@@ -10,6 +10,7 @@ use node::stats::interpolated_quantile as quantile;
 use serde::{Deserialize, Serialize};
 
 use crate::landing::outcome::{self, Ending};
+use crate::landing::plan::{ONLY_SIZE_COUNTS, only_size_counts};
 use crate::landing::table::{median_interval, sign_test};
 use crate::results::FLIGHTS_AS_JSON;
 
@@ -359,6 +360,8 @@ pub struct Cell {
 /// Two runs, side by side.
 #[derive(Clone, Debug, Serialize)]
 pub struct Comparison {
+    /// What must be known before a number is believed.
+    pub warnings: Vec<String>,
     /// The first and the second run, with all of their flights.
     pub runs: [Side; 2],
     /// All pairs.
@@ -413,7 +416,12 @@ impl Comparison {
                 pairs: Pairs::new(&members),
             }
         });
+        let is_told = |run: &Run| {
+            run.flights.iter().any(|flight| only_size_counts(&flight.vision, &flight.settings))
+        };
+        let told = [first, second].into_iter().any(is_told).then(|| ONLY_SIZE_COUNTS.to_owned());
         Ok(Self {
+            warnings: told.into_iter().collect(),
             runs: [side(first, pairs.len()), side(second, pairs.len())],
             cells: cells.collect(),
             points: MEASURES.iter().map(|it| (it.name, values(it, &pairs))).collect(),

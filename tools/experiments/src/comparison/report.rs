@@ -32,6 +32,7 @@ pub fn text(comparison: &Comparison, command: &str) -> String {
         text.push_str(&head(*letter, side));
     }
     text.push_str(&differing(&comparison.runs));
+    text.extend(comparison.warnings.iter().map(|warning| format!("\n**{warning}**\n")));
     text.push_str(&summaries(comparison));
     if comparison.cells.len() > 1 {
         text.push_str(&by_cell(comparison));
@@ -290,6 +291,24 @@ mod tests {
             [&[("calm", [0.01, 0.03])], &[("calm", [0.02, 0.04])]].map(|it| run(it));
         let told = text(&Comparison::new(&first, &second).unwrap(), "compare");
         assert!(!told.contains("counts once"), "{told}");
+    }
+
+    #[test]
+    fn two_markers_that_count_for_nothing_are_told_in_bold() {
+        let of = |marker: &str| {
+            let mut run = run(&[("calm", [0.01, 0.03])]);
+            run.flights
+                .iter_mut()
+                .for_each(|it| it.settings.push_str(&format!(" marker={marker}")));
+            run
+        };
+        let [rings, square] = ["rings:0.15", "apriltag-36h11:3:0.15"].map(of);
+        let told = Comparison::new(&rings, &square).unwrap();
+        assert!(text(&told, "compare").contains("\n\n**Vision is modelled"), "{told:?}");
+        let json = serde_json::to_value(&told).unwrap();
+        assert!(json["warnings"][0].as_str().is_some_and(|it| it.contains("--vision rendered")));
+        let told = Comparison::new(&rings, &rings).unwrap();
+        assert!(!text(&told, "compare").contains("**"), "{told:?}");
     }
 
     #[test]

@@ -21,6 +21,7 @@ pub mod tape_file;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use crate::landing::plan::{ONLY_SIZE_COUNTS, Vision, only_size_counts};
 use crate::landing::{Watch, in_parallel_until};
 use crate::results::{self, Folder};
 use flight::{fly, fly_with_tape};
@@ -61,11 +62,34 @@ pub fn run(request: &Request, folder: &mut Folder, watch: Watch<'_>) -> anyhow::
     })?;
     let outcomes: Vec<Outcome> = outcomes.into_iter().flatten().collect();
     let title = format!(
-        "{}{} flights in lock-step, seeds from {}",
+        "{}{}{} flights in lock-step, seeds from {}",
         results::origin(&request.command),
+        note(&flights),
         outcomes.len(),
         request.plan.seed
     );
     let report = report::write(folder, &title, &outcomes, planned, false)?;
     Ok(Findings { report, outcomes, planned })
+}
+
+/// What must be said before any number, in bold.
+fn note(flights: &[plan::Planned]) -> String {
+    let modelled = Vision::Modelled.name();
+    let is_told = flights.iter().any(|planned| only_size_counts(modelled, &planned.settings()));
+    if is_told { format!("**{ONLY_SIZE_COUNTS}**\n\n") } else { String::new() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn that_a_marker_counts_for_nothing_is_told() {
+        let of = |marker: &str| {
+            let marker = marker.parse().ok();
+            note(&plan::Plan { marker, flights: 1, ..plan::Plan::default() }.flights())
+        };
+        assert!(of("aruco-4x4-50:3:0.15").contains("`--real-time`"));
+        assert_eq!(of("rings:0.2"), "");
+    }
 }

@@ -395,6 +395,21 @@ pub(crate) fn refuse_other_marker(
     ))
 }
 
+/// What is said of flights for which [`only_size_counts`].
+pub const ONLY_SIZE_COUNTS: &str = "Vision is modelled with the errors of `rings`: of this marker nothing but the size counts, and another family gives \
+     the same flights. Markers are compared with `--vision rendered` (faults with `--real-time`).";
+
+/// Whether flights with this vision and these settings have a marker that is not found as it would be: modelled vision has the errors of the
+/// rings, whatever the marker.
+pub fn only_size_counts(vision: &str, settings: &str) -> bool {
+    let words = shlex::split(settings).unwrap_or_default();
+    let marker = words.iter().rev().find_map(|word| {
+        word.strip_prefix("simulator.pad.marker=").or_else(|| word.strip_prefix("marker="))
+    });
+    let is_of_rings = |marker: &str| marker.trim_matches(['"', '\'']).starts_with("rings");
+    vision == Vision::Modelled.name() && marker.is_some_and(|marker| !is_of_rings(marker))
+}
+
 /// Whether the pad's marker is the one that a controller looks for, `FAMILY` or `FAMILY:ID`.
 fn is_of(pad: &str, wanted: &str) -> bool {
     let (Ok(pad), Ok((family, id))) = (pad.parse::<Marker>(), messages::marker_name(wanted)) else {
@@ -415,7 +430,7 @@ fn without_repeats<T: PartialEq>(values: &[T]) -> impl Iterator<Item = &T> {
 
 /// The guidance, the marker where one was asked for, and the further settings, one word for each: by them the flights of two campaigns
 /// are told apart.
-pub(crate) fn told_settings(marker: Option<&Marker>, set: &[String]) -> String {
+pub fn told_settings(marker: Option<&Marker>, set: &[String]) -> String {
     const GUIDANCE: &str = "controller.guidance";
     let key_of = |setting: &String| setting.split('=').next().unwrap_or_default().trim().to_owned();
     let of_controller: Vec<String> =
@@ -509,6 +524,21 @@ mod tests {
             told(Plan { set, marker, ..Plan::default() }),
             "controller.guidance=thesis marker=apriltag-36h11:7:0.15 simulator.camera.rate_hz=20"
         );
+    }
+
+    #[test]
+    fn modelled_vision_is_told_from_that_of_another_marker_than_rings() {
+        let is_told = |vision: Vision, marker: &str, set: &[&str]| {
+            let set = set.iter().map(|&it| it.to_owned()).collect();
+            let plan = Plan { vision, marker: marker.parse().ok(), set, ..Plan::default() };
+            only_size_counts(plan.vision.name(), &plan.flights()[0].settings)
+        };
+        assert!(is_told(Vision::Modelled, "aruco-4x4-50:3:0.15", &[]));
+        let of_pad = ["simulator.pad.marker=\"stag-hd23:7:0.15\"", "controller.marker=stag-hd23"];
+        assert!(is_told(Vision::Modelled, "", &of_pad));
+        assert!(!is_told(Vision::Rendered, "aruco-4x4-50:3:0.15", &[]));
+        assert!(!is_told(Vision::Modelled, "rings:0.3", &["simulator.camera.rate_hz=20"]));
+        assert!(!is_told(Vision::Modelled, "", &[]));
     }
 
     #[test]

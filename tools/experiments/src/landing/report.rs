@@ -10,7 +10,7 @@ use messages::Touchdown;
 
 use super::flight::{fly, fly_recorded};
 use super::outcome::{Ending, MAX_HOP_M, MAX_SINK_M_S, MAX_SLIDE_M_S, Outcome};
-use super::plan::{Planned, Request};
+use super::plan::{ONLY_SIZE_COUNTS, Planned, Request, only_size_counts};
 use super::table::{markdown, share_interval};
 use super::{in_parallel_until, plots, thesis_figures};
 use crate::results::{self, FLIGHTS_AS_CSV, FLIGHTS_AS_JSON, Folder, LANDINGS_HEADING, REPORT};
@@ -63,11 +63,12 @@ fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
     let dangerous = outcomes.iter().filter(|o| o.is_unsafe()).count();
     let again = outcomes.iter().filter(|o| o.has_left_ground()).count();
     format!(
-        "{LANDINGS_HEADING}\n{}{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe, {again} left the ground again after a touch (by more than {MAX_HOP_M} m).\n\n\
+        "{LANDINGS_HEADING}\n{}{}{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe, {again} left the ground again after a touch (by more than {MAX_HOP_M} m).\n\n\
          Unsafe: touched the ground faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways, or, without having given up, more than {} m off. Times count from the start of the landing. \
          Numbers of error, time, speed and tilt are of those that landed.\n\n",
         results::interrupted(outcomes.len(), planned),
         results::origin(&request.command),
+        note(outcomes),
         outcomes.len(),
         plan.vision.name(),
         plan.seed,
@@ -76,6 +77,12 @@ fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
         100.0 * high,
         Touchdown::MAX_ERROR_M,
     )
+}
+
+/// What must be said before any number, in bold.
+fn note(outcomes: &[Outcome]) -> String {
+    let is_told = outcomes.iter().any(|it| only_size_counts(it.vision, &it.settings));
+    if is_told { format!("**{ONLY_SIZE_COUNTS}**\n\n") } else { String::new() }
 }
 
 fn failures(flights: &[Planned], outcomes: &[Outcome]) -> String {
@@ -186,4 +193,31 @@ fn recordings(
         let _ = writeln!(text, "- `{name}`: {error}, {}; {}", outcome.why, planned.cell);
     }
     Ok(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::landing::plan::Plan;
+
+    /// The report's head for flights of a plan that all landed.
+    fn told(plan: Plan) -> String {
+        let request = Request { plan, ..Request::default() };
+        let landed = |planned: &Planned| Outcome {
+            ending: Ending::Landed,
+            error_m: Some(0.01),
+            ..Outcome::new(planned)
+        };
+        let outcomes: Vec<Outcome> = request.plan.flights().iter().map(landed).collect();
+        head(&request, &outcomes, outcomes.len())
+    }
+
+    #[test]
+    fn that_a_marker_counts_for_nothing_is_told_before_any_number() {
+        let marker = "aruco-4x4-50:3:0.15".parse().ok();
+        let told_of = told(Plan { marker, ..Plan::default() });
+        let [note, number] = ["**Vision is modelled", "80 flights"].map(|it| told_of.find(it));
+        assert!(note.is_some() && note < number, "{told_of}");
+        assert!(!told(Plan::default()).contains("**"));
+    }
 }
