@@ -6,10 +6,11 @@
 //! Modules in reading order: [`markers`] is the experiment with markers. [`frame_spec`] specifies and renders
 //! one frame, whose marker may be a poor [`mod@print`]; [`set`] names the sets and [`sets`] has their frames; [`store`] keeps them on disk; [`record`]
 //! has a detector's results, and [`score`] their errors; [`photographs`] has the results on real images;
-//! [`report`] is the report, with the [`tables`] and [`figures`] of the [`thesis`]. [`landing`] is the
+//! [`report`] is the report, with errors in [`common`] frames, the [`tables`] and [`figures`] of the [`thesis`]. [`landing`] is the
 //! experiment with landings, of which [`comparison`] puts two runs side by side, [`faults`] the campaign in which something dies, lies or falls silent; [`results`] is the folder of
 //! their results.
 
+pub mod common;
 pub mod comparison;
 pub mod faults;
 pub mod figures;

@@ -9,12 +9,14 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use markers::{Family, Marker};
 
+use crate::common;
 use crate::figures::{self, FIGURES};
 use crate::frame_spec::FrameRenderer;
 use crate::photographs;
 use crate::record::{self, ALL_AT_ONCE, FOLLOWING, Ids, OURS};
 use crate::report;
 use crate::results;
+use crate::rows::csv;
 use crate::set::{MARKERS, SIZE_M, Set};
 use crate::sets::Variant;
 use crate::store;
@@ -160,6 +162,9 @@ pub fn run(
         text += "The id that a frame shows is known, as in a landing.\n\n";
     }
     text += &(report::text(&runs) + &extra);
+    let in_common = common::rows(&runs);
+    text += &common::markdown(&in_common);
+    std::fs::write(results_in.join(common::FILE), csv(&in_common)?)?;
     for table in tables::all(&runs) {
         text.push_str(&format!("\n{}", table.markdown));
         std::fs::write(results_in.join(format!("{}.csv", table.name)), table.csv)?;

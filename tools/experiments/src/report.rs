@@ -9,6 +9,7 @@ use anyhow::Context;
 use node::stats::interpolated_quantile as quantile;
 use serde::Serialize;
 
+use crate::landing::table::share_interval;
 use crate::record::{self, OURS, Record};
 use crate::score::{Score, Summary};
 use crate::set::Set;
@@ -157,6 +158,12 @@ pub fn append_processing(text: &mut String, variant: &Variant, run: &Run) {
     );
 }
 
+/// How many of how many, with the interval of the share.
+fn share(found: usize, of: usize) -> String {
+    let [low, high] = share_interval(found, of).map(|share| 100.0 * share);
+    format!("{found}/{of} ({low:.0} to {high:.0} %)")
+}
+
 /// A number, or a dash where there is none.
 pub fn number(value: Option<f64>, digits: usize) -> String {
     value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}"))
@@ -167,7 +174,9 @@ pub fn number(value: Option<f64>, digits: usize) -> String {
 fn append_summary(text: &mut String, runs: &[Run]) {
     let _ = writeln!(
         text,
-        "## All sets\n\nchi2 are medians: 1.39 (centre) and 0.45 (range) for a consistent covariance. Times are processor time. In frames without a marker every detection is elsewhere.\n"
+        "## All sets\n\nchi2 are medians: 1.39 (centre) and 0.45 (range) for a consistent covariance. Times are processor time. In frames without a marker every detection is elsewhere. \
+         Errors are of the frames in which the marker was found, which are others for each marker and detector: to compare them see the errors in common frames. \
+         After what was found is Wilson's 95 % interval of its share, as if each frame were drawn by itself.\n"
     );
     let _ = writeln!(
         text,
@@ -176,7 +185,7 @@ fn append_summary(text: &mut String, runs: &[Run]) {
     for run in runs {
         let s = Score::new(&run.answers).summary();
         let found = if run.set.has_marker() {
-            format!("{}/{}", s.found, s.frames)
+            share(s.found, s.frames)
         } else {
             // There is none to find.
             format!("none in {}", s.frames)
@@ -379,6 +388,12 @@ mod tests {
         let record = Record { image: "a.png".to_owned(), ms: 1.0, found: Vec::new() };
         let answers = vec![(frame, record)];
         Run { set, family: "experiment".to_owned(), detector: OURS.to_owned(), answers }
+    }
+
+    #[test]
+    fn what_was_found_has_its_interval() {
+        assert_eq!(share(3, 8), "3/8 (14 to 69 %)");
+        assert_eq!(share(370, 370), "370/370 (99 to 100 %)");
     }
 
     #[test]
