@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::landing::outcome::{self, Ending};
 use crate::landing::plan::{ONLY_SIZE_COUNTS, only_size_counts};
-use crate::landing::table::{median_interval, sign_test};
+use crate::landing::table::{median_interval, percentile, sign_test};
 use crate::results::FLIGHTS_AS_JSON;
 
 /// A flight, as its row tells it.
@@ -148,8 +148,8 @@ impl Run {
 pub struct Spread {
     /// Median.
     pub median: f64,
-    /// 95th percentile.
-    pub p95: f64,
+    /// 95th percentile; `None` for fewer than 20 values.
+    pub p95: Option<f64>,
     /// The greatest.
     pub worst: f64,
 }
@@ -158,7 +158,7 @@ impl Spread {
     /// That of some values; `None` of none.
     fn of(values: &[f64]) -> Option<Self> {
         let part = |part| quantile(values, part);
-        Some(Self { median: part(0.5)?, p95: part(0.95)?, worst: part(1.0)? })
+        Some(Self { median: part(0.5)?, p95: percentile(values, 0.95), worst: part(1.0)? })
     }
 }
 
@@ -364,6 +364,8 @@ pub struct Comparison {
     pub warnings: Vec<String>,
     /// The first and the second run, with all of their flights.
     pub runs: [Side; 2],
+    /// What the paired flights of each run gave.
+    pub paired: [Summary; 2],
     /// All pairs.
     #[serde(flatten)]
     pub pairs: Pairs,
@@ -407,14 +409,10 @@ impl Comparison {
                 None => cells.push((&pair.first.cell, vec![*pair])),
             }
         }
-        let cells = cells.into_iter().map(|(name, members)| {
-            let (one, other): (Vec<&Flight>, Vec<&Flight>) =
-                members.iter().map(|pair| (pair.first, pair.second)).unzip();
-            Cell {
-                cell: name.to_owned(),
-                runs: [Summary::new(&one), Summary::new(&other)],
-                pairs: Pairs::new(&members),
-            }
+        let cells = cells.into_iter().map(|(name, members)| Cell {
+            cell: name.to_owned(),
+            runs: summaries(&members),
+            pairs: Pairs::new(&members),
         });
         let is_told = |run: &Run| {
             run.flights.iter().any(|flight| only_size_counts(&flight.vision, &flight.settings))
@@ -424,10 +422,18 @@ impl Comparison {
             warnings: told.into_iter().collect(),
             runs: [side(first, pairs.len()), side(second, pairs.len())],
             cells: cells.collect(),
+            paired: summaries(&pairs),
             points: MEASURES.iter().map(|it| (it.name, values(it, &pairs))).collect(),
             pairs: Pairs::new(&pairs),
         })
     }
+}
+
+/// What the flights of each run gave in these pairs.
+fn summaries(pairs: &[Pair<'_>]) -> [Summary; 2] {
+    let (first, second): (Vec<&Flight>, Vec<&Flight>) =
+        pairs.iter().map(|pair| (pair.first, pair.second)).unzip();
+    [Summary::new(&first), Summary::new(&second)]
 }
 
 fn side(run: &Run, pairs: usize) -> Side {

@@ -45,7 +45,10 @@ pub fn text(comparison: &Comparison, command: &str) -> String {
 fn head(letter: char, side: &Side) -> String {
     let alone = match side.unpaired {
         0 => String::new(),
-        count => format!("; {count} of its flights have no partner in the other"),
+        count => format!(
+            "; {count} of its {} flights have no partner in the other, and count nowhere here",
+            side.summary.flights
+        ),
     };
     format!(
         "- {letter}: `{}`, {}; alight {}, vision {}{alone}\n",
@@ -71,7 +74,7 @@ fn differing([first, second]: &[Side; 2]) -> String {
 }
 
 fn summaries(comparison: &Comparison) -> String {
-    let [first, second] = comparison.runs.each_ref().map(|side| &side.summary);
+    let [first, second] = &comparison.paired;
     let (pairs, landed) = (&comparison.pairs, &comparison.pairs.landed);
     let once = match comparison.cells.len() {
         0 | 1 => "",
@@ -82,8 +85,8 @@ fn summaries(comparison: &Comparison) -> String {
     };
     let mut text = format!(
         "\nPairs have the same circumstances and seed: {}, of which {} landed in both, {} in A alone, {} in B alone (sign test p = {}) and {} in neither. \
-         The numbers of flights are of all of each run; errors, times and speeds, and their differences (B - A: below 0 B is better), \
-         are of pairs that landed in both.{once} \
+         All numbers are of pairs, those of flights of all, and errors, times and speeds, and their differences (B - A: below 0 B is better), \
+         of those that landed in both; 95 % is told of 20 or more.{once} \
          The interval is that of the median at 95 %, by order statistics (from six seeds on); p is of a two-sided sign test. \
          Unsafe: faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways, or, without having given up, too far off.\n\n\
          | | A | B | B - A, median | 95 % interval | B smaller, larger in seeds | p |\n|---|---|---|---|---|---|---|\n",
@@ -106,7 +109,7 @@ fn summaries(comparison: &Comparison) -> String {
     for measure in &MEASURES {
         let Some(difference) = pairs.differences.get(measure.name) else { continue };
         let digits = measure.digits;
-        let [one, other] = difference.runs.map(|spread| part(spread, digits, |it| it.median));
+        let [one, other] = difference.runs.map(|spread| part(spread, digits, |it| Some(it.median)));
         let _ = writeln!(
             text,
             "| {}: median | {one} | {other} | {} | {} | {}, {} of {} | {} |",
@@ -127,15 +130,16 @@ fn summaries(comparison: &Comparison) -> String {
 }
 
 type Count = fn(&Summary) -> usize;
-type Part = fn(&Spread) -> f64;
+type Part = fn(&Spread) -> Option<f64>;
 /// Something with its name in the table.
 type Named<T> = (&'static str, T);
 
 /// What else a spread has than its median.
-const PARTS: [Named<Part>; 2] = [("95 %", |it| it.p95), ("worst", |it| it.worst)];
+const PARTS: [Named<Part>; 2] = [("95 %", |it| it.p95), ("worst", |it| Some(it.worst))];
 
 fn part(spread: Option<Spread>, digits: usize, of: Part) -> String {
-    spread.map_or_else(|| "-".to_owned(), |spread| format!("{:.digits$}", of(&spread)))
+    let value = spread.and_then(|spread| of(&spread));
+    value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}"))
 }
 
 fn signed(value: Option<f64>, digits: usize) -> String {
@@ -175,7 +179,7 @@ fn by_cell(comparison: &Comparison) -> String {
                 None => String::new(),
             };
             let [one, other] =
-                difference.runs.map(|spread| part(spread, measure.digits, |it| it.median));
+                difference.runs.map(|spread| part(spread, measure.digits, |it| Some(it.median)));
             let _ = write!(
                 text,
                 " {one}, {other} | {}{between} |",
@@ -287,6 +291,14 @@ mod tests {
         assert!(told.contains(row), "{told}");
         assert!(told.contains("| touchdown error, m: worst | 0.030 | 0.040 |"), "{told}");
         assert!(told.contains("here it counts once"), "{told}");
+        // Those of a wind that the other run did not have count nowhere.
+        assert!(
+            told.contains("| flights | 4 | 4 |") && told.contains("2 of its 6 flights"),
+            "{told}"
+        );
+        assert!(told.contains("| within 0.1 m | 4 | 4 |"), "{told}");
+        // Of four landings no percentile is told.
+        assert!(told.contains("| touchdown error, m: 95 % | - | - |"), "{told}");
         let [first, second] =
             [&[("calm", [0.01, 0.03])], &[("calm", [0.02, 0.04])]].map(|it| run(it));
         let told = text(&Comparison::new(&first, &second).unwrap(), "compare");

@@ -7,9 +7,10 @@ use node::stats::interpolated_quantile as quantile;
 use plotters::coord::CoordTranslate;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::outcome::{Ending, Outcome};
-use super::table::{Column, cells, median_interval, numbers, share_interval};
+use super::table::{Column, cells, median_interval, numbers, percentile, share_interval};
 use crate::results::PLOTS;
 use crate::rows::rounded;
 
@@ -92,17 +93,20 @@ fn panels(outcomes: &[Outcome]) -> [usize; 2] {
 }
 
 /// Height of the heading over panels, in pixels.
-const HEADING_PX: u32 = 64;
+const HEADING_PX: u32 = 96;
+/// Number of landings from which their 99th percentile is told.
+const ENOUGH_FOR_99: usize = 100;
 
 fn against_wind_size(outcomes: &[Outcome]) -> [u32; 2] {
     match panels(outcomes) {
-        [1, 1] => [900, 620],
+        [1, 1] => [900, 652],
         [columns, rows] => [480 * columns as u32, HEADING_PX + 360 * rows as u32],
     }
 }
 
 /// A panel for each fault, all with the same axes: every flight that landed as a dot; for each 1 m/s of wind the median with the interval
-/// in which it lies, and the 99th percentile.
+/// in which it lies, the 99th percentile or of fewer landings the worst, and how many landed: what gave up has no dot, and the flights that are
+/// left may be the easy ones.
 fn against_wind(
     area: &Area<'_>,
     outcomes: &[Outcome],
@@ -117,14 +121,19 @@ fn against_wind(
     heading.draw(&Circle::new((24, 46), 3, GREY.filled()))?;
     heading.draw(&Text::new("a flight that landed", (36, 38), ("sans-serif", 13)))?;
     let bar = "median; bar: 95 % interval of the median, not the spread (from six flights on)";
-    for (index, (x, text)) in [(190, bar), (760, "99 %")].into_iter().enumerate() {
-        let line = COLOURS[index].stroke_width(2);
-        heading.draw(&PathElement::new([(x, 46), (x + 16, 46)], line))?;
-        heading.draw(&Text::new(text, (x + 24, 38), ("sans-serif", 13)))?;
+    let numbered = "over each wind: landed of flown, red where not all landed";
+    let percentile =
+        format!("99 % (dots), of fewer than {ENOUGH_FOR_99} landings the worst (circles)");
+    for (index, (x, text)) in [(190, bar), (190, percentile.as_str())].into_iter().enumerate() {
+        let (line, y) = (COLOURS[index].stroke_width(2), 46 + 20 * index as i32);
+        heading.draw(&PathElement::new([(x, y), (x + 16, y)], line))?;
+        heading.draw(&Text::new(text, (x + 24, y - 8), ("sans-serif", 13)))?;
     }
+    heading.draw(&Text::new(numbered, (24, 78), ("sans-serif", 13)))?;
     let all: Vec<&Outcome> = outcomes.iter().collect();
     let fastest = outcomes.iter().map(|o| o.wind_m_s).fold(1.0, f64::max);
-    let reach = [fastest + 0.6, 1.15 * numbers(&all, of).into_iter().fold(1e-3, f64::max)];
+    // With room for the numbers of flights over the dots.
+    let reach = [fastest + 0.6, 1.25 * numbers(&all, of).into_iter().fold(1e-3, f64::max)];
     let [columns, rows] = panels(outcomes);
     let areas = below.split_evenly((rows, columns));
     for (panel, (fault, members)) in areas.iter().zip(by_fault(outcomes)) {
@@ -156,28 +165,74 @@ fn one_fault(
     chart.configure_mesh().x_desc("mean wind, m/s").y_desc(axis).x_labels(8).y_labels(6).draw()?;
     let dots: Vec<(f64, f64)> = landed.iter().filter_map(|o| Some((o.wind_m_s, of(o)?))).collect();
     chart.draw_series(dots.into_iter().map(|at| Circle::new(at, 2, GREY.mix(0.7).filled())))?;
-    let bins: Vec<(f64, Vec<f64>)> = (0..=fastest.ceil() as u32)
-        .filter_map(|bin| {
-            let near = |o: &&Outcome| (o.wind_m_s - f64::from(bin)).abs() <= 0.5;
-            let members: Vec<&Outcome> = landed.iter().copied().filter(|o| near(o)).collect();
-            let values = numbers(&members, of);
-            (!values.is_empty()).then_some((f64::from(bin), values))
-        })
-        .collect();
-    let curve = |part: f64| -> Vec<(f64, f64)> {
-        bins.iter().filter_map(|(bin, values)| Some((*bin, quantile(values, part)?))).collect()
-    };
-    for (colour, part) in COLOURS.into_iter().zip([0.5, 0.99]) {
-        // A line through one wind alone has no length.
-        let points = curve(part).into_iter().map(move |at| Circle::new(at, 3, colour.filled()));
-        chart.draw_series(points)?;
-        chart.draw_series(LineSeries::new(curve(part), colour.stroke_width(2)))?;
-    }
-    for (bin, values) in &bins {
-        if let Some([low, high]) = median_interval(values) {
-            error_bar(&mut chart, *bin, [low, high], COLOURS[0])?;
+    let bins = bins(members, of);
+    let medians = bins.iter().filter_map(|bin| Some((bin.wind_m_s, quantile(&bin.values, 0.5)?)));
+    draw_line(&mut chart, medians.map(|at| (at, true)).collect(), COLOURS[0])?;
+    let worst = bins.iter().filter_map(|bin| {
+        let (value, is_percentile) = bin.worst()?;
+        Some(((bin.wind_m_s, value), is_percentile))
+    });
+    draw_line(&mut chart, worst.collect(), COLOURS[1])?;
+    for bin in &bins {
+        if let Some([low, high]) = median_interval(&bin.values) {
+            error_bar(&mut chart, bin.wind_m_s, [low, high], COLOURS[0])?;
         }
     }
+    for bin in &bins {
+        let colour = if bin.landed < bin.flown { COLOURS[1] } else { BLACK.into() };
+        let centred = Pos::new(HPos::Center, VPos::Top);
+        let style = ("sans-serif", 12).into_font().color(&colour).pos(centred);
+        let text = format!("{} of {}", bin.landed, bin.flown);
+        chart.draw_series([Text::new(text, (bin.wind_m_s, 0.99 * max), style)])?;
+    }
+    Ok(())
+}
+
+/// The flights of 1 m/s of wind.
+struct Bin {
+    wind_m_s: f64,
+    flown: usize,
+    landed: usize,
+    /// Of those that landed.
+    values: Vec<f64>,
+}
+
+impl Bin {
+    /// The 99th percentile (true), or of too few landings the greatest value.
+    fn worst(&self) -> Option<(f64, bool)> {
+        let percentile = percentile(&self.values, 0.99).map(|value| (value, true));
+        percentile.or_else(|| Some((quantile(&self.values, 1.0)?, false)))
+    }
+}
+
+/// The winds with flights, whether they landed or not.
+fn bins(members: &[&Outcome], of: Column) -> Vec<Bin> {
+    let fastest = members.iter().map(|o| o.wind_m_s).fold(0.0, f64::max);
+    let bin = |wind: u32| {
+        let wind_m_s = f64::from(wind);
+        // Each flight is in one of them.
+        let is_near = |o: &&Outcome| (o.wind_m_s + 0.5).floor() == wind_m_s;
+        let near: Vec<&Outcome> = members.iter().copied().filter(is_near).collect();
+        let landed = near.iter().filter(|o| o.ending == Ending::Landed).count();
+        let (flown, values) = (near.len(), numbers(&near, of));
+        (flown > 0).then_some(Bin { wind_m_s, flown, landed, values })
+    };
+    (0..=fastest.ceil() as u32).filter_map(bin).collect()
+}
+
+/// A line through points; those that are `true` are filled. A line through one wind alone has no length.
+fn draw_line(
+    chart: &mut Chart<'_, '_>,
+    points: Vec<((f64, f64), bool)>,
+    colour: RGBColor,
+) -> Result<(), DrawError> {
+    let places: Vec<(f64, f64)> = points.iter().map(|(at, _)| *at).collect();
+    chart.draw_series(LineSeries::new(places, colour.stroke_width(2)))?;
+    let dots = points.into_iter().map(|(at, is_filled)| match is_filled {
+        true => Circle::new(at, 3, colour.filled()),
+        false => Circle::new(at, 4, colour.stroke_width(2)),
+    });
+    chart.draw_series(dots)?;
     Ok(())
 }
 
@@ -399,6 +454,29 @@ mod tests {
             assert_eq!(svg.matches("mean wind, m/s").count(), 4, "{name}");
             assert!(svg.contains("95 % interval of the median") && !svg.contains("cm\n"), "{name}");
         }
+    }
+
+    #[test]
+    fn flights_that_gave_up_count_in_their_wind() {
+        let wind = crate::landing::plan::Values::List(vec![0.0, 8.0]);
+        let plan = Plan { wind, flights: 8, ..Plan::default() };
+        let flown = |planned: &crate::landing::plan::Planned| Outcome {
+            ending: match planned.wind_m_s > 5.0 && planned.seed > 1 {
+                true => Ending::Aborted,
+                false => Ending::Landed,
+            },
+            error_m: Some(0.01 * planned.seed as f64),
+            ..Outcome::new(planned)
+        };
+        let outcomes: Vec<Outcome> = plan.flights().iter().map(flown).collect();
+        let plots = all(&outcomes).unwrap();
+        for told in ["8 of 8", "1 of 8", "of fewer than 100 landings the worst"] {
+            assert!(plots[0].1.contains(told), "{told} is not in the plot");
+        }
+        let members: Vec<&Outcome> = outcomes.iter().collect();
+        let bins = bins(&members, |o| o.error_m);
+        let worst: Vec<_> = bins.iter().map(|bin| (bin.landed, bin.flown, bin.worst())).collect();
+        assert_eq!(worst, [(8, 8, Some((0.08, false))), (1, 8, Some((0.01, false)))]);
     }
 
     #[test]

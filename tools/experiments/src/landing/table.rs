@@ -13,6 +13,14 @@ pub fn numbers(outcomes: &[&Outcome], of: Column) -> Vec<f64> {
     landed.filter_map(|outcome| of(outcome)).collect()
 }
 
+/// A percentile, `part` from 0 to 1; `None` for fewer numbers than it is one of: 100 for the 99th, 20 for the 95th. Of fewer it would be
+/// little else than the greatest.
+pub fn percentile(numbers: &[f64], part: f64) -> Option<f64> {
+    // A little less, as 1 - 0.95 is a little more than 0.05.
+    let enough = 1.0 / (1.0 - part) - 1e-6;
+    interpolated_quantile(numbers, part).filter(|_| numbers.len() as f64 >= enough)
+}
+
 /// 95 % confidence interval of the median from order statistics, which is that of the sign test. `None` for fewer than six numbers,
 /// which are not enough for it.
 pub fn median_interval(numbers: &[f64]) -> Option<[f64; 2]> {
@@ -64,7 +72,7 @@ pub fn cells(outcomes: &[Outcome]) -> Vec<(&str, Vec<&Outcome>)> {
     cells
 }
 
-const HEADER: &str = "| circumstances | flights | landed | given up | within 0.1 m | error: median, 99 %, worst, m | to disarm: median, worst, s | sink worst, m/s | slide median, worst, m/s | tilt at touch worst, deg | beyond 0.6 m/s down, 0.1 m/s aside, 10 deg | unsafe |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n";
+const HEADER: &str = "| circumstances | flights | landed | given up | within 0.1 m | error: median, 99 % (of 100 landings or more), worst, m | to disarm: median, worst, s | sink worst, m/s | slide median, worst, m/s | tilt at touch worst, deg | beyond 0.6 m/s down, 0.1 m/s aside, 10 deg | unsafe |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n";
 
 /// The table of all cells in Markdown.
 pub fn markdown(outcomes: &[Outcome]) -> String {
@@ -93,7 +101,8 @@ fn row(name: &str, members: &[&Outcome]) -> String {
         count(&|o| o.ending == Ending::Aborted),
         count(&|o| o.is_within(0.1)),
         text(error, 0.5, 3),
-        text(error, 0.99, 3),
+        percentile(&numbers(members, error), 0.99)
+            .map_or_else(|| "-".to_owned(), |number| format!("{number:.3}")),
         text(error, 1.0, 3),
         text(disarm, 0.5, 1),
         text(disarm, 1.0, 1),
@@ -118,6 +127,33 @@ mod tests {
         assert!((sign_test(0, 6) - 2.0 / 64.0).abs() < 1e-12);
         assert!((sign_test(7, 1) - 18.0 / 256.0).abs() < 1e-12);
         assert!(sign_test(0, 5000) < 1e-300);
+    }
+
+    #[test]
+    fn a_percentile_is_given_of_enough_numbers() {
+        let numbers = |count: u32| (0..count).map(f64::from).collect::<Vec<f64>>();
+        assert_eq!(percentile(&numbers(99), 0.99), None);
+        assert!(percentile(&numbers(100), 0.99).is_some_and(|it| it > 97.9 && it < 98.1));
+        assert_eq!(
+            (percentile(&numbers(19), 0.95), percentile(&numbers(21), 0.95)),
+            (None, Some(19.0))
+        );
+        assert!(percentile(&numbers(20), 0.95).is_some());
+    }
+
+    #[test]
+    fn the_table_has_a_percentile_of_a_hundred_landings_alone() {
+        let of = |flights: u64| {
+            let wind = super::super::plan::Values::List(vec![5.0]);
+            let plan = super::super::plan::Plan { wind, flights, ..Default::default() };
+            let landed = plan.flights().into_iter().map(|planned| Outcome {
+                ending: Ending::Landed,
+                error_m: Some(0.02),
+                ..Outcome::new(&planned)
+            });
+            markdown(&landed.collect::<Vec<Outcome>>())
+        };
+        assert!(of(99).contains("| 0.020 - 0.020 |") && of(100).contains("| 0.020 0.020 0.020 |"));
     }
 
     #[test]
