@@ -63,7 +63,12 @@ impl FromStr for Values {
                 .ok_or_else(|| format!("`{part}` is not a number >= 0; write 5, or 0,5,8, or 0..8"))
         };
         match text.split_once("..") {
-            Some((min, max)) => Ok(Self::Range(number(min)?, number(max)?)),
+            Some((min, max)) => match (number(min)?, number(max)?) {
+                (min, max) if min <= max => Ok(Self::Range(min, max)),
+                (min, max) => {
+                    Err(format!("the range `{text}` begins above its end; write {max}..{min}"))
+                }
+            },
             None => Ok(Self::List(text.split(',').map(number).collect::<Result<_, _>>()?)),
         }
     }
@@ -467,15 +472,16 @@ mod tests {
     fn lists_and_ranges_are_parsed() {
         assert_eq!("0,5".parse(), Ok(Values::List(vec![0.0, 5.0])));
         assert_eq!("0..8".parse(), Ok(Values::Range(0.0, 8.0)));
-        for wrong in ["", "a", "1,", "0..", "-1"] {
+        for wrong in ["", "a", "1,", "0..", "-1", "8..2", "0.3..0.2"] {
             assert!(wrong.parse::<Values>().is_err(), "{wrong}");
         }
+        assert!("8..2".parse::<Values>().unwrap_err().contains("write 2..8"));
     }
 
     #[test]
     fn heights_at_which_no_landing_begins_are_refused() {
         assert_eq!(heights("0.1,10"), Ok(Values::List(vec![0.1, 10.0])));
-        for wrong in ["0", "10,0.05", "0..5", "5..101", "x"] {
+        for wrong in ["0", "10,0.05", "0..5", "5..101", "12..4", "x"] {
             assert!(heights(wrong).is_err(), "{wrong}");
         }
         assert!(heights("0").unwrap_err().contains("from 0.1 to 100 m"));

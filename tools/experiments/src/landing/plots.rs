@@ -179,7 +179,7 @@ fn one_fault(
         }
     }
     for bin in &bins {
-        let colour = if bin.landed < bin.flown { COLOURS[1] } else { BLACK.into() };
+        let colour = if bin.landed < bin.flown { COLOURS[1] } else { BLACK };
         let centred = Pos::new(HPos::Center, VPos::Top);
         let style = ("sans-serif", 12).into_font().color(&colour).pos(centred);
         let text = format!("{} of {}", bin.landed, bin.flown);
@@ -211,7 +211,7 @@ fn bins(members: &[&Outcome], of: Column) -> Vec<Bin> {
     let bin = |wind: u32| {
         let wind_m_s = f64::from(wind);
         // Each flight is in one of them.
-        let is_near = |o: &&Outcome| (o.wind_m_s + 0.5).floor() == wind_m_s;
+        let is_near = |o: &&Outcome| (o.wind_m_s + 0.5).floor() as u32 == wind;
         let near: Vec<&Outcome> = members.iter().copied().filter(is_near).collect();
         let landed = near.iter().filter(|o| o.ending == Ending::Landed).count();
         let (flown, values) = (near.len(), numbers(&near, of));
