@@ -2,12 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use fiducial::tracker::{Tracker, TrackingSettings};
 use fiducial::{Detector, Observation, Settings};
 use image::GrayImage;
 use imaging::GrayView;
-use markers::Marker;
+use markers::{Family, Marker};
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
@@ -224,14 +224,21 @@ pub fn write<'a>(path: &Path, records: impl IntoIterator<Item = &'a Record>) -> 
     std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))
 }
 
-/// The results in a file's text. A field of another name is refused: what it says would be missing without a word.
+/// The results in a file's text. A field of another name and a family of which there is none are refused: what they say would be missing
+/// without a word, or count as a false detection.
 ///
 /// # Errors
 /// When a line is no result, with the file and the line.
 pub fn parse(path: &Path, text: &str) -> anyhow::Result<Vec<Record>> {
     let parsed = |(at, line): (usize, &str)| {
         let place = || format!("line {} of {}", at + 1, path.display());
-        serde_json::from_str(line).with_context(place)
+        let record: Record = serde_json::from_str(line).with_context(place)?;
+        let unknown = record.found.iter().find(|found| Family::named(&found.family).is_none());
+        if let Some(Found { family, .. }) = unknown {
+            let known = Family::ALL.map(Family::name).join(", ");
+            bail!("{}: there is no family `{family}`; known are {known}", place());
+        }
+        Ok(record)
     };
     text.lines().enumerate().map(parsed).collect()
 }
@@ -276,5 +283,21 @@ mod tests {
         assert!(told.contains("line 2 of mine.jsonl"), "{told}");
         assert!(told.contains("unknown field `covariance_px2`"), "{told}");
         assert!(parse(path, "{\"image\":\"a.png\",\"ms\":1,\"found\":[],\"time_ms\":1}").is_err());
+    }
+
+    #[test]
+    fn a_family_of_which_there_is_none_is_refused_with_its_line() {
+        let line = |family: &str| {
+            format!(
+                "{{\"image\":\"a.png\",\"ms\":1,\"found\":[{{\"family\":\"{family}\",\"id\":3,\"centre_px\":[1,2]}}]}}"
+            )
+        };
+        let text = [line("aruco-4x4-50"), line("aruco_4x4_50")].join("\n");
+        let told = parse(Path::new("mine.jsonl"), &text).unwrap_err().to_string();
+        assert!(
+            told.starts_with("line 2 of mine.jsonl: ") && told.contains("`aruco_4x4_50`"),
+            "{told}"
+        );
+        assert!(told.contains("aruco-4x4-50, "), "{told}");
     }
 }
