@@ -13,7 +13,7 @@ use experiments::comparison::report;
 use experiments::landing::fault::Fault;
 use experiments::landing::plan::{self, Plan, Values, Vision};
 use experiments::landing::{self, Watch};
-use experiments::markers::{Request, Step, compared};
+use experiments::markers::{Request, Step, check_unused, compared};
 use experiments::record::Ids;
 use experiments::results::Folder;
 use experiments::set::{Set, families};
@@ -137,12 +137,15 @@ struct MarkersArgs {
     /// folder of that name. Existing frames are not rendered again.
     #[arg(short, long, value_name = "DIR", default_value = "experiment-markers")]
     output: PathBuf,
+    /// Replace this detector's results of an earlier run, once there are new ones; without it a folder that has some is refused. Frames and
+    /// the results of other detectors stay.
+    #[arg(long)]
+    replace: bool,
     /// Only this set: positions, far, landing, adverse, tilt, blur, noise, light, rolling, shade, ground, cut, textured,
     /// tracking, negatives or circles. May be repeated.
     #[arg(long = "set", value_name = "NAME")]
     sets: Vec<Set>,
-    /// Only this family; of `--photographs` only apriltag-36h11 has some with a marker. May be repeated. The report is of all results in
-    /// the folder.
+    /// Only this family; of `--photographs` only apriltag-36h11 has some with a marker. May be repeated.
     #[arg(long = "family", value_name = "FAMILY", value_parser = family_name)]
     families: Vec<String>,
     /// Folder of photographs with `labels.jsonl`, to test on as well.
@@ -332,10 +335,12 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
                 families: args.families.clone(),
                 // They have been through a camera already: once is enough.
                 photographs: photographs.take(),
+                replaces: args.replace,
                 ..Request::within(&args.output, variant, ids)
             }
         })
         .collect();
+    requests.iter().try_for_each(check_unused)?;
     let interruption = Interruption::on_signals("the set under way is still searched")?;
     let steps = Steps::of_names();
     let mut done = Vec::new();

@@ -1,12 +1,12 @@
 //! The experiment with markers: renders missing sets, runs the detector, scores all results, writes the
 //! report.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use markers::{Family, Marker};
 
 use crate::common;
@@ -14,13 +14,14 @@ use crate::figures::{self, FIGURES};
 use crate::frame_spec::FrameRenderer;
 use crate::photographs;
 use crate::record::{self, ALL_AT_ONCE, FOLLOWING, Ids, OURS};
-use crate::report;
+use crate::report::{self, Run};
 use crate::results;
 use crate::rows::csv;
 use crate::set::{MARKERS, SIZE_M, Set};
 use crate::sets::Variant;
 use crate::store;
 use crate::tables;
+use crate::thesis::TABLES;
 
 /// What to run.
 #[derive(Clone, Debug)]
@@ -41,6 +42,8 @@ pub struct Request {
     pub variant: Variant,
     /// The ids that are looked for in frames with a marker.
     pub ids: Ids,
+    /// Whether results of an earlier run are replaced; otherwise they are refused.
+    pub replaces: bool,
 }
 
 impl Request {
@@ -63,6 +66,7 @@ impl Request {
             photographs: None,
             variant,
             ids,
+            replaces: false,
         }
     }
 }
@@ -97,15 +101,62 @@ pub struct Findings {
     pub is_interrupted: bool,
 }
 
+/// The file of the report.
+pub const REPORT: &str = "report.md";
+/// The scores as lines of JSON, and as comma-separated values.
+const SCORES: [&str; 2] = ["scores.jsonl", "scores.csv"];
+
+/// Refuses a folder that has results of an earlier run, unless they are to be replaced.
+///
+/// # Errors
+/// When it has some, with the first of them.
+pub fn check_unused(request: &Request) -> anyhow::Result<()> {
+    let Request { results_in, replaces, .. } = request;
+    match earlier(results_in)?.first() {
+        Some(first) if !replaces => bail!(
+            "{} has the results of an experiment already ({}); name another folder with `-o`, or replace them with `--replace`, \
+             which keeps frames and the results of other detectors",
+            results_in.display(),
+            first.strip_prefix(results_in).unwrap_or(first).display()
+        ),
+        _ => Ok(()),
+    }
+}
+
+/// What an earlier run has written into its folder of results; not those of other detectors.
+fn earlier(results: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let mut earlier: Vec<PathBuf> = Vec::new();
+    let tables = TABLES.iter().map(|table| format!("{}.csv", tables::name(table)));
+    let figures = FIGURES.iter().map(|(name, _)| format!("{name}.svg"));
+    let files = [REPORT, common::FILE].into_iter().chain(SCORES).map(str::to_owned);
+    earlier.extend(files.chain(tables).chain(figures).map(|name| results.join(name)));
+    for detector in [OURS, ALL_AT_ONCE, FOLLOWING] {
+        for set in Set::ALL.map(Set::name).into_iter().chain([PHOTOGRAPHS]) {
+            let Ok(entries) = std::fs::read_dir(results.join(detector).join(set)) else { continue };
+            for entry in entries {
+                let path = entry?.path();
+                if path.extension().is_some_and(|ending| ending == "jsonl") {
+                    earlier.push(path);
+                }
+            }
+        }
+    }
+    earlier.retain(|path| path.exists());
+    earlier.sort();
+    Ok(earlier)
+}
+
 /// Runs the experiment; `begins` is told of each step, and may break it off before that one. The report is of what was done.
 ///
 /// # Errors
-/// When a file cannot be read or written.
+/// When a file cannot be read or written, or there are results of an earlier run that are not to be replaced.
 pub fn run(
     request: &Request,
     begins: &mut dyn FnMut(Step<'_>) -> ControlFlow<()>,
 ) -> anyhow::Result<Findings> {
     let Request { sets_in, results_in, .. } = request;
+    check_unused(request)?;
+    let mut old = earlier(results_in)?;
     std::fs::create_dir_all(results_in)
         .with_context(|| format!("making {}", results_in.display()))?;
     if let Some(folder) = &request.photographs {
@@ -127,6 +178,7 @@ pub fn run(
             break;
         }
         store::make(sets_in, set, marker, request.variant, &mut renderer)?;
+        remove(std::mem::take(&mut old))?;
         let folder = store::folder(sets_in, set, marker);
         if set.has_marker() {
             let any = Marker { id: None, ..marker };
@@ -144,27 +196,32 @@ pub fn run(
         && done + 1 == of
         && begins(Step { what: "photographs", number: of, of }).is_continue()
     {
+        remove(std::mem::take(&mut old))?;
         extra = run_photographs(folder, results_in, &request.families)?;
         done += 1;
     }
     let is_interrupted = done < of;
+    if done == 0 {
+        // What an earlier run has left stays as it was.
+        let report = format!("Interrupted before the first of {of} sets and families.\n");
+        return Ok(Findings { report, is_interrupted });
+    }
     let runs = report::runs(sets_in, results_in)?;
     let mut text = match is_interrupted {
         true => format!("Interrupted after {done} of {of} sets and families.\n\n"),
         false => String::new(),
     };
     text += &results::origin(&request.command);
-    if !request.command.is_empty() {
-        text +=
-            "Rows of other sets, families and detectors are of earlier runs in this folder.\n\n";
-    }
+    text += &of_others(&runs, sets_in);
     if request.ids == Ids::Shown {
         text += "The id that a frame shows is known, as in a landing.\n\n";
     }
     text += &(report::text(&runs) + &extra);
     let in_common = common::rows(&runs);
     text += &common::markdown(&in_common);
-    std::fs::write(results_in.join(common::FILE), csv(&in_common)?)?;
+    if !in_common.is_empty() {
+        std::fs::write(results_in.join(common::FILE), csv(&in_common)?)?;
+    }
     for table in tables::all(&runs) {
         text.push_str(&format!("\n{}", table.markdown));
         std::fs::write(results_in.join(format!("{}.csv", table.name)), table.csv)?;
@@ -174,9 +231,48 @@ pub fn run(
             std::fs::write(results_in.join(format!("{name}.svg")), svg)?;
         }
     }
-    std::fs::write(results_in.join("report.md"), &text)?;
-    std::fs::write(results_in.join("scores.jsonl"), report::json_lines(&runs)?)?;
+    std::fs::write(results_in.join(REPORT), &text)?;
+    let [lines, table] = SCORES;
+    std::fs::write(results_in.join(lines), report::json_lines(&runs)?)?;
+    std::fs::write(results_in.join(table), report::csv(&runs)?)?;
     Ok(Findings { report: text, is_interrupted })
+}
+
+fn remove(old: Vec<PathBuf>) -> anyhow::Result<()> {
+    for path in old {
+        std::fs::remove_file(&path)
+            .with_context(|| format!("removing {} of an earlier run", path.display()))?;
+    }
+    Ok(())
+}
+
+/// What the command and the version at the report's head do not hold for: other detectors, and frames of another version.
+fn of_others(runs: &[Run], sets_in: &Path) -> String {
+    let ours = [OURS, ALL_AT_ONCE, FOLLOWING];
+    let others: BTreeSet<&str> = runs.iter().map(|run| run.detector.as_str()).collect();
+    let others: Vec<&str> = others.into_iter().filter(|name| !ours.contains(name)).collect();
+    let mut text = String::new();
+    if !others.is_empty() {
+        text += &format!(
+            "The results of {} are of files that were there already.\n\n",
+            others.join(", ")
+        );
+    }
+    let mut versions: BTreeMap<String, BTreeSet<&str>> = BTreeMap::new();
+    for run in runs.iter().filter(|run| run.detector == OURS) {
+        let folder = sets_in.join(run.set.name());
+        let folder = if run.set.has_marker() { folder.join(&run.family) } else { folder };
+        versions.entry(store::rendered_by(&folder)).or_default().insert(run.set.name());
+    }
+    versions.remove(node::version());
+    for (version, sets) in versions {
+        let sets: Vec<&str> = sets.into_iter().collect();
+        text += &format!(
+            "**Frames of {} were there already, rendered by alight {version}; without the folder `sets` they are rendered anew.**\n\n",
+            sets.join(", ")
+        );
+    }
+    text
 }
 
 /// Our recall and accuracy in several requests that were run, by processing, family and set.
@@ -187,7 +283,7 @@ pub fn compared(requests: &[Request]) -> anyhow::Result<String> {
     let mut text = report::processing_head();
     for request in requests {
         let runs = report::runs(&request.sets_in, &request.results_in)?;
-        let wanted = |run: &&report::Run| {
+        let wanted = |run: &&Run| {
             run.detector == OURS
                 && request.sets.contains(&run.set)
                 && (request.families.is_empty() || request.families.contains(&run.family))
@@ -300,4 +396,63 @@ fn run_photographs(folder: &Path, results: &Path, wanted: &[String]) -> anyhow::
 
 fn photographs_file(results: &Path, detector: &str, family: &str) -> PathBuf {
     results.join(detector).join(PHOTOGRAPHS).join(format!("{family}.jsonl"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn write(folder: &Path, name: &str) {
+        let path = folder.join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, "old").unwrap();
+    }
+
+    #[test]
+    fn a_used_folder_is_refused_and_what_is_of_others_never_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut request = Request::within(folder.path(), Variant::default(), Ids::Any);
+        let results = request.results_in.clone();
+        let kept = ["mine/far/rings.jsonl", "notes.md", "alight/notes/rings.jsonl"];
+        kept.iter().for_each(|name| write(&results, name));
+        check_unused(&request).unwrap();
+        let ours = ["alight/far/rings.jsonl", "alight-all/textured/rings.jsonl", "report.md"];
+        for name in ours.into_iter().chain(["table-a1.csv", "scores.csv", "figure-4-7.svg"]) {
+            write(&results, name);
+            let told = check_unused(&request).unwrap_err().to_string();
+            assert!(told.contains(name) && told.contains("`--replace`"), "{told}");
+            // Nothing is begun, nor is anything of the earlier run touched.
+            let begun = run(&request, &mut |_| panic!("a set is begun")).unwrap_err().to_string();
+            assert_eq!(begun, told);
+            request.replaces = true;
+            check_unused(&request).unwrap();
+            let findings = run(&request, &mut |_| ControlFlow::Break(())).unwrap();
+            assert!(findings.is_interrupted && results.join(name).exists(), "{findings:?}");
+            remove(earlier(&results).unwrap()).unwrap();
+            request.replaces = false;
+            check_unused(&request).unwrap();
+        }
+        assert!(kept.iter().all(|name| results.join(name).exists()));
+    }
+
+    #[test]
+    fn a_report_tells_what_of_it_was_there_already() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = |detector: &str, set| Run {
+            set,
+            family: "rings".to_owned(),
+            detector: detector.to_owned(),
+            answers: Vec::new(),
+        };
+        let runs = [run(OURS, Set::Far), run(OURS, Set::Cut), run("mine", Set::Far)];
+        for (set, version) in [("far", node::version()), ("cut", "0.0.9")] {
+            let folder = folder.path().join(set).join("rings");
+            std::fs::create_dir_all(&folder).unwrap();
+            std::fs::write(folder.join(store::RENDERED_BY), version).unwrap();
+        }
+        let told = of_others(&runs, folder.path());
+        assert!(told.contains("results of mine are of files"), "{told}");
+        assert!(told.contains("Frames of cut were") && told.contains("alight 0.0.9"), "{told}");
+        assert_eq!(of_others(&runs[..1], folder.path()), "");
+    }
 }

@@ -11,6 +11,7 @@ use serde::Serialize;
 
 use crate::landing::table::share_interval;
 use crate::record::{self, OURS, Record};
+use crate::rows;
 use crate::score::{Score, Summary};
 use crate::set::Set;
 use crate::sets::Variant;
@@ -35,7 +36,7 @@ struct Line<'a> {
     detector: &'a str,
     set: &'static str,
     family: &'a str,
-    group: Option<&'a str>,
+    group: Option<String>,
     #[serde(flatten)]
     summary: Summary,
 }
@@ -101,25 +102,35 @@ pub fn text(runs: &[Run]) -> String {
 /// When a score cannot be written as JSON.
 pub fn json_lines(runs: &[Run]) -> anyhow::Result<String> {
     let mut text = String::new();
-    let mut append = |run: &Run, group: Option<&str>, score: &Score| -> anyhow::Result<()> {
-        let line = Line {
+    for line in lines(runs) {
+        text.push_str(&serde_json::to_string(&line)?);
+        text.push('\n');
+    }
+    Ok(text)
+}
+
+fn lines(runs: &[Run]) -> Vec<Line<'_>> {
+    let mut lines = Vec::new();
+    for run in runs {
+        let line = |group: Option<String>, score: &Score| Line {
             detector: &run.detector,
             set: run.set.name(),
             family: &run.family,
             group,
             summary: score.summary(),
         };
-        text.push_str(&serde_json::to_string(&line)?);
-        text.push('\n');
-        Ok(())
-    };
-    for run in runs {
-        append(run, None, &Score::new(&run.answers))?;
-        for (group, score) in groups(run) {
-            append(run, Some(&group), &score)?;
-        }
+        lines.push(line(None, &Score::new(&run.answers)));
+        lines.extend(groups(run).into_iter().map(|(group, score)| line(Some(group), &score)));
     }
-    Ok(text)
+    lines
+}
+
+/// The same scores as comma-separated values.
+///
+/// # Errors
+/// When a score cannot be written.
+pub fn csv(runs: &[Run]) -> anyhow::Result<String> {
+    Ok(rows::csv(&lines(runs))?)
 }
 
 /// Scores by group.

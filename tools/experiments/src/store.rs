@@ -18,6 +18,9 @@ use crate::sets::{self, Variant};
 /// The file with the ground truth of the frames beside it.
 pub const TRUTH: &str = "truth.jsonl";
 
+/// The file with the version that rendered the frames beside it.
+pub const RENDERED_BY: &str = "rendered-by.txt";
+
 /// A frame with its ground truth.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct StoredFrame {
@@ -165,8 +168,15 @@ pub fn make(
         lines.write_all(b"\n")?;
     }
     lines.flush()?;
+    std::fs::write(folder.join(RENDERED_BY), node::version())?;
     std::fs::rename(&unfinished, &truth)?;
     Ok(specs.len())
+}
+
+/// The version that rendered the frames of a folder.
+pub fn rendered_by(folder: &Path) -> String {
+    let told = std::fs::read_to_string(folder.join(RENDERED_BY));
+    told.map_or_else(|_| "of an unknown version".to_owned(), |it| it.trim().to_owned())
 }
 
 fn write_png(path: &Path, pixels: &[u8], camera: &CameraLine) -> anyhow::Result<()> {

@@ -103,10 +103,15 @@ pub fn all(runs: &[Run]) -> Vec<Written> {
         .collect()
 }
 
+/// The name of a table's file, `table-a1`.
+pub fn name(table: &Table) -> String {
+    format!("table-{}", table.name.to_lowercase().replace('.', ""))
+}
+
 // Writing to a string cannot fail, so that the results of `write!` are ignored.
 
 fn write(table: &Table, ours: &Run, others: &[&Run]) -> Written {
-    let name = format!("table-{}", table.name.to_lowercase().replace('.', ""));
+    let name = name(table);
     let mut markdown = format!(
         "### Table {}: {}, {} binning\n\nMean and standard deviation of the errors along the axis (x), to the right (y) and downwards (z), in millimetres; right: errors along the axis of the thesis' real camera, and of the reference detectors on the same rendered frames. A dash: not found in every frame.\n\n",
         table.name, table.family, table.binning
