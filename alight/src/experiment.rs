@@ -5,7 +5,7 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::{Args, Subcommand, ValueEnum};
 use experiments::Preset;
 use experiments::comparison::pairs::{Comparison, Run};
@@ -13,7 +13,7 @@ use experiments::comparison::report;
 use experiments::landing::fault::Fault;
 use experiments::landing::plan::{self, Plan, Values, Vision};
 use experiments::landing::{self, Watch};
-use experiments::markers::{Request, Step, check_unused, compared};
+use experiments::markers::{Request, Step, check_unused, compared, compared_name};
 use experiments::record::Ids;
 use experiments::results::Folder;
 use experiments::set::{Set, families};
@@ -341,6 +341,15 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
         })
         .collect();
     requests.iter().try_for_each(check_unused)?;
+    if let [first, _, ..] = requests.as_slice() {
+        let table = args.output.join(format!("{}.csv", compared_name(first)));
+        if table.exists() && !args.replace {
+            bail!(
+                "{} is there already; name another folder with `-o`, or replace it with `--replace`",
+                table.display()
+            );
+        }
+    }
     let interruption = Interruption::on_signals("the set under way is still searched")?;
     let steps = Steps::of_names();
     let mut done = Vec::new();
@@ -363,7 +372,13 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
     }
     steps.finish();
     if done.len() > 1 {
-        print(&compared(&done)?)?;
+        let table = compared(&done)?;
+        for (ending, text) in [("md", table.markdown.trim_start()), ("csv", &table.csv)] {
+            let path = args.output.join(format!("{}.{ending}", table.name));
+            std::fs::write(&path, text).with_context(|| format!("writing {}", path.display()))?;
+        }
+        print(&table.markdown)?;
+        write_error(&format!("that table: {}.md and .csv", args.output.join(table.name).display()));
     }
     Ok(interruption.exit_code())
 }

@@ -14,7 +14,7 @@ use crate::figures::{self, FIGURES};
 use crate::frame_spec::FrameRenderer;
 use crate::photographs;
 use crate::record::{self, ALL_AT_ONCE, FOLLOWING, Ids, OURS};
-use crate::report::{self, Run};
+use crate::report::{self, OfProcessing, Run};
 use crate::results;
 use crate::rows::csv;
 use crate::set::{MARKERS, SIZE_M, Set};
@@ -275,24 +275,47 @@ fn of_others(runs: &[Run], sets_in: &Path) -> String {
     text
 }
 
+/// A table as Markdown and as comma-separated values.
+#[derive(Clone, Debug)]
+pub struct Compared {
+    /// The name of its files, without their endings.
+    pub name: String,
+    /// For people.
+    pub markdown: String,
+    /// For programs.
+    pub csv: String,
+}
+
 /// Our recall and accuracy in several requests that were run, by processing, family and set.
 ///
 /// # Errors
 /// When results are damaged.
-pub fn compared(requests: &[Request]) -> anyhow::Result<String> {
-    let mut text = report::processing_head();
+pub fn compared(requests: &[Request]) -> anyhow::Result<Compared> {
+    let mut all = Vec::new();
     for request in requests {
-        let runs = report::runs(&request.sets_in, &request.results_in)?;
-        let wanted = |run: &&Run| {
-            run.detector == OURS
-                && request.sets.contains(&run.set)
-                && (request.families.is_empty() || request.families.contains(&run.family))
-        };
-        for run in runs.iter().filter(wanted) {
-            report::append_processing(&mut text, &request.variant, run);
-        }
+        all.push((request, report::runs(&request.sets_in, &request.results_in)?));
     }
-    Ok(text)
+    let rows: Vec<OfProcessing<'_>> = all
+        .iter()
+        .flat_map(|(request, runs)| {
+            let wanted = |run: &&Run| {
+                run.detector == OURS
+                    && request.sets.contains(&run.set)
+                    && (request.families.is_empty() || request.families.contains(&run.family))
+            };
+            runs.iter().filter(wanted).map(|run| report::of_processing(&request.variant, run))
+        })
+        .collect();
+    let name = requests.first().map_or_else(String::new, compared_name);
+    Ok(Compared { name, markdown: report::by_processing(&rows), csv: csv(&rows)? })
+}
+
+/// The name of the files with the table by processing of such a request: what all of its rows share.
+pub fn compared_name(request: &Request) -> String {
+    let Variant { seed, every, .. } = request.variant;
+    let ids = if request.ids == Ids::Shown { "-known-id" } else { "" };
+    let part = if every > 1 { format!("-every{every}") } else { String::new() };
+    format!("by-processing-seed{seed}{part}{ids}")
 }
 
 fn sized(families: &[Family]) -> Vec<Marker> {

@@ -142,31 +142,49 @@ pub fn groups(run: &Run) -> BTreeMap<String, Score> {
     groups.into_iter().map(|(group, list)| (group.to_owned(), Score::new(list))).collect()
 }
 
-/// The head of the table of [`append_processing`].
-pub fn processing_head() -> String {
-    "\n## By processing\n\n| processing | seed | set | marker | found % | centre px median | p95 | range % median | centre chi2 | range chi2 | wrong ids | elsewhere | ms |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|\n".to_owned()
+/// A row of the table by processing.
+#[derive(Serialize)]
+pub struct OfProcessing<'a> {
+    processing: String,
+    seed: u64,
+    set: &'static str,
+    family: &'a str,
+    #[serde(flatten)]
+    summary: Summary,
 }
 
-/// Appends a row of the table by processing.
-pub fn append_processing(text: &mut String, variant: &Variant, run: &Run) {
-    let s = Score::new(&run.answers).summary();
-    let _ = writeln!(
-        text,
-        "| {} | {} | {} | {} | {:.1} | {} | {} | {} | {} | {} | {} | {} | {} |",
-        variant.processing,
-        variant.seed,
-        run.set.name(),
-        run.family,
-        100.0 * s.found as f64 / s.frames.max(1) as f64,
-        number(s.centre_median_px, 4),
-        number(s.centre_p95_px, 3),
-        number(s.range_median_percent, 3),
-        number(s.centre_chi2, 2),
-        number(s.range_chi2, 2),
-        s.wrong_ids,
-        s.elsewhere,
-        number(s.ms, 2),
-    );
+/// The row of one run.
+pub fn of_processing<'a>(variant: &Variant, run: &'a Run) -> OfProcessing<'a> {
+    OfProcessing {
+        processing: variant.processing.to_string(),
+        seed: variant.seed,
+        set: run.set.name(),
+        family: &run.family,
+        summary: Score::new(&run.answers).summary(),
+    }
+}
+
+/// The table by processing, in Markdown.
+pub fn by_processing(rows: &[OfProcessing<'_>]) -> String {
+    let mut text = "\n## By processing\n\n| processing | seed | set | marker | found | found % | centre px median | p95 | range % median | centre chi2 | range chi2 | wrong ids | elsewhere | ms |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n".to_owned();
+    for OfProcessing { processing, seed, set, family, summary: s } in rows {
+        let _ = writeln!(
+            text,
+            "| {processing} | {seed} | {set} | {family} | {}/{} | {:.1} | {} | {} | {} | {} | {} | {} | {} | {} |",
+            s.found,
+            s.frames,
+            100.0 * s.found as f64 / s.frames.max(1) as f64,
+            number(s.centre_median_px, 4),
+            number(s.centre_p95_px, 3),
+            number(s.range_median_percent, 3),
+            number(s.centre_chi2, 2),
+            number(s.range_chi2, 2),
+            s.wrong_ids,
+            s.elsewhere,
+            number(s.ms, 2),
+        );
+    }
+    text
 }
 
 /// How many of how many, with the interval of the share.
@@ -231,11 +249,21 @@ pub fn height_m(group: &str) -> Option<u32> {
     group.split('-').nth(1)?.get(..2)?.parse().ok()
 }
 
-/// The last height, in metres, up to which every frame is found; a set of which only some frames are taken lacks heights.
-fn complete_to(heights: impl Iterator<Item = u32>, score_at: impl Fn(u32) -> Score) -> u32 {
+/// The last height, in metres, up to which every frame is found, and how many frames a height has: of the fewest to the most. A set of
+/// which only some frames are taken lacks heights.
+fn complete_to(heights: impl Iterator<Item = u32>, score_at: impl Fn(u32) -> Score) -> String {
     let scores = heights.map(|height| (height, score_at(height)));
     let complete = scores.take_while(|(_, score)| score.found == score.frames);
-    complete.filter(|(_, score)| score.frames > 0).last().map_or(0, |(height, _)| height)
+    let complete: Vec<(u32, usize)> = complete
+        .filter(|(_, score)| score.frames > 0)
+        .map(|(height, score)| (height, score.frames))
+        .collect();
+    let Some((height, _)) = complete.last() else { return "-".to_owned() };
+    let counts = || complete.iter().map(|(_, frames)| *frames);
+    match (counts().min().unwrap_or(0), counts().max().unwrap_or(0)) {
+        (few, many) if few == many => format!("{height} ({few})"),
+        (few, many) => format!("{height} ({few} to {many})"),
+    }
 }
 
 fn append_positions(text: &mut String, runs: &[Run]) {
@@ -244,7 +272,7 @@ fn append_positions(text: &mut String, runs: &[Run]) {
     }
     let _ = writeln!(
         text,
-        "\n## The thesis' positions\n\n| marker | detector | binning | frames found | every frame found to m | centre px median | p95 | range % median to 10 m | p95 | bias % | range % median at 13 m | bias mm |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
+        "\n## The thesis' positions\n\n| marker | detector | binning | frames found | every frame found to m (frames of a distance) | centre px median | p95 | found to 10 m | range % median | p95 | bias % | found at 13 m | range % median | bias mm |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
     );
     for run in runs.iter().filter(|run| run.set == Set::Positions) {
         for binning in ["2x2", "4x4"] {
@@ -260,16 +288,20 @@ fn append_positions(text: &mut String, runs: &[Run]) {
             let (all, near, last) = (all.summary(), near.summary(), last.summary());
             let _ = writeln!(
                 text,
-                "| {} | {} | {binning} | {}/{} | {complete} | {} | {} | {} | {} | {} | {} | {} |",
+                "| {} | {} | {binning} | {}/{} | {complete} | {} | {} | {}/{} | {} | {} | {} | {}/{} | {} | {} |",
                 run.family,
                 run.detector,
                 all.found,
                 all.frames,
                 number(all.centre_median_px, 4),
                 number(all.centre_p95_px, 4),
+                near.found,
+                near.frames,
                 number(near.range_median_percent, 4),
                 number(near.range_p95_percent, 4),
                 number(near.range_bias_percent, 4),
+                last.found,
+                last.frames,
                 number(last.range_median_percent, 4),
                 number(last.range_bias_mm, 1),
             );
@@ -283,7 +315,7 @@ fn append_farthest(text: &mut String, runs: &[Run]) {
     }
     let _ = writeln!(
         text,
-        "\n## Farthest, 2x2\n\n| marker | detector | every frame found to m | found at 20 | 24 | 28 | 30 | 32 | 34 | 36 | 38 | 40 m |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
+        "\n## Farthest, 2x2\n\n| marker | detector | every frame found to m (frames of a distance) | found at 20 | 24 | 28 | 30 | 32 | 34 | 36 | 38 | 40 m |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
     );
     for run in runs.iter().filter(|run| run.set == Set::Far) {
         let groups = groups(run);
@@ -292,7 +324,8 @@ fn append_farthest(text: &mut String, runs: &[Run]) {
             complete_to((10..=40).step_by(2), |height| at(height).cloned().unwrap_or_default());
         let _ = write!(text, "| {} | {} | {farthest} |", run.family, run.detector);
         for height in [20, 24, 28, 30, 32, 34, 36, 38, 40] {
-            let found = at(height).map_or_else(|| "-".to_owned(), |it| it.found.to_string());
+            let found = at(height)
+                .map_or_else(|| "-".to_owned(), |it| format!("{}/{}", it.found, it.frames));
             let _ = write!(text, " {found} |");
         }
         text.push('\n');
@@ -399,6 +432,28 @@ mod tests {
         let record = Record { image: "a.png".to_owned(), ms: 1.0, found: Vec::new() };
         let answers = vec![(frame, record)];
         Run { set, family: "experiment".to_owned(), detector: OURS.to_owned(), answers }
+    }
+
+    #[test]
+    fn a_figure_has_the_number_of_its_frames() {
+        let of = |frames: usize| {
+            move |height: u32| Score {
+                frames: if height == 4 { 1 } else { frames },
+                found: if height < 8 {
+                    frames.min(if height == 4 { 1 } else { frames })
+                } else {
+                    0
+                },
+                ..Score::default()
+            }
+        };
+        assert_eq!(complete_to(1..=13, of(1)), "7 (1)");
+        assert_eq!(complete_to(1..=13, of(5)), "7 (1 to 5)");
+        assert_eq!(complete_to(9..=13, of(5)), "-");
+        let rows = [run(Set::Negatives)];
+        let row = of_processing(&Variant::default(), &rows[0]);
+        let told = by_processing(&[row]);
+        assert!(told.contains("| linear | 0 | negatives | experiment | 0/1 | 0.0 | - |"), "{told}");
     }
 
     #[test]

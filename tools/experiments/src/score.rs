@@ -4,6 +4,7 @@
 use node::stats::{interpolated_quantile as quantile, mean};
 use serde::Serialize;
 
+use crate::landing::table::percentile;
 use crate::record::{Found, Record};
 use crate::store::{MarkerLine, StoredFrame};
 
@@ -122,11 +123,11 @@ impl Score {
             wrong_ids: self.wrong_ids,
             elsewhere: self.elsewhere,
             centre_median_px: quantile(&self.centre_px, 0.5),
-            centre_p95_px: quantile(&self.centre_px, 0.95),
+            centre_p95_px: percentile(&self.centre_px, 0.95),
             centre_worst_px: quantile(&self.centre_px, 1.0),
             corner_median_px: quantile(&self.corner_px, 0.5),
             range_median_percent: quantile(&absolute, 0.5).map(|part| 100.0 * part),
-            range_p95_percent: quantile(&absolute, 0.95).map(|part| 100.0 * part),
+            range_p95_percent: percentile(&absolute, 0.95).map(|part| 100.0 * part),
             range_bias_percent: mean(&self.range_ratio).map(|part| 100.0 * part),
             range_bias_mm: mean(&self.range_m).map(|m| 1e3 * m),
             centre_chi2: quantile(&self.centre_chi2, 0.5),
@@ -134,7 +135,7 @@ impl Score {
             range_worst_sigmas: quantile(&self.range_chi2, 1.0).map(f64::sqrt),
             range_chi2: quantile(&self.range_chi2, 0.5),
             ms: quantile(&self.ms, 0.5),
-            ms_p95: quantile(&self.ms, 0.95),
+            ms_p95: percentile(&self.ms, 0.95),
         }
     }
 }

@@ -113,7 +113,7 @@ pub fn name(table: &Table) -> String {
 fn write(table: &Table, ours: &Run, others: &[&Run]) -> Written {
     let name = name(table);
     let mut markdown = format!(
-        "### Table {}: {}, {} binning\n\nMean and standard deviation of the errors along the axis (x), to the right (y) and downwards (z), in millimetres; right: errors along the axis of the thesis' real camera, and of the reference detectors on the same rendered frames. A dash: not found in every frame.\n\n",
+        "### Table {}: {}, {} binning\n\nMean and standard deviation of the errors along the axis (x), to the right (y) and downwards (z), in millimetres; right: errors along the axis of the thesis' real camera, and of the reference detectors on the same rendered frames. The thesis' are of five frames each. A dash: not found in every frame, or one frame alone, which has no deviation.\n\n",
         table.name, table.family, table.binning
     );
     let mut csv = String::from("x_m,y_m,detector,frames,found");
@@ -125,16 +125,17 @@ fn write(table: &Table, ours: &Run, others: &[&Run]) -> Written {
     csv.push('\n');
     let _ = write!(
         markdown,
-        "| x m | y m | mean x | y | z | deviation x | y | z | thesis mean x | deviation x |"
+        "| x m | y m | found | mean x | y | z | deviation x | y | z | thesis mean x | deviation x |"
     );
     for other in others {
         let _ = write!(markdown, " {} mean x | deviation x |", other.detector);
     }
-    let _ = writeln!(markdown, "\n|{}", "---|".repeat(10 + 2 * others.len()));
+    let _ = writeln!(markdown, "\n|{}", "---|".repeat(11 + 2 * others.len()));
     let other_positions: Vec<_> =
         others.iter().map(|run| (run, positions(run, table.binning))).collect();
     for (index, position) in positions(ours, table.binning).iter().enumerate() {
-        let _ = write!(markdown, "| {} | {} |", position.x_m, position.y_m);
+        let Position { x_m, y_m, frames, errors_m, .. } = position;
+        let _ = write!(markdown, "| {x_m} | {y_m} | {}/{frames} |", errors_m.len());
         for statistic in [mean, standard_deviation] {
             for axis in 0..3 {
                 let _ = write!(markdown, " {} |", millimetres(position, axis, statistic));
@@ -202,6 +203,59 @@ mod tests {
         assert_eq!(place("2x2-07m-2m", "2x2"), Some((7, -2.0)));
         assert_eq!(place("4x4-03m+0.5m", "4x4"), Some((3, 0.5)));
         assert_eq!(place("4x4-03m+0.5m", "2x2"), None);
+    }
+
+    #[test]
+    fn a_mean_has_the_number_of_its_frames() {
+        let camera = crate::store::CameraLine {
+            width: 8,
+            height: 8,
+            fx: 8.0,
+            fy: 8.0,
+            cx: 4.0,
+            cy: 4.0,
+            distortion: Vec::new(),
+        };
+        let frame = StoredFrame {
+            image: "a.png".to_owned(),
+            set: "positions".to_owned(),
+            group: "2x2-07m-2m".to_owned(),
+            camera,
+            marker: Some(MarkerLine {
+                family: "rings".to_owned(),
+                id: None,
+                size_m: 0.1,
+                centre_px: [0.0; 2],
+                corners_px: [[0.0; 2]; 4],
+                size_px: 20.0,
+                is_whole: true,
+                translation_m: [0.0, 0.0, 7.0],
+                rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
+            }),
+        };
+        let found = crate::record::Found {
+            family: "rings".to_owned(),
+            id: None,
+            centre_px: [0.0; 2],
+            centre_covariance_px2: None,
+            corners_px: None,
+            translation_m: Some([0.0, 0.0, 7.002]),
+            range_variance_m2: None,
+            confidence: None,
+        };
+        let answer = (frame, Record { image: "a.png".to_owned(), ms: 1.0, found: vec![found] });
+        let run = Run {
+            set: Set::Positions,
+            family: "rings".to_owned(),
+            detector: OURS.to_owned(),
+            answers: vec![answer],
+        };
+        let written = all(&[run]);
+        assert!(
+            written[0].markdown.contains("| 7 | -2 | 1/1 | 2.000 |"),
+            "{}",
+            written[0].markdown
+        );
     }
 
     #[test]
