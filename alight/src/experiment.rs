@@ -373,7 +373,7 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
     steps.finish();
     if done.len() > 1 {
         let table = compared(&done)?;
-        for (ending, text) in [("md", table.markdown.trim_start()), ("csv", &table.csv)] {
+        for (ending, text) in [("md", table.markdown.trim_start()), ("csv", table.csv.as_str())] {
             let path = args.output.join(format!("{}.{ending}", table.name));
             std::fs::write(&path, text).with_context(|| format!("writing {}", path.display()))?;
         }

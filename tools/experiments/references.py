@@ -4,7 +4,8 @@
     python3 tools/experiments/references.py SETS RESULTS [set=NAME ...] [family=NAME ...] [detector=NAME ...] [photographs=FOLDER]
 
 SETS is what `alight experiment markers` has rendered, RESULTS where it keeps its answers; the references' answers are
-put beside them in the same form, and `alight experiment markers` scores them with its own. Everything runs on one thread,
+put beside them in the same form, and the same command with `--replace` scores them with its own. Sets that are not
+rendered are left out. Everything runs on one thread,
 and times are processor time. Detectors that are not installed are skipped with a message: OpenCV
 (opencv-contrib-python or opencv-python), AprilTag 3 (pyapriltags or pupil-apriltags), STag (stag-python). The thesis'
 rings are rebuilt from its Algorithms 1 to 15 on OpenCV.
@@ -43,7 +44,7 @@ except ImportError:
 cv2.setNumThreads(1)
 
 SETS = [
-    "textured", "adverse", "landing", "far", "tilt", "blur", "noise", "light", "rolling", "cut", "tracking", "negatives", "circles",
+    "textured", "adverse", "landing", "far", "tilt", "blur", "noise", "light", "rolling", "shade", "ground", "cut", "tracking", "negatives", "circles",
     "positions",
 ]  # fmt: skip
 # Families of the labelled photographs, as the labels name them.
@@ -330,9 +331,11 @@ def main():
     for name in wanted["set"] or (SETS if not wanted["photographs"] else []):
         folders = sorted(folder for folder in (sets / name).glob("*/") if (folder / "truth.jsonl").is_file())
         families = {folder.name: folder for folder in folders}
-        if name in ("negatives", "circles"):
+        if name in ("negatives", "circles") and (sets / name / "truth.jsonl").is_file():
             kinds = ("rings", "apriltag-16h5", "aruco-4x4-50", "stag-hd23", "apriltag-36h11")
             families = {family: sets / name for family in kinds}
+        if wanted["set"] and not families:
+            sys.exit(f"{sets / name} has no frames: `alight experiment markers --set {name}` renders them")
         for family, folder in families.items():
             if wanted["family"] and family not in wanted["family"]:
                 continue
