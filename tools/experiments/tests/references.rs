@@ -18,7 +18,12 @@ fn reference_detectors_take_the_sets_that_are_there() {
     let frames = store::make(&sets, Set::Far, marker, variant, &mut renderer).unwrap();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("references.py");
     let run = |rest: &[&str]| {
-        Command::new(testing::interpreter()).arg(&script).args([&sets, &results]).args(rest).output().unwrap()
+        Command::new(testing::interpreter())
+            .arg(&script)
+            .args([&sets, &results])
+            .args(rest)
+            .output()
+            .unwrap()
     };
     let output = run(&[]);
     let told = String::from_utf8_lossy(&output.stdout);

@@ -202,7 +202,9 @@ pub fn plot(comparison: &Comparison) -> anyhow::Result<String> {
             format!("{letter}: {}, {}", side.folder.display(), side.settings.join(" and "))
         });
         let under = "below the line B is better";
-        let title = format!("Pairs of flights that landed in both; {under}");
+        let title = format!(
+            "Pairs of flights that landed in both; {under}. A seed counts once, with the median of its pairs"
+        );
         head.draw(&Text::new(title, (16, 12), ("sans-serif", 20)))?;
         for (row, line) in lines.enumerate() {
             let short: String = line.chars().take(140).collect();
@@ -213,6 +215,22 @@ pub fn plot(comparison: &Comparison) -> anyhow::Result<String> {
         }
         Ok(())
     })
+}
+
+/// A tick of an axis, with all of its digits: they may be closer together than the digits that mean something.
+fn tick(value: &f64) -> String {
+    rounded(*value, 6).to_string()
+}
+
+/// A panel's title, with the numbers of the table: of seeds, while the points are pairs.
+fn title(measure: &Measure, of: &Comparison) -> String {
+    match of.pairs.differences.get(measure.name) {
+        Some(Difference { pairs, seeds, smaller, larger, .. }) => format!(
+            "{}: {pairs} pairs; B smaller, larger in {smaller}, {larger} of {seeds} seeds",
+            measure.words
+        ),
+        None => measure.words.to_owned(),
+    }
 }
 
 fn scatter(area: &Area<'_>, measure: &Measure, of: &Comparison) -> Result<(), DrawError> {
@@ -227,24 +245,21 @@ fn scatter(area: &Area<'_>, measure: &Measure, of: &Comparison) -> Result<(), Dr
     // A little around all points, and never an empty range.
     let margin = (0.06 * (high - low)).max(0.5 * 0.1f64.powi(measure.digits as i32));
     let (low, high) = ((low - margin).max(0.0), high + margin);
-    let smaller = points.iter().filter(|it| it.second < it.first).count();
-    let title = format!("{}: B smaller in {smaller} of {} pairs", measure.words, points.len());
+    let title = title(measure, of);
     let mut chart = ChartBuilder::on(area)
         .caption(title, ("sans-serif", 16))
         .margin(12)
         .x_label_area_size(40)
         .y_label_area_size(60)
         .build_cartesian_2d(low..high, low..high)?;
-    let digits = measure.digits;
-    let label = |value: &f64| format!("{value:.digits$}");
     chart
         .configure_mesh()
         .x_desc("A")
         .y_desc("B")
         .x_labels(6)
         .y_labels(6)
-        .x_label_formatter(&label)
-        .y_label_formatter(&label)
+        .x_label_formatter(&tick)
+        .y_label_formatter(&tick)
         .draw()?;
     chart.draw_series(LineSeries::new([(low, low), (high, high)], GREY.stroke_width(2)))?;
     let dots =
@@ -321,6 +336,21 @@ mod tests {
         assert!(json["warnings"][0].as_str().is_some_and(|it| it.contains("--vision rendered")));
         let told = Comparison::new(&rings, &rings).unwrap();
         assert!(!text(&told, "compare").contains("**"), "{told:?}");
+    }
+
+    #[test]
+    fn the_plot_has_the_numbers_of_the_table_and_ticks_that_are_true() {
+        let [first, second] = [
+            &[("calm", [0.01, 0.03]), ("windy", [0.01, 0.03])],
+            &[("calm", [0.02, 0.02]), ("windy", [0.012, 0.02])],
+        ]
+        .map(|it| run(it));
+        let comparison = Comparison::new(&first, &second).unwrap();
+        let svg = plot(&comparison).unwrap();
+        let numbers = "touchdown error, m: 4 pairs; B smaller, larger in 1, 1 of 2 seeds";
+        assert!(svg.contains(numbers), "{svg}");
+        assert!(text(&comparison, "compare").contains("| 1, 1 of 2 |"));
+        assert_eq!([0.0, 0.005, 0.01, 12.5].map(|it| tick(&it)), ["0", "0.005", "0.01", "12.5"]);
     }
 
     #[test]
