@@ -318,7 +318,10 @@ fn success(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     let cells = cells(outcomes);
     let count = cells.len() as f64;
     let mut chart = ChartBuilder::on(area)
-        .caption("Proportion that landed within 0.1 m, with its 95 % interval", ("sans-serif", 20))
+        .caption(
+            "Proportion that landed within 0.1 m, with its 95 % interval (Wilson)",
+            ("sans-serif", 20),
+        )
         .margin(12)
         .x_label_area_size(40)
         .build_cartesian_2d(0.0..200.0, 0.0..count)?;

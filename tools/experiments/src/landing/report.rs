@@ -1,6 +1,7 @@
 //! Writes the files of the landing experiment: every flight as CSV and JSON lines, plots, the thesis' figures of one
 //! flight, recordings of the worst flights flown again, and the report.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::BufWriter;
@@ -59,11 +60,10 @@ pub fn write(
 fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
     let plan = &request.plan;
     let within = outcomes.iter().filter(|o| o.is_within(0.1)).count();
-    let [low, high] = share_interval(within, outcomes.len());
     let dangerous = outcomes.iter().filter(|o| o.is_unsafe()).count();
     let again = outcomes.iter().filter(|o| o.has_left_ground()).count();
     format!(
-        "{LANDINGS_HEADING}\n{}{}{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe, {again} left the ground again after a touch (by more than {MAX_HOP_M} m).\n\n\
+        "{LANDINGS_HEADING}\n{}{}{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({}), {dangerous} unsafe, {again} left the ground again after a touch (by more than {MAX_HOP_M} m).\n\n\
          Unsafe: touched the ground faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways, or, without having given up, more than {} m off. Times count from the start of the landing. \
          Numbers of error, time, speed and tilt are of those that landed.\n\n",
         results::interrupted(outcomes.len(), planned),
@@ -72,11 +72,29 @@ fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
         outcomes.len(),
         plan.vision.name(),
         plan.seed,
-        100.0 * within as f64 / outcomes.len().max(1) as f64,
-        100.0 * low,
-        100.0 * high,
+        share(outcomes),
         Touchdown::MAX_ERROR_M,
     )
+}
+
+/// The share within 0.1 m, with its interval. A seed has the same draws in all circumstances, so that its flights are not independent: over
+/// several of them the interval is that of the seeds of which every flight landed there.
+fn share(outcomes: &[Outcome]) -> String {
+    let mut of_seeds: BTreeMap<u64, bool> = BTreeMap::new();
+    for outcome in outcomes {
+        *of_seeds.entry(outcome.seed).or_insert(true) &= outcome.is_within(0.1);
+    }
+    let good = of_seeds.values().filter(|is_good| **is_good).count();
+    let within = outcomes.iter().filter(|o| o.is_within(0.1)).count();
+    let [low, high] = share_interval(good, of_seeds.len()).map(|part| 100.0 * part);
+    let interval = format!("95 % interval of Wilson {low:.2} to {high:.2} %");
+    let percent = 100.0 * within as f64 / outcomes.len().max(1) as f64;
+    match of_seeds.len() {
+        seeds if seeds == outcomes.len() => format!("{percent:.2} %, {interval}"),
+        seeds => {
+            format!("{percent:.2} %; every flight of {good} of {seeds} seeds, {interval} of these")
+        }
+    }
 }
 
 /// What must be said before any number, in bold.
@@ -210,6 +228,22 @@ mod tests {
         };
         let outcomes: Vec<Outcome> = request.plan.flights().iter().map(landed).collect();
         head(&request, &outcomes, outcomes.len())
+    }
+
+    #[test]
+    fn a_share_has_the_interval_of_its_seeds() {
+        let plan = |wind: &[f64]| Plan {
+            wind: crate::landing::plan::Values::List(wind.to_vec()),
+            flights: 8,
+            ..Plan::default()
+        };
+        let told_of = told(plan(&[0.0]));
+        let alone = "8 landed within 0.1 m (100.00 %, 95 % interval of Wilson 67.56 to 100.00 %)";
+        assert!(told_of.contains(alone), "{told_of}");
+        // Not that of sixteen flights, 80.64 %.
+        let told_of = told(plan(&[0.0, 5.0]));
+        let both = "16 landed within 0.1 m (100.00 %; every flight of 8 of 8 seeds, 95 % interval of Wilson 67.56 to 100.00 % of these)";
+        assert!(told_of.contains(both), "{told_of}");
     }
 
     #[test]
