@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::landing::outcome::{self, Ending};
 use crate::landing::plan::{ONLY_SIZE_COUNTS, only_size_counts};
-use crate::landing::table::{median_interval, percentile, sign_test};
+use crate::landing::table::{median_coverage, median_interval, percentile, sign_test};
 use crate::results::FLIGHTS_AS_JSON;
 
 /// A flight, as its row tells it.
@@ -247,6 +247,8 @@ pub struct Difference {
     pub median: Option<f64>,
     /// Its 95 % interval by order statistics; `None` for fewer than six seeds.
     pub interval: Option<[f64; 2]>,
+    /// The probability with which such an interval contains the median: 95 % or more.
+    pub interval_percent: Option<f64>,
     /// Seeds in which the second run's value is smaller.
     pub smaller: usize,
     /// Seeds in which it is larger.
@@ -272,6 +274,7 @@ impl Difference {
             runs: [spread(|it| it.first), spread(|it| it.second)],
             median: quantile(&differences, 0.5),
             interval: median_interval(&differences),
+            interval_percent: median_coverage(differences.len()).map(|part| 100.0 * part),
             smaller,
             larger,
             p: sign_test(smaller, larger),
@@ -294,11 +297,47 @@ pub struct Landed {
     pub p: f64,
 }
 
+/// In how many seeds the second run has fewer and more flights that landed, landed within 0.1 m or were unsafe.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize)]
+pub struct Tested {
+    /// Number of seeds.
+    pub seeds: usize,
+    /// Seeds in which the second run has fewer.
+    pub fewer: usize,
+    /// Seeds in which it has more.
+    pub more: usize,
+    /// Two-sided sign test of these.
+    pub p: f64,
+}
+
+impl Tested {
+    fn new(pairs: &[Pair<'_>], is: fn(&Flight) -> bool) -> Self {
+        let mut ahead: BTreeMap<u64, i64> = BTreeMap::new();
+        for it in pairs {
+            *ahead.entry(it.first.seed).or_default() +=
+                i64::from(is(it.second)) - i64::from(is(it.first));
+        }
+        let seeds = |sign: i64| ahead.values().filter(|by| by.signum() == sign).count();
+        let (fewer, more) = (seeds(-1), seeds(1));
+        Self { seeds: ahead.len(), fewer, more, p: sign_test(fewer, more) }
+    }
+}
+
+/// What flights are counted by: the name in the JSON, and what counts.
+pub const COUNTS: [Counted; 3] = [
+    ("landed", Flight::is_landed),
+    ("within_100_mm", |it| it.is_within(0.1)),
+    ("unsafe", Flight::is_unsafe),
+];
+type Counted = (&'static str, fn(&Flight) -> bool);
+
 /// Pairs of some circumstances, or of all; for tests and intervals a seed counts once.
 #[derive(Clone, Debug, Serialize)]
 pub struct Pairs {
     /// Number of pairs.
     pub pairs: usize,
+    /// The tests of what is counted, by its name.
+    pub counts: BTreeMap<&'static str, Tested>,
     /// Which of them landed.
     pub landed: Landed,
     /// The differences of those of which both landed, by the measure's name.
@@ -313,12 +352,7 @@ impl Pairs {
             pairs.iter().filter(is).count()
         };
         let (first_alone, second_alone) = (count(true, false), count(false, true));
-        let mut ahead: BTreeMap<u64, i64> = BTreeMap::new();
-        for it in pairs {
-            let by = i64::from(it.first.is_landed()) - i64::from(it.second.is_landed());
-            *ahead.entry(it.first.seed).or_default() += by;
-        }
-        let seeds = |sign: i64| ahead.values().filter(|by| by.signum() == sign).count();
+        let counts = COUNTS.map(|(name, is)| (name, Tested::new(pairs, is)));
         Self {
             pairs: pairs.len(),
             landed: Landed {
@@ -326,8 +360,9 @@ impl Pairs {
                 first_alone,
                 second_alone,
                 neither: count(false, false),
-                p: sign_test(seeds(1), seeds(-1)),
+                p: Tested::new(pairs, Flight::is_landed).p,
             },
+            counts: counts.into_iter().collect(),
             differences: MEASURES
                 .iter()
                 .map(|measure| (measure.name, Difference::new(&values(measure, pairs))))
@@ -529,6 +564,9 @@ mod tests {
         for value in [error.median.unwrap(), error.interval.unwrap()[0]] {
             assert!((value + 0.01).abs() < 1e-9, "{value}");
         }
+        // Those of every seed but 7 are within 0.1 m in both.
+        let within = comparison.pairs.counts["within_100_mm"];
+        assert_eq!((within.seeds, within.fewer, within.more), (7, 1, 0));
         let late = &comparison.cells[2].pairs.differences["touchdown_error_m"];
         assert_eq!((late.pairs, late.seeds, late.smaller, late.larger), (6, 6, 0, 6));
     }

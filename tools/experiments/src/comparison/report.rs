@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use plotters::prelude::*;
 
-use super::pairs::{Comparison, Difference, MEASURES, Measure, Side, Spread, Summary};
+use super::pairs::{COUNTS, Comparison, Difference, MEASURES, Measure, Side, Spread, Summary};
 use crate::landing::outcome::{MAX_SINK_M_S, MAX_SLIDE_M_S};
 use crate::landing::plots::{Area, COLOURS, DrawError, GREY, picture};
 use crate::results::{
@@ -87,24 +87,32 @@ fn summaries(comparison: &Comparison) -> String {
         "\nPairs have the same circumstances and seed: {}, of which {} landed in both, {} in A alone, {} in B alone (sign test p = {}) and {} in neither. \
          All numbers are of pairs, those of flights of all, and errors, times and speeds, and their differences (B - A: below 0 B is better), \
          of those that landed in both; 95 % is told of 20 or more.{once} \
-         The interval is that of the median at 95 %, by order statistics (from six seeds on); p is of a two-sided sign test. \
+         The interval is that of the median at 95 % or, as it ends at one of the differences, a little more, which stands beside it, by order statistics (from six \
+         seeds on); p is of a two-sided sign test, for numbers of flights of the seeds in which B has fewer or more. {} values are tested: if A and B did not differ, \
+         one of them would have p < 0.05 in up to {:.0} % of comparisons, so take one that you did not choose beforehand for p < {:.3} alone. \
          Unsafe: faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways, or, without having given up, too far off.\n\n\
-         | | A | B | B - A, median | 95 % interval | B smaller, larger in seeds | p |\n|---|---|---|---|---|---|---|\n",
+         | | A | B | B - A, median | 95 % interval | B smaller (fewer), larger (more) in seeds | p |\n|---|---|---|---|---|---|---|\n",
         pairs.pairs,
         landed.both,
         landed.first_alone,
         landed.second_alone,
         p_value(landed.p),
-        landed.neither
+        landed.neither,
+        TESTS,
+        100.0 * (1.0 - 0.95f64.powi(TESTS as i32)),
+        0.05 / TESTS as f64,
     );
-    let counts: [Named<Count>; 4] = [
-        ("flights", |it| it.flights),
+    let _ = writeln!(text, "| flights | {} | {} | | | | |", first.flights, second.flights);
+    let counts: [Named<Count>; 3] = [
         ("landed", |it| it.landed),
         ("within 0.1 m", |it| it.within_100_mm),
         ("unsafe", |it| it.dangerous),
     ];
-    for (name, of) in counts {
-        let _ = writeln!(text, "| {name} | {} | {} | | | | |", of(first), of(second));
+    for ((name, of), (key, _)) in counts.into_iter().zip(COUNTS) {
+        let tested = pairs.counts.get(key).map_or_else(String::new, |it| {
+            format!("{}, {} of {} | {}", it.fewer, it.more, it.seeds, p_value(it.p))
+        });
+        let _ = writeln!(text, "| {name} | {} | {} | | | {tested} |", of(first), of(second));
     }
     for measure in &MEASURES {
         let Some(difference) = pairs.differences.get(measure.name) else { continue };
@@ -115,7 +123,7 @@ fn summaries(comparison: &Comparison) -> String {
             "| {}: median | {one} | {other} | {} | {} | {}, {} of {} | {} |",
             measure.words,
             signed(difference.median, digits + 1),
-            interval(difference, digits + 1),
+            interval_with_percent(difference, digits + 1),
             difference.smaller,
             difference.larger,
             difference.seeds,
@@ -128,6 +136,9 @@ fn summaries(comparison: &Comparison) -> String {
     }
     text
 }
+
+/// How many values are tested.
+const TESTS: usize = COUNTS.len() + MEASURES.len();
 
 type Count = fn(&Summary) -> usize;
 type Part = fn(&Spread) -> Option<f64>;
@@ -157,6 +168,12 @@ fn interval(difference: &Difference, digits: usize) -> String {
         }
         None => "-".to_owned(),
     }
+}
+
+/// The interval with the probability that it really has.
+fn interval_with_percent(difference: &Difference, digits: usize) -> String {
+    let percent = difference.interval_percent.map(|it| format!(" ({it:.1} %)"));
+    interval(difference, digits) + &percent.unwrap_or_default()
 }
 
 fn p_value(p: f64) -> String {
@@ -318,6 +335,26 @@ mod tests {
             [&[("calm", [0.01, 0.03])], &[("calm", [0.02, 0.04])]].map(|it| run(it));
         let told = text(&Comparison::new(&first, &second).unwrap(), "compare");
         assert!(!told.contains("counts once"), "{told}");
+    }
+
+    #[test]
+    fn what_is_counted_is_tested_and_an_interval_has_its_probability() {
+        // Two errors for each of four circumstances would be two seeds; here each pair is a seed of its own.
+        let of = |error_m: f64| {
+            let mut run = run(&[("calm", [error_m; 2]); 4]);
+            (1..).zip(&mut run.flights).for_each(|(seed, flight)| flight.seed = seed);
+            run
+        };
+        let told = text(&Comparison::new(&of(0.02), &of(0.4)).unwrap(), "compare");
+        for row in [
+            "| landed | 8 | 8 | | | 0, 0 of 8 | 1.000 |",
+            "| within 0.1 m | 8 | 0 | | | 8, 0 of 8 | 0.008 |",
+            "| unsafe | 0 | 8 | | | 0, 8 of 8 | 0.008 |",
+            "| +0.3800 | +0.3800 to +0.3800 (99.2 %) | 0, 8 of 8 | 0.008 |",
+        ] {
+            assert!(told.contains(row), "{row} is not in {told}");
+        }
+        assert!(told.contains("7 values are tested") && told.contains("p < 0.007 alone"), "{told}");
     }
 
     #[test]

@@ -26,10 +26,21 @@ pub fn percentile(numbers: &[f64], part: f64) -> Option<f64> {
 pub fn median_interval(numbers: &[f64]) -> Option<[f64; 2]> {
     let mut sorted = numbers.to_vec();
     sorted.sort_unstable_by(f64::total_cmp);
-    // How many on each side are as improbable as to be left out.
-    let left_out = heads(sorted.len()).take_while(|at_most| *at_most <= 0.025).count();
+    let left_out = left_out(sorted.len());
     let low = left_out.checked_sub(1)?;
     Some([*sorted.get(low)?, *sorted.get(sorted.len().checked_sub(left_out)?)?])
+}
+
+/// How many numbers on each side of the median's interval are as improbable as to be left out.
+fn left_out(count: usize) -> usize {
+    heads(count).take_while(|at_most| *at_most <= 0.025).count()
+}
+
+/// The probability that [`median_interval`] of so many numbers contains the median: 0.95 or more, as it ends at one of the numbers. `None`
+/// where there is no interval.
+pub fn median_coverage(count: usize) -> Option<f64> {
+    let beyond = heads(count).nth(left_out(count).checked_sub(1)?)?;
+    Some(1.0 - 2.0 * beyond)
 }
 
 /// The probability of at most 0, 1, 2, ... heads in so many tosses of a coin.
@@ -165,6 +176,9 @@ mod tests {
         assert_eq!(median_interval(&[6.0, 2.0, 3.0, 4.0, 5.0, 1.0]), Some([1.0, 6.0]));
         assert_eq!(median_interval(&[1.0, 2.0, 3.0, 4.0, 5.0]), None);
         assert_eq!(median_interval(&[]), None);
+        let covered =
+            [5, 6, 8, 20].map(|count| median_coverage(count).map(|it| (1e4 * it).round()));
+        assert_eq!(covered, [None, Some(9688.0), Some(9922.0), Some(9586.0)]);
         let many: Vec<f64> = (0..100_001).map(f64::from).collect();
         let [low, high] = median_interval(&many).unwrap();
         assert!((49_650.0..49_720.0).contains(&low) && low + high == 100_000.0, "{low} {high}");
