@@ -26,6 +26,8 @@ pub const FAMILIES: [(&str, &str); 5] = [
 struct Photograph {
     image: String,
     markers: Vec<Label>,
+    /// What may be found or not.
+    #[serde(default)]
     uncertain: Vec<Label>,
     #[serde(default)]
     negative: bool,
@@ -42,6 +44,12 @@ struct Label {
 }
 
 impl Label {
+    /// Whether it is of a family, by the labels' name or by ours.
+    fn is_of(&self, family: &str) -> bool {
+        let label = FAMILIES.iter().find(|(_, ours)| *ours == family).map(|(label, _)| *label);
+        self.family == family || label == Some(self.family.as_str())
+    }
+
     fn centre(&self) -> [f64; 2] {
         [0, 1].map(|i| self.corners.iter().map(|corner| corner[i]).sum::<f64>() / 4.0)
     }
@@ -77,15 +85,20 @@ pub struct Recall {
     pub unlabelled: usize,
     /// Photographs with missed markers, and their number.
     pub missed: Vec<(String, usize)>,
+    /// Photographs with detections of another id or without a label, and their number.
+    pub others: Vec<(String, usize)>,
 }
 
 fn photographs(folder: &Path) -> anyhow::Result<Vec<Photograph>> {
     let path = folder.join("labels.jsonl");
     let text =
         std::fs::read_to_string(&path).with_context(|| format!("reading {}", path.display()))?;
-    text.lines()
-        .map(|line| serde_json::from_str(line).with_context(|| path.display().to_string()))
-        .collect()
+    let parsed = |(at, line): (usize, &str)| {
+        serde_json::from_str(line).with_context(|| {
+            format!("line {} of {}; docs/experiments.md has its form", at + 1, path.display())
+        })
+    };
+    text.lines().enumerate().map(parsed).collect()
 }
 
 /// Whether a folder has photographs with labels.
@@ -109,10 +122,9 @@ pub fn any_of(family: Family) -> Marker {
 /// When a photograph or the labels cannot be read.
 pub fn run(folder: &Path, family: Family) -> anyhow::Result<Vec<Record>> {
     let mut detector = Detector::new(&[any_of(family)], Settings::default())?;
-    let label = label_of(family.name());
     let mut records = Vec::new();
     for photograph in photographs(folder)? {
-        if photograph.markers.iter().any(|marker| Some(marker.family.as_str()) == label) {
+        if photograph.markers.iter().any(|marker| marker.is_of(family.name())) {
             let image = record::read(&folder.join(&photograph.image))?;
             let (ms, found) = record::answer(&mut detector, &image, None, 1)?;
             records.push(Record { image: photograph.image, ms, found });
@@ -152,10 +164,9 @@ pub fn labelled(
     folder: &Path,
     family: Family,
 ) -> anyhow::Result<impl Iterator<Item = anyhow::Result<LabelledImage>>> {
-    let label = label_of(family.name());
     Ok(photographs(folder)?.into_iter().filter_map(move |photograph| {
         let mut labels = photograph.markers;
-        labels.retain(|marker| Some(marker.family.as_str()) == label);
+        labels.retain(|marker| marker.is_of(family.name()));
         (!labels.is_empty()).then(|| {
             Ok(LabelledImage { image: record::read(&folder.join(&photograph.image))?, labels })
         })
@@ -167,19 +178,14 @@ pub fn labelled_families() -> impl Iterator<Item = Family> {
     FAMILIES.iter().filter_map(|(_, name)| Family::named(name))
 }
 
-fn label_of(family: &str) -> Option<&'static str> {
-    FAMILIES.iter().find(|(_, ours)| *ours == family).map(|(label, _)| *label)
-}
-
 /// The recall of the labelled markers of a family.
 ///
 /// # Errors
 /// When the labels cannot be read, or a result is missing.
 pub fn recall(folder: &Path, family: &str, records: &[Record]) -> anyhow::Result<Recall> {
-    let label = label_of(family);
     let mut recall = Recall::default();
     for photograph in photographs(folder)? {
-        let is_ours = |marker: &&Label| Some(marker.family.as_str()) == label;
+        let is_ours = |marker: &&Label| marker.is_of(family);
         let markers: Vec<&Label> = photograph.markers.iter().filter(is_ours).collect();
         if markers.is_empty() {
             continue;
@@ -195,6 +201,7 @@ pub fn recall(folder: &Path, family: &str, records: &[Record]) -> anyhow::Result
         if found < markers.len() {
             recall.missed.push((photograph.image.clone(), markers.len() - found));
         }
+        let before = recall.wrong_ids + recall.elsewhere + recall.unlabelled;
         for found in &record.found {
             let at = |label: &&Label| label.is_at(found);
             match photograph.markers.iter().find(at) {
@@ -206,6 +213,10 @@ pub fn recall(folder: &Path, family: &str, records: &[Record]) -> anyhow::Result
                 None if photograph.complete == Some(true) => recall.elsewhere += 1,
                 None => recall.unlabelled += 1,
             }
+        }
+        let others = recall.wrong_ids + recall.elsewhere + recall.unlabelled - before;
+        if others > 0 {
+            recall.others.push((photograph.image.clone(), others));
         }
     }
     Ok(recall)
@@ -281,13 +292,58 @@ pub fn text(recalls: &Recalls) -> String {
             r.found, r.markers, r.wrong_ids, r.elsewhere, r.unlabelled
         );
     }
-    for (family, detector, r) in rows() {
-        if detector == record::OURS {
-            let _ = writeln!(text, "\nMissed by us, {family}:");
-            for (image, count) in &r.missed {
+    for (family, _, r) in rows().filter(|(_, detector, _)| *detector == record::OURS) {
+        for (what, photographs) in
+            [("Missed", &r.missed), ("Of another id or without a label", &r.others)]
+        {
+            if !photographs.is_empty() {
+                let _ = writeln!(text, "\n{what} by us, {family}:");
+            }
+            for (image, count) in photographs {
                 let _ = writeln!(text, "- {image}: {count}");
             }
         }
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn labels_of_ones_own_need_no_more_than_is_known() {
+        let folder = tempfile::tempdir().unwrap();
+        let label = |family: &str| {
+            format!(
+                "{{\"image\":\"a.jpg\",\"markers\":[{{\"family\":\"{family}\",\"id\":3,\"corners\":[[0,0],[10,0],[10,10],[0,10]]}}]}}"
+            )
+        };
+        let found = |id, centre_px| Found {
+            family: "apriltag-36h11".to_owned(),
+            id: Some(id),
+            centre_px,
+            centre_covariance_px2: None,
+            corners_px: None,
+            translation_m: None,
+            range_variance_m2: None,
+            confidence: None,
+        };
+        let seen = vec![found(3, [5.0, 5.0]), found(4, [50.0, 50.0])];
+        let records = [Record { image: "a.jpg".to_owned(), ms: 1.0, found: seen }];
+        let path = folder.path().join("labels.jsonl");
+        for family in ["tag36h11", "apriltag-36h11"] {
+            std::fs::write(&path, label(family)).unwrap();
+            check(folder.path()).unwrap();
+            let recall = recall(folder.path(), "apriltag-36h11", &records).unwrap();
+            assert_eq!((recall.markers, recall.found, recall.unlabelled), (1, 1, 1), "{family}");
+            let of_ours = BTreeMap::from([(record::OURS.to_owned(), recall)]);
+            let told = text(&BTreeMap::from([("apriltag-36h11".to_owned(), of_ours)]));
+            assert!(told.contains("without a label by us, apriltag-36h11:\n- a.jpg: 1"), "{told}");
+        }
+        let wrong = label("tag36h11").replace("corners", "corner");
+        std::fs::write(&path, format!("{}\n{wrong}\n", label("tag36h11"))).unwrap();
+        let told = format!("{:#}", check(folder.path()).unwrap_err());
+        assert!(told.contains("line 2 of") && told.contains("docs/experiments.md"), "{told}");
+    }
 }

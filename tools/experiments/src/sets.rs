@@ -128,6 +128,11 @@ mod tests {
             ("positions", 37 * 2 * 5),
         ];
         assert_eq!(counts, expected);
+        // The documentation's table has them, too.
+        let text = include_str!("../../../docs/experiments.md");
+        for (name, frames) in expected {
+            assert!(text.contains(&format!("| `{name}` | {frames} | ")), "{name}, {frames}");
+        }
     }
 
     #[test]
