@@ -439,6 +439,16 @@ mod tests {
     }
 
     #[test]
+    fn a_range_that_begins_above_its_end_is_a_wrong_use() {
+        for (option, range) in [("--wind", "8..2"), ("--height", "12..4"), ("--offset", "3..1")] {
+            let problem = Tool::try_parse_from(["alight", "experiment", "landing", option, range]);
+            let problem = problem.err().unwrap();
+            assert_eq!(problem.exit_code(), 2, "{problem}");
+            assert!(problem.to_string().contains("begins above its end"), "{problem}");
+        }
+    }
+
+    #[test]
     fn a_marker_that_no_pad_can_have_is_refused() {
         assert!(sized_marker("apriltag-36h11:7:0.15").is_ok() && sized_marker("rings:0.3").is_ok());
         for wrong in
