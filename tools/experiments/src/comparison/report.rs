@@ -220,9 +220,10 @@ pub fn plot(comparison: &Comparison) -> anyhow::Result<String> {
         });
         let under = "below the line B is better";
         let title = format!(
-            "Pairs of flights that landed in both; {under}. A seed counts once, with the median of its pairs"
+            "The {} pairs of flights that landed in both; {under}. A seed counts once, with the median of its pairs",
+            comparison.pairs.landed.both
         );
-        head.draw(&Text::new(title, (16, 12), ("sans-serif", 20)))?;
+        head.draw(&Text::new(title, (16, 12), ("sans-serif", 18)))?;
         for (row, line) in lines.enumerate() {
             let short: String = line.chars().take(140).collect();
             head.draw(&Text::new(short, (16, 44 + 22 * row as i32), ("sans-serif", 15)))?;
@@ -242,10 +243,9 @@ fn tick(value: &f64) -> String {
 /// A panel's title, with the numbers of the table: of seeds, while the points are pairs.
 fn title(measure: &Measure, of: &Comparison) -> String {
     match of.pairs.differences.get(measure.name) {
-        Some(Difference { pairs, seeds, smaller, larger, .. }) => format!(
-            "{}: {pairs} pairs; B smaller, larger in {smaller}, {larger} of {seeds} seeds",
-            measure.words
-        ),
+        Some(Difference { seeds, smaller, larger, .. }) => {
+            format!("{}: B smaller, larger in {smaller}, {larger} of {seeds} seeds", measure.words)
+        }
         None => measure.words.to_owned(),
     }
 }
@@ -264,7 +264,7 @@ fn scatter(area: &Area<'_>, measure: &Measure, of: &Comparison) -> Result<(), Dr
     let (low, high) = ((low - margin).max(0.0), high + margin);
     let title = title(measure, of);
     let mut chart = ChartBuilder::on(area)
-        .caption(title, ("sans-serif", 16))
+        .caption(title, ("sans-serif", 15))
         .margin(12)
         .x_label_area_size(40)
         .y_label_area_size(60)
@@ -384,8 +384,8 @@ mod tests {
         .map(|it| run(it));
         let comparison = Comparison::new(&first, &second).unwrap();
         let svg = plot(&comparison).unwrap();
-        let numbers = "touchdown error, m: 4 pairs; B smaller, larger in 1, 1 of 2 seeds";
-        assert!(svg.contains(numbers), "{svg}");
+        let numbers = "touchdown error, m: B smaller, larger in 1, 1 of 2 seeds";
+        assert!(svg.contains(numbers) && svg.contains("The 4 pairs"), "{svg}");
         assert!(text(&comparison, "compare").contains("| 1, 1 of 2 |"));
         assert_eq!([0.0, 0.005, 0.01, 12.5].map(|it| tick(&it)), ["0", "0.005", "0.01", "12.5"]);
     }
