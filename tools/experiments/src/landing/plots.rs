@@ -166,13 +166,14 @@ fn one_fault(
     let dots: Vec<(f64, f64)> = landed.iter().filter_map(|o| Some((o.wind_m_s, of(o)?))).collect();
     chart.draw_series(dots.into_iter().map(|at| Circle::new(at, 2, GREY.mix(0.7).filled())))?;
     let bins = bins(members, of);
-    let medians = bins.iter().filter_map(|bin| Some((bin.wind_m_s, quantile(&bin.values, 0.5)?)));
-    draw_line(&mut chart, medians.map(|at| (at, true)).collect(), COLOURS[0])?;
-    let worst = bins.iter().filter_map(|bin| {
-        let (value, is_percentile) = bin.worst()?;
-        Some(((bin.wind_m_s, value), is_percentile))
-    });
-    draw_line(&mut chart, worst.collect(), COLOURS[1])?;
+    let median =
+        |bin: &Bin| Some(Mark { x: bin.wind_m_s, y: quantile(&bin.values, 0.5)?, is_filled: true });
+    let worst = |bin: &Bin| {
+        let (y, is_filled) = bin.worst()?;
+        Some(Mark { x: bin.wind_m_s, y, is_filled })
+    };
+    draw_line(&mut chart, &bins.iter().filter_map(median).collect::<Vec<Mark>>(), COLOURS[0])?;
+    draw_line(&mut chart, &bins.iter().filter_map(worst).collect::<Vec<Mark>>(), COLOURS[1])?;
     for bin in &bins {
         if let Some([low, high]) = median_interval(&bin.values) {
             error_bar(&mut chart, bin.wind_m_s, [low, high], COLOURS[0])?;
@@ -220,17 +221,24 @@ fn bins(members: &[&Outcome], of: Column) -> Vec<Bin> {
     (0..=fastest.ceil() as u32).filter_map(bin).collect()
 }
 
-/// A line through points; those that are `true` are filled. A line through one wind alone has no length.
+/// A point of a line, a dot or else a circle.
+struct Mark {
+    x: f64,
+    y: f64,
+    is_filled: bool,
+}
+
+/// A line through points. One through one wind alone has no length, but its point.
 fn draw_line(
     chart: &mut Chart<'_, '_>,
-    points: Vec<((f64, f64), bool)>,
+    points: &[Mark],
     colour: RGBColor,
 ) -> Result<(), DrawError> {
-    let places: Vec<(f64, f64)> = points.iter().map(|(at, _)| *at).collect();
+    let places = points.iter().map(|at| (at.x, at.y));
     chart.draw_series(LineSeries::new(places, colour.stroke_width(2)))?;
-    let dots = points.into_iter().map(|(at, is_filled)| match is_filled {
-        true => Circle::new(at, 3, colour.filled()),
-        false => Circle::new(at, 4, colour.stroke_width(2)),
+    let dots = points.iter().map(|at| match at.is_filled {
+        true => Circle::new((at.x, at.y), 3, colour.filled()),
+        false => Circle::new((at.x, at.y), 4, colour.stroke_width(2)),
     });
     chart.draw_series(dots)?;
     Ok(())
