@@ -2,6 +2,7 @@
 //! and the error of a wrong command line.
 
 use std::net::SocketAddr;
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use anyhow::Context;
@@ -129,6 +130,22 @@ pub(crate) fn meet_port(text: &str) -> Result<u16, String> {
         Ok(0) | Err(_) => Err(MEET_RULE.to_owned()),
     }
 }
+
+/// A reader of whole numbers in a range that says which: that of the standard library says of `-1` that a digit is invalid.
+pub(crate) fn whole_number<T: TryFrom<u64>>(
+    range: RangeInclusive<u64>,
+) -> impl Fn(&str) -> Result<T, String> + Clone {
+    move |text| {
+        let number = text.parse().ok().filter(|number| range.contains(number));
+        let (first, last) = (range.start(), range.end());
+        number
+            .and_then(|number| T::try_from(number).ok())
+            .ok_or_else(|| format!("write a whole number from {first} to {last}"))
+    }
+}
+
+/// Flights that are flown at the same time.
+pub(crate) const JOBS: RangeInclusive<u64> = 1..=1024;
 
 /// An address at which a service is to listen.
 pub(crate) fn address(text: &str) -> Result<SocketAddr, String> {

@@ -19,8 +19,9 @@ use crate::{
 const WRONG_USE: u8 = 2;
 
 /// The rule for the exit status of all subcommands.
-const EXIT_STATUS: &str = "Exit status: 0 done; 1 not done, or done with losses (not landed, not verified, something lost, damaged or unreadable: what is \
-                           printed says what); 2 wrong use: a command line, a setting or a configuration that cannot be. An experiment that a signal cuts \
+const EXIT_STATUS: &str = "Exit status: 0 done; 1 not done, or done with losses (not landed, not verified, something lost, damaged or unreadable, as data that \
+                           are not there, a recording, an image or results: what is printed says what); 2 wrong use: a command line, a setting or a \
+                           configuration that cannot be, as a configuration file, calibration or pad that is not there. An experiment that a signal cuts \
                            short ends with that of the signal: 130 by Ctrl-C, 143 by SIGTERM, 129 by the end of its terminal.";
 
 /// The version with the commit, of the build script.
@@ -205,6 +206,44 @@ mod tests {
             let told = problem.unwrap_err().to_string();
             assert!(told.contains("invalid value '-3") && told.contains("for '--wind"), "{told}");
         }
+    }
+
+    #[test]
+    fn a_number_that_cannot_be_is_told_by_its_range() {
+        let seed = "write a whole number from 0 to 18446744073709551615";
+        for (words, told) in [
+            (&["land", "--seed", "-1"][..], seed),
+            (&["experiment", "landing", "--seed", "1.5"], seed),
+            (&["experiment", "markers", "--seed", "99999999999999999999"], seed),
+            (&["experiment", "faults", "--seed", "x"], seed),
+            (&["experiment", "landing", "--flights", "-1"], "from 1 to 1000000"),
+            (&["experiment", "faults", "--flights", "0"], "from 1 to 1000000"),
+            (&["experiment", "landing", "--recordings", "-2"], "from 0 to 1000000"),
+            (&["experiment", "landing", "--jobs", "0"], "from 1 to 1024"),
+            (&["experiment", "faults", "--jobs", "-1"], "from 1 to 1024"),
+            (&["swap", "--to", "x", "--ready-s", "18446744073709551615"], "from 0 to 86400"),
+            (&["doctor", "--seconds", "-1"], "from 1 to 60"),
+            (&["report", "a.mcap", "--landing", "0"], "from 1 to 1000000"),
+        ] {
+            let arguments = ["alight"].iter().chain(words);
+            let problem = with_negative_numbers(Cli::command()).try_get_matches_from(arguments);
+            let problem = problem.unwrap_err().to_string();
+            assert!(problem.contains(told), "{words:?}: {problem}");
+        }
+    }
+
+    #[test]
+    fn a_calibration_that_is_not_there_is_a_wrong_use_and_missing_data_are_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let missing = folder.path().join("nosuch").display().to_string();
+        let camera = ["detect", "--marker", "rings:0.2", "--camera", &missing, "a.png"];
+        assert!(is_wrong_use(&performed(&camera).unwrap_err()));
+        let compare = ["experiment", "compare", &missing, &missing];
+        assert!(!is_wrong_use(&performed(&compare).unwrap_err()));
+        assert_eq!(
+            performed(&["detect", "--marker", "rings", &missing]).unwrap(),
+            ExitCode::FAILURE
+        );
     }
 
     /// Performs what the words of a command line say.

@@ -26,7 +26,7 @@ use tokio::time::timeout;
 
 use self::focus::Focus;
 use self::keys::Checked;
-use crate::args::{Format, NetworkArgs, OPERATOR, WrongUse};
+use crate::args::{Format, NetworkArgs, OPERATOR, WrongUse, whole_number};
 use crate::programs::{missing, missing_of_service};
 use crate::runtime::{block_on, tool_identity};
 use crate::services::{RELAY, Service};
@@ -43,7 +43,7 @@ pub(crate) struct DoctorArgs {
     #[arg(long, value_name = "FILE", requires = "role")]
     config: Option<PathBuf>,
     /// Time for which to watch the network, in seconds, from 1 to 60.
-    #[arg(long, value_name = "SECONDS", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=60))]
+    #[arg(long, value_name = "SECONDS", default_value_t = 3, value_parser = whole_number::<u64>(1..=60))]
     seconds: u64,
     /// Format of the result: text, or one JSON object.
     #[arg(long, value_enum, default_value_t)]

@@ -20,7 +20,7 @@ use experiments::set::{Set, families};
 use experiments::sets::Variant;
 use markers::Marker;
 
-use crate::args::{Format, WrongUse, flight_setting, sized_marker};
+use crate::args::{Format, JOBS, WrongUse, flight_setting, sized_marker, whole_number};
 use crate::children::this_command;
 use crate::faults::{self, FaultsArgs};
 use crate::interruption::{FLIGHTS_END, Interruption};
@@ -62,7 +62,7 @@ struct LandingArgs {
     #[arg(long)]
     replace: bool,
     /// Number of flights of each combination.
-    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = whole_number::<u64>(1..=1_000_000))]
     flights: u64,
     /// Vision: rendered frames with the real detector, or a model of the detector's errors.
     #[arg(long, value_enum, default_value_t = VisionArg::Modelled)]
@@ -96,14 +96,14 @@ struct LandingArgs {
     #[arg(long, value_name = "SERVICE.KEY=VALUE", value_parser = flight_setting)]
     set: Vec<String>,
     /// Number of flights in parallel [default: number of cores].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole_number::<usize>(JOBS))]
     jobs: Option<usize>,
     /// Number of the worst flights of each combination that are written as recordings (MCAP), for `alight report` and
     /// `alight replay`; 0 for none.
-    #[arg(long, value_name = "N", default_value_t = 1)]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = whole_number::<usize>(0..=1_000_000))]
     recordings: usize,
     /// Seed of the first flight of each combination; the others follow.
-    #[arg(long, value_name = "S", default_value_t = 1)]
+    #[arg(long, value_name = "S", default_value_t = 1, value_parser = whole_number::<u64>(0..=u64::MAX))]
     seed: u64,
 }
 
@@ -164,7 +164,7 @@ struct MarkersArgs {
     #[arg(long)]
     known_id: bool,
     /// Seed of poses, ids, grounds and noise. With 0 they are those on which the detector was developed.
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = whole_number::<u64>(0..=u64::MAX))]
     seed: u64,
     /// Only every Nth frame of each set.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]

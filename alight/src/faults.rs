@@ -18,7 +18,7 @@ use experiments::landing::plan::{
 use experiments::results::{self, Folder};
 use markers::Marker;
 
-use crate::args::{WrongUse, flight_setting, sized_marker};
+use crate::args::{JOBS, WrongUse, flight_setting, sized_marker, whole_number};
 use crate::children::this_command;
 use crate::interruption::{FLIGHTS_END, Interruption};
 use crate::progress::Steps;
@@ -38,10 +38,10 @@ pub(crate) struct FaultsArgs {
     #[arg(long)]
     replace: bool,
     /// Number of flights [default: 1000, in real time as many as there are kinds].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::<u64>(1..=1_000_000))]
     flights: Option<u64>,
     /// Seed of the first flight; the others follow. A seed draws the fault's begin and duration, and the wind.
-    #[arg(long, value_name = "S", default_value_t = 1)]
+    #[arg(long, value_name = "S", default_value_t = 1, value_parser = whole_number::<u64>(0..=u64::MAX))]
     seed: u64,
     /// Only this kind of fault. May be repeated. An unknown name lists all.
     #[arg(long = "kind", value_name = "NAME")]
@@ -66,7 +66,7 @@ pub(crate) struct FaultsArgs {
     #[arg(long, value_name = "SERVICE.KEY=VALUE", value_parser = flight_setting)]
     set: Vec<String>,
     /// Number of flights in parallel [default: number of cores].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole_number::<usize>(JOBS))]
     jobs: Option<usize>,
     /// Folder for a recording of each flight with its controller's tape, for `alight replay`; in lock-step only.
     #[arg(long, value_name = "DIR", conflicts_with = "real_time")]

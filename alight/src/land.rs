@@ -17,7 +17,7 @@ use node::{Layers, Network, Node, Shutdown, read_text};
 use tempfile::TempDir;
 use tokio::time::Instant;
 
-use crate::args::{Format, OPERATOR, WrongUse, address, meet_port, source_of};
+use crate::args::{Format, OPERATOR, WrongUse, address, meet_port, source_of, whole_number};
 use crate::children::{ChildEvent, Children, options_for_shell};
 use crate::ending::recording;
 use crate::outcome::{LandingSummary, OurRecorder};
@@ -32,7 +32,7 @@ use crate::terminal::{print, write_error};
 #[command(after_help = EXIT_STATUS)]
 pub(crate) struct LandArgs {
     /// Seed of everything random: wind, noise, ground.
-    #[arg(long, default_value_t = 1, value_name = "N")]
+    #[arg(long, default_value_t = 1, value_name = "N", value_parser = whole_number::<u64>(0..=u64::MAX))]
     seed: u64,
     /// One setting of a service: SERVICE.KEY=VALUE, for example simulator.wind.mean_m_s=5. May be repeated.
     #[arg(long, value_name = "SERVICE.KEY=VALUE")]

@@ -11,7 +11,7 @@ use report::{
     Figure, Flight, FlightReader, comparison, document, figures, marks, page, replay_tapes, summary,
 };
 
-use crate::args::WrongUse;
+use crate::args::{WrongUse, whole_number};
 use crate::ending::{Ending, format_of};
 use crate::terminal::{print, write_error};
 
@@ -27,7 +27,7 @@ pub(crate) struct ReportArgs {
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Which landing of each recording, from 1 on, where it has several [default: the last].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole_number::<usize>(1..=1_000_000))]
     landing: Option<usize>,
     /// The page [default: beside the first recording, with its name, `flight.html`; of two flights `one-and-other.html`, with
     /// `--landing 2` `flight-landing-2.html`]. Its name ends in .html, or in .pdf for a PDF document.

@@ -27,7 +27,7 @@ use tokio::process::{Child, Command};
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
 use self::comparison::Comparison;
-use crate::args::{Format, NetworkArgs, WrongUse};
+use crate::args::{Format, NetworkArgs, WrongUse, whole_number};
 use crate::runtime::with_node;
 use crate::terminal::{print, write_error};
 
@@ -63,10 +63,10 @@ pub(crate) struct SwapArgs {
     #[arg(long, default_value_t = 15, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=30))]
     frames: u32,
     /// Timeout until the new detector is ready, in seconds.
-    #[arg(long, default_value_t = 20, value_name = "SECONDS")]
+    #[arg(long, default_value_t = 20, value_name = "SECONDS", value_parser = whole_number::<u64>(0..=86_400))]
     ready_s: u64,
     /// Timeout until it agrees, in seconds. Frames in which the active one sees no marker are not compared.
-    #[arg(long, default_value_t = 20, value_name = "SECONDS")]
+    #[arg(long, default_value_t = 20, value_name = "SECONDS", value_parser = whole_number::<u64>(0..=86_400))]
     agree_s: u64,
     /// Keep the old detector running, in shadow.
     #[arg(long)]
