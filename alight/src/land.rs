@@ -14,6 +14,8 @@ use markers::{Marker, Pad};
 use messages::{ControllerStatus, topic};
 use node::network::variable;
 use node::{Layers, Network, Node, Shutdown, read_text};
+use rustix::io::Errno;
+use rustix::process::{Pid, test_kill_process};
 use tempfile::TempDir;
 use tokio::time::Instant;
 
@@ -373,7 +375,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         && let Ok(landing) = &watched
     {
         for left in node.alive("detector", "*").await.unwrap_or_default() {
-            let end = end_of(&node, landing, &left).await;
+            let Some(end) = end_of(&node, landing, &left).await else { continue };
             progress.say(&format!(
                 "Detector {left} still runs, and will be in the network of the next landing; {end}"
             ));
@@ -528,10 +530,17 @@ fn without_detector(own: &str, status: Option<&ControllerStatus>) -> String {
     }
 }
 
-/// How a detector is ended that was left running.
-async fn end_of(node: &Node, landing: &LandingSummary, detector: &str) -> String {
-    if let Some(pid) = landing.pid_of("detector", detector) {
-        return format!("`kill {pid}` ends it");
+/// How a detector is ended that was left running; `None` for one that has ended, as that of the landing itself: its presence in the
+/// network may outlive its process.
+async fn end_of(node: &Node, landing: &LandingSummary, detector: &str) -> Option<String> {
+    let here = node::host_name();
+    let kill = |host: &str, pid: u32| match host == here {
+        true => format!("`kill {pid}` ends it"),
+        false => format!("`kill {pid}` on {host} ends it"),
+    };
+    let healths = landing.healths_of("detector", detector);
+    if let Some(left) = healths.iter().find(|it| it.host != here || is_running(it.pid)) {
+        return Some(kill(&left.host, left.pid));
     }
     // One of another program tells no health, and its process all the same.
     let infos = node.subscriber(topic::DETECTOR_INFO, &[detector]).await;
@@ -540,10 +549,15 @@ async fn end_of(node: &Node, landing: &LandingSummary, detector: &str) -> String
         Err(_) => None,
     };
     match told {
-        Some(info) if info.host == node::host_name() => format!("`kill {}` ends it", info.pid),
-        Some(info) => format!("`kill {}` on {} ends it", info.pid, info.host),
-        None => "end it where it was started".to_owned(),
+        Some(info) => Some(kill(&info.host, info.pid)),
+        None => healths.is_empty().then(|| "end it where it was started".to_owned()),
     }
+}
+
+/// Whether this host has a process of this number, whoever's it is.
+fn is_running(pid: u32) -> bool {
+    let pid = i32::try_from(pid).ok().and_then(Pid::from_raw);
+    pid.is_some_and(|pid| test_kill_process(pid) != Err(Errno::SRCH))
 }
 
 /// What the exit of another service means for the landing.
@@ -822,11 +836,39 @@ mod tests {
         };
         infos.publish(&info).await;
         let landing = LandingSummary::default();
-        assert_eq!(end_of(&node, &landing, "python").await, "`kill 4711` ends it");
+        let end = async |detector: &str| end_of(&node, &landing, detector).await;
+        assert_eq!(end("python").await.as_deref(), Some("`kill 4711` ends it"));
         infos.publish(&DetectorInfo { host: "ground-station".into(), ..info }).await;
-        let elsewhere = end_of(&node, &landing, "python").await;
-        assert_eq!(elsewhere, "`kill 4711` on ground-station ends it");
-        assert_eq!(end_of(&node, &landing, "nobody").await, "end it where it was started");
+        let elsewhere = end("python").await;
+        assert_eq!(elsewhere.as_deref(), Some("`kill 4711` on ground-station ends it"));
+        assert_eq!(end("nobody").await.as_deref(), Some("end it where it was started"));
+        node.close().await;
+        Ok(())
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_detector_whose_process_has_ended_is_not_said_to_be_left() -> anyhow::Result<()> {
+        let (port, _lock) = free_port()?;
+        let zenoh = ZenohSource::Text(node::session::local_config(port));
+        let node = Node::open(tool_identity("land"), &zenoh).await?;
+        let mut ended = std::process::Command::new("true").spawn()?;
+        let ended_pid = ended.id();
+        ended.wait()?;
+        let health = |pid, stamp_ns| messages::Health {
+            service: "detector".into(),
+            instance: "main".into(),
+            host: node::host_name(),
+            pid,
+            stamp_ns,
+            ..messages::Health::sample()
+        };
+        let mut landing = LandingSummary::default();
+        landing.health(health(ended_pid, 2));
+        assert_eq!(end_of(&node, &landing, "main").await, None);
+        // Another one of its name was there before.
+        let left = std::process::id();
+        landing.health(health(left, 1));
+        assert_eq!(end_of(&node, &landing, "main").await, Some(format!("`kill {left}` ends it")));
         node.close().await;
         Ok(())
     }

@@ -242,16 +242,13 @@ impl LandingSummary {
         });
     }
 
-    /// The newest process number of a service, from its health.
-    pub(crate) fn pid_of(&self, service: &str, instance: &str) -> Option<u32> {
-        let is_its = |((name, _), (_, last)): &(&(String, u32), &(Health, Health))| {
-            name == service && last.instance == instance
-        };
-        self.healths
-            .iter()
-            .filter(is_its)
-            .max_by_key(|(_, (_, last))| last.stamp_ns)
-            .map(|((_, pid), _)| *pid)
+    /// The last healths of the processes of a service, the newest first.
+    pub(crate) fn healths_of(&self, service: &str, instance: &str) -> Vec<&Health> {
+        let last = self.healths.values().map(|(_, last)| last);
+        let is_its = |it: &&Health| it.service == service && it.instance == instance;
+        let mut healths: Vec<&Health> = last.filter(is_its).collect();
+        healths.sort_by_key(|it| std::cmp::Reverse(it.stamp_ns));
+        healths
     }
 
     /// True while no landing has begun.
