@@ -192,19 +192,26 @@ fn compared(searched: &Searched) -> String {
     row("found", &|it| share(it.frames, searched.searched));
     if let Some(showing) = searched.showing_the_pad {
         row("found in flight, pad in the picture", &|it| share(it.visible, showing));
-        row("error against truth, median", &|it| at(&it.errors_m, 0.5, 1e3, 1, "mm"));
-        row("error against truth, 95 %", &|it| at(&it.errors_m, 0.95, 1e3, 1, "mm"));
+        row("error in space, median", &|it| at(&it.errors_m, 0.5, 1e3, 2, "mm"));
+        row("error in space, 95 %", &|it| at(&it.errors_m, 0.95, 1e3, 2, "mm"));
     }
     row("time of a search, median", &|it| at(&it.times_ms, 0.5, 1.0, 2, "ms"));
     row("time of a search, 95 %", &|it| at(&it.times_ms, 0.95, 1.0, 2, "ms"));
     text.push_str(&aligned(&rows));
     text.push_str(&format!(
-        "{} found then only, {} now only; where both are, {} apart in the median, {} at most\n",
+        "{} found then only, {} now only; the two are {} apart in the median, {} at most\n",
         searched.lost,
         searched.gained,
-        at(&searched.apart_m, 0.5, 1e3, 1, "mm"),
-        at(&searched.apart_m, 1.0, 1e3, 1, "mm")
+        at(&searched.apart_m, 0.5, 1e3, 2, "mm"),
+        at(&searched.apart_m, 1.0, 1e3, 2, "mm")
     ));
+    let compared = searched.apart_m.len();
+    text.push_str(&match searched.showing_the_pad {
+        Some(_) => format!(
+            "errors (from the true pad, in all three directions) and distances are of the {compared} frames in flight, with the pad in the picture, in which both found the marker with its pose\n"
+        ),
+        None => format!("distances are of the {compared} frames in which both found the marker with its pose\n"),
+    });
     let family = now.marker.split(':').next().unwrap_or_default();
     let looks_for_it = |marker: &String| marker.split(':').next() == Some(family);
     if now.frames == 0 && !searched.looked_for.iter().any(looks_for_it) {
@@ -311,6 +318,27 @@ mod tests {
         for marker in ["rings", "stag-hd23:4"] {
             assert!(!compared(&searched(marker)).contains("looks for"), "{marker}");
         }
+    }
+
+    #[test]
+    fn errors_are_told_with_the_frames_that_they_are_of() {
+        let side = |errors_m: &[f64]| replay::frames::Found {
+            errors_m: errors_m.to_vec(),
+            ..Default::default()
+        };
+        let searched = Searched {
+            showing_the_pad: Some(5),
+            apart_m: vec![0.001; 3],
+            then: side(&[0.001, 0.0014, 0.002]),
+            now: side(&[0.001, 0.0062, 0.009]),
+            ..Searched::default()
+        };
+        let told = compared(&searched);
+        assert!(told.contains("error in space, median") && told.contains("1.40 mm"), "{told}");
+        assert!(told.contains("6.20 mm") && told.contains("of the 3 frames in flight"), "{told}");
+        let without_truth = compared(&Searched { showing_the_pad: None, ..searched });
+        assert!(!without_truth.contains("error"), "{without_truth}");
+        assert!(without_truth.contains("of the 3 frames in which both"), "{without_truth}");
     }
 
     #[test]

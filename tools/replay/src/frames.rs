@@ -51,7 +51,8 @@ pub struct Found {
     pub frames: usize,
     /// Those of them that were taken in flight and show the pad, by truth.
     pub visible: usize,
-    /// Distances between the marker as it was found and the true pad, in metres in space, in the order of the frames.
+    /// Distances between the marker as it was found and the true pad, in metres in space, in the order of the frames: of those that were
+    /// taken in flight, show the pad, and in which both searches found it with its pose, so that both sides are of the same frames.
     pub errors_m: Vec<f64>,
     /// How long each search took, without decoding the picture, in milliseconds.
     pub times_ms: Vec<f64>,
@@ -84,7 +85,7 @@ pub struct Searched {
     pub lost: usize,
     /// Frames in which it is found now and was not then.
     pub gained: usize,
-    /// Distances between both, in metres in space.
+    /// Distances between both, in metres in space; where the truth is known, of the frames whose errors are.
     pub apart_m: Vec<f64>,
     /// What the controller decides on the new detections, for each tape.
     pub changes: Vec<Change>,
@@ -329,16 +330,23 @@ impl Frames {
                 Some(pose) => pose.camera_from_marker.translation_m,
                 None => [f64::NAN; 3],
             };
-            let point = Point::new(x, y, z);
-            side.errors_m.extend(pad.map(|pad| (point - pad).norm()).filter(|it| it.is_finite()));
-            *place = Some(point);
+            *place = Some(Point::new(x, y, z));
         }
         match places {
             [Some(_), None] => searched.lost += 1,
             [None, Some(_)] => searched.gained += 1,
             [Some(one), Some(other)] => {
                 let apart_m = (other - one).norm();
-                searched.apart_m.extend(Some(apart_m).filter(|it| it.is_finite()));
+                // A vehicle on the pad is a few centimetres from it and does not move: such frames would be most of what is compared.
+                let is_compared = searched.showing_the_pad.is_none() || is_visible;
+                if !is_compared || !apart_m.is_finite() {
+                    return;
+                }
+                searched.apart_m.push(apart_m);
+                if let Some(pad) = pad {
+                    searched.then.errors_m.push((one - pad).norm());
+                    searched.now.errors_m.push((other - pad).norm());
+                }
             }
             [None, None] => {}
         }

@@ -197,10 +197,11 @@ fn the_same_search_of_the_same_pixels_finds_the_same() {
     assert_eq!((searched.then.visible, searched.now.visible), (8, 8));
     assert_eq!(searched.looked_for, [format!("aruco-4x4-50:7:{SIZE_M}")]);
     assert_eq!((searched.lost, searched.gained, searched.is_lossy), (0, 0, false));
-    assert_eq!(searched.apart_m, [0.0; 9]);
+    // Those in flight.
+    assert_eq!(searched.apart_m, [0.0; 8]);
     assert_eq!(searched.then.errors_m, searched.now.errors_m);
     // By truth: a centimetre at a metre.
-    assert!(searched.now.errors_m.len() == 9 && searched.now.errors_m.iter().all(|it| *it < 0.01));
+    assert!(searched.now.errors_m.len() == 8 && searched.now.errors_m.iter().all(|it| *it < 0.01));
     assert!(searched.now.times_ms.iter().all(|it| *it > 0.0));
     assert_eq!(searched.changes.len(), 1);
     assert_eq!(searched.changes[0].end.events, 13);
@@ -243,6 +244,20 @@ fn what_another_detector_does_not_find_is_told_and_changes_the_detections_of_the
     assert_eq!((searched.now.frames, searched.now.marker.as_str()), (9, "aruco-4x4-50"));
     // Twice the size is twice as far away.
     assert!(searched.now.errors_m.iter().all(|it| *it > 0.9), "{:?}", searched.now.errors_m);
+}
+
+#[test]
+fn errors_are_of_the_frames_in_which_both_found_the_marker() {
+    // Of the frames in flight that show the pad, 1 to 8, the pictures of the last four show nothing.
+    let kept = |header: &FrameHeader, pixels: &[u8]| {
+        let nothing = vec![180; pixels.len()];
+        let shown = if header.sequence < 5 { pixels } else { &nothing };
+        Picture::Jpeg(jpeg(header, shown, 95).unwrap())
+    };
+    let searched = again(recording(kept), &Again::default()).unwrap();
+    let (then, now) = (&searched.then, &searched.now);
+    assert_eq!((then.visible, now.visible), (8, 4));
+    assert_eq!([then.errors_m.len(), now.errors_m.len(), searched.apart_m.len()], [4; 3]);
 }
 
 #[test]
