@@ -31,7 +31,8 @@ pub(crate) struct RectifyArgs {
     /// Bayer pattern of grey images with a sensor's raw samples: RGGB, GRBG, GBRG or BGGR.
     #[arg(long, value_name = "PATTERN")]
     bayer: Option<BayerPattern>,
-    /// Image files (PNG of 8 or 16 bits, JPEG), videos, and folders of them.
+    /// Image files (PNG of 8 or 16 bits, JPEG), videos, and folders of them. Images are read as they are stored, not turned by their
+    /// Exif orientation.
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
 }
@@ -43,6 +44,9 @@ pub(crate) struct RectifyArgs {
 /// When the calibration cannot be read, or a file not be written or is there already.
 pub(crate) fn run(args: &RectifyArgs) -> anyhow::Result<ExitCode> {
     let rectifier = Rectifier::new(&read_calibration(&args.camera)?);
+    if let Some(note) = Source::note_of_others(&args.images) {
+        write_error(&note);
+    }
     let mut source = Source::new(&args.images);
     let mut outputs = Outputs::new(args, &source);
     let calibration = outputs.claim("camera.yaml")?;
@@ -138,7 +142,7 @@ fn rectified(
     bayer: Option<BayerPattern>,
 ) -> anyhow::Result<GrayImage> {
     let name = item.name.clone();
-    let image = item.into_image(bayer).map_err(anyhow::Error::msg)?;
+    let image = item.into_image(bayer).map_err(anyhow::Error::msg)?.grey;
     let mut straight = GrayImage::filled(image.width(), image.height(), 0);
     let view = image.view().with_context(|| format!("{name} has no pixels"))?;
     ensure!(

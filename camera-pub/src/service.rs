@@ -10,7 +10,7 @@ use airlink::AirSender;
 use anyhow::{Context, bail, ensure};
 use geometry::CameraModel;
 use imaging::{GrayImage, GrayView, SampleFormat};
-use media::{DecodedImage, frame_bytes, images_in, samples_to_grey};
+use media::{DecodedImage, ImageError, frame_bytes, images_in, samples_to_grey};
 use messages::{BayerPattern, CameraControl, CameraInfo, FrameHeader, PixelFormat, topic};
 use node::{
     BoxFuture, FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns,
@@ -184,7 +184,7 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
         }
     });
     let Some(size) = first_size else {
-        let problem = first_problem.map_or_else(String::new, |problem| problem.to_string());
+        let problem = first_problem.as_ref().map_or_else(String::new, told);
         bail!("none of the {} images can be read; the first one: {problem}", images.len());
     };
     let sizes = images
@@ -193,6 +193,14 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
         .filter_map(|path| frame_bytes(path, max_pixels).ok());
     let max_frame_bytes = sizes.max().unwrap_or(size.pixels());
     Ok(Found { source: Source::Images(images), size, max_frame_bytes })
+}
+
+/// What is wrong with an image, and the key that allows it where it is too large.
+fn told(problem: &ImageError) -> String {
+    match problem {
+        ImageError::TooLarge { .. } => format!("{problem}, or raise `source.max_megapixels`"),
+        _ => problem.to_string(),
+    }
 }
 
 fn camera_info(config: &Config, size: FrameSize) -> anyhow::Result<CameraInfo> {
@@ -597,6 +605,7 @@ impl Stream {
             Ok(image) => image,
             Err(problem) => {
                 if self.health.failed("unreadable image") {
+                    let problem = told(&problem);
                     tracing::warn!(%problem, "Dropped a frame that is no whole JPEG file");
                 }
                 return Err(NoFrame::Damaged);
@@ -654,7 +663,8 @@ impl Stream {
     /// Decodes an image into the buffer from which it is published.
     fn prepare(&self, path: &Path) -> anyhow::Result<Prepared> {
         let began = Instant::now();
-        let image = DecodedImage::read(path, self.config.max_pixels())?;
+        let image = DecodedImage::read(path, self.config.max_pixels())
+            .map_err(|problem| anyhow::Error::msg(told(&problem)))?;
         let (width, height) = (image.width(), image.height());
         if (FrameSize { width, height }) != self.size && self.health.failed("image of another size")
         {

@@ -176,6 +176,9 @@ async fn a_start_without_images_is_an_error_with_its_reason() -> anyhow::Result<
     GrayImage::from_pixel(64, 48, Luma([200])).save(folder.path().join("2.png"))?;
     let too_large = problem(config(folder.path(), &["source.max_megapixels=0.003"])?).await?;
     ensure!(too_large.contains("none of the 2 images"), "{too_large}");
+    std::fs::remove_file(folder.path().join("1.png"))?;
+    let too_large = problem(config(folder.path(), &["source.max_megapixels=0.003"])?).await?;
+    ensure!(too_large.contains("smaller, or raise `source.max_megapixels`"), "{too_large}");
     Ok(())
 }
 

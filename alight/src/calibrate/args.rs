@@ -73,7 +73,7 @@ pub(crate) struct BoardArgs {
     #[arg(long, value_name = "CAMERA", conflicts_with_all = ["images", "print"])]
     pub(super) live: Option<String>,
     /// Image files (PNG of 8 or 16 bits, JPEG), videos, and folders of them. Of a video those frames are taken in which the
-    /// board has moved.
+    /// board has moved. Images are read as they are stored, not turned by their Exif orientation.
     #[arg(required_unless_present_any = ["print", "live"], value_name = "IMAGE")]
     pub(super) images: Vec<PathBuf>,
     #[command(flatten)]

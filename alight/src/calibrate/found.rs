@@ -13,6 +13,7 @@ use super::args::BoardArgs;
 use super::sharpness::edge_width_px;
 use crate::args::Format;
 use crate::detect::{Item, Source};
+use crate::terminal::write_error;
 
 /// Pixels of all images that are kept to be looked at again: a gigabyte of memory.
 const MAX_KEPT_PIXELS: usize = 1 << 30;
@@ -197,6 +198,9 @@ pub(super) fn find_boards(
         ProgressStyle::with_template("{spinner} {pos} images, {elapsed} {msg}")
             .unwrap_or_else(|_| ProgressStyle::default_spinner()),
     );
+    if let Some(note) = Source::note_of_others(&args.images) {
+        write_error(&note);
+    }
     let mut source = Source::new(&args.images);
     while !found.is_full
         && let Some(item) = source.next()
@@ -218,7 +222,8 @@ pub(super) fn find_boards(
 fn add_item(found: &mut FoundImages, finder: &mut Finder<'_>, item: Item, args: &BoardArgs) {
     let (name, is_frame) = (item.name.clone(), item.is_frame);
     match item.into_image(args.bayer) {
-        Ok(image) => {
+        Ok(still) => {
+            let image = still.grey;
             let origin = if is_frame { Origin::Video } else { Origin::File };
             found.add(finder, Picture { name, image, origin });
         }

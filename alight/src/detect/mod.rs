@@ -15,9 +15,9 @@ use std::time::Instant;
 
 use fiducial::{Detector, Settings, Tracker};
 use geometry::CameraModel;
-use imaging::{BayerPattern, GrayImage, GrayView};
+use imaging::{BayerPattern, GrayView};
 use markers::{Marker, Pad};
-use media::read_calibration;
+use media::{StillImage, read_calibration};
 use node::read_text;
 
 use crate::terminal::{Output, write_error};
@@ -27,7 +27,8 @@ use queue::process_all;
 use report::{Detection, Found, Line};
 pub(crate) use source::{Item, Source, stem};
 
-/// Prints the detections in each image, in the order given. Exit status 1 when an image could not be read, or a drawing not be written.
+/// Prints the detections in each image, in the order given. Exit status 1 when an image could not be read or has no poses as the
+/// calibration is for another size, or a drawing could not be written.
 ///
 /// # Errors
 /// When the calibration or the markers are invalid, or standard output cannot be written.
@@ -40,9 +41,14 @@ pub(crate) fn run(args: &DetectArgs) -> anyhow::Result<ExitCode> {
     let processors = || std::thread::available_parallelism().map_or(1, usize::from);
     let threads = if args.track { 1 } else { args.threads.map_or_else(processors, usize::from) };
     let examiner = Examiner::new(args, lens)?;
+    if let Some(note) = Source::note_of_others(&args.images) {
+        write_error(&note);
+    }
     let source = Source::new(&args.images);
     let printed = examiner.examine_all(source, threads, args.format, Output)?;
-    let is_whole = printed.unreadable == 0 && !examiner.lacks_drawing.load(Ordering::Relaxed);
+    let lacks = [&examiner.lacks_drawing, &examiner.lacks_poses];
+    let is_whole =
+        printed.unreadable == 0 && !lacks.iter().any(|lacks| lacks.load(Ordering::Relaxed));
     Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
@@ -96,7 +102,9 @@ struct Examiner {
     gallery: Option<Gallery>,
     /// Whether a drawing could not be written.
     lacks_drawing: AtomicBool,
-    was_warned: AtomicBool,
+    /// Whether an image was of another size than the calibration.
+    lacks_poses: AtomicBool,
+    was_told_of_turns: AtomicBool,
     /// How many more are searched without the camera, in doubt of it.
     looks_without_camera: AtomicUsize,
     was_doubted: AtomicBool,
@@ -135,7 +143,8 @@ impl Examiner {
             tracks: args.track,
             gallery: args.draw.as_deref().map(Gallery::new).transpose()?,
             lacks_drawing: AtomicBool::new(false),
-            was_warned: AtomicBool::new(false),
+            lacks_poses: AtomicBool::new(false),
+            was_told_of_turns: AtomicBool::new(false),
             looks_without_camera: AtomicUsize::new(MAX_LOOKS_WITHOUT_CAMERA),
             was_doubted: AtomicBool::new(false),
             camera_option: match (&args.camera, args.focal_px) {
@@ -185,15 +194,22 @@ impl Examiner {
 
     fn detect(
         &self,
-        image: &GrayImage,
+        still: &StillImage,
         [name, stem]: [&str; 2],
         time_s: f64,
         worker: &mut Worker,
     ) -> Result<Found, String> {
+        let StillImage { grey: image, exif_orientation } = still;
         let Some(view) = image.view() else {
             return Err("the image has no pixels".to_owned());
         };
-        let camera = self.camera(image, name);
+        if let Some(note) = self.note_of_turn(still, name) {
+            write_error(&note);
+        }
+        let (camera, no_poses) = match self.camera(still, name) {
+            Ok(camera) => (camera, None),
+            Err(reason) => (None, Some(reason)),
+        };
         let Worker { detector, tracker } = worker;
         let began = Instant::now();
         let found = match tracker {
@@ -219,7 +235,14 @@ impl Examiner {
             Some(Detection::from_pad(pad, &seen))
         });
         let detections = found.iter().map(Detection::from).chain(pads).collect();
-        Ok(Found { width: image.width(), height: image.height(), detect_ms, detections })
+        Ok(Found {
+            width: image.width(),
+            height: image.height(),
+            exif_orientation: *exif_orientation,
+            detect_ms,
+            no_poses,
+            detections,
+        })
     }
 
     /// A warning where a marker is found without the camera only: what is no circle or square in space, as the camera would show
@@ -256,32 +279,55 @@ impl Examiner {
         }
     }
 
-    fn camera(&self, image: &GrayImage, name: &str) -> Option<CameraModel> {
+    /// What is said of the first image that a viewer would turn: it is searched as it is stored.
+    fn note_of_turn(&self, still: &StillImage, name: &str) -> Option<String> {
+        let orientation = still.exif_orientation?;
+        if self.was_told_of_turns.swap(true, Ordering::Relaxed) {
+            return None;
+        }
+        Some(format!(
+            "note: viewers turn {name} (Exif orientation {orientation}); it is searched as it is stored, which is as the sensor saw it \
+             and as the images of `alight calibrate board` are read: pixels, poses and drawings are of that, here and in others like it"
+        ))
+    }
+
+    /// The camera for an image, if one is known.
+    ///
+    /// # Errors
+    /// When the calibration is for images of another size.
+    fn camera(&self, still: &StillImage, name: &str) -> Result<Option<CameraModel>, String> {
+        let image = &still.grey;
         let (width, height) = (image.width() as u32, image.height() as u32);
         match self.lens {
-            Lens::Unknown => None,
-            Lens::Ideal { focal_px } => Some(CameraModel::pinhole(width, height, focal_px)),
+            Lens::Unknown => Ok(None),
+            Lens::Ideal { focal_px } => Ok(Some(CameraModel::pinhole(width, height, focal_px))),
             Lens::Calibrated(camera) if (camera.width, camera.height) == (width, height) => {
-                Some(camera)
+                Ok(Some(camera))
             }
             Lens::Calibrated(camera) => {
-                if !self.was_warned.swap(true, Ordering::Relaxed) {
-                    Self::warn_of_size(&camera, image, name);
+                if !self.lacks_poses.swap(true, Ordering::Relaxed) {
+                    write_error(&warning_of_size(&camera, still, name));
                 }
-                None
+                Err(format!("the calibration is for {} x {} pixels", camera.width, camera.height))
             }
         }
     }
+}
 
-    fn warn_of_size(camera: &CameraModel, image: &GrayImage, name: &str) {
-        write_error(&format!(
-            "warning: {name} has {} x {} pixels, but the calibration is for {} x {}: no poses for images of this size",
-            image.width(),
-            image.height(),
-            camera.width,
-            camera.height
-        ));
+/// What is said of the first image of another size than the calibration's.
+fn warning_of_size(camera: &CameraModel, still: &StillImage, name: &str) -> String {
+    let (width, height) = (still.grey.width() as u32, still.grey.height() as u32);
+    let mut warning = format!(
+        "warning: {name} has {width} x {height} pixels, but the calibration is for {} x {}: no poses for images of this size",
+        camera.width, camera.height
+    );
+    if still.exif_orientation.is_some() && (camera.width, camera.height) == (height, width) {
+        warning.push_str(
+            "; it may be of pictures that were turned by their Exif orientation, as OpenCV's `imread` does: calibrate from \
+             the pictures as they are stored (`alight calibrate board`, or `IMREAD_IGNORE_ORIENTATION`)",
+        );
     }
+    warning
 }
 
 #[cfg(test)]
@@ -415,8 +461,9 @@ mod tests {
 
     #[test]
     fn a_camera_that_hides_a_marker_is_doubted_once() {
-        let mut image = GrayImage::filled(320, 240, 0);
+        let mut image = imaging::GrayImage::filled(320, 240, 0);
         image.pixels_mut().copy_from_slice(&picture_of_tilted_rings());
+        let image = StillImage::from(image);
         let examiner = |focal: &str| {
             let args = args(&["--marker", "rings:0.2", "--focal-px", focal, "a.png"]).unwrap();
             Examiner::new(&args, Lens::Ideal { focal_px: args.focal_px.unwrap() }).unwrap()
@@ -427,7 +474,7 @@ mod tests {
         };
         assert_eq!(found(&examiner("300")), 1);
         let wrong = examiner("30");
-        let view = image.view().unwrap();
+        let view = image.grey.view().unwrap();
         let told = wrong.doubt_of_camera(view, "a.png").unwrap();
         for part in ["a.png", "rings", "`--focal-px 30`", "320 x 240"] {
             assert!(told.contains(part), "`{part}` is not in: {told}");
@@ -442,6 +489,87 @@ mod tests {
         let other = examiner("30");
         assert_eq!(found(&other), 0);
         assert!(other.was_doubted.load(Ordering::Relaxed));
+    }
+
+    /// A JPEG file of the thesis' marker right of the centre, with an Exif orientation.
+    fn jpeg_of_orientation(orientation: u8) -> Vec<u8> {
+        let mut shifted = image::GrayImage::from_pixel(320, 240, image::Luma([120]));
+        image::imageops::replace(&mut shifted, &picture_of_rings(100.0), 60, 10);
+        let mut jpeg = std::io::Cursor::new(Vec::new());
+        shifted.write_to(&mut jpeg, image::ImageFormat::Jpeg).unwrap();
+        let jpeg = jpeg.into_inner();
+        let exif = b"\xff\xe1\0\x22Exif\0\0MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0";
+        [&jpeg[..2], exif, &[orientation, 0, 0, 0, 0, 0, 0], &jpeg[2..]].concat()
+    }
+
+    #[test]
+    fn a_picture_that_exif_would_turn_has_the_pose_that_the_sensor_saw() {
+        let folder = tempfile::tempdir().unwrap();
+        for orientation in [1, 3, 6] {
+            let file = folder.path().join(format!("{orientation}.jpg"));
+            std::fs::write(file, jpeg_of_orientation(orientation)).unwrap();
+        }
+        // The principal point is far from the image's centre.
+        let camera = CameraModel { cx: 140.0, cy: 100.0, ..CameraModel::pinhole(320, 240, 300.0) };
+        let path = folder.path().to_str().unwrap();
+        let text = ["--marker", "rings:0.2", "--camera", "camera.yaml", "--format", "jsonl", path];
+        let args = args(&text).unwrap();
+        let examiner = Examiner::new(&args, Lens::Calibrated(camera)).unwrap();
+        let mut out = Vec::new();
+        examiner.examine_all(Source::new(&args.images), 1, args.format, &mut out).unwrap();
+        let lines: Vec<Value> =
+            String::from_utf8(out).unwrap().lines().map(|l| l.parse().unwrap()).collect();
+        let place = |line: &Value| line["detections"][0]["pose"]["translation_m"].clone();
+        assert!(place(&lines[0])[0].as_f64().unwrap() > 0.15, "{}", lines[0]);
+        assert!(lines.iter().all(|line| place(line) == place(&lines[0])), "{lines:?}");
+        let orientations: Vec<_> = lines.iter().map(|it| it["exif_orientation"].as_u64()).collect();
+        assert_eq!(orientations, [None, Some(3), Some(6)]);
+        assert!(examiner.was_told_of_turns.load(Ordering::Relaxed));
+    }
+
+    #[test]
+    fn a_picture_that_exif_would_turn_is_told_once() {
+        let examiner =
+            Examiner::new(&args(&["--marker", "rings", "a.jpg"]).unwrap(), Lens::Unknown).unwrap();
+        let still = |exif_orientation| {
+            let grey = imaging::GrayImage::filled(320, 240, 0);
+            StillImage { grey, exif_orientation }
+        };
+        assert_eq!(examiner.note_of_turn(&still(None), "a.jpg"), None);
+        let told = examiner.note_of_turn(&still(Some(3)), "b.jpg").unwrap();
+        assert!(told.contains("b.jpg") && told.contains("Exif orientation 3"), "{told}");
+        assert_eq!(examiner.note_of_turn(&still(Some(3)), "c.jpg"), None);
+        let upright = CameraModel::pinhole(240, 320, 300.0);
+        let told = warning_of_size(&upright, &still(Some(6)), "a.jpg");
+        assert!(told.contains("320 x 240") && told.contains("Exif"), "{told}");
+        assert!(!warning_of_size(&upright, &still(None), "a.jpg").contains("Exif"));
+        let larger = CameraModel::pinhole(640, 480, 300.0);
+        assert!(!warning_of_size(&larger, &still(Some(6)), "a.jpg").contains("Exif"));
+    }
+
+    #[test]
+    fn images_of_another_size_than_the_calibration_lack_their_poses_and_say_so() {
+        let folder = folder();
+        let photo = folder.path().join("0.png");
+        let camera = folder.path().join("camera.yaml");
+        let calibration = |width: u32| {
+            let details = media::CalibrationDetails::default();
+            let model = CameraModel::pinhole(width, 240, 300.0);
+            let format = media::CalibrationFormat::Ros;
+            media::write_calibration(&camera, &model, format, &details).unwrap();
+            let text = ["--marker", "rings:0.2", "--camera", camera.to_str().unwrap()];
+            args(&[&text[..], &["--format", "jsonl", photo.to_str().unwrap()]].concat()).unwrap()
+        };
+        assert_eq!(run(&calibration(320)).unwrap(), ExitCode::SUCCESS);
+        let args = calibration(640);
+        assert_eq!(run(&args).unwrap(), ExitCode::FAILURE);
+        let model = read_calibration(&camera).unwrap();
+        let examiner = Examiner::new(&args, Lens::Calibrated(model)).unwrap();
+        let mut out = Vec::new();
+        examiner.examine_all(Source::new(&args.images), 1, args.format, &mut out).unwrap();
+        let line: Value = String::from_utf8(out).unwrap().parse().unwrap();
+        assert_eq!(line["no_poses"], "the calibration is for 640 x 240 pixels", "{line}");
+        assert_eq!(line["detections"][0]["pose"], Value::Null, "{line}");
     }
 
     #[test]

@@ -28,7 +28,13 @@ pub(super) enum Line {
 pub(super) struct Found {
     pub(super) width: usize,
     pub(super) height: usize,
+    /// How its Exif data want the image turned to be looked at, which is not done.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) exif_orientation: Option<u8>,
     pub(super) detect_ms: f64,
+    /// Why nothing in it has a pose although the camera is known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) no_poses: Option<String>,
     pub(super) detections: Vec<Detection>,
 }
 
@@ -109,7 +115,7 @@ impl Line {
         match self {
             Self::Error { image, error } => format!("{image}  error: {error}\n"),
             Self::Image { image, found, .. } => {
-                let Found { width, height, detect_ms, detections } = found;
+                let Found { width, height, detect_ms, detections, .. } = found;
                 let count = detections.len();
                 let markers = if count == 1 { "marker" } else { "markers" };
                 let mut text = format!(

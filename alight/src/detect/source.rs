@@ -3,14 +3,17 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-use imaging::{BayerPattern, GrayImage};
+use imaging::BayerPattern;
 use media::{
-    DEFAULT_MAX_PIXELS, IMAGE_EXTENSIONS, VIDEO_EXTENSIONS, Video, VideoImage, files_in, is_video,
-    read_image,
+    DEFAULT_MAX_PIXELS, IMAGE_EXTENSIONS, OTHER_IMAGE_EXTENSIONS, StillImage, VIDEO_EXTENSIONS,
+    Video, VideoImage, files_in, is_video, read_image,
 };
 
 /// Assumed interval between image files, in seconds.
 const IMAGE_PERIOD_S: f64 = 0.1;
+
+/// How many files that are left out are named.
+const MAX_NAMES: usize = 5;
 
 /// The ending of annotated images, which are none of a folder's images.
 pub(crate) const DRAWN_ENDING: &str = ".drawn.png";
@@ -75,6 +78,25 @@ impl Source {
         stem
     }
 
+    /// What is said of the images in folders that are of formats that are not read; `None` where there are none.
+    pub(crate) fn note_of_others(paths: &[PathBuf]) -> Option<String> {
+        let folders = paths.iter().filter(|path| path.is_dir());
+        // What cannot be listed is told where it is read.
+        let others = folders.filter_map(|path| files_in(path, &[OTHER_IMAGE_EXTENSIONS]).ok());
+        let others: Vec<PathBuf> = others.flatten().collect();
+        let shown = others.iter().take(MAX_NAMES).map(|path| path.display().to_string());
+        let mut names = shown.collect::<Vec<_>>().join(", ");
+        let count = match others.len() {
+            0 => return None,
+            1 => "1 image is".to_owned(),
+            count => format!("{count} images are"),
+        };
+        if let more @ 1.. = others.len().saturating_sub(MAX_NAMES) {
+            names.push_str(&format!(" and {more} more"));
+        }
+        Some(format!("{count} left out, as neither PNG nor JPEG: {names}; convert them"))
+    }
+
     /// The files that are still to be read.
     pub(crate) fn files(&self) -> impl Iterator<Item = &Path> {
         self.listed
@@ -137,11 +159,13 @@ impl Item {
         Self { stem: stem(&name), name, time_s: 0.0, is_frame: false, content }
     }
 
-    /// The grey image, or the reason why there is none.
-    pub(crate) fn into_image(self, bayer: Option<BayerPattern>) -> Result<GrayImage, String> {
+    /// The grey image as it is stored, or the reason why there is none.
+    pub(crate) fn into_image(self, bayer: Option<BayerPattern>) -> Result<StillImage, String> {
         let image = match self.content {
             Content::File(path) => read_image(&path, DEFAULT_MAX_PIXELS, bayer),
-            Content::Frame(path, image) => image.grey(&path, DEFAULT_MAX_PIXELS),
+            Content::Frame(path, image) => {
+                image.grey(&path, DEFAULT_MAX_PIXELS).map(StillImage::from)
+            }
             Content::Unreadable(problem) => return Err(problem),
         };
         image.map_err(|problem| problem.to_string())
@@ -169,6 +193,23 @@ mod tests {
         let distinct: std::collections::BTreeSet<_> = stems.iter().collect();
         assert_eq!(distinct.len(), 4, "{stems:?}");
         assert!(stems[1].ends_with("a_b.jpg~2") && stems[2].ends_with("a_b.jpg~3"), "{stems:?}");
+    }
+
+    #[test]
+    fn images_of_other_formats_in_a_folder_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let paths = [folder.path().to_owned(), folder.path().join("x.bmp")];
+        let note = || Source::note_of_others(&paths);
+        let write = |name: &str| std::fs::write(folder.path().join(name), "").unwrap();
+        ["a.jpg", "notes.txt", "flight.mp4"].into_iter().for_each(write);
+        assert_eq!(note(), None);
+        write("b.HEIC");
+        let told = note().unwrap();
+        assert!(told.starts_with("1 image is left out") && told.contains("b.HEIC"), "{told}");
+        ["c.bmp", "d.tiff", "e.webp", "f.gif", "g.dng"].into_iter().for_each(write);
+        let told = note().unwrap();
+        assert!(told.starts_with("6 images are left out, as neither PNG nor JPEG"), "{told}");
+        assert!(told.contains("f.gif and 1 more") && !told.contains("g.dng"), "{told}");
     }
 
     #[test]

@@ -1,9 +1,10 @@
-//! Image files (PNG and JPEG): found in folders in order, decoded to 8-bit grey oriented by Exif, or to a
-//! frame's samples, within a limit of pixels, and refused when damaged.
+//! Image files (PNG and JPEG): found in folders in order, decoded to 8-bit grey or to a frame's samples as they are stored, within
+//! a limit of pixels, and refused when damaged.
 
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
+use ::image::metadata::Orientation;
 use ::image::{ColorType, DynamicImage, ImageDecoder, ImageReader, Limits};
 use imaging::{BayerPattern, Converter, GrayImage, GrayView, SampleFormat};
 
@@ -60,8 +61,7 @@ pub enum ImageError {
     },
     /// An image larger than the limit.
     #[error(
-        "{path:?} has {width} x {height} pixels; the limit is {max_pixels} pixels, and {edge} for an edge; make it \
-         smaller, or of a camera raise `source.max_megapixels` in its configuration",
+        "{path:?} has {width} x {height} pixels; the limit is {max_pixels} pixels, and {edge} for an edge; make it smaller",
         edge = GrayView::MAX_EDGE_PX
     )]
     TooLarge {
@@ -106,6 +106,12 @@ pub enum ImageError {
 
 /// File extensions of images.
 pub const IMAGE_EXTENSIONS: &[&str] = &["png", "jpg", "jpeg"];
+
+/// File extensions of images of other formats, which are not read.
+pub const OTHER_IMAGE_EXTENSIONS: &[&str] = &[
+    "arw", "avif", "bmp", "cr2", "cr3", "dng", "exr", "gif", "heic", "heif", "jp2", "jxl", "nef",
+    "orf", "pbm", "pgm", "pnm", "ppm", "raf", "raw", "rw2", "tga", "tif", "tiff", "webp",
+];
 
 /// The images at a path: the file itself, or those in a folder and its subfolders, sorted by path. The files
 /// are not opened.
@@ -167,9 +173,24 @@ pub(crate) fn has_extension(path: &Path, extensions: &[&str]) -> bool {
     extensions.iter().any(|known| extension.eq_ignore_ascii_case(known))
 }
 
-/// An image file (PNG or JPEG) in grey, oriented as its Exif data says. Colours are weighted by ITU-R BT.601,
-/// 16-bit grey is scaled to the range it uses, transparent pixels are blended with white. With a `bayer`
-/// pattern, an image of one channel is a sensor's raw samples.
+/// An image file in grey.
+#[derive(Clone, Debug)]
+pub struct StillImage {
+    /// The image as it is stored.
+    pub grey: GrayImage,
+    /// How its Exif data want it turned to be looked at, from 2 to 8; `None` where it is upright as it is stored.
+    pub exif_orientation: Option<u8>,
+}
+
+impl From<GrayImage> for StillImage {
+    fn from(grey: GrayImage) -> Self {
+        Self { grey, exif_orientation: None }
+    }
+}
+
+/// An image file (PNG or JPEG) in grey, as it is stored: whatever Exif's orientation is, it is as the sensor saw it, of which a
+/// camera's calibration is. Colours are weighted by ITU-R BT.601, 16-bit grey is scaled to the range it uses, transparent pixels are
+/// blended with white. With a `bayer` pattern, an image of one channel is a sensor's raw samples.
 ///
 /// # Errors
 /// [`ImageError`] when the file cannot be read, is not a complete image, or has more than `max_pixels`.
@@ -177,15 +198,15 @@ pub fn read_image(
     path: &Path,
     max_pixels: u64,
     bayer: Option<BayerPattern>,
-) -> Result<GrayImage, ImageError> {
+) -> Result<StillImage, ImageError> {
     let decoded = DecodedImage::read(path, max_pixels)?;
     if bayer.is_some() && decoded.raw_bits().is_none() {
         return Err(ImageError::NotRaw { path: path.to_owned() });
     }
-    Ok(decoded.grey(bayer))
+    Ok(StillImage { grey: decoded.grey(bayer), exif_orientation: decoded.exif_orientation() })
 }
 
-/// Like [`read_image`], from the bytes of a file; errors name `path`.
+/// The grey image of [`read_image`], from the bytes of a file; errors name `path`.
 ///
 /// # Errors
 /// As [`read_image`].
@@ -208,6 +229,7 @@ pub fn frame_bytes(path: &Path, max_pixels: u64) -> Result<usize, ImageError> {
 /// A decoded image, in the pixel format of its file.
 pub struct DecodedImage {
     image: DynamicImage,
+    orientation: Orientation,
 }
 
 impl DecodedImage {
@@ -246,9 +268,14 @@ impl DecodedImage {
         // The decoder takes the blocks behind a hole for those within it.
         check_scan(bytes).map_err(|fault| damaged(&fault))?;
         let orientation = decoder.orientation().map_err(|cause| damaged(&cause))?;
-        let mut image = DynamicImage::from_decoder(decoder).map_err(|cause| damaged(&cause))?;
-        image.apply_orientation(orientation);
-        Ok(Self { image })
+        let image = DynamicImage::from_decoder(decoder).map_err(|cause| damaged(&cause))?;
+        Ok(Self { image, orientation })
+    }
+
+    /// How its Exif data want it turned to be looked at, which is not done; `None` where it is upright.
+    pub fn exif_orientation(&self) -> Option<u8> {
+        let is_turned = self.orientation != Orientation::NoTransforms;
+        is_turned.then(|| self.orientation.to_exif())
     }
 
     /// Width in pixels.
@@ -440,7 +467,7 @@ mod tests {
     fn read_bytes(bytes: &[u8], max_pixels: u64) -> Result<GrayImage, String> {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), bytes).unwrap();
-        read_image(file.path(), max_pixels, None).map_err(|e| e.to_string())
+        read_image(file.path(), max_pixels, None).map(|it| it.grey).map_err(|e| e.to_string())
     }
 
     fn photo() -> DynamicImage {
@@ -483,7 +510,8 @@ mod tests {
         let file = tempfile::NamedTempFile::new().unwrap();
         let read = |image: DynamicImage| {
             std::fs::write(file.path(), bytes_of(&image, ImageFormat::Png)).unwrap();
-            read_image(file.path(), 1000, Some(BayerPattern::Rggb)).map_err(|e| e.to_string())
+            let read = read_image(file.path(), 1000, Some(BayerPattern::Rggb));
+            read.map(|it| it.grey).map_err(|e| e.to_string())
         };
         let samples = |x: u32, y: u32| [[60_u8, 120], [120, 40]][y as usize % 2][x as usize % 2];
         let grey = read(ImageBuffer::from_fn(8, 6, |x, y| Luma([samples(x, y)])).into()).unwrap();
@@ -496,10 +524,31 @@ mod tests {
     fn a_jpeg_keeps_its_grey_levels() {
         let read = read_bytes(&bytes_of(&photo(), ImageFormat::Jpeg), DEFAULT_MAX_PIXELS).unwrap();
         let mut exact = vec![0; 64 * 48];
-        DecodedImage { image: photo() }.write_grey(&mut exact);
+        DecodedImage { image: photo(), orientation: Orientation::NoTransforms }
+            .write_grey(&mut exact);
         let error: u32 =
             read.pixels().iter().zip(&exact).map(|(a, b)| u32::from(a.abs_diff(*b))).sum();
         assert!(error / (64 * 48) < 6, "{error}");
+    }
+
+    #[test]
+    fn an_image_is_as_the_sensor_saw_it_however_exif_would_turn_it() {
+        let plain = bytes_of(&photo(), ImageFormat::Jpeg);
+        let stored = read_bytes(&plain, DEFAULT_MAX_PIXELS).unwrap();
+        let file = tempfile::NamedTempFile::new().unwrap();
+        for orientation in 1..=8 {
+            std::fs::write(file.path(), with_orientation(&plain, orientation)).unwrap();
+            let read = read_image(file.path(), DEFAULT_MAX_PIXELS, None).unwrap();
+            assert_eq!((read.grey.width(), read.grey.height()), (64, 48), "{orientation}");
+            assert_eq!(read.grey.pixels(), stored.pixels(), "{orientation}");
+            assert_eq!(read.exif_orientation, (orientation > 1).then_some(orientation));
+        }
+    }
+
+    /// A JPEG file whose Exif data have an orientation.
+    fn with_orientation(jpeg: &[u8], orientation: u8) -> Vec<u8> {
+        let exif = b"\xff\xe1\0\x22Exif\0\0MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0";
+        [&jpeg[..2], exif, &[orientation, 0, 0, 0, 0, 0, 0], &jpeg[2..]].concat()
     }
 
     #[test]

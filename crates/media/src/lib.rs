@@ -27,8 +27,8 @@ pub use calibration::{
 };
 pub use h264::{H264Error, LiveH264};
 pub use image::{
-    DEFAULT_MAX_PIXELS, DecodedImage, IMAGE_EXTENSIONS, ImageError, decode_image, files_in,
-    frame_bytes, images_in, read_image, samples_to_grey,
+    DEFAULT_MAX_PIXELS, DecodedImage, IMAGE_EXTENSIONS, ImageError, OTHER_IMAGE_EXTENSIONS,
+    StillImage, decode_image, files_in, frame_bytes, images_in, read_image, samples_to_grey,
 };
 pub use jpeg::JpegScanner;
 pub use rectify::Rectifier;
