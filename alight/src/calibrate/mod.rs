@@ -43,7 +43,8 @@ pub(crate) struct CalibrateArgs {
 
 #[derive(Subcommand)]
 enum What {
-    /// A camera's intrinsics from images of a printed board: print it with --print, take 20 to 60 pictures (tilted by up to
+    /// A camera's intrinsics from images of a printed board: print it with --print (a grid of AprilTags; a chessboard or another board is not
+    /// found: calibrate with OpenCV from those, whose file is read as well), take 20 to 60 pictures (tilted by up to
     /// 45 degrees to all sides, near and far, in every corner of the image), then calibrate.
     Board(BoardArgs),
     /// A camera's time offset, mount, focal length and first radial coefficient (k1) from the recording of a landing
@@ -172,7 +173,7 @@ fn refuse(
         Format::Text => {
             print(report::found_text(found, shown).trim_end())?;
             print(report::shown_text(shown).trim_end())?;
-            print(&format!("No calibration: {refusal}."))
+            print(&format!("No calibration: {}.", report::refusal_text(found, refusal)))
         }
         Format::Json => print(&report::json(found, shown, None, Some(refusal)).to_string()),
     }

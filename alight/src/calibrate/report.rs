@@ -17,6 +17,16 @@ const MAP: [usize; 2] = [6, 4];
 /// Names that are listed.
 const MAX_NAMES: usize = 5;
 
+/// Why there is no calibration; where no image shows the board, which board is meant.
+pub(super) fn refusal_text(found: &FoundImages, refusal: &Refusal) -> String {
+    if found.views.is_empty() {
+        return "no image shows the board, which is the grid of AprilTags that `alight calibrate board --print` writes; a chessboard \
+                or another board is not found: calibrate with OpenCV from those, and give its file wherever a calibration is taken"
+            .to_owned();
+    }
+    refusal.to_string()
+}
+
 /// Which images show the board, and where in the image it was.
 pub(super) fn found_text(found: &FoundImages, shown: &Shown) -> String {
     let points: usize = found.views.iter().map(|view| view.points.len()).sum();
@@ -205,7 +215,7 @@ pub(super) fn json(
         "edges": edges,
         "shaken": found.shaken,
         "shown": shown.json(),
-        "refused": refusal.map(ToString::to_string),
+        "refused": refusal.map(|refusal| refusal_text(found, refusal)),
         "calibration": calibration.map(calibration_json),
     })
 }
@@ -257,4 +267,22 @@ fn calibration_json(calibration: &Calibration) -> Value {
         "uncertainty_by_place": uncertainty,
         "views": views,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use calibration::{ImageSize, View};
+
+    #[test]
+    fn images_without_the_board_are_told_which_board_is_meant() {
+        let refusal = Refusal::TooFewViews { views: 0, min_views: 3, min_points: 12 };
+        let mut found = FoundImages::default();
+        let told = refusal_text(&found, &refusal);
+        assert!(told.contains("AprilTags") && told.contains("chessboard"), "{told}");
+        assert!(told.contains("OpenCV") && !told.contains("more pictures"), "{told}");
+        let size = ImageSize { width: 640, height: 480 };
+        found.views.push(View { name: "a.png".to_owned(), size, points: Vec::new() });
+        assert_eq!(refusal_text(&found, &refusal), refusal.to_string());
+    }
 }
