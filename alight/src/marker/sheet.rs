@@ -23,6 +23,8 @@ const CUT_MARK_GAP_MM: f64 = 1.0;
 const CUT_MARK_LENGTH_MM: f64 = 3.5;
 /// Font size, in millimetres.
 pub(super) const TEXT_MM: f64 = 3.2;
+/// No letter is wider than this share of the font size.
+const LETTER: f64 = 0.75;
 
 /// Paper sizes, upright.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -169,7 +171,7 @@ impl Sheet {
         if 2.0 * half_mm > paper.room_mm() + ROUNDING_MM {
             return Err(too_large(marker, size_m, half_mm, paper));
         }
-        Ok(Self::from_drawing(&drawing, &format!("{}, size {size_m} m", marker.name()), paper))
+        Ok(Self::from_drawing(&drawing, &[format!("{}, size {size_m} m", marker.name())], paper))
     }
 
     /// A sheet with all markers of a pad, its landing point at the centre.
@@ -187,8 +189,14 @@ impl Sheet {
             );
             return Err(SheetError::TooLarge { problem });
         }
-        let count = pad.markers().len();
-        Ok(Self::from_drawing(&drawing, &format!("{}, {count} markers", pad.name()), paper))
+        let markers = pad.markers().iter().map(|placed| placed.marker);
+        let name = pad.name();
+        let counted = match pad.markers().len() {
+            1 => "1 marker".to_owned(),
+            count => format!("{count} markers"),
+        };
+        let titles = [format!("{name}, {counted}"), in_one_line(&kinds(markers), paper)];
+        Ok(Self::from_drawing(&drawing, &titles, paper))
     }
 
     /// A sheet with a calibration board, and what to do with it.
@@ -232,16 +240,20 @@ impl Sheet {
         Ok(sheet)
     }
 
-    fn from_drawing(drawing: &Drawing, title: &str, paper: Paper) -> Self {
+    fn from_drawing(drawing: &Drawing, titles: &[String], paper: Paper) -> Self {
         let mut sheet = Self { size_mm: paper.size_mm(), marks: Vec::new() };
         sheet.draw(drawing, sheet.centre());
         sheet.draw_cut_marks(drawing.half_extent_m * 1e3);
         sheet.draw_ruler();
         let [width, height] = sheet.size_mm;
         let left = (width - RULER_MM) / 2.0;
-        sheet.write([left, height - 11.0], title.to_owned());
+        let advice_mm = height - MARGIN_MM - 1.0;
+        let line_mm = if titles.len() > 1 { 3.5 } else { 5.0 };
+        for (above, title) in (1..).zip(titles.iter().rev()) {
+            sheet.write([left, advice_mm - line_mm * f64::from(above)], title.clone());
+        }
         let advice = "Print at 100 %: the ruler must measure 100 mm.";
-        sheet.write([left, height - MARGIN_MM - 1.0], advice.to_owned());
+        sheet.write([left, advice_mm], advice.to_owned());
         sheet
     }
 
@@ -314,6 +326,43 @@ impl Sheet {
     }
 }
 
+/// The markers of a pad by family and size, each with its ids.
+fn kinds(markers: impl Iterator<Item = Marker>) -> Vec<String> {
+    let mut kinds: Vec<(Marker, Vec<u32>)> = Vec::new();
+    for marker in markers {
+        let same = kinds
+            .iter_mut()
+            .find(|(first, _)| first.family == marker.family && first.size_m == marker.size_m);
+        match same {
+            Some((_, ids)) => ids.extend(marker.id),
+            None => kinds.push((marker, marker.id.into_iter().collect())),
+        }
+    }
+    let told = kinds.into_iter().map(|(marker, ids)| {
+        let ids: Vec<String> = ids.iter().map(u32::to_string).collect();
+        let ids = if ids.is_empty() { String::new() } else { format!(":{}", ids.join(",")) };
+        let size = marker.size_m.map_or_else(String::new, |size_m| format!(" {size_m} m"));
+        format!("{}{ids}{size}", marker.family)
+    });
+    told.collect()
+}
+
+/// As many kinds of markers as there is room for beside the ruler's left end; the others are counted.
+fn in_one_line(kinds: &[String], paper: Paper) -> String {
+    let [width, _] = paper.size_mm();
+    let room_mm = (width + RULER_MM) / 2.0 - MARGIN_MM;
+    let max_letters = (room_mm / (LETTER * TEXT_MM)) as usize;
+    let lines = (0..=kinds.len()).rev().map(|shown| {
+        let more = match kinds.len() - shown {
+            0 => None,
+            rest => Some(format!("{rest} more by the pad's file")),
+        };
+        let parts = kinds.iter().take(shown).cloned().chain(more);
+        parts.collect::<Vec<_>>().join("; ")
+    });
+    lines.into_iter().find(|line| line.len() <= max_letters).unwrap_or_default()
+}
+
 /// The smallest paper on which it fits.
 fn larger_paper(needed_mm: f64) -> Option<&'static Paper> {
     Paper::value_variants().iter().find(|paper| paper.room_mm() + ROUNDING_MM >= needed_mm)
@@ -383,6 +432,37 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn a_pads_sheet_names_its_markers_with_ids_and_sizes() {
+        let texts = |pad: &Pad, paper: Paper| -> Vec<String> {
+            let [width, _] = paper.size_mm();
+            let sheet = Sheet::with_pad(pad, paper).unwrap();
+            let texts = sheet.marks.iter().filter_map(|mark| match mark {
+                Mark::Text { at_mm: [x, _], text } => {
+                    assert!(x + LETTER * TEXT_MM * text.len() as f64 <= width, "{text}");
+                    Some(text.clone())
+                }
+                Mark::Disc { .. } | Mark::Rectangle { .. } => None,
+            });
+            texts.collect()
+        };
+        let built_in = texts(&Pad::named("a4", |file| node::read_text(file)).unwrap(), Paper::A4);
+        assert!(built_in.contains(&"pad:0, 2 markers".to_owned()), "{built_in:?}");
+        let markers = "apriltag-custom48h12:0 0.099 m; aruco-4x4-50:0 0.024 m".to_owned();
+        assert!(built_in.contains(&markers), "{built_in:?}");
+        let four = |size_m: &dyn Fn(u32) -> String| -> Pad {
+            let placed = (0..4).map(|id| {
+                let (x_m, size_m) = (0.03 * f64::from(id) - 0.045, size_m(id));
+                format!("[[markers]]\nmarker = \"aruco-4x4-50:{id}:{size_m}\"\nx_m = {x_m}\n")
+            });
+            format!("id = 1\n{}", placed.collect::<String>()).parse().unwrap()
+        };
+        let row = texts(&four(&|_| "0.02".to_owned()), Paper::A5);
+        assert!(row.contains(&"aruco-4x4-50:0,1,2,3 0.02 m".to_owned()), "{row:?}");
+        let sizes = texts(&four(&|id| format!("0.01{id}")), Paper::A5);
+        assert!(sizes.iter().any(|text| text.ends_with("; 3 more by the pad's file")), "{sizes:?}");
     }
 
     #[test]
