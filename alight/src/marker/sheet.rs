@@ -355,10 +355,10 @@ fn in_one_line(kinds: &[String], paper: Paper) -> String {
     let lines = (0..=kinds.len()).rev().map(|shown| {
         let more = match kinds.len() - shown {
             0 => None,
-            rest => Some(format!("{rest} more by the pad's file")),
+            rest => Some(format!("{rest} more")),
         };
         let parts = kinds.iter().take(shown).cloned().chain(more);
-        parts.collect::<Vec<_>>().join("; ")
+        parts.collect::<Vec<_>>().join(", ")
     });
     lines.into_iter().find(|line| line.len() <= max_letters).unwrap_or_default()
 }
@@ -450,7 +450,7 @@ mod tests {
         };
         let built_in = texts(&Pad::named("a4", |file| node::read_text(file)).unwrap(), Paper::A4);
         assert!(built_in.contains(&"pad:0, 2 markers".to_owned()), "{built_in:?}");
-        let markers = "apriltag-custom48h12:0 0.099 m; aruco-4x4-50:0 0.024 m".to_owned();
+        let markers = "apriltag-custom48h12:0 0.099 m, aruco-4x4-50:0 0.024 m".to_owned();
         assert!(built_in.contains(&markers), "{built_in:?}");
         let four = |size_m: &dyn Fn(u32) -> String| -> Pad {
             let placed = (0..4).map(|id| {
@@ -462,7 +462,7 @@ mod tests {
         let row = texts(&four(&|_| "0.02".to_owned()), Paper::A5);
         assert!(row.contains(&"aruco-4x4-50:0,1,2,3 0.02 m".to_owned()), "{row:?}");
         let sizes = texts(&four(&|id| format!("0.01{id}")), Paper::A5);
-        assert!(sizes.iter().any(|text| text.ends_with("; 3 more by the pad's file")), "{sizes:?}");
+        assert!(sizes.iter().any(|text| text.ends_with(", 3 more")), "{sizes:?}");
     }
 
     #[test]
