@@ -242,7 +242,7 @@ pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
 /// Warns before the flights that another marker would give the same ones.
 pub(crate) fn tell_only_size_counts(vision: Vision, settings: &str) {
     if only_size_counts(vision.name(), settings) {
-        write_error(&format!("warning: {}", ONLY_SIZE_COUNTS));
+        write_error(&format!("warning: {ONLY_SIZE_COUNTS}"));
     }
 }
 
