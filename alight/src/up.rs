@@ -101,11 +101,9 @@ fn tell_missing(
     match lacking.split_last() {
         None => Ok(ExitCode::SUCCESS),
         Some((last, [])) => bail!(last.clone()),
-        Some(_) => bail!(
-            "{} things are missing or wrong on this machine:\n  {}",
-            lacking.len(),
-            lacking.join("\n  ")
-        ),
+        Some(_) => {
+            bail!("{} things are missing or wrong:\n  {}", lacking.len(), lacking.join("\n  "))
+        }
     }
 }
 

@@ -730,11 +730,13 @@ impl MountConfig {
     }
 }
 
-/// Whether an angle of a mount is an eighth of a turn or a multiple of it in radians: in degrees no mount is made to such digits.
+/// Whether an angle of a mount is an eighth, a quarter, three eighths, a half, three quarters or the whole of a turn in radians: in degrees
+/// no mount is made to such digits. Five eighths of a turn would be 5.5 degrees as well.
 fn is_radians(angle: f64) -> bool {
     let eighths = angle / std::f64::consts::FRAC_PI_4;
     let nearest = eighths.round();
-    (1.0..=8.0).contains(&nearest.abs()) && (eighths - nearest).abs() < MAX_RADIANS_OFF
+    let is_usual = [1.0, 2.0, 3.0, 4.0, 6.0, 8.0].contains(&nearest.abs());
+    is_usual && (eighths - nearest).abs() < MAX_RADIANS_OFF
 }
 
 fn holds(holds: bool, otherwise: &'static str) -> Result<(), &'static str> {
@@ -746,6 +748,16 @@ mod tests {
     use super::*;
     use geometry::Vector;
     use node::Layers;
+
+    #[test]
+    fn angles_in_radians_are_told_from_those_in_degrees() {
+        for angle in [0.785, -1.57, 1.5708, 2.356, 3.1416, -4.712, 6.283] {
+            assert!(is_radians(angle), "{angle}");
+        }
+        for tenths in (-3600..=3600).map(f64::from) {
+            assert!(!is_radians(tenths / 10.0), "{tenths} tenths of a degree");
+        }
+    }
 
     fn load(set: &[&str]) -> Result<Config, String> {
         let set = set.iter().map(|s| (*s).to_owned()).collect();
@@ -868,6 +880,7 @@ mod tests {
             |deg: &'static str, part: &str| check(&["mount.orientation=angles", deg], part);
         angles("mount.roll_pitch_yaw_deg=[0, 0, 1.5708]", "look like radians");
         angles("mount.roll_pitch_yaw_deg=[0.02, -0.78539816, 1.57]", "look like radians");
+        angles("mount.roll_pitch_yaw_deg=[3.14, 0, 4.712]", "look like radians");
         check(&["mount.roll_pitch_yaw_deg=[0, 0, 180]"], "set that to angles");
         check(&["mount.rotation_wxyz=[0, 0, 0, 1]"], "set that to quaternion");
         check(&["mount.roll_pitch_yaw_rad=[0, 0, 1.5]"], "did you mean `mount.roll_pitch_yaw_deg`");

@@ -326,8 +326,16 @@ impl Sheet {
     }
 }
 
-/// The markers of a pad by family and size, each with its ids.
-fn kinds(markers: impl Iterator<Item = Marker>) -> Vec<String> {
+/// The markers of one family and size on a pad, as a sheet names them.
+struct Kind {
+    /// With its ids.
+    full: String,
+    /// With their number, where there is no room for the ids.
+    short: String,
+}
+
+/// The markers of a pad by family and size.
+fn kinds(markers: impl Iterator<Item = Marker>) -> Vec<Kind> {
     let mut kinds: Vec<(Marker, Vec<u32>)> = Vec::new();
     for marker in markers {
         let same = kinds
@@ -338,29 +346,46 @@ fn kinds(markers: impl Iterator<Item = Marker>) -> Vec<String> {
             None => kinds.push((marker, marker.id.into_iter().collect())),
         }
     }
-    let told = kinds.into_iter().map(|(marker, ids)| {
-        let ids: Vec<String> = ids.iter().map(u32::to_string).collect();
-        let ids = if ids.is_empty() { String::new() } else { format!(":{}", ids.join(",")) };
-        let size = marker.size_m.map_or_else(String::new, |size_m| format!(" {size_m} m"));
-        format!("{}{ids}{size}", marker.family)
+    let told = kinds.into_iter().map(|(Marker { family, size_m, .. }, mut ids)| {
+        let size = size_m.map_or_else(String::new, |size_m| format!(" {size_m} m"));
+        if ids.is_empty() {
+            let name = format!("{family}{size}");
+            return Kind { full: name.clone(), short: name };
+        }
+        ids.sort_unstable();
+        let full = format!("{family}:{}{size}", ranges(&ids).join(","));
+        Kind { full, short: format!("{family}: {} of{size}", ids.len()) }
     });
     told.collect()
 }
 
-/// As many kinds of markers as there is room for beside the ruler's left end; the others are counted.
-fn in_one_line(kinds: &[String], paper: Paper) -> String {
+/// Sorted numbers, with those in a row as the first and the last of them.
+fn ranges(sorted: &[u32]) -> Vec<String> {
+    let rows = sorted.chunk_by(|one, next| one.checked_add(1) == Some(*next));
+    let texts = rows.map(|row| match row {
+        [first, _, .., last] => format!("{first}-{last}"),
+        _ => row.iter().map(u32::to_string).collect::<Vec<_>>().join(","),
+    });
+    texts.collect()
+}
+
+/// As many kinds of markers as there is room for beside the ruler's left end, with their ids or else with their numbers; the others are
+/// counted.
+fn in_one_line(kinds: &[Kind], paper: Paper) -> String {
     let [width, _] = paper.size_mm();
     let room_mm = (width + RULER_MM) / 2.0 - MARGIN_MM;
     let max_letters = (room_mm / (LETTER * TEXT_MM)) as usize;
-    let lines = (0..=kinds.len()).rev().map(|shown| {
+    let line = |shown: usize, name: fn(&Kind) -> &str| {
         let more = match kinds.len() - shown {
             0 => None,
             rest => Some(format!("{rest} more")),
         };
-        let parts = kinds.iter().take(shown).cloned().chain(more);
+        let parts = kinds.iter().take(shown).map(|kind| name(kind).to_owned()).chain(more);
         parts.collect::<Vec<_>>().join(", ")
-    });
-    lines.into_iter().find(|line| line.len() <= max_letters).unwrap_or_default()
+    };
+    let full = (1..=kinds.len()).rev().map(|shown| line(shown, |kind| &kind.full));
+    let short = (0..=kinds.len()).rev().map(|shown| line(shown, |kind| &kind.short));
+    full.chain(short).find(|line| line.len() <= max_letters).unwrap_or_default()
 }
 
 /// The smallest paper on which it fits.
@@ -460,9 +485,21 @@ mod tests {
             format!("id = 1\n{}", placed.collect::<String>()).parse().unwrap()
         };
         let row = texts(&four(&|_| "0.02".to_owned()), Paper::A5);
-        assert!(row.contains(&"aruco-4x4-50:0,1,2,3 0.02 m".to_owned()), "{row:?}");
+        assert!(row.contains(&"aruco-4x4-50:0-3 0.02 m".to_owned()), "{row:?}");
         let sizes = texts(&four(&|id| format!("0.01{id}")), Paper::A5);
         assert!(sizes.iter().any(|text| text.ends_with(", 3 more")), "{sizes:?}");
+    }
+
+    #[test]
+    fn ids_in_a_row_are_named_by_the_first_and_the_last_and_many_apart_by_their_number() {
+        assert_eq!(ranges(&[3]), ["3"]);
+        assert_eq!(ranges(&[0, 1, 4, 5, 6, 9]), ["0,1", "4-6", "9"]);
+        let of = |ids: Vec<u32>| {
+            let markers = ids.iter().map(|id| format!("aruco-4x4-50:{id}:0.02").parse().unwrap());
+            in_one_line(&kinds(markers), Paper::A5)
+        };
+        assert_eq!(of((0..20).rev().collect()), "aruco-4x4-50:0-19 0.02 m");
+        assert_eq!(of((0..25).map(|i| 2 * i).collect()), "aruco-4x4-50: 25 of 0.02 m");
     }
 
     #[test]
