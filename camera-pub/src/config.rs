@@ -751,7 +751,8 @@ mod tests {
 
     #[test]
     fn angles_in_radians_are_told_from_those_in_degrees() {
-        for angle in [0.785, -1.57, 1.5708, 2.356, 3.1416, -4.712, 6.283] {
+        for eighths in [1.0, -2.0, 3.0, 4.0, -6.0, 8.0] {
+            let angle = (eighths * std::f64::consts::FRAC_PI_4 * 1000.0_f64).round() / 1000.0;
             assert!(is_radians(angle), "{angle}");
         }
         for tenths in (-3600..=3600).map(f64::from) {

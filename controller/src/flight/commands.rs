@@ -1,5 +1,6 @@
 //! The operator's commands to a flight: start, hold, resume, abort and land here, carried out or refused with the reason.
 
+use autopilot::Conflict;
 use landing::{Event as LanderEvent, OperatorCommand, Phase};
 
 use super::Flight;
@@ -23,7 +24,12 @@ impl Flight {
         if self.mission.is_asking_for_land() {
             return Err("the vehicle is asked to land here".to_owned());
         }
-        if let Some(conflict) = self.autopilot.conflict(now_ns) {
+        // One that has flown a landing since its motors were started is ours, whoever came later.
+        let is_armed = self.autopilot.state().is_some_and(|state| state.armed);
+        let is_ours = is_armed && self.mission.started_ns().is_some();
+        let of_vehicles = |it: &Conflict| matches!(it, Conflict::SeveralVehicles { .. });
+        let conflict = self.autopilot.conflict(now_ns);
+        if let Some(conflict) = conflict.filter(|it| !(is_ours && of_vehicles(it))) {
             return Err(format!("no landing was started: {conflict}"));
         }
         self.check_way_out()?;
@@ -88,7 +94,8 @@ impl Flight {
         Ok(format!("in phase `{phase}`: {why}"))
     }
 
-    /// Lands where the vehicle is. Without a landing, too: it needs no marker and no detector.
+    /// Lands where the vehicle is. Without a landing, too: it needs no marker and no detector. Who else is on the link does not matter: it is
+    /// a way down for a vehicle that hovers, and it goes to the one that is heard.
     pub(super) fn land_here(&mut self, now_ns: i64) -> Result<String, String> {
         if self.landing_target.is_some() {
             return Err(
@@ -102,11 +109,6 @@ impl Flight {
         // PX4 climbs in a mode of its own.
         if self.mission.is_taking_off() && !is_flying_guided(&self.autopilot) {
             return Err("the vehicle is taking off; land it once it is up".to_owned());
-        }
-        // A vehicle that took off for us is ours.
-        let conflict = self.autopilot.conflict(now_ns).filter(|_| !self.mission.is_taking_off());
-        if let Some(conflict) = conflict {
-            return Err(format!("not landed here: {conflict}"));
         }
         if is_holding_px4(&self.autopilot) {
             self.check_way_out()?;

@@ -175,12 +175,13 @@ impl Packet {
         Some(decode(raw, &shape))
     }
 
-    /// Whether it is the heartbeat of an autopilot, as opposed to that of a ground station, a camera or a companion.
+    /// Whether it is the heartbeat of a vehicle's autopilot, as opposed to that of a ground station, its antenna, a camera or a companion.
     pub fn is_heartbeat_of_autopilot(&self) -> bool {
         let Some(MavMessage::HEARTBEAT(heartbeat)) = &self.message else { return false };
         self.sender.component == AUTOPILOT
             && heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
             && heartbeat.mavtype != MavType::MAV_TYPE_GCS
+            && heartbeat.mavtype != MavType::MAV_TYPE_ANTENNA_TRACKER
     }
 
     /// The payload as it was sent; MAVLink 2 leaves out zero bytes at its end.

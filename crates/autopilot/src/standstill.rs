@@ -14,6 +14,8 @@ const MAX_WAIT_NS: i64 = 2_500_000_000;
 #[derive(Copy, Clone, Debug, Default)]
 pub(crate) struct Standstill {
     ticked_ns: Option<i64>,
+    /// When the first one of those ended after which the mode is not known, and the last one.
+    first_ns: Option<i64>,
     ended_ns: Option<i64>,
 }
 
@@ -24,16 +26,27 @@ impl Standstill {
         self.ticked_ns = Some(before_ns.max(now_ns));
         if now_ns.saturating_sub(before_ns) > MIN_PAUSE_NS {
             self.ended_ns = Some(now_ns);
+            self.first_ns.get_or_insert(now_ns);
         }
-        self.ended_ns.take_if(|ended_ns| now_ns.saturating_sub(*ended_ns) > MAX_WAIT_NS);
+        // A process that stands still again and again asks nevertheless.
+        if self
+            .first_ns
+            .take_if(|first_ns| now_ns.saturating_sub(*first_ns) > MAX_WAIT_NS)
+            .is_some()
+        {
+            self.ended_ns = None;
+        }
     }
 
     /// The vehicle's mode was received; `measured_ns` is when the newest measurement before it was made, if there is one.
     pub(crate) fn mode_shown(&mut self, now_ns: i64, measured_ns: Option<i64>) {
-        self.ended_ns.take_if(|ended_ns| {
+        let shown = self.ended_ns.take_if(|ended_ns| {
             let is_read = now_ns.saturating_sub(*ended_ns) >= BACKLOG_NS;
             is_read && measured_ns.is_none_or(|measured_ns| measured_ns >= *ended_ns)
         });
+        if shown.is_some() {
+            self.first_ns = None;
+        }
     }
 
     /// Whether the mode that is known may be of before.
@@ -75,6 +88,16 @@ mod tests {
             assert!(standstill.is_mode_old(), "{ms} ms");
         }
         standstill.tick(3525 * MS);
+        assert!(!standstill.is_mode_old());
+    }
+    #[test]
+    fn the_wait_is_bounded_for_a_process_that_stands_still_again_and_again() {
+        let mut standstill = frozen();
+        for ms in (1500..3500).step_by(500) {
+            standstill.tick(ms * MS);
+            assert!(standstill.is_mode_old(), "{ms} ms");
+        }
+        standstill.tick(3600 * MS);
         assert!(!standstill.is_mode_old());
     }
 }

@@ -194,7 +194,8 @@ impl Lander {
         let operator =
             operator.or_else(|| self.is_dispute_over().then_some(OperatorCommand::Resume));
         let alarm = reaction(&self.config.phases, event).or_else(|| self.dispute_alarm(now));
-        if operator == Some(OperatorCommand::Resume) {
+        // A dispute that is over goes on by itself; what else is wrong only an operator has looked at again.
+        if matches!(event, Event::Operator(OperatorCommand::Resume)) {
             self.repeat_checks();
         }
         let inputs = Inputs {

@@ -26,7 +26,8 @@ impl Lander {
                 self.sightings.forget_since(since);
                 return Err(Rejection::RepeatedPicture);
             }
-            if stands {
+            // One that is carried by hand, as before the first flight, shows nothing: its height is not that of a flight.
+            if stands || !self.status.is_some_and(|status| status.armed) {
                 self.size_check.interrupt();
             } else {
                 self.size_check.observe(&self.config.estimator, frame, marker, &self.history);
