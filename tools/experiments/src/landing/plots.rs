@@ -179,14 +179,24 @@ fn one_fault(
             error_bar(&mut chart, bin.wind_m_s, [low, high], COLOURS[0])?;
         }
     }
-    for bin in &bins {
+    let width_px = chart.plotting_area().dim_in_pixel().0;
+    let lines = number_lines(&bins, f64::from(width_px) / (fastest + 0.4));
+    for (index, bin) in bins.iter().enumerate() {
         let colour = if bin.landed < bin.flown { COLOURS[1] } else { BLACK };
         let centred = Pos::new(HPos::Center, VPos::Top);
         let style = ("sans-serif", 12).into_font().color(&colour).pos(centred);
-        let text = format!("{} of {}", bin.landed, bin.flown);
-        chart.draw_series([Text::new(text, (bin.wind_m_s, 0.99 * max), style)])?;
+        let y = (0.99 - 0.05 * (index % lines) as f64) * max;
+        chart.draw_series([Text::new(bin.number(), (bin.wind_m_s, y), style)])?;
     }
     Ok(())
+}
+
+/// In how many lines, in turn, the numbers over the winds are, so that none covers its neighbour.
+fn number_lines(bins: &[Bin], px_per_m_s: f64) -> usize {
+    // Of digits 12 pixels high, with a gap.
+    const WIDTH_PX: f64 = 8.0;
+    let longest = bins.iter().map(|bin| bin.number().len()).max().unwrap_or(0);
+    if WIDTH_PX * longest as f64 > px_per_m_s { 2 } else { 1 }
 }
 
 /// The flights of 1 m/s of wind.
@@ -199,6 +209,11 @@ struct Bin {
 }
 
 impl Bin {
+    /// How many landed of how many.
+    fn number(&self) -> String {
+        format!("{}/{}", self.landed, self.flown)
+    }
+
     /// The 99th percentile (true), or of too few landings the greatest value.
     fn worst(&self) -> Option<(f64, bool)> {
         let percentile = percentile(&self.values, 0.99).map(|value| (value, true));
@@ -481,13 +496,15 @@ mod tests {
         };
         let outcomes: Vec<Outcome> = plan.flights().iter().map(flown).collect();
         let plots = all(&outcomes).unwrap();
-        for told in ["8 of 8", "1 of 8", "of fewer than 100 landings the worst"] {
+        for told in ["8/8", "1/8", "of fewer than 100 landings the worst"] {
             assert!(plots[0].1.contains(told), "{told} is not in the plot");
         }
         let members: Vec<&Outcome> = outcomes.iter().collect();
         let bins = bins(&members, |o| o.error_m);
         let worst: Vec<_> = bins.iter().map(|bin| (bin.landed, bin.flown, bin.worst())).collect();
         assert_eq!(worst, [(8, 8, Some((0.08, false))), (1, 8, Some((0.01, false)))]);
+        // Three characters need 24 pixels beside each other.
+        assert_eq!([23.0, 25.0].map(|px_per_m_s| number_lines(&bins, px_per_m_s)), [2, 1]);
     }
 
     #[test]
