@@ -1,7 +1,7 @@
 //! Writes the files of the landing experiment: every flight as CSV and JSON lines, plots, the thesis' figures of one
 //! flight, recordings of the worst flights flown again, and the report.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::BufWriter;
@@ -78,22 +78,28 @@ fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
 }
 
 /// The share within 0.1 m, with its interval. A seed has the same draws in all circumstances, so that its flights are not independent: over
-/// several of them the interval is that of the seeds of which every flight landed there.
+/// several of them the interval is of the seeds of which every flight landed there, among those flown in all of them.
 fn share(outcomes: &[Outcome]) -> String {
-    let mut of_seeds: BTreeMap<u64, bool> = BTreeMap::new();
+    let cells: BTreeSet<&str> = outcomes.iter().map(|o| o.cell.as_str()).collect();
+    let mut of_seeds: BTreeMap<u64, Vec<bool>> = BTreeMap::new();
     for outcome in outcomes {
-        *of_seeds.entry(outcome.seed).or_insert(true) &= outcome.is_within(0.1);
+        of_seeds.entry(outcome.seed).or_default().push(outcome.is_within(0.1));
     }
-    let good = of_seeds.values().filter(|is_good| **is_good).count();
-    let within = outcomes.iter().filter(|o| o.is_within(0.1)).count();
-    let [low, high] = share_interval(good, of_seeds.len()).map(|part| 100.0 * part);
+    of_seeds.retain(|_, flights| flights.len() >= cells.len());
+    let good = of_seeds.values().filter(|flights| flights.iter().all(|is_within| *is_within));
+    let (good, seeds) = (good.count(), of_seeds.len());
+    let percent = |part: usize, of: usize| 100.0 * part as f64 / of.max(1) as f64;
+    let [low, high] = share_interval(good, seeds).map(|part| 100.0 * part);
     let interval = format!("95 % interval of Wilson {low:.2} to {high:.2} %");
-    let percent = 100.0 * within as f64 / outcomes.len().max(1) as f64;
-    match of_seeds.len() {
-        seeds if seeds == outcomes.len() => format!("{percent:.2} %, {interval}"),
-        seeds => {
-            format!("{percent:.2} %; every flight of {good} of {seeds} seeds, {interval} of these")
-        }
+    let within = outcomes.iter().filter(|o| o.is_within(0.1)).count();
+    let share = percent(within, outcomes.len());
+    match (cells.len(), seeds) {
+        (0 | 1, _) => format!("{share:.2} %, {interval}"),
+        (_, 0) => format!("{share:.2} %; no seed was flown in all circumstances"),
+        _ => format!(
+            "{share:.2} %; of the {seeds} seeds {good} ({:.2} %, {interval}) have every flight there",
+            percent(good, seeds)
+        ),
     }
 }
 
@@ -242,8 +248,27 @@ mod tests {
         assert!(told_of.contains(alone), "{told_of}");
         // Not that of sixteen flights, 80.64 %.
         let told_of = told(plan(&[0.0, 5.0]));
-        let both = "16 landed within 0.1 m (100.00 %; every flight of 8 of 8 seeds, 95 % interval of Wilson 67.56 to 100.00 % of these)";
+        let both = "16 landed within 0.1 m (100.00 %; of the 8 seeds 8 (100.00 %, 95 % interval of Wilson 67.56 to 100.00 %) have every flight there)";
         assert!(told_of.contains(both), "{told_of}");
+    }
+
+    #[test]
+    fn a_seed_counts_that_was_flown_in_all_circumstances() {
+        let wind = crate::landing::plan::Values::List(vec![0.0, 5.0]);
+        let plan = Plan { wind, flights: 8, ..Plan::default() };
+        let landed = |(index, planned): (usize, &Planned)| Outcome {
+            ending: Ending::Landed,
+            error_m: Some(if index == 1 { 0.2 } else { 0.01 }),
+            ..Outcome::new(planned)
+        };
+        let outcomes: Vec<Outcome> = plan.flights().iter().enumerate().map(landed).collect();
+        let told = share(&outcomes);
+        assert!(told.starts_with("93.75 %; of the 8 seeds 7 (87.50 %, "), "{told}");
+        // Interrupted after four seeds in the second wind, or before it.
+        let told = share(&outcomes[..12]);
+        assert!(told.starts_with("91.67 %; of the 4 seeds 3 (75.00 %, "), "{told}");
+        let told = share(&outcomes[..8]);
+        assert!(told.starts_with("87.50 %, 95 % interval of Wilson"), "{told}");
     }
 
     #[test]
