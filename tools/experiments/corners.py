@@ -138,7 +138,7 @@ def main():
     found = ours(command, family, images)
     distances, outward, without = collections.defaultdict(list), [], 0
     for image in images:
-        grey = cv2.imread(image, cv2.IMREAD_GRAYSCALE)
+        grey = cv2.imread(image, references.AS_STORED)
         if grey is None or not found.get(image):
             continue
         seen = [found[image], *(other.detect(grey) for other in others)]

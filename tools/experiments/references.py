@@ -47,7 +47,7 @@ SETS = [
     "textured", "adverse", "landing", "far", "tilt", "blur", "noise", "light", "rolling", "shade", "ground", "cut", "tracking", "negatives", "circles",
     "positions",
 ]  # fmt: skip
-# Families of the labelled photographs, as the labels name them.
+# Families of the labelled photographs: OpenCV's names and ours, labels may have either.
 LABELS = {
     "tag36h11": "apriltag-36h11",
     "aruco_4x4_1000": "aruco-4x4-1000",
@@ -55,6 +55,8 @@ LABELS = {
     "aruco_6x6_1000": "aruco-6x6-1000",
     "stag_hd21": "stag-hd21",
 }
+# As Alight reads them: where a file says by Exif that it is to be turned, as it is stored.
+AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 # Sets in which time matters, and how often their frames are looked at.
 TIMED, TIMED_RUNS = ("textured", "tracking"), 5
 
@@ -312,10 +314,12 @@ def run_photographs(photographs, results, wanted):
                 continue
             detector, lines = kind(family), []
             for photograph in labels:
-                if any(marker["family"] == label for marker in photograph["markers"]):
-                    grey = cv2.imread(str(photographs / photograph["image"]), cv2.IMREAD_GRAYSCALE)
+                if any(marker["family"] in (label, family) for marker in photograph["markers"]):
+                    grey = cv2.imread(str(photographs / photograph["image"]), AS_STORED)
                     ms, seen = answer(detector, grey, 1)
                     lines.append({"image": photograph["image"], "ms": ms, "found": seen})
+            if not lines:
+                continue
             write(results / kind.name / "photographs" / f"{family}.jsonl", lines)
             print(f"photographs {family} {kind.name}: {len(lines)}", flush=True)
 

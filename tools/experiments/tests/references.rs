@@ -4,6 +4,7 @@ use std::path::Path;
 use std::process::Command;
 
 use experiments::frame_spec::FrameRenderer;
+use experiments::record;
 use experiments::set::{SIZE_M, Set};
 use experiments::sets::Variant;
 use experiments::store;
@@ -38,4 +39,38 @@ fn reference_detectors_take_the_sets_that_are_there() {
     let output = run(&["set=circles"]);
     let told = String::from_utf8_lossy(&output.stderr);
     assert!(!output.status.success() && told.contains("--set circles"), "{told}");
+    // Labels have our names or OpenCV's. A family of which there is no photograph has no file.
+    let far = store::folder(&sets, Set::Far, marker);
+    let frame = store::frames(&far).unwrap().remove(0);
+    let pixels = record::read(&far.join(&frame.image)).unwrap();
+    std::fs::write(far.join("turned.jpg"), turned(&pixels).unwrap()).unwrap();
+    let [x, y] = frame.marker.unwrap().centre_px;
+    for family in ["aruco-4x4-1000", "aruco_4x4_1000"] {
+        let label = format!(
+            "{{\"image\":\"turned.jpg\",\"markers\":[{{\"family\":\"{family}\",\"id\":0,\"corners\":[]}}]}}\n"
+        );
+        std::fs::write(far.join("labels.jsonl"), label).unwrap();
+        let output = run(&["detector=opencv", &format!("photographs={}", far.display())]);
+        let told = String::from_utf8_lossy(&output.stdout);
+        let folder = results.join("opencv/photographs");
+        let file = folder.join("aruco-4x4-1000.jsonl");
+        let text = std::fs::read_to_string(&file).unwrap();
+        let records = record::parse(&file, &text).unwrap();
+        let found = records.iter().flat_map(|record| &record.found);
+        // Where it is in the picture as it is stored, not as it is turned.
+        let is_there = |[u, v]: [f64; 2]| (u - x).hypot(v - y) < 1.0;
+        assert!(found.clone().any(|it| is_there(it.centre_px)), "{family}: {x}, {y}, {text}");
+        assert!(!folder.join("apriltag-36h11.jsonl").exists(), "{told}");
+        std::fs::remove_dir_all(folder).unwrap();
+    }
+}
+
+/// A JPEG whose Exif says that it is to be turned by a quarter.
+fn turned(pixels: &image::GrayImage) -> image::ImageResult<Vec<u8>> {
+    let mut file = Vec::new();
+    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 95).encode_image(pixels)?;
+    let exif = b"\xff\xe1\x00\x22Exif\0\0MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0";
+    // After the mark of its beginning.
+    file.splice(2..2, exif.iter().copied());
+    Ok(file)
 }
