@@ -13,7 +13,7 @@ use crate::common;
 use crate::figures::{self, FIGURES};
 use crate::frame_spec::FrameRenderer;
 use crate::photographs;
-use crate::record::{self, ALL_AT_ONCE, FOLLOWING, Ids, OURS};
+use crate::record::{self, ALL_AT_ONCE, ALL_OURS, FOLLOWING, Ids, OURS};
 use crate::report::{self, OfProcessing, Run};
 use crate::results;
 use crate::rows::csv;
@@ -130,7 +130,7 @@ fn earlier(results: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let figures = FIGURES.iter().map(|(name, _)| format!("{name}.svg"));
     let files = [REPORT, common::FILE].into_iter().chain(SCORES).map(str::to_owned);
     earlier.extend(files.chain(tables).chain(figures).map(|name| results.join(name)));
-    for detector in [OURS, ALL_AT_ONCE, FOLLOWING] {
+    for detector in ALL_OURS {
         for set in Set::ALL.map(Set::name).into_iter().chain([PHOTOGRAPHS]) {
             let Ok(entries) = std::fs::read_dir(results.join(detector).join(set)) else { continue };
             for entry in entries {
@@ -159,9 +159,11 @@ pub fn run(
     let mut old = earlier(results_in)?;
     std::fs::create_dir_all(results_in)
         .with_context(|| format!("making {}", results_in.display()))?;
+    // Before the rendering, which takes minutes, and before results of an earlier run are removed.
+    report::check_others(sets_in, results_in)?;
     if let Some(folder) = &request.photographs {
-        // Before the rendering, which takes minutes.
         photographs::check(folder)?;
+        recalls(folder, results_in, &|detector| !ALL_OURS.contains(&detector))?;
     }
     let mut renderer = FrameRenderer::default();
     let mut extra = String::new();
@@ -178,26 +180,17 @@ pub fn run(
             break;
         }
         store::make(sets_in, set, marker, request.variant, &mut renderer)?;
-        remove(std::mem::take(&mut old))?;
-        let folder = store::folder(sets_in, set, marker);
-        if set.has_marker() {
-            let any = Marker { id: None, ..marker };
-            detect(results_in, set, name, &folder, &[any], request.ids)?;
-            time(results_in, set, any, &folder)?;
-        } else {
-            for (name, families) in photographs::families_for_negatives() {
-                let markers = sized(&families);
-                detect(results_in, set, name, &folder, &markers, Ids::Any)?;
-            }
-        }
+        let written = search(request, set, marker)?;
+        remove(std::mem::take(&mut old), &written)?;
         done += 1;
     }
     if let Some(folder) = &request.photographs
         && done + 1 == of
         && begins(Step { what: "photographs", number: of, of }).is_continue()
     {
-        remove(std::mem::take(&mut old))?;
-        extra = run_photographs(folder, results_in, &request.families)?;
+        let written = search_photographs(folder, results_in, &request.families)?;
+        remove(std::mem::take(&mut old), &written)?;
+        extra = report_photographs(folder, results_in)?;
         done += 1;
     }
     let is_interrupted = done < of;
@@ -238,7 +231,9 @@ pub fn run(
     Ok(Findings { report: text, is_interrupted })
 }
 
-fn remove(old: Vec<PathBuf>) -> anyhow::Result<()> {
+/// Removes what an earlier run has left and this one has not written anew.
+fn remove(mut old: Vec<PathBuf>, written: &[PathBuf]) -> anyhow::Result<()> {
+    old.retain(|path| !written.contains(path));
     for path in old {
         std::fs::remove_file(&path)
             .with_context(|| format!("removing {} of an earlier run", path.display()))?;
@@ -248,9 +243,8 @@ fn remove(old: Vec<PathBuf>) -> anyhow::Result<()> {
 
 /// What the command and the version at the report's head do not hold for: other detectors, and frames of another version.
 fn of_others(runs: &[Run], sets_in: &Path) -> String {
-    let ours = [OURS, ALL_AT_ONCE, FOLLOWING];
     let others: BTreeSet<&str> = runs.iter().map(|run| run.detector.as_str()).collect();
-    let others: Vec<&str> = others.into_iter().filter(|name| !ours.contains(name)).collect();
+    let others: Vec<&str> = others.into_iter().filter(|name| !ALL_OURS.contains(name)).collect();
     let mut text = String::new();
     if !others.is_empty() {
         text += &format!(
@@ -338,7 +332,24 @@ fn markers(request: &Request, set: Set) -> anyhow::Result<Vec<Marker>> {
         .collect()
 }
 
-/// Runs the detector over a set and writes the results.
+/// Searches a set, whose frames are there; the files that it has written.
+fn search(request: &Request, set: Set, marker: Marker) -> anyhow::Result<Vec<PathBuf>> {
+    let Request { sets_in, results_in, ids, .. } = request;
+    let folder = store::folder(sets_in, set, marker);
+    let mut written = Vec::new();
+    if set.has_marker() {
+        let any = Marker { id: None, ..marker };
+        written.push(detect(results_in, set, marker.family.name(), &folder, &[any], *ids)?);
+        written.extend(time(results_in, set, any, &folder)?);
+    } else {
+        for (name, families) in photographs::families_for_negatives() {
+            written.push(detect(results_in, set, name, &folder, &sized(&families), Ids::Any)?);
+        }
+    }
+    Ok(written)
+}
+
+/// Runs the detector over a set and writes the results into the file that is returned.
 fn detect(
     results: &Path,
     set: Set,
@@ -346,16 +357,22 @@ fn detect(
     folder: &Path,
     markers: &[Marker],
     ids: Ids,
-) -> anyhow::Result<()> {
+) -> anyhow::Result<PathBuf> {
     let is_timed = matches!(set, Set::Textured | Set::Tracking);
     let runs = if is_timed { TIMED_RUNS } else { 1 };
     let answers = record::run(folder, markers, ids, runs)?;
     let file = record::file(results, OURS, set, name);
-    record::write(&file, answers.iter().map(|(_, record)| record))
+    record::write(&file, answers.iter().map(|(_, record)| record))?;
+    Ok(file)
 }
 
-/// The timed sets, with all families at once and with tracking.
-fn time(results: &Path, set: Set, marker: Marker, folder: &Path) -> anyhow::Result<()> {
+/// The timed sets, with all families at once and with tracking; the file that it has written.
+fn time(
+    results: &Path,
+    set: Set,
+    marker: Marker,
+    folder: &Path,
+) -> anyhow::Result<Option<PathBuf>> {
     const RATE_HZ: f64 = 30.0;
     let name = marker.family.name();
     if set == Set::Textured {
@@ -363,39 +380,66 @@ fn time(results: &Path, set: Set, marker: Marker, folder: &Path) -> anyhow::Resu
         let answers = record::run(folder, &sized(&families), Ids::Any, TIMED_RUNS)?;
         let file = record::file(results, ALL_AT_ONCE, set, name);
         record::write(&file, answers.iter().map(|(_, record)| record))?;
+        return Ok(Some(file));
     }
     if set == Set::Tracking {
         let records = record::follow(folder, &[marker], RATE_HZ, TIMED_RUNS)?;
-        record::write(&record::file(results, FOLLOWING, set, name), &records)?;
+        let file = record::file(results, FOLLOWING, set, name);
+        record::write(&file, &records)?;
+        return Ok(Some(file));
     }
-    Ok(())
+    Ok(None)
 }
 
 /// The folder of a detector's results on photographs.
 const PHOTOGRAPHS: &str = "photographs";
 
-/// Searches labelled photographs for these families (for all when none is given), and those without a marker for every family.
-fn run_photographs(folder: &Path, results: &Path, wanted: &[String]) -> anyhow::Result<String> {
+/// Searches labelled photographs for these families (for all when none is given); the files that it has written.
+fn search_photographs(
+    folder: &Path,
+    results: &Path,
+    wanted: &[String],
+) -> anyhow::Result<Vec<PathBuf>> {
+    let mut written = Vec::new();
     for (_, name) in photographs::FAMILIES {
         if !wanted.is_empty() && !wanted.iter().any(|wanted| wanted == name) {
             continue;
         }
         if let Some(family) = Family::named(name) {
             let records = photographs::run(folder, family)?;
-            record::write(&photographs_file(results, OURS, name), &records)?;
+            let file = photographs_file(results, OURS, name);
+            record::write(&file, &records)?;
+            written.push(file);
         }
     }
+    Ok(written)
+}
+
+/// What these detectors have found of the labelled photographs.
+fn recalls(
+    folder: &Path,
+    results: &Path,
+    is_meant: &dyn Fn(&str) -> bool,
+) -> anyhow::Result<photographs::Recalls> {
     let mut recalls: photographs::Recalls = BTreeMap::new();
-    for entry in std::fs::read_dir(results)? {
-        let detector = entry?.file_name().to_string_lossy().into_owned();
+    let mut detectors = report::detectors(results)?;
+    detectors.retain(|name| is_meant(name));
+    for detector in detectors {
         for (_, name) in photographs::FAMILIES {
             let file = photographs_file(results, &detector, name);
             let Ok(text) = std::fs::read_to_string(&file) else { continue };
             let records = record::parse(&file, &text)?;
-            let recall = photographs::recall(folder, name, &records)?;
+            let recall = photographs::recall(folder, name, &records)
+                .with_context(|| format!("reading {}", file.display()))?;
             recalls.entry(name.to_owned()).or_default().insert(detector.clone(), recall);
         }
     }
+    Ok(recalls)
+}
+
+/// The labelled photographs in the report, and those without a marker, which are searched for every family.
+fn report_photographs(folder: &Path, results: &Path) -> anyhow::Result<String> {
+    let recalls = recalls(folder, results, &|_| true)?;
     let mut text = photographs::text(&recalls);
     for (name, families) in photographs::families_for_negatives() {
         let (images, wrong) = photographs::negatives(folder, &families)?;
@@ -428,7 +472,7 @@ mod tests {
     fn write(folder: &Path, name: &str) {
         let path = folder.join(name);
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-        std::fs::write(path, "old").unwrap();
+        std::fs::write(path, "").unwrap();
     }
 
     #[test]
@@ -451,11 +495,66 @@ mod tests {
             check_unused(&request).unwrap();
             let findings = run(&request, &mut |_| ControlFlow::Break(())).unwrap();
             assert!(findings.is_interrupted && results.join(name).exists(), "{findings:?}");
-            remove(earlier(&results).unwrap()).unwrap();
+            remove(earlier(&results).unwrap(), &[]).unwrap();
             request.replaces = false;
             check_unused(&request).unwrap();
         }
         assert!(kept.iter().all(|name| results.join(name).exists()));
+    }
+
+    #[test]
+    fn results_of_an_earlier_run_stay_until_there_are_new_ones() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut request = Request {
+            sets: vec![Set::Far],
+            families: vec!["aruco-4x4-50".to_owned()],
+            replaces: true,
+            ..Request::within(folder.path(), Variant { every: 40, ..Variant::default() }, Ids::Any)
+        };
+        let results = request.results_in.clone();
+        let old = "alight/cut/rings.jsonl";
+        write(&results, old);
+        let mut go = |_: Step<'_>| ControlFlow::Continue(());
+        // A damaged frame, so that there is nothing new.
+        let marker = format!("aruco-4x4-50:0:{SIZE_M}").parse().unwrap();
+        let frames = store::folder(&request.sets_in, Set::Far, marker);
+        let renderer = &mut FrameRenderer::default();
+        store::make(&request.sets_in, Set::Far, marker, request.variant, renderer).unwrap();
+        let image = frames.join(&store::frames(&frames).unwrap()[0].image);
+        let pixels = std::fs::read(&image).unwrap();
+        std::fs::write(&image, "no picture").unwrap();
+        assert!(run(&request, &mut go).is_err() && results.join(old).exists());
+        std::fs::write(&image, pixels).unwrap();
+        // Faults of other detectors: a line that is none, a frame that is missing, a photograph that is missing.
+        let mine = results.join("mine/far/aruco-4x4-50.jsonl");
+        let refused = |request: &Request| {
+            let told =
+                format!("{:#}", run(request, &mut |_| panic!("a set is begun")).unwrap_err());
+            assert!(results.join(old).exists(), "{told}");
+            told
+        };
+        std::fs::create_dir_all(mine.parent().unwrap()).unwrap();
+        for (text, wanted) in [("no line", "line 1 of "), ("", "no line for the frame")] {
+            std::fs::write(&mine, text).unwrap();
+            let told = refused(&request);
+            assert!(told.contains(wanted) && told.contains("mine"), "{told}");
+        }
+        std::fs::remove_file(&mine).unwrap();
+        let line = "{\"image\":\"a.png\",\"markers\":[{\"family\":\"apriltag-36h11\",\"id\":3,\"corners\":[[0,0],[9,0],[9,9],[0,9]]}]}";
+        std::fs::write(folder.path().join("labels.jsonl"), line).unwrap();
+        request.photographs = Some(folder.path().to_owned());
+        write(&results, "mine/photographs/apriltag-36h11.jsonl");
+        let told = refused(&request);
+        let place = Path::new("mine").join(PHOTOGRAPHS).join("apriltag-36h11.jsonl");
+        assert!(told.contains("no result for a.png"), "{told}");
+        assert!(told.contains(&place.display().to_string()), "{told}");
+        request.photographs = None;
+        assert!(!run(&request, &mut go).unwrap().is_interrupted);
+        assert!(!results.join(old).exists());
+        assert!(results.join("alight/far/aruco-4x4-50.jsonl").exists());
+        // The same again removes nothing of what it writes.
+        run(&request, &mut go).unwrap();
+        assert!(results.join("alight/far/aruco-4x4-50.jsonl").exists());
     }
 
     #[test]

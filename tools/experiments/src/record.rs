@@ -23,6 +23,9 @@ pub const ALL_AT_ONCE: &str = "alight-all";
 /// The name of its results with tracking.
 pub const FOLLOWING: &str = "alight-following";
 
+/// All names of this detector's results; others are of other detectors.
+pub const ALL_OURS: [&str; 3] = [OURS, ALL_AT_ONCE, FOLLOWING];
+
 /// The result for one frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

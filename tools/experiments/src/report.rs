@@ -3,19 +3,19 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use node::stats::interpolated_quantile as quantile;
 use serde::Serialize;
 
 use crate::landing::table::share_interval;
-use crate::record::{self, OURS, Record};
+use crate::record::{self, ALL_OURS, OURS, Record};
 use crate::rows;
 use crate::score::{Score, Summary};
 use crate::set::Set;
 use crate::sets::Variant;
-use crate::store::StoredFrame;
+use crate::store::{StoredFrame, TRUTH};
 
 /// The results of one detector on one family in one set.
 #[derive(Debug)]
@@ -41,20 +41,20 @@ struct Line<'a> {
     summary: Summary,
 }
 
-/// All runs in the folder `results`, those of this detector first.
-///
-/// # Errors
-/// When results are damaged or of other frames.
-pub fn runs(root: &Path, results: &Path) -> anyhow::Result<Vec<Run>> {
-    let mut detectors = Vec::new();
-    for entry in std::fs::read_dir(results).with_context(|| format!("{}", results.display()))? {
-        let entry = entry?;
-        if entry.path().is_dir() {
-            detectors.push(entry.file_name().to_string_lossy().into_owned());
-        }
-    }
-    detectors.sort_by_key(|name| (name != OURS, name.clone()));
-    let mut runs = Vec::new();
+/// A file with results of one detector on one family in one set.
+struct ResultsFile {
+    set: Set,
+    family: String,
+    detector: String,
+    path: PathBuf,
+    /// The folder of its frames.
+    frames: PathBuf,
+}
+
+/// The files with results in the folder `results`, those of this detector first.
+fn files(root: &Path, results: &Path) -> anyhow::Result<Vec<ResultsFile>> {
+    let mut files = Vec::new();
+    let detectors = detectors(results)?;
     for set in Set::ALL {
         for detector in &detectors {
             let Ok(entries) = std::fs::read_dir(results.join(detector).join(set.name())) else {
@@ -69,16 +69,61 @@ pub fn runs(root: &Path, results: &Path) -> anyhow::Result<Vec<Run>> {
             families.sort();
             for family in families {
                 let below = root.join(set.name());
-                let folder = if set.has_marker() { below.join(&family) } else { below };
-                let file = record::file(results, detector, set, &family);
-                if let Some(answers) = record::join(&file, &folder)? {
-                    runs.push(Run { set, family, detector: detector.clone(), answers });
-                }
+                let frames = if set.has_marker() { below.join(&family) } else { below };
+                let path = record::file(results, detector, set, &family);
+                files.push(ResultsFile { set, family, detector: detector.clone(), path, frames });
             }
+        }
+    }
+    Ok(files)
+}
+
+/// The detectors that have a folder in `results`, this one first.
+///
+/// # Errors
+/// When the folder cannot be read.
+pub fn detectors(results: &Path) -> anyhow::Result<Vec<String>> {
+    let mut detectors = Vec::new();
+    for entry in std::fs::read_dir(results).with_context(|| format!("{}", results.display()))? {
+        let entry = entry?;
+        if entry.path().is_dir() {
+            detectors.push(entry.file_name().to_string_lossy().into_owned());
+        }
+    }
+    detectors.sort_by_key(|name| (name != OURS, name.clone()));
+    Ok(detectors)
+}
+
+/// All runs in the folder `results`, those of this detector first.
+///
+/// # Errors
+/// When results are damaged or of other frames.
+pub fn runs(root: &Path, results: &Path) -> anyhow::Result<Vec<Run>> {
+    let mut runs = Vec::new();
+    for ResultsFile { set, family, detector, path, frames } in files(root, results)? {
+        if let Some(answers) = record::join(&path, &frames)? {
+            runs.push(Run { set, family, detector, answers });
         }
     }
     runs.sort_by_key(|run| (place(run.set), run.family.clone()));
     Ok(runs)
+}
+
+/// Checks the results of detectors other than ours, with their frames where these are rendered.
+///
+/// # Errors
+/// When results are damaged or of other frames.
+pub fn check_others(root: &Path, results: &Path) -> anyhow::Result<()> {
+    let mut files = files(root, results)?;
+    files.retain(|file| !ALL_OURS.contains(&file.detector.as_str()));
+    for ResultsFile { path, frames, .. } in files {
+        if frames.join(TRUTH).exists() {
+            record::join(&path, &frames)?;
+        } else if let Ok(text) = std::fs::read_to_string(&path) {
+            record::parse(&path, &text)?;
+        }
+    }
+    Ok(())
 }
 
 fn place(set: Set) -> usize {
