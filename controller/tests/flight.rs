@@ -905,6 +905,20 @@ fn no_landing_begins_where_another_vehicle_or_another_controller_is_on_the_link(
         receive_from(&mut flight, 3000 * MS, sender, &message);
         assert!(hover(&mut flight, 3000, 4000, 4).setpoints > 10);
     }
+    // Nor is the vehicle that it has flown kept from landing where it is, and, beside another vehicle, from beginning anew.
+    for (number, (sender, message, told)) in others().into_iter().enumerate() {
+        let mut flight = in_flight("airborne");
+        hover(&mut flight, 20, 3000, 4);
+        receive_from(&mut flight, 3000 * MS, sender, &message);
+        hover(&mut flight, 3000, 3500, 4);
+        assert!(flight.command(3500 * MS, &ControllerCommand::Abort).accepted);
+        hover(&mut flight, 3520, 10_000, 4);
+        assert_eq!(flight.status(10_000 * MS).phase, Phase::Aborted);
+        let again = flight.command(10_000 * MS, &ControllerCommand::Start);
+        assert_eq!(again.reason.contains(told), number == 1, "{again:?}");
+        let here = flight.command(10_020 * MS, &ControllerCommand::LandHere);
+        assert!(here.accepted, "{here:?}");
+    }
     // Nor does another vehicle keep the one from landing that is pinned.
     let [(sender, message, _), _] = others();
     let mut flight = flight_with("airborne", &["autopilot.system_id=1"]);

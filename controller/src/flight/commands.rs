@@ -24,12 +24,9 @@ impl Flight {
         if self.mission.is_asking_for_land() {
             return Err("the vehicle is asked to land here".to_owned());
         }
-        // One that has flown a landing since its motors were started is ours, whoever came later.
-        let is_armed = self.autopilot.state().is_some_and(|state| state.armed);
-        let is_ours = is_armed && self.mission.started_ns().is_some();
         let of_vehicles = |it: &Conflict| matches!(it, Conflict::SeveralVehicles { .. });
         let conflict = self.autopilot.conflict(now_ns);
-        if let Some(conflict) = conflict.filter(|it| !(is_ours && of_vehicles(it))) {
+        if let Some(conflict) = conflict.filter(|it| !(self.is_ours() && of_vehicles(it))) {
             return Err(format!("no landing was started: {conflict}"));
         }
         self.check_way_out()?;
@@ -64,6 +61,13 @@ impl Flight {
         Ok(format!("in phase `{phase}`: {why}"))
     }
 
+    /// Whether the vehicle took off for us, or has flown a landing of ours and its motors still run: whoever came later does not take the
+    /// way down from it.
+    fn is_ours(&self) -> bool {
+        let is_armed = self.autopilot.state().is_some_and(|state| state.armed);
+        self.mission.is_taking_off() || is_armed && self.mission.started_ns().is_some()
+    }
+
     /// Refuses while a PX4 is taken back to HOLD.
     fn check_way_out(&self) -> Result<(), String> {
         let refusal = "the vehicle is just being taken back to HOLD";
@@ -94,8 +98,7 @@ impl Flight {
         Ok(format!("in phase `{phase}`: {why}"))
     }
 
-    /// Lands where the vehicle is. Without a landing, too: it needs no marker and no detector. Who else is on the link does not matter: it is
-    /// a way down for a vehicle that hovers, and it goes to the one that is heard.
+    /// Lands where the vehicle is. Without a landing, too: it needs no marker and no detector.
     pub(super) fn land_here(&mut self, now_ns: i64) -> Result<String, String> {
         if self.landing_target.is_some() {
             return Err(
@@ -109,6 +112,10 @@ impl Flight {
         // PX4 climbs in a mode of its own.
         if self.mission.is_taking_off() && !is_flying_guided(&self.autopilot) {
             return Err("the vehicle is taking off; land it once it is up".to_owned());
+        }
+        let conflict = self.autopilot.conflict(now_ns).filter(|_| !self.is_ours());
+        if let Some(conflict) = conflict {
+            return Err(format!("not landed here: {conflict}"));
         }
         if is_holding_px4(&self.autopilot) {
             self.check_way_out()?;

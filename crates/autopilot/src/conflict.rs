@@ -20,7 +20,7 @@ pub enum Conflict {
     /// Two autopilots are on the link, and the configuration does not say which one is flown.
     #[error(
         "two vehicles are on the autopilot's link, with the system ids {system} and {other}, and nothing says which one is to be \
-         flown. Set `autopilot.system_id` to its id, and start the controller again; in the air `land-here` and the autopilot's own modes go on"
+         flown. Set `autopilot.system_id` to its id, and start the controller again; in the air the autopilot's own modes go on"
     )]
     SeveralVehicles {
         /// The system id of the vehicle that was heard first.
