@@ -534,8 +534,9 @@ async fn after_five_starts_without_a_clock_it_is_still_believed() {
                 // Stamps of 2015 are refused until the companion has seen one of the other side.
                 if start == 0 {
                     vehicle.send_when_connected(&heartbeat(true)).await;
-                    companion.send_when_connected(&heartbeat(false)).await;
                 }
+                // Again: the first is lost where the vehicle has not noticed yet that the connection of before is gone.
+                companion.send_when_connected(&heartbeat(false)).await;
                 sleep(Duration::from_millis(5)).await;
             }
         };
