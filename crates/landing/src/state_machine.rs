@@ -164,19 +164,31 @@ pub struct StateMachine {
     cause: Option<Reason>,
 }
 
-/// Whether a hold for this reason ends once the reason is gone.
-fn resumes_by_itself(reason: Reason) -> bool {
-    matches!(
-        reason,
-        Reason::TargetLost
-            | Reason::TargetRefused
-            | Reason::TargetNotFound
-            | Reason::VehicleStale
-            | Reason::ModeUnknown
-            | Reason::AutopilotLost
-            | Reason::LinkSlow
-            | Reason::Disputed
-    )
+/// What ends a hold without a command.
+enum EndOfHold {
+    /// The marker is seen.
+    Marker,
+    /// The vehicle's state and mode are known.
+    Vehicle,
+    /// The link to the autopilot is quick enough.
+    Link,
+    /// Two detectors agree again: the lander goes on for the operator then.
+    Agreement,
+}
+
+/// What ends a hold for this reason; `None` where only a command does.
+fn end_of_hold(reason: Reason) -> Option<EndOfHold> {
+    match reason {
+        Reason::TargetLost | Reason::TargetRefused | Reason::TargetNotFound => {
+            Some(EndOfHold::Marker)
+        }
+        Reason::VehicleStale | Reason::ModeUnknown | Reason::AutopilotLost => {
+            Some(EndOfHold::Vehicle)
+        }
+        Reason::LinkSlow => Some(EndOfHold::Link),
+        Reason::Disputed => Some(EndOfHold::Agreement),
+        _ => None,
+    }
 }
 
 /// The configured reaction to an alarm, and the reason; `None` for any other event.
@@ -251,7 +263,7 @@ impl StateMachine {
     pub fn waits_for_operator(&self) -> bool {
         match self.phase {
             Phase::Aborted => true,
-            Phase::Hold => !resumes_by_itself(self.reason),
+            Phase::Hold => end_of_hold(self.reason).is_none(),
             _ => false,
         }
     }
@@ -661,13 +673,11 @@ impl StateMachine {
         if self.reason == Reason::LinkSlow && inputs.may_stand && !is_stale {
             return Some((Phase::Final, Reason::MayStand));
         }
-        let resumes = match self.reason {
-            Reason::TargetLost | Reason::TargetRefused | Reason::TargetNotFound => {
-                self.target_visible(inputs) && !is_stale
-            }
-            Reason::VehicleStale | Reason::ModeUnknown | Reason::AutopilotLost => !is_stale,
-            Reason::LinkSlow => !is_stale && !inputs.is_link_slow,
-            _ => false,
+        let resumes = match end_of_hold(self.reason) {
+            Some(EndOfHold::Marker) => self.target_visible(inputs) && !is_stale,
+            Some(EndOfHold::Vehicle) => !is_stale,
+            Some(EndOfHold::Link) => !is_stale && !inputs.is_link_slow,
+            Some(EndOfHold::Agreement) | None => false,
         };
         resumes.then_some((Phase::Search, Reason::Searching))
     }
