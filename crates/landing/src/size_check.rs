@@ -14,7 +14,7 @@ use libm::{exp, fabs, fmax, hypot, log};
 
 use crate::config::EstimatorConfig;
 use crate::event::{FrameObservation, MarkerInFrame};
-use crate::history::History;
+use crate::history::Motion;
 use crate::measurement::MarkerPose;
 use crate::time::Timestamp;
 
@@ -85,19 +85,17 @@ struct Slope {
 }
 
 impl SizeCheck {
-    /// Adds a marker as it was seen.
+    /// Adds a marker as it was seen from a vehicle that moved so.
     pub(crate) fn observe(
         &mut self,
         config: &EstimatorConfig,
         frame: &FrameObservation,
         marker: &MarkerInFrame,
-        history: &History,
+        motion: &Motion,
     ) {
-        let (Some(pose), Some(motion)) = (marker.body_from_marker, history.at(frame.stamp)) else {
-            return;
-        };
-        let pose = MarkerPose::resolve(&motion, pose, marker.alternative);
-        let Ok(seen) = pose.measurement(config, frame, marker, &motion) else { return };
+        let Some(pose) = marker.body_from_marker else { return };
+        let pose = MarkerPose::resolve(motion, pose, marker.alternative);
+        let Ok(seen) = pose.measurement(config, frame, marker, motion) else { return };
         if self.mount != frame.body_from_camera {
             *self = Self { mount: frame.body_from_camera, ..Self::default() };
         }

@@ -30,7 +30,7 @@ impl Lander {
             if stands || !self.status.is_some_and(|status| status.armed) {
                 self.size_check.interrupt();
             } else {
-                self.size_check.observe(&self.config.estimator, frame, marker, &self.history);
+                self.size_check.observe(config, frame, marker, &motion);
             }
             if let Some(pose) = marker.body_from_marker {
                 self.axis_check.add(frame.stamp, &motion, pose.origin());
