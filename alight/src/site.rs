@@ -65,6 +65,13 @@ pub(crate) struct Site {
     pub(crate) folder: PathBuf,
 }
 
+/// A process in the file, and where it stands there, in words.
+struct Placed<'a> {
+    role: Role,
+    place: String,
+    entry: &'a Entry,
+}
+
 /// A process in the file.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -218,20 +225,17 @@ impl Site {
     /// Refuses two detectors with one id, of which the second would not run: on this machine and on those that it reaches.
     fn check_detectors(&self, role: Role) -> anyhow::Result<()> {
         let mut taken = BTreeMap::new();
-        for role in self.together(role) {
-            for (number, entry) in self.entries(role).iter().enumerate() {
-                // The files of another machine's services may be missing here.
-                let job = self.job(role, entry).ok();
-                let Some(job) = job.filter(|job| job.service == Some(Service::Detector)) else {
-                    continue;
-                };
-                let place = format!("[[{}]] number {}", role.name(), number + 1);
-                if let Some(first) = taken.insert(job.key.clone(), place.clone()) {
-                    let id = job.key.split_once('.').map_or(job.key.as_str(), |(_, id)| id);
-                    anyhow::bail!(WrongUse(format!(
-                        "{first} and {place} are detectors with one id, `{id}`; give one of them another: set = ['id=\"other\"']"
-                    )));
-                }
+        for Placed { role, place, entry } in self.placed(role) {
+            // The files of another machine's services may be missing here.
+            let job = self.job(role, entry).ok();
+            let Some(job) = job.filter(|job| job.service == Some(Service::Detector)) else {
+                continue;
+            };
+            if let Some(first) = taken.insert(job.key.clone(), place.clone()) {
+                let id = job.key.split_once('.').map_or(job.key.as_str(), |(_, id)| id);
+                anyhow::bail!(WrongUse(format!(
+                    "{first} and {place} are detectors with one id, `{id}`; give one of them another: set = ['id=\"other\"']"
+                )));
             }
         }
         Ok(())
@@ -242,19 +246,16 @@ impl Site {
     pub(crate) fn marker_problem(&self, role: Role) -> Option<String> {
         let mut detectors = Vec::new();
         let mut controller = None;
-        for (number, entry) in self.together(role).flat_map(|role| {
-            self.entries(role).iter().enumerate().map(move |(i, entry)| ((role, i + 1), entry))
-        }) {
-            let job = self.job(number.0, entry).ok()?;
-            let place = || format!("[[{}]] number {}", number.0.name(), number.1);
+        for Placed { role, place, entry } in self.placed(role) {
+            let job = self.job(role, entry).ok()?;
             match job.service {
                 Some(Service::Controller) => {
                     let marker = job.layers.load::<controller::Config>().ok()?.settings.marker;
-                    controller = Some((place(), marker));
+                    controller = Some((place, marker));
                 }
                 Some(Service::Detector) => {
                     let config = job.layers.load::<detector::Config>().ok()?.settings;
-                    detectors.push((place(), config.looked_for().ok()?));
+                    detectors.push((place, config.looked_for().ok()?));
                 }
                 // It may be a detector.
                 None => return None,
@@ -276,13 +277,18 @@ impl Site {
         ))
     }
 
-    /// The machines whose processes meet in one network with those of a role.
-    fn together(&self, role: Role) -> impl Iterator<Item = Role> + use<> {
-        let together: &'static [Role] = match role {
+    /// The processes of the machines that meet in one network with that of a role.
+    fn placed(&self, role: Role) -> impl Iterator<Item = Placed<'_>> {
+        let together: &[Role] = match role {
             Role::Local => &[Role::Local],
             Role::Drone | Role::Relay | Role::Ground => &[Role::Drone, Role::Relay, Role::Ground],
         };
-        together.iter().copied()
+        together.iter().flat_map(|&role| {
+            self.entries(role).iter().enumerate().map(move |(index, entry)| {
+                let place = format!("[[{}]] number {}", role.name(), index + 1);
+                Placed { role, place, entry }
+            })
+        })
     }
 
     fn relay_job(&self, role: Role) -> anyhow::Result<Option<Job>> {
