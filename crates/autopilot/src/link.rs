@@ -853,6 +853,15 @@ mod tests {
     use super::*;
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
+    /// A line that has more to send than is allowed while it is slow.
+    fn slow_line<L>(is_slow: &AtomicBool) -> Manner<impl Fn(&L) -> Duration> {
+        let backlog = |_: &L| match is_slow.load(Ordering::Relaxed) {
+            true => SPARE_BACKLOG * 2,
+            false => SPARE_BACKLOG,
+        };
+        Manner { backlog, gap: PACKET_GAP, silence: None }
+    }
+
     /// A link's two sides, connected.
     fn pair() -> (LinkSender, Port) {
         let (queue, outgoing) = mpsc::channel(OUTGOING);
@@ -899,11 +908,7 @@ mod tests {
     #[tokio::test]
     async fn packets_of_low_priority_wait_until_a_slow_line_has_sent_the_others() {
         let is_slow = AtomicBool::new(true);
-        let backlog = |_: &_| match is_slow.load(Ordering::Relaxed) {
-            true => SPARE_BACKLOG * 2,
-            false => SPARE_BACKLOG,
-        };
-        let manner = Manner { backlog, gap: PACKET_GAP, silence: None };
+        let manner = slow_line(&is_slow);
         let (sender, mut port) = pair();
         port.connected("peer".into());
         let (line, mut other_end) = tokio::io::duplex(4096);
@@ -929,11 +934,7 @@ mod tests {
     #[tokio::test]
     async fn of_setpoints_that_wait_for_a_slow_line_only_the_newest_is_sent() {
         let is_slow = AtomicBool::new(true);
-        let backlog = |_: &_| match is_slow.load(Ordering::Relaxed) {
-            true => SPARE_BACKLOG * 2,
-            false => SPARE_BACKLOG,
-        };
-        let manner = Manner { backlog, gap: PACKET_GAP, silence: None };
+        let manner = slow_line(&is_slow);
         let (sender, mut port) = pair();
         assert_eq!(sender.send_newest(b"setpoint"), Err(SendError::NotConnected));
         port.connected("peer".into());
