@@ -497,9 +497,7 @@ mod tests {
         image::imageops::replace(&mut shifted, &picture_of_rings(100.0), 60, 10);
         let mut jpeg = std::io::Cursor::new(Vec::new());
         shifted.write_to(&mut jpeg, image::ImageFormat::Jpeg).unwrap();
-        let jpeg = jpeg.into_inner();
-        let exif = b"\xff\xe1\0\x22Exif\0\0MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0";
-        [&jpeg[..2], exif, &[orientation, 0, 0, 0, 0, 0, 0], &jpeg[2..]].concat()
+        testing::with_exif_orientation(jpeg.get_ref(), orientation)
     }
 
     #[test]

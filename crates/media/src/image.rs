@@ -537,18 +537,13 @@ mod tests {
         let stored = read_bytes(&plain, DEFAULT_MAX_PIXELS).unwrap();
         let file = tempfile::NamedTempFile::new().unwrap();
         for orientation in 1..=8 {
-            std::fs::write(file.path(), with_orientation(&plain, orientation)).unwrap();
+            std::fs::write(file.path(), testing::with_exif_orientation(&plain, orientation))
+                .unwrap();
             let read = read_image(file.path(), DEFAULT_MAX_PIXELS, None).unwrap();
             assert_eq!((read.grey.width(), read.grey.height()), (64, 48), "{orientation}");
             assert_eq!(read.grey.pixels(), stored.pixels(), "{orientation}");
             assert_eq!(read.exif_orientation, (orientation > 1).then_some(orientation));
         }
-    }
-
-    /// A JPEG file whose Exif data have an orientation.
-    fn with_orientation(jpeg: &[u8], orientation: u8) -> Vec<u8> {
-        let exif = b"\xff\xe1\0\x22Exif\0\0MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0";
-        [&jpeg[..2], exif, &[orientation, 0, 0, 0, 0, 0, 0], &jpeg[2..]].concat()
     }
 
     #[test]

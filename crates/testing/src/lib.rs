@@ -1,8 +1,9 @@
-//! What the tests of several crates share: skips that are seen, recordings, peers in Python and JavaScript, ffmpeg, free ports, second tries and
-//! waiting.
+//! What the tests of several crates share: skips that are seen, recordings, peers in Python and JavaScript, ffmpeg, pictures that Exif turns,
+//! free ports, second tries and waiting.
 //!
 //! It is a dev-dependency only, and knows no other crate of this workspace.
 
+mod exif;
 mod ffmpeg;
 pub mod ports;
 mod recordings;
@@ -11,6 +12,7 @@ mod second_try;
 mod skip;
 mod waiting;
 
+pub use exif::with_exif_orientation;
 pub use ffmpeg::has_x264;
 pub use recordings::recording;
 pub use scripts::{interpreter, node, node_passes, python, python_passes};

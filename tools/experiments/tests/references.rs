@@ -69,8 +69,5 @@ fn reference_detectors_take_the_sets_that_are_there() {
 fn turned(pixels: &image::GrayImage) -> image::ImageResult<Vec<u8>> {
     let mut file = Vec::new();
     image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 95).encode_image(pixels)?;
-    let exif = b"\xff\xe1\x00\x22Exif\0\0MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0";
-    // After the mark of its beginning.
-    file.splice(2..2, exif.iter().copied());
-    Ok(file)
+    Ok(testing::with_exif_orientation(&file, 6))
 }
