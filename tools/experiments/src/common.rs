@@ -90,7 +90,7 @@ fn found(run: &Run) -> BTreeSet<&str> {
 fn of_group(group: &Group<'_>) -> Vec<Row> {
     let by_member: Vec<BTreeSet<&str>> = group.members.iter().map(|run| found(run)).collect();
     let in_all = |image: &str| by_member.iter().all(|found| found.contains(image));
-    let row = |run: &&Run| {
+    let row = |(run, found): (&&Run, &BTreeSet<&str>)| {
         let common = run.answers.iter().filter(|(frame, _)| in_all(&frame.image));
         let Summary {
             frames: common,
@@ -107,7 +107,7 @@ fn of_group(group: &Group<'_>) -> Vec<Row> {
             detector: run.detector.clone(),
             family: run.family.clone(),
             frames: run.answers.len(),
-            found: found(run).len(),
+            found: found.len(),
             common,
             centre_median_px,
             centre_p95_px,
@@ -115,7 +115,7 @@ fn of_group(group: &Group<'_>) -> Vec<Row> {
             range_median_percent,
         }
     };
-    group.members.iter().map(row).collect()
+    group.members.iter().zip(&by_member).map(row).collect()
 }
 
 /// The table in Markdown; nothing without a comparison.
@@ -162,44 +162,16 @@ mod tests {
 
     /// A run in which frames have these errors in pixels; one without was missed.
     fn run(detector: &str, family: &str, errors_px: &[Option<f64>]) -> Run {
-        let camera = CameraLine {
-            width: 8,
-            height: 8,
-            fx: 8.0,
-            fy: 8.0,
-            cx: 4.0,
-            cy: 4.0,
-            distortion: Vec::new(),
-        };
-        let marker = MarkerLine {
-            family: family.to_owned(),
-            id: None,
-            size_m: 0.1,
-            centre_px: [0.0; 2],
-            corners_px: [[0.0; 2]; 4],
-            size_px: 20.0,
-            is_whole: true,
-            translation_m: [0.0, 0.0, 1.0],
-            rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
-        };
         let answer = |(index, error_px): (usize, &Option<f64>)| {
             let image = format!("{index}.png");
-            let found = error_px.map(|error_px| Found {
-                family: family.to_owned(),
-                id: None,
-                centre_px: [error_px, 0.0],
-                centre_covariance_px2: None,
-                corners_px: None,
-                translation_m: None,
-                range_variance_m2: None,
-                confidence: None,
-            });
+            let found = error_px
+                .map(|error_px| Found { centre_px: [error_px, 0.0], ..Found::sample(family) });
             let frame = StoredFrame {
                 image: image.clone(),
                 set: "far".to_owned(),
                 group: String::new(),
-                camera: camera.clone(),
-                marker: Some(marker.clone()),
+                camera: CameraLine::sample(),
+                marker: Some(MarkerLine::sample(family)),
             };
             (frame, Record { image, ms: 1.0, found: found.into_iter().collect() })
         };

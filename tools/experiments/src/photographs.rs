@@ -319,16 +319,8 @@ mod tests {
                 "{{\"image\":\"a.jpg\",\"markers\":[{{\"family\":\"{family}\",\"id\":3,\"corners\":[[0,0],[10,0],[10,10],[0,10]]}}]}}"
             )
         };
-        let found = |id, centre_px| Found {
-            family: "apriltag-36h11".to_owned(),
-            id: Some(id),
-            centre_px,
-            centre_covariance_px2: None,
-            corners_px: None,
-            translation_m: None,
-            range_variance_m2: None,
-            confidence: None,
-        };
+        let found =
+            |id, centre_px| Found { id: Some(id), centre_px, ..Found::sample("apriltag-36h11") };
         let seen = vec![found(3, [5.0, 5.0]), found(4, [50.0, 50.0])];
         let records = [Record { image: "a.jpg".to_owned(), ms: 1.0, found: seen }];
         let path = folder.path().join("labels.jsonl");

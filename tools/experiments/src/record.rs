@@ -65,6 +65,23 @@ pub struct Found {
     pub confidence: Option<f64>,
 }
 
+#[cfg(test)]
+impl Found {
+    /// A detection of a family at the first pixel, of which nothing else is known.
+    pub fn sample(family: &str) -> Self {
+        Self {
+            family: family.to_owned(),
+            id: None,
+            centre_px: [0.0; 2],
+            centre_covariance_px2: None,
+            corners_px: None,
+            translation_m: None,
+            range_variance_m2: None,
+            confidence: None,
+        }
+    }
+}
+
 impl From<&Observation> for Found {
     fn from(seen: &Observation) -> Self {
         let covariance = &seen.centre_covariance_px2;

@@ -458,20 +458,11 @@ mod tests {
     use crate::store::CameraLine;
 
     fn run(set: Set) -> Run {
-        let camera = CameraLine {
-            width: 8,
-            height: 8,
-            fx: 8.0,
-            fy: 8.0,
-            cx: 4.0,
-            cy: 4.0,
-            distortion: Vec::new(),
-        };
         let frame = StoredFrame {
             image: "a.png".to_owned(),
             set: set.name().to_owned(),
             group: String::new(),
-            camera,
+            camera: CameraLine::sample(),
             marker: None,
         };
         let record = Record { image: "a.png".to_owned(), ms: 1.0, found: Vec::new() };

@@ -329,16 +329,7 @@ mod tests {
         let text = include_str!("../../../docs/experiments.md");
         let landings = crate::landing::plan::Plan::default().flights();
         let faults = crate::faults::plan::Plan { flights: 1, ..Default::default() }.flights();
-        let found = crate::record::Found {
-            family: "rings".to_owned(),
-            id: None,
-            centre_px: [0.0; 2],
-            centre_covariance_px2: None,
-            corners_px: None,
-            translation_m: None,
-            range_variance_m2: None,
-            confidence: None,
-        };
+        let found = crate::record::Found::sample("rings");
         let sections = [
             ("## Markers\n", names_of(&crate::score::Score::default().summary())),
             ("## Markers\n", names_of(&found)),

@@ -79,6 +79,33 @@ pub struct MarkerLine {
     pub rotation_wxyz: [f64; 4],
 }
 
+#[cfg(test)]
+impl CameraLine {
+    /// A tiny pinhole camera.
+    pub fn sample() -> Self {
+        let (width, height, distortion) = (8, 8, Vec::new());
+        Self { width, height, fx: 8.0, fy: 8.0, cx: 4.0, cy: 4.0, distortion }
+    }
+}
+
+#[cfg(test)]
+impl MarkerLine {
+    /// A marker of 0.1 m, a metre in front of the camera.
+    pub fn sample(family: &str) -> Self {
+        Self {
+            family: family.to_owned(),
+            id: None,
+            size_m: 0.1,
+            centre_px: [0.0; 2],
+            corners_px: [[0.0; 2]; 4],
+            size_px: 20.0,
+            is_whole: true,
+            translation_m: [0.0, 0.0, 1.0],
+            rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
+        }
+    }
+}
+
 impl CameraLine {
     fn new(model: &CameraModel) -> Self {
         let CameraModel { width, height, fx, fy, cx, cy, distortion } = *model;

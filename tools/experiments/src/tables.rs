@@ -207,41 +207,19 @@ mod tests {
 
     #[test]
     fn a_mean_has_the_number_of_its_frames() {
-        let camera = crate::store::CameraLine {
-            width: 8,
-            height: 8,
-            fx: 8.0,
-            fy: 8.0,
-            cx: 4.0,
-            cy: 4.0,
-            distortion: Vec::new(),
-        };
         let frame = StoredFrame {
             image: "a.png".to_owned(),
             set: "positions".to_owned(),
             group: "2x2-07m-2m".to_owned(),
-            camera,
+            camera: crate::store::CameraLine::sample(),
             marker: Some(MarkerLine {
-                family: "rings".to_owned(),
-                id: None,
-                size_m: 0.1,
-                centre_px: [0.0; 2],
-                corners_px: [[0.0; 2]; 4],
-                size_px: 20.0,
-                is_whole: true,
                 translation_m: [0.0, 0.0, 7.0],
-                rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
+                ..MarkerLine::sample("rings")
             }),
         };
         let found = crate::record::Found {
-            family: "rings".to_owned(),
-            id: None,
-            centre_px: [0.0; 2],
-            centre_covariance_px2: None,
-            corners_px: None,
             translation_m: Some([0.0, 0.0, 7.002]),
-            range_variance_m2: None,
-            confidence: None,
+            ..crate::record::Found::sample("rings")
         };
         let answer = (frame, Record { image: "a.png".to_owned(), ms: 1.0, found: vec![found] });
         let run = Run {
