@@ -228,10 +228,9 @@ pub fn setpoint_bytes(is_signed: bool) -> usize {
     HEADER_V2 + SET_POSITION_TARGET_LOCAL_NED_DATA::ENCODED_LEN + CHECKSUM + signature
 }
 
-/// Whether a packet is a setpoint.
+/// Whether a packet is a setpoint, by its header.
 pub fn is_setpoint(raw: &[u8]) -> bool {
-    let packet = Packet::from_raw(raw);
-    packet.is_some_and(|packet| packet.message_id == SET_POSITION_TARGET_LOCAL_NED_DATA::ID)
+    shape(raw).is_ok_and(|shape| shape.id == SET_POSITION_TARGET_LOCAL_NED_DATA::ID)
 }
 
 /// The packet that is all of these bytes, as MAVLink 2 with these incompatibility flags, from start byte to checksum; `None`
