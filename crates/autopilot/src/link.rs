@@ -295,8 +295,8 @@ impl LinkSender {
     /// Sends a packet when no other one waits and a serial line has little left to send, so that heavy traffic (a ground
     /// station that sends corrections or files over a slow line) hardly delays the setpoints. Few such packets wait.
     pub fn send_spare(&self, packet: &[u8]) -> Result<(), SendError> {
-        let is_full = self.spare.capacity() <= COMMANDS;
-        if is_full && self.shared.connected.load(Ordering::Acquire) {
+        self.check_connected()?;
+        if self.spare.capacity() <= COMMANDS {
             return Err(SendError::Full);
         }
         self.put(&self.spare, packet)
@@ -313,17 +313,19 @@ impl LinkSender {
     /// # Errors
     /// When there is no connection.
     pub fn send_newest(&self, packet: &[u8]) -> Result<(), SendError> {
-        if !self.shared.connected.load(Ordering::Acquire) || self.queue.is_closed() {
-            return Err(SendError::NotConnected);
-        }
+        self.check_connected()?;
         self.shared.newest.put(packet.to_vec());
         Ok(())
     }
 
+    fn check_connected(&self) -> Result<(), SendError> {
+        // The link's task may have ended, which has the other end of the queue.
+        let is_connected = self.shared.connected.load(Ordering::Acquire);
+        if is_connected && !self.queue.is_closed() { Ok(()) } else { Err(SendError::NotConnected) }
+    }
+
     fn put(&self, queue: &mpsc::Sender<Vec<u8>>, packet: &[u8]) -> Result<(), SendError> {
-        if !self.shared.connected.load(Ordering::Acquire) {
-            return Err(SendError::NotConnected);
-        }
+        self.check_connected()?;
         queue.try_send(packet.to_vec()).map_err(|refused| match refused {
             mpsc::error::TrySendError::Full(_) => SendError::Full,
             mpsc::error::TrySendError::Closed(_) => SendError::NotConnected,
