@@ -1,13 +1,13 @@
-//! What is published of a camera's exposure: who sets it, what is wanted, and why.
+//! Publishes a camera's exposure: the process that sets it, the requested setting, and the reason.
 
 use messages::{CameraControl, ExposureSetter, ExposureSetting, topic};
-use metering::Telling;
+use metering::ControlThrottle;
 use node::{Node, Publisher, clock_name};
 
-/// How a camera is exposed that does not follow the marker.
+/// The exposure of a camera that does not follow the marker.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Configured {
-    /// For this long.
+    /// A fixed exposure time.
     Fixed { exposure_ns: u32 },
     /// By its own metering.
     Metering,
@@ -16,7 +16,7 @@ pub(crate) enum Configured {
 impl From<Configured> for CameraControl {
     fn from(configured: Configured) -> Self {
         let (set_by, in_use) = match configured {
-            // Of its gain no more is known than the number in a unit of its own.
+            // Its gain is known only as a number in the driver's unit.
             Configured::Fixed { exposure_ns } => {
                 (ExposureSetter::Fixed, Some(ExposureSetting { exposure_ns, gain: None }))
             }
@@ -26,15 +26,15 @@ impl From<Configured> for CameraControl {
     }
 }
 
-/// Publishes it.
+/// Publishes a camera's exposure.
 pub(crate) struct ControlPublisher {
     publisher: Publisher<CameraControl>,
     camera: String,
-    telling: Telling,
+    throttle: ControlThrottle,
 }
 
 impl ControlPublisher {
-    /// Of a camera of this name.
+    /// For a camera of this name.
     ///
     /// # Errors
     /// When the session is closed.
@@ -42,11 +42,11 @@ impl ControlPublisher {
         Ok(Self {
             publisher: node.publisher(topic::CAMERA_CONTROL, &[camera]).await?,
             camera: camera.to_owned(),
-            telling: Telling::default(),
+            throttle: ControlThrottle::default(),
         })
     }
 
-    /// Publishes what is told after a frame with this stamp, when it is due. A frame that was not published has no number.
+    /// Publishes the exposure after a frame with this stamp, when it is due. A frame that was not published has no number.
     pub(crate) async fn publish(
         &mut self,
         sequence: Option<u64>,
@@ -55,7 +55,7 @@ impl ControlPublisher {
     ) {
         let (camera, clock) = (self.camera.clone(), clock_name().to_owned());
         let control = CameraControl { camera, sequence, stamp_ns, clock, ..control };
-        if self.telling.is_due(&control) {
+        if self.throttle.is_due(&control) {
             self.publisher.publish(&control).await;
         }
     }

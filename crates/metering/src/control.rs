@@ -24,11 +24,11 @@ const MIN_CONTRAST: f64 = 1.3;
 const MAX_STEP: f64 = 64.0;
 /// Maximum blur by motion during the exposure, in pixels.
 const MAX_BLUR_PX: f64 = 1.0;
-/// How much longer than the blur allows an exposure stays as it is, and how much shorter, when gain makes up for it: what
-/// changes with every frame never settles in a camera that needs some frames for a change.
+/// How much longer than the blur allows an exposure stays as it is, and how much shorter, when gain compensates:
+/// a setting that changes with every frame never settles in a camera that needs some frames for a change.
 const LONGER: f64 = 1.1;
 const SHORTER: f64 = 0.6;
-/// Changes below this are none.
+/// Smaller changes are ignored.
 const MIN_CHANGE: f64 = 0.03;
 /// Exponent on the next steps, relative to before, where one goes back: the last one went too far.
 const BACK_EXPONENT: f64 = 0.5;
@@ -43,7 +43,7 @@ pub struct Setting {
     pub gain: f64,
 }
 
-/// What a camera can be set to.
+/// The range of a camera's settings.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Limits {
     /// Minimum exposure time, in seconds.
@@ -57,7 +57,7 @@ pub struct Limits {
 /// A frame of the pad.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Seen {
-    /// The setting with which this frame was taken, whatever was ordered since.
+    /// The setting with which this frame was taken, also after another one was ordered.
     pub setting: Setting,
     /// The pad's levels in it.
     pub levels: Levels,
@@ -65,7 +65,7 @@ pub struct Seen {
     pub motion_px_s: f64,
 }
 
-/// What follows from a frame.
+/// The result of a frame.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Step {
     /// The setting for the next frames; `None` when that of this frame stays.
@@ -88,8 +88,8 @@ impl Setting {
 /// The step follows from the frame's own setting, so that frames which were under way when a setting was ordered are not
 /// counted twice. It takes grey levels to be proportional to light. Tone curves rise more slowly, so that it is then too small:
 /// exact after one step for a linear camera, after a few for others. Of clipped white it is only known that it is too much; black
-/// tells how much. A gain that is not what its control's value says, as one in decibels, may make a step too large: one that goes back
-/// takes the root of what it would be, and so do those after it, until white is good.
+/// shows how much. A gain that is not proportional to its control's value, as one in decibels, may make a step too
+/// large: a step back, and those after it, is reduced to its square root until white is good.
 #[derive(Clone, Debug)]
 pub struct ExposureControl {
     /// The last step as it would be without an exponent; 1 for none.
@@ -205,7 +205,7 @@ mod tests {
         /// White's level at an exposure of one second and gain 1.
         light: f64,
         gamma: f64,
-        /// Its gain is in decibels: the logarithm of what it truly is grows with the value that is set.
+        /// Its gain is in decibels: the logarithm of the true gain grows with the value that is set.
         in_decibels: bool,
     }
 
@@ -300,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn the_reason_says_what_is_wrong_with_white_or_what_keeps_it_so() {
+    fn the_reason_is_the_error_of_white_or_the_limit_that_causes_it() {
         let why = |exposure_s, gain, white, motion_px_s| {
             let (setting, levels) =
                 (Setting { exposure_s, gain }, Levels { white, black: white / 16.0 });
@@ -332,7 +332,7 @@ mod tests {
     }
 
     proptest! {
-        /// In any light in which the limits allow it, whatever the curve, white settles, and stays.
+        /// White settles and stays with any tone curve, in any light in which the limits allow it.
         #[test]
         fn white_settles_within_its_range(
             stops in -7.0..7.0f64, gamma in 1.0..2.4f64,
@@ -348,7 +348,7 @@ mod tests {
             prop_assert!(settled.steps <= 10, "{settled:?}");
         }
 
-        /// Also where the gain is not what its value says, though in more steps.
+        /// Also where the gain is not proportional to its value, though in more steps.
         #[test]
         fn white_settles_with_a_gain_in_decibels(
             part in 0.02..0.98f64, gamma in 1.0..2.4f64, gain in 1.0..64.0f64,
@@ -362,7 +362,7 @@ mod tests {
         }
 
         #[test]
-        fn whatever_is_seen_a_setting_is_within_the_limits(
+        fn any_setting_is_within_the_limits(
             exposure_s: f64, gain: f64, white: f64, black: f64, motion_px_s: f64,
         ) {
             let levels = Levels { white, black };

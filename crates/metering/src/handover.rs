@@ -1,4 +1,4 @@
-//! Who sets the exposure: the pad, or the camera's own metering.
+//! Decides whether the pad or the camera's own metering sets the exposure.
 
 /// A pad that was metered for this long was seen well, in nanoseconds.
 const WELL_NS: i64 = 3_000_000_000;
@@ -9,7 +9,7 @@ const MAX_WAIT_NS: i64 = 40_000_000_000;
 /// Hands the exposure to the pad while it is seen.
 ///
 /// A pad that its own metering makes invisible, as the edge of a deep shadow on it may, is seen again once the camera meters
-/// by itself, and would be lost again at once. Each time that happens it waits twice as long.
+/// on its own, and would be lost again at once. Each time this happens the handover waits twice as long.
 #[derive(Clone, Debug, Default)]
 pub struct Handover {
     seen_since_ns: Option<i64>,

@@ -1,22 +1,22 @@
 //! Exposure for the marker: which exposure time and gain a camera's next frames need, so that the pad's white is bright,
 //! not clipped, and not blurred.
 //!
-//! A camera's own metering weighs the whole frame: over dark ground it washes a white pad out, against snow it loses it. This
-//! crate knows no camera and no clock. It reads detections, which tell where the pad is and how fast it moves in the image,
-//! and the pixels there; who sets a camera's controls is camera-pub, or the simulated camera.
+//! A camera's own metering weighs the complete frame: over dark ground it overexposes a white pad, against snow it
+//! underexposes it. This crate does not depend on a camera or a clock. It reads detections, which give the pad's position and
+//! speed in the image, and the pixels there. Camera-pub or the simulated camera sets the camera's controls.
 //!
-//! Modules in reading order: [`pad`] follows the pad from detections, [`region`] has the grey levels of its white and black,
-//! [`control`] the next exposure time and gain, and why, and [`handover`] says when they count, and when the camera's own metering.
-//! [`telling`] says what others are told of it.
+//! Modules in reading order: [`pad`] follows the pad from detections, [`region`] measures the grey levels of white and black,
+//! [`control`] computes the next exposure time and gain, and [`handover`] chooses between them and the camera's own metering.
+//! [`throttle`] limits how often the exposure is published.
 
 pub mod control;
 pub mod handover;
 pub mod pad;
 pub mod region;
-pub mod telling;
+pub mod throttle;
 
 pub use control::{ExposureControl, Limits, Seen, Setting, Step};
 pub use handover::Handover;
 pub use pad::{Pad, PadTrack};
 pub use region::{Levels, levels};
-pub use telling::Telling;
+pub use throttle::ControlThrottle;

@@ -1,4 +1,4 @@
-//! Where the pad is in a frame, to be metered there, and how fast it moves, from detections of its markers in earlier frames.
+//! Predicts the pad's position and speed in a frame, to meter it there, from detections of its markers in earlier frames.
 
 use std::collections::VecDeque;
 
@@ -9,9 +9,9 @@ use messages::{ControllerStatus, Detection, Detections};
 const MAX_AGE_NS: i64 = 700_000_000;
 /// Time over which the fastest motion counts, in nanoseconds: a vehicle that sways is slow in between.
 const MOTION_NS: i64 = 500_000_000;
-/// Maximum number of motions that are kept: those of 64 detections in that time.
+/// Maximum number of motions that are stored: those of 64 detections in that time.
 const MAX_MOTIONS: usize = 64;
-/// Minimum time between two detections that tell a motion, in nanoseconds; several detectors search the same frame.
+/// Minimum time between two detections that give a motion, in nanoseconds; several detectors search the same frame.
 const MIN_STEP_NS: i64 = 1_000_000;
 
 /// The pad in a frame.
@@ -21,8 +21,8 @@ pub struct Pad {
     pub centre_px: [f64; 2],
     /// Its largest extent, in pixels.
     pub size_px: f64,
-    /// How fast the fastest of its points moved during the half second before it was last seen, in pixels per second: what turning, moving and
-    /// the range make of it together.
+    /// How fast the fastest of its points moved during the half second before it was last seen, in pixels
+    /// per second: the sum of rotation, translation and change of range.
     pub motion_px_s: f64,
     /// How far it may have moved since it was seen, in pixels.
     pub drift_px: f64,
@@ -59,7 +59,7 @@ struct Motion {
 }
 
 impl PadTrack {
-    /// A track of what is detected in this camera's frames.
+    /// A track of the pad that is detected in this camera's frames.
     pub fn new(camera: &str) -> Self {
         Self {
             camera: camera.to_owned(),
@@ -126,7 +126,7 @@ impl PadTrack {
     pub fn at(&mut self, stamp_ns: i64) -> Option<Pad> {
         self.last.take_if(|last| last.age_ns(stamp_ns).saturating_abs() > MAX_AGE_NS);
         let last = self.last.as_ref()?;
-        // What is not seen goes on moving.
+        // A pad that is not seen continues to move.
         let is_recent =
             |motion: &Motion| last.stamp_ns.saturating_sub(motion.stamp_ns) <= MOTION_NS;
         self.motions.retain(is_recent);

@@ -7,7 +7,7 @@ use crate::pad::Pad;
 /// Radius of the region relative to the pad's largest extent: that of a square is its diagonal, half of which is 0.35
 /// sides, so that the region stays within it however it is turned.
 const RADIUS_PER_SIZE: f64 = 0.35;
-/// Maximum number of samples along the region's edge: more cost time and tell nothing.
+/// Maximum number of samples along the region's edge: more cost time and add no information.
 const MAX_SAMPLES: usize = 64;
 /// Minimum number of samples: of a smaller part of the pad too little is seen.
 const MIN_SAMPLES: u32 = 24;
@@ -40,9 +40,9 @@ impl Levels {
 }
 
 /// The levels of the pad in this frame; `None` when it does not show enough of it, or when the pad may be elsewhere, having
-/// moved by more than its size since it was seen: what is there instead may be in another light.
+/// moved by more than its size since it was seen: the ground there may be in another light.
 ///
-/// White is the median of what is brighter than the middle between the darkest and the brightest level. A reflection that
+/// White is the median of the samples brighter than the mean of the darkest and the brightest level. A reflection that
 /// covers less than half of the white does not change it, nor does a shadow on a part of the pad.
 pub fn levels(frame: GrayView<'_>, pad: &Pad) -> Option<Levels> {
     if pad.drift_px > pad.size_px {
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn white_and_black_are_told_whatever_the_ground_is() {
+    fn white_and_black_are_measured_on_any_ground() {
         for ground in [0, 90, 255] {
             let is_pad = |x: usize, y: usize| x.abs_diff(100) < 25 && y.abs_diff(80) < 25;
             let paint = |x, y| match (is_pad(x, y), stripes(x)) {

@@ -54,7 +54,7 @@ pub struct SimCamera {
     exposing: Exposing,
     control: CameraControl,
     light: LightSettings,
-    /// Exposure time times gain times light for which the levels of what lies between camera and pad are stated.
+    /// Exposure time times gain times light for which the levels of haze and glare between camera and pad are stated.
     nominal: f64,
 }
 
@@ -150,7 +150,7 @@ impl SimCamera {
         self.exposing.follow(status);
     }
 
-    /// What is told of the exposure after the frame that was rendered last, but for its header.
+    /// The message about the exposure after the frame that was rendered last, without its header.
     pub fn control(&self) -> &CameraControl {
         &self.control
     }
@@ -224,7 +224,7 @@ impl SimCamera {
             return Occluder::None;
         };
         let size_px = self.marker_m * model.fx / camera_from_marker.origin().z();
-        // What adds light is brighter, too, in a frame that is exposed longer.
+        // Added light is also brighter in a frame that is exposed longer.
         let CameraSettings { exposure_s, gain, .. } = self.settings;
         let exposed = exposure_s * gain * self.light.at(request.begun_s) / self.nominal;
         match kind {

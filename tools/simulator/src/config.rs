@@ -42,7 +42,7 @@ pub struct Config {
     pub id: String,
     /// Seed of everything random.
     pub seed: u64,
-    /// What flies.
+    /// The vehicle.
     pub vehicle: VehicleKind,
     /// Height above which the scenario begins, in metres.
     pub begin_height_m: f64,
@@ -64,7 +64,7 @@ pub struct Config {
     pub air: AirConfig,
 }
 
-/// What flies.
+/// The source of the vehicle's pose.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum VehicleKind {

@@ -1,5 +1,5 @@
-//! How the simulated camera sets exposure and gain: fixed, by the mean of its frames as a camera's own metering does, or for
-//! the marker as camera-pub does, and what it tells of that.
+//! Sets exposure and gain of the simulated camera: fixed, by the mean of its frames as a camera's own metering does, or for
+//! the marker as camera-pub does. Composes the message about it.
 
 use std::collections::VecDeque;
 
@@ -45,12 +45,12 @@ struct Ordered {
     setting: Setting,
 }
 
-/// What follows from a frame.
+/// The result of a frame.
 #[derive(Default)]
 struct Decision {
     /// The setting for later frames; `None` when nothing changes.
     next: Option<Setting>,
-    /// What is told of it, without the settings.
+    /// The message about it, without the settings.
     control: CameraControl,
 }
 
@@ -93,7 +93,7 @@ impl Exposing {
         self.track.follow(status);
     }
 
-    /// Orders the setting that follows from a frame, and returns what is told of it.
+    /// Orders the setting that follows from a frame, and returns the message about it.
     pub(crate) fn taken(
         &mut self,
         sequence: u64,
@@ -117,20 +117,20 @@ impl Exposing {
         }
         let last = self.ordered.back().map_or(self.setting, |last| last.setting);
         let is_wanted = control.set_by == ExposureSetter::Marker;
-        // A camera that meters by itself tells nobody what it has chosen.
-        let is_told = control.set_by != ExposureSetter::Camera;
+        // A camera that meters on its own does not report its setting.
+        let is_known = control.set_by != ExposureSetter::Camera;
         CameraControl {
-            in_use: is_told.then(|| self.setting.into()),
+            in_use: is_known.then(|| self.setting.into()),
             wanted: is_wanted.then(|| last.into()),
             ..control
         }
     }
 
-    /// What the pad makes of it, or without one the camera's own metering.
+    /// The decision for the pad, or without one that of the camera's own metering.
     fn for_pad(&mut self, stamp_ns: i64, frame: GrayView<'_>) -> Decision {
         let pad = self.track.at(stamp_ns);
         let is_metered = self.handover.meters_pad(stamp_ns, pad.is_some());
-        let told = CameraControl {
+        let without_levels = CameraControl {
             set_by: ExposureSetter::Marker,
             why: ExposureReason::NotInFrame,
             motion_px_s: pad.map(|pad| pad.motion_px_s),
@@ -143,11 +143,11 @@ impl Exposing {
                 Some(_) => ExposureReason::LostSoon,
                 None => ExposureReason::NoMarker,
             };
-            let control = CameraControl { set_by: ExposureSetter::Camera, why, ..told };
+            let control = CameraControl { set_by: ExposureSetter::Camera, why, ..without_levels };
             return Decision { next: Some(self.by_mean(frame)), control };
         };
         let Some(levels) = levels(frame, &pad) else {
-            return Decision { next: None, control: told };
+            return Decision { next: None, control: without_levels };
         };
         let seen = Seen { setting: self.setting, levels, motion_px_s: pad.motion_px_s };
         let step = self.control.next(&seen, &self.limits);
@@ -155,12 +155,12 @@ impl Exposing {
             why: step.why,
             levels: Some(levels.into()),
             limits: Some(step.limits.into()),
-            ..told
+            ..without_levels
         };
         Decision { next: step.next, control }
     }
 
-    /// What the camera's own metering makes of a frame.
+    /// The setting that the camera's own metering derives from a frame.
     fn by_mean(&self, frame: GrayView<'_>) -> Setting {
         let (across, down) = (frame.width() / MAX_SAMPLES + 1, frame.height() / MAX_SAMPLES + 1);
         let (mut sum, mut count) = (0.0, 0.0);
@@ -220,33 +220,48 @@ mod tests {
     }
 
     #[test]
-    fn what_is_told_says_who_sets_the_exposure_what_the_pad_wants_and_why() {
+    fn the_message_has_the_setter_the_requested_exposure_and_the_reason() {
         let linear = "camera.processing=linear";
         let mut marker = exposing(&["camera.exposure=marker", "camera.max_gain=16", linear]);
         let dark = GrayImage::filled(64, 48, 10);
         marker.open(0);
-        let told = marker.taken(0, 0, dark.view().unwrap());
-        assert_eq!((told.set_by, told.why), (ExposureSetter::Camera, ExposureReason::NoMarker));
-        assert_eq!((told.in_use, told.wanted), (None, None));
-        assert!(told.limits.is_some());
+        let control = marker.taken(0, 0, dark.view().unwrap());
+        assert_eq!(
+            (control.set_by, control.why),
+            (ExposureSetter::Camera, ExposureReason::NoMarker)
+        );
+        assert_eq!((control.in_use, control.wanted), (None, None));
+        assert!(control.limits.is_some());
         let mut found = Detections::sample();
         found.header.camera = "down".to_owned();
         (found.detections[0].centre_px, found.detections[0].size_px) = ([32.0, 24.0], 40.0);
         marker.detected(&found);
         let setting = marker.open(1);
-        let told = marker.taken(1, 66_000_000, dark.view().unwrap());
-        assert_eq!((told.set_by, told.why), (ExposureSetter::Marker, ExposureReason::TooDark));
-        assert_eq!(told.in_use, Some(setting.into()));
-        assert!(told.wanted.unwrap().exposure_ns > told.in_use.unwrap().exposure_ns, "{told:?}");
-        assert!(told.levels.unwrap().white < 0.05, "{told:?}");
+        let control = marker.taken(1, 66_000_000, dark.view().unwrap());
+        assert_eq!(
+            (control.set_by, control.why),
+            (ExposureSetter::Marker, ExposureReason::TooDark)
+        );
+        assert_eq!(control.in_use, Some(setting.into()));
+        assert!(
+            control.wanted.unwrap().exposure_ns > control.in_use.unwrap().exposure_ns,
+            "{control:?}"
+        );
+        assert!(control.levels.unwrap().white < 0.05, "{control:?}");
         let mut fixed = exposing(&["camera.exposure=fixed"]);
         let setting = fixed.open(0);
-        let told = fixed.taken(0, 0, dark.view().unwrap());
-        assert_eq!((told.set_by, told.why), (ExposureSetter::Fixed, ExposureReason::Configured));
-        assert_eq!(told.in_use, Some(setting.into()));
+        let control = fixed.taken(0, 0, dark.view().unwrap());
+        assert_eq!(
+            (control.set_by, control.why),
+            (ExposureSetter::Fixed, ExposureReason::Configured)
+        );
+        assert_eq!(control.in_use, Some(setting.into()));
         let mut average = exposing(&["camera.exposure=average"]);
-        let told = average.taken(0, 0, dark.view().unwrap());
-        assert_eq!((told.set_by, told.why), (ExposureSetter::Camera, ExposureReason::Configured));
-        assert_eq!((told.in_use, told.wanted), (None, None));
+        let control = average.taken(0, 0, dark.view().unwrap());
+        assert_eq!(
+            (control.set_by, control.why),
+            (ExposureSetter::Camera, ExposureReason::Configured)
+        );
+        assert_eq!((control.in_use, control.wanted), (None, None));
     }
 }

@@ -19,7 +19,7 @@ use messages::{
     CameraControl, CameraInfo, ControllerStatus, Detections, FrameHeader, MavlinkBytes,
     PixelFormat, Touchdown, Truth, Wind, topic,
 };
-use metering::Telling;
+use metering::ControlThrottle;
 use node::{
     BoxFuture, FramePublisher, Loan, Node, Publisher, Shutdown, Subscriber, clock_name, now_ns,
 };
@@ -47,10 +47,10 @@ const MAX_DELAYED: usize = 32;
 const TOO_LONG: &str = "frames that took too long to render";
 /// Time without the truth after which it is requested again.
 const REQUEST_PERIOD: Duration = Duration::from_secs(1);
-/// Ids of the messages with the truth of a simulated ArduPilot and PX4. Asked for one that it does not know, ArduPilot tells the pilot.
+/// Ids of the messages with the truth of a simulated ArduPilot and PX4. ArduPilot warns the pilot of a request for an unknown id.
 const SIM_STATE: f32 = 108.0;
 const HIL_STATE_QUATERNION: f32 = 115.0;
-/// Number of such requests without an answer after which it is told.
+/// Number of such requests without an answer after which a warning is logged.
 const MAX_UNANSWERED: u32 = 5;
 const NO_TRUTH: &str = "the autopilot sends no truth of its simulation (SIM_STATE, HIL_STATE_QUATERNION), so the camera and the touchdown's error follow its estimate";
 /// The MAVLink component id of an autopilot.
@@ -295,7 +295,7 @@ struct TruthOf {
 }
 
 impl TruthOf {
-    /// From a packet of an autopilot that tells its firmware.
+    /// From a packet of an autopilot that contains its firmware.
     fn new(packet: &Packet) -> Option<Self> {
         let Some(MavMessage::HEARTBEAT(heartbeat)) = &packet.message else { return None };
         let message = match Firmware::of(heartbeat) {
@@ -313,7 +313,7 @@ impl AutopilotSide {
                 let address: Address = config.autopilot.address.parse()?;
                 let signing = match config.autopilot.signing_key.as_str() {
                     "" => None,
-                    // No other program listens to the simulated autopilot, so it keeps no stamps.
+                    // No other program receives from the simulated autopilot, so it keeps no stamps.
                     path => Some(SigningConfig::read(path.as_ref(), 0, None, "simulator")?),
                 };
                 let link = Link::open_for(address, Peering::default(), signing).await;
@@ -338,7 +338,7 @@ impl AutopilotSide {
                 if let LinkEvent::Packet { packet, received } = link.recv().await {
                     let answers = match &mut *simulation.source() {
                         VehicleSource::Simulated(world) => {
-                            // What the packet waited here is no part of the link's delay.
+                            // The time for which the packet waited here is not part of the link's delay.
                             let received_s = simulation.now_s() - received.elapsed().as_secs_f64();
                             world.advance_to(received_s);
                             world.handle_at(received_s.max(world.now_s()), &packet);
@@ -442,7 +442,7 @@ struct Delayed {
     pixels: Loan,
 }
 
-/// What tells where the pad is.
+/// The subscriptions that give the pad's position.
 struct Sightings {
     detections: Subscriber<Detections>,
     /// Names the detector in use.
@@ -462,7 +462,7 @@ struct Camera {
     infos: Publisher<CameraInfo>,
     info: CameraInfo,
     controls: Publisher<CameraControl>,
-    telling: Telling,
+    throttle: ControlThrottle,
     period_s: f64,
 }
 
@@ -494,7 +494,7 @@ impl Camera {
             infos: node.publisher(topic::CAMERA_INFO, &[name]).await?,
             info,
             controls: node.publisher(topic::CAMERA_CONTROL, &[name]).await?,
-            telling: Telling::default(),
+            throttle: ControlThrottle::default(),
             period_s: 1.0 / config.camera.rate_hz,
             node: node.clone(),
             simulation,
@@ -533,7 +533,7 @@ impl Camera {
         Ok((stopped, thread))
     }
 
-    /// Tells the sensor where the pad was seen.
+    /// Passes the pad's position to the sensor.
     fn follow_pad(&mut self) {
         let Some(sightings) = &self.sightings else { return };
         while let Some(status) = sightings.status.waiting() {
@@ -578,7 +578,7 @@ impl Camera {
             format: PixelFormat::Mono8,
             parts: Vec::new(),
         };
-        self.tell_control(&header).await;
+        self.publish_control(&header).await;
         let again = passage.again_after_s.map(|after_s| (time_s + after_s, frame.to_vec()));
         if passage.arrives_after_s > 0.0 {
             self.delay(time_s + passage.arrives_after_s, header.clone(), frame);
@@ -592,7 +592,7 @@ impl Camera {
     }
 
     /// Publishes how the camera is exposed after the frame with this header.
-    async fn tell_control(&mut self, header: &FrameHeader) {
+    async fn publish_control(&mut self, header: &FrameHeader) {
         let control = CameraControl {
             camera: header.camera.clone(),
             sequence: Some(header.sequence),
@@ -600,7 +600,7 @@ impl Camera {
             clock: header.clock.clone(),
             ..self.sensor.control().clone()
         };
-        if self.telling.is_due(&control) {
+        if self.throttle.is_due(&control) {
             self.controls.publish(&control).await;
         }
     }

@@ -1,14 +1,14 @@
-//! When a camera's exposure is published again as `CameraControl`: a change of setting, reason, refusal or who sets it at
-//! once; what stays, with levels and limits that differ in each frame, at intervals.
+//! Decides when a camera's exposure is published again as `CameraControl`: a change of setting, reason, refusal or setter at
+//! once; an unchanged exposure, with levels and limits that differ in each frame, at intervals.
 
 use messages::{CameraControl, ExposureLimits, ExposureReason, ExposureSetting, MarkerLevels};
 
 use crate::control::{Limits, Setting};
 use crate::region::Levels;
 
-/// Time after which what stays is told again, in nanoseconds: for those who have come since.
+/// Time after which an unchanged exposure is published again, in nanoseconds: for new subscribers.
 const REPEAT_NS: i64 = 1_000_000_000;
-/// The same while the exposure follows a marker, whose levels and motion are told as well.
+/// The same while the exposure follows a marker, whose levels and motion are published as well.
 const MARKER_REPEAT_NS: i64 = 200_000_000;
 
 impl From<Setting> for ExposureSetting {
@@ -38,15 +38,15 @@ fn nanoseconds(time_s: f64) -> u32 {
     (time_s * 1e9).round() as u32
 }
 
-/// Says which messages are due: each change at once, and what stays once a second, or five times a second while a marker is
-/// seen. Levels, motion and limits are no change: they differ in each frame.
+/// Decides which messages are due: each change at once, an unchanged exposure once a second, or five times a second while a
+/// marker is seen. Levels, motion and limits do not count as a change: they differ in each frame.
 #[derive(Clone, Debug, Default)]
-pub struct Telling {
+pub struct ControlThrottle {
     last: Option<CameraControl>,
 }
 
-impl Telling {
-    /// True when this is to be published; at the next call it has been.
+impl ControlThrottle {
+    /// True when this message is to be published; the next call compares with it.
     pub fn is_due(&mut self, control: &CameraControl) -> bool {
         let repeat_ns = match control.why {
             ExposureReason::Configured | ExposureReason::NoMarker => REPEAT_NS,
@@ -63,7 +63,7 @@ impl Telling {
     }
 }
 
-/// What is told at once when it changes.
+/// The fields that are published at once when they change.
 fn decided(control: &CameraControl) -> impl PartialEq {
     (control.why, control.set_by, control.wanted, control.in_use, control.refused.as_deref())
 }
@@ -74,12 +74,12 @@ mod tests {
     use messages::ExposureSetter;
 
     #[test]
-    fn a_fixed_setting_is_told_once_a_second_or_when_it_changes() {
-        let mut telling = Telling::default();
+    fn a_fixed_setting_is_published_once_a_second_or_when_it_changes() {
+        let mut throttle = ControlThrottle::default();
         let mut is_due = |stamp_ms: i64, set_by, exposure_ns| {
             let in_use = Some(ExposureSetting { exposure_ns, gain: None });
             let stamp_ns = stamp_ms * 1_000_000;
-            telling.is_due(&CameraControl { stamp_ns, set_by, in_use, ..Default::default() })
+            throttle.is_due(&CameraControl { stamp_ns, set_by, in_use, ..Default::default() })
         };
         assert!(is_due(0, ExposureSetter::Fixed, 1000));
         assert!(!is_due(500, ExposureSetter::Fixed, 1000));
@@ -87,22 +87,22 @@ mod tests {
         assert!(is_due(700, ExposureSetter::Camera, 2000));
         assert!(!is_due(1699, ExposureSetter::Camera, 2000));
         assert!(is_due(1700, ExposureSetter::Camera, 2000));
-        assert!(is_due(0, ExposureSetter::Camera, 2000), "its clock began anew");
+        assert!(is_due(0, ExposureSetter::Camera, 2000), "its clock began again");
         assert!(is_due(-1, ExposureSetter::Camera, 2000));
     }
 
     /// The number of messages that are due in ten seconds of 100 frames each, of which each one is made by `control`.
     fn due_in_ten_seconds(control: impl Fn(u32) -> CameraControl) -> usize {
-        let mut telling = Telling::default();
+        let mut throttle = ControlThrottle::default();
         let stamped = |frame: u32| {
             let stamp_ns = i64::from(frame) * 10_000_000;
             CameraControl { stamp_ns, ..control(frame) }
         };
-        (0..1000).filter(|frame| telling.is_due(&stamped(*frame))).count()
+        (0..1000).filter(|frame| throttle.is_due(&stamped(*frame))).count()
     }
 
     #[test]
-    fn what_stays_is_not_told_at_the_rate_of_the_camera() {
+    fn an_unchanged_exposure_is_not_published_at_the_rate_of_the_camera() {
         let of = |why| {
             due_in_ten_seconds(|frame| {
                 let noise = f64::from(frame % 7);
@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn each_change_is_told_at_once() {
+    fn each_change_is_published_at_once() {
         let setting = |exposure_ns| Some(ExposureSetting { exposure_ns, gain: Some(1.0) });
         let good = || CameraControl { why: ExposureReason::Good, ..CameraControl::default() };
         let changes: [&dyn Fn(u32) -> CameraControl; 5] = [
@@ -146,7 +146,7 @@ mod tests {
         let setting = Setting { exposure_s: 1e9, gain: 2.0 };
         assert_eq!(ExposureSetting::from(setting).exposure_ns, u32::MAX);
         let setting = Setting { exposure_s: 2.5e-3, gain: 2.0 };
-        let told = ExposureSetting { exposure_ns: 2_500_000, gain: Some(2.0) };
-        assert_eq!(ExposureSetting::from(setting), told);
+        let message = ExposureSetting { exposure_ns: 2_500_000, gain: Some(2.0) };
+        assert_eq!(ExposureSetting::from(setting), message);
     }
 }
