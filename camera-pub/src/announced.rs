@@ -25,7 +25,7 @@ use crate::v4l2::abi::text;
 
 /// Period of the questions, until they are answered.
 const ASK_PERIOD: Duration = Duration::from_millis(700);
-/// Maximum number of components that are asked, of streams of each, and of hosts that are heard.
+/// Maximum number of components that are queried, of streams of each, and of hosts whose packets are read.
 const MAX_COMPONENTS: usize = 32;
 const MAX_STREAMS: usize = 16;
 const MAX_HOSTS: usize = 16;
@@ -42,9 +42,9 @@ pub struct AnnouncedCamera {
     pub system: u8,
     /// MAVLink's id of the component that answers for it.
     pub component: u8,
-    /// Which of the component's cameras it is, from 1 to 6 for cameras of an autopilot; 0 for a component of its own.
+    /// Which of the component's cameras it is, from 1 to 6 for cameras of an autopilot; 0 where the component is the camera.
     pub device: u8,
-    /// Its maker and model; empty where it does not say them.
+    /// Its maker and model; empty where it does not report them.
     pub name: String,
     /// Its video streams.
     pub streams: Vec<AnnouncedStream>,
@@ -59,31 +59,31 @@ pub struct AnnouncedStream {
     pub name: String,
     /// How it is sent: `RTSP`, `RTP over UDP`, `MPEG over TCP`, `MPEG-TS` or `WebRTC`.
     pub transport: &'static str,
-    /// `H.264`, `H.265`, or nothing where the camera does not say it.
+    /// `H.264`, `H.265`, or empty where the camera does not report it.
     pub encoding: &'static str,
     /// Its address without name and password, or the port at which the ground station receives it.
     pub address: String,
-    /// Width and height in pixels; `None` where the camera does not say them.
+    /// Width and height in pixels; `None` where the camera does not report them.
     pub size_px: Option<[u16; 2]>,
-    /// Pictures per second; `None` where the camera does not say it.
+    /// Pictures per second; `None` where the camera does not report it.
     pub rate_hz: Option<f32>,
-    /// The `[source]` table; `None` for what `camera-pub` does not read by itself.
+    /// The `[source]` table; `None` for streams that `camera-pub` does not read on its own.
     pub source: Option<String>,
 }
 
-/// What was found at an address.
+/// The cameras found at an address.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Announced {
     /// The cameras.
     pub cameras: Vec<AnnouncedCamera>,
-    /// Why there may be more, or none at all.
+    /// The reason why there may be more, or none at all.
     pub problem: Option<String>,
 }
 
-/// Asks at an address (that of an autopilot's link, or a UDP port at which cameras announce themselves) for so long.
+/// Queries an address (that of an autopilot's link, or a UDP port at which cameras announce themselves) for `ask_for`.
 ///
 /// # Errors
-/// When the address is none, or cannot be listened at.
+/// When the address is invalid, or its port cannot be opened.
 pub async fn announced_cameras(address: &str, ask_for: Duration) -> anyhow::Result<Announced> {
     let address: Address = address.parse()?;
     let mut port = Port::open(&address).await?;
@@ -94,11 +94,11 @@ pub async fn announced_cameras(address: &str, ask_for: Duration) -> anyhow::Resu
     loop {
         tokio::select! {
             () = sleep_until(end) => break,
-            heard = port.recv() => match heard {
-                Heard::Packets(packets, from) => {
+            received = port.recv() => match received {
+                Received::Packets(packets, from) => {
                     packets.iter().for_each(|packet| inquiry.take(packet, from));
                 }
-                Heard::Problem(reason) => problem = Some(reason),
+                Received::Error(reason) => problem = Some(reason),
             },
             _ = due.tick() => {
                 for Question { to, system, message } in inquiry.questions(attempt) {
@@ -116,26 +116,26 @@ pub async fn announced_cameras(address: &str, ask_for: Duration) -> anyhow::Resu
         Some(reason) => Some(reason),
         None if is_deaf => Some(format!("no MAVLink came to {address} within {ask_for:?}")),
         None if port.lacks_key() => Some(format!(
-            "what sends to {address} signs its packets, and may answer nobody without its key"
+            "the sender at {address} signs its packets, and may answer no program without its key"
         )),
         None => None,
     };
     Ok(Announced { cameras, problem })
 }
 
-/// Where MAVLink comes from.
+/// The source of MAVLink packets.
 enum Port {
-    /// A port at which anybody may announce himself, with what came from each.
+    /// A port at which any host may announce itself, with a parser for each.
     Open { socket: UdpSocket, hosts: BTreeMap<SocketAddr, Parser> },
     /// The link to one other side.
     Link(Link),
 }
 
-/// What came.
-enum Heard {
+/// What a port received.
+enum Received {
     Packets(Vec<Packet>, Option<SocketAddr>),
-    /// Why nothing can come.
-    Problem(String),
+    /// The reason why no packet can be received.
+    Error(String),
 }
 
 impl Port {
@@ -152,32 +152,32 @@ impl Port {
     }
 
     /// May be cancelled without losing anything.
-    async fn recv(&mut self) -> Heard {
+    async fn recv(&mut self) -> Received {
         match self {
             Self::Open { socket, hosts } => {
                 let mut buffer = [0; MAX_DATAGRAM];
                 loop {
-                    // A host that has gone refuses what was sent to it.
+                    // A host that has gone refuses packets that were sent to it.
                     let Ok((length, from)) = socket.recv_from(&mut buffer).await else { continue };
                     if hosts.contains_key(&from) || hosts.len() < MAX_HOSTS {
                         let packets = hosts.entry(from).or_default().push(&buffer[..length]);
-                        return Heard::Packets(packets, Some(from));
+                        return Received::Packets(packets, Some(from));
                     }
                 }
             }
             Self::Link(link) => loop {
                 match link.recv().await {
                     LinkEvent::Packet { packet, .. } => {
-                        return Heard::Packets(vec![*packet], None);
+                        return Received::Packets(vec![*packet], None);
                     }
-                    LinkEvent::Disconnected { reason } => return Heard::Problem(reason),
+                    LinkEvent::Disconnected { reason } => return Received::Error(reason),
                     LinkEvent::Connected { .. } | LinkEvent::OtherAutopilot { .. } => {}
                 }
             },
         }
     }
 
-    /// What cannot be sent now is asked again.
+    /// Errors are ignored: each question is sent again until it is answered.
     fn send(&self, to: Option<SocketAddr>, packet: &[u8]) {
         match self {
             Self::Open { socket, .. } => {
@@ -196,7 +196,7 @@ impl Port {
     }
 }
 
-/// Who is there, and what is known of it.
+/// The components that were seen, and what is known of each.
 #[derive(Debug, Default)]
 struct Inquiry {
     components: BTreeMap<(u8, u8), Component>,
@@ -211,14 +211,14 @@ struct Component {
     names: BTreeMap<u8, String>,
     /// By the number of the camera and that of the stream.
     streams: BTreeMap<(u8, u8), AnnouncedStream>,
-    /// The number of streams that it says it has.
+    /// The number of streams that it reports.
     count: Option<u8>,
 }
 
 /// A message to send.
 struct Question {
     to: Option<SocketAddr>,
-    /// In whose name: an autopilot passes on what comes from its own vehicle.
+    /// The system id of the sender: an autopilot forwards packets that come from its own vehicle.
     system: u8,
     message: MavMessage,
 }
@@ -235,7 +235,7 @@ impl Inquiry {
             MavMessage::CAMERA_INFORMATION(_) | MavMessage::VIDEO_STREAM_INFORMATION(_) => true,
             _ => return,
         };
-        // As a target 0 is everybody.
+        // As a target 0 is a broadcast.
         if system == 0 || component == 0 || !self.has_room(system, component, is_camera) {
             return;
         }
@@ -243,20 +243,22 @@ impl Inquiry {
         component.from = from;
         component.is_camera |= is_camera;
         match message {
-            MavMessage::CAMERA_INFORMATION(told) if component.names.len() < MAX_STREAMS => {
-                component.names.insert(told.camera_device_id, name(told));
+            MavMessage::CAMERA_INFORMATION(camera) if component.names.len() < MAX_STREAMS => {
+                component.names.insert(camera.camera_device_id, name(camera));
             }
-            MavMessage::VIDEO_STREAM_INFORMATION(told) => {
-                component.count = Some(told.count);
+            MavMessage::VIDEO_STREAM_INFORMATION(video) => {
+                component.count = Some(video.count);
                 if component.streams.len() < MAX_STREAMS {
-                    component.streams.insert((told.camera_device_id, told.stream_id), stream(told));
+                    component
+                        .streams
+                        .insert((video.camera_device_id, video.stream_id), stream(video));
                 }
             }
             _ => {}
         }
     }
 
-    /// Whether this one is known or can be: a camera takes the place of one that is not known to be one.
+    /// Whether this component is known or can be added: a camera replaces a component that is not known to be a camera.
     fn has_room(&mut self, system: u8, component: u8, is_camera: bool) -> bool {
         if self.components.contains_key(&(system, component))
             || self.components.len() < MAX_COMPONENTS
@@ -268,12 +270,12 @@ impl Inquiry {
         other.is_some_and(|key| self.components.remove(&key).is_some())
     }
 
-    /// A heartbeat, without which an autopilot passes no answers on to this program, and what is not answered yet.
+    /// A heartbeat, without which an autopilot forwards no answers to this program, and all questions without an answer.
     #[expect(deprecated, reason = "older cameras know only the older commands")]
     fn questions(&self, attempt: u8) -> Vec<Question> {
         let mut questions = Vec::new();
         if self.components.is_empty() {
-            // It opens the way to whom this program sends to.
+            // It opens the way to the address that this program sends to.
             questions.push(Question {
                 to: None,
                 system: 1,
@@ -306,7 +308,7 @@ impl Inquiry {
         questions
     }
 
-    /// Those of them that are cameras.
+    /// The components that are cameras.
     fn cameras(&self) -> Vec<AnnouncedCamera> {
         let mut cameras = Vec::new();
         for (&(system, component), known) in &self.components {
@@ -336,43 +338,43 @@ impl Inquiry {
     }
 }
 
-fn name(told: &CAMERA_INFORMATION_DATA) -> String {
-    let parts = [&told.vendor_name, &told.model_name].map(|bytes| printable(&text(bytes)));
+fn name(camera: &CAMERA_INFORMATION_DATA) -> String {
+    let parts = [&camera.vendor_name, &camera.model_name].map(|bytes| printable(&text(bytes)));
     parts.join(" ").trim().to_owned()
 }
 
-fn stream(told: &VIDEO_STREAM_INFORMATION_DATA) -> AnnouncedStream {
-    let encoding = match told.encoding {
+fn stream(video: &VIDEO_STREAM_INFORMATION_DATA) -> AnnouncedStream {
+    let encoding = match video.encoding {
         VideoStreamEncoding::VIDEO_STREAM_ENCODING_H264 => "H.264",
         VideoStreamEncoding::VIDEO_STREAM_ENCODING_H265 => "H.265",
         VideoStreamEncoding::VIDEO_STREAM_ENCODING_UNKNOWN => "",
     };
-    let told_address = printable(told.uri.to_str().unwrap_or_default());
+    let reported_address = printable(video.uri.to_str().unwrap_or_default());
     // A name and a password are for a file, not for a terminal or a configuration.
-    let address = without_credentials(&told_address);
-    let size_px = [told.resolution_h, told.resolution_v];
+    let address = without_credentials(&reported_address);
+    let size_px = [video.resolution_h, video.resolution_v];
     let size_px = (size_px.iter().all(|edge| (1..=16384).contains(edge))).then_some(size_px);
-    let rate_hz = Some(told.framerate).filter(|rate| RATES_HZ.contains(&f64::from(*rate)));
-    let is_read = told.mavtype == VideoStreamType::VIDEO_STREAM_TYPE_RTSP
+    let rate_hz = Some(video.framerate).filter(|rate| RATES_HZ.contains(&f64::from(*rate)));
+    let is_read = video.mavtype == VideoStreamType::VIDEO_STREAM_TYPE_RTSP
         && address.starts_with("rtsp://")
         && encoding != "H.265";
     let mut table = format!("[source]\nrtsp = \"{address}\"");
-    if address != told_address {
+    if address != reported_address {
         table += "\nrtsp_credentials = \"FILE\"  # with a line user:password, chmod 600";
     }
     table += &match size_px {
         Some([width, height]) => format!("\nsize_px = [{width}, {height}]"),
         None => {
-            "\n# size_px = [WIDTH, HEIGHT] is needed, and the camera does not say it".to_owned()
+            "\n# size_px = [WIDTH, HEIGHT] is needed, and the camera does not report it".to_owned()
         }
     };
     if let Some(rate_hz) = rate_hz {
         table += &format!("\nrate_hz = {rate_hz:?}");
     }
     AnnouncedStream {
-        id: told.stream_id,
-        name: printable(told.name.to_str().unwrap_or_default()),
-        transport: match told.mavtype {
+        id: video.stream_id,
+        name: printable(video.name.to_str().unwrap_or_default()),
+        transport: match video.mavtype {
             VideoStreamType::VIDEO_STREAM_TYPE_RTSP => "RTSP",
             VideoStreamType::VIDEO_STREAM_TYPE_RTPUDP => "RTP over UDP",
             VideoStreamType::VIDEO_STREAM_TYPE_TCP_MPEG => "MPEG over TCP",
@@ -387,7 +389,7 @@ fn stream(told: &VIDEO_STREAM_INFORMATION_DATA) -> AnnouncedStream {
     }
 }
 
-/// What others sent, without what moves a terminal's cursor, turns its text around or ends a string of TOML.
+/// Text of another program, without characters that move a terminal's cursor, reverse its text or end a string of TOML.
 fn printable(text: &str) -> String {
     text.chars().filter(|it| (' '..='~').contains(it) && !matches!(it, '"' | '\\')).collect()
 }
@@ -450,8 +452,8 @@ mod tests {
                 let is_old = command.command == MavCmd::MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION;
                 if is_old && asked > 4 && mavtype == MavType::MAV_TYPE_CAMERA {
                     let encoding = VideoStreamEncoding::VIDEO_STREAM_ENCODING_H264;
-                    let told = information("rtsp://10.0.0.2:8554/main", encoding);
-                    send(MavMessage::VIDEO_STREAM_INFORMATION(told));
+                    let video = information("rtsp://10.0.0.2:8554/main", encoding);
+                    send(MavMessage::VIDEO_STREAM_INFORMATION(video));
                 }
             }
         }
@@ -479,7 +481,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn nobody_and_a_closed_port_are_told_apart() {
+    async fn a_silent_port_and_a_closed_port_are_distinguished() {
         let soon = Duration::from_millis(900);
         let silent = announced_cameras("udpin:127.0.0.1:0", soon).await.unwrap();
         assert!(silent.problem.unwrap().contains("no MAVLink came to udpin:127.0.0.1:0"));
@@ -490,7 +492,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_announced_is_shown_without_secrets_and_read_only_where_it_can_be() {
+    fn announced_streams_are_shown_without_secrets_and_read_only_where_possible() {
         let h264 = VideoStreamEncoding::VIDEO_STREAM_ENCODING_H264;
         let h265 = VideoStreamEncoding::VIDEO_STREAM_ENCODING_H265;
         for (uri, shown) in [
@@ -507,8 +509,8 @@ mod tests {
             framerate: 1e30,
             ..information("rtsp://me:hidden@10.0.0.2/a", h264)
         };
-        for told in [information("rtsp://me:hidden@10.0.0.2/a", h264), odd] {
-            let table = stream(&told).source.unwrap();
+        for video in [information("rtsp://me:hidden@10.0.0.2/a", h264), odd] {
+            let table = stream(&video).source.unwrap();
             assert!(table.contains("rtsp_credentials") && !table.contains("hidden"), "{table}");
             let folder = tempfile::tempdir().unwrap();
             let file = Some(folder.path().join("camera.toml"));
@@ -528,13 +530,13 @@ mod tests {
     }
 
     #[test]
-    fn cameras_of_an_autopilot_are_told_apart() {
+    fn cameras_of_an_autopilot_are_distinguished() {
         let mut inquiry = Inquiry::default();
         let h264 = VideoStreamEncoding::VIDEO_STREAM_ENCODING_H264;
         for camera_device_id in [1, 2] {
-            let told = information(&format!("rtsp://10.0.0.{camera_device_id}/a"), h264);
-            let told = VIDEO_STREAM_INFORMATION_DATA { camera_device_id, ..told };
-            let message = MavMessage::VIDEO_STREAM_INFORMATION(told);
+            let video = information(&format!("rtsp://10.0.0.{camera_device_id}/a"), h264);
+            let video = VIDEO_STREAM_INFORMATION_DATA { camera_device_id, ..video };
+            let message = MavMessage::VIDEO_STREAM_INFORMATION(video);
             inquiry.take(&packet(Sender { system: 1, component: 1 }, &message), None);
         }
         let cameras = inquiry.cameras();
@@ -542,7 +544,7 @@ mod tests {
     }
 
     #[test]
-    fn neither_ground_stations_nor_a_crowd_are_asked() {
+    fn neither_ground_stations_nor_too_many_components_are_queried() {
         let mut inquiry = Inquiry::default();
         let station = Sender { system: 255, component: 190 };
         inquiry.take(&packet(station, &heartbeat(MavType::MAV_TYPE_GCS)), None);
@@ -554,7 +556,7 @@ mod tests {
         assert_eq!(inquiry.components.len(), MAX_COMPONENTS);
         assert_eq!(inquiry.questions(0).len(), 5 * MAX_COMPONENTS);
         assert_eq!(inquiry.cameras(), []);
-        // A camera takes the place of one of them.
+        // A camera replaces one of them.
         inquiry.take(&packet(CAMERA, &heartbeat(MavType::MAV_TYPE_CAMERA)), None);
         assert_eq!(inquiry.components.len(), MAX_COMPONENTS);
         assert_eq!(inquiry.cameras().len(), 1);

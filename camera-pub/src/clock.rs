@@ -1,5 +1,5 @@
-//! Turns stamps of a camera's own clock into times of the host's by the quickest arrivals, learnt anew where that clock was set;
-//! and arrivals that are told in UTC.
+//! Converts stamps of a camera's clock into the host's time by the quickest arrivals, again after that clock was set.
+//! Also converts arrivals that are stamped in UTC.
 
 /// Time in which the quickest frame is looked for, in nanoseconds. Clocks that go apart by 50 in a million move by half a
 /// millisecond in two of these.
@@ -16,7 +16,7 @@ const MAX_FAR_NS: i64 = 2_000_000_000;
 const STEP_FRAMES: u32 = 20;
 const MIN_STEP_NS: i64 = 50_000_000;
 
-/// What a camera's clock is behind the host's.
+/// Estimates how far a camera's clock is behind the host's.
 ///
 /// No frame arrives before it is sent, and the quickest hardly later: the least difference of arrival and stamp over the last
 /// five to ten seconds is the offset, as in the clock filter of NTP (RFC 5905, section 10).
@@ -90,7 +90,7 @@ impl CameraClock {
     }
 }
 
-/// Arrivals that are told by the system's clock (UTC), which may be set, as times of the host's own.
+/// Converts arrivals that are stamped by the system's clock (UTC), which may be set, into times of the host's clock.
 #[cfg(feature = "genicam")]
 #[derive(Debug, Default)]
 pub(crate) struct UtcArrivals {
@@ -99,7 +99,7 @@ pub(crate) struct UtcArrivals {
     set_ns: Option<i64>,
 }
 
-/// UTC is not slewed by more than this between two frames, in nanoseconds; what is more is a step.
+/// UTC is not slewed by more than this between two frames, in nanoseconds; a larger change is a step.
 #[cfg(feature = "genicam")]
 const MAX_SLEW_NS: u64 = 2_000_000;
 /// Longest time for which a frame waits to be read, in nanoseconds.
@@ -130,7 +130,7 @@ mod tests {
     const MS: i64 = 1_000_000;
 
     /// The largest error of frames at 25 Hz over a minute, in nanoseconds, with a clock that is ahead by `drift` and
-    /// arrivals that are late by what `late_ns` says of a frame's number.
+    /// arrivals that are late by `late_ns` of a frame's number.
     fn worst_ns(drift: f64, until_sent_ns: i64, late_ns: impl Fn(i64) -> i64) -> i64 {
         let mut clock = CameraClock::default();
         let mut worst_ns = 0;
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stamp_is_told_within_a_millisecond_whatever_delays_most_frames() {
+    fn a_stamp_is_converted_within_a_millisecond_whatever_delays_most_frames() {
         // Nine of ten frames are late by up to 8 ms.
         let late_ns = |number: i64| if number % 10 == 3 { 0 } else { number * 7919 % 8 * MS };
         for drift in [0.0, 5e-5, -5e-5] {
@@ -168,11 +168,11 @@ mod tests {
                 let arrival_ns = 50_000 * MS + number * 40 * MS;
                 // Read 3 ms later; the clock is set between.
                 let now_ns = arrival_ns + 3 * MS;
-                let utc = |host_ns: i64, since: i64| {
-                    host_ns + 1_000_000 * MS + if number >= since { step_ns } else { 0 }
+                let utc = |at_ns: i64, since: i64| {
+                    at_ns + 1_000_000 * MS + if number >= since { step_ns } else { 0 }
                 };
-                let told_ns = arrivals.host_ns(utc(arrival_ns, 101), utc(now_ns, 100), now_ns);
-                let error_ns = told_ns - arrival_ns;
+                let host_ns = arrivals.host_ns(utc(arrival_ns, 101), utc(now_ns, 100), now_ns);
+                let error_ns = host_ns - arrival_ns;
                 assert!((0..=3 * MS).contains(&error_ns), "{number}: {error_ns}");
                 assert!((100..130).contains(&number) || error_ns == 0, "{number}: {error_ns}");
             }
@@ -189,8 +189,8 @@ mod tests {
                 let truth_ns = 50_000 * MS + number * 40 * MS;
                 let stamp_ns = truth_ns - if number < 60 { 0 } else { 300 * MS };
                 let arrival_ns = truth_ns + number * 7919 % 8 * MS;
-                let told_ns = clock.host_ns(stamp_ns, 0, arrival_ns);
-                errors_ns.push(told_ns.map(|told_ns| told_ns - truth_ns));
+                let host_ns = clock.host_ns(stamp_ns, 0, arrival_ns);
+                errors_ns.push(host_ns.map(|host_ns| host_ns - truth_ns));
             }
             let late = errors_ns[79..].iter().flatten().all(|error_ns| error_ns.abs() <= MS);
             assert_eq!(late, is_noticed, "{errors_ns:?}");
@@ -205,9 +205,9 @@ mod tests {
                 // From the hundredth on all wait for 700 ms, and come one after the other then.
                 let late_ns =
                     if number < 100 { 0 } else { (700 - (number - 100) * 40).max(0) * MS };
-                let told_ns = clock.host_ns(number * 40 * MS, 0, truth_ns + late_ns);
+                let host_ns = clock.host_ns(number * 40 * MS, 0, truth_ns + late_ns);
                 let expected_ns = (number >= 9).then_some(truth_ns);
-                assert_eq!(told_ns, expected_ns, "{number}");
+                assert_eq!(host_ns, expected_ns, "{number}");
             }
         }
     }
@@ -224,8 +224,8 @@ mod tests {
                 let is_set = number >= 100;
                 let truth_ns = 50_000 * MS + number * 40 * MS + if is_set { pause_ns } else { 0 };
                 let stamp_ns = truth_ns - 49_000 * MS + if is_set { set_ns } else { 0 };
-                let told_ns = clock.host_ns(stamp_ns, 0, truth_ns);
-                if is_set && told_ns == Some(truth_ns) {
+                let host_ns = clock.host_ns(stamp_ns, 0, truth_ns);
+                if is_set && host_ns == Some(truth_ns) {
                     first.get_or_insert(number - 100);
                 }
             }
@@ -239,10 +239,10 @@ mod tests {
         for number in 0..100 {
             clock.host_ns(number * 40 * MS, 0, 50_000 * MS + number * 40 * MS);
         }
-        let told: Vec<_> = (0..20)
+        let hosts_ns: Vec<_> = (0..20)
             .map(|number| clock.host_ns(number * 40 * MS, 0, 60_000 * MS + number * 40 * MS))
             .collect();
-        assert_eq!(told[8], None, "a restarted camera's stamps are not believed at once");
-        assert_eq!(told[19], Some(60_000 * MS + 19 * 40 * MS));
+        assert_eq!(hosts_ns[8], None, "a restarted camera's stamps are not believed at once");
+        assert_eq!(hosts_ns[19], Some(60_000 * MS + 19 * 40 * MS));
     }
 }

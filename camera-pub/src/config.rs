@@ -68,7 +68,7 @@ struct ExposureConfig {
     settle_frames: u32,
 }
 
-/// Who sets the exposure.
+/// The process that sets the exposure.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 enum ExposureControl {
@@ -93,7 +93,7 @@ pub(crate) struct ProgramConfig {
     pub(crate) rate_hz: f64,
     /// Time from the middle of the exposure to a frame's first byte.
     pub(crate) delay_ns: i64,
-    /// What the stamps in its metadata are of.
+    /// The instant of the stamps in its metadata.
     pub(crate) shutter: Shutter,
     /// Maximum time without a frame.
     pub(crate) timeout: Duration,
@@ -113,7 +113,7 @@ pub(crate) struct DeviceConfig {
     pub(crate) path: PathBuf,
     /// Size of its frames.
     pub(crate) size: FrameSize,
-    /// What it is opened for.
+    /// The format, rate and controls that are requested.
     pub(crate) wanted: Wanted,
 }
 
@@ -131,7 +131,7 @@ pub(crate) struct GenicamConfig {
     pub(crate) features: Vec<String>,
     /// The colours of its pixels; `None` for a grey camera.
     pub(crate) bayer: Option<BayerPattern>,
-    /// What its stamps are of.
+    /// The instant of its stamps.
     pub(crate) shutter: Shutter,
     /// Time for which a frame is held back before it is sent.
     pub(crate) delay_ns: i64,
@@ -157,7 +157,7 @@ pub(crate) struct RtspConfig {
     pub(crate) max_pixels: u64,
 }
 
-/// What the stamps of a stream's pictures are from.
+/// The source of the stamps of a stream's pictures.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum RtspStamps {
@@ -551,7 +551,7 @@ impl SourceConfig {
         values.collect()
     }
 
-    /// What the camera's stamps are of, if it is configured.
+    /// The instant of the camera's stamps, if it is configured.
     fn stamped_at(&self) -> Option<StampedAt> {
         match self.stamp_at.as_str() {
             "exposure-start" => Some(StampedAt::ExposureStart),
@@ -630,7 +630,7 @@ impl CalibrationConfig {
             ),
         );
         let has_file = self.file != Path::new("");
-        let otherwise = "it needs `calibration.file`: `calibration.focal_px` and what follows are of the frames as they are published";
+        let otherwise = "it needs `calibration.file`: `calibration.focal_px` and all keys below are of the published frames";
         check.parses("calibration.binning", holds(has_file || self.binning == 0, otherwise));
         let is_whole = self.region_px.is_empty();
         check.parses("calibration.region_px", holds(has_file || is_whole, otherwise));
@@ -750,7 +750,7 @@ mod tests {
     use node::Layers;
 
     #[test]
-    fn angles_in_radians_are_told_from_those_in_degrees() {
+    fn angles_in_radians_are_distinguished_from_those_in_degrees() {
         for eighths in [1.0, -2.0, 3.0, 4.0, -6.0, 8.0] {
             let angle = (eighths * std::f64::consts::FRAC_PI_4 * 1000.0_f64).round() / 1000.0;
             assert!(is_radians(angle), "{angle}");

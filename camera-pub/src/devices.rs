@@ -1,4 +1,4 @@
-//! The video devices of this machine: what they offer, and how to configure them.
+//! Lists the video devices of this machine, their formats and controls, and how to configure them.
 
 use std::path::{Path, PathBuf};
 
@@ -16,7 +16,7 @@ pub struct ConnectedDevice {
     pub path: PathBuf,
     /// A link to it, where there is one: its number may be another camera's when it is plugged in again.
     pub link: Option<PathBuf>,
-    /// What it offers; `None` when it cannot be asked.
+    /// Its formats and controls; `None` when it cannot be queried.
     pub description: Option<DeviceDescription>,
     /// Why it cannot be asked.
     pub problem: Option<String>,
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn devices_are_listed_by_their_numbers_with_what_is_wrong() {
+    fn devices_are_listed_by_their_numbers_with_their_errors() {
         let folder = tempfile::tempdir().unwrap();
         for name in ["video10", "video2", "videodev", "null"] {
             std::fs::write(folder.path().join(name), "").unwrap();

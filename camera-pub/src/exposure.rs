@@ -1,4 +1,4 @@
-//! When a frame was exposed, from the one instant that a camera's driver tells.
+//! Computes when a frame was exposed from the one instant that a camera's driver stamps.
 //!
 //! A row is exposed for the exposure time and then read; a rolling shutter reads one row after the other. A frame's
 //! stamp is the middle of its exposure: that of its middle row.
@@ -37,7 +37,7 @@ impl Exposure {
         Self { mid_ns, exposure_ns: 0 }
     }
 
-    /// True when the camera told it.
+    /// True when the camera reported it.
     pub(crate) fn is_exact(self) -> bool {
         self.exposure_ns > 0
     }

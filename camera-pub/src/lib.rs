@@ -1,15 +1,15 @@
-//! Light to frames: images are published with their stamp, and with the camera's calibration and mount.
+//! Publishes a camera's frames with their stamps, and with its calibration and mount.
 //!
-//! Frames come from a program that reads a camera, or from image files. The crate knows no vehicle, and of
-//! detectors only what they have found where, which a camera can be exposed for.
+//! Frames come from a program that reads a camera, or from image files. The crate does not depend on the vehicle. Of
+//! detectors it reads only the detections, for which a camera can be exposed.
 //!
-//! Modules in reading order: [`config`] says what can be chosen, [`service`] publishes, `program` reads what
-//! a camera's program writes, `side_channel` what it tells of each frame beside: `metadata` splits that, `pairing`
-//! finds each frame's own, `exposure` says from its stamp when the frame was exposed. `repeated` knows a picture that
-//! comes again. `rect` publishes frames without the lens' distortion for whoever wants them.
-//! `v4l2` reads cameras without a program, `genicam` (a feature) those of that standard, `rtsp` (a feature) those that stream over a network; `clock` is the host's time
-//! of a camera's own. `marker` says how cameras are exposed for the marker, `control` publishes that; [`devices`] lists those of this machine,
-//! [`announced`] those that are announced over MAVLink.
+//! Modules in reading order: [`config`] has the settings, [`service`] publishes, `program` reads the output of
+//! a camera's program, `side_channel` its metadata: `metadata` splits that into records, `pairing`
+//! finds the record of each frame, `exposure` computes from its stamp when the frame was exposed. `repeated` detects a
+//! picture that is delivered again. `rect` publishes frames without the lens' distortion where a subscriber requests them.
+//! `v4l2` reads cameras without a program, `genicam` (a feature) those of that standard, `rtsp` (a feature) those that stream
+//! over a network. `clock` converts a camera's time to the host's. `marker` decides how cameras are exposed for the marker,
+//! `control` publishes that. [`devices`] lists the cameras of this machine, [`announced`] those that are announced over MAVLink.
 
 pub mod announced;
 #[cfg(any(feature = "genicam", feature = "rtsp"))]

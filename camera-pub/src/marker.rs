@@ -1,5 +1,5 @@
-//! Decides frame by frame how a camera is exposed for the marker: where detections have it, the levels there, the next
-//! exposure time and gain or the camera's own metering, and what is published of it.
+//! Decides frame by frame how a camera is exposed for the marker: its position from detections, the levels there, the next
+//! exposure time and gain or the camera's own metering, and the message about it.
 
 use imaging::GrayView;
 use messages::{
@@ -10,7 +10,7 @@ use node::{Node, Subscriber};
 
 use crate::v4l2::exposer::Order;
 
-/// Follows the marker, and says how to expose for it.
+/// Follows the marker, and decides how to expose for it.
 pub(crate) struct MarkerExposure {
     track: PadTrack,
     handover: Handover,
@@ -18,7 +18,7 @@ pub(crate) struct MarkerExposure {
     sightings: Option<Sightings>,
 }
 
-/// What tells where the marker is.
+/// The subscriptions that give the marker's position.
 struct Sightings {
     detections: Subscriber<Detections>,
     /// Names the detector in use.
@@ -28,28 +28,28 @@ struct Sightings {
 /// How a frame was exposed, and how the next ones can be.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Exposed {
-    /// Whether the camera can meter by itself.
+    /// Whether the camera can meter on its own.
     pub(crate) has_metering: bool,
-    /// True when the camera certainly meters by itself.
+    /// True when the camera certainly meters on its own.
     pub(crate) is_metering: bool,
-    /// What was set last; `None` while it is not set here.
+    /// The setting that was ordered last; `None` while it is not set here.
     pub(crate) ordered: Option<Setting>,
-    /// With what the frame was taken; `None` while that is not known.
+    /// The setting with which the frame was taken; `None` while that is not known.
     pub(crate) setting: Option<Setting>,
     pub(crate) limits: Limits,
     /// Whether its luma is from 16 to 235.
     pub(crate) is_limited: bool,
 }
 
-/// What a device refused to do.
+/// An order that a device refused.
 #[derive(Clone, Debug)]
 pub(crate) struct Refusal {
     pub(crate) order: Order,
-    /// What it answered.
+    /// Its answer.
     pub(crate) answer: String,
 }
 
-/// What to do after a frame, and why.
+/// The order after a frame, and its reason.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Decision {
     pub(crate) order: Order,
@@ -65,16 +65,16 @@ pub(crate) struct Decision {
 }
 
 impl Decision {
-    /// What is told of it once it was carried out, which made the exposure `after`, was refused, or was put off in the pause
-    /// after a refusal.
-    pub(crate) fn told(&self, after: &Exposed, refusal: Option<&Refusal>) -> CameraControl {
+    /// The message about it once it was carried out, was refused, or was delayed in the pause after a refusal. `after` is the
+    /// exposure then.
+    pub(crate) fn message(&self, after: &Exposed, refusal: Option<&Refusal>) -> CameraControl {
         let wanted = match self.order {
             Order::Keep | Order::TakeOver => after.ordered,
             Order::OwnMetering => None,
             Order::Set(setting) => Some(setting),
         };
         let set_by = match after.ordered {
-            // A camera without metering keeps what was set. Any other has only not been asked to meter yet.
+            // A camera without metering keeps its setting. Any other has not been ordered to meter yet.
             Some(_) if self.order == Order::OwnMetering && !after.has_metering => {
                 ExposureSetter::Fixed
             }
@@ -82,7 +82,7 @@ impl Decision {
             None if after.is_metering => ExposureSetter::Camera,
             None => ExposureSetter::Fixed,
         };
-        // An answer to another kind of order says nothing of this one.
+        // An answer to another kind of order has no information about this one.
         let is_of_its_kind = |refusal: &&Refusal| {
             std::mem::discriminant(&refusal.order) == std::mem::discriminant(&self.order)
         };
@@ -102,7 +102,7 @@ impl Decision {
 }
 
 impl MarkerExposure {
-    /// For a camera of this name, which nothing is heard of yet.
+    /// For a camera of this name, of which nothing is known yet.
     pub(crate) fn new(camera: &str) -> Self {
         Self {
             track: PadTrack::new(camera),
@@ -112,11 +112,11 @@ impl MarkerExposure {
         }
     }
 
-    /// Listens to detectors from now on.
+    /// Subscribes to detections.
     ///
     /// # Errors
     /// When the session is closed.
-    pub(crate) async fn listen(&mut self, node: &Node) -> anyhow::Result<()> {
+    pub(crate) async fn subscribe(&mut self, node: &Node) -> anyhow::Result<()> {
         self.sightings = Some(Sightings {
             detections: node.subscriber(topic::DETECTIONS, &[]).await?,
             status: node.subscriber(topic::STATUS, &[]).await?,
@@ -124,7 +124,7 @@ impl MarkerExposure {
         Ok(())
     }
 
-    /// What to do after a frame with this stamp, and why.
+    /// The order after a frame with this stamp, and its reason.
     pub(crate) fn after(
         &mut self,
         stamp_ns: i64,
@@ -197,8 +197,8 @@ mod tests {
     use std::rc::Rc;
     use std::time::Duration;
 
-    /// A detector's message of the pad that the played camera shows in its middle.
-    fn message(stamp_ns: i64, centre_px: Option<[f64; 2]>) -> Detections {
+    /// A detector's message of the pad that the played camera shows in its centre.
+    fn detections(stamp_ns: i64, centre_px: Option<[f64; 2]>) -> Detections {
         let detection = centre_px.map(|centre_px| Detection {
             family: "rings".into(),
             id: None,
@@ -232,8 +232,8 @@ mod tests {
         marker: MarkerExposure,
         /// Of each frame: its number, whether its stamp is exact, and how far that is from the truth.
         frames: Vec<Frame>,
-        /// What is told after each.
-        told: Vec<CameraControl>,
+        /// The message after each.
+        controls: Vec<CameraControl>,
         /// How often a control was refused.
         refused: u32,
         /// How long each frame takes.
@@ -286,7 +286,7 @@ mod tests {
                 video,
                 marker,
                 frames: Vec::new(),
-                told: Vec::new(),
+                controls: Vec::new(),
                 refused: 0,
                 needed: Duration::ZERO,
             }
@@ -309,8 +309,8 @@ mod tests {
                 let decision = self.marker.after(exposure.mid_ns, frame, &exposed);
                 self.refused += u32::from(capture.expose(decision.order).is_err());
                 let after = capture.exposed().unwrap();
-                self.told.push(decision.told(&after, capture.refusal()));
-                self.marker.track.update(&message(exposure.mid_ns, pad_at(exposure.mid_ns)));
+                self.controls.push(decision.message(&after, capture.refusal()));
+                self.marker.track.update(&detections(exposure.mid_ns, pad_at(exposure.mid_ns)));
                 let error_ns = exposure.mid_ns - self.fake.mid_exposure_ns(number);
                 let white = f64::from(grey[240 * 640 + 320]) / 255.0;
                 self.frames.push(Frame { number, is_exact: exposure.is_exact(), error_ns, white });
@@ -339,7 +339,7 @@ mod tests {
             let (white, truth) = (exposing.last().white, exposing.truth());
             println!("light {light}: white {white:.2}, {truth:?}");
             assert!((0.6..=0.85).contains(&white), "{light}: {white} {truth:?}");
-            // Of one or two units of 100 us half a unit is much: gain has what is left.
+            // Of one or two units of 100 us half a unit is much: gain has the rest.
             let max_gain = if truth.exposure_ns < MS / 2 { 1.7 } else { 1.1 };
             let is_second = truth.gain < max_gain || truth.exposure_ns == 5 * MS;
             assert!(is_second, "gain is second: {truth:?}");
@@ -347,7 +347,7 @@ mod tests {
     }
 
     #[test]
-    fn white_of_a_limited_range_that_is_clipped_is_told_as_such() {
+    fn clipped_white_of_a_limited_range_is_recognised() {
         let mut exposing = Loop::with("YUYV", Stamps::ExposureStart);
         exposing.fake.light(0.2);
         exposing.run(1000 * MS, still);
@@ -466,47 +466,52 @@ mod tests {
     }
 
     #[test]
-    fn after_each_frame_it_is_told_who_sets_the_exposure_what_is_wanted_and_why() {
+    fn the_message_after_each_frame_has_the_setter_the_requested_exposure_and_the_reason() {
         let mut exposing = Loop::new(Stamps::ExposureStart);
         exposing.fake.light(0.2);
         exposing.run(500 * MS, |_| None);
-        assert_eq!(exposing.told.len(), exposing.frames.len());
-        let told = exposing.told.last().unwrap();
-        assert_eq!((told.set_by, told.why), (ExposureSetter::Camera, ExposureReason::NoMarker));
-        assert_eq!((told.in_use, told.wanted, told.levels), (None, None, None));
-        assert_eq!(told.limits.unwrap().max_exposure_ns, 5_000_000);
+        assert_eq!(exposing.controls.len(), exposing.frames.len());
+        let control = exposing.controls.last().unwrap();
+        assert_eq!(
+            (control.set_by, control.why),
+            (ExposureSetter::Camera, ExposureReason::NoMarker)
+        );
+        assert_eq!((control.in_use, control.wanted, control.levels), (None, None, None));
+        assert_eq!(control.limits.unwrap().max_exposure_ns, 5_000_000);
         // A marker is seen, in too little light.
-        exposing.told.clear();
+        exposing.controls.clear();
         exposing.run(1000 * MS, still);
-        let of = |told: &[CameraControl], why| told.iter().find(|told| told.why == why).cloned();
-        let taken = of(&exposing.told, ExposureReason::TakenOver).unwrap();
+        let of = |controls: &[CameraControl], why| {
+            controls.iter().find(|control| control.why == why).cloned()
+        };
+        let taken = of(&exposing.controls, ExposureReason::TakenOver).unwrap();
         assert!(taken.set_by == ExposureSetter::Marker && taken.wanted.is_some(), "{taken:?}");
-        let settling = of(&exposing.told, ExposureReason::Settling).unwrap();
+        let settling = of(&exposing.controls, ExposureReason::Settling).unwrap();
         assert!(settling.in_use.is_none() && settling.wanted.is_some(), "{settling:?}");
         exposing.fake.light(0.05);
         exposing.run(1000 * MS, still);
-        let dark = of(&exposing.told, ExposureReason::TooDark).unwrap();
+        let dark = of(&exposing.controls, ExposureReason::TooDark).unwrap();
         let light = |setting: messages::ExposureSetting| {
             f64::from(setting.exposure_ns) * setting.gain.unwrap_or_default()
         };
         assert!(light(dark.wanted.unwrap()) > light(dark.in_use.unwrap()), "{dark:?}");
         let levels = dark.levels.unwrap();
         assert!(levels.white < 0.6 && levels.black < levels.white, "{dark:?}");
-        let good = exposing.told.last().unwrap();
+        let good = exposing.controls.last().unwrap();
         assert_eq!((good.set_by, good.why), (ExposureSetter::Marker, ExposureReason::Good));
         assert!(good.wanted.is_some() && good.wanted == good.in_use, "{good:?}");
         assert!((0.6..=0.85).contains(&good.levels.unwrap().white), "{good:?}");
         // Suddenly in bright light.
-        exposing.told.clear();
+        exposing.controls.clear();
         exposing.fake.light(4.0);
         exposing.run(1000 * MS, still);
-        let clipped = of(&exposing.told, ExposureReason::Clipped).unwrap();
+        let clipped = of(&exposing.controls, ExposureReason::Clipped).unwrap();
         assert!(clipped.levels.unwrap().white > 0.98, "{clipped:?}");
         assert!(light(clipped.wanted.unwrap()) < light(clipped.in_use.unwrap()), "{clipped:?}");
         // In so little that the largest exposure and gain are not enough.
         exposing.fake.light(0.001);
         exposing.run(1500 * MS, still);
-        let limited = exposing.told.last().unwrap();
+        let limited = exposing.controls.last().unwrap();
         assert_eq!(limited.why, ExposureReason::AtLimits, "{limited:?}");
         let (wanted, limits) = (limited.wanted.unwrap(), limited.limits.unwrap());
         assert_eq!(wanted.exposure_ns, limits.max_exposure_ns);
@@ -514,56 +519,62 @@ mod tests {
     }
 
     #[test]
-    fn what_a_device_answers_to_an_order_that_it_refuses_is_told_until_it_takes_one() {
+    fn a_devices_refusal_is_reported_until_it_accepts_an_order() {
         let mut exposing = Loop::new(Stamps::FirstPacket);
         exposing.fake.light(0.2);
         exposing.run(1500 * MS, still);
-        assert!(exposing.told.iter().all(|told| told.refused.is_none()));
+        assert!(exposing.controls.iter().all(|control| control.refused.is_none()));
         exposing.fake.refuse(Some(CID_EXPOSURE_ABSOLUTE));
         exposing.fake.light(1.0);
-        exposing.told.clear();
+        exposing.controls.clear();
         exposing.run(1500 * MS, still);
         // Also while it is not tried again.
-        let refused: Vec<_> = exposing.told.iter().filter(|told| told.refused.is_some()).collect();
-        assert!(refused.len() > 100, "{} of {}", refused.len(), exposing.told.len());
-        for told in refused {
-            let answer = told.refused.as_deref().unwrap();
+        let refused: Vec<_> =
+            exposing.controls.iter().filter(|control| control.refused.is_some()).collect();
+        assert!(refused.len() > 100, "{} of {}", refused.len(), exposing.controls.len());
+        for control in refused {
+            let answer = control.refused.as_deref().unwrap();
             assert!(answer.starts_with("VIDIOC_S_EXT_CTRLS: "), "{answer}");
-            assert!(told.wanted != told.in_use && told.set_by == ExposureSetter::Marker);
+            assert!(control.wanted != control.in_use && control.set_by == ExposureSetter::Marker);
             let is_bright = [ExposureReason::Clipped, ExposureReason::TooBright];
-            assert!(is_bright.contains(&told.why), "{told:?}");
+            assert!(is_bright.contains(&control.why), "{control:?}");
         }
         exposing.fake.refuse(None);
         exposing.run(1500 * MS, still);
-        let last = exposing.told.last().unwrap();
+        let last = exposing.controls.last().unwrap();
         assert_eq!((last.why, &last.refused), (ExposureReason::Good, &None));
     }
 
     #[test]
-    fn an_answer_to_another_order_is_not_told_of_a_marker_that_is_lost_meanwhile() {
+    fn the_refusal_of_another_order_is_not_reported_for_a_marker_that_is_lost_meanwhile() {
         let mut exposing = Loop::new(Stamps::FirstPacket);
         exposing.fake.light(0.2);
         exposing.run(1500 * MS, still);
         exposing.fake.refuse(Some(CID_EXPOSURE_ABSOLUTE));
         exposing.fake.light(1.0);
         exposing.run(1000 * MS, still);
-        assert!(exposing.told.last().unwrap().refused.is_some());
-        exposing.told.clear();
+        assert!(exposing.controls.last().unwrap().refused.is_some());
+        exposing.controls.clear();
         exposing.run(2000 * MS, |_| None);
-        let lost = exposing.told.iter().filter(|told| told.why == ExposureReason::NoMarker);
+        let lost =
+            exposing.controls.iter().filter(|control| control.why == ExposureReason::NoMarker);
         // No order is given to the device for a second after it refused one.
         let (paused, metering): (Vec<_>, Vec<_>) =
-            lost.partition(|told| told.set_by != ExposureSetter::Camera);
+            lost.partition(|control| control.set_by != ExposureSetter::Camera);
         assert!(paused.len() > 10 && metering.len() > 10, "{} {}", paused.len(), metering.len());
-        for told in paused {
-            assert_eq!((told.set_by, &told.refused), (ExposureSetter::Marker, &None), "{told:?}");
-            assert!(told.in_use.is_some() && told.wanted.is_none(), "{told:?}");
+        for control in paused {
+            assert_eq!(
+                (control.set_by, &control.refused),
+                (ExposureSetter::Marker, &None),
+                "{control:?}"
+            );
+            assert!(control.in_use.is_some() && control.wanted.is_none(), "{control:?}");
         }
-        assert!(metering.iter().all(|told| told.refused.is_none()));
+        assert!(metering.iter().all(|control| control.refused.is_none()));
     }
 
     #[test]
-    fn a_camera_without_metering_keeps_what_was_set_for_a_marker_that_is_lost() {
+    fn a_camera_without_metering_keeps_its_setting_after_the_marker_is_lost() {
         let setting = Setting { exposure_s: 1e-3, gain: 2.0 };
         let limits = Limits { min_exposure_s: 1e-4, max_exposure_s: 5e-3, max_gain: 16.0 };
         let grey = [0; 64];
@@ -577,26 +588,29 @@ mod tests {
                 Exposed { has_metering, is_metering, ordered, setting, limits, is_limited };
             let decision = MarkerExposure::new("down").after(0, frame, &exposed);
             assert_eq!(decision.order, Order::OwnMetering);
-            assert_eq!(decision.told(&exposed, None).set_by, set_by);
+            assert_eq!(decision.message(&exposed, None).set_by, set_by);
         }
     }
 
     #[test]
-    fn a_marker_that_is_lost_soon_is_told_as_the_reason_for_the_cameras_own_metering() {
+    fn a_marker_that_is_lost_soon_is_reported_as_the_reason_for_the_cameras_own_metering() {
         let mut exposing = Loop::new(Stamps::ExposureStart);
         exposing.fake.light(0.2);
         exposing.run(500 * MS, still);
         exposing.run(1000 * MS, |_| None);
         exposing.run(500 * MS, still);
-        let told = exposing.told.last().unwrap();
-        assert_eq!((told.set_by, told.why), (ExposureSetter::Camera, ExposureReason::LostSoon));
-        assert!(told.motion_px_s.is_some() && told.wanted.is_none(), "{told:?}");
+        let control = exposing.controls.last().unwrap();
+        assert_eq!(
+            (control.set_by, control.why),
+            (ExposureSetter::Camera, ExposureReason::LostSoon)
+        );
+        assert!(control.motion_px_s.is_some() && control.wanted.is_none(), "{control:?}");
     }
 
     #[test]
     fn a_stamp_is_exact_to_a_millisecond_or_marked_also_while_the_exposure_changes() {
         let all = [Stamps::ExposureStart, Stamps::FirstPacket, Stamps::FrameEnd];
-        // Whoever needs several periods for a frame finds frames that waited in all buffers.
+        // A reader that needs several periods for a frame finds frames that waited in all buffers.
         for (stamps, needed_ms) in all.into_iter().flat_map(|it| [(it, 0), (it, 35), (it, 80)]) {
             let mut exposing = Loop::new(stamps);
             exposing.needed = Duration::from_millis(needed_ms);

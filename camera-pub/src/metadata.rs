@@ -1,4 +1,4 @@
-//! What a camera's program tells of each frame beside its pixels: a stream of JSON objects as `rpicam-vid --metadata`
+//! Splits the metadata that a camera's program writes for each frame: a stream of JSON objects as `rpicam-vid --metadata`
 //! writes it.
 //!
 //! Its array has one member per line (raspberrypi/rpicam-apps, `output/output.cpp`):
@@ -23,7 +23,7 @@ const MAX_LINE_BYTES: usize = 16_384;
 /// Maximum number of records that wait to be taken; older ones are dropped.
 const MAX_RECORDS: usize = 64;
 
-/// What a program tells of one frame.
+/// The metadata of one frame.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) struct Metadata {
     /// The sensor's stamp, in nanoseconds of the program's clock.
@@ -38,7 +38,7 @@ pub(crate) struct Metadata {
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) enum Record {
     /// It says when the frame was exposed, and how long.
-    Whole(Metadata),
+    Complete(Metadata),
     /// It is cut or damaged, or says neither.
     Torn,
 }
@@ -164,7 +164,7 @@ impl Open {
             return;
         };
         let value = value.trim();
-        let was_told = match name {
+        let is_repeated = match name {
             "SensorTimestamp" => {
                 let sensor_ns = value.parse().ok().filter(|ns| *ns > 0);
                 self.is_damaged |= sensor_ns.is_none();
@@ -181,14 +181,14 @@ impl Open {
             }
             _ => false,
         };
-        // Two objects that became one, as the lines between are missing.
-        self.is_damaged |= was_told;
+        // Two objects were joined, as the lines between them are missing.
+        self.is_damaged |= is_repeated;
     }
 
     fn record(self) -> Record {
         match (self.sensor_ns, self.exposure_ns.filter(|ns| *ns > 0)) {
             (Some(sensor_ns), Some(exposure_ns)) if !self.is_damaged => {
-                Record::Whole(Metadata { sensor_ns, exposure_ns, gain: self.gain })
+                Record::Complete(Metadata { sensor_ns, exposure_ns, gain: self.gain })
             }
             _ => Record::Torn,
         }
@@ -215,21 +215,21 @@ mod tests {
         std::iter::from_fn(|| reader.next()).collect()
     }
 
-    fn whole(sensor_ns: i64, exposure_us: u32) -> Record {
+    fn complete(sensor_ns: i64, exposure_us: u32) -> Record {
         let exposure_ns = exposure_us * 1000;
-        Record::Whole(Metadata { sensor_ns, exposure_ns, gain: Some(2.5) })
+        Record::Complete(Metadata { sensor_ns, exposure_ns, gain: Some(2.5) })
     }
 
     #[test]
     fn an_object_is_there_before_its_closing_brace() {
         let mut reader = MetadataReader::default();
         let first = object(0, 1_385_372_610_000, 1996);
-        // What `std::endl` has flushed: all but the brace.
+        // The part that `std::endl` has flushed: all but the brace.
         reader.push(first.strip_suffix('}').unwrap().as_bytes());
-        assert_eq!(all(&mut reader), [whole(1_385_372_610_000, 1996)]);
+        assert_eq!(all(&mut reader), [complete(1_385_372_610_000, 1996)]);
         reader.push(b"}");
         reader.push(object(1, 1_385_405_943_000, 1997).strip_suffix('}').unwrap().as_bytes());
-        assert_eq!(all(&mut reader), [whole(1_385_405_943_000, 1997)]);
+        assert_eq!(all(&mut reader), [complete(1_385_405_943_000, 1997)]);
         reader.push(b"}\n]\n");
         assert_eq!(all(&mut reader), []);
     }
@@ -240,11 +240,11 @@ mod tests {
         reader
             .push(b"{\"SensorTimestamp\": 5, \"ScalerCrop\": [0, 0, 4, 3], \"ExposureTime\": 7}\n");
         let metadata = Metadata { sensor_ns: 5, exposure_ns: 7000, gain: None };
-        assert_eq!(all(&mut reader), [Record::Whole(metadata)]);
+        assert_eq!(all(&mut reader), [Record::Complete(metadata)]);
     }
 
     #[test]
-    fn what_is_cut_or_damaged_is_torn() {
+    fn cut_and_damaged_objects_are_torn() {
         let cases = [
             "{\n    \"SensorTimestamp\": 12\n}\n",
             "{\n    \"SensorTimestamp\": 12,\n    \"ExposureTime\": 0\n",
@@ -269,7 +269,7 @@ mod tests {
         reader.push(b"{\n    \"SensorTimestamp\": 12,\n");
         reader.push(object(1, 13, 20).as_bytes());
         reader.push(b"\n");
-        assert_eq!(all(&mut reader), [Record::Torn, whole(13, 20)]);
+        assert_eq!(all(&mut reader), [Record::Torn, complete(13, 20)]);
     }
 
     proptest! {
@@ -282,7 +282,7 @@ mod tests {
                 stamps.iter().enumerate().map(|(n, (ns, us))| object(n, *ns, *us)).collect();
             let mut reader = MetadataReader::default();
             text.as_bytes().chunks(piece).for_each(|piece| reader.push(piece));
-            let expected: Vec<Record> = stamps.iter().map(|(ns, us)| whole(*ns, *us)).collect();
+            let expected: Vec<Record> = stamps.iter().map(|(ns, us)| complete(*ns, *us)).collect();
             prop_assert_eq!(all(&mut reader), expected);
         }
 

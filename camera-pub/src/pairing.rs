@@ -25,7 +25,7 @@ const DELAY_WEIGHT: i64 = 8;
 pub(crate) struct Pairing {
     shutter: Shutter,
     period_ns: i64,
-    /// What is added to the program's stamps to have them on the host's clock: one of these, until it is known which.
+    /// The offset that is added to the program's stamps to convert them to the host's clock: one of these, until one is chosen.
     clock_offsets_ns: Vec<i64>,
     /// Number of records so far, torn ones among them.
     records: i64,
@@ -116,7 +116,7 @@ impl Pairing {
 
     /// Takes a record.
     pub(crate) fn add(&mut self, record: Record) {
-        if let Record::Whole(metadata) = record {
+        if let Record::Complete(metadata) = record {
             if metadata.sensor_ns == self.last_sensor_ns {
                 // Doubled: not one more.
                 return;
@@ -180,7 +180,7 @@ impl Pairing {
         }))
     }
 
-    /// A frame that was queued has arrived: what was written meanwhile says nothing about when.
+    /// A frame that was queued has arrived: the records written meanwhile do not show when.
     pub(crate) fn skip_frame(&mut self) {
         self.frames += 1;
         self.candidate = None;
@@ -191,7 +191,7 @@ impl Pairing {
     fn matching(&self, arrival_ns: i64) -> Option<Placed> {
         let known_ns = self.delay_ns?;
         let of_frame = |placed: &Placed| {
-            // The records of two frames are a period apart. A number that agrees settles what is nearly half of it off.
+            // The records of two frames are a period apart. A number that agrees decides for records that are nearly half a period off.
             let is_next = placed.number - self.frames == self.shift;
             let max_ns = if is_next { self.period_ns / 5 * 2 } else { self.period_ns / 4 };
             let may_be_its = placed.read_in >= self.frames && (is_next || self.doubtful == 0);
@@ -278,7 +278,7 @@ mod tests {
     const SHUTTER: Shutter =
         Shutter { stamped_at: StampedAt::ReadoutStart, readout_ns: 20_000_000 };
 
-    /// What happens to a line of the metadata.
+    /// The fault of a line of the metadata.
     #[derive(Copy, Clone, Debug, PartialEq)]
     enum Line {
         Good,
@@ -293,7 +293,7 @@ mod tests {
         WrongStamp(i64),
     }
 
-    /// A stream of frames, and what is read of each.
+    /// A stream of frames, and the record that is read for each.
     struct Stream {
         /// By how much each frame arrives late.
         late_ns: Vec<i64>,
@@ -325,7 +325,7 @@ mod tests {
             1_000_000_000 + n * PERIOD_NS
         }
 
-        /// Reads the stream as the service does: what has arrived before a frame, what arrives until a little after it.
+        /// Reads the stream as the service does: the records that arrive before a frame, and until a little after it.
         fn read(&self) -> Outcome {
             let arrival_ns = |n: i64| Self::sensor_ns(n) + DELAY_NS + self.late_ns[n as usize];
             let mut written = Vec::new();
@@ -337,7 +337,7 @@ mod tests {
                     exposure_ns: EXPOSURE_NS,
                     gain: None,
                 };
-                let whole = Record::Whole(metadata);
+                let whole = Record::Complete(metadata);
                 match *line {
                     Line::Good => written.push((at_ns, whole)),
                     Line::Late(late_ns) => written.push((at_ns + late_ns, whole)),
@@ -347,11 +347,11 @@ mod tests {
                     Line::Lost => {}
                     Line::WrongStamp(by_ns) => {
                         let sensor_ns = metadata.sensor_ns + by_ns;
-                        written.push((at_ns, Record::Whole(Metadata { sensor_ns, ..metadata })));
+                        written.push((at_ns, Record::Complete(Metadata { sensor_ns, ..metadata })));
                     }
                 }
             }
-            // Lines keep their order: what is late delays those behind it.
+            // Lines keep their order: a late line delays those behind it.
             for n in 1..written.len() {
                 written[n].0 = written[n].0.max(written[n - 1].0);
             }
@@ -448,7 +448,7 @@ mod tests {
             for n in 0..20 {
                 let sensor_ns = Stream::sensor_ns(n) + ahead_ns;
                 let exposure_ns = EXPOSURE_NS;
-                pairing.add(Record::Whole(Metadata { sensor_ns, exposure_ns, gain: None }));
+                pairing.add(Record::Complete(Metadata { sensor_ns, exposure_ns, gain: None }));
                 let exposure = pairing.end_frame(Stream::sensor_ns(n) + DELAY_NS)?;
                 let truth_ns = Stream::sensor_ns(n) - 2 * MS + 10 * MS;
                 assert!(exposure.is_none_or(|exposure| exposure.mid_ns == truth_ns));

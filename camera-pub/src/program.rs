@@ -295,7 +295,7 @@ async fn waiting_of<T>(work: impl Future<Output = T>) -> (T, Waiting) {
     (result, waiting)
 }
 
-/// Tells which frames were queued on their way.
+/// Detects frames that were queued on their way.
 struct Queue {
     /// Nominal time between frames.
     period_ns: i64,
@@ -330,9 +330,9 @@ impl Queue {
     }
 
     /// Whether the frame whose first byte is read at `stamp_ns`, after the read waited so long for it, was queued: one that
-    /// follows sooner than a camera can deliver, and one that was there already and is later than it was due. What is due is
-    /// counted on from the last frame that was waited for, so that what a slow reader is behind adds up, and is no sooner than the
-    /// end of a frame that came as it was made.
+    /// follows sooner than a camera can deliver, and one that was there already and is later than it was due. Due
+    /// times are counted from the last frame that was waited for, so that the delay of a slow reader adds up. They are no sooner
+    /// than the end of a frame that was read as it was made.
     fn has_held(&mut self, stamp_ns: i64, waited_ns: i64) -> bool {
         let quarter_ns = self.period_ns / 4;
         let due_ns = match self.last {
@@ -418,8 +418,8 @@ mod tests {
         assert!(was_queued(9, 6), "sooner than a camera can");
         assert!(was_queued(70, 0), "there since some time between 40 and 70 ms");
     }
-    /// The largest age of the frames that were not queued, and their number, of 500 frames of a camera that are read by one
-    /// who needs so long for each that is not queued.
+    /// The largest age of the frames that were not queued, and their number, of 500 frames of a camera that are read by a
+    /// reader that needs so long for each that is not queued.
     fn read_slowly(period: Duration, needed: Duration) -> (Duration, usize) {
         let ns = |time: Duration| time.as_nanos() as i64;
         let mut queue = Queue::of(PERIOD);
@@ -439,7 +439,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_that_come_over_the_whole_period_are_fresh_also_when_that_is_longer_than_it_is_said_to_be()
+    fn frames_that_are_written_over_the_whole_period_are_fresh_also_when_it_is_longer_than_configured()
      {
         let (made_ns, needed_ns) = (1_000_000_000_000 / 29_970, 5_000_000);
         let mut queue = Queue::of(Duration::from_secs_f64(1.0 / 30.0));
@@ -478,7 +478,7 @@ mod tests {
             queued
         };
         let queued = tokio::select! {
-            () = writing => panic!("nobody reads"),
+            () = writing => panic!("the reader has ended"),
             queued = reading => queued,
         };
         // A busy machine may hold a few.
@@ -486,7 +486,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_do_not_grow_old_before_a_reader_who_is_a_little_too_slow() {
+    fn frames_of_a_slightly_slow_reader_do_not_grow_old() {
         for needed_ms in [39, 41, 45, 49, 55, 81, 130] {
             let (oldest, fresh) = read_slowly(PERIOD, Duration::from_millis(needed_ms));
             assert!(oldest <= PERIOD / 4, "{needed_ms} ms for a frame: {oldest:?} old");
@@ -494,7 +494,7 @@ mod tests {
             let all = 500 * 40 / needed_ms.max(40) as usize;
             assert!(fresh > all * 3 / 5, "{needed_ms} ms for a frame: {fresh} of {all}");
         }
-        // Of a camera that is a little slower than it is said to be, for one who is quick enough.
+        // Of a camera that is a little slower than configured, for a reader that is quick enough.
         let (oldest, fresh) = read_slowly(PERIOD + PERIOD / 50, PERIOD);
         assert!(oldest.is_zero() && fresh == 500, "{oldest:?}, {fresh} frames");
     }

@@ -1,5 +1,5 @@
-//! Rectified frames, `camera/{camera}/rect`: made while somebody subscribes, on a thread of their own, so that no other
-//! subscriber waits for them.
+//! Publishes rectified frames, `camera/{camera}/rect`, while there is a subscriber. A separate thread makes them, so that
+//! other subscribers do not wait.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -42,7 +42,7 @@ impl RectPublisher {
         let (newest, offers) = watch::channel(None);
         let is_wanted = Arc::<AtomicBool>::default();
         let work = Work {
-            // Without shared memory: those who watch may be anywhere, and there may be none for the whole flight.
+            // Without shared memory: subscribers may be on any machine, and there may be none for the whole flight.
             frames: node.frame_publisher(topic::RECT, &[name], 0).await?,
             camera,
             rectifier: None,
@@ -58,7 +58,7 @@ impl RectPublisher {
         Ok(Self { is_wanted, newest })
     }
 
-    /// True when somebody subscribes.
+    /// True while there is a subscriber.
     pub(crate) fn is_wanted(&self) -> bool {
         self.is_wanted.load(Ordering::Relaxed)
     }
@@ -117,7 +117,7 @@ impl Work {
         let Some(camera) = &self.camera else {
             if self.health.failed("rectified frame wanted without a calibration") {
                 tracing::warn!(
-                    "Somebody subscribes to rectified frames, and this camera has no calibration: set `calibration.file`"
+                    "A client subscribes to rectified frames, and this camera has no calibration: set `calibration.file`"
                 );
             }
             return;

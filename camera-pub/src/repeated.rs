@@ -22,7 +22,7 @@ pub(crate) struct Pictures {
     is_stuck: bool,
 }
 
-/// What a picture is.
+/// The kind of a picture.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Picture {
     /// Another one than before, or a still one.

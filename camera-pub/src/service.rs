@@ -50,7 +50,7 @@ const SUBSCRIBER_POLL: Duration = Duration::from_millis(20);
 /// program exits or stops writing. A device that is lost is opened again.
 ///
 /// # Errors
-/// When there is no image to publish, the program cannot be started or exits, the device cannot do what is configured, or
+/// When there is no image to publish, the program cannot be started or exits, the device does not support the configuration, or
 /// another camera has this name.
 pub fn run(
     node: Node,
@@ -102,7 +102,7 @@ async fn on_own_thread(
             tokio::select! {
                 result = stream.run(source) => result,
                 () = shutdown.requested() => Ok(()),
-                // The service is gone: nobody waits for the result.
+                // The service is gone: no task waits for the result.
                 () = done.closed() => Ok(()),
             }
         });
@@ -129,7 +129,7 @@ enum Source {
     Rtsp(RtspConfig),
 }
 
-/// What there is to publish.
+/// The images that can be published.
 struct Found {
     source: Source,
     /// The size in the camera info.
@@ -184,7 +184,7 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
         }
     });
     let Some(size) = first_size else {
-        let problem = first_problem.as_ref().map_or_else(String::new, told);
+        let problem = first_problem.as_ref().map_or_else(String::new, image_error_text);
         bail!("none of the {} images can be read; the first one: {problem}", images.len());
     };
     let sizes = images
@@ -195,8 +195,8 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
     Ok(Found { source: Source::Images(images), size, max_frame_bytes })
 }
 
-/// What is wrong with an image, and the key that allows it where it is too large.
-fn told(problem: &ImageError) -> String {
+/// The error of an image, and the key that allows it where it is too large.
+fn image_error_text(problem: &ImageError) -> String {
     match problem {
         ImageError::TooLarge { .. } => format!("{problem}, or raise `source.max_megapixels`"),
         _ => problem.to_string(),
@@ -250,10 +250,10 @@ enum NoFrame {
     OtherSize(FrameSize),
 }
 
-/// What was read of a device.
+/// The result of reading a device.
 struct Read {
     frame: Result<Prepared, NoFrame>,
-    /// What is told of the exposure after it.
+    /// The message about the exposure after it.
     control: Option<CameraControl>,
 }
 
@@ -273,7 +273,7 @@ impl Stream {
         let jpegs = node.frame_publisher(topic::JPEG, &names, 0).await?;
         let mut marker = MarkerExposure::new(config.instance());
         if config.exposes_for_marker() {
-            marker.listen(node).await?;
+            marker.subscribe(node).await?;
         }
         Ok(Self {
             config: config.clone(),
@@ -495,7 +495,7 @@ impl Stream {
         Ok(Prepared { width, height, format: PixelFormat::Mono8, pixels, grey: None })
     }
 
-    /// Refuses a frame whose size is not the one that is configured, which is told.
+    /// Refuses a frame whose size is not the configured one, with a warning.
     fn expect(&self, width: usize, height: usize) -> Result<(), NoFrame> {
         let size = FrameSize { width, height };
         if size == self.size {
@@ -550,7 +550,7 @@ impl Stream {
                     }
                 }
             }
-            control = capture.exposed().map(|after| decision.told(&after, capture.refusal()));
+            control = capture.exposed().map(|after| decision.message(&after, capture.refusal()));
         }
         for (reason, count) in [
             ("frames that were queued", counts.queued),
@@ -605,8 +605,8 @@ impl Stream {
             Ok(image) => image,
             Err(problem) => {
                 if self.health.failed("unreadable image") {
-                    let problem = told(&problem);
-                    tracing::warn!(%problem, "Dropped a frame that is no whole JPEG file");
+                    let problem = image_error_text(&problem);
+                    tracing::warn!(%problem, "Dropped a frame that is not a complete JPEG file");
                 }
                 return Err(NoFrame::Damaged);
             }
@@ -664,7 +664,7 @@ impl Stream {
     fn prepare(&self, path: &Path) -> anyhow::Result<Prepared> {
         let began = Instant::now();
         let image = DecodedImage::read(path, self.config.max_pixels())
-            .map_err(|problem| anyhow::Error::msg(told(&problem)))?;
+            .map_err(|problem| anyhow::Error::msg(image_error_text(&problem)))?;
         let (width, height) = (image.width(), image.height());
         if (FrameSize { width, height }) != self.size && self.health.failed("image of another size")
         {
@@ -690,7 +690,7 @@ impl Stream {
         format != PixelFormat::Mono8 && (self.air.is_wanted() || self.rect.is_wanted())
     }
 
-    /// Publishes the frame of a camera, and what is told of its exposure.
+    /// Publishes the frame of a camera, and the message about its exposure.
     async fn publish_exposed(
         &mut self,
         frame: Prepared,
@@ -716,7 +716,7 @@ impl Stream {
         if picture == Picture::Stuck && self.health.failed("camera repeats one picture") {
             tracing::warn!(
                 "The camera gives the same picture, to the last bit, since a second; it is not published again until another \
-                 comes. Its signal is gone, or what plays it hangs; a coded video of a scene that does not move may do so as well. \
+                 comes. Its signal is gone, or its player hangs; a coded video of a scene that does not move may do so as well. \
                  Still pictures are published from `source.paths`"
             );
         }
@@ -774,7 +774,7 @@ fn with_bits_of_a_format(samples: &mut [u8], bits: u32) -> u32 {
         return bits;
     }
     for pair in samples.as_chunks_mut::<2>().0 {
-        // What is above the significant bits is no light.
+        // Bits above the significant ones are not light.
         *pair = (u16::from_le_bytes(*pair) << (16 - bits)).to_le_bytes();
     }
     16
@@ -813,8 +813,7 @@ mod tests {
         Node::open(Identity { service, instance: "down".into() }, &local).await.unwrap()
     }
 
-    /// Publishes the frames of a played device to which this happens, until `see` has seen enough of them; returns what was
-    /// counted.
+    /// Publishes the frames of a played device with this fault until `see` has seen enough of them; returns the counts.
     async fn publish(
         fourcc: &'static str,
         script: &[(u32, Happening)],
@@ -856,7 +855,7 @@ mod tests {
         health
     }
 
-    /// A played device whose exposure is published, and who listens to that.
+    /// A played device whose exposure is published, and its subscriber.
     struct Exposing {
         fake: Rc<Fake>,
         device: DeviceConfig,
@@ -895,7 +894,7 @@ mod tests {
         }
     }
 
-    /// Who listens, and finds the pad in the middle of each frame while it says so.
+    /// A subscriber that can report the pad in the centre of each frame.
     struct Viewer {
         fake: Rc<Fake>,
         frames: FrameSubscriber,
@@ -915,7 +914,7 @@ mod tests {
             }
         }
 
-        /// What is told next; the device gives one frame after the other until then.
+        /// The next message about the exposure; the device gives one frame after the other until then.
         async fn next(&self, is_found: bool) -> CameraControl {
             loop {
                 if let Some(control) = self.controls.waiting() {
@@ -936,7 +935,7 @@ mod tests {
     }
 
     #[tokio::test(flavor = "multi_thread")]
-    async fn a_subscriber_sees_what_the_marker_wants_of_the_exposure_and_why() {
+    async fn a_subscriber_receives_the_exposure_for_the_marker_and_its_reason() {
         let exposing = Exposing::new("marker").await;
         let (fake, viewer) = (Rc::clone(&exposing.fake), exposing.viewer.clone());
         let seeing = async {
@@ -946,7 +945,7 @@ mod tests {
                 let setting = setting.unwrap();
                 f64::from(setting.exposure_ns) * setting.gain.unwrap()
             };
-            // What is seen first, whether the pad is found until then, and what happens then.
+            // The reason that is expected first, whether the pad is found until then, and the event then.
             for (why, is_found, then) in [
                 (ExposureReason::NoMarker, false, None),
                 (ExposureReason::TakenOver, true, None),
@@ -1012,7 +1011,7 @@ mod tests {
         exposing.while_seeing(seeing).await;
     }
 
-    /// What happens to a played device once something was seen of it.
+    /// The event of a played device once a message was received.
     #[derive(Copy, Clone, Debug, PartialEq)]
     enum Then {
         Light(f64),

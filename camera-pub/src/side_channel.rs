@@ -1,7 +1,7 @@
-//! The pipe over which a camera's program tells of each frame what is not in its pixels.
+//! Makes the pipe over which a camera's program sends the metadata of each frame.
 //!
-//! The service makes a named pipe in a folder of its own and hands its path to the program, in the place of
-//! [`PLACEHOLDER`] in its arguments.
+//! The service makes a named pipe in a new folder and passes its path to the program, where its arguments have
+//! [`PLACEHOLDER`].
 
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ use crate::exposure::{Exposure, Shutter};
 use crate::metadata::MetadataReader;
 use crate::pairing::Pairing;
 
-/// What stands for the pipe's path in a program's arguments.
+/// The placeholder of the pipe's path in a program's arguments.
 pub(crate) const PLACEHOLDER: &str = "{metadata}";
 /// Maximum time to wait for a frame's metadata after its last byte; `rpicam-vid` writes them at once.
 const MAX_WAIT_NS: i64 = 10_000_000;
@@ -115,7 +115,7 @@ impl SideChannel {
         self.pairing.has_agreed()
     }
 
-    /// Takes what has arrived.
+    /// Reads the bytes that have arrived.
     fn drain(&mut self) {
         let mut bytes = [0; 4096];
         loop {

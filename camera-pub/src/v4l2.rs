@@ -1,9 +1,9 @@
-//! Cameras of Video4Linux, read without any other program: USB cameras, and sensors whose drivers convert themselves.
+//! Reads cameras of Video4Linux without another program: USB cameras, and sensors whose drivers convert the frames.
 //!
-//! Modules in reading order: `abi` is what crosses the border to the kernel and the trait of a device; `kernel` makes the
-//! calls, the only file that does; `describe` lists what a device offers; `pixels` takes the grey levels
-//! of a frame; `exposer` sets its exposure; `capture` reads frames; `video` goes on when the device is lost. All but `kernel`
-//! runs in tests against a device that is played (`fake`).
+//! Modules in reading order: `abi` has the structures of the kernel's interface and the trait of a device. `kernel` is the
+//! only file that makes system calls. `describe` lists a device's capabilities, `pixels` takes the grey levels of a frame,
+//! `exposer` sets its exposure, `capture` reads frames, and `video` continues when the device is lost. Tests run all but
+//! `kernel` against a simulated device (`fake`).
 
 pub(crate) mod abi;
 pub(crate) mod capture;

@@ -267,10 +267,10 @@ async fn a_picture_that_is_repeated_is_published_once() -> anyhow::Result<()> {
         ensure!(frame.header.stamp_ns > stamp_ns, "its stamp is not newer");
         stamp_ns = frame.header.stamp_ns;
         if level > 1 {
-            let told = || camera.health().failures("camera repeats one picture");
-            let is_told = async || told() + 1 >= u64::from(level);
+            let repeats = || camera.health().failures("camera repeats one picture");
+            let is_counted = async || repeats() + 1 >= u64::from(level);
             tokio::select! {
-                told = until("it is told", PATIENCE, is_told) => told?,
+                repeats = until("the repeated picture is counted", PATIENCE, is_counted) => repeats?,
                 _ = frames.next() => bail!("the repeated picture {level} is published again"),
             }
         }

@@ -6,7 +6,7 @@
 Frames of 64 x 48 grey pixels every 40 ms, 30 ms after their sensor stamp. The number stands in the first two pixels, the
 sensor's stamp (nanoseconds, lowest byte first) in the next eight. The metadata are written as
 raspberrypi/rpicam-apps does (output/output.cpp): the closing brace of an object comes with the next one.
-FAULT: none, or what happens to one line in five: late, torn, doubled, lost; or clock: stamps of the wall clock.
+FAULT: none, or the fault of one line in five: late, torn, doubled, lost; or clock: stamps of the wall clock.
 """
 
 import sys

@@ -121,17 +121,17 @@ def publish(session, prefix, args, stopped):
         session.declare_queryable(key, lambda query: query.reply(key, info)),
         session.liveliness().declare_token(f"{prefix}alive/camera-pub/{args.id}"),
     ]
-    told_s = 0.0
+    published_s = 0.0
     for sequence, (stamp_ns, pixels) in enumerate(pictures(args, stopped)):
-        if time.monotonic() - told_s > 1.0:
-            told_s = time.monotonic()
+        if time.monotonic() - published_s > 1.0:
+            published_s = time.monotonic()
             infos.put(info)
         frames.put(pixels, attachment=frame_header(args.id, sequence, stamp_ns, size))
     return kept
 
 
 def configuration(args):
-    """The session's configuration, and what keys begin with."""
+    """The session's configuration, and the prefix of its keys."""
     if args.zenoh:
         # A file of the project: a peer like all others, whose keys get the vehicle's name from `namespace`.
         return zenoh.Config.from_file(args.zenoh), ""

@@ -28,9 +28,9 @@ const MAX_EXTRA_BYTES: usize = 1 << 20;
 pub struct GenicamCamera {
     /// Its name for `source.genicam`.
     pub name: String,
-    /// Who made it.
+    /// Its manufacturer.
     pub vendor: String,
-    /// What it is.
+    /// Its model.
     pub model: String,
     /// Its address on the network or the bus.
     pub address: String,
@@ -115,7 +115,7 @@ impl OpenCamera {
     /// Opens a camera, sets it up, and has it send.
     ///
     /// # Errors
-    /// When it does not answer, or cannot do what is wanted.
+    /// When it does not answer, or does not support the configuration.
     pub(super) fn start(config: &GenicamConfig) -> anyhow::Result<Self> {
         let name = Some(config.name.as_str()).filter(|name| *name != "any");
         let camera = Camera::new(name).map_err(|problem| {
@@ -140,7 +140,7 @@ impl OpenCamera {
                 bounds.map(|(min, max)| format!(", which can be from {min:.2} to {max:.2} now"));
             format!("setting `source.rate_hz` to {}{}", config.rate_hz, bounds.unwrap_or_default())
         })?;
-        // Setting the rate ends what a trigger was set to.
+        // Setting the rate resets the trigger.
         set_features()?;
         let is_metering = camera.exposure_time_auto().is_ok_and(|auto| auto != Auto::Off);
         let exposure_us = camera.exposure_time().ok().filter(|_| !is_metering);
@@ -173,7 +173,7 @@ impl OpenCamera {
         })
     }
 
-    /// How the camera is exposed; `None` where it does not tell.
+    /// How the camera is exposed; `None` where it does not report that.
     pub(super) fn configured(&self) -> Option<Configured> {
         match self.exposure_ns {
             Some(exposure_ns) => Some(Configured::Fixed { exposure_ns }),
@@ -186,17 +186,17 @@ impl OpenCamera {
         self.is_gone.load(Ordering::Relaxed)
     }
 
-    /// The newest whole frame that is there within this time.
-    pub(super) fn take(&mut self, patience: Duration) -> Option<Taken> {
+    /// The newest complete frame that arrives within this time.
+    pub(super) fn take(&mut self, timeout: Duration) -> Option<Taken> {
         let mut newest: Option<Buffer> = None;
-        // Whoever takes longer than a period for a frame would else be given the oldest, which wait until all buffers are full.
+        // A reader that needs more than a period for a frame would otherwise get the oldest, after all buffers have filled.
         for taken in 0..BUFFERS {
             let popped = match taken {
-                0 => self.stream.timeout_pop_buffer(patience.as_micros() as u64),
+                0 => self.stream.timeout_pop_buffer(timeout.as_micros() as u64),
                 _ => self.stream.try_pop_buffer(),
             };
             let Some(buffer) = popped else { break };
-            let refused = if self.is_whole(&buffer) {
+            let refused = if self.is_complete(&buffer) {
                 let older = newest.replace(buffer);
                 self.counts.queued += u64::from(older.is_some());
                 older
@@ -213,7 +213,7 @@ impl OpenCamera {
     }
 
     /// Whether a buffer has all of a frame as it is wanted; another is counted.
-    fn is_whole(&mut self, buffer: &Buffer) -> bool {
+    fn is_complete(&mut self, buffer: &Buffer) -> bool {
         if buffer.status() != BufferStatus::Success {
             self.counts.torn += 1;
             return false;
@@ -230,7 +230,7 @@ impl OpenCamera {
         self.stream.push_buffer(taken.buffer);
     }
 
-    /// What was not delivered since the last call.
+    /// The counts of frames that were not delivered since the last call.
     pub(super) fn take_counts(&mut self) -> Counts {
         std::mem::take(&mut self.counts)
     }
@@ -252,9 +252,9 @@ impl OpenCamera {
                 StampedAt::ReadoutStart | StampedAt::FrameEnd => 0,
             };
         let stamp_ns = i64::try_from(buffer.timestamp()).ok().filter(|stamp_ns| *stamp_ns > 0);
-        let told_ns =
+        let host_ns =
             stamp_ns.and_then(|stamp_ns| self.clock.host_ns(stamp_ns, until_sent_ns, arrival_ns));
-        match (told_ns, self.exposure_ns) {
+        match (host_ns, self.exposure_ns) {
             (Some(host_ns), Some(exposure_ns)) => {
                 Exposure { mid_ns: self.shutter.mid_exposure_ns(host_ns, exposure_ns), exposure_ns }
             }

@@ -21,13 +21,13 @@ pub(crate) struct Feed {
     camera: Option<OpenCamera>,
     last_frame_ns: i64,
     retry_ns: i64,
-    /// What was not delivered, also of a camera that is lost.
+    /// The counts of frames that were not delivered, also of a camera that is lost.
     counts: Counts,
     /// Since when there are no frames, and why.
     outage: Option<(i64, String)>,
 }
 
-/// What happened next.
+/// The next event.
 pub(crate) enum Next {
     /// A frame, to be given back.
     Frame(Taken),
@@ -43,7 +43,7 @@ impl Feed {
     /// Opens the camera.
     ///
     /// # Errors
-    /// It does not answer, or cannot do what is wanted.
+    /// It does not answer, or does not support the configuration.
     pub(crate) fn start(config: &GenicamConfig) -> anyhow::Result<Self> {
         let mut config = config.clone();
         // The same one after a loss: another one has another calibration.
@@ -64,7 +64,7 @@ impl Feed {
         })
     }
 
-    /// The next frame, or what there is instead of one. It waits briefly; while a lost camera is asked, for up to a few
+    /// The next frame, or the event instead of one. It waits briefly; while a lost camera is asked, for up to a few
     /// seconds.
     pub(crate) fn next(&mut self) -> Next {
         let Some(camera) = &mut self.camera else {
@@ -105,7 +105,7 @@ impl Feed {
         }
     }
 
-    /// What was not delivered since the last call.
+    /// The counts of frames that were not delivered since the last call.
     pub(crate) fn take_counts(&mut self) -> Counts {
         std::mem::take(&mut self.counts)
     }
@@ -115,7 +115,7 @@ impl Feed {
         let now_ns = now_ns();
         self.retry_ns = now_ns + RETRY_NS;
         let since_ns = self.outage.as_ref().map_or(now_ns, |(since_ns, _)| *since_ns);
-        // What repeats is said once.
+        // A repeated error is logged once.
         if self.outage.as_ref().is_none_or(|(_, before)| before != problem) {
             tracing::warn!(problem, "The camera is lost; it is opened again until it is back");
         }
@@ -123,7 +123,7 @@ impl Feed {
         Next::Lost(reason)
     }
 
-    /// How the camera is exposed; `None` while it is lost, and where it does not tell.
+    /// How the camera is exposed; `None` while it is lost, and where it does not report that.
     pub(crate) fn configured(&self) -> Option<Configured> {
         self.camera.as_ref()?.configured()
     }

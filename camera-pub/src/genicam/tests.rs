@@ -63,7 +63,7 @@ fn number_in(taken: &Taken) -> Option<u8> {
     is_whole.then_some(first as u8)
 }
 
-/// What was seen in a time.
+/// The frames and counts of a period.
 #[derive(Debug, Default)]
 struct Seen {
     whole: u64,
@@ -88,7 +88,7 @@ fn watch(feed: &mut Feed, time: Duration) -> Seen {
                 match number_in(&taken) {
                     Some(number) => {
                         if last.is_none() {
-                            // What is left out before the first frame is missing between no two.
+                            // Frames that were dropped before the first one are not missing between two.
                             feed.take_counts();
                         }
                         let expected = last.map(|last| (u64::from(last) + 1) % 255);
@@ -120,11 +120,11 @@ fn watch(feed: &mut Feed, time: Duration) -> Seen {
 }
 
 #[tokio::test]
-async fn every_frame_comes_whole_with_its_stamp() -> anyhow::Result<()> {
-    with_second_try(async || every_frame_is_whole()).await
+async fn every_frame_arrives_complete_with_its_stamp() -> anyhow::Result<()> {
+    with_second_try(async || every_frame_is_complete()).await
 }
 
-fn every_frame_is_whole() -> anyhow::Result<()> {
+fn every_frame_is_complete() -> anyhow::Result<()> {
     let _alone = alone();
     let _fake = fake();
     let mut feed = Feed::start(&config())?;
@@ -154,7 +154,7 @@ fn every_frame_is_whole() -> anyhow::Result<()> {
 }
 
 #[test]
-fn for_how_long_a_camera_is_exposed_is_told() {
+fn the_exposure_time_of_a_camera_is_reported() {
     let _alone = alone();
     let _fake = fake();
     let feed = Feed::start(&config()).unwrap();
@@ -162,7 +162,7 @@ fn for_how_long_a_camera_is_exposed_is_told() {
 }
 
 #[test]
-fn a_reader_who_is_too_slow_gets_the_newest_frame() {
+fn a_slow_reader_gets_the_newest_frame() {
     let _alone = alone();
     let _fake = fake();
     let mut feed = Feed::start(&config()).unwrap();
@@ -232,7 +232,7 @@ fn opening_again_and_again_leaves_nothing_open() {
 }
 
 #[test]
-fn colours_have_their_pattern_and_what_a_camera_cannot_do_is_said() {
+fn colours_have_their_pattern_and_unsupported_features_are_reported() {
     let _alone = alone();
     let _fake = fake();
     let mut feed =
@@ -249,6 +249,6 @@ fn colours_have_their_pattern_and_what_a_camera_cannot_do_is_said() {
     let size = FrameSize { width: 9000, height: 486 };
     let large = problem(GenicamConfig { size, ..config() });
     assert!(large.contains("at most [2048, 2048]"), "{large}");
-    let nobody = problem(GenicamConfig { name: "127.0.0.77".to_owned(), ..config() });
-    assert!(nobody.contains("does not answer"), "{nobody}");
+    let missing = problem(GenicamConfig { name: "127.0.0.77".to_owned(), ..config() });
+    assert!(missing.contains("does not answer"), "{missing}");
 }

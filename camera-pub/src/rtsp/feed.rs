@@ -18,9 +18,9 @@ use crate::exposure::Exposure;
 const RETRY: Duration = Duration::from_millis(500);
 /// Time without a picture after which the camera has stalled, beside three periods.
 const STALL_S: f64 = 1.0;
-/// Time of pictures that give no frame after which the reason is told, in nanoseconds.
+/// Time of pictures that give no frame after which the reason is logged, in nanoseconds.
 const FRAMELESS_NS: i64 = 5_000_000_000;
-/// Time in which a camera must tell its clock, where that is wanted, in seconds: most tell it every five.
+/// Time in which a camera must send its clock, where that is configured, in seconds: most send it every five.
 const CLOCK_S: f64 = 20.0;
 
 /// A camera's stream, open or lost.
@@ -46,15 +46,15 @@ pub(crate) struct Feed {
 #[derive(Default)]
 struct Frameless {
     since_ns: Option<i64>,
-    is_told: bool,
+    is_reported: bool,
 }
 
 impl Frameless {
-    /// Notes a picture without a frame; true where the reason is to be told, which is once.
+    /// Counts a picture without a frame; true when the reason is to be logged, which is once.
     fn add(&mut self, now_ns: i64) -> bool {
         let since_ns = *self.since_ns.get_or_insert(now_ns);
-        let is_due = now_ns - since_ns >= FRAMELESS_NS && !self.is_told;
-        self.is_told |= is_due;
+        let is_due = now_ns - since_ns >= FRAMELESS_NS && !self.is_reported;
+        self.is_reported |= is_due;
         is_due
     }
 
@@ -64,9 +64,9 @@ impl Frameless {
     }
 }
 
-/// What happened next.
+/// The next event.
 pub(crate) enum Next {
-    /// A picture and when it was taken: RTSP tells no exposure time, so that this is an estimate.
+    /// A picture and the time at which it was taken. This is an estimate, as RTSP carries no exposure time.
     Frame(Image, Exposure),
     /// A picture that is not delivered, and why.
     Dropped(&'static str),
@@ -107,10 +107,10 @@ impl Feed {
         })
     }
 
-    /// The next picture, or what there is instead of one.
+    /// The next picture, or the event instead of one.
     ///
     /// # Errors
-    /// The stamps shall be of the camera's clock, and that is another one or not told.
+    /// The stamps shall be of the camera's clock, and that differs from the host's or is not sent.
     pub(crate) async fn next(&mut self) -> anyhow::Result<Next> {
         let Some(stream) = &mut self.stream else { return Ok(self.reopen().await) };
         let stall_s = (3.0 / self.config.rate_hz.max(1e-3)).max(STALL_S);
@@ -191,7 +191,7 @@ impl Feed {
                     f64::from(self.unknown) < CLOCK_S * self.config.rate_hz,
                     "the camera sends no times of its clock (RTCP sender reports): set `source.rtsp_stamps` to \"arrival\""
                 );
-                return Ok(Next::Dropped("pictures before the camera told its clock"));
+                return Ok(Next::Dropped("pictures before the camera sent its clock"));
             }
             Stamp::NotBelieved { age_ns } => {
                 let age_s = age_ns as f64 * 1e-9;
@@ -230,7 +230,7 @@ impl Feed {
         Next::Nothing
     }
 
-    /// What repeats is said once.
+    /// A repeated error is logged once.
     fn note(&mut self, problem: String) {
         let since_ns = self.outage.as_ref().map_or_else(now_ns, |(since_ns, _)| *since_ns);
         if self.outage.as_ref().is_none_or(|(_, before)| *before != problem) {
@@ -255,16 +255,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pictures_without_a_frame_are_told_once_after_five_seconds() {
+    fn pictures_without_a_frame_are_reported_once_after_five_seconds() {
         const SECOND: i64 = 1_000_000_000;
         let mut frameless = Frameless::default();
-        let told = |frameless: &mut Frameless, from_s: i64| {
+        let reports = |frameless: &mut Frameless, from_s: i64| {
             (from_s..from_s + 10).filter(|at_s| frameless.add(at_s * SECOND)).collect::<Vec<_>>()
         };
         assert!((0..4).all(|at_s| !frameless.add(at_s * SECOND)));
         // A frame in between, as after a loss.
         frameless.end();
-        assert_eq!(told(&mut frameless, 4), [9]);
-        assert!(told(&mut frameless, 14).is_empty());
+        assert_eq!(reports(&mut frameless, 4), [9]);
+        assert!(reports(&mut frameless, 14).is_empty());
     }
 }

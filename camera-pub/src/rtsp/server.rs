@@ -29,14 +29,14 @@ const KEY_EVERY: u64 = 10;
 /// `user:password`, and the same in Base64.
 pub(super) const CREDENTIALS: [&str; 2] = ["alight:s3cret", "YWxpZ2h0OnMzY3JldA=="];
 
-/// What is streamed.
+/// The coding of the stream.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(super) enum Streamed {
     H264,
     Jpeg,
     /// A coding that is not read.
     H265,
-    /// What is pushed to it.
+    /// The stream that is pushed to it.
     Pushed,
 }
 
@@ -45,7 +45,7 @@ pub(super) enum Streamed {
 pub(super) struct Script {
     pub(super) streamed: Streamed,
     pub(super) wants_credentials: bool,
-    /// Whether it tells its clock, and by how much that is ahead, in nanoseconds.
+    /// How far its clock is ahead, in nanoseconds; `None` where it does not send its clock.
     pub(super) clock_ahead_ns: Option<i64>,
     /// One of so many packets is lost; 0: none.
     pub(super) lose_every: u64,
@@ -117,7 +117,7 @@ impl Camera {
         self.shared.taken.lock().unwrap()[number as usize]
     }
 
-    /// Unplugs the camera, or plugs it in again: who calls then finds nobody.
+    /// Unplugs the camera, or plugs it in again: connections are refused meanwhile.
     pub(super) fn switch(&self, is_off: bool) {
         self.shared.is_off.store(is_off, Ordering::SeqCst);
     }
@@ -140,7 +140,7 @@ impl Drop for Camera {
 async fn accept(shared: Arc<Shared>, listener: TcpListener) {
     while let Ok((stream, _)) = listener.accept().await {
         let shared = Arc::clone(&shared);
-        // Who is gone needs no answer.
+        // A client that is gone needs no answer.
         tokio::spawn(async move { serve(&shared, stream).await.unwrap_or_default() });
     }
 }
@@ -182,7 +182,7 @@ async fn serve(shared: &Arc<Shared>, stream: TcpStream) -> std::io::Result<()> {
         let method = request.split(' ').next().unwrap_or_default();
         shared.requests.lock().unwrap().push(method.to_owned());
         let mut answer = "RTSP/1.0 200 OK\r\n".to_owned();
-        let mut told = String::new();
+        let mut body_text = String::new();
         let is_allowed = !shared.script.wants_credentials
             || header("Authorization") == Some(&format!("Basic {}", CREDENTIALS[1]));
         match method {
@@ -196,7 +196,7 @@ async fn serve(shared: &Arc<Shared>, stream: TcpStream) -> std::io::Result<()> {
             }
             "ANNOUNCE" => *shared.pushed.lock().unwrap() = String::from_utf8(body).ok(),
             "DESCRIBE" => {
-                told = description(shared);
+                body_text = description(shared);
                 answer.push_str("Content-Type: application/sdp\r\n");
             }
             "SETUP" => {
@@ -209,7 +209,12 @@ async fn serve(shared: &Arc<Shared>, stream: TcpStream) -> std::io::Result<()> {
             _ => answer.push_str("Session: 7\r\n"),
         }
         let sequence = header("CSeq").unwrap_or_default();
-        write!(answer, "CSeq: {sequence}\r\nContent-Length: {}\r\n\r\n{told}", told.len()).unwrap();
+        write!(
+            answer,
+            "CSeq: {sequence}\r\nContent-Length: {}\r\n\r\n{body_text}",
+            body_text.len()
+        )
+        .unwrap();
         write.write_all(answer.as_bytes()).await?;
         if method == "PLAY" && is_allowed {
             return play(shared, write).await;

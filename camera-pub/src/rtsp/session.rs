@@ -71,7 +71,7 @@ pub(super) struct SenderReport {
 /// A stream that is open.
 pub(super) struct OpenStream {
     pub(super) coding: Coding,
-    /// The newest ones: whoever is too slow for them misses the oldest.
+    /// The newest ones: a slow reader misses the oldest.
     pictures: broadcast::Receiver<Result<Picture, String>>,
     missed: u64,
     reader: JoinHandle<()>,
@@ -208,7 +208,7 @@ fn credentials(path: &Path) -> anyhow::Result<Credentials> {
     );
     let mut text = String::new();
     file.take(MAX_CREDENTIALS).read_to_string(&mut text).with_context(cause)?;
-    // What is wrong with them is not told with them.
+    // Errors do not contain the credentials.
     let (username, password) =
         text.trim_end_matches(['\r', '\n']).split_once(':').with_context(|| {
             format!("{path:?} of `source.rtsp_credentials` has no line of the form user:password")

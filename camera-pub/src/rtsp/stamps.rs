@@ -17,7 +17,7 @@ pub(super) struct StreamStamps {
     /// Time from the middle of the exposure to the instant that is stamped.
     delay_ns: i64,
     quickest: CameraClock,
-    /// From the instant that the camera's clock told to the quickest arrival.
+    /// From the instant that the camera's clock stamped to the quickest arrival.
     way_ns: Option<i64>,
 }
 
@@ -26,7 +26,7 @@ pub(super) struct StreamStamps {
 pub(super) enum Stamp {
     /// In nanoseconds of the host's clock.
     At(i64),
-    /// The camera has not told its clock yet.
+    /// The camera has not sent its clock yet.
     Unknown,
     /// The camera's clock is another one: by it a picture is so old when it arrives.
     NotBelieved {
@@ -99,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn without_the_cameras_clock_the_quickest_picture_tells_the_stamps() {
+    fn without_the_cameras_clock_the_quickest_picture_gives_the_stamps() {
         let mut stamps = StreamStamps::new(RtspStamps::Arrival, 84 * MS);
         for number in 0..200 {
             let (taken_ns, times) = times(number, 0);

@@ -28,7 +28,7 @@ fn config(camera: &Camera) -> RtspConfig {
     }
 }
 
-/// What the feed tells until so many frames have come.
+/// The output of the feed until so many frames have come.
 #[derive(Default)]
 struct Seen {
     /// Grey levels, width, and stamp.
@@ -73,7 +73,7 @@ fn number(pixels: &[u8], near: u64) -> u64 {
     (near..near + 400).find(is).expect("no picture that was sent looks like this")
 }
 
-/// The error of each frame's stamp, in nanoseconds, from the `skipped`th frame on; pictures are told apart by their pixels.
+/// The error of each frame's stamp, in nanoseconds, from the `skipped`th frame on; pictures are identified by their pixels.
 fn errors(camera: &Camera, seen: &Seen, skipped: usize) -> Vec<i64> {
     let mut before = 0;
     let mut errors = Vec::new();
@@ -93,7 +93,7 @@ async fn pictures_are_those_that_were_sent_and_stamped_when_they_were_taken() {
     let seen = see(&mut feed, 100).await;
     let mut errors = errors(&camera, &seen, 20);
     errors.sort_unstable();
-    // The quickest tells them all; a loaded machine may be late with each.
+    // The quickest gives all stamps; a loaded machine may be late with each.
     assert!(errors[errors.len() / 2].abs() <= MS, "{errors:?}");
     assert!(seen.lost.is_empty(), "{:?}", seen.lost);
     assert!(feed.decoding() > Duration::ZERO);
@@ -106,7 +106,7 @@ async fn stamps_of_the_cameras_clock_are_exact_to_a_tenth_of_a_millisecond() {
     let stamps = RtspConfig { stamps: RtspStamps::Camera, delay_ns: 0, ..config(&camera) };
     let mut feed = Feed::start(&stamps).await.unwrap();
     let seen = see(&mut feed, 60).await;
-    assert!(seen.dropped.contains(&"pictures before the camera told its clock"));
+    assert!(seen.dropped.contains(&"pictures before the camera sent its clock"));
     let errors = errors(&camera, &seen, 0);
     // 90 kHz is 11 microseconds; between two calls of the clocks a loaded machine may do something else.
     let exact = errors.iter().filter(|error| error.abs() <= 50_000).count();
@@ -115,7 +115,7 @@ async fn stamps_of_the_cameras_clock_are_exact_to_a_tenth_of_a_millisecond() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_camera_whose_clock_is_wrong_or_not_told_is_refused_with_the_reason() {
+async fn a_camera_whose_clock_is_wrong_or_not_sent_is_refused_with_the_reason() {
     for (clock_ahead_ns, part) in
         [(Some(-3600 * 1000 * MS), "3600.0 s old"), (None, "sender reports")]
     {
@@ -162,7 +162,7 @@ async fn motion_jpeg_is_read() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_reader_who_is_too_slow_for_motion_jpeg_gets_the_newest_picture() {
+async fn a_slow_reader_of_motion_jpeg_gets_the_newest_picture() {
     let camera = Camera::play(Script::of(Streamed::Jpeg)).await;
     let mut feed = Feed::start(&config(&camera)).await.unwrap();
     let mut ages_ns = Vec::new();
@@ -183,7 +183,7 @@ async fn lost_packets_cost_pictures_until_the_next_key_frame_and_tear_none() {
     let camera = Camera::play(script).await;
     let mut feed = Feed::start(&config(&camera)).await.unwrap();
     let seen = see(&mut feed, 100).await;
-    // `errors` panics for a picture that nobody sent.
+    // `errors` panics for a picture that was not sent.
     assert_eq!(errors(&camera, &seen, 0).len(), 100);
     assert!(seen.dropped.len() > 10, "{:?}", seen.dropped);
 }
@@ -216,7 +216,7 @@ async fn a_camera_that_is_gone_or_says_nothing_is_back_within_two_seconds() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn pictures_of_another_size_are_told_as_such() {
+async fn pictures_of_another_size_are_delivered_with_their_size() {
     let script = Script { wide: 20..40, ..Script::of(Streamed::H264) };
     let camera = Camera::play(script).await;
     let mut feed = Feed::start(&config(&camera)).await.unwrap();
@@ -227,7 +227,7 @@ async fn pictures_of_another_size_are_told_as_such() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn credentials_are_sent_and_never_told() {
+async fn credentials_are_sent_and_never_shown() {
     let script = Script { wants_credentials: true, ..Script::of(Streamed::H264) };
     let camera = Camera::play(script).await;
     let refused = |config: RtspConfig| async move {
@@ -263,8 +263,8 @@ async fn a_stream_that_cannot_be_read_is_refused_with_the_reason() {
     let camera = Camera::play(Script::of(Streamed::H265)).await;
     let problem = format!("{:#}", Feed::start(&config(&camera)).await.err().unwrap());
     assert!(problem.contains("its video is H265") && problem.contains("H.264"), "{problem}");
-    let nobody = RtspConfig { url: "rtsp://127.0.0.1:9/main".to_owned(), ..config(&camera) };
-    let problem = format!("{:#}", Feed::start(&nobody).await.err().unwrap());
+    let closed = RtspConfig { url: "rtsp://127.0.0.1:9/main".to_owned(), ..config(&camera) };
+    let problem = format!("{:#}", Feed::start(&closed).await.err().unwrap());
     assert!(problem.contains("cannot be opened"), "{problem}");
     assert_eq!(camera.requests(), ["DESCRIBE"]);
 }
@@ -280,7 +280,7 @@ fn ffmpeg(arguments: &[&str]) -> Command {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_ffmpeg_streams_is_what_ffmpeg_shows() {
+async fn pictures_of_an_ffmpeg_stream_equal_those_that_ffmpeg_decodes() {
     if !testing::has_x264() {
         return;
     }

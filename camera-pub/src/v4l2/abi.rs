@@ -1,5 +1,4 @@
-//! What crosses the border to the kernel: structures, numbers and flags of `linux/videodev2.h`, as they are on 64-bit
-//! machines.
+//! Defines the kernel's interface: structures, numbers and flags of `linux/videodev2.h`, as they are on 64-bit machines.
 //!
 //! Names are the kernel's, without `v4l2_`. A test compares sizes, offsets and numbers with the C compiler's.
 
@@ -309,19 +308,19 @@ pub(crate) trait Device {
     /// Makes an ioctl.
     ///
     /// # Errors
-    /// What the driver answers, as `errno`.
+    /// The driver's error, as `errno`.
     fn call(&self, call: Call<'_>) -> io::Result<()>;
 
     /// Maps the buffer that [`Call::QueryBuf`] described.
     ///
     /// # Errors
-    /// What the kernel answers.
+    /// The kernel's error.
     fn map(&self, buffer: &Buffer) -> io::Result<Self::Mapping>;
 
     /// Waits until a buffer can be taken back, or an error is there to be read; false after `timeout`.
     ///
     /// # Errors
-    /// What the kernel answers.
+    /// The kernel's error.
     fn wait(&self, timeout: Duration) -> io::Result<bool>;
 
     /// The host's clock, on which drivers stamp.

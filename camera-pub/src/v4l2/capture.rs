@@ -41,7 +41,7 @@ const UVC: &str = "uvcvideo";
 /// Change of the exposure time from which on stamps are not exact while it comes into force.
 const MAX_UNSURE_NS: u32 = 1_000_000;
 
-/// What a device is opened for.
+/// The format, rate and controls that are requested of a device.
 #[derive(Clone, Debug)]
 pub(crate) struct Wanted {
     pub(crate) fourcc: String,
@@ -52,7 +52,7 @@ pub(crate) struct Wanted {
     pub(crate) controls: Vec<ControlValue>,
     /// For an exposure that follows the marker.
     pub(crate) for_marker: Option<ForMarker>,
-    /// What stamps are of, where it is configured; else what the driver says.
+    /// The instant of the stamps, where it is configured; else the driver's flags decide.
     pub(crate) stamped_at: Option<StampedAt>,
     pub(crate) readout_ns: i64,
     /// Time from mid-exposure to arrival, for drivers that do not stamp on the host's clock.
@@ -75,7 +75,7 @@ pub(crate) enum Lost {
     /// It gives no frames.
     #[error("it gave no frame for {0:.1?}")]
     Stalled(Duration),
-    /// Nothing of what it gave could be read.
+    /// None of its frames could be read.
     #[error("its frames could not be read for {0:.1?}: they are damaged, or no JPEG files")]
     Unreadable(Duration),
     /// Its frames are others than those that were agreed on.
@@ -90,7 +90,7 @@ pub(crate) enum Lost {
         /// Time from the last stamp to the frame's arrival.
         before_arrival_s: f64,
     },
-    /// It does not do what is configured.
+    /// It does not support the configuration.
     #[error("{0}")]
     Refused(String),
     /// It is another camera than the one that is waited for.
@@ -99,14 +99,14 @@ pub(crate) enum Lost {
     /// It failed in another way.
     #[error("{call}: {cause}")]
     Failed {
-        /// What was called.
+        /// The system call.
         call: &'static str,
-        /// What it answered.
+        /// Its error.
         cause: io::Error,
     },
 }
 
-/// What happened between frames.
+/// The counts of events between frames.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Counts {
     /// Frames that the driver could not store, by the gaps of its numbers.
@@ -151,7 +151,7 @@ pub(crate) struct Capture<D: Device> {
     rows: Rows,
     rate_hz: f64,
     stamped_at: Option<StampedAt>,
-    /// What stamps are of that the driver calls the start of a frame.
+    /// The instant of stamps that the driver flags as the start of a frame.
     start: StampedAt,
     readout_ns: i64,
     delay_ns: i64,
@@ -185,7 +185,7 @@ impl<D: Device> Capture<D> {
     /// Opens the device for frames as wanted, and starts them, where it is a camera that is accepted.
     ///
     /// # Errors
-    /// It is no camera or none that is accepted, cannot do what is wanted, or fails.
+    /// It is not a camera or not an accepted one, does not support the configuration, or fails.
     pub(crate) fn start(
         device: D,
         wanted: &Wanted,
@@ -241,7 +241,7 @@ impl<D: Device> Capture<D> {
             refusal: None,
             counts: Counts::default(),
         };
-        // From here on `drop` gives back what there is.
+        // From here on `drop` releases the buffers.
         capture.request_buffers()?;
         match capture.device.call(Call::StreamOn) {
             Err(cause) if cause.raw_os_error() == Some(libc::ENOSPC) => {
@@ -315,7 +315,7 @@ impl<D: Device> Capture<D> {
         self.refusal.as_ref()
     }
 
-    /// How the device is exposed where the exposure does not follow the marker; `None` as long as it does not tell.
+    /// How the device is exposed where the exposure does not follow the marker; `None` as long as it does not report that.
     pub(crate) fn configured(&self) -> Option<Configured> {
         match self.exposure_ns {
             0 => self.says_metering.then_some(Configured::Metering),
@@ -323,7 +323,7 @@ impl<D: Device> Capture<D> {
         }
     }
 
-    /// What happened since the last call.
+    /// The counts since the last call.
     pub(crate) fn take_counts(&mut self) -> Counts {
         std::mem::take(&mut self.counts)
     }
@@ -346,17 +346,17 @@ impl<D: Device> Capture<D> {
         Ok(())
     }
 
-    /// Takes the newest whole frame; `None` when there is none within `timeout`, or only damaged ones.
+    /// Takes the newest complete frame; `None` when there is none within `timeout`, or only damaged ones.
     ///
     /// # Errors
-    /// The device is gone, or what it gives is not what was agreed on.
+    /// The device is gone, or its frames differ from the negotiated format.
     pub(crate) fn take(&mut self, timeout: Duration) -> Result<Option<Taken>, Lost> {
         let mut newest: Option<Buffer> = None;
-        // Whoever takes longer than a period for a frame would else be given the oldest, which wait until all buffers are full.
+        // A reader that needs more than a period for a frame would otherwise get the oldest, after all buffers have filled.
         for taken in 0..self.buffers.len() {
             let timeout = if taken == 0 { timeout } else { Duration::ZERO };
             let Some(buffer) = self.dequeue(timeout)? else { break };
-            let refused = if self.is_whole(&buffer)? {
+            let refused = if self.is_complete(&buffer)? {
                 let older = newest.replace(buffer);
                 self.counts.queued += u64::from(older.is_some());
                 older
@@ -398,18 +398,18 @@ impl<D: Device> Capture<D> {
     }
 
     /// Whether a buffer has all of a frame.
-    fn is_whole(&mut self, buffer: &Buffer) -> Result<bool, Lost> {
+    fn is_complete(&mut self, buffer: &Buffer) -> Result<bool, Lost> {
         if buffer.flags & BUF_FLAG_ERROR != 0 {
             self.counts.damaged += 1;
             return Ok(false);
         }
         let mapped = self.buffers.get(buffer.index as usize).map_or(0, Mapping::len);
         let bytes = buffer.bytesused as usize;
-        let is_whole = match self.rows.pixels {
+        let is_complete = match self.rows.pixels {
             Pixels::Mjpeg => (1..=mapped).contains(&bytes),
             _ => (self.rows.min_bytes()..=mapped).contains(&bytes),
         };
-        if is_whole {
+        if is_complete {
             self.cut_in_a_row = 0;
             return Ok(true);
         }
@@ -424,14 +424,14 @@ impl<D: Device> Capture<D> {
 
     fn exposure(&mut self, buffer: &Buffer, arrival_ns: i64) -> Result<Exposure, Lost> {
         let by_arrival = Exposure::estimated(arrival_ns - self.delay_ns);
-        // Also where the driver stamps on no clock of the host: how the device is exposed is told all the same.
+        // Also where the driver's stamps are of no clock of the host: the exposure is published nevertheless.
         if arrival_ns.saturating_sub(self.exposure_read_ns) > EXPOSURE_READ_NS {
             self.read_exposure();
             self.exposure_read_ns = arrival_ns;
         }
         let Some((stamp_ns, shutter)) = self.stamp(buffer) else { return Ok(by_arrival) };
         let unsure_ns = self.exposer.as_ref().map_or(0, Exposer::unsure_ns);
-        // Half of what is open is the stamp's error.
+        // Half of the uncertainty is the stamp's error.
         let is_known = unsure_ns < MAX_UNSURE_NS;
         let exposure_ns = if is_known { self.exposure_ns } else { 0 };
         let delay_ns = arrival_ns.saturating_sub(stamp_ns);
@@ -451,7 +451,7 @@ impl<D: Device> Capture<D> {
         Ok(Exposure { mid_ns: shutter.mid_exposure_ns(stamp_ns, exposure_ns), exposure_ns })
     }
 
-    /// The driver's stamp and what it is of; `None` where it does not say that it is of the host's clock.
+    /// The driver's stamp and its instant; `None` where it is not flagged as of the host's clock.
     fn stamp(&self, buffer: &Buffer) -> Option<(i64, Shutter)> {
         if buffer.flags & BUF_FLAG_TIMESTAMP_MASK != BUF_FLAG_TIMESTAMP_MONOTONIC {
             return None;
@@ -468,7 +468,7 @@ impl<D: Device> Capture<D> {
         Some((stamp_ns, Shutter { stamped_at, readout_ns: self.readout_ns }))
     }
 
-    /// When a frame had been read from the sensor; `None` where its stamp does not tell.
+    /// When a frame had been read from the sensor; `None` where its stamp does not give that.
     fn read_ns(&self, buffer: &Buffer) -> Option<i64> {
         let (stamp_ns, shutter) = self.stamp(buffer)?;
         let delay_ns = self.device.now_ns().saturating_sub(stamp_ns);
@@ -476,8 +476,8 @@ impl<D: Device> Capture<D> {
         is_possible.then(|| stamp_ns.saturating_add(shutter.until_read_ns(self.exposure_ns)))
     }
 
-    /// Reads the exposure time; 0 while the camera meters by itself, as it does not say then what it chose for which frame, and
-    /// where it does not say whether it meters.
+    /// Reads the exposure time; 0 while the camera meters on its own, as its choice for a frame is unknown then, and where the
+    /// driver does not report whether it meters.
     fn read_exposure(&mut self) {
         let auto = control_value(&self.device, CID_EXPOSURE_AUTO);
         self.says_metering = matches!(auto, Ok(Some(auto)) if auto != EXPOSURE_MANUAL);
@@ -504,7 +504,10 @@ impl<D: Device> Capture<D> {
     ///
     /// # Errors
     /// The device is gone.
-    #[expect(clippy::needless_pass_by_value, reason = "what is given back cannot be read any more")]
+    #[expect(
+        clippy::needless_pass_by_value,
+        reason = "a buffer that is given back cannot be read any more"
+    )]
     pub(crate) fn give_back(&mut self, taken: Taken) -> Result<(), Lost> {
         self.queue(taken.index)
     }
@@ -515,7 +518,7 @@ impl<D: Device> Capture<D> {
 }
 
 impl Lost {
-    /// What it is counted as.
+    /// The name under which it is counted.
     pub(crate) fn reason(&self) -> &'static str {
         match self {
             Self::Unplugged => "camera unplugged",
@@ -524,7 +527,7 @@ impl Lost {
             Self::FormatChanged(_) => "camera's format changed",
             Self::ForeignClock { .. } => "camera's stamps of another clock",
             Self::Another(_) => "another camera",
-            Self::Refused(_) => "camera refused what is configured",
+            Self::Refused(_) => "camera refused the configuration",
             Self::Failed { .. } => "camera failed",
         }
     }
@@ -544,7 +547,7 @@ impl<D: Device> Drop for Capture<D> {
     }
 }
 
-/// The error of a call; that of a device that is gone is told apart.
+/// The error of a call; that of a device that is gone is distinguished.
 fn failed<T>(call: &'static str, result: io::Result<T>) -> Result<T, Lost> {
     result.map_err(|cause| match cause.raw_os_error() {
         Some(libc::ENODEV | libc::ENXIO) => Lost::Unplugged,
@@ -580,7 +583,7 @@ fn set_format(device: &impl Device, wanted: &Wanted) -> Result<Rows, Lost> {
     if ![FIELD_NONE, FIELD_ANY].contains(&pix.field) {
         let field = pix.field;
         return Err(Lost::Refused(format!(
-            "its frames are interlaced (field {field} of VIDIOC_S_FMT), which tears what moves: read it by `source.command` with \
+            "its frames are interlaced (field {field} of VIDIOC_S_FMT), which tears moving objects: read it by `source.command` with \
              ffmpeg, deinterlaced (`-vf yadif`)"
         )));
     }

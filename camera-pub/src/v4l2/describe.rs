@@ -1,4 +1,4 @@
-//! What a device offers: its name, pixel formats, sizes, rates and controls.
+//! Lists a device's name, pixel formats, sizes, rates and controls.
 
 use std::io;
 
@@ -77,7 +77,7 @@ pub struct ControlDescription {
     pub(crate) is_writable: bool,
 }
 
-/// Asks a device what it offers.
+/// Queries a device's capabilities.
 ///
 /// # Errors
 /// It is no video device, or is gone.
@@ -107,7 +107,7 @@ pub(crate) fn is_multi_planar(capability: &Capability) -> bool {
     caps(capability) & CAP_VIDEO_CAPTURE_MPLANE != 0 && !is_camera(capability)
 }
 
-/// What a node can do, where the driver tells that; else what all nodes of its device can.
+/// The capabilities of a node, where the driver reports them; else those of all nodes of its device.
 fn caps(capability: &Capability) -> u32 {
     let has_own = capability.capabilities & CAP_DEVICE_CAPS != 0;
     if has_own { capability.device_caps } else { capability.capabilities }

@@ -29,7 +29,7 @@ pub(crate) struct ForMarker {
     pub(crate) settle_frames: u32,
 }
 
-/// What to do with a device's exposure.
+/// An order for a device's exposure.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) enum Order {
     Keep,
@@ -40,14 +40,14 @@ pub(crate) enum Order {
     Set(Setting),
 }
 
-/// The controls, and what they are set to.
+/// The controls and their values.
 pub(crate) struct Exposer {
     wanted: ForMarker,
     /// The value of the metering's control with which the camera meters; `None` where it never does.
     metering: Option<i32>,
     exposure: Range,
     gain: Option<Gain>,
-    /// Whether the camera certainly meters by itself: what another program or an earlier start has set, it keeps.
+    /// Whether the camera certainly meters on its own: it keeps settings of another program or an earlier start.
     is_metering: bool,
     /// The gain's value before it was set here.
     own_gain: Option<i32>,
@@ -122,7 +122,7 @@ impl Exposer {
         })
     }
 
-    /// What it can be set to.
+    /// The range of its values.
     pub(crate) fn limits(&self) -> Limits {
         let min_exposure_s = f64::from(self.exposure.min.max(1)) * UNIT_S;
         let max_exposure_s = f64::from(self.exposure.max) * UNIT_S;
@@ -146,7 +146,7 @@ impl Exposer {
         self.setting.filter(|_| !self.is_settling())
     }
 
-    /// What was set last; `None` while the camera's exposure is not set here.
+    /// The last setting; `None` while the camera's exposure is not set here.
     pub(crate) fn ordered(&self) -> Option<Setting> {
         self.setting
     }
@@ -173,7 +173,7 @@ impl Exposer {
     /// Carries out an order, and returns the exposure time that is set by it, in nanoseconds.
     ///
     /// # Errors
-    /// What the device answers.
+    /// The device's error.
     pub(crate) fn follow(
         &mut self,
         device: &impl Device,
@@ -209,7 +209,7 @@ impl Exposer {
                 let exposure_s = f64::from(exposure.max(1)) * UNIT_S;
                 let taken = self.set(device, Setting { exposure_s, gain: gain.unwrap_or(1.0) });
                 if taken.is_err() {
-                    // Neither would set it then. What this answers says no more than the first refusal.
+                    // Neither would set it then. This answer adds nothing to the first refusal.
                     drop(self.follow(device, Order::OwnMetering));
                 }
                 taken.map(Some)
@@ -253,7 +253,7 @@ impl Exposer {
         if let Some((id, value)) = control {
             set(device, id, value)?;
         }
-        // What the camera had chosen before is not known.
+        // The camera's choice before is not known.
         let change = |before: Setting| ((exposure_s - before.exposure_s).abs() * 1e9) as u32;
         self.changed_ns = self.setting.map_or(u32::MAX, change);
         self.setting = Some(next);

@@ -1,10 +1,9 @@
-//! A V4L2 device as uvcvideo shows one, played for tests with a clock, formats, controls, buffers and faults of its
-//! own.
+//! Simulates a V4L2 device of uvcvideo for tests, with its own clock, formats, controls, buffers and faults.
 //!
 //! Its answers are those that users of real cameras recorded: capabilities, and JPEG without bytes per line, of
 //! pikvm/ustreamer issue 2 (uvcvideo, PTZ Pro Camera); sizes and intervals, listed twice, of PhotonVision/photonvision
-//! issue 1219 (OV9281); exposure in 100 us from 1 to 2500 and its metering 0 to 3 of copyleftdev/facecam-ubuntu. What
-//! the calls may do is the kernel's documentation (userspace-api/media/v4l): the nearest size is set, DQBUF answers
+//! issue 1219 (OV9281); exposure in 100 us from 1 to 2500 and its metering 0 to 3 of copyleftdev/facecam-ubuntu. The
+//! calls behave as in the kernel's documentation (userspace-api/media/v4l): the nearest size is set, DQBUF answers
 //! EAGAIN without a frame and ENODEV without a device, and no buffers are freed that are mapped.
 
 use std::cell::{Cell, RefCell};
@@ -36,7 +35,7 @@ const DELIVERY_NS: i64 = 4 * MS;
 pub(crate) const GAIN: u32 = 0x0098_0913;
 const SIZES: [(u32, u32); 3] = [(1280, 720), (640, 480), (320, 240)];
 
-/// What the driver's stamps are of.
+/// The instant of the driver's stamps.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) enum Stamps {
     ExposureStart,
@@ -47,7 +46,7 @@ pub(crate) enum Stamps {
     Unknown,
 }
 
-/// What is odd about a camera.
+/// The quirk of a camera.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Oddity {
     /// Its frames are of two fields.
@@ -64,7 +63,7 @@ pub(crate) struct Exposed {
     pub(crate) gain: f64,
 }
 
-/// What happens at a frame.
+/// The event at a frame.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) enum Happening {
     Damaged,
@@ -90,7 +89,7 @@ pub(crate) struct Fake {
     away_until_ns: Cell<i64>,
     script: RefCell<Vec<(u32, Happening)>>,
     is_metering: Cell<bool>,
-    /// What its controls are set to.
+    /// The values of its controls.
     exposure: Cell<i32>,
     gain: Cell<i32>,
     /// From which frames on they are in force.
@@ -102,13 +101,13 @@ pub(crate) struct Fake {
     /// Where it is plugged in, and whether its path is a link.
     bus: Cell<[u8; 20]>,
     is_linked: Cell<bool>,
-    /// What is at other numbers.
-    beside: RefCell<Vec<Rc<Self>>>,
+    /// The devices at other numbers.
+    others: RefCell<Vec<Rc<Self>>>,
     /// The control that it does not set.
     refused: Cell<Option<u32>>,
     /// Whether it sets no gain while it meters.
     chooses_gain: Cell<bool>,
-    /// The control that it does not tell.
+    /// The control whose value it does not return.
     hidden: Cell<Option<u32>>,
     /// How many frames it still gives while it is held, in which no time passes without one; `None` while it is not.
     frames_left: Cell<Option<u32>>,
@@ -179,7 +178,7 @@ impl Fake {
             oddity: Cell::new(None),
             bus: Cell::new(*b"usb-0000:0e:00.0-2.4"),
             is_linked: Cell::new(false),
-            beside: RefCell::default(),
+            others: RefCell::default(),
             refused: Cell::new(None),
             chooses_gain: Cell::new(false),
             hidden: Cell::new(None),
@@ -238,7 +237,7 @@ impl Fake {
         chooses || self.refused.get() == Some(control)
     }
 
-    /// Fails to tell this control from now on, or none.
+    /// Fails to return the value of this control from now on, or of none.
     pub(crate) fn hide(&self, control: Option<u32>) {
         self.hidden.set(control);
     }
@@ -289,7 +288,7 @@ impl Fake {
 
     /// Puts another camera at another number.
     pub(crate) fn put_beside(&self, other: &Rc<Self>) {
-        self.beside.borrow_mut().push(Rc::clone(other));
+        self.others.borrow_mut().push(Rc::clone(other));
     }
 
     /// Gives it a path that is a link.
@@ -360,7 +359,7 @@ impl Port for Rc<Fake> {
     }
 
     fn others(&self) -> Vec<Self> {
-        self.beside.borrow().clone()
+        self.others.borrow().clone()
     }
 
     fn name(&self) -> String {
@@ -663,7 +662,7 @@ impl FakeDevice {
     }
 }
 
-/// What a frame's number is in JPEG, which changes single pixels.
+/// A frame's number after JPEG compression, which changes single pixels.
 pub(crate) fn grey_level(number: u32) -> u8 {
     (number % 24) as u8 * 10
 }

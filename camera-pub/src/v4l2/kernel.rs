@@ -31,7 +31,7 @@ impl KernelDevice {
     /// Opens `/dev/video0` and its like.
     ///
     /// # Errors
-    /// What the kernel answers.
+    /// The kernel's error.
     pub(crate) fn open(path: &Path) -> io::Result<Self> {
         let mut options = OpenOptions::new();
         // A read or DQBUF without a frame must not block: `wait` does, with a bound.
@@ -173,7 +173,7 @@ impl Mapping for KernelMapping {
 
 impl Drop for KernelMapping {
     fn drop(&mut self) {
-        // SAFETY: what was mapped by `map`, once; no slice of it outlives `self`.
+        // SAFETY: this memory was mapped by `map`, once; no slice of it outlives `self`.
         unsafe { libc::munmap(self.start.as_ptr().cast(), self.len) };
     }
 }
@@ -184,7 +184,7 @@ mod tests {
     use crate::v4l2::abi::Capability;
 
     #[test]
-    fn a_device_that_is_no_camera_is_told_by_its_answer() {
+    fn a_device_other_than_a_camera_is_recognised_by_its_answer() {
         let device = KernelDevice::open(Path::new("/dev/null")).unwrap();
         let answer = device.call(Call::QueryCap(&mut Capability::default()));
         assert_eq!(answer.unwrap_err().raw_os_error(), Some(libc::ENOTTY));

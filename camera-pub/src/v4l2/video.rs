@@ -16,7 +16,7 @@ const STALL_NS: i64 = 1_000_000_000;
 
 /// Where a camera is opened.
 pub(crate) trait Port: Sized {
-    /// What it opens.
+    /// The type of device that it opens.
     type Device: Device;
 
     /// Opens the device.
@@ -31,7 +31,7 @@ pub(crate) trait Port: Sized {
     /// The devices of all other numbers.
     fn others(&self) -> Vec<Self>;
 
-    /// What a message calls it.
+    /// Its name in messages.
     fn name(&self) -> String;
 
     /// The host's clock.
@@ -58,7 +58,7 @@ struct Outage {
     problem: String,
 }
 
-/// What happened next.
+/// The next event.
 pub(crate) enum Next {
     /// A frame, to be given back.
     Frame(Taken),
@@ -74,7 +74,7 @@ impl<P: Port> Video<P> {
     /// Opens the camera.
     ///
     /// # Errors
-    /// It is not there, or cannot do what is wanted.
+    /// It is not there, or does not support the configuration.
     pub(crate) fn start(port: P, wanted: Wanted) -> Result<Self, Lost> {
         let capture = open(&port, &wanted, None)?;
         let now_ns = port.now_ns();
@@ -100,7 +100,7 @@ impl<P: Port> Video<P> {
         self.capture.as_mut()
     }
 
-    /// The next frame, or what there is instead of one.
+    /// The next frame, or the event instead of one.
     ///
     /// # Errors
     /// The camera's stamps have been of another clock from the start.
@@ -142,7 +142,7 @@ impl<P: Port> Video<P> {
         self.retry_ns = now_ns + RETRY_NS;
         let problem = lost.to_string();
         let since_ns = self.outage.as_ref().map_or(now_ns, |outage| outage.since_ns);
-        // What repeats is said once.
+        // A repeated error is logged once.
         if self.outage.as_ref().is_none_or(|outage| outage.problem != problem) {
             tracing::warn!(problem, "The camera is lost; it is opened again until it is back");
         }
@@ -180,7 +180,7 @@ impl<P: Port> Video<P> {
             port.open().is_ok_and(|device| Identity::of(&device).as_ref() == Some(&self.identity))
         };
         let mut found = self.port.others().into_iter().filter(is_it);
-        // Several cameras of one device cannot be told apart.
+        // Several cameras of one device cannot be distinguished.
         let (Some(port), None) = (found.next(), found.next()) else { return None };
         let opened = open(&port, &self.wanted, Some(&self.identity));
         if opened.is_ok() {
@@ -244,7 +244,7 @@ mod tests {
         }
     }
 
-    /// What was seen of a run.
+    /// The frames and counts of a run.
     #[derive(Default)]
     struct Seen {
         frames: u64,
@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn how_it_is_exposed_is_told_also_of_a_driver_that_stamps_on_no_clock() {
+    fn the_exposure_is_reported_also_for_a_driver_whose_stamps_are_of_no_clock() {
         for stamps in [Stamps::ExposureStart, Stamps::Unknown] {
             let fake = Fake::of("GREY", stamps, 0);
             let mut video = Video::start(Rc::clone(&fake), wanted(&fake)).unwrap();
@@ -472,7 +472,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_reader_gets_the_newest_frame_that_is_whole() {
+    fn a_slow_reader_gets_the_newest_complete_frame() {
         let fake = Fake::of("GREY", Stamps::ExposureStart, 0);
         (1..2000).step_by(2).for_each(|number| fake.script(number, Happening::Damaged));
         let mut video = Video::start(Rc::clone(&fake), wanted(&fake)).unwrap();
@@ -523,7 +523,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_device_cannot_do_is_refused_with_what_it_can() {
+    fn unsupported_settings_are_refused_with_the_supported_ones() {
         use crate::v4l2::capture::ControlValue;
         let problem = |wanted: Wanted| {
             let fake = Fake::of("MJPG", Stamps::ExposureStart, 0);
