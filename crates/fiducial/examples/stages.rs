@@ -1,4 +1,4 @@
-//! Writes what each stage of the two ring detectors makes of an image, for comparison with other libraries, and
+//! Writes the result of each stage of the two ring detectors for an image, for comparison with other libraries, and
 //! prints how long each stage takes: `cargo run --release -p fiducial --example stages -- IMAGE FOLDER`.
 #![allow(clippy::print_stdout, reason = "a program for people at a terminal")]
 

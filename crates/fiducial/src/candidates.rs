@@ -1,4 +1,4 @@
-//! Where in an image a marker may be.
+//! Finds the regions of an image where a marker may be.
 
 pub(crate) mod ellipses;
 pub(crate) mod evidence;

@@ -1,4 +1,4 @@
-//! Which codeword a candidate carries.
+//! Decodes the codeword of a candidate.
 
 pub(crate) mod cells;
 pub(crate) mod erasures;

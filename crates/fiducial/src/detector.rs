@@ -22,14 +22,16 @@ pub enum DetectorError {
     #[error("a detector needs at least one marker to look for")]
     NoMarker,
     /// Two markers that look the same.
-    #[error("the marker `{name}` is listed twice; one image cannot tell two sizes of it apart")]
+    #[error(
+        "the marker `{name}` is listed twice; two sizes of it cannot be distinguished in one image"
+    )]
     Twice {
         /// The marker's name.
         name: String,
     },
     /// Two markers of one print, in two sizes.
     #[error(
-        "the markers `{marker}` and `{other}` are one print; one image cannot tell two sizes of it apart"
+        "the markers `{marker}` and `{other}` are one print; two sizes of it cannot be distinguished in one image"
     )]
     LookAlike {
         /// The marker.
@@ -138,7 +140,7 @@ impl Detector {
         self.detect_with(view, camera, schedule, stages)
     }
 
-    /// Tells where markers that are followed should be in the next image: there a part of one is enough.
+    /// Sets where tracked markers should be in the next image: there a part of a marker is enough.
     pub(crate) fn follow(&mut self, markers: impl Iterator<Item = Prediction>) {
         const MAX_FOLLOWED: usize = 16;
         self.followed.clear();
@@ -146,7 +148,7 @@ impl Detector {
         self.followed.extend(markers.take(MAX_FOLLOWED));
     }
 
-    /// Ends what [`Detector::follow`] began: images that come next are searched as single ones.
+    /// Ends the mode of [`Detector::follow`]: the next images are searched as single ones.
     pub(crate) fn follow_none(&mut self) {
         self.followed.clear();
     }

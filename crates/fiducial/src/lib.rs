@@ -1,15 +1,15 @@
 //! Detects markers and estimates their pose.
 //!
-//! This crate knows images as borrowed grey views and cameras as models. It knows no network, no file, no
-//! clock and no thread; a [`StageObserver`] can time the stages of a detection.
+//! This crate reads images as borrowed grey views and cameras as models. It does not depend on network, files, a
+//! clock or threads; a [`StageObserver`] can time the stages of a detection.
 //!
-//! What a marker is stands in the crate `markers`. Modules in the order of the data: `optics` is what camera
-//! and lens do to a marker, `candidates` where one may be, `decode` which codeword a candidate carries,
-//! [`refine`] its corners to a fraction of a pixel, [`pose`] its pose; [`families`] has a detector for each
-//! kind of marker, [`schedule`] says which fallback passes an image gets, [`detector`] runs them,
+//! The crate `markers` defines markers. Modules in the order of the data: `optics` models the effect of camera and
+//! lens on a marker, `candidates` finds regions that may be markers, `decode` reads a candidate's codeword,
+//! [`refine`] measures its corners to a fraction of a pixel, [`pose`] its pose; [`families`] has a detector for each
+//! kind of marker, [`schedule`] chooses the fallback passes of an image, [`detector`] runs them,
 //! [`observation`] is their result. [`tracker`] searches first where the markers of the last images should be,
 //! and remembers their camera's [`response`]; [`bundle`] solves the markers of one pad together. [`trace`]
-//! tells why candidates were refused, [`overlay`] draws that on the image.
+//! records why candidates were refused, [`overlay`] draws that on the image.
 
 pub mod bundle;
 mod candidates;

@@ -28,13 +28,13 @@ pub struct Observation {
     pub confidence: f64,
     /// Its pose, when its size and the camera are known.
     pub pose: Option<MarkerPose>,
-    /// How the camera shows light, where the marker told it.
+    /// The camera's response to light, where the marker gave it.
     pub response: Option<ResponseEstimate>,
 }
 
 impl Observation {
-    /// An observation in a region of interest, in pixels of the whole frame. What binned pixels tell of how the camera shows light,
-    /// as its sharpening, is not so of the frame's.
+    /// Converts an observation in a region of interest to pixels of the complete frame. The response estimated from binned
+    /// pixels, such as the sharpening, is dropped: the frame's pixels have another one.
     pub fn mapped(&self, roi: &Roi) -> Self {
         let mut seen = self.clone();
         seen.centre = roi.to_frame(seen.centre);
@@ -93,8 +93,8 @@ mod tests {
     use crate::response::Measured;
 
     #[test]
-    fn binned_pixels_do_not_tell_the_cameras_response() {
-        let told = Measured { value: 0.5, deviation: 0.1 };
+    fn binned_pixels_do_not_give_the_cameras_response() {
+        let measured = Measured { value: 0.5, deviation: 0.1 };
         let seen = Observation {
             family: Family::Rings,
             id: None,
@@ -105,7 +105,7 @@ mod tests {
             size_px: 30.0,
             confidence: 1.0,
             pose: None,
-            response: Some(ResponseEstimate { curve: told, sharpening: told }),
+            response: Some(ResponseEstimate { curve: measured, sharpening: measured }),
         };
         let cropped = seen.mapped(&Roi::cropped(5.0, 5.0, 40, 40));
         assert!(cropped.response.is_some());

@@ -1,4 +1,4 @@
-//! What a camera and its lens do to an edge, and the numerics that fit a model to pixels.
+//! Models the effect of a camera and its lens on an edge, and has the numerics that fit a model to pixels.
 
 pub(crate) mod camera_response;
 pub(crate) mod edge_response;

@@ -1,4 +1,4 @@
-//! Draws what a detection saw on the image: [`debug`] the marks, on a [`canvas`], with the letters of a [`font`].
+//! Draws the stages of a detection on the image: [`debug`] the marks, on a [`canvas`], with the letters of a [`font`].
 
 pub mod canvas;
 pub mod debug;

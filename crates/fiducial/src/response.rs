@@ -1,8 +1,8 @@
-//! The tone curve and the sharpening of a camera, estimated from the markers of the last images with their deviations, or fixed
-//! by a setting.
+//! Estimates the tone curve and the sharpening of a camera with their deviations from the markers of the last images; a setting
+//! can fix them.
 //!
-//! Every marker tells the tone curve and the sharpening of the camera that shows it, a small one badly. Those of a stream are the
-//! same camera's, so the mean of the last markers is what the next fit starts from, held to it as strongly as they agreed.
+//! Every marker gives the tone curve and the sharpening of the camera that shows it, a small one badly. Those of a stream are the
+//! same camera's, so the next fit starts from the mean of the last markers, constrained to it as strongly as they agreed.
 
 use std::fmt;
 use std::str::FromStr;
@@ -29,12 +29,12 @@ pub struct Measured {
 }
 
 impl Measured {
-    /// What a measurement tells by itself, that was held to `known` while it was made; `None` where it tells no more than that.
+    /// The information of a measurement without the prior `known` of its fit; `None` where it adds nothing to the prior.
     pub(crate) fn without(self, known: Option<Self>) -> Option<Self> {
         let Some(known) = known else { return Some(self) };
         let [all, before] = [self, known].map(|it| it.deviation.powi(-2));
         let own = all - before;
-        // A tenth of what was known is lost in rounding and in the choice of pixels.
+        // A tenth of the prior is lost in rounding and in the choice of pixels.
         (own > 0.1 * before && own.is_finite()).then(|| Self {
             value: (self.value * all - known.value * before) / own,
             deviation: own.powf(-0.5),
@@ -112,7 +112,7 @@ impl fmt::Display for ResponseEstimate {
     }
 }
 
-/// The response that the last markers told.
+/// The response estimated from the last markers.
 #[derive(Copy, Clone, Debug, Default)]
 pub struct ResponseMemory {
     curve: Running,
@@ -124,19 +124,19 @@ pub struct ResponseMemory {
 const MIN_MARKERS: u32 = 5;
 
 impl ResponseMemory {
-    /// Adds what a marker told.
-    pub fn add(&mut self, told: &ResponseEstimate) {
-        self.curve.add(told.curve);
-        self.sharpening.add(told.sharpening);
+    /// Adds a marker's estimate.
+    pub fn add(&mut self, estimate: &ResponseEstimate) {
+        self.curve.add(estimate.curve);
+        self.sharpening.add(estimate.sharpening);
         self.markers = self.markers.saturating_add(1);
     }
 
-    /// The number of markers that told it.
+    /// The number of markers from which it is estimated.
     pub fn markers(&self) -> u32 {
         self.markers
     }
 
-    /// What the next marker is expected to tell, with the deviation from marker to marker; `None` after too few.
+    /// The expected estimate of the next marker, with the deviation from marker to marker; `None` after too few.
     pub fn known(&self) -> Option<ResponseEstimate> {
         if self.markers < MIN_MARKERS {
             return None;
@@ -163,14 +163,14 @@ impl Running {
     /// The model is only that good: exposures and blurs differ.
     const MIN_DEVIATION: f64 = 0.05;
 
-    fn add(&mut self, told: Measured) {
-        let variance = told.deviation.powi(2) + Self::MIN_DEVIATION.powi(2);
-        if !(told.value.is_finite() && variance.is_finite()) {
+    fn add(&mut self, measured: Measured) {
+        let variance = measured.deviation.powi(2) + Self::MIN_DEVIATION.powi(2);
+        if !(measured.value.is_finite() && variance.is_finite()) {
             return;
         }
         let weight = Self::MIN_DEVIATION.powi(2) / variance;
         let kept = self.weight * (1.0 - weight / Self::MEMORY);
-        let off = told.value - self.mean;
+        let off = measured.value - self.mean;
         let share = weight / (kept + weight);
         if self.weight > 0.0 {
             self.square += share * (off * off - self.square);
@@ -191,7 +191,7 @@ impl Running {
 mod tests {
     use super::*;
 
-    fn told(curve: f64, deviation: f64) -> ResponseEstimate {
+    fn estimate(curve: f64, deviation: f64) -> ResponseEstimate {
         ResponseEstimate {
             curve: Measured { value: curve, deviation },
             sharpening: Measured { value: 0.5, deviation },
@@ -202,41 +202,41 @@ mod tests {
     fn the_mean_of_good_measurements_is_kept_and_bad_ones_hardly_move_it() {
         let mut memory = ResponseMemory::default();
         for k in 0..4 {
-            memory.add(&told(1.0 + 0.02 * f64::from(k % 2), 0.03));
+            memory.add(&estimate(1.0 + 0.02 * f64::from(k % 2), 0.03));
             assert_eq!(memory.known(), None, "after {k}");
         }
         for k in 0..30 {
-            memory.add(&told(1.0 + 0.02 * f64::from(k % 2), 0.03));
+            memory.add(&estimate(1.0 + 0.02 * f64::from(k % 2), 0.03));
         }
         let known = memory.known().unwrap().curve;
         assert!((known.value - 1.01).abs() < 0.01 && (0.04..0.07).contains(&known.deviation));
-        memory.add(&told(3.0, 1.0));
+        memory.add(&estimate(3.0, 1.0));
         let after = memory.known().unwrap().curve;
         assert!((after.value - known.value).abs() < 0.01, "{after:?}");
-        memory.add(&told(f64::NAN, 0.1));
+        memory.add(&estimate(f64::NAN, 0.1));
         assert!(memory.known().unwrap().curve.value.is_finite());
     }
 
     #[test]
-    fn another_camera_is_learnt_and_the_change_is_told_by_the_deviation() {
+    fn another_camera_is_learnt_and_the_change_widens_the_deviation() {
         let mut memory = ResponseMemory::default();
         for _ in 0..100 {
-            memory.add(&told(0.2, 0.03));
+            memory.add(&estimate(0.2, 0.03));
         }
         for _ in 0..10 {
-            memory.add(&told(1.2, 0.03));
+            memory.add(&estimate(1.2, 0.03));
         }
         let changing = memory.known().unwrap().curve;
         assert!(changing.deviation > 0.2, "{changing:?}");
         for _ in 0..400 {
-            memory.add(&told(1.2, 0.03));
+            memory.add(&estimate(1.2, 0.03));
         }
         let learnt = memory.known().unwrap().curve;
         assert!((learnt.value - 1.2).abs() < 0.02 && learnt.deviation < 0.12, "{learnt:?}");
     }
 
     #[test]
-    fn what_was_known_before_is_taken_out_of_a_measurement() {
+    fn the_prior_is_removed_from_a_measurement() {
         let known = Measured { value: 1.0, deviation: 0.2 };
         // The mean of 1.0 and 2.0, both with 0.2.
         let both = Measured { value: 1.5, deviation: 0.2 / 2f64.sqrt() };

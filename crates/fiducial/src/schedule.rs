@@ -1,9 +1,9 @@
-//! Which fallback passes an image gets, and in which order.
+//! Chooses the fallback passes for an image, and their order.
 //!
 //! Fallback passes find markers that are occluded, cut by the frame, or far away; each takes about as long as the rest of
 //! a detection. They run in images in which nothing else was found. In a stream of images without markers they take turns,
 //! one in each image, in the order of [`FallbackPass::ALL`]; in one image the one for a shadow's edge is the first, as the others
-//! place what they find there less well, and they run in the order of `FallbackStep::ALL`.
+//! locate markers there less exactly, and they run in the order of `FallbackStep::ALL`.
 //!
 //! | pass | finds | families |
 //! |---|---|---|
@@ -97,7 +97,7 @@ pub(crate) enum FallbackStep {
     QuietZones,
     /// Segments for families to which quiet zones are quicker.
     LateSegments,
-    /// The last one: what was made of the image itself is lost to it.
+    /// The last one: it overwrites the data of the image itself.
     Brightened,
 }
 
@@ -159,7 +159,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_schedule_allows_what_it_was_made_of() {
+    fn a_schedule_allows_the_passes_it_was_made_of() {
         for pass in FallbackPass::ALL {
             let only = PassSchedule::only(pass);
             for other in FallbackPass::ALL {

@@ -107,7 +107,7 @@ impl Reason {
 }
 
 impl Trace {
-    /// Reserves what textured images need.
+    /// Reserves memory for textured images.
     pub(crate) fn make_room(&mut self) {
         const CAPACITY: usize = 1024;
         self.ellipses.reserve(CAPACITY);

@@ -105,8 +105,8 @@ const MARGIN: f64 = 0.25;
 /// Lower bound of a prediction's uncertainty: the sum of a part in pixels and a part in units of the marker's size.
 const MIN_UNCERTAINTY_PX: f64 = 4.0;
 const MIN_UNCERTAINTY_RATIO: f64 = 0.1;
-/// Regions begin and end at multiples of this, in pixels, so that what is computed by tiles, such as thresholds, has the tiles that
-/// it has in the whole image.
+/// Regions begin and end at multiples of this, in pixels. Values that are computed by tiles, such as thresholds, then have the
+/// same tiles as in the whole image.
 const TILE: usize = 16;
 /// Largest share of the image that regions may cover; above it the whole image is searched.
 const MAX_COVERED: f64 = 0.4;
@@ -174,13 +174,13 @@ impl Tracker {
         }
         detector.follow_none();
         self.update_tracks(time_s);
-        for told in self.found.iter().filter_map(|seen| seen.response.as_ref()) {
-            self.response.add(told);
+        for estimate in self.found.iter().filter_map(|seen| seen.response.as_ref()) {
+            self.response.add(estimate);
         }
         &self.found
     }
 
-    /// How the camera shows light, as the markers in its images told.
+    /// The camera's response to light, as estimated from the markers in its images.
     pub fn response(&self) -> &ResponseMemory {
         &self.response
     }
@@ -634,7 +634,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn whatever_is_found_regions_lie_in_the_image_and_apart(
+        fn regions_are_in_the_image_and_disjoint_for_any_detections(
             places in prop::collection::vec((any::<f64>(), any::<f64>(), any::<f64>(), 0_u32..3), 0..40),
             near in prop::collection::vec((0.0..1300.0, 0.0..1000.0, 1.0..200.0, 0_u32..3), 0..40),
             expected in prop::collection::vec((any::<f64>(), -50.0..1400.0, any::<f64>()), 0..30),

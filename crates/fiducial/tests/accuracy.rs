@@ -1,7 +1,7 @@
 //! Centre and range of the three-ring marker in renderings of the thesis' camera at both binnings against truth, range by range,
 //! and against the stated covariances.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
-#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+#![allow(clippy::print_stdout, reason = "the tests print their figures")]
 
 mod render;
 
@@ -11,7 +11,7 @@ use render::{SIZE_M, Scene};
 
 const RANGES_M: [f64; 8] = [0.3, 0.6, 1.0, 2.0, 4.0, 7.0, 10.0, 13.0];
 
-/// What came of the frames at one range.
+/// The results of the frames at one range.
 #[derive(Default)]
 struct Row {
     frames: usize,

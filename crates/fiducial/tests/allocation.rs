@@ -1,6 +1,6 @@
-//! Memory: a few frames' worth at first, and nothing for any frame after the first, whatever is in it.
+//! Checks the memory: a few frames' worth at first, and nothing for any frame after the first, with any content.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
-#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+#![allow(clippy::print_stdout, reason = "the tests print their figures")]
 
 use allocation_counter::{AllocationInfo, measure};
 use fiducial::{Detector, Settings};
@@ -9,7 +9,7 @@ use imaging::GrayView;
 use markers::Marker;
 use rendering::views::{Binning, MARKERS, TestScene, View};
 
-/// What a detector may allocate at first, in frames.
+/// The limit of a detector's first allocation, in frames.
 const MAX_FRAMES: f64 = 8.0;
 
 /// A marker on painted asphalt, from several heights; and tiles, among whose joints there are as many quads as are

@@ -1,7 +1,7 @@
 //! The pose of a pad of several markers in rendered pictures with truth, from 15 m to a hand's breadth, with markers
 //! turned, missing or wrong.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
-#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+#![allow(clippy::print_stdout, reason = "the tests print their figures")]
 
 use fiducial::{Detector, Observation, PadObservation, Settings, observe_pad};
 use geometry::{
@@ -64,7 +64,7 @@ impl Over {
         Self { pad, camera, detector, renderer, settings, ned_from_pad, pixels }
     }
 
-    /// What is found from a place above the pad (metres north, east and up of its landing point), and the pad's pose in
+    /// The markers found from a position above the pad (metres north, east and up of its landing point), and the pad's pose in
     /// truth.
     fn look(
         &mut self,
@@ -225,7 +225,7 @@ fn a_false_marker_among_several_is_left_out_wherever_it_is() {
 }
 
 #[test]
-fn the_landing_point_may_be_beyond_what_the_lens_model_reaches() {
+fn the_landing_point_may_be_beyond_the_range_of_the_lens_model() {
     let pad = "id = 1\nmarkers = [{ marker = \"aruco-4x4-50:2:0.08\", x_m = 0.6 }]";
     let mut over = Over::new(pad.parse().unwrap());
     let at = over.ned_from_pad * Point::new(0.6, 0.0, 0.0);

@@ -1,7 +1,7 @@
 //! The three-ring marker in hard rendered images, from 7 cm to 30 m: cut, tilted, dim, blurred, in shadow,
 //! through a lens, covered, inverted; and rings of others that are no marker.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop anywhere")]
-#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+#![allow(clippy::print_stdout, reason = "the tests print their figures")]
 
 mod render;
 
@@ -27,7 +27,7 @@ fn find(image: &GrayImage, camera: &CameraModel) -> Option<Observation> {
     found
 }
 
-/// Asserts that the marker is found within these bounds; returns what was found.
+/// Asserts that the marker is found within these bounds; returns the observation.
 fn expect(
     name: &str,
     scene: &Scene,
@@ -40,7 +40,7 @@ fn expect(
     marker
 }
 
-/// Asserts that what was found is within these bounds.
+/// Asserts that the observation is within these bounds.
 fn check(name: &str, scene: &Scene, marker: &Observation, centre_px: f64, range_percent: f64) {
     let pose = marker.pose.as_ref().unwrap();
     let range_m = pose.camera_from_marker.origin().coords.coords.norm();

@@ -1,7 +1,7 @@
 //! Rings, square markers and STags in frames with tone curve, sharpening and JPEG, also under the edge of a shadow: how many
 //! are found, their errors, and the estimated response.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
-#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+#![allow(clippy::print_stdout, reason = "the tests print their figures")]
 
 use fiducial::{
     Detector, FallbackPass, Observation, PassSchedule, Settings, Tracker, TrackingSettings,
@@ -16,7 +16,7 @@ use rendering::{PadInScene, Preset, Processing, Renderer, Scene, Surface};
 
 const SHARPEN: Sharpen = Sharpen { radius_px: 1.0, amount: 0.8, limit_levels: 255.0 };
 
-/// What cameras do, one by one and together.
+/// The steps of cameras' processing, one by one and together.
 fn kinds() -> [(&'static str, Processing); 4] {
     let linear = Processing::LINEAR;
     let curve = Processing { tone: ToneCurve::Srgb, ..linear };
@@ -25,7 +25,7 @@ fn kinds() -> [(&'static str, Processing); 4] {
     [("linear", linear), ("tone curve", curve), ("sharpened", sharp), ("all and JPEG", all)]
 }
 
-/// Frames, and what came of them.
+/// Frames and their results.
 #[derive(Default)]
 struct Errors {
     frames: usize,
@@ -352,7 +352,7 @@ fn a_weak_tone_curve_does_not_change_the_range_of_a_stag() {
     errors.expect("weak tone curve", 0, [0.01, 0.02], [0.03, 0.1]);
 }
 
-/// What many markers told of a camera's response holds the next ones, and makes none of them worse.
+/// The camera's response estimated from many markers constrains the next fits, and makes none of them worse.
 #[test]
 fn the_response_of_a_camera_is_remembered_in_a_stream() {
     let camera = Binning::FourByFour.camera();
@@ -374,7 +374,7 @@ fn the_response_of_a_camera_is_remembered_in_a_stream() {
                     (camera.project(place).unwrap(), place.coords.coords.norm());
                 let found =
                     tracker.detect(&mut in_stream, view, Some(&camera), time_s, &mut ()).to_vec();
-                // The first half of the stream is what it learns from.
+                // It learns from the first half of the stream.
                 if index >= 30 {
                     remembered.note(&found, centre, range_m);
                     one_by_one.note(alone.detect(view, Some(&camera), &mut ()), centre, range_m);
@@ -384,7 +384,7 @@ fn the_response_of_a_camera_is_remembered_in_a_stream() {
             println!("{name}, {preset}: {known:?}");
             // Of the farthest some are not read.
             one_by_one.expect(&format!("{name}, {preset}, alone"), 3, [0.03, 0.3], [0.2, 0.8]);
-            // Nearer by both are off by what the model of the processing lacks.
+            // Nearer, both are off by the error of the processing's model.
             let [median, _] = Errors::shares(&mut one_by_one.range_percent);
             let max = [(1.5 * median).max(0.1), 0.8];
             remembered.expect(&format!("{name}, {preset}, remembered"), 3, [0.03, 0.3], max);

@@ -1,6 +1,6 @@
-//! How well the corners of square markers are found in pictures whose every edge is known.
+//! Measures the errors of the corners of square markers in pictures whose every edge is known.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
-#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+#![allow(clippy::print_stdout, reason = "the tests print their figures")]
 
 mod scene;
 
@@ -92,7 +92,7 @@ fn corners_are_found_to_a_hundredth_of_a_pixel() {
     }
 }
 
-/// Of a marker that is larger than the image, what is put together of pieces is off by tens of pixels outside of it.
+/// Corners of a marker larger than the image that are joined from pieces are off by tens of pixels outside of it.
 #[test]
 fn corners_outside_of_the_image_are_found_from_far_off() {
     let mut scratch = Scratch::default();

@@ -19,7 +19,7 @@ fn is_white(code: &SquareCode, id: usize, border: usize, [x, y]: [f64; 2]) -> bo
     code.codewords[id] >> (code.bits.len() - 1 - bit) & 1 == 1
 }
 
-/// An image of `size` pixels of what is at each place, each pixel the mean of a box of `blur` pixels.
+/// An image of `size` pixels of the level at each point, each pixel the mean of a box of `blur` pixels.
 fn picture(size: [usize; 2], blur: f64, grey: impl Fn([f64; 2]) -> f64) -> GrayImage {
     const PLACES: usize = 6;
     let mut image = GrayImage::filled(size[0], size[1], 0);
@@ -124,7 +124,7 @@ fn a_drawing_without_noise_and_blur_has_a_pose_and_a_covariance_that_is_sane() {
         let range_m = focal_px * size_m / (8.0 * cell_px);
         let off_m = pose.camera_from_marker.origin().z() - range_m;
         let deviation_m = pose.covariance[(2, 2)].sqrt();
-        assert!(off_m.abs() < 3.0 * deviation_m, "{name}: {off_m} m, {deviation_m} m told");
+        assert!(off_m.abs() < 3.0 * deviation_m, "{name}: {off_m} m, {deviation_m} m stated");
     }
 }
 
@@ -156,7 +156,7 @@ fn where_a_drawing_is_in_whole_pixels_its_covariance_says_so() {
         let pose = found[0].pose.unwrap();
         let off_m = pose.camera_from_marker.origin().z() - focal_px * size_m / (8.0 * cell_px);
         let variance_m2 = pose.covariance[(2, 2)];
-        assert!(off_m * off_m < 9.0 * variance_m2, "{name}: {off_m} m, {variance_m2} m2 told");
+        assert!(off_m * off_m < 9.0 * variance_m2, "{name}: {off_m} m, {variance_m2} m2 stated");
     }
 }
 
@@ -353,7 +353,7 @@ fn markers_in_the_other_colours_can_be_left_out() {
 }
 
 #[test]
-fn a_small_marker_beside_a_large_one_is_found_by_who_is_thorough() {
+fn a_small_marker_next_to_a_large_one_is_found_by_a_thorough_search() {
     let marker = "rings:1".parse().unwrap();
     let drawing = markers::Drawing::new(&marker, 1.0).unwrap();
     let places = [([150.3, 130.7], 200.0), ([310.6, 80.2], 40.0)];

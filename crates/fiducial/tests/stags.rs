@@ -12,7 +12,7 @@ const SIDE: usize = 72;
 const LARGE: usize = 192;
 
 /// A marker's drawing with its square `side_px` wide, turned about a point near the middle of the image: every pixel is the
-/// mean of what it and half of its neighbours cover, with noise of two grey levels.
+/// mean of the area that it and half of its neighbours cover, with noise of two grey levels.
 struct Shot {
     drawing: Drawing,
     side_px: f64,
@@ -39,7 +39,7 @@ impl Shot {
         self.seen(SIDE, |_, light| light)
     }
 
-    /// An image of `size` pixels both ways; `veil` says what becomes of the light of a place, which is given in sides of the
+    /// An image of `size` pixels both ways; `veil` changes the light of a point, which is given in sides of the
     /// marker from its middle, right and down.
     fn seen(&self, size: usize, veil: impl Fn([f64; 2], f64) -> f64) -> Vec<u8> {
         const SAMPLES: usize = 4;

@@ -1,4 +1,4 @@
-//! Following a marker through rendered frames finds what searching whole frames finds.
+//! Compares tracking a marker through rendered frames with searches of whole frames.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 
 mod render;
@@ -24,7 +24,7 @@ fn frames(camera: CameraModel) -> Vec<(Option<Scene>, GrayImage)> {
     (0..24).map(frame).collect()
 }
 
-/// Counts the searches, by what a search always tells first.
+/// Counts the searches by the stage that each search reports first.
 #[derive(Default)]
 struct Stages {
     first: Option<&'static str>,
@@ -114,7 +114,7 @@ impl fiducial::StageObserver for SlowPasses {
 }
 
 #[test]
-fn what_takes_long_is_done_in_turn_until_a_damaged_marker_is_found() {
+fn slow_passes_take_turns_until_a_damaged_marker_is_found() {
     let camera = CameraModel::pinhole(648, 486, 909.0);
     let markers = [
         format!("rings:{SIZE_M}"),

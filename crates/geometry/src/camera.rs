@@ -81,9 +81,8 @@ impl CameraModel {
         }
     }
 
-    /// The pixel at which a point appears; `None` for a point behind the camera or beyond what the lens model
-    /// describes: further off axis than where its pixels turn back towards the middle. The pixel may lie outside the
-    /// image.
+    /// The pixel at which a point appears; `None` for a point behind the camera or beyond the range of the
+    /// lens model: further off axis than where its pixels turn back towards the centre. The pixel may lie outside the image.
     pub fn project(&self, point: Point<Camera>) -> Option<Pixel> {
         if !point.is_finite() || point.z() <= 1e-9 {
             return None;
@@ -253,7 +252,7 @@ impl Distortion {
         slopes
     }
 
-    /// From distorted to ideal normalised coordinates; `None` for what nothing within the model's reach gives.
+    /// From distorted to ideal normalised coordinates; `None` for coordinates outside the model's range.
     fn undistort(&self, u: f64, v: f64) -> Option<(f64, f64)> {
         let (x, y) = match *self {
             Self::None => (u, v),

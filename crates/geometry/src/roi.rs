@@ -3,7 +3,7 @@
 use crate::camera::{CameraModel, Pixel};
 
 /// A region of interest: a rectangle of a frame, maybe scaled down. It is the image of a camera at the same place and in the
-/// same orientation, so poses in it are those of the frame; only what is in pixels is mapped.
+/// same orientation, so poses in it are those of the frame; only values in pixels are mapped.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Roi {
     /// The frame's pixel at the centre of the region's first pixel.

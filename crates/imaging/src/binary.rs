@@ -26,7 +26,7 @@ impl BitImage {
         self.words.resize(stride * (height + 2) + 1, 0);
     }
 
-    /// Reserves what images of this size need.
+    /// Reserves memory for images of this size.
     pub(crate) fn make_room(&mut self, width: usize, height: usize) {
         let words = ((width + 1).div_ceil(64) + 1) * (height + 2) + 1;
         self.words.reserve(words.saturating_sub(self.words.len()));
@@ -95,7 +95,7 @@ pub enum Middle {
     Ratio,
 }
 
-/// What is dark and what is bright.
+/// The dark and the bright pixels.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Contrast {
     /// The threshold.
@@ -124,7 +124,7 @@ pub struct Binarizer {
 }
 
 impl Binarizer {
-    /// Reserves what images of this size need.
+    /// Reserves memory for images of this size.
     pub(crate) fn make_room(&mut self, width: usize, height: usize) {
         fn reserve<T>(list: &mut Vec<T>, count: usize) {
             list.reserve(count.saturating_sub(list.len()));

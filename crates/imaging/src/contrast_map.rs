@@ -1,4 +1,4 @@
-//! Where an image has contrast between places as wide as markers' parts: a texture of dots and blades averages out there, paper
+//! Maps where an image has contrast between regions as wide as markers' parts: a texture of dots and blades averages out there, paper
 //! and ink do not.
 
 use crate::binary::spread;
@@ -23,7 +23,7 @@ pub struct ContrastMap {
 }
 
 impl ContrastMap {
-    /// Reserves what images of this size need.
+    /// Reserves memory for images of this size.
     pub fn make_room(&mut self, view: GrayView<'_>) {
         let count = (view.width() >> LEVEL) * (view.height() >> LEVEL);
         for list in [&mut self.percent, &mut self.low, &mut self.high] {

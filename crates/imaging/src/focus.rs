@@ -1,4 +1,4 @@
-//! How sharp an image is, whatever it shows.
+//! Measures how sharp an image is, with any content.
 
 use crate::GrayView;
 
@@ -15,7 +15,7 @@ const MAX_NOISE: f64 = 1.5;
 const MAX_AVERAGED: usize = 16;
 /// Median of the absolute second difference of normal noise, in its standard deviations.
 const SECOND_DIFFERENCE: f64 = 1.652;
-/// The part of the edges that is narrower: a picture also shows what is soft, or lies askew to rows and columns.
+/// The part of the edges that is narrower: a picture also shows soft edges, and edges oblique to rows and columns.
 const NARROW: f64 = 0.1;
 
 /// The width of an image's narrow edges in pixels: contrast by steepest slope, the first decile over rows and columns. A step

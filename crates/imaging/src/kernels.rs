@@ -85,8 +85,8 @@ pub(crate) fn above(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
     below(thresholds, pixels, words);
 }
 
-/// Does some work, with the loops of what is inlined into it compiled for AVX2 where the processor has it (for NEON all code
-/// is compiled where the target has it). It is the same code, and none of its arithmetic is fused, so the result is the same.
+/// Runs `work`, with the loops of all inlined code compiled for AVX2 where the processor has it (for NEON all code is compiled
+/// where the target has it). The code is the same, and none of its arithmetic is fused, so the result is the same.
 #[inline]
 pub fn with_vectors<T>(work: impl FnOnce() -> T) -> T {
     #[cfg(target_arch = "x86_64")]
@@ -459,7 +459,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn vectors_give_what_plain_rust_gives(
+        fn vectors_give_the_results_of_plain_rust(
             (width, bytes) in (1_usize..700).prop_flat_map(|w| (Just(w), prop::collection::vec(any::<u8>(), w * 4))),
         ) {
             let rows: [&[u8]; 4] = [0, 1, 2, 3].map(|i| &bytes[i * width..][..width]);

@@ -124,7 +124,7 @@ impl Outlines {
         self.points.clear();
         self.spans.clear();
         self.pyramid.build(view, MAX_LEVELS, MIN_EDGE_PX);
-        // What textures need; a frame with more makes the buffers grow.
+        // Enough for textures; a frame with more makes the buffers grow.
         let (width, height) = (view.width(), view.height());
         let pixels = width * height;
         self.points.reserve(pixels / POINTS_EVERY);

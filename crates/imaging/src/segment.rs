@@ -74,7 +74,7 @@ pub struct Segments {
 }
 
 impl Segments {
-    /// Reserves what a textured image of this size needs.
+    /// Reserves memory for a textured image of this size.
     pub fn make_room(&mut self, width: usize, height: usize) {
         fn reserve<T>(list: &mut Vec<T>, count: usize) {
             list.reserve(count.saturating_sub(list.len()));

@@ -125,7 +125,7 @@ impl Board {
         Some([[left, top], [right, top], [right, bottom], [left, bottom]])
     }
 
-    /// What is printed, the board's middle at the origin.
+    /// The print, with the board's centre at the origin.
     pub fn drawing(&self) -> Drawing {
         let size_m = self.size_m();
         let half_extent_m = size_m[0].max(size_m[1]) / 2.0 + self.tag_m / 8.0;

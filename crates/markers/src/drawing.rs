@@ -1,4 +1,4 @@
-//! What a marker looks like: layers of shapes in the marker's plane.
+//! Draws a marker as layers of shapes in the marker's plane.
 //!
 //! A family's drawing is that of its reference implementation: the bitmaps of AprilTag and OpenCV cell by cell (white
 //! where AprilTag's pictures are transparent), STag as its marker generator paints it, without the id in letters.
@@ -60,7 +60,7 @@ pub struct Drawing {
 }
 
 impl Marker {
-    /// Whether the print of two markers of one size is the same, by whatever names: small ArUco dictionaries are the beginnings
+    /// Whether the print of two markers of one size is the same, also under two names: small ArUco dictionaries are the beginnings
     /// of large ones.
     pub fn looks_like(&self, other: &Self) -> bool {
         let drawing = |marker: &Self| Drawing::new(marker, 1.0);
@@ -72,7 +72,7 @@ impl Marker {
 }
 
 impl Drawing {
-    /// The drawing of `marker` at `size_m`, whatever size the marker itself states; `None` when the family has ids and
+    /// The drawing of `marker` at `size_m`, independent of the size that the marker itself states; `None` when the family has ids and
     /// this is none of them.
     pub fn new(marker: &Marker, size_m: f64) -> Option<Self> {
         match (marker.family, marker.id) {

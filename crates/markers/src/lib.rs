@@ -1,11 +1,11 @@
-//! What a marker is: its family, its code and what is printed.
+//! Defines markers: family, code and print.
 //!
-//! This crate knows no image, no camera, no file and no clock; how a marker is found is not known here.
+//! This crate does not depend on images, cameras, files or a clock, nor on how a marker is found.
 //!
 //! Modules in reading order: [`marker`] names a marker by family, id and size; `tables` reads the codewords of the
 //! families from `data/*.bin`, [`codebook`] finds the codeword nearest to one that was read; [`square_code`] has the
 //! cells of square markers, [`stag_code`] the dots of STags, [`ring_design`] the radii of the three rings; [`drawing`]
-//! is what is printed, [`pad`] several markers in known positions on one sheet, [`board`] rows of tags to calibrate with.
+//! draws the print, [`pad`] is several markers in known positions on one sheet, [`board`] rows of tags to calibrate with.
 
 pub mod board;
 pub mod codebook;

@@ -151,7 +151,7 @@ impl Family {
 }
 
 impl Family {
-    /// What a person should know before this family is used, as a sentence; nothing of most.
+    /// A caution for users of this family, as a sentence; `None` for most.
     pub fn caution(self) -> Option<&'static str> {
         match self {
             Self::RingsThesis => Some(
@@ -169,7 +169,7 @@ impl fmt::Display for Family {
     }
 }
 
-/// One marker: what is printed, and how large.
+/// One marker: its print and its size.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Marker {
     /// Its family.
@@ -199,7 +199,7 @@ pub enum MarkerError {
     Id {
         /// The whole text.
         text: String,
-        /// What is wrong with the id.
+        /// The error of the id.
         problem: String,
     },
     /// A size that is not a number within the limits.
@@ -304,7 +304,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_marker_reads_back_what_it_prints() {
+    fn a_marker_parses_its_own_name() {
         for text in [
             "rings",
             "rings:0.15341",
@@ -327,7 +327,7 @@ mod tests {
     }
 
     #[test]
-    fn the_family_for_comparison_is_told_as_such() {
+    fn only_the_family_for_comparison_has_a_caution() {
         let cautions = Family::ALL.map(Family::caution);
         assert_eq!(cautions.iter().flatten().count(), 1);
         let caution = Family::RingsThesis.caution().unwrap();
@@ -348,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_markers_say_what_is_wrong() {
+    fn invalid_markers_are_refused_with_the_reason() {
         let problem = |text: &str| text.parse::<Marker>().unwrap_err().to_string();
         assert!(problem("ring").contains("known are apriltag-16h5, "));
         assert!(problem("rings:zero").contains("`zero` is not a number of metres"));

@@ -10,7 +10,7 @@
 //! marker = "apriltag-36h11:3:0.15"
 //! x_m = -0.1
 //! y_m = 0.0
-//! quarter_turns = 0       # counter-clockwise, as seen by who reads the sheet
+//! quarter_turns = 0       # counter-clockwise, as seen by a reader of the sheet
 //! ```
 
 use std::ops::RangeInclusive;
@@ -61,7 +61,7 @@ pub enum PadError {
     Described {
         /// The file's name.
         name: String,
-        /// What is wrong.
+        /// The error.
         problem: Box<PadError>,
     },
     /// Not TOML, or not a description of a pad.
@@ -86,7 +86,7 @@ pub enum PadError {
         number: usize,
         /// Its text.
         text: String,
-        /// What is wrong with it.
+        /// Its error.
         problem: String,
     },
     /// Two pads of one name.
@@ -95,14 +95,14 @@ pub enum PadError {
         /// Their name.
         name: String,
     },
-    /// A marker of a pad that may be seen elsewhere, so that an image of it does not tell where the pad is.
+    /// A marker of a pad that may be seen elsewhere. An image of it does not show where the pad is.
     #[error("the marker `{marker}` of `{pad}` is also {elsewhere}")]
     Shared {
         /// The pad's name.
         pad: String,
         /// Its marker.
         marker: Marker,
-        /// Where else it is, and what to do.
+        /// The other pad or list, and the remedy.
         elsewhere: String,
     },
 }
@@ -166,7 +166,7 @@ impl Pad {
         &self.markers
     }
 
-    /// Checks that pads can be told apart in an image.
+    /// Checks that pads can be distinguished in an image.
     ///
     /// # Errors
     /// [`PadError`] when two have one name, or a marker that looks the same.
@@ -183,7 +183,7 @@ impl Pad {
                             pad: pad.name(),
                             marker: *marker,
                             elsewhere: format!(
-                                "on `{}`, as `{}`, and one image of it cannot tell which pad it shows; give one of them another marker",
+                                "on `{}`, as `{}`, and one image of it does not show which pad it is; give one of them another marker",
                                 other.name(),
                                 same.marker
                             ),
@@ -235,7 +235,7 @@ impl Pad {
 }
 
 impl Marker {
-    /// As what else this marker of a pad is listed, and what to do; `None` where the list may have the other one.
+    /// The other entry as which this marker of a pad is listed, and the remedy; `None` where the list may have both.
     fn conflict(&self, listed: &Self) -> Option<String> {
         let has_any_id = listed.id.is_none() && self.id.is_some();
         if self.family == listed.family {
@@ -393,7 +393,7 @@ impl Placed {
             marker.size_m.ok_or("a marker of a pad needs a size in metres, as its last part")?;
         if let Some(same) = before.iter().find(|it| it.marker.looks_like(&marker)) {
             return Err(format!(
-                "it is on the pad twice, first as `{}`, and the two could not be told apart in an image",
+                "it is on the pad twice, first as `{}`, and the two could not be distinguished in an image",
                 same.marker
             ));
         }

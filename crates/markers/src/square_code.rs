@@ -1,4 +1,4 @@
-//! What the cells of a square marker mean: where a family's bits lie, and which codewords there are.
+//! Assigns the cells of a square marker to a family's bits, and lists its codewords.
 
 use std::sync::OnceLock;
 

@@ -1,4 +1,4 @@
-//! What the dots of an STag mean and where they lie. Lengths are in units of the black square's edge, from the marker's
+//! Assigns the dots of an STag to bits and positions. Lengths are in units of the black square's edge, from the marker's
 //! centre, x right, y up.
 //!
 //! The numbers are those of STag's marker generator at 53a3667 (github.com/bbenligiray/stag).

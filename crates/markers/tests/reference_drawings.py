@@ -2,7 +2,7 @@
 """Compares reference_drawings.txt with the pictures of the reference libraries; with --write it is written from them.
 
 OpenCV (pip: opencv-python-headless) draws ArUco, AprilTag (pip: pyapriltags) its own families, both one pixel for each
-cell. What AprilTag leaves transparent in its published pictures is white here: cells that are neither bits nor one of the
+cell. Cells that AprilTag's published pictures leave transparent are white here: cells that are neither bits nor one of the
 rings of black and of white. A family whose library is not installed is not compared.
 """
 

@@ -1,4 +1,4 @@
-//! What families share of an image: its outlines and quads, each made at most once.
+//! Computes the data of an image that families share: its outlines and quads, each at most once.
 
 use imaging::{ContrastMap, GrayView, Outlines, Places, outline};
 
@@ -48,7 +48,7 @@ const SHADED_PERCENT: u8 = 45;
 /// and partly covered, all that this search finds in the whole image are found with 100 %, and two less with 200 %.
 const INK_PERCENT: u8 = 100;
 
-/// What a family needs of an image.
+/// The data of an image that a family needs.
 #[derive(Copy, Clone, Debug, Default)]
 pub(crate) struct Needs {
     /// The pyramid of the image.
@@ -85,7 +85,7 @@ pub(crate) struct Evidence {
 }
 
 impl Evidence {
-    /// Reserves what textured images need.
+    /// Reserves memory for textured images.
     pub(crate) fn make_room(&mut self, view: GrayView<'_>, needs: &Needs) {
         self.contrast.make_room(view);
         if needs.quads.is_some() {
@@ -96,7 +96,7 @@ impl Evidence {
         }
     }
 
-    /// Makes what the fast passes need of an image.
+    /// Computes the data of an image for the fast passes.
     pub(crate) fn find(
         &mut self,
         view: GrayView<'_>,
@@ -153,7 +153,7 @@ impl Evidence {
         self.contrast.reaches(self.min_percent)
     }
 
-    /// Makes what a step of the fallbacks needs, of the image that it searches.
+    /// Computes the data for a step of the fallbacks, of the image that it searches.
     pub(crate) fn prepare(
         &mut self,
         view: GrayView<'_>,
@@ -206,7 +206,7 @@ impl Evidence {
 }
 
 impl Needs {
-    /// What both families need.
+    /// The needs of both families.
     pub(crate) fn and(self, other: Self) -> Self {
         let quads = match (self.quads, other.quads) {
             (Some(a), Some(b)) => Some(OutlineNeeds {

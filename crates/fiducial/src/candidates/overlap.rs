@@ -1,4 +1,4 @@
-//! Which quads are of the same square, and which are suppressed by a better one.
+//! Finds quads of the same square, and suppresses those that conflict with a better one.
 
 use geometry::Pixel;
 
@@ -29,7 +29,7 @@ impl Overlap {
         distance_px < 0.2 * known_px && other_px < 1.5 * known_px && known_px < 1.5 * other_px
     }
 
-    /// Whether they have the same middle, whatever their sizes.
+    /// Whether they have the same centre, at any sizes.
     pub(crate) fn is_concentric(&self) -> bool {
         self.distance_px < 0.25 * self.known_px
     }
@@ -45,7 +45,7 @@ impl Overlap {
     }
 }
 
-/// Non-maximum suppression: sorts by score, best first, and drops what conflicts with something better.
+/// Non-maximum suppression: sorts by score, best first, and drops results that conflict with a better one.
 pub(crate) fn suppress_non_maxima<T: Copy>(
     found: &mut Vec<T>,
     score: impl Fn(&T) -> f64,

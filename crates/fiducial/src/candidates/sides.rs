@@ -277,7 +277,7 @@ mod tests {
             let expected: Vec<u32> = (0..300).filter(|i| is_touched(&sides[*i as usize])).collect();
             assert_eq!(found, expected, "{places:?}");
         }
-        // What is no place is somewhere.
+        // Invalid coordinates fall into some cell.
         assert!(grid.touching(&[[f32::NAN; 2]; 2]).flatten().count() <= sides.len());
     }
 }

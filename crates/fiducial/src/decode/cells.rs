@@ -1,9 +1,9 @@
 //! Solves for the bits of a square marker from all pixels of a quad together, by least squares through the blur, and for how well a
 //! codeword explains them.
 //!
-//! Where cells are hardly wider than a pixel, a pixel shows several of them: the sum of the cells' values, weighted by their shares
-//! of it through the blur. Border and quiet zone are one unknown each, every bit is one more. The sums of the solution also tell
-//! how well any codeword explains the pixels.
+//! Where cells are hardly wider than a pixel, a pixel shows several of them: the sum of the cells' values, weighted by their
+//! fractions of it through the blur. Border and quiet zone are one unknown each, every bit is one more. The sums of the
+//! solution also give how well any codeword explains the pixels.
 
 use geometry::Pixel;
 use imaging::pyramid::from_level_0;

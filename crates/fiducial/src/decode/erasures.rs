@@ -94,7 +94,7 @@ impl CellImage {
     }
 }
 
-/// Whether two codes have the same cells, in whatever order their bits are.
+/// Whether two codes have the same cells, in any order of their bits.
 pub(crate) fn have_same_cells(a: &SquareCode, b: &SquareCode) -> bool {
     let has =
         |cells: &[[i8; 2]], others: &[[i8; 2]]| others.iter().all(|cell| cells.contains(cell));
@@ -127,7 +127,7 @@ pub(crate) fn has_border(view: GrayView<'_>, quad: &Quad, code: &SquareCode) -> 
     ratios.is_border(2 * usize::from(code.cells))
 }
 
-/// What a cell of a marker is.
+/// The kind of a marker's cell.
 #[derive(Copy, Clone, Debug, PartialEq)]
 enum Kind {
     /// Always black (for a reversed border: white).
@@ -343,7 +343,7 @@ impl Grid {
             for dy in -1..=1 {
                 for dx in -1..=1 {
                     let Some(near) = self.index([column + dx, row + dy]) else { continue };
-                    // Glare only adds light, so what is dark beside it is black.
+                    // Glare only adds light, so dark cells next to it are black.
                     if is_covered || colours[near] == Colour::White {
                         colours[near] = Colour::Unknown;
                     }
@@ -526,13 +526,13 @@ fn decode_with_erasures(
     };
     let codeword = code.codewords.get(best.id as usize).copied()?;
     let erased = code.bits.len() as u32 - known;
-    // The code's minimum distance bounds what can be corrected beside the erasures.
+    // The code's minimum distance bounds the errors that can be corrected besides the erasures.
     let correctable = u32::from(code.min_hamming).saturating_sub(erased + 1) / 2;
     let max_hamming = correctable.max(u32::from(erased == 0));
     if best.hamming > max_hamming || best.second <= best.hamming {
         return None;
     }
-    // In some families two ids differ in one or two bits: what reads as another one exactly is that one, though not looked for,
+    // In some families two ids differ in one or two bits: a reading that equals another one exactly is that one, even if not looked for,
     // and where those bits are erased it may be either.
     let may_be_other = erased > 0 && code.min_hamming <= 2;
     if ids.is_some() && (best.hamming > 0 || may_be_other) {

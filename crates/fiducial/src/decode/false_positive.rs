@@ -1,8 +1,8 @@
-//! How likely a quad that is not a marker shows a codeword by chance.
+//! Estimates the probability that a quad other than a marker shows a codeword by chance.
 //!
 //! Windows, stripes and letters show simple words, whose rows or columns repeat. The information of a
 //! codeword is the length of its shortest description, in bits: bit by bit; by its few different rows (or
-//! columns) and their order; or by the places of its few white cells. The evidence is what remains of that
+//! columns) and their order; or by the positions of its few white cells. The evidence is the remainder
 //! after the choice among all codewords that are looked for, in four rotations.
 
 use markers::SquareCode;
@@ -12,7 +12,7 @@ const MAX_LINES: usize = 16;
 /// Bits to name the kind of description.
 const KIND_BITS: f64 = 2.0;
 
-/// Agreement with a codeword in excess of what chance gives among `codewords` in four rotations, in bits,
+/// Agreement with a codeword in excess of chance among `codewords` in four rotations, in bits,
 /// when `read` of its bits were read and `hamming` of these differ.
 pub(crate) fn evidence(
     code: &SquareCode,

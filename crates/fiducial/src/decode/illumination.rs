@@ -18,7 +18,7 @@ const MIN_INTACT: f32 = 0.6;
 /// ... and among all.
 const MIN_SEEN: f32 = 0.35;
 
-/// What a cell looks like.
+/// The observed colour of a cell.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) enum Colour {
     Black,
@@ -59,7 +59,7 @@ impl<const N: usize> BorderRatios<N> {
         Self { log_ratios: [0.0; N], seen: 0, low: 0, max_low: quantile(2, places) }
     }
 
-    /// Adds a place; false when it is no border, whatever the others show.
+    /// Adds a place; false when it is no border, independent of the others.
     pub(crate) fn add(&mut self, log_ratio: f32) -> bool {
         if let Some(slot) = self.log_ratios.get_mut(self.seen) {
             *slot = log_ratio;
@@ -85,7 +85,7 @@ fn quantile(fifths: usize, count: usize) -> usize {
 }
 
 /// The fraction of the seen cells that look as they should, the mean of black and white ones; `None` when it,
-/// or what is seen, is too little. Each cell is given by whether it should be white, and what it looks like.
+/// or the number of seen cells, is too small. Each cell is given by whether it should be white, and its observed colour.
 pub(crate) fn intact_fraction(cells: impl Iterator<Item = (bool, Colour)>) -> Option<f32> {
     let mut counts = [[0.0_f32; 3]; 2];
     for (is_white, colour) in cells {

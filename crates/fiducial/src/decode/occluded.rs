@@ -90,7 +90,7 @@ pub(crate) struct SquareReading {
     pub(crate) reading: Reading,
 }
 
-/// Smallest cell that can be told from its neighbours, in pixels.
+/// Smallest cell that can be distinguished from its neighbours, in pixels.
 const MIN_CELL_PX: f64 = 2.5;
 /// Largest number of readings tried in one image.
 const MAX_READ: usize = 100;
@@ -98,7 +98,7 @@ const MAX_READ: usize = 100;
 const WELL_INTACT: f32 = 0.9;
 
 impl Occluded<SquareReading> {
-    /// The square markers among quads of segments. `is_open` tells whether a quad may be a marker of a code.
+    /// The square markers among quads of segments. `is_open` is true where a quad may be a marker of a code.
     pub(crate) fn find_squares<'a>(
         &mut self,
         view: GrayView<'_>,

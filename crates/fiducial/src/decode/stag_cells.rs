@@ -2,8 +2,9 @@
 //! codeword explains them.
 //!
 //! Where a dot is hardly wider than a pixel, a pixel shows several of them: the sum of the dots' values, weighted by their
-//! shares of it through the blur. All that is always black is one more unknown, all that is always white another. The sums of
-//! the solution also tell how well any codeword explains the pixels, also where no dot can be told from its neighbours.
+//! fractions of it through the blur. All that is always black is one more unknown, all that is always white another. The sums of
+//! the solution also give how well any codeword explains the pixels, even where dots cannot be distinguished from their
+//! neighbours.
 
 use imaging::GrayView;
 use markers::stag_code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET_ZONE};
@@ -216,7 +217,7 @@ impl Dots {
             DARK | BRIGHT => unknown == BRIGHT,
             _ => !stag_code::is_black(word, unknown - 2),
         };
-        // Sums over what is white, and over all; in each pixel the shares of all add up to 1.
+        // Sums over the white unknowns, and over all; in each pixel the fractions of all add up to 1.
         let (mut white, mut grey) = (0.0, 0.0);
         let mut whites = [0_usize; UNKNOWNS];
         let mut count = 0;

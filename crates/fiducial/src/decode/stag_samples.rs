@@ -238,7 +238,7 @@ fn read_dots(
         let mean = shares[..seen].iter().sum::<f32>() / seen.max(1) as f32;
         let is_grey = (0.4..0.6).contains(&mean);
         let is_white = mean > 0.5;
-        // Glare only adds light, so what is dark beside it is black.
+        // Glare only adds light, so dark samples next to it are black.
         let is_doubtful = is_white && covered.iter().any(is_near);
         let is_erased = seen < 3 || bright > 1 || is_grey || is_doubtful;
         word = word.appended((!is_erased).then_some(!is_white));

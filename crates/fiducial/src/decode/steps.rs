@@ -27,7 +27,7 @@ const MIN_DISTANCE_PX: f64 = 1.0;
 const MIN_WHITE: f32 = 12.0;
 /// Largest ratio of black to white.
 const MAX_RATIO: f32 = 0.7;
-/// Squared difference from an expected step from which on an edge says nothing more: the edge of a shadow, or what lies there.
+/// Squared difference from an expected step from which on an edge is not used: the edge of a shadow, or of an object.
 const MAX_COST: f32 = 0.25;
 /// By how much flipping a bit must change the cost of its edges for the bit to be read: one edge.
 const MIN_BIT_COST: f32 = 0.2;
@@ -46,7 +46,7 @@ const RIVALS: u32 = 3;
 /// Smallest margin to the second best codeword: nine edges.
 const MIN_MARGIN: f32 = 2.2;
 
-/// What is on one side of an edge.
+/// The cell on one side of an edge.
 #[derive(Copy, Clone, Debug, PartialEq)]
 enum Cell {
     Known { is_white: bool },
@@ -110,7 +110,7 @@ impl Steps {
                 }
             }
         }
-        // Whatever the codeword is: texture ends here.
+        // For any codeword: texture is refused here.
         let min_cost = |edge: &Edge| {
             [-1.0, 0.0, 1.0].map(|at| edge.cost_of(at)).into_iter().fold(MAX_COST, f32::min)
         };
@@ -218,7 +218,7 @@ impl Steps {
         self.edges().map(|edge| edge.cost(word, code)).sum()
     }
 
-    /// How many bits the edges tell, and how many of these are others than the word's.
+    /// How many bits the edges show, and how many of these differ from the word's.
     fn bits_read(&self, word: u64, code: &SquareCode) -> [u32; 2] {
         let mut known = 0;
         let mut hamming = 0;

@@ -1,4 +1,4 @@
-//! What a detector of a family takes and gives.
+//! Defines the input and output of a family's detector.
 
 use std::fmt::Debug;
 
@@ -15,7 +15,7 @@ use crate::trace::Trace;
 
 /// The detector of one kind of marker, for all its families. It keeps its memory from image to image.
 pub(crate) trait FamilyDetector: Debug + Send {
-    /// What it needs of an image.
+    /// The data of an image that it needs.
     fn needs(&self) -> Needs;
 
     /// The steps of the fallbacks that it has.
@@ -26,7 +26,7 @@ pub(crate) trait FamilyDetector: Debug + Send {
         true
     }
 
-    /// Reserves what textured images need.
+    /// Reserves memory for textured images.
     fn make_room(&mut self) {}
 
     /// Finds its markers in an image, without fallbacks.
@@ -50,7 +50,7 @@ pub(crate) trait FamilyDetector: Debug + Send {
     }
 }
 
-/// An image and what is shared of it.
+/// An image and its shared data.
 #[derive(Debug)]
 pub(crate) struct FrameInput<'a> {
     pub(crate) view: GrayView<'a>,
@@ -69,7 +69,7 @@ pub(crate) struct FrameInput<'a> {
 }
 
 impl FrameInput<'_> {
-    /// The same once more, for what comes after one that takes it.
+    /// The same once more, for the detector after one that consumes it.
     pub(crate) fn again(&mut self) -> FrameInput<'_> {
         FrameInput { evidence: &mut *self.evidence, ..*self }
     }

@@ -1,5 +1,5 @@
-//! Which ids of a family of square markers are looked for and still missing, the image and the expected marker to search,
-//! and how a decoded quad becomes an observation.
+//! Holds the ids of a family of square markers that are looked for and still missing, the image and the expected marker to
+//! search, and converts a decoded quad to an observation.
 
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Pyramid};
@@ -92,7 +92,7 @@ impl FamilyQuery {
         self.markers.iter().filter_map(|marker| marker.id)
     }
 
-    /// Whether an id is looked for. What looks like a window is looked for only by its number.
+    /// Whether an id is looked for. An id that looks like a window is looked for only by its number.
     pub(crate) fn includes(&self, id: u32) -> bool {
         let is_symmetrical =
             || SquareCode::for_family(self.family).is_some_and(|code| code.is_symmetrical(id));

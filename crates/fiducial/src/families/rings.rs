@@ -95,7 +95,7 @@ impl RingPass {
     }
 }
 
-/// Bounds on the time for any image, far above what a frame with a marker needs.
+/// Bounds on the time for any image, far above the needs of a frame with a marker.
 const MAX_ELLIPSES: usize = 4000;
 const MAX_ARC_FITS: usize = 3000;
 const MAX_CANDIDATES: usize = 400;
@@ -125,7 +125,7 @@ pub(crate) struct RingDetector {
     first: usize,
     /// Whether white rings on black are searched.
     white_on_black: bool,
-    /// Whether all passes run, whatever was found.
+    /// Whether all passes run, also after a marker was found.
     thorough: bool,
     /// Number of candidates among the image's complete ellipses.
     complete: usize,
@@ -134,7 +134,7 @@ pub(crate) struct RingDetector {
     buffers: Buffers,
 }
 
-/// What candidates are evaluated on.
+/// The image on which candidates are evaluated.
 #[derive(Copy, Clone)]
 struct Evaluation<'a> {
     view: GrayView<'a>,
@@ -307,7 +307,7 @@ impl RingDetector {
                 Err(Reason::Repeated)
             } else {
                 let outcome = evaluation.evaluate(&candidate, &mut self.buffers);
-                // What is known to be something else is so on coarse levels as well.
+                // A candidate known to be something else is so on coarse levels as well.
                 let is_known = |reason| matches!(reason, Reason::Blackness | Reason::Type);
                 let is_open = outcome.as_ref().is_err_and(|reason| !is_known(*reason));
                 match coarse.filter(|_| is_open && found.len() == first) {

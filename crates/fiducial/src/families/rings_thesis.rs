@@ -36,7 +36,7 @@ pub const T_TYPE: f64 = 0.1;
 /// Minimum share of black pixels in a ring (Algorithm 6).
 pub const T_BLACK: f64 = 0.8;
 
-/// Bounds on the time for any image, which the thesis does not have; far above what its frames need.
+/// Bounds on the time for any image, which the thesis does not have; far above the needs of its frames.
 const MAX_CONTOUR_POINTS: usize = 4_000_000;
 const MAX_ELLIPSES: usize = 20_000;
 const MAX_PAIRS: usize = 50_000;

@@ -30,7 +30,7 @@ use crate::refine::pattern::Pattern;
 use crate::schedule::FallbackStep;
 use crate::trace::{Reason, Trace};
 
-/// Bounds on the work in one image, far above what frames with markers need: layouts that are solved for in quads that are no
+/// Bounds on the work in one image, far above the needs of frames with markers: layouts that are solved for in quads that are no
 /// markers, and markers, of which a calibration board has hundreds.
 const MAX_SOLVED: usize = 500;
 const MAX_FOUND: usize = 1024;
@@ -203,7 +203,7 @@ impl SquareTagDetector {
         known.or(Some(self.layouts.len() - 1))
     }
 
-    /// Makes room for what a frame with texture needs.
+    /// Reserves memory for a frame with texture.
     fn reserve(&mut self) {
         if self.is_empty() {
             return;
@@ -391,7 +391,7 @@ impl SquareTagDetector {
         self.found.push(found);
     }
 
-    /// Adds the observations of what was decoded from the index `from` on, the most confident first.
+    /// Adds the observations decoded from the index `from` on, the most confident first.
     fn observe_all(&mut self, input: ImageInput<'_>, from: usize, found: &mut Vec<Observation>) {
         let first = found.len();
         let mut index = from;

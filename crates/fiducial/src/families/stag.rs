@@ -116,7 +116,7 @@ pub(crate) struct Reading {
     is_washed_out: bool,
 }
 
-/// What samples must reach.
+/// The limits for samples.
 #[derive(Copy, Clone, Debug)]
 struct SampleBounds {
     r_squared: f32,
@@ -168,7 +168,7 @@ impl StagDetector {
         detector
     }
 
-    /// Makes room for what a frame with texture needs.
+    /// Reserves memory for a frame with texture.
     fn reserve(&mut self) {
         if !self.is_empty() {
             self.known.clear();
@@ -281,7 +281,7 @@ impl StagDetector {
         self.known.iter().any(|known| Overlap::new(known, &quad.corners).is_covered())
     }
 
-    /// Reads a quad, as shown with a tone curve, and adds its marker to what was found.
+    /// Reads a quad, as shown with a tone curve, and adds its marker to the results.
     fn add(
         &mut self,
         input: ImageInput<'_>,

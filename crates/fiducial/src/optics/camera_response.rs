@@ -1,8 +1,8 @@
-//! How a camera shows light, in proportion to it or with a tone curve and sharpened: the whiteness shown for a share of white, with
-//! derivatives.
+//! Models a camera's response to light, linear or with a tone curve and sharpened: the whiteness shown for a fraction of white,
+//! with derivatives.
 //!
-//! After an unknown monotonic curve and a symmetric kernel a blurred edge has another shape and another place. Both are
-//! those of every other edge between the same black and white, so that a marker that is not small tells the two numbers itself.
+//! After an unknown monotonic curve and a symmetric kernel a blurred edge has another shape and another position. Both are
+//! those of every other edge between the same black and white, so that a marker that is not small gives both numbers on its own.
 
 use crate::response::{Measured, ResponseEstimate};
 
@@ -13,7 +13,7 @@ pub(crate) const SHARPENING_PX: f64 = 1.0;
 /// paper.
 const MAX_CURVE: f64 = 4.0;
 
-/// What a camera makes of an image that is linear in light.
+/// A camera's processing of an image that is linear in light.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) struct CameraResponse {
     /// The tone curve `(1 + c) w / (1 + c w)` of a whiteness from 0 to 1: 0 is linear, about 1 is nearly sRGB.
@@ -37,9 +37,9 @@ pub(crate) struct ShownWhiteness {
 
 impl CameraResponse {
     pub(crate) const LINEAR: Self = Self { curve: 0.0, sharpening: 0.0 };
-    /// What most cameras do: a start for a fit.
+    /// The typical response: a start for a fit.
     pub(crate) const ORDINARY: Self = Self { curve: 1.0, sharpening: 0.0 };
-    /// What curves are expected to be before a marker tells: sRGB's is 1.1, that of a Raspberry Pi's camera module 3.
+    /// The prior of the curve, before a marker gives an estimate: sRGB's is 1.1, that of a Raspberry Pi's camera module 3.
     pub(crate) const CURVE_PRIOR: Measured = Measured { value: 1.2, deviation: 0.7 };
     /// Unsharp masks of cameras made for people have about 0.2 to 0.6.
     pub(crate) const SHARPENING_PRIOR: Measured = Measured { value: 0.4, deviation: 0.2 };
@@ -52,7 +52,7 @@ impl CameraResponse {
         Self::LINEAR.moved([known.curve.value, known.sharpening.value])
     }
 
-    /// After a step of a fit, within what cameras do.
+    /// After a step of a fit, within the range of cameras.
     pub(crate) fn moved(&self, [curve, sharpening]: [f64; 2]) -> Self {
         Self {
             curve: (self.curve + curve).clamp(-0.25, MAX_CURVE),
@@ -67,7 +67,7 @@ impl CameraResponse {
         let Self { curve, sharpening } = *self;
         let (sharp, wide) = (Tone::at(own, curve), Tone::at(blurred, curve));
         let shown = own + sharp.added;
-        // What the curve adds at an edge is as wide as the blur; the kernel spreads it and keeps its integral.
+        // The curve's addition at an edge is as wide as the blur; the kernel spreads it and keeps its integral.
         let shown_blurred = blurred + blur_ratio * wide.added;
         ShownWhiteness {
             white: (1.0 + sharpening) * shown - sharpening * shown_blurred,
@@ -84,7 +84,7 @@ impl CameraResponse {
 
 /// The tone curve at one whiteness.
 struct Tone {
-    /// What it adds, and its derivatives by the whiteness and by the curve.
+    /// Its addition, with derivatives by the whiteness and by the curve.
     added: f64,
     slope: f64,
     by_curve: f64,

@@ -38,7 +38,7 @@ impl InverseTone {
         (white > black).then_some(Self { black, white, curve })
     }
 
-    /// The light of a grey value, as the grey value of a linear camera that shows black and white alike. What is beyond them, as a
+    /// The light of a grey value, as the grey value of a linear camera that shows black and white alike. Values beyond them, as a
     /// brighter place of the quiet zone, counts as black or white.
     fn light(&self, grey: u8) -> f64 {
         let Self { black, white, curve } = *self;

@@ -1,17 +1,17 @@
 //! Levenberg-Marquardt for a few unknowns, on the stack.
 //!
-//! A [`Problem`] gives the normal equations at a place and the place after a step; [`minimise`] solves, damps
-//! and compares. When to stop, how to damp and what to do about a step that leads nowhere are a [`Schedule`].
+//! A [`Problem`] gives the normal equations at a point and the point after a step; [`minimise`] solves, damps
+//! and compares. A [`Schedule`] defines the end, the damping and the handling of a step that does not improve.
 //! A problem that needs Gauss-Newton only takes [`NormalEquations::step`] with no damping.
 
 use nalgebra::{SMatrix, SVector};
 
-/// The normal equations of `N` unknowns at one place, with the cost there and what else came with them.
+/// The normal equations of `N` unknowns at one point, with the cost there and extra data.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct NormalEquations<const N: usize, E = ()> {
     /// Weighted sum of the outer products of the residuals' gradients; its lower half is read.
     pub(crate) matrix: SMatrix<f64, N, N>,
-    /// Weighted sum of gradients times what each residual lacks: the downhill direction.
+    /// Weighted sum of gradients times negative residuals: the downhill direction.
     pub(crate) right: SVector<f64, N>,
     pub(crate) cost: f64,
     /// Sums of the problem's own.
@@ -63,7 +63,7 @@ pub(crate) struct Damping {
     pub(crate) min_after_bad: f64,
     /// Above this the fit ends.
     pub(crate) max: f64,
-    /// Added to the diagonal whatever the damping.
+    /// Added to the diagonal at any damping.
     pub(crate) ridge: f64,
 }
 
@@ -83,7 +83,7 @@ pub(crate) struct Schedule {
     pub(crate) fails_without_equations: bool,
 }
 
-/// What comes next in a fit.
+/// The next action of a fit.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Next {
     Continue,
@@ -93,22 +93,22 @@ pub(crate) enum Next {
     Fail,
 }
 
-/// What becomes of a place that was stepped to.
+/// The decision on the point after a step.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Review {
     /// It is taken when it costs no more than the best one.
     Compare,
-    /// It is taken whatever it costs: the costs do not compare.
+    /// It is taken at any cost: the costs are not comparable.
     Take,
     /// It is the result, with the equations of the place before it.
     Finish,
 }
 
-/// What [`minimise`] minimises.
+/// The problem that [`minimise`] solves.
 pub(crate) trait Problem<const N: usize> {
     /// A place in the space of the unknowns.
     type Place: Copy;
-    /// What the equations carry along.
+    /// Extra data of the equations.
     type Extra;
 
     /// The equations at a place; `None` where there are none.

@@ -1,4 +1,4 @@
-//! What interpolating a colour mosaic does to grey: each of its four kinds of pixels is blurred by a kernel of its own.
+//! Models the effect of interpolating a colour mosaic on grey: each of its four kinds of pixels is blurred by its own kernel.
 //!
 //! Behind a mosaic of colour filters a pixel measures red, green or blue; the other two are means of its neighbours'
 //! (bilinear interpolation). A grey pixel whose own colour is green has more of its own light than one whose colour is
@@ -21,7 +21,7 @@ pub(crate) fn phase(x: usize, y: usize) -> u8 {
     u8::from(x % 2 == 1) + 2 * u8::from(y % 2 == 1)
 }
 
-/// What a pixel takes of its neighbours: of both beside it, of those above and below, of the four diagonal ones.
+/// A pixel's weights of its neighbours: of both beside it, of those above and below, of the four diagonal ones.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) struct Kernel {
     beside: f64,

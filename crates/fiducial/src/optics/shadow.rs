@@ -1,11 +1,11 @@
 //! Finds the straight edge of a shadow in an image by the same rise of the grey values' logarithm all along it, and makes the image without
 //! that shadow.
 //!
-//! Whatever lies on the ground, a shadow takes the same share of its light all along the edge (the shadows of intrinsic
+//! On any ground a shadow takes the same fraction of its light all along the edge (the shadows of intrinsic
 //! images: Barrow and Tenenbaum, 1978; Finlayson, Hordley, Lu and Drew, 2006). So the edge is a line along which the logarithm of
-//! the grey value rises by the same step again and again, where markers, paint and joints rise in places. What it is divided by
+//! the grey value rises by the same step again and again, where markers, paint and joints rise in places. The divisor
 //! is measured: the mean rise across the line, with its penumbra, the lens' blur and the camera's sharpening. A tone curve that is
-//! nearly a power makes of the light's ratio another one, which is measured as well.
+//! nearly a power changes the light's ratio to another one, which is measured as well.
 
 use std::f64::consts::TAU;
 use std::ops::Range;
@@ -17,13 +17,13 @@ use nalgebra::{Matrix3, Vector3};
 
 /// The level of the pyramid on which lines are searched: means of 4 x 4 pixels.
 const LEVEL: usize = 2;
-/// Grey levels added to all before their logarithm, as the darkest are mostly noise: for the search, and for what is measured.
+/// Grey levels added to all before their logarithm, as the darkest are mostly noise: for the search, and for the measurement.
 const STRAY_LIGHT: f64 = 4.0;
 const ROUNDING: f64 = 0.5;
 /// Minimum rise of the logarithm across two pixels of the level where a line may be, and minimum step of a shadow.
 const MIN_RISE: f32 = 0.22;
 const MIN_STEP: f64 = 0.22;
-/// Maximum step, a ratio of 16: what is darker shows little but noise.
+/// Maximum step, a ratio of 16: darker pixels show little but noise.
 const MAX_STEP: f64 = 2.77;
 /// Directions and distances of the Hough transform; a distance is two pixels of the level.
 const DIRECTIONS: usize = 96;
@@ -40,7 +40,7 @@ const MAX_LINES: usize = 3;
 /// Maximum distance of a pixel of the level from the line it is part of, and of the directions of their rise as a cosine.
 const NEAR_PX: f64 = 3.0;
 const MIN_COSINE: f64 = 0.9;
-/// Half of what is looked at across the line, in pixels, and the part of it in which no light changes any more.
+/// Half the width of the profile across the line, in pixels, and the part of it in which no light changes any more.
 const HALF_PX: i32 = 16;
 const PLAIN_FROM_PX: i32 = 7;
 const PLAIN_TO_PX: i32 = 12;
@@ -127,7 +127,7 @@ struct EdgePixel {
     rise: [f32; 2],
 }
 
-/// What one place along a line shows.
+/// The profile at one position along a line.
 #[derive(Copy, Clone, Debug)]
 struct Crossing {
     along: f64,
@@ -149,7 +149,7 @@ pub(crate) struct ShadowFinder {
 }
 
 impl ShadowFinder {
-    /// Reserves what images of this size need.
+    /// Reserves memory for images of this size.
     pub(crate) fn make_room(&mut self, view: GrayView<'_>) {
         fn reserve<T>(list: &mut Vec<T>, count: usize) {
             list.reserve(count.saturating_sub(list.len()));
@@ -312,7 +312,7 @@ impl ShadowFinder {
         Some(step)
     }
 
-    /// Lists what the image shows across the line, at places along it.
+    /// Lists the profiles across the line, at positions along it.
     fn look_across(&mut self, view: GrayView<'_>, line: &Bend) {
         self.crossings.clear();
         let half = line.length;
@@ -460,7 +460,7 @@ fn logarithm(view: GrayView<'_>, [x, y]: [f64; 2]) -> Option<f64> {
     Some((bilinear(view, x, y)? + ROUNDING).ln())
 }
 
-/// What the image shows across a line at a place along it, but for where it rises; `None` beyond the image.
+/// The profile across a line at a position along it, without the position of its rise; `None` beyond the image.
 fn crossing(view: GrayView<'_>, line: &Bend, along: f64) -> Option<Crossing> {
     // All between the ends is in the image as well.
     for end in [-HALF_PX, HALF_PX] {
@@ -549,7 +549,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_shadow_is_none() {
+    fn edges_other_than_shadows_are_not_found() {
         assert!(find(&ground([1.0, 0.0], -1e6, 2.0, 1.0)).is_none());
         assert!(find(&vec![0; SIZE[0] * SIZE[1]]).is_none());
         assert!(find(&vec![255; SIZE[0] * SIZE[1]]).is_none());

@@ -1,5 +1,5 @@
-//! The sides of a square in a drawing: a picture without noise and blur, in which a pixel is black or white but for one on an edge. Such
-//! pixels tell little of light and blur, but each side's place at once.
+//! Measures the sides of a square in a drawing: a picture without noise and blur, where only pixels on edges are neither black
+//! nor white. Such pixels show little of light and blur, but each side's position at once.
 
 use geometry::Pixel;
 use imaging::GrayView;
@@ -18,9 +18,9 @@ const REACH: usize = 3;
 const MAX_GREY: usize = 3;
 /// Largest distance of a place from the side's line, in pixels: one drawn in whole pixels has steps.
 const MAX_OFF_PX: f64 = 1.0;
-/// Variance of a place in whole pixels, in square pixels.
+/// Variance of a position in whole pixels, in square pixels.
 const WHOLE_PIXEL_PX2: f64 = 1.0 / 12.0;
-/// Standard deviation of a side that grey pixels tell, in pixels.
+/// Standard deviation of a side that is measured by grey pixels, in pixels.
 const SIDE_PX: f64 = 0.05;
 
 /// A square's corners where its sides meet.
@@ -52,7 +52,7 @@ pub(crate) fn drawn_square(view: GrayView<'_>, near: &[Pixel; 4]) -> Option<Draw
         meeting(&right, &bottom)?,
         meeting(&bottom, &left)?,
     ];
-    // What an earlier resizing made grey may be at whole pixels as well.
+    // Edges that an earlier resizing made grey may be at whole pixels as well.
     let variance = |side: &Side| SIDE_PX * SIDE_PX + side.whole_pixel_px2;
     let side_px2 = [top, right, bottom, left].iter().map(variance).sum::<f64>() / 4.0;
     // Two corners share a side's error: as much as twice its variance in each of them alone.
@@ -165,7 +165,7 @@ mod tests {
     use super::*;
     use imaging::GrayImage;
 
-    /// A black square on white, of which each pixel shows the share of what it covers.
+    /// A black square on white, of which each pixel shows the covered fraction.
     fn square([left, top]: [f64; 2], [right, bottom]: [f64; 2]) -> GrayImage {
         let mut image = GrayImage::filled(60, 60, 0);
         let covered = |from: f64, to: f64, at: usize| {
@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn grey_pixels_tell_where_a_side_is() {
+    fn grey_pixels_give_the_position_of_a_side() {
         let found = seen(&square([10.3, 9.8], [45.1, 46.4])).unwrap();
         let truth = [[10.3, 9.8], [45.1, 9.8], [45.1, 46.4], [10.3, 46.4]];
         for (corner, [x, y]) in found.corners.iter().zip(truth) {
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn whole_pixels_matter_to_sides_along_them_and_at_45_degrees() {
+    fn whole_pixels_widen_the_covariance_of_sides_along_them_and_at_45_degrees() {
         let sigma_px = |slope: f64| whole_pixel_px2(slope, 100.0, 80.0).sqrt();
         assert!((sigma_px(0.0) - 0.2887).abs() < 1e-3 && (sigma_px(-1.0) - 0.2887).abs() < 1e-3);
         assert!((sigma_px(0.5) - 0.1443).abs() < 1e-3);

@@ -148,7 +148,7 @@ fn fit_samples(target: Target<'_>, is_near: bool, scratch: &mut Scratch) -> Opti
 }
 
 /// The fit with a shift of all edges towards black by the same distance, when there is one: a tone curve makes white
-/// wider. Edges that have black outside and others that have it inside tell it from the square's size.
+/// wider. Edges that have black outside and others that have it inside distinguish it from the square's size.
 fn with_common_shift(
     equations: &NormalEquations<UNKNOWNS>,
     plain: Fit,
@@ -204,7 +204,7 @@ fn with_common_shift(
     }
 }
 
-/// Widens a covariance by what the edges contradict each other after the last step: of the homography, the blur and, where
+/// Widens a covariance by the contradiction of the edges after the last step: of the homography, the blur and, where
 /// there is one, the common shift.
 fn widen<const N: usize>(
     covariance: &mut SMatrix<f64, 8, 8>,

@@ -1,4 +1,4 @@
-//! What the two refinements, along the edges and on grey values, share: their input, memory and result.
+//! Defines the input, memory and result that both refinements share, that along the edges and that on grey values.
 
 use geometry::{CameraModel, Pixel};
 use imaging::GrayView;
@@ -43,7 +43,7 @@ pub struct Refined {
     pub white: f64,
     /// Root mean square residual of the pixels, as a fraction of the contrast.
     pub residual: f64,
-    /// How the camera shows light, where the marker told it.
+    /// The camera's response to light, where the marker gave it.
     pub response: Option<ResponseEstimate>,
 }
 
@@ -114,7 +114,7 @@ pub(crate) struct EdgeSample {
     pub(crate) measurement: Option<EdgeMeasurement>,
 }
 
-/// What the pixels across an edge measure.
+/// The measurement of the pixels across an edge.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct EdgeMeasurement {
     /// Derivatives of the edge's position by the homography's parameters.
@@ -191,7 +191,7 @@ impl PhotometricModel {
     }
 }
 
-/// What is fitted: an image, its lens, and the square's first homography.
+/// The input of a fit: an image, its lens, and the square's first homography.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Target<'a> {
     pub(crate) view: GrayView<'a>,
@@ -204,7 +204,7 @@ pub(crate) struct Target<'a> {
 /// How strongly each part of a marker pulls at all that is fitted; together they are in balance.
 pub(crate) type Pulls<const N: usize> = [SVector<f64, N>; PARTS];
 
-/// Parts of a square: its outline, its middle and what is between, on each of four sides; those on opposite sides follow
+/// Parts of a square: its outline, its centre and the area between, on each of four sides; those on opposite sides follow
 /// each other.
 const PARTS: usize = 12;
 
@@ -222,8 +222,8 @@ pub(crate) fn part([a, b]: [f64; 2]) -> usize {
 }
 
 /// Widens the covariance of the first unknowns where the parts contradict each other by more than their noise, as on bent
-/// paper, or where the model of a camera's processing is not quite the camera's: what is near is off together. Then the
-/// parts, or opposite ones together, are what is independent (a cluster-robust covariance). `inverse` is that of the normal
+/// paper, or where the model of a camera's processing is not quite the camera's: neighbouring pixels are off together. Then the
+/// parts, or opposite ones together, are independent (a cluster-robust covariance). `inverse` is that of the normal
 /// equations.
 pub(crate) fn widen_by_parts<const N: usize>(
     covariance: &mut SMatrix<f64, 8, 8>,
@@ -253,7 +253,7 @@ pub(crate) struct Fit {
     pub(crate) model: PhotometricModel,
     /// As in [`Refined`].
     pub(crate) residual: f64,
-    /// Whether a shift of all edges towards black, as by a tone curve, can be told from the square's size.
+    /// Whether a shift of all edges towards black, as by a tone curve, can be distinguished from the square's size.
     pub(crate) is_shift_known: bool,
     /// That shift, towards white; 0 where it was not fitted as such.
     pub(crate) shift_px: f64,

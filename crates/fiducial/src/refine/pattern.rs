@@ -1,11 +1,11 @@
-//! Which cells of a square marker are black and which are white.
+//! Lists the black and the white cells of a square marker.
 
 use markers::SquareCode;
 
 /// Largest number of cells across a pattern, its surroundings included.
 pub const MAX_CELLS: usize = 32;
 
-/// The cells of a square marker and what is around it.
+/// The cells of a square marker and of its surroundings.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pattern {
     across: usize,

@@ -26,7 +26,7 @@ const UNKNOWNS_PROCESSED: usize = 16;
 struct MinResponse {
     /// One step towards it lowers the cost by this share; it is kept when the fit does.
     gain: f64,
-    /// What is smaller is an error of the model, also of what is known.
+    /// Smaller values are errors of the model, also of the prior.
     response: f64,
 }
 
@@ -35,9 +35,9 @@ const MIN_RESPONSE: MinResponse = MinResponse { gain: 0.15, response: 0.2 };
 const MIN_RESPONSE_OF_OUTLINE: MinResponse = MinResponse { gain: 0.05, response: 0.1 };
 /// The form of a camera's tone curve is not quite the model's: each side of an STag may be off by this share of curve
 /// times blur, so that it looks larger or smaller; of codes of square cells edges of both senses hold the size. From `positions` of seed 7 in `raspberry-pi`,
-/// where STags were too small by 0.025 px beyond what their noise explains.
+/// where STags were too small by 0.025 px beyond their noise.
 const CURVE_FORM_ERROR: f64 = 0.006;
-/// One of this many pixels tells.
+/// One of this many pixels is used.
 const RESPONSE_STRIDE: usize = 4;
 /// Prior information on the brightness beyond the pattern, in units of one pixel's: it is that of white, give
 /// or take the contrast.
@@ -124,7 +124,7 @@ pub(crate) fn fit_processed_design(
     is_curved.then(|| state.processed_result(&equations, &grid, CURVE_FORM_ERROR, pixels))?
 }
 
-/// With what a fit begins.
+/// The start of a fit.
 #[derive(Copy, Clone, Debug)]
 struct Start {
     spread_px: f64,
@@ -201,7 +201,7 @@ fn processed(
     min: MinResponse,
     scratch: &mut Scratch,
 ) -> Option<(State, NormalEquations<UNKNOWNS_PROCESSED, Residuals>)> {
-    // What the narrow loss takes for outliers may be the processing.
+    // Outliers of the narrow loss may be effects of the processing.
     let wide = Loss { limit: 0.25 * plain.light.contrast.abs(), is_huber: true };
     let start = State { loss: wide, ..*plain };
     let Scratch { pixels, magnitudes, .. } = &mut *scratch;
@@ -219,7 +219,7 @@ fn processed(
     }
     let first = start.equations::<UNKNOWNS_PROCESSED>(grid, pixels, RESPONSE_STRIDE)?;
     let gain = first.step(1e-6, 1e-9)?.dot(&first.right);
-    // What a step without the processing would gain.
+    // The gain of a step without the processing.
     let of_plain = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|i, j| first.matrix[(i, j)]);
     let right = SVector::<f64, UNKNOWNS>::from_fn(|i, _| first.right[i]);
     let plain_gain = right.dot(&of_plain.cholesky()?.solve(&right));
@@ -244,7 +244,7 @@ struct State {
     homography: Homography,
     light: PhotometricModel,
     response: CameraResponse,
-    /// What the response is held to.
+    /// The prior of the response.
     known: Option<ResponseEstimate>,
     /// Half the marker, the unit of `shade`.
     half_px: f64,
@@ -323,7 +323,7 @@ impl Residuals {
     }
 
     /// Whether most pixels are saturated, some black and some white, as in a drawing without light and blur: the few others, on the
-    /// edges, need not tell the square's place, its light and its blur together.
+    /// edges, may not determine the square's position, its light and its blur together.
     fn is_bilevel(&self) -> bool {
         let is_both = self.saturated_black > 0 && self.saturated > self.saturated_black;
         is_both && self.saturated as f64 > self.weight
@@ -419,20 +419,20 @@ impl State {
         let variance = (residuals.variance() * residuals.weight / freedom).max(ROUNDING_VARIANCE);
         let inverse = inverse(&equations.matrix)?;
         let covariance = SMatrix::<f64, 8, 8>::from_fn(|i, j| inverse[(i, j)]) * variance;
-        // What is not known better than by the outline alone is left to that.
+        // A result that is no better than that of the outline alone is left to the outline.
         let max_px2 = MAX_BILEVEL_CORNER_PX * MAX_BILEVEL_CORNER_PX;
         if residuals.is_bilevel() && self.worst_corner_px2(&covariance) > max_px2 {
             return None;
         }
-        let told = |index: usize, value: f64, known: Option<Measured>| {
+        let estimate = |index: usize, value: f64, known: Option<Measured>| {
             let variance = inverse.get((index, index))? * variance;
             Measured { value, deviation: variance.sqrt() }.without(known)
         };
         let CameraResponse { curve, sharpening } = self.response;
         let response = (N == UNKNOWNS_PROCESSED).then(|| {
             Some(ResponseEstimate {
-                curve: told(UNKNOWNS, curve, self.known.map(|known| known.curve))?,
-                sharpening: told(UNKNOWNS + 1, sharpening, self.known.map(|k| k.sharpening))?,
+                curve: estimate(UNKNOWNS, curve, self.known.map(|known| known.curve))?,
+                sharpening: estimate(UNKNOWNS + 1, sharpening, self.known.map(|k| k.sharpening))?,
             })
         });
         Some(Fit {
@@ -536,7 +536,7 @@ impl State {
             }
             let shown = grey.clamp(0.0, 255.0);
             if N == UNKNOWNS_PROCESSED && shown != grey {
-                // Compression comes after saturation, so that such pixels differ a little and tell nothing.
+                // Compression comes after saturation. Such pixels differ a little and contain no information.
                 pixel.residual = f64::NAN;
                 residuals.saturate(grey < 0.0);
                 total_cost += self.loss.influence(pixel.grey - shown).cost;

@@ -3,7 +3,7 @@
 //! The edges of all cells are predicted together, since through the blur of lens and pixels a cell of two pixels
 //! never shows its own black or white. In the square's coordinates the blur is a Gaussian whose axes are oblique
 //! because of the perspective. A cell's share of it is the product of two differences of edge responses, with the
-//! terms of Mehler's series for what the obliqueness adds where edges cross.
+//! terms of Mehler's series for the effect of the obliqueness where edges cross.
 
 use geometry::Pixel;
 use imaging::GrayView;
@@ -120,7 +120,7 @@ struct Lattice {
 
 impl Lattice {
     fn new(interval: usize) -> Self {
-        // The golden section: rows are shifted by what is never near a simple fraction of the interval.
+        // The golden section: the shift of rows is never near a simple fraction of the interval.
         Self { interval, shift: (0.618 * interval as f64).round() as usize }
     }
 
@@ -153,7 +153,7 @@ impl<'a> PatternGrid<'a> {
         Self { wide: Some(wide), ..self }
     }
 
-    /// The grid for what a camera blurs before it sharpens.
+    /// The grid of the light that a camera blurs before it sharpens.
     pub(crate) fn for_wide_blur(&self) -> &Self {
         self.wide.unwrap_or(self)
     }

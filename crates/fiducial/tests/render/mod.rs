@@ -13,7 +13,7 @@ use markers::{Drawing, Ink, Marker, Shape};
 /// Size of the thesis' marker, in metres.
 pub(crate) const SIZE_M: f64 = 0.15341;
 
-/// What a rendered frame looks like.
+/// The settings of a rendered frame.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Scene {
     pub(crate) camera: CameraModel,
@@ -61,7 +61,7 @@ impl Scene {
     }
 
     /// The frame. Around the marker every pixel is the mean over its area, blurred by the lens; further away the
-    /// ground is a texture without detail that anybody could miss.
+    /// ground is a texture without fine detail.
     pub(crate) fn render(&self) -> GrayImage {
         let (width, height) = (self.camera.width as usize, self.camera.height as usize);
         let mut random = Random(self.seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
@@ -135,7 +135,7 @@ impl Scene {
     fn expose(&self, area: [i64; 4], texture: &[f64]) -> Vec<f64> {
         let discs = discs();
         let place = self.places();
-        // What a point is on: paper or ground, and how bright that is.
+        // The surface at a point, paper or ground, and its brightness.
         let shade = |x: f64, y: f64| {
             let (px, py) = place(x, y);
             if px.abs().max(py.abs()) >= self.paper * SIZE_M {

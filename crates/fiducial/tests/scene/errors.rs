@@ -19,7 +19,7 @@ pub(crate) const BARREL: Distortion =
 pub(crate) struct Errors {
     pub(crate) frames: usize,
     pub(crate) centre_px: Vec<f64>,
-    /// Of the square root of the area, as a share: what makes the range wrong.
+    /// Of the square root of the area, as a fraction: it causes the error of the range.
     pub(crate) size: Vec<f64>,
     /// Squared errors of the corners in units of their covariance; 8 on average.
     pub(crate) normalised: Vec<f64>,

@@ -3,7 +3,7 @@
 //! form.
 #![allow(dead_code, reason = "each test uses its own part of it")]
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
-#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+#![allow(clippy::print_stdout, reason = "the tests print their figures")]
 
 pub(crate) mod errors;
 
@@ -69,7 +69,7 @@ impl Scene {
         }
     }
 
-    /// What is printed, as far as its square and one cell around it go.
+    /// The print of its square and one cell around it.
     pub(crate) fn pattern(&self) -> Pattern {
         Pattern::new(self.cells, 1, |x, y| Some(self.is_white(x, y))).unwrap()
     }

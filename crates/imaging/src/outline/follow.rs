@@ -282,7 +282,7 @@ impl Search<'_> {
         for down in 1..ROWS {
             rows[down] = row(down);
             parts[down] = flood(rows[down], beside(parts[down - 1]) & rows[down]);
-            // Most of a texture is joined right below. The end of a run tells whether it is flooded.
+            // Most of a texture is joined right below. The end of a run shows whether it is flooded.
             if down == 1 && is_of_other(upwards(rows[0], beside(parts[1]) & rows[0])) {
                 return true;
             }
@@ -502,7 +502,7 @@ fn upwards(bits: u64, seeds: u64) -> u64 {
 }
 
 impl Tops {
-    /// Reserves what rows of this length need.
+    /// Reserves memory for rows of this length.
     pub(super) fn make_room(&mut self, width: usize) {
         for words in [&mut self.ends, &mut self.flooded, &mut self.places] {
             words.reserve((width / 64 + 4).saturating_sub(words.len()));

@@ -34,7 +34,7 @@ pub(crate) struct EdgePoint {
 
 /// Points sampled on an ellipse to map it through a lens.
 const ELLIPSE_POINTS: u32 = 24;
-/// Shares of a circle's radius, of which the largest that the lens model reaches tells its size.
+/// Fractions of a circle's radius. The largest that the lens model reaches gives its size.
 const REACHED_SHARES: [f64; 5] = [1.0, 0.8, 0.6, 0.4, 0.2];
 /// Huber limit of edge residuals, in pixels.
 pub(crate) const HUBER_PX: f64 = 0.3;
@@ -299,7 +299,7 @@ impl CirclePose {
         let plane = self.plane(camera);
         for circle in points.chunk_by(|a, b| a.radius == b.radius) {
             let towards_m = circle.first().map_or(0.0, |point| towards_even(point.radius, size_m));
-            // What moves an edge moves all of it, so that many points on a circle are no better than one.
+            // An effect that moves an edge moves all of it: many points on a circle are no better than one.
             let share = 1.0 / circle.len() as f64;
             for point in circle {
                 let at = plane.intersect(&point.ray);
@@ -372,9 +372,9 @@ impl CirclePose {
     }
 }
 
-/// Standard deviation of what moves a whole edge in the image of a marker, in pixels: lens, print, light.
+/// Standard deviation of effects that move a whole edge in the image of a marker, in pixels: lens, print, light.
 const EDGE_BIAS_PX: f64 = 0.1;
-/// The same of what a camera's processing does to all edges alike, in pixels.
+/// The same of the effect of a camera's processing on all edges alike, in pixels.
 const PROCESSING_PX: f64 = 0.3;
 
 /// Where between the marker (0) and a target of evenly wide rings (1) radii lie, with its standard deviation.
@@ -605,7 +605,7 @@ mod tests {
     }
 
     #[test]
-    fn edges_that_all_lie_in_the_black_tell_how_far() {
+    fn edges_that_are_all_in_the_black_give_their_offset() {
         let camera = CameraModel::pinhole(1296, 972, 1818.0);
         let truth = pose(0.1, -0.2, 2.0, 0.2, 0.1);
         let (u, v) = truth.basis();

@@ -1,4 +1,4 @@
-//! The middle of a marker, which tells it from targets: rings that are evenly wide, as people like to draw them, are
+//! Checks the centre of a marker, which distinguishes it from targets: rings of equal width, as targets are often drawn, are
 //! nearly as far apart as the marker's, but have something else where the marker has its dot.
 
 use imaging::bilinear;

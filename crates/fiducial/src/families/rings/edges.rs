@@ -17,7 +17,7 @@ const MIN_EDGE_SHARE: f64 = 0.5;
 const CLEAR_SHARE: f64 = 0.8;
 /// Grey values from here on are saturated.
 pub(super) const SATURATED: f64 = 252.0;
-/// Largest share of white in what covers a ring.
+/// Largest fraction of white in an object that covers a ring.
 const MAX_COVERED_SHARE: f64 = 0.25;
 /// Blur shifts a curved edge towards the centre by this over the radius, all in pixels: half the variance of
 /// the blur of a lens in focus and of the pixels.
@@ -153,7 +153,7 @@ impl EdgeSearch<'_> {
         support
     }
 
-    /// Which edges are there at a pose. What clutter shows as well is too little unless a marker is followed there: one ring of
+    /// Which edges are there at a pose. Edges that clutter shows as well are too few unless a marker is tracked there: one ring of
     /// the two large ones, three circles of which the middle is beyond the frame, white rings on black with gaps.
     pub(super) fn completeness(
         &self,
@@ -184,8 +184,8 @@ impl EdgeSearch<'_> {
 
     /// Whether a marker is followed that should be near this pose.
     pub(super) fn is_followed(&self, pose: &CirclePose) -> bool {
-        /// Maximum distance of the centre in marker sizes, and bounds on the ratio of the distances from the camera: what
-        /// a vehicle may do from one frame to the next beyond going on as before.
+        /// Maximum distance of the centre in marker sizes, and bounds on the ratio of the distances from the camera: the
+        /// possible change of a vehicle's motion from one frame to the next.
         const MAX_AWAY: f64 = 0.1;
         const RATIO: std::ops::Range<f64> = 0.7..1.4;
         let is_near = |followed: &CirclePose| {

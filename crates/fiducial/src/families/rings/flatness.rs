@@ -1,4 +1,4 @@
-//! How much less sure a pose is where the edges show that the print is not flat: bent or folded paper, cloth in waves.
+//! Widens a pose's covariance where the edges show that the print is not flat: bent or folded paper, cloth in waves.
 
 use geometry::CameraModel;
 use nalgebra::{Matrix6, SMatrix, SVector, Vector3};
@@ -16,7 +16,7 @@ const MIN_BEND: f64 = 16.3;
 const MAX_CHANCE: f64 = 3.0;
 /// Number of parts into which a ring is divided.
 const SECTORS: usize = 8;
-/// Degrees of freedom with which the parts tell how far they contradict each other; a single ring has fewer.
+/// Degrees of freedom needed to measure how far the parts contradict each other; a single ring has fewer.
 const MIN_FREE: usize = 8;
 /// The parts of three rings.
 const PARTS: usize = 3 * SECTORS;
@@ -28,11 +28,11 @@ const FLAT: usize = 5;
 const BENT: usize = FLAT + 3;
 
 impl CirclePose {
-    /// The covariance of a pose, centre (m) and rotation vector (rad), that was fitted to a flat print, widened by what the
+    /// The covariance of a pose, centre (m) and rotation vector (rad), that was fitted to a flat print, widened where the
     /// edge points contradict that. The noise of single points, or pixels, hides it.
     ///
-    /// A bend (height as a quadratic of the place) may move the pose, and what is near on the print is off together, so that
-    /// its parts are what is independent, not the points (a cluster-robust covariance).
+    /// A bend (height as a quadratic of the position) may move the pose. Neighbouring points of the print are off together, so
+    /// that its parts are independent, not the points (a cluster-robust covariance).
     pub(crate) fn widened_by_form(
         &self,
         covariance: Matrix6<f64>,
@@ -186,7 +186,7 @@ mod tests {
     }
 
     /// The centre's error after the fit to such edges, in pixels; that error squared in units of the covariance of points that
-    /// are independent, and of the one that is told; and both covariances' ratio.
+    /// are independent, and of the reported one; and both covariances' ratio.
     fn fitted(
         circles: usize,
         seed: u64,
@@ -202,12 +202,12 @@ mod tests {
         let error_px = seen.distance(&project(truth.centre, &camera).unwrap());
         let unit = found.bent(&points, &camera).unwrap().inverse * (rms_px * rms_px);
         let alone = found.propagated(&unit) + Matrix6::identity() * 1e-12;
-        let told = found.widened_by_form(alone, &points, &camera);
+        let reported = found.widened_by_form(alone, &points, &camera);
         let nees = |all: &Matrix6<f64>| {
             let across = all.fixed_view::<2, 2>(0, 0).into_owned().try_inverse().unwrap();
             off.xy().dot(&(across * off.xy()))
         };
-        (error_px, nees(&alone), nees(&told), told[(0, 0)] / alone[(0, 0)])
+        (error_px, nees(&alone), nees(&reported), reported[(0, 0)] / alone[(0, 0)])
     }
 
     #[test]
@@ -217,7 +217,7 @@ mod tests {
             let draws: Vec<_> = (1..=DRAWS).map(|seed| fitted(circles, seed, |_, _| 0.0)).collect();
             let wider = draws.iter().filter(|(.., wider)| *wider > 1.0 + 1e-9).count();
             assert!(wider <= DRAWS as usize / 20, "{circles} circles: {wider} of {DRAWS}");
-            let squares: f64 = draws.iter().map(|(_, _, told, _)| told).sum();
+            let squares: f64 = draws.iter().map(|(_, _, reported, _)| reported).sum();
             let mean = squares / DRAWS as f64;
             assert!((1.6..2.4).contains(&mean), "{circles} circles: {mean}");
         }
@@ -229,9 +229,9 @@ mod tests {
             move |x: f64, y: f64| height * RADII[0] * ((0.6 * x + 0.8 * y) / RADII[0]).powi(2)
         };
         for height in [0.04, 0.1, -0.1] {
-            let (error_px, alone, told, _) = fitted(6, 1, bend(height));
+            let (error_px, alone, reported, _) = fitted(6, 1, bend(height));
             assert!(error_px > 0.1 && alone > 30.0, "{height}: {error_px} {alone}");
-            assert!(told < 9.2, "{height}: {error_px} {told}");
+            assert!(reported < 9.2, "{height}: {error_px} {reported}");
         }
     }
 
@@ -239,10 +239,13 @@ mod tests {
     fn a_folded_and_a_waved_print_are_less_sure() {
         let fold = |x: f64, y: f64| 0.06 * (0.6 * x + 0.8 * y).abs();
         let waves = |x: f64, _: f64| 0.02 * RADII[0] * (4.7 * x / RADII[0]).sin();
-        for (name, (error_px, alone, told, wider)) in
+        for (name, (error_px, alone, reported, wider)) in
             [("fold", fitted(6, 1, fold)), ("waves", fitted(6, 1, waves))]
         {
-            assert!(wider > 2.0 && told < 0.5 * alone, "{name}: {error_px} {alone} {told} {wider}");
+            assert!(
+                wider > 2.0 && reported < 0.5 * alone,
+                "{name}: {error_px} {alone} {reported} {wider}"
+            );
         }
     }
 }

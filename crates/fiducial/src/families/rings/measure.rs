@@ -513,7 +513,7 @@ fn from_photometric(fit: &PhotometricPoses, confidence: f64) -> Option<MeasuredM
             rms_px: rms_px(other.blur_px, other.residual),
         }),
         confidence,
-        response: best.told,
+        response: best.estimated_response,
     })
 }
 
@@ -544,8 +544,8 @@ fn is_small_marker(fit: &PhotometricFit, candidate_px: f64) -> bool {
         && is_plain_or_close(fit, MIN_R_SQUARED_PROCESSED_SMALL)
 }
 
-/// Whether a fit to pixels interpolated from a colour mosaic is a small marker's. Compression is a large part of what it
-/// leaves, so that the radii that would fit best decide, and of these how far all together are from evenly wide rings.
+/// Whether a fit to pixels interpolated from a colour mosaic is a small marker's. Compression is a large part of its
+/// residual, so that the radii that would fit best decide, and of these how far all together are from evenly wide rings.
 fn is_interpolated_marker(fit: &PhotometricFit, diameter_px: f64) -> bool {
     let are_radii_likely = |radii: Radii| {
         radii.is_below_evenness(MAX_EVENNESS_INTERPOLATED)
@@ -565,7 +565,7 @@ fn is_interpolated_marker(fit: &PhotometricFit, diameter_px: f64) -> bool {
         && fit.radii.is_some_and(are_radii_likely)
 }
 
-/// Whether a fit is a small marker's where the edge of a shadow was: what is left of it disturbs the grey values, but not which
+/// Whether a fit is a small marker's where the edge of a shadow was: its remainder disturbs the grey values, but not which
 /// radii fit best. Of 40 markers of 19 to 25 px the radii were known to 0.011 at worst.
 fn is_marker_under_edge(fit: &PhotometricFit) -> bool {
     const MAX_RESIDUAL: f64 = 0.11;
@@ -602,7 +602,7 @@ fn is_blacker_than_ink(fit: &PhotometricFit) -> bool {
     fit.black < -MAX_BLACKNESS * fit.contrast && !is_sharpened(fit)
 }
 
-/// Whether the radii that would fit best are the marker's, as far as they can be told.
+/// Whether the radii that would fit best are the marker's, as far as they can be measured.
 fn has_marker_radii(fit: &PhotometricFit) -> bool {
     has_balance(fit)
         && fit.radii.is_none_or(|radii| {

@@ -3,7 +3,7 @@
 //!
 //! Where rings are a few pixels wide, the blur of one edge reaches the next, and edges located one by one
 //! come out too far apart. Here pose, blur and exposure are fitted together, to minimise the difference
-//! between the image predicted by the model and the image observed. `model` has what is fitted, `scene` selects the pixels,
+//! between the image predicted by the model and the image observed. `model` has the unknowns, `scene` selects the pixels,
 //! `blur` is the model of one pixel, `solve` fits the model, `score` rates the result.
 
 mod blur;
@@ -43,7 +43,7 @@ const MIN_RESPONSE_GAIN: f64 = 0.2;
 const MIN_MOSAIC_RESIDUAL: f64 = 0.015;
 const MAX_MOSAIC_COST: f64 = 0.8;
 /// It is tried when one step with it costs less than this share of one without it, or, where a tone curve hides that, than
-/// this share of what was before.
+/// this fraction of the cost before.
 const MAX_MOSAIC_STEP: f64 = 0.85;
 const MAX_PROCESSED_STEP: f64 = 0.25;
 /// Start tilt in radians. Seen face on, every tilt looks the same to first order: a saddle of the cost.

@@ -173,7 +173,7 @@ impl RadiusDistribution {
         let [nx, ny] = normal;
         let variance = rr * (px_per_metre * px_per_metre);
         let per_variance = 1.0 / variance;
-        // Motion blurs like a box, as a pixel does; its variance is what exceeds the least of any direction.
+        // Motion blurs like a box, as a pixel does; its variance is the excess over the smallest of any direction.
         let of_box = 1.0 - blur.min_variance * per_variance;
         Self {
             at,

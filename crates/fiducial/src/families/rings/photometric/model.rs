@@ -1,4 +1,4 @@
-//! What a photometric fit takes and returns, and its limits.
+//! Defines the input, the result and the limits of a photometric fit.
 
 use geometry::CameraModel;
 use imaging::GrayView;
@@ -20,7 +20,7 @@ pub(super) const UNKNOWNS: usize = 10;
 /// The same and two numbers of the motion or of the camera's response.
 pub(super) const UNKNOWNS_WITH_EXTRAS: usize = 12;
 
-/// What is fitted beside pose, blur and light.
+/// The unknowns besides pose, blur and light.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(super) enum Extras {
     Nothing,
@@ -82,7 +82,7 @@ pub(crate) struct PhotometricFit {
     pub(crate) blur_px: f64,
     pub(crate) response: CameraResponse,
     /// The same with its deviations, where it was fitted.
-    pub(crate) told: Option<ResponseEstimate>,
+    pub(crate) estimated_response: Option<ResponseEstimate>,
     /// The mosaic from which the pixels were interpolated.
     pub(crate) mosaic: Option<Mosaic>,
     /// Of a small marker: how far the radii that fit best are from its own.
@@ -115,7 +115,7 @@ pub(crate) struct PhotometricPoses {
     pub(crate) alternative: Option<Alternative>,
 }
 
-/// What is fitted, and where.
+/// The input of a fit.
 #[derive(Copy, Clone)]
 pub(crate) struct PhotometricInput<'a> {
     pub(crate) view: GrayView<'a>,

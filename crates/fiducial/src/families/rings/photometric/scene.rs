@@ -41,7 +41,7 @@ pub(crate) struct PixelSample {
     pub(super) inside: bool,
 }
 
-/// What a model is fitted to.
+/// The data to which a model is fitted.
 #[derive(Clone, Copy)]
 pub(super) struct Scene<'a> {
     pub(super) samples: &'a [PixelSample],
@@ -61,7 +61,7 @@ pub(super) struct Scene<'a> {
     pub(super) radii_count: bool,
     /// Whether targets of evenly wide rings are fitted as well.
     pub(super) compares_targets: bool,
-    /// Whether a camera's processing is held to what cameras do.
+    /// Whether a camera's processing is constrained by the prior of ordinary cameras.
     pub(super) has_prior: bool,
 }
 

@@ -1,5 +1,5 @@
-//! Scores a photometric fit of the three-ring marker: what it leaves, beside a plain disc, rings of free grey values, free radii and evenly
-//! wide rings; and its covariance.
+//! Scores a photometric fit of the three-ring marker: its residual compared with a plain disc, rings of free grey values, free
+//! radii and rings of equal width; and its covariance.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -19,7 +19,7 @@ use crate::response::{Measured, ResponseEstimate};
 const PRIOR_NORMAL: f64 = 0.6;
 
 /// The form of a camera's tone curve is not quite the model's: a marker's edge may be off by this share of curve times blur, so that it looks
-/// larger or smaller. From `positions` of seed 7 in `raspberry-pi`, where rings were too small by 0.012 px beyond what their noise explains.
+/// larger or smaller. From `positions` of seed 7 in `raspberry-pi`, where rings were too small by 0.012 px beyond their noise.
 const CURVE_FORM_ERROR: f64 = 0.0026;
 
 /// The figures that distinguish a marker from other things.
@@ -291,15 +291,15 @@ impl Scene<'_> {
     /// A fit with its covariance and a score that may come from fewer samples.
     pub(super) fn with_score(&self, fit: &ModelFit, score: &Score) -> Option<PhotometricFit> {
         let all = self.covariance(fit)?;
-        let is_told = self.extras == Extras::Response && self.has_prior;
-        let told = is_told.then(|| {
+        let is_estimated = self.extras == Extras::Response && self.has_prior;
+        let estimated_response = is_estimated.then(|| {
             let CameraResponse { curve, sharpening } = fit.model.response;
-            let told = |index: usize, value: f64, prior: Measured| {
+            let estimate = |index: usize, value: f64, prior: Measured| {
                 Measured { value, deviation: all[(index, index)].sqrt() }.without(Some(prior))
             };
             Some(ResponseEstimate {
-                curve: told(UNKNOWNS, curve, CameraResponse::CURVE_PRIOR)?,
-                sharpening: told(UNKNOWNS + 1, sharpening, CameraResponse::SHARPENING_PRIOR)?,
+                curve: estimate(UNKNOWNS, curve, CameraResponse::CURVE_PRIOR)?,
+                sharpening: estimate(UNKNOWNS + 1, sharpening, CameraResponse::SHARPENING_PRIOR)?,
             })
         });
         let radii = self.radii_count.then(|| fit.model.radii(self, fit.huber_limit)).flatten();
@@ -318,7 +318,7 @@ impl Scene<'_> {
             black: fit.model.black,
             blur_px: fit.model.blur_px,
             response: fit.model.response,
-            told: told.flatten(),
+            estimated_response: estimated_response.flatten(),
             mosaic: self.mosaic,
             radii,
             target_cost: may_be_target.then(|| self.target_cost(fit)).flatten(),
@@ -365,7 +365,7 @@ impl Scene<'_> {
         let mut all = information.cholesky()?.inverse();
         if self.extras == Extras::Response {
             // The model of a camera's processing is not quite the camera's: all edges of a circle are off together, and those of
-            // different circles differently. Then the circles are what is independent, not the pixels (a cluster-robust
+            // different circles differently. Then the circles are independent, not the pixels (a cluster-robust
             // covariance).
             const FEW: f64 = CIRCLES as f64 / (CIRCLES - 1) as f64;
             let pulls = fit.model.pulls(self, fit.huber_limit)?;
@@ -378,7 +378,7 @@ impl Scene<'_> {
                     all[(row, column)] *= by_row * by_column;
                 }
             }
-            // What the form of its curve leaves looks like another range.
+            // The error of the curve's form looks like another range.
             let pose = &fit.model.pose;
             let outline = pose.projected(self.radii[0].0, self.camera)?;
             let spread_px = (fit.model.blur_px.powi(2) + PIXEL_VARIANCE).sqrt();

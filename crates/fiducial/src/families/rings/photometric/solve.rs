@@ -59,7 +59,7 @@ pub(super) struct Sharpened {
 }
 
 impl Sharpened {
-    /// What a camera of this response shows of a pixel and of what surrounds it.
+    /// The value that a camera of this response shows for a pixel and its neighbours.
     #[inline]
     pub(super) fn processed(
         &self,
@@ -168,7 +168,7 @@ impl RingModel {
         (self.black + contrast * white, contrast)
     }
 
-    /// Sets black and white to what fits best with everything else fixed.
+    /// Sets black and white to the values that fit best with all other unknowns fixed.
     fn expose(&mut self, scene: &Scene<'_>) -> Option<()> {
         let mut exposure = ClippedExposure::new(MAX_GREY);
         self.for_each_response(scene, |sample, response| {
@@ -247,8 +247,8 @@ impl RingModel {
         total.is_finite().then_some(NormalEquations { matrix, right, cost: total, extra })
     }
 
-    /// What is known of cameras in general, where this one's processing is fitted. The pixels of a small marker alone leave tone
-    /// curve, sharpening, blur and black nearly open: without a prior the fit explains noise by a camera that there is not, and
+    /// The prior of cameras in general, where this one's processing is fitted. The pixels of a small marker alone leave tone
+    /// curve, sharpening, blur and black nearly open: without a prior the fit explains noise by a camera that does not exist, and
     /// then other radii fit best. `limit` is the Huber limit of the residuals, in grey levels.
     pub(super) fn priors(
         &self,
@@ -309,7 +309,7 @@ impl RingModel {
     }
 }
 
-/// A residual of the unknowns themselves, how far they are from what is expected of them, and its gradient.
+/// A residual of the unknowns themselves, how far they are from their expected values, and its gradient.
 pub(super) struct PriorTerm {
     pub(super) gradient: SVector<f64, UNKNOWNS_WITH_EXTRAS>,
     pub(super) residual: f64,
