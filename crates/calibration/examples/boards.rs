@@ -1,4 +1,4 @@
-//! Calibrates synthetic cameras from synthetic boards, and prints what the results are worth.
+//! Calibrates synthetic cameras from synthetic boards, and prints the errors and uncertainties of the results.
 #![expect(clippy::print_stdout, clippy::panic, reason = "the tables are its purpose")]
 
 use std::time::Instant;
@@ -55,7 +55,7 @@ fn main() {
     }
 }
 
-/// A calibration, and what it is worth.
+/// A calibration and its errors.
 struct Solve {
     found: Calibration,
     score: Score,

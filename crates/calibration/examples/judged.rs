@@ -15,7 +15,7 @@ fn main() {
     let number = |at: usize, default: u64| {
         std::env::args().nth(at).and_then(|arg| arg.parse().ok()).unwrap_or(default)
     };
-    // With a third argument what each set shows is printed.
+    // With a third argument the evidence of each set is printed.
     let (sets, first_seed, is_long) = (number(1, 3), number(2, 0), number(3, 0) > 0);
     println!("{:12} {:>5} {:>8} {:>6}  reasons", "kind", "sets", "refused", "named");
     let kinds = std::iter::once(None).chain(Bad::ALL.map(Some));

@@ -19,7 +19,7 @@ pub(crate) const FLAWS: usize = SOLVED;
 /// All that the views share.
 pub(crate) const SHARED: usize = FLAWS + 3;
 
-/// Intrinsics, bend (metres that the middle lies deeper than the ends, along x and along y), flaws.
+/// Intrinsics, bend (metres that the centre is deeper than the ends, along x and along y), flaws.
 pub(crate) type Shared = SVector<f64, SHARED>;
 /// How a pixel changes with them, row by row.
 pub(crate) type SharedSlope = [[f64; SHARED]; 2];
@@ -50,7 +50,7 @@ pub(crate) struct Sheet {
 }
 
 impl Sheet {
-    /// What the views show of the board; each view's points in the order of their tags.
+    /// The board's points in the views; each view's points in the order of their tags.
     pub(crate) fn new(views: &[&View]) -> Self {
         let places = || views.iter().flat_map(|view| &view.points).map(|point| point.place_m);
         let bounds = [0, 1].map(|axis| {
@@ -109,7 +109,7 @@ impl BoardPoint {
         camera_from_board * Point::from_coords(self.place(shared).into())
     }
 
-    /// What was seen less what is expected, in pixels; `None` where the camera shows nothing of it.
+    /// The residual, observed less predicted, in pixels; `None` where the point is not in the image.
     pub(crate) fn residual(
         &self,
         camera: &CameraModel,

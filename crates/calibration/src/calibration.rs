@@ -12,7 +12,7 @@ use crate::lens::{INTRINSICS, Lens};
 use crate::stages::Solved;
 use crate::view::{ImageSize, View};
 
-/// What may be chosen.
+/// The options of a calibration.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Options {
     /// Whether the board may be bent; its shape is then solved for. Glass and aluminium are flat, paper never is.
@@ -34,21 +34,21 @@ pub struct Calibration {
     pub lens: Lens,
     /// Covariance of fx, fy, cx, cy (px) and of the lens's numbers in their order, zero for those that it has not.
     pub covariance: SMatrix<f64, INTRINSICS, INTRINSICS>,
-    /// How much deeper the board's middle lies than its left and right ends, and than its upper and lower ones, in metres.
+    /// How much deeper the board's centre is than its left and right ends, and than its upper and lower ones, in metres.
     pub bend_m: [f64; 2],
     /// Standard deviation of the bend, in metres.
     pub bend_sigma_m: [f64; 2],
     /// Standard deviation of the points along each axis, in pixels, without outliers.
     pub noise_px: f64,
-    /// Root mean square of the residuals' lengths, outliers included: what OpenCV reports.
+    /// Root mean square of the residuals' lengths, outliers included: as OpenCV reports it.
     pub rms_px: f64,
     /// How far from the principal point points were seen that fit, in pixels.
     pub seen_radius_px: f64,
     /// The views that were used.
     pub views: Vec<SolvedView>,
-    /// How the board was shown, and what the fit leaves unexplained.
+    /// How the board was shown, and the residuals that the fit does not explain.
     pub evidence: Evidence,
-    /// What two halves of the views say of each other; `None` where a half alone shows no camera.
+    /// The comparison of two halves of the views; `None` where a half alone does not determine the camera.
     pub cross_validation: Option<CrossValidation>,
 }
 
@@ -61,11 +61,11 @@ pub struct SolvedView {
     pub camera_from_board: Transform<Camera, Board>,
     /// Root mean square of its residuals' lengths, in pixels.
     pub rms_px: f64,
-    /// What is left of each point.
+    /// The residual of each point.
     pub residuals: Vec<Residual>,
 }
 
-/// What is left of a point.
+/// The residual of a point.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Residual {
     /// The tag that it belongs to.
@@ -76,7 +76,7 @@ pub struct Residual {
     pub residual_px: [f64; 2],
 }
 
-/// What is left in a part of the image.
+/// The residuals in a part of the image.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct PlaceResidual {
     /// The part's middle.
@@ -118,7 +118,7 @@ const COLUMNS: usize = 16;
 const ROWS: usize = 12;
 
 impl Calibration {
-    /// What a solved bundle says; `None` where the views do not determine the camera.
+    /// The result of a solved bundle; `None` where the views do not determine the camera.
     pub(crate) fn new(solved: &Solved, views: &[&View], middle_m: [f64; 2]) -> Option<Self> {
         let shared = &solved.place.shared;
         let camera = solved.bundle().camera(shared);
@@ -174,34 +174,34 @@ impl Calibration {
         ImageSize { width: self.camera.width, height: self.camera.height }
     }
 
-    /// The covariance of the pixel at which what is seen at `pixel` would be expected, in square pixels: of the projection of
-    /// a direction that is known in the camera frame. `None` where the lens model says nothing.
+    /// The covariance of the projection, in square pixels, of the direction in the camera frame that is seen at `pixel`. `None`
+    /// outside the range of the lens model.
     pub fn projection_covariance(&self, pixel: Pixel) -> Option<Matrix2<f64>> {
         let ray = self.camera.unproject(pixel)?;
         let slope = self.camera.intrinsics_jacobian(Point::from_coords(ray.coords.into()))?;
         Some(slope * self.covariance * slope.transpose())
     }
 
-    /// Whether points were seen as far from the principal point as this, or almost. Farther out nothing holds the lens's
-    /// polynomial, whose covariance knows only what its own numbers could do there.
+    /// Whether points were seen as far from the principal point as this, or almost. Farther out no points constrain the
+    /// lens's polynomial, and its covariance contains only the uncertainty of its coefficients.
     pub fn is_known_at(&self, pixel: Pixel) -> bool {
         let radius_px = pixel.distance(&Pixel::new(self.camera.cx, self.camera.cy));
         radius_px <= MAX_BEYOND_SEEN * self.seen_radius_px
     }
 
     /// One standard deviation of the projection at a place of the image, in pixels along each axis (root mean square of both
-    /// axes); `None` where the lens model says nothing, or points were not seen so far from the middle.
+    /// axes); `None` outside the range of the lens model, or where points were not seen so far from the centre.
     pub fn uncertainty_px(&self, pixel: Pixel) -> Option<f64> {
         self.formal_uncertainty_px(pixel).filter(|_| self.is_known_at(pixel))
     }
 
-    /// What the covariance says, also where points were not seen.
+    /// The uncertainty by the covariance, also where points were not seen.
     fn formal_uncertainty_px(&self, pixel: Pixel) -> Option<f64> {
         let covariance = self.projection_covariance(pixel)?;
         Some(fmax(covariance.trace() / 2.0, 0.0).sqrt())
     }
 
-    /// What 95 % of the whole image do not exceed of what the covariance says: too much of it is too few views, wherever.
+    /// The 95th percentile, over the whole image, of the uncertainty by the covariance: if it is too large there are too few views.
     pub(crate) fn worst_formal_uncertainty_px(&self) -> f64 {
         let places = self.size().middles(COLUMNS, ROWS);
         percentile_95(places.filter_map(|pixel| self.formal_uncertainty_px(pixel)).collect())
@@ -221,7 +221,7 @@ impl Calibration {
         map.iter().filter(|place| place.sigma_px.is_none()).count() as f64 / map.len() as f64
     }
 
-    /// What 95 % of the image do not exceed of [`Calibration::uncertainty_px`], where it is known.
+    /// The 95th percentile of [`Calibration::uncertainty_px`] over the image, where it is known.
     pub fn worst_uncertainty_px(&self) -> f64 {
         let map = self.uncertainty_map(COLUMNS, ROWS);
         percentile_95(map.iter().filter_map(|place| place.sigma_px).collect())
@@ -251,10 +251,10 @@ impl Calibration {
         map
     }
 
-    /// By how much a marker is placed wrongly because the camera is not known better: one standard deviation, which 95 % of
-    /// the known image do not exceed. The marker is at this distance along the line of sight, faces the camera, has a side of a
-    /// tenth of the distance, and its corners are seen without any error; its pose is the one that fits them best. Not in it
-    /// is what else makes a landing inexact: the corners' own noise, a wrong marker size, the camera's mount.
+    /// The error of a marker's position that the camera's uncertainty causes: one standard deviation, the 95th percentile over
+    /// the known image. The marker is at this distance along the line of sight, faces the camera, has a side of a
+    /// tenth of the distance, and its corners are seen without any error; its pose is the one that fits them best. Other
+    /// errors of a landing are not included: the corners' own noise, a wrong marker size, the camera's mount.
     pub fn error_at(&self, distance_m: f64) -> PlacementError {
         let [mut lateral_m, mut range_m] = [Vec::new(), Vec::new()];
         for pixel in self.size().middles(COLUMNS, ROWS).filter(|pixel| self.is_known_at(*pixel)) {
@@ -294,7 +294,7 @@ impl Calibration {
 /// The part of the image's length in which a coordinate lies.
 fn part(at: f64, length: u32, parts: usize) -> usize {
     let share = (at + 0.5) / f64::from(length) * parts as f64;
-    // The cast takes what is negative to zero.
+    // The cast converts negative values to zero.
     (share as usize).min(parts.saturating_sub(1))
 }
 

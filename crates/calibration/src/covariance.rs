@@ -1,4 +1,4 @@
-//! How sure a result is, when the errors of one tag's points are not independent.
+//! Computes a result's covariance when the errors of one tag's points are not independent.
 //!
 //! The covariance is a "sandwich" clustered by tag and view: the spread of the sums over each cluster, between two inverses of
 //! the equations' matrix (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986). Residuals are
@@ -10,14 +10,14 @@ use nalgebra::{Matrix6, Vector6};
 use crate::board::{Linearised, Shared};
 use crate::equations::{Bundle, Cross, Free, Place, Reduced, SharedMatrix, ViewSums, inverse};
 
-/// What a minimum says of all shared numbers, whichever are free.
+/// The covariance of all shared numbers at a minimum, free or fixed.
 pub(crate) struct Information {
     reduced: Reduced,
     /// The spread of the clusters' sums, with the slope of the loss's weight that the equations leave out.
     middle: SharedMatrix,
 }
 
-/// What is known about the free numbers.
+/// The information on the free numbers.
 pub(crate) struct Certainty {
     pub(crate) covariance: SharedMatrix,
     /// From the place to the minimum: zero but for numbers that were not free there.
@@ -25,7 +25,7 @@ pub(crate) struct Certainty {
 }
 
 impl Information {
-    /// What is known at a place; `None` where the views do not determine their poses.
+    /// The information at these values; `None` where the views do not determine their poses.
     pub(crate) fn new(bundle: &Bundle<'_>, place: &Place) -> Option<Self> {
         let equations = bundle.equations(place);
         let reduced = equations.reduced(0.0)?;

@@ -1,7 +1,7 @@
-//! The normal equations of a bundle: what the views share, and a pose for each.
+//! Builds the normal equations of a bundle: the numbers that the views share, and a pose for each.
 //!
 //! Each view's pose meets the shared numbers in its own block only, so the poses are eliminated one by one (Schur complement;
-//! Triggs et al., "Bundle adjustment: a modern synthesis", 2000, section 6.1), and what is left is small.
+//! Triggs et al., "Bundle adjustment: a modern synthesis", 2000, section 6.1), and a small system is left.
 
 use geometry::CameraModel;
 use nalgebra::{Isometry3, Matrix6, SMatrix, Vector6};
@@ -15,14 +15,14 @@ pub(crate) type SharedMatrix = SMatrix<f64, SHARED, SHARED>;
 /// The block between the shared numbers and a pose.
 pub(crate) type Cross = SMatrix<f64, SHARED, 6>;
 
-/// What is solved for.
+/// The unknowns.
 #[derive(Clone, Debug)]
 pub(crate) struct Place {
     pub(crate) shared: Shared,
     pub(crate) poses: Vec<Isometry3<f64>>,
 }
 
-/// What is minimised: the points of each view, and the loss of their residuals.
+/// The cost that is minimised: the points of each view, and the loss of their residuals.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Bundle<'a> {
     pub(crate) lens: Lens,

@@ -1,4 +1,4 @@
-//! How a board was shown (tilt, distances, cells of the image covered) and what the fit leaves: residuals by tag and place,
+//! Measures how a board was shown (tilt, distances, cells of the image covered) and the fit's residuals: by tag and position,
 //! flaws of the print, structures beyond noise.
 
 use geometry::CameraModel;
@@ -10,7 +10,7 @@ use crate::covariance::Information;
 use crate::stages::Solved;
 use crate::view::ImageSize;
 
-/// What speaks for and against a set of views.
+/// The evidence for and against a set of views.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Evidence {
     /// The board's tilt against the image, in radians: one view of ten exceeds it.
@@ -25,9 +25,9 @@ pub struct Evidence {
     pub stretch: Option<Estimate>,
     /// How far the board is from square, in radians.
     pub shear: Option<Estimate>,
-    /// What the residuals have in common at the same place of the image, in pixels (root mean square).
+    /// The common part of the residuals at the same position in the image, in pixels (root mean square).
     pub lens_structure_px: f64,
-    /// What the residuals of single views have in common beyond that, in pixels.
+    /// The further common part of the residuals within single views, in pixels.
     pub view_structure_px: f64,
 }
 
@@ -91,7 +91,7 @@ fn percentile(values: &mut [f64], percent: usize) -> f64 {
 fn cell(seen: [f64; 2], size: ImageSize, parts: [usize; 2]) -> usize {
     let [width, height] = [size.width, size.height].map(f64::from);
     let part = |at: f64, length: f64, parts: usize| {
-        // The cast takes what is negative to zero.
+        // The cast converts negative values to zero.
         (((at + 0.5) / length * parts as f64) as usize).min(parts - 1)
     };
     part(seen[1], height, parts[1]) * parts[0] + part(seen[0], width, parts[0])
@@ -141,8 +141,8 @@ struct TagResidual {
     residual_px: [f64; 2],
 }
 
-/// What residuals have in common by the image's place, and beyond that within views; both as root mean square over all tags,
-/// less what chance gives.
+/// The common part of residuals by position in the image, and the further one within views; both as root mean square over
+/// all tags, less the part of random errors.
 fn structures(solved: &Solved) -> [f64; 2] {
     let mut tags = tag_residuals(solved);
     let lens = by_cell(&mut tags);
@@ -234,7 +234,7 @@ impl Cell {
     }
 }
 
-/// What a polynomial of the second degree over the board explains within views.
+/// The part of the residuals within views that a polynomial of the second degree over the board explains.
 fn within_views(tags: &[TagResidual]) -> f64 {
     const TERMS: usize = 6;
     let (mut explained, mut left, mut freedom, mut terms, mut count) = (0.0, 0.0, 0.0, 0.0, 0.0);

@@ -1,15 +1,15 @@
-//! A camera's time offset, mount, focal length and first radial coefficient (k1) from a flight over a pad that stands still.
+//! Estimates a camera's time offset, mount, focal length and first radial coefficient (k1) from a flight over a stationary pad.
 //!
-//! The pad has one place. Where the vehicle's attitude and position put it moves with the vehicle when the camera is not as
-//! configured: with the height and the heading under a mount that is off, with the tilt under a focal length or a k1 that is
-//! off, with every turn under stamps that are early or late. What the autopilot errs by moves it, too, and slowly; that is
-//! solved for with the camera, and how large it is, is estimated from the flight itself, so that a deviation says what the
-//! flight has shown. Hovering shows nothing (Yang, Geneva, Eckenhoff, Huang, "Degenerate motion analysis for aided INS with online
+//! The pad has one position. Its position computed from the vehicle's attitude and position moves with the vehicle when the
+//! camera is not as configured: with the height and the heading under a mount that is off, with the tilt under a focal length or a k1 that is
+//! off, with every turn under stamps that are early or late. The autopilot's errors move it as well, slowly. They are
+//! estimated together with the camera, and their size is estimated from the flight itself, so that the deviations follow from
+//! the flight. Hovering shows nothing (Yang, Geneva, Eckenhoff, Huang, "Degenerate motion analysis for aided INS with online
 //! spatial and temporal sensor calibration", 2019).
 //!
-//! Stages in reading order: `sample` is what is given, `quantity` what is estimated; `motion` is the vehicle's pose at any time, `model` predicts what the camera sees,
-//! [`excitation`] is what the flight can show, `filter` eliminates the drift, of which `scale` finds how large it is (`noise`), `start` finds the
-//! time offset roughly.
+//! Stages in reading order: `sample` has the input, `quantity` the estimated quantities; `motion` is the vehicle's pose at any
+//! time, `model` predicts the detections, [`excitation`] measures which quantities are observable, `filter` eliminates the
+//! drift, `scale` estimates its size (`noise`), `start` finds the time offset roughly.
 
 pub mod excitation;
 mod filter;
@@ -34,7 +34,7 @@ use quantity::OFFSET;
 pub use quantity::{QUANTITIES, Quantity};
 pub use sample::{ConfiguredCamera, MarkerSample, VehicleSample};
 
-/// An estimated quantity: what is added to what was configured.
+/// An estimated quantity: a correction of the configured value.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct FlightEstimate {
     /// Which.
@@ -56,22 +56,22 @@ impl FlightEstimate {
         self.value.abs() <= MIN_DEVIATIONS * self.deviation
     }
 
-    /// What is to be added to the configured value: zero where it is not observable or may be right.
+    /// The correction of the configured value: zero where it is not observable or may be right.
     pub fn correction(&self) -> f64 {
         if self.is_observable() && !self.may_be_as_configured() { self.value } else { 0.0 }
     }
 }
 
-/// What a flight says of its camera.
+/// The result of a flight for its camera.
 #[derive(Clone, Debug)]
 pub struct FlightCalibration {
-    /// The camera with what was observable corrected.
+    /// The camera after the correction of the observable quantities.
     pub camera: ConfiguredCamera,
     /// The estimates, in the order of [`QUANTITIES`].
     pub estimates: [FlightEstimate; 6],
     /// Their covariance, in the same order.
     pub covariance: SMatrix<f64, 6, 6>,
-    /// What the autopilot's estimate seemed to err by.
+    /// The estimated errors of the autopilot's estimate.
     pub drift: Drift,
     /// How the vehicle moved.
     pub excitation: Excitation,
@@ -79,7 +79,7 @@ pub struct FlightCalibration {
     pub markers: usize,
 }
 
-/// Standard deviations of what was estimated of the autopilot's errors.
+/// Standard deviations of the autopilot's estimated errors.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Drift {
     /// Of the slow error of the horizontal position, in metres.
@@ -134,7 +134,7 @@ pub enum FlightRefusal {
          deviations; record a flight with more tilt and turns"
     )]
     Unsettled {
-        /// What changes most.
+        /// The quantity that changes most.
         quantity: &'static str,
         /// By how much, over its standard deviation.
         steps: f64,
@@ -142,12 +142,12 @@ pub enum FlightRefusal {
     /// Numbers that are no flight.
     #[error("the flight's numbers have no solution: {why}")]
     Numbers {
-        /// What went wrong.
+        /// The error.
         why: &'static str,
     },
 }
 
-/// What the image's scale has, which an error of the attitude makes smaller.
+/// The quantities of the image's scale, which an error of the attitude makes smaller.
 const SCALE: [Quantity; 2] = [Quantity::FocalScale, Quantity::K1];
 /// The fewest detections of a flight.
 pub const MIN_MARKERS: usize = 60;
@@ -171,7 +171,7 @@ const CONVERGED: f64 = 0.02;
 /// Largest step, in deviations, that may still be ahead when there are no more iterations.
 const MAX_UNSETTLED: f64 = 3.0;
 
-/// Estimates what differs between a camera and its configuration.
+/// Estimates the differences between a camera and its configuration.
 ///
 /// # Errors
 /// When the samples are too few or contradict each other.
@@ -195,7 +195,7 @@ pub fn calibrate_flight(
     let hidden = QUANTITIES.into_iter().filter(|quantity| !excitation.shows(*quantity));
     let prior = hidden.fold(unknown, |prior, quantity| prior.with(quantity, 0.0));
     let mut solution = solved(&model, &prior, Noise::default(), begin)?;
-    // The attitude's errors may have too large a part in the tilts: what they make of the scale would be taken for the camera's.
+    // The attitude's errors may be too large a part of the tilts: their effect on the scale would be attributed to the camera.
     let shows_scale = excitation.shows(Quantity::FocalScale);
     let scale_bias = Some(excitation.attenuation(solution.noise.lean_rad))
         .filter(|bias| shows_scale && *bias <= Quantity::FocalScale.max_deviation());
@@ -212,8 +212,9 @@ pub fn calibrate_flight(
         return Err(FlightRefusal::Contradiction { wander_m, share: result.outliers });
     }
     is_settled(&result)?;
-    let told = Told { configured, markers: model.markers().len(), excitation, noise, scale_bias };
-    Ok(told.calibration(&parameters, &result))
+    let assessment =
+        Assessment { configured, markers: model.markers().len(), excitation, noise, scale_bias };
+    Ok(assessment.calibration(&parameters, &result))
 }
 
 /// The parameters that explain a flight best, and the size of the errors.
@@ -268,8 +269,8 @@ fn deviation(result: &Filtered, index: usize) -> f64 {
     libm::fmax(result.covariance[(index, index)], 0.0).sqrt()
 }
 
-/// The variance of an estimate: of the flight's noise, of what no flight averages out, and of the step that is still ahead where
-/// the solution goes back and forth.
+/// The variance of an estimate: of the flight's noise, of errors that no flight averages out, and of the remaining step where the
+/// solution oscillates.
 fn variance(result: &Filtered, quantity: Quantity) -> f64 {
     let i = quantity.index();
     let noise = libm::fmax(result.covariance[(i, i)], 0.0);
@@ -290,8 +291,8 @@ fn is_settled(result: &Filtered) -> Result<(), FlightRefusal> {
     Ok(())
 }
 
-/// What is told of a solution.
-struct Told<'a> {
+/// The quality of a solution, with which its calibration is reported.
+struct Assessment<'a> {
     configured: &'a ConfiguredCamera,
     markers: usize,
     excitation: Excitation,
@@ -300,13 +301,13 @@ struct Told<'a> {
     scale_bias: Option<f64>,
 }
 
-impl Told<'_> {
+impl Assessment<'_> {
     fn shows(&self, quantity: Quantity) -> bool {
         let is_scale = SCALE.contains(&quantity);
         self.excitation.shows(quantity) && (!is_scale || self.scale_bias.is_some())
     }
 
-    /// What the attitude's errors make of the focal length no length of the flight averages out.
+    /// The variance of the focal length from the attitude's errors. A longer flight does not average it out.
     fn bias_variance(&self, quantity: Quantity) -> f64 {
         match quantity {
             Quantity::FocalScale => self.scale_bias.map_or(0.0, squared),

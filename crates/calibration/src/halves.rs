@@ -11,12 +11,12 @@ use crate::lens::INTRINSICS;
 use crate::stages::Solved;
 use crate::view::ImageSize;
 
-/// What two halves of the views say of each other.
+/// The comparison of two halves of the views.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct CrossValidation {
-    /// Root mean square, over the image, of the distance between what both project, after the best rotation; px.
+    /// Root mean square, over the image, of the distance between both projections, after the best rotation; px.
     pub difference_px: f64,
-    /// What the halves' stated uncertainties make one expect of it, in pixels.
+    /// The difference expected from the halves' stated uncertainties, in pixels.
     pub expected_px: f64,
 }
 
@@ -44,8 +44,8 @@ impl Half {
     }
 }
 
-/// What every second view says of the others, and the first half of them of the second, which shows what changed in between.
-/// Nothing where a half shows no camera.
+/// The comparison of every second view with the others, and of the first half with the second, which shows changes in between.
+/// Empty where a half does not determine the camera.
 pub(crate) fn cross_validations(whole: &Solved) -> impl Iterator<Item = CrossValidation> {
     let middle = whole.views.len() / 2;
     let by = |is_first: &dyn Fn(usize) -> bool| {

@@ -136,7 +136,7 @@ fn refuse_mirrored(sheet: &Sheet, size: ImageSize) -> Result<(), Refusal> {
     if 2 * mirrored > views { Err(Refusal::Mirrored { mirrored, views }) } else { Ok(()) }
 }
 
-/// What a set of views must show, chosen so that good synthetic sets pass and those of `tests/synthetic/bad.rs` do not.
+/// The requirements for a set of views, chosen so that good synthetic sets pass and those of `tests/synthetic/bad.rs` do not.
 mod limit {
     /// Tilt that one view of ten exceeds, in degrees.
     pub(super) const MIN_TILT_DEG: f64 = 15.0;
@@ -155,9 +155,9 @@ mod limit {
     /// Where the points are better than that, residuals that are mostly the lens's show already from here.
     pub(super) const MAX_CLEAR_STRUCTURE_PX: f64 = 0.05;
     pub(super) const MAX_CLEAR_LENS_SHARE: f64 = 0.5;
-    /// What the place in the image explains by what the view explains, from which on it is the lens and not motion.
+    /// The part explained by the position in the image over that explained by the view, from which on the lens is wrong, not motion.
     pub(super) const MIN_LENS_OF_VIEW: f64 = 0.3;
-    /// Differences of two halves: more than this, and more times what they claim.
+    /// Differences of two halves: in pixels, and in multiples of their stated uncertainty.
     pub(super) const MAX_DIFFERENCE_PX: f64 = 0.3;
     pub(super) const MAX_RATIO: f64 = 4.0;
     /// Noise and uncertainty in pixels, for images of up to 2000 pixels and by their width beyond.
@@ -166,7 +166,7 @@ mod limit {
     pub(super) const LARGE_IMAGE: f64 = 2000.0;
 }
 
-/// The first reason not to believe a result: how the board was shown comes first, as what follows may be caused by it.
+/// The first reason not to accept a result: how the board was shown comes first, as it may cause the later ones.
 fn judge(calibration: &Calibration) -> Result<(), Refusal> {
     let evidence = &calibration.evidence;
     shown_well(evidence)?;

@@ -1,4 +1,4 @@
-//! Which camera model is looked for, and its numbers as a vector.
+//! Defines the camera models that can be calibrated, and their numbers as a vector.
 
 use geometry::{CameraModel, Distortion, Point};
 use nalgebra::{SMatrix, SVector};

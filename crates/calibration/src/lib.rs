@@ -1,9 +1,9 @@
-//! A camera's intrinsics from images of a board, and its time offset, mount, focal length and k1 from a flight, with what they are
-//! worth.
+//! Calibrates a camera: intrinsics from images of a board, and time offset, mount, focal length and k1 from a flight, each with
+//! its uncertainty.
 //!
-//! The way through it: one [`View`] for each image, with the board's points that were found in it, goes into
-//! [`calibrate`]. What comes out is a [`Calibration`] (the [`geometry::CameraModel`], its covariance, each view's pose and
-//! residuals, and functions that say what the uncertainty means), or a [`Refusal`] with the reason in a sentence for people.
+//! Usage: [`calibrate`] takes one [`View`] for each image, with the board's points that were found in it. It returns a
+//! [`Calibration`] (the [`geometry::CameraModel`], its covariance, each view's pose and residuals, and functions that convert
+//! the uncertainty to pixels and metres), or a [`Refusal`] with the reason in a sentence for users.
 //!
 //! ```
 //! use calibration::{calibrate, ImageSize, Lens, Options, Sighting, View};
@@ -17,14 +17,14 @@
 //! println!("{refusal}");
 //! ```
 //!
-//! This crate knows no image, no marker, no file and no clock.
+//! This crate does not depend on images, markers, files or a clock.
 //!
-//! Modules in reading order: [`view`] is what is given, [`lens`] which camera model is looked for; `board` predicts a board's
-//! point with its derivatives, `equations` and `solve` find a minimum, `start` guesses where, `stages` is the way from guess
-//! to result, `covariance` says how sure it is;
-//! [`evidence`] is what the fit leaves unexplained, [`halves`] compares two halves of the views; [`calibration`] is the result,
-//! `judge` refuses by [`refusal`]. [`flight`] is another way, without a board: [`calibrate_flight`] compares the pad that a
-//! camera sees in flight with where the autopilot says that the vehicle is.
+//! Modules in reading order: [`view`] is the input, [`lens`] the camera model that is estimated; `board` predicts a board's
+//! point with its derivatives, `equations` and `solve` find a minimum, `start` computes the first guess, `stages` leads from
+//! it to the result, `covariance` gives the uncertainty;
+//! [`evidence`] measures the residuals of the fit, [`halves`] compares two halves of the views; [`calibration`] is the result,
+//! `judge` refuses by [`refusal`]. [`flight`] is another method, without a board: [`calibrate_flight`] compares the pad's
+//! detections in flight with the vehicle's pose that the autopilot reports.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
 

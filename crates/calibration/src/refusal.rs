@@ -3,7 +3,7 @@
 use crate::lens::Lens;
 use crate::view::ImageSize;
 
-/// Why there is no calibration: what was found, against which limit, and what to do.
+/// Why there is no calibration: the value, its limit, and the remedy.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Refusal {
@@ -93,7 +93,7 @@ pub enum Refusal {
     /// The board always faced the camera.
     #[error(
         "the board was tilted by {tilt_deg:.0} degrees at most (nine views of ten by less), and at least {min_deg:.0} are \
-         needed to tell focal length from distance: tilt it by 30 to 45 degrees, to all sides"
+         needed to distinguish focal length from distance: tilt it by 30 to 45 degrees, to all sides"
     )]
     NoTilt {
         /// The tilt that one view of ten exceeds.
@@ -160,7 +160,7 @@ pub enum Refusal {
     },
     /// The lens is of another kind.
     #[error(
-        "{lens} does not describe this lens: what it leaves depends on the place in the image, by {structure_px:.2} px (limit \
+        "{lens} does not describe this lens: its residuals depend on the position in the image, by {structure_px:.2} px (limit \
          {max_px:.2} px); take a model with more numbers, or Kannala-Brandt for a wide lens"
     )]
     WrongLens {

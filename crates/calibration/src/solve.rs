@@ -1,4 +1,4 @@
-//! Levenberg-Marquardt over what the views share and a pose for each.
+//! Minimises by Levenberg-Marquardt over the numbers that the views share and a pose for each.
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3, Vector6};
 
@@ -13,7 +13,7 @@ pub(crate) struct Minimum {
     pub(crate) has_settled: bool,
 }
 
-/// Share of the cost that a step must gain, or the fit has settled: far below what a thousandth of a standard deviation costs.
+/// Fraction of the cost that a step must gain, or the fit has converged: far below the cost of a thousandth of a standard deviation.
 const SETTLED: f64 = 1e-9;
 const MAX_DAMPING: f64 = 1e9;
 

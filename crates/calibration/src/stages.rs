@@ -1,4 +1,4 @@
-//! From points to the minimum: a guess, what matters most, then all, with a loss that narrows to the noise found.
+//! Leads from points to the minimum: a guess, the most important numbers, then all, with a loss that narrows to the noise found.
 
 use geometry::Pixel;
 
@@ -75,7 +75,7 @@ pub(crate) fn solve(
     best
 }
 
-/// What is to be solved.
+/// The problem to be solved.
 #[derive(Copy, Clone)]
 struct Task<'a> {
     sheet: &'a Sheet,
@@ -85,7 +85,7 @@ struct Task<'a> {
 }
 
 impl Task<'_> {
-    /// From an undistorted camera, what matters most first.
+    /// From an undistorted camera, the most important numbers first.
     fn rough(&self, focal_px: f64) -> Option<Solved> {
         let mut solved = self.posed(undistorted(focal_px, self.size))?;
         solved.minimise(&Free::none().with(0..2).with(4..5), 5);
@@ -197,7 +197,7 @@ impl Solved {
         part
     }
 
-    /// What is known at the minimum.
+    /// The information at the minimum.
     pub(crate) fn information(&self) -> Option<Information> {
         Information::new(&self.bundle(), &self.place)
     }

@@ -1,4 +1,4 @@
-//! What is given: the points of a board that were found in images.
+//! The input of a calibration: the points of a board that were found in images.
 
 use geometry::Pixel;
 
@@ -41,7 +41,7 @@ pub struct Sighting {
     pub seen: Pixel,
 }
 
-/// What one image shows of the board.
+/// The board's points in one image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
     /// For people: the file's name.

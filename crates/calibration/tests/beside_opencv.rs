@@ -40,7 +40,7 @@ fn photographs_give_the_camera_that_opencv_finds() {
                 .unwrap();
         let bent =
             calibrate_unjudged(&set.views, Lens::BrownConrady5, &Options::default()).unwrap();
-        let told = |name: &str, found: &Calibration| {
+        let print = |name: &str, found: &Calibration| {
             let CameraModel { fx, fy, cx, cy, .. } = found.camera;
             let sigma = found.covariance[(0, 0)].sqrt();
             println!(
@@ -48,8 +48,8 @@ fn photographs_give_the_camera_that_opencv_finds() {
                 set.name, found.rms_px
             );
         };
-        told("flat", &flat);
-        told("bent", &bent);
+        print("flat", &flat);
+        print("bent", &bent);
         // Theirs is the least RMS of a flat board; ours gives single bad corners less weight.
         assert!(
             flat.rms_px < 1.05 * theirs.rms_px,

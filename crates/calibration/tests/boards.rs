@@ -101,7 +101,7 @@ fn bad_sets_are_refused_with_their_reason() {
 }
 
 #[test]
-fn a_refusal_says_the_value_the_limit_and_what_to_do() {
+fn a_refusal_states_the_value_the_limit_and_the_remedy() {
     let truth = lenses()[0];
     let (views, lens) = Bad::TagSize.set(&truth, 502);
     let refusal = calibrate(&views, lens, &Options::default()).unwrap_err();

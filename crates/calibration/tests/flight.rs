@@ -12,7 +12,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-/// What a camera truly is, relative to its configuration.
+/// A camera's true parameters, relative to its configuration.
 #[derive(Copy, Clone, Debug, Default)]
 struct Truth {
     offset_s: f64,
@@ -177,7 +177,7 @@ fn markers(path: &Path, truth: &Truth, random: &mut ChaCha8Rng) -> Vec<MarkerSam
         if (u.abs() > 640.0) || (v.abs() > 480.0) {
             continue;
         }
-        // What a detector that knows the configured focal length makes of it.
+        // The result of a detector with the configured focal length.
         let focal = configured.model.fx;
         let z = focal * marker_m / noisy_px;
         let ray = Vector::<Camera>::new(u / focal, v / focal, 1.0);
@@ -229,8 +229,8 @@ fn deviations_are_honest_over_many_landings() {
             *square += (error / estimate.deviation).powi(2) / count as f64;
         }
     }
-    // 20 squares of a normal error have a mean from 0.4 to 1.9 in 199 of 200 cases. What no flight averages out is in the
-    // deviations, and not in these flights.
+    // 20 squares of a normal error have a mean from 0.4 to 1.9 in 199 of 200 cases. Errors that no flight averages
+    // out are in the deviations, and not in these flights.
     for (square, quantity) in squares.into_iter().zip(QUANTITIES) {
         println!("{quantity:?}: mean square of error over deviation {square:.2}");
         assert!((0.25..1.9).contains(&square), "{quantity:?}: {square}");
@@ -329,8 +329,8 @@ fn stamps_of_another_clock_are_refused() {
     for offset_s in [7.0, -2.5] {
         let (vehicle, markers) = flown(Flown::landing(4), &Truth { offset_s, ..WRONG });
         match calibrate_flight(&configured(), &vehicle, &markers) {
-            Err(FlightRefusal::Offset { offset_s: told_s }) => {
-                assert!((told_s - offset_s).abs() < 0.2, "{told_s}");
+            Err(FlightRefusal::Offset { offset_s: reported_s }) => {
+                assert!((reported_s - offset_s).abs() < 0.2, "{reported_s}");
             }
             other => panic!("{offset_s} s: {other:?}"),
         }

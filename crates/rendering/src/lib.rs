@@ -1,12 +1,12 @@
-//! Images of printed markers on the ground, with their truth: what a camera above a pad would see.
+//! Renders images of printed markers on the ground, as a camera above a pad sees them, with their truth.
 //!
-//! The crate knows drawings of markers, camera models and poses. It knows no vehicle, file or clock, and no
-//! detector. All randomness comes from a seed.
+//! The crate uses drawings of markers, camera models and poses. It does not depend on vehicles, files, a clock or
+//! detectors. All randomness comes from a seed.
 //!
-//! Modules in reading order: [`scene`] has what is rendered and the camera, [`render`] renders it,
-//! [`occluder`] has effects between scene and sensor, [`processing`] what a camera makes of the light on its
-//! sensor, [`ground`] the textures around the pads, [`views`] the frames of the thesis' experiment; `error` says why
-//! something cannot be drawn, `quantise` makes grey levels whole.
+//! Modules in reading order: [`scene`] has the objects and the camera, [`render`] renders them,
+//! [`occluder`] has effects between scene and sensor, [`processing`] a camera's processing of the light on its
+//! sensor, [`ground`] the textures around the pads, [`views`] the frames of the thesis' experiment; `error` has the
+//! errors of scenes that cannot be drawn, `quantise` rounds grey levels.
 
 mod error;
 pub mod ground;

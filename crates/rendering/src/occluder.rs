@@ -1,4 +1,4 @@
-//! Effects between the scene and the sensor: shadows, glare, occlusion, haze, what lies on a marker or on the lens.
+//! Effects between the scene and the sensor: shadows, glare, occlusion, haze, objects on a marker or dirt on the lens.
 
 use geometry::Pixel;
 
@@ -106,7 +106,7 @@ pub struct Stroke {
 }
 
 impl Stroke {
-    /// Covers what it hides in row `y`.
+    /// Covers the pixels that it hides in row `y`.
     fn cover_row(&self, y: f64, light: &mut [f32]) {
         let reach = f64::from(self.radius_px + EDGE_PX);
         if y < self.from.y.min(self.to.y) - reach || y > self.from.y.max(self.to.y) + reach {

@@ -1,5 +1,5 @@
-//! What a camera does to a rendered frame, from the flaws of its lens to the losses of JPEG or H.264: the settings of each stage with their
-//! limits, and the processing of a single frame.
+//! Processes a rendered frame as a camera does, from the flaws of its lens to the losses of JPEG or H.264. Has the settings of
+//! each stage with their limits.
 //!
 //! The stages are those of an ordinary camera, in its order: `lens` and `unsteady` (on the light behind the Gaussian blur that the renderer
 //! draws with), vignetting, exposure and noise (the sensor's), then `mosaic` (colour filters, interpolation), `denoise`, `local_tone`,
@@ -32,7 +32,7 @@ pub use video::Video;
 pub struct Processing {
     /// The flaws of the lens.
     pub lens: Lens,
-    /// What changes from frame to frame.
+    /// The changes from frame to frame.
     pub unsteady: Unsteady,
     /// Whether the sensor has an RGGB mosaic of colour filters, from which grey is interpolated; else it is
     /// monochrome.
@@ -71,7 +71,7 @@ pub enum Denoise {
     },
 }
 
-/// Local adaptation of brightness, as of a merged series of exposures: what is darker than the mean of the
+/// Local adaptation of brightness, as of a merged series of exposures: a pixel darker than the mean of the
 /// frame becomes brighter, and the other way round.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -190,7 +190,7 @@ impl Processing {
     }
 }
 
-/// Root mean square of what two pictures differ by, in grey levels.
+/// Root mean square of the difference of two pictures, in grey levels.
 #[cfg(test)]
 fn rms(a: &[u8], b: &[u8]) -> f64 {
     let squares = a.iter().zip(b).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2));

@@ -6,9 +6,9 @@
 //! well.
 //!
 //! Modules in reading order: `exposure` has the camera's poses while the shutter is open, `lens` the
-//! direction of each pixel, `painting` what a tile of the image shows of a marker, `scenery` the paintings of
+//! direction of each pixel, `painting` the part of a marker in a tile of the image, `scenery` the paintings of
 //! a scene, `painter` the edges of markers, `band` a row of tiles, `ground_row` the ground along a row,
-//! `sensor` turns light into grey levels, or for a camera that processes its frames into what it develops.
+//! `sensor` turns light into grey levels, or into raw values for a camera that processes its frames.
 
 mod band;
 mod exposure;
@@ -131,7 +131,7 @@ impl Renderer {
     /// Takes the next frames with this exposure time, in seconds, and gain, in this light on the scene.
     ///
     /// # Errors
-    /// [`RenderError::Setting`] for what no camera or scene has.
+    /// [`RenderError::Setting`] for invalid settings of camera or scene.
     pub fn expose(&mut self, exposure_s: f64, gain: f64, light: f64) -> Result<(), RenderError> {
         let settings = CameraSettings { exposure_s, gain, ..self.settings.clone() };
         settings.check()?;

@@ -1,4 +1,4 @@
-//! What is rendered: light, ground, pads (drawing, pose, paper) and painted marks; and the camera's model, mount,
+//! Defines the rendered scene: light, ground, pads (drawing, pose, paper) and painted marks; and the camera's model, mount,
 //! exposure, gain, noise, blur and processing.
 
 use geometry::{Body, Camera, CameraModel, Marker as MarkerFrame, Ned, Point, Rotation, Transform};
@@ -12,7 +12,7 @@ use crate::processing::Processing;
 /// Reflectance of paper.
 pub(crate) const PAPER: f32 = 0.88;
 
-/// What there is to see.
+/// The objects in the scene.
 #[derive(Clone, Debug)]
 pub struct Scene {
     /// The ground, at height 0 in NED.
@@ -28,7 +28,7 @@ pub struct Scene {
 /// Something printed on top of a flat square box.
 #[derive(Clone, Debug)]
 pub struct PadInScene {
-    /// What is printed.
+    /// Its print.
     pub drawing: Drawing,
     /// The printed face in the world.
     pub ned_from_marker: Transform<Ned, MarkerFrame>,
@@ -63,7 +63,7 @@ pub struct CameraSettings {
     pub blur_px: f64,
     /// Vignetting: 0 none, 1 that of the lens' projection, the fourth power of the cosine for a lens that is no fisheye.
     pub vignetting: f64,
-    /// What becomes of the light on the sensor.
+    /// The processing of the light on the sensor.
     pub processing: Processing,
 }
 

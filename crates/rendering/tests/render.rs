@@ -3,7 +3,7 @@
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,
-    reason = "helpers of tests fail like tests, and print what they measure"
+    reason = "helpers of tests fail like tests, and print their measurements"
 )]
 
 use geometry::{
@@ -370,7 +370,7 @@ fn other_lenses_agree_with_brute_force() {
     }
 }
 
-/// Centroid of what is darker than paper within a radius of the marker's centre.
+/// Centroid of the pixels darker than paper within a radius of the marker's centre.
 fn dark_centroid(out: &[u8], centre: Pixel, radius_px: f64, white: f64) -> Pixel {
     let (mut weight, mut x, mut y) = (0.0, 0.0, 0.0);
     for (index, level) in out.iter().enumerate() {

@@ -1,8 +1,8 @@
-//! What is left of a stream of H.264, beside what a real encoder and a real decoder leave of the same pictures.
+//! Compares the losses of a stream of H.264 with those of a real encoder and a real decoder for the same pictures.
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,
-    reason = "a test may stop anywhere, and tells what it measured"
+    reason = "a test may stop anywhere, and prints its measurements"
 )]
 
 use std::io::Write;
@@ -36,7 +36,7 @@ fn pictures(surface: Surface, processing: Processing) -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// What ffmpeg makes of its standard input.
+/// The output of ffmpeg for its standard input.
 fn ffmpeg(arguments: &str, input: Vec<u8>) -> Vec<u8> {
     let mut child = Command::new("ffmpeg")
         .args(["-nostdin", "-loglevel", "error"])
@@ -69,7 +69,7 @@ fn through_x264(pictures: &[Vec<u8>], quantiser: u8) -> Vec<Vec<u8>> {
     shown.chunks_exact(width * height).map(<[u8]>::to_vec).collect()
 }
 
-/// Root mean square of what two pictures differ by.
+/// Root mean square of the difference of two pictures.
 fn rms(a: &[u8], b: &[u8]) -> f64 {
     let squares = a.iter().zip(b).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2));
     (squares.sum::<f64>() / a.len() as f64).sqrt()

@@ -1,9 +1,9 @@
-//! What a flight can show at all.
+//! Measures which quantities a flight makes observable.
 //!
 //! Each quantity needs a motion of its own (Yang, Geneva, Eckenhoff, Huang, 2019). Without it the autopilot's errors alone look
-//! like that motion, and as they are in what is predicted as well as in its derivatives, an estimate would follow them however
-//! small its deviation is (errors in variables; Fuller, "Measurement error models", 1987). What was not excited is therefore not
-//! solved for.
+//! like that motion. As they are in the prediction as well as in its derivatives, an estimate would follow them, even with a
+//! small deviation (errors in variables; Fuller, "Measurement error models", 1987). Quantities that were not excited are
+//! therefore not estimated.
 
 use geometry::squared;
 
@@ -21,7 +21,7 @@ pub struct Excitation {
     pub turn_rad: f64,
 }
 
-/// The tilt that shows time offset and mount yaw: ten times what an autopilot's attitude errs by. The focal length needs more
+/// The tilt that shows time offset and mount yaw: ten times the error of an autopilot's attitude. The focal length needs more
 /// ([`Excitation::attenuation`]).
 const MIN_TILT_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 /// By how much more errors of the attitude count than their variance says, as the position's drift explains slow tilts away. Focal
@@ -55,7 +55,7 @@ impl Excitation {
 
     /// The part by which the focal length seems too short when roll and pitch err by this standard deviation each, in radians. The
     /// image shows the true tilt alone, so it is the errors' part in the variance of the estimated tilts (attenuation; Fuller,
-    /// section 1.1), times what the drift of the position makes of it.
+    /// section 1.1), times the effect of the position's drift.
     pub fn attenuation(&self, lean_rad: f64) -> f64 {
         let part = 2.0 * squared(lean_rad / self.tilt_rad);
         if lean_rad > 0.0 { SLOW_TILTS * part } else { 0.0 }

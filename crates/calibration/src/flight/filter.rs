@@ -1,7 +1,7 @@
-//! Eliminates what drifts from the equations, one marker after the other.
+//! Eliminates the drifting states from the equations, one marker after the other.
 //!
-//! For a place in the parameters the equations are linear, the drifts are first-order Gauss-Markov processes, and what is left
-//! of the parameters at the end is what least squares over all of them together would give: a Kalman filter is that elimination
+//! At given parameters the equations are linear, and the drifts are first-order Gauss-Markov processes. The parameters that
+//! result at the end are those of least squares over all states together: a Kalman filter is that elimination
 //! (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, chapter 5). A detection's
 //! error has the heavy tails of Student's distribution, by which outliers lose influence (Lange, Little, Taylor, "Robust
 //! statistical modeling using the t distribution", 1989).
@@ -26,7 +26,7 @@ const HEADING_RAD: f64 = 0.1;
 const CLIMB_PART: f64 = 0.05;
 const PAD_M: [f64; 3] = [10.0, 10.0, 3.0];
 
-/// What is assumed of the parameters.
+/// The prior of the parameters.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct Prior {
     mean: Parameters,
@@ -34,7 +34,7 @@ pub(super) struct Prior {
 }
 
 impl Prior {
-    /// What is assumed before a flight whose pad is about where these parameters have it.
+    /// The prior of a flight whose pad is about where these parameters have it.
     pub(super) fn around(begin: &Parameters) -> Self {
         let (mut mean, mut deviation) = (Parameters::zeros(), Parameters::zeros());
         for quantity in QUANTITIES {
@@ -55,7 +55,7 @@ impl Prior {
     }
 }
 
-/// What is left of the parameters.
+/// The result for the parameters.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct Filtered {
     /// From the place of the equations to the minimum.

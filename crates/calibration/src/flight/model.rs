@@ -10,7 +10,7 @@ use super::motion::{Motion, Pose};
 use super::quantity::{FOCAL, K1, MOUNT, OFFSET};
 use super::sample::{ConfiguredCamera, MarkerSample};
 
-/// What does not change in a flight: the camera's, then the autopilot's and the pad's.
+/// The constant parameters of a flight: the camera's, then the autopilot's and the pad's.
 pub(super) const PARAMETERS: usize = 11;
 /// Error of the autopilot's heading, in radians.
 pub(super) const HEADING: usize = 6;
@@ -18,19 +18,19 @@ pub(super) const HEADING: usize = 6;
 pub(super) const CLIMB: usize = 7;
 /// The pad's place in local NED, in metres.
 pub(super) const PAD: usize = 8;
-/// What drifts: the autopilot's position, in metres, and its roll and pitch, in radians.
+/// The drifting states: the autopilot's position, in metres, and its roll and pitch, in radians.
 pub(super) const DRIFTS: usize = 5;
 pub(super) const POSITION: usize = PARAMETERS;
 pub(super) const LEAN: usize = PARAMETERS + 3;
 /// All of it.
 pub(super) const STATES: usize = PARAMETERS + DRIFTS;
 
-/// What does not change, in the order above.
+/// The constant parameters, in the order above.
 pub(super) type Parameters = SVector<f64, PARAMETERS>;
-/// The same with what drifts.
+/// The same with the drifting states.
 pub(super) type State = SVector<f64, STATES>;
 
-/// What is seen of a marker: its pixel, and the logarithm of its distance along the optical axis.
+/// The observation of a marker: its pixel, and the logarithm of its distance along the optical axis.
 type Seen = Vector3<f64>;
 
 /// Steps of the derivatives, in the states' units.
@@ -68,7 +68,7 @@ pub(super) struct Measured {
 #[derive(Copy, Clone, Debug)]
 pub(super) struct Linearised {
     pub(super) stamp_s: f64,
-    /// What was seen less what is predicted.
+    /// The residual, observed less predicted.
     pub(super) residual: Seen,
     /// The prediction's derivative.
     pub(super) slope: SMatrix<f64, 3, STATES>,
@@ -169,7 +169,7 @@ impl<'a> Model<'a> {
         Some(state)
     }
 
-    /// What the camera would see from where the autopilot says that the vehicle is.
+    /// The predicted observation from the vehicle's pose that the autopilot reports.
     fn predicted(&self, state: &State, pose: &Pose) -> Option<Seen> {
         let parameters: Parameters = state.fixed_rows::<PARAMETERS>(0).into();
         let camera = corrected(&self.configured, &parameters);

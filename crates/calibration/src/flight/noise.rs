@@ -24,7 +24,7 @@ pub(super) struct Noise {
 }
 
 impl Default for Noise {
-    /// About what logs of autopilots show.
+    /// Typical values in logs of autopilots.
     fn default() -> Self {
         Self {
             pixel_px: 0.3,
@@ -39,13 +39,13 @@ impl Default for Noise {
 }
 
 impl Noise {
-    /// What is added to a detection's own covariance.
+    /// The addition to a detection's own covariance.
     pub(super) fn of_detection(&self) -> Matrix3<f64> {
         let (pixel, distance) = (self.pixel_px, self.distance);
         Matrix3::from_diagonal(&Vector3::new(pixel * pixel, pixel * pixel, distance * distance))
     }
 
-    /// Standard deviation of what the position's error changes by within a second, in metres.
+    /// Standard deviation of the change of the position's error within a second, in metres.
     pub(super) fn wander_m(&self) -> f64 {
         self.position_m * (2.0 * (1.0 - libm::exp(-1.0 / self.position_s))).sqrt()
     }

@@ -7,7 +7,7 @@ pub(super) const MOUNT: usize = 1;
 pub(super) const FOCAL: usize = 4;
 pub(super) const K1: usize = 5;
 
-/// What is estimated.
+/// An estimated quantity.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Quantity {
     /// How much later than their stamps frames are exposed, in seconds.
@@ -20,7 +20,7 @@ pub enum Quantity {
     MountYaw,
     /// True over configured focal length, less 1.
     FocalScale,
-    /// What is added to the lens's first radial coefficient.
+    /// The correction of the lens's first radial coefficient.
     K1,
 }
 
@@ -35,7 +35,7 @@ pub const QUANTITIES: [Quantity; 6] = [
 ];
 
 impl Quantity {
-    /// What it is called.
+    /// Its name.
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::TimeOffset => "time offset",
@@ -47,8 +47,8 @@ impl Quantity {
         }
     }
 
-    /// The standard deviation from which on a quantity counts as not observable, in its unit: about what an error of it costs
-    /// is a centimetre at touchdown, and for k1 the focal length's at the image's border.
+    /// The standard deviation from which on a quantity counts as not observable, in its unit: its error costs about
+    /// a centimetre at touchdown, and for k1 the same as the focal length's at the image's border.
     pub fn max_deviation(self) -> f64 {
         match self {
             Self::TimeOffset => 0.0015,
@@ -71,7 +71,7 @@ impl Quantity {
         }
     }
 
-    /// The standard deviation of what no flight averages out, in its unit: telemetry that comes with stamps of whole
+    /// The standard deviation of errors that no flight averages out, in its unit: telemetry that comes with stamps of whole
     /// milliseconds and every 50 ms. Found in simulated landings whose autopilot does not err.
     pub(super) fn model_deviation(self) -> f64 {
         match self {

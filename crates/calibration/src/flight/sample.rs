@@ -1,4 +1,4 @@
-//! What a flight is given as.
+//! The input of a flight: the vehicle's poses and the markers' detections.
 
 use geometry::{Body, Camera, CameraModel, Ned, Point, Rotation, Transform, Vector};
 use nalgebra::Matrix3;

@@ -1,4 +1,4 @@
-//! How large the errors are in a flight, by what makes it most likely.
+//! Estimates the size of the errors in a flight by maximum likelihood.
 
 use super::filter::{Prior, filtered};
 use super::model::{Linearised, Parameters};

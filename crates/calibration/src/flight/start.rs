@@ -1,4 +1,4 @@
-//! Where to begin: the time offset that explains a flight best, roughly.
+//! Finds a start value: the time offset that explains a flight best, roughly.
 
 use geometry::{Ned, Point};
 

@@ -1,12 +1,12 @@
 //! OpenCV's calibration of the same points, and the sets of corners in photographs that it found.
 #![allow(dead_code, unreachable_pub, reason = "each of those that share this file uses a part")]
-#![allow(clippy::expect_used, reason = "what is missing fails the test, or the table")]
+#![allow(clippy::expect_used, reason = "missing data fail the test, or the table")]
 
 use calibration::{ImageSize, Lens, Sighting, View};
 use geometry::{CameraModel, Distortion, Pixel};
 use serde_json::{Value, json};
 
-/// What OpenCV found.
+/// OpenCV's result.
 #[derive(Copy, Clone, Debug)]
 pub struct Found {
     pub camera: CameraModel,
@@ -68,7 +68,7 @@ pub fn photographs() -> Vec<Photographs> {
     let text = std::fs::read_to_string(path).expect("the file is there");
     let sets: Vec<Value> = serde_json::from_str(&text).expect("it is JSON");
     let solved = sets.iter().filter(|set| set["rms_px"].is_f64());
-    solved.map(|set| read(set).expect("a set has what its neighbours have")).collect()
+    solved.map(|set| read(set).expect("a set has the fields of its neighbours")).collect()
 }
 
 fn read(set: &Value) -> Option<Photographs> {

@@ -1,4 +1,4 @@
-"""Calibrates with OpenCV from the points in a JSON file, and prints what it found as JSON."""
+"""Calibrates with OpenCV from the points in a JSON file, and prints the result as JSON."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-//! Views of a board whose truth is known: what a detector would find in them, with errors that its tags' corners share.
+//! Makes views of a board whose truth is known: a detector's points in them, with errors that its tags' corners share.
 #![allow(dead_code, unreachable_pub, reason = "each of the tests that share this file uses a part")]
 
 use calibration::{Calibration, ImageSize, Lens, Sighting, View};
@@ -76,7 +76,7 @@ pub struct Taking {
     pub part: [f64; 4],
     /// Whether the board is always parallel to the image.
     pub is_parallel: bool,
-    /// The side of the printed tags, in metres: what is said of it is TAG_M.
+    /// The side of the printed tags, in metres: the stated size is TAG_M.
     pub tag_m: f64,
     /// How far the board moves while a picture is read out, row by row, in metres.
     pub motion_m: f64,
@@ -131,7 +131,7 @@ fn corners(tag: u32, side_m: f64) -> [[f64; 2]; 4] {
     [[x - half, y - half], [x + half, y - half], [x + half, y + half], [x - half, y + half]]
 }
 
-/// What is seen by this camera, by these rules.
+/// The views of this camera, by these rules.
 pub fn views(camera: &CameraModel, taking: &Taking, seed: u64) -> Vec<View> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut views = Vec::new();
@@ -208,7 +208,7 @@ fn pose(camera: &CameraModel, taking: &Taking, random: &mut impl Rng) -> Option<
     Some(Isometry3::from_parts(Translation3::from(sight * distance), rotation))
 }
 
-/// How far the projections of two cameras differ, in pixels: what 95 % of the image that `truth` describes do not exceed.
+/// How far the projections of two cameras differ, in pixels: the 95th percentile over the image that `truth` describes.
 pub fn map_error_px(truth: &CameraModel, found: &CameraModel) -> f64 {
     turned_error_px(truth, found, &UnitQuaternion::identity(), pixels())
 }

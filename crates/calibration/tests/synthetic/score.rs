@@ -1,4 +1,4 @@
-//! What a result is worth against its truth.
+//! Compares a result with its truth.
 
 use calibration::Calibration;
 use geometry::{CameraModel, Distortion, Pixel, Point};
@@ -13,7 +13,7 @@ pub struct Score {
     pub focal_percent: f64,
     /// The larger error of the principal point along an axis.
     pub principal_px: f64,
-    /// What 95 % of the image do not exceed.
+    /// The 95th percentile over the image.
     pub map_px: f64,
     /// The same after the best rotation.
     pub turned_px: f64,
@@ -80,7 +80,7 @@ fn nees(truth: &Truth, found: &Calibration) -> f64 {
     let scale = SVector::<f64, 12>::from_fn(|i, _| 1.0 / covariance[(i, i)].sqrt());
     let scaled = SMatrix::<f64, 12, 12>::from_fn(|i, j| covariance[(i, j)] * scale[i] * scale[j]);
     let error = SVector::<f64, 12>::from_fn(|i, _| (b[i] - a[i]) * scale[i]);
-    // What is no covariance counts as wrong without bound.
+    // An invalid covariance counts as an infinite error.
     let solved = scaled.cholesky().map(|factors| factors.solve(&error));
     solved.map_or(f64::INFINITY, |solved| error.dot(&solved) / count as f64)
 }

@@ -42,7 +42,7 @@ impl Developer {
         })
     }
 
-    /// The light of `len` pixels, to be written, then what the sensor makes of it.
+    /// The light of `len` pixels, to be written, then the sensor's values.
     pub(crate) fn raw(&mut self, len: usize) -> &mut [f32] {
         self.raw.resize(len, 0.0);
         &mut self.raw
@@ -70,7 +70,7 @@ impl Developer {
         }
     }
 
-    /// Develops what was written to the sensor.
+    /// Develops the light that was written to the sensor.
     pub(crate) fn develop(&mut self, out: &mut [u8]) -> Result<(), RenderError> {
         let width = self.width;
         if width == 0 || out.len() != self.raw.len() || !out.len().is_multiple_of(width) {

@@ -1,6 +1,6 @@
-//! What JPEG loses: blocks of 8 x 8 pixels become cosines, whose amplitudes are rounded to multiples of a step.
+//! Applies the losses of JPEG: blocks of 8 x 8 pixels become cosines, whose amplitudes are rounded to multiples of a step.
 //!
-//! What follows in a file, the coding of those numbers, loses nothing and takes most of the time, so it is left out. The
+//! The next step of an encoder, the coding of those numbers, loses nothing and takes most of the time, so it is left out. The
 //! tests compare with an encoder and a decoder.
 
 use crate::quantise::quantise;
@@ -39,7 +39,7 @@ impl Jpeg {
         Self { steps, per_step: steps.map(|row| row.map(|step| 1.0 / step)) }
     }
 
-    /// Replaces an image by what is left of it.
+    /// Replaces an image by its compressed version.
     pub(super) fn apply(&self, pixels: &mut [u8], width: usize) {
         for rows in pixels.chunks_mut(EDGE * width.max(1)) {
             let height = rows.len() / width.max(1);
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_is_what_a_decoder_reads_of_an_encoders_file() {
+    fn the_result_is_that_of_an_encoder_and_a_decoder() {
         let (width, height) = (141, 99);
         let pixels = picture(width, height);
         for quality in [30, 60, 75, 85, 92, 100] {

@@ -1,5 +1,5 @@
-//! What a lens adds to a Gaussian blur: a field that is not flat, colours of different size, veiling glare,
-//! and what changes from frame to frame: flicker of lamps, steps of the exposure.
+//! Applies a lens's errors besides a Gaussian blur: field curvature, lateral colour, veiling glare. Also changes from frame
+//! to frame: flicker of lamps, steps of the exposure.
 
 use serde::{Deserialize, Serialize};
 
@@ -19,7 +19,7 @@ pub struct Lens {
     pub flare: f32,
 }
 
-/// What changes from frame to frame; by default nothing.
+/// The changes from frame to frame; by default none.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Unsteady {
@@ -78,7 +78,7 @@ impl Lens {
         let width = width.max(1);
         let field = Field::new(light.len(), width);
         let height = light.len() / width;
-        // Of red and of blue: what lies outwards in the image comes from nearer the middle, by a part of the distance
+        // Of red and of blue: pixels further outwards in the image come from nearer the centre, by a fraction of the distance
         // that is the same everywhere. So each column and each row has its own taps.
         let scales = [-self.fringe_px * RED_OVER_BLUE, self.fringe_px]
             .map(|outwards| -outwards / field.half_diagonal);

@@ -1,4 +1,4 @@
-//! The colour filters of a sensor, and grey from what they let through.
+//! Applies the colour filters of a sensor, and computes grey from the filtered light.
 
 use super::filters::{beside, three_rows};
 

@@ -8,7 +8,7 @@ use super::{Denoise, Lens, LocalTone, Processing, Sharpen, ToneCurve, Video};
 /// A kind of camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Preset {
-    /// No processing: what a raw file shows.
+    /// No processing, as in a raw file.
     #[default]
     Linear,
     /// A USB camera in MJPEG.

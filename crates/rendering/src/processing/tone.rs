@@ -26,7 +26,7 @@ pub enum ToneCurve {
 }
 
 impl ToneCurve {
-    /// The grey level of a light, both from 0 to 1. What is outside counts as the nearest end.
+    /// The grey level of a light, both from 0 to 1. Values outside are clamped.
     pub fn level(self, light: f32) -> f32 {
         let light = light.clamp(0.0, 1.0);
         match self {

@@ -1,10 +1,9 @@
-//! What H.264 loses of rendered frames: each macroblock predicted with a motion vector or from its neighbours, its residual transformed and
-//! quantised, the edges deblocked.
+//! Applies the losses of H.264 to rendered frames: each macroblock predicted with a motion vector or from its neighbours, its
+//! residual transformed and quantised, the edges deblocked.
 //!
-//! Of the residual only what is larger than the quantiser's step is sent. So parts of a picture stay as they were, move with their
-//! surroundings, or are drawn anew, which no compression of single pictures shows. Motion compensation, the transform of 4 x 4 residuals,
-//! the quantiser and the deblocking filter are those of the format (ITU-T H.264); what an encoder is free to choose is chosen as fast ones
-//! do: one motion vector for each macroblock, found by descending the sum of absolute differences, intra prediction of whole macroblocks
+//! Only residuals larger than the quantiser's step are sent. So parts of a picture stay as they were, move with their
+//! surroundings, or are coded again, which no compression of single pictures shows. Motion compensation, the transform of 4 x 4 residuals,
+//! the quantiser and the deblocking filter are those of the format (ITU-T H.264); the free choices of an encoder are those of fast ones: one motion vector for each macroblock, found by descending the sum of absolute differences, intra prediction of whole macroblocks
 //! and of 4 x 4 blocks in five of its nine modes, and no blocks of single small levels. Left out are the coding of the numbers, which loses
 //! nothing, chroma, partitions, the transforms of 8 x 8 pixels and of the mean levels of a macroblock, the pixels above right of a block,
 //! and the control of the rate: the quantiser is the same everywhere. Fewer pixels stay as they were than with x264.
@@ -41,7 +40,7 @@ const KEY_FRAME_FINER: u8 = 3;
 /// Steps of the search for a motion: by two pixels, and then by each of these, in quarters.
 const MAX_STEPS: usize = 24;
 const FINER: [i32; 3] = [4, 2, 1];
-/// What is worth less is not coded, of a quarter of a macroblock and of the whole (thresholds on the cost of coefficients, as in x264).
+/// Residuals of lower cost are not coded, of a quarter of a macroblock and of the whole (thresholds on the cost of coefficients, as in x264).
 const MIN_WORTH_OF_QUARTER: u32 = 4;
 const MIN_WORTH: u32 = 6;
 /// Bits that it costs to say how a macroblock is predicted: from the previous picture beside its motion, from its neighbours as a whole,
@@ -80,7 +79,7 @@ impl VideoCoder {
         }
     }
 
-    /// Replaces the next picture by what a decoder makes of it.
+    /// Replaces the next picture by the decoder's result.
     pub(super) fn apply(&mut self, pixels: &mut [u8], width: usize) {
         let height = pixels.len() / width.max(1);
         if width == 0 || height == 0 {
@@ -119,7 +118,7 @@ impl VideoCoder {
         let parameter = self.video.quantiser.saturating_sub(finer);
         let intra = Quantiser::new(parameter, true);
         let inter = Quantiser::new(parameter, false);
-        // What a bit costs in absolute differences (the Joint Model's choice for motion).
+        // The cost of a bit in absolute differences (the Joint Model's choice for motion).
         let per_bit =
             (0.85 * 2_f64.powf((f64::from(parameter) - 12.0) / 3.0)).sqrt().max(1.0) as u32;
         self.coded.clear();
@@ -155,7 +154,7 @@ impl VideoCoder {
         deblock(&mut self.now, &self.coded, parameter);
     }
 
-    /// The motion that predicts a macroblock best, and what it costs.
+    /// The motion that predicts a macroblock best, and its cost.
     fn motion(
         &self,
         block: &[u8; 256],
@@ -215,7 +214,7 @@ impl VideoCoder {
         best
     }
 
-    /// Codes what a prediction from the previous picture leaves; which blocks have levels.
+    /// Codes the residual of a prediction from the previous picture; returns which blocks have levels.
     fn code_moved(
         &mut self,
         block: &[u8; 256],
@@ -248,7 +247,7 @@ impl VideoCoder {
         blocks
     }
 
-    /// Codes a macroblock that is predicted as a whole, or else block by block, from what is coded of the picture.
+    /// Codes a macroblock that is predicted as a whole, or else block by block, from the coded part of the picture.
     fn code_intra(
         &mut self,
         block: &[u8; 256],
@@ -335,8 +334,8 @@ fn place_in_macroblock(part: usize, at: usize) -> usize {
     (part / 4 * 4 + at / 4) * MACROBLOCK + part % 4 * 4 + at % 4
 }
 
-/// About what it costs to predict the blocks of a macroblock one by one: from the pixels of the picture itself, as what is coded of
-/// them is not known before.
+/// The approximate cost of predicting the blocks of a macroblock one by one: from the pixels of the picture itself, as the coded
+/// ones are not known before.
 fn blocks_cost(block: &[u8; 256], source: &Plane, x: usize, y: usize) -> u32 {
     (0..16)
         .map(|part| {
@@ -350,7 +349,7 @@ fn blocks_cost(block: &[u8; 256], source: &Plane, x: usize, y: usize) -> u32 {
 /// from the left, along the two diagonals; with the sum of its absolute differences.
 fn best_prediction(own: &Block, plane: &Plane, x: usize, y: usize) -> (u32, Block) {
     let (has_left, has_above) = (x > 0, y > 0);
-    // What is not in the picture is in the plane's margin.
+    // Pixels outside the picture are in the plane's margin.
     let (x, y) = (x as i32, y as i32);
     let above = plane.row(x - 1, y - 1, 5);
     let left = [0, 1, 2, 3].map(|row| plane.row(x - 1, y + row, 1)[0]);
@@ -426,7 +425,7 @@ mod tests {
             .collect()
     }
 
-    /// The pictures of a camera that moves, and what is left of them.
+    /// The pictures of a moving camera, and their coded versions.
     fn stream(
         quantiser: u8,
         key_frame_every: u16,
@@ -468,7 +467,7 @@ mod tests {
     }
 
     #[test]
-    fn what_moves_is_found_and_costs_little() {
+    fn motion_is_found_and_costs_little() {
         let mut coder = VideoCoder::new(Video { quantiser: 30, key_frame_every: 99 });
         for index in 0..5 {
             coder.apply(&mut scene([f64::from(index) * 2.75, f64::from(index) * -1.25]), SIZE[0]);

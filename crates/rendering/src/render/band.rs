@@ -41,7 +41,7 @@ impl Band {
         *state = if paint.cover == 1.0 { TileState::Covered } else { TileState::Mixed };
     }
 
-    /// Lays a painted tile over what is there.
+    /// Lays a painted tile over the present light.
     pub(super) fn lay(&mut self, column: usize, tile: usize, paint: &Channels) {
         let Some(state) = self.tiles.get_mut(column) else { return };
         let range = column * tile * tile..(column + 1) * tile * tile;

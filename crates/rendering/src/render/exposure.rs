@@ -1,4 +1,4 @@
-//! Where the camera is while the shutter is open.
+//! Interpolates the camera's pose while the shutter is open.
 
 use geometry::{Body, Camera, CameraModel, Ned, Pixel, Point, Transform};
 

@@ -50,7 +50,7 @@ fn columns(
     index(from).min(end)..end
 }
 
-/// What a tile sees of a painting during the exposure.
+/// The part of a painting in a tile during the exposure.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct Glimpse<'a> {
     /// At each instant.
@@ -271,8 +271,8 @@ enum Outline {
 struct HalfPlane {
     depth: [f32; 3],
     motion: f32,
-    /// Depth behind the opposite edge of a strip that is thinner than the profile: such edges cover together what is between
-    /// them, and not the product of what each covers by itself.
+    /// Depth behind the opposite edge of a strip that is thinner than the profile: such edges together cover the part
+    /// between them, and not the product of their single coverages.
     opposite: Option<[f32; 3]>,
 }
 
@@ -463,7 +463,7 @@ impl Outlines {
                 let row = Row::new(quadratic, v);
                 let margin = self.profile.margin(*motion);
                 let deep = |u: f32| -row.value(u) > row.steepness(u) * margin;
-                // A convex shape that contains both ends contains what is between them.
+                // A convex shape that contains both ends contains all points between them.
                 if row.bend > 0.0 && ends.iter().all(|u| deep(*u)) {
                     cover.fill(1.0);
                 } else if *motion == [0.0; 2] {
@@ -510,8 +510,8 @@ impl Outlines {
         }
     }
 
-    /// Multiplies the coverage with that of a strip between two nearly parallel edges. What of the kernel is beyond one edge is all
-    /// behind the other, so the strip has what both cover, less one.
+    /// Multiplies the coverage with that of a strip between two nearly parallel edges. The part of the kernel beyond one edge is
+    /// completely behind the other, so the strip has the sum of both coverages, less one.
     fn strip_row(
         &self,
         plane: &HalfPlane,

@@ -1,5 +1,5 @@
-//! A drawing of shapes on a plane in the scene, as the camera of one instant sees it, and what a tile of
-//! pixels shows of it: one paint, or edges.
+//! Projects a drawing of shapes on a plane in the scene into the camera of one instant, and finds for a tile of
+//! pixels whether it has one paint or edges.
 
 use geometry::{Camera, CameraModel, Distortion, Marker, Ned, Point, Transform};
 
@@ -14,7 +14,7 @@ pub(super) struct Painting {
     pub(super) half_extent_m: f64,
     /// Depth of the box whose lid the square is.
     pub(super) thickness_m: f64,
-    /// What is painted, bottom first.
+    /// The shapes, bottom first.
     pub(super) coats: Vec<Coat>,
 }
 
@@ -139,7 +139,7 @@ fn box_outline(painting: &Painting, eye: [f64; 3]) -> ([Affine; 8], usize) {
     (planes, len)
 }
 
-/// What a tile shows of a painting.
+/// The part of a painting in a tile.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(super) enum Shown {
     /// The same paint everywhere.
@@ -224,7 +224,7 @@ pub(super) fn pixel_bounds(
     if beyond.contains(&corners) {
         return None;
     }
-    // With a distorting lens the corners do not bound what lies between them.
+    // With a distorting lens the corners do not bound the points between them.
     if !in_front || model.distortion != Distortion::None {
         return Some(PixelBounds { columns: [0, last[0]], rows: [0, last[1]] });
     }
@@ -240,7 +240,7 @@ pub(super) fn pixel_bounds(
 /// Maximum deviation of a corner from a straight path between the instants of an exposure, in pixels.
 const MAX_DEVIATION_PX: f64 = 1.0;
 
-/// What a window of half edge `half` around the lens's centre shows of a painting. The window must contain
+/// The part of a painting in a window of half edge `half` around the lens's centre. The window must contain
 /// all points from which the tile gets light. The coats with edges in it are put into `crossing`, top first.
 pub(super) fn shown(
     painting: &Painting,

@@ -14,7 +14,7 @@ const BLACK: f32 = 0.05;
 /// Reflectance of the sides of a pad's box.
 const SIDES: f32 = 0.3;
 
-/// The painting of a pad: the box, its lid and what is printed on it.
+/// The painting of a pad: the box, its lid and its print.
 pub(super) fn pad_painting(pad: &PadInScene) -> Result<Painting, RenderError> {
     let finite = |value: f64| value.is_finite() && value >= 0.0;
     if !(finite(pad.paper_m) && finite(pad.thickness_m) && pad.ned_from_marker.origin().is_finite())

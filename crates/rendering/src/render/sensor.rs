@@ -126,9 +126,9 @@ impl Sensor {
     }
 }
 
-/// What the pixels of a row share.
+/// The common values of a row's pixels.
 struct Row {
-    /// What vignetting leaves in the middle column.
+    /// The light after vignetting in the centre column.
     gain: f32,
     seed: u64,
 }

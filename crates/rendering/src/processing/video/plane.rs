@@ -4,7 +4,7 @@
 pub(super) const MACROBLOCK: usize = 16;
 /// Pixels around a picture that repeat its border, for motion that leads out of it.
 const MARGIN: usize = 32;
-/// Of the margin, what the filter between pixels needs.
+/// The part of the margin that the filter between pixels needs.
 const REACH: usize = 4;
 
 /// Displacement to the place in the previous picture that predicts a block, in quarters of a pixel.
@@ -46,7 +46,7 @@ impl Plane {
         &mut self.pixels[at..][..length]
     }
 
-    /// Index of a pixel and the distance of rows, for what runs in both directions.
+    /// Index of a pixel and the distance of rows, for filters in both directions.
     pub(super) fn pixels_from(&mut self, x: usize, y: usize) -> (&mut [u8], usize, usize) {
         let at = self.at(x as i32, y as i32);
         (&mut self.pixels, at, self.stride)
@@ -90,7 +90,7 @@ impl Reference {
         &mut self.planes[0]
     }
 
-    /// Computes what is between the pixels.
+    /// Computes the samples between the pixels.
     pub(super) fn interpolate(&mut self) {
         let [whole, right, below, both] = &mut self.planes;
         let stride = whole.stride;
@@ -146,8 +146,8 @@ impl Reference {
         out
     }
 
-    /// Sum of the absolute differences of a macroblock from what this picture predicts; where it is no less than `bound`, that or
-    /// more.
+    /// Sum of the absolute differences between a macroblock and this picture's prediction; where it is no less than `bound`,
+    /// `bound` or more.
     pub(super) fn difference(
         &self,
         block: &[u8; 256],

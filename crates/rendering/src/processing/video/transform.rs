@@ -3,7 +3,7 @@
 /// A block of 4 x 4 values, by rows.
 pub(super) type Block = [i32; 16];
 
-/// What a level stands for at QP 0 to 5, doubled with every six more: where row and column are even, where both are odd, and
+/// The value of a level at QP 0 to 5, doubled with every six more: where row and column are even, where both are odd, and
 /// elsewhere (`normAdjust4x4`).
 const SCALES: [[i32; 3]; 6] =
     [[10, 16, 13], [11, 18, 14], [13, 20, 16], [14, 23, 18], [16, 25, 20], [18, 29, 23]];
