@@ -1,4 +1,4 @@
-//! What a person brings as files: images, videos, calibrations, recordings.
+//! Reads files of a user: images, videos, calibrations, recordings.
 
 use std::path::{Path, PathBuf};
 
@@ -58,7 +58,7 @@ pub fn calibration(input: &[u8]) {
     }
 }
 
-/// A recording to repair, of which what is kept is whole, to read and to replay.
+/// A recording to repair, to read and to replay; after the repair it is complete.
 pub fn recording(input: &[u8]) {
     let mut reader = flightlog::TapeReader::default();
     if reader.read(input).is_ok() {

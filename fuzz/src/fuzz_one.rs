@@ -1,6 +1,11 @@
 //! libFuzzer's program: fuzzes the target that `FUZZ_TARGET` names. `fuzz/run` builds and starts it.
 #![no_main]
-#![allow(unsafe_code, missing_docs, unreachable_pub, reason = "what libFuzzer's macro expands to")]
+#![allow(
+    unsafe_code,
+    missing_docs,
+    unreachable_pub,
+    reason = "libFuzzer's macro expands to such code"
+)]
 
 use std::collections::BTreeSet;
 use std::sync::{Mutex, OnceLock, PoisonError};
@@ -13,8 +18,8 @@ static PANICS: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
 
 #[expect(clippy::panic, reason = "libFuzzer has no other way to say why it does not begin")]
 fn chosen() -> Target {
-    // libFuzzer's own hook ends the process, also for what is caught, as panics of foreign decoders are. What is not
-    // caught ends it all the same. Each place is told once.
+    // libFuzzer's own hook ends the process, also for panics that are caught, as those of foreign decoders are. A panic that
+    // is not caught ends it nevertheless. Each position is printed once.
     std::panic::set_hook(Box::new(|panic| {
         let place = panic.location().map(ToString::to_string).unwrap_or_default();
         let is_ours = fuzz::is_of_this_workspace(&place);

@@ -1,10 +1,10 @@
-//! Everything that reads bytes or text from outside, as functions that take any input and must not panic, hang
+//! Runs every reader of bytes or text from outside, as functions that take any input and must not panic, hang
 //! or use more memory than [`MAX_MEMORY_MB`].
 //!
 //! `fuzz/run` mutates inputs with libFuzzer; the corpus it keeps is replayed by a plain `cargo test -p fuzz`.
 //!
-//! Modules in reading order: [`payloads`] has what arrives over the network and the autopilot's link,
-//! [`files`] what a person brings as files, [`texts`] names and settings.
+//! Modules in reading order: [`payloads`] reads messages of the network and bytes of the autopilot's link,
+//! [`files`] reads files of a user, [`texts`] names and settings.
 
 pub mod files;
 pub mod payloads;

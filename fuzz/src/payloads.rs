@@ -1,4 +1,4 @@
-//! What arrives over the network and the autopilot's link.
+//! Reads messages of the network and bytes of the autopilot's link.
 
 use airlink::Unpacker;
 use autopilot::{Autopilot, Config, Parser};
@@ -12,7 +12,7 @@ use messages::{
 /// Edges of the frames that an air-link payload is read for, in pixels.
 const MAX_EDGE_PX: u32 = 512;
 
-/// A payload of any topic: read as each type. What was read is written, and must be read again. The result is as what it could be read.
+/// A payload of any topic: read as each type. The value is written, and must be read again. Returns the types that could read it.
 pub fn codec(input: &[u8]) -> Vec<&'static str> {
     let read = [
         again::<FrameHeader>(input),
@@ -52,7 +52,7 @@ fn again<M: Message>(input: &[u8]) -> Option<&'static str> {
     Some(M::NAME)
 }
 
-/// Bytes of the autopilot's link: found as packets whatever pieces they come in, and handled by the client.
+/// Bytes of the autopilot's link: found as packets in pieces of any length, and handled by the client.
 pub fn mavlink(input: &[u8]) {
     let Some((first, bytes)) = input.split_first() else { return };
     let mut parser = Parser::new();

@@ -50,7 +50,7 @@ fn load<C: Settings>(layers: &Layers) {
 pub fn marker(input: &[u8]) {
     let Ok(text) = std::str::from_utf8(input) else { return };
     if let Ok(marker) = text.parse::<Marker>() {
-        // What is written of it names the same marker.
+        // Its written name names the same marker.
         assert_eq!(marker.to_string().parse::<Marker>().as_ref(), Ok(&marker));
         assert!(marker.name().parse::<Marker>().is_ok());
     }

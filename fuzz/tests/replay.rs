@@ -1,4 +1,4 @@
-//! What fuzzing has found and kept is read again, by every run of the tests.
+//! Reads the corpus that fuzzing has found and stored, in every run of the tests.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -15,7 +15,7 @@ static OWN_PANICS: AtomicUsize = AtomicUsize::new(0);
 
 #[test]
 fn every_kept_input_is_read_without_a_panic_in_bounded_time_and_memory() -> anyhow::Result<()> {
-    // What the readers contain is a decoder's panic, never one of their own.
+    // The readers catch a decoder's panic, never one of their own.
     std::panic::set_hook(Box::new(|panic| {
         let place = panic.location().map(ToString::to_string).unwrap_or_default();
         eprintln!("{panic}");

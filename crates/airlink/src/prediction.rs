@@ -35,7 +35,7 @@ pub struct RoiPredictor {
 
 #[derive(Clone, Debug)]
 struct Track {
-    /// Who saw it last.
+    /// The detector that saw it last.
     detector: String,
     family: String,
     id: Option<u32>,
@@ -260,7 +260,7 @@ mod tests {
             predictor.update(&of("tags", detections(stamp_ms, &[])));
             assert!(predictor.roi(stamp_ms * MS).is_some(), "frame {frame}");
         }
-        // Whoever saw it last is the one that misses it.
+        // The detector that saw it last decides that it is missed.
         predictor.update(&of("tags", detections(1320, &marker)));
         for stamp_ms in [1386, 1452] {
             predictor.update(&of("rings", detections(stamp_ms, &[])));

@@ -1,4 +1,4 @@
-//! Which frames become pictures for people, so that there are no more than a rate allows.
+//! Chooses the frames that become pictures for people, within a maximum rate.
 
 /// Share of the period by which a frame may be early, as frames come unevenly.
 const MAX_EARLY: f64 = 0.3;

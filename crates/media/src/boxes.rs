@@ -67,7 +67,7 @@ fn check_within(
         }
         at += size;
     }
-    // The parser would take what is left for the beginning of a box.
+    // The parser would read the remaining bytes as the beginning of a box.
     if depth > 0 && at != within.end {
         damaged("a box does not end with its last one")
     } else {
@@ -111,7 +111,7 @@ mod tests {
         assert!(is_sound(&deep) && !is_sound(&boxed(b"moov", &boxed(b"moov", &deep))));
         let many = boxed(b"free", &[]).repeat(MAX_BOXES + 1);
         assert!(is_sound(&many) && !is_sound(&boxed(b"moov", &many)));
-        // What is left over, and a last box that is cut.
+        // Surplus bytes, and a last box that is cut.
         let meta = boxed(b"meta", &[&[0; 4], inner.as_slice(), &[0, 0, 0, 1]].concat());
         let file = boxed(b"moov", &boxed(b"udta", &[meta, boxed(b"free", &[])].concat()));
         assert!(!is_sound(&file));
@@ -119,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn what_made_the_parser_ask_for_exabytes_is_refused() {
+    fn a_file_that_made_the_parser_allocate_exabytes_is_refused() {
         assert!(!is_sound(include_bytes!("../../../fuzz/corpus/mp4/meta_of_exabytes.mp4")));
     }
 }

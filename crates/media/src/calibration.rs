@@ -16,7 +16,7 @@ mod writing;
 
 use std::path::{Path, PathBuf};
 
-use fields::{Held, Problem};
+use fields::{Parsed, Problem};
 use geometry::CameraModel;
 use serde_yaml_ng::Value;
 
@@ -47,7 +47,7 @@ pub enum CalibrationError {
     Form {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The error.
         problem: String,
     },
     /// A key that is missing or has an invalid value.
@@ -57,9 +57,9 @@ pub enum CalibrationError {
         path: PathBuf,
         /// The key.
         key: String,
-        /// What is wrong with it.
+        /// The error.
         problem: String,
-        /// What it must be.
+        /// The valid values.
         expected: &'static str,
     },
     /// Images of another mode than the calibration is for.
@@ -67,7 +67,7 @@ pub enum CalibrationError {
     Mode {
         /// The file.
         path: PathBuf,
-        /// Which mode, and what to do.
+        /// The mode, and the remedy.
         problem: String,
     },
 }
@@ -87,10 +87,10 @@ pub struct CalibrationFile {
     pub calibrated: SensorRegion,
 }
 
-/// A mode as it is known from elsewhere: of what is not given the file says it.
+/// A mode as it is configured; the file gives the fields that are `None`.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub struct WantedMode {
-    /// What is read of the sensor; what the calibration holds for where it is not given.
+    /// The part of the sensor that is read; by default the part for which the calibration holds.
     pub region: Option<SensorRegion>,
     /// The binning; none where only a region is given.
     pub binning: Option<u32>,
@@ -112,12 +112,12 @@ impl CalibrationFile {
     /// [`CalibrationError`] names the file, the key and the expected value.
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
         let root = keys_and_values(path)?;
-        let held = fields::held(&root).ok_or_else(|| CalibrationError::Form {
+        let parsed = fields::parse(&root).ok_or_else(|| CalibrationError::Form {
             path: path.to_owned(),
             problem: "has none of the keys of a calibration".to_owned(),
         })?;
-        let Held { camera, mode, sensor_px, calibrated } =
-            held.map_err(|Problem { key, problem, expected }| CalibrationError::Key {
+        let Parsed { camera, mode, sensor_px, calibrated } =
+            parsed.map_err(|Problem { key, problem, expected }| CalibrationError::Key {
                 path: path.to_owned(),
                 key,
                 problem,
@@ -130,7 +130,7 @@ impl CalibrationFile {
     /// parts of the sensor for which the calibration does not hold, are refused.
     ///
     /// # Errors
-    /// [`CalibrationError::Mode`] with both modes, and what to do.
+    /// [`CalibrationError::Mode`] with both modes, and the remedy.
     pub fn camera_in(
         &self,
         image_px: [u32; 2],
@@ -180,7 +180,7 @@ impl CalibrationFile {
         Ok(mode.of_images(&self.mode.of_sensor(&self.camera, self.sensor_px)))
     }
 
-    /// From the size alone nobody can tell whether the sensor was binned, cropped, or only every second pixel read.
+    /// The size alone does not show whether the sensor was binned, cropped, or read at every second pixel only.
     fn other_size_advice(&self, [width, height]: [u32; 2]) -> String {
         let SensorRegion { width: all_width, height: all_height, .. } = self.calibrated;
         let binning = (2..=8).find(|b| [all_width / b, all_height / b] == [width, height]);
@@ -319,7 +319,7 @@ distortion_coefficients: !!opencv-matrix
     }
 
     #[test]
-    fn a_mode_that_cannot_be_converted_is_refused_with_what_to_do() {
+    fn a_mode_that_cannot_be_converted_is_refused_with_the_remedy() {
         let refused = |image_px, region: Option<SensorRegion>, binning| {
             in_mode(ROS, image_px, WantedMode { region, binning }).unwrap_err()
         };
@@ -337,7 +337,7 @@ distortion_coefficients: !!opencv-matrix
     }
 
     #[test]
-    fn what_was_calibrated_of_a_sensor_is_the_most_that_is_converted() {
+    fn modes_beyond_the_calibrated_part_of_a_sensor_are_refused() {
         let text = format!(
             "{OPENCV}alight:\n   sensor: [2000, 1500]\n   region: [100, 60, 1280, 960]\n   binning: 2\n"
         );

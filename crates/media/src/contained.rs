@@ -1,12 +1,12 @@
-//! Decoders of other projects, of which some panic on damaged files.
+//! Converts panics of other projects' decoders on damaged files into errors.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// The cause of an error of a decoder that panicked.
 const CAUSE: &str = "its decoder failed on it";
 
-/// What `decode` returns; when it panics the error that `damaged` makes of the cause. What it worked on is not to be used
-/// after that.
+/// Returns the result of `decode`; after a panic the error that `damaged` makes of the cause. Values that `decode` changed must
+/// not be used after a panic.
 pub(crate) fn contained<T, E>(
     decode: impl FnOnce() -> Result<T, E>,
     damaged: impl FnOnce(&str) -> E,

@@ -12,7 +12,7 @@ use rust_h264::sps::{Sps, parse_sps};
 
 use crate::contained::contained;
 
-/// Why a picture could not be decoded. The decoder goes on at the next key frame.
+/// Why a picture could not be decoded. The decoder continues at the next key frame.
 #[derive(Debug, thiserror::Error)]
 #[error("a picture of H.264 cannot be decoded: {cause}")]
 pub struct H264Error {
@@ -30,7 +30,7 @@ impl H264Error {
 pub struct LiveH264 {
     decoder: Decoder,
     limits: Limits,
-    /// Whether pictures depend on what was decoded: not before the first key frame, nor after a loss.
+    /// Whether pictures depend on decoded ones: not before the first key frame, nor after a loss.
     has_begun: bool,
 }
 
@@ -40,7 +40,7 @@ impl LiveH264 {
         Self { decoder: Decoder::default(), limits: Limits::new(max_pixels), has_begun: false }
     }
 
-    /// Forgets the stream: pictures before the next key frame are not decoded, as they refer to what is missing.
+    /// Forgets the stream: pictures before the next key frame are not decoded, as they refer to missing ones.
     pub fn restart(&mut self) {
         *self = Self::new(self.limits.max_pixels);
     }
@@ -102,13 +102,13 @@ const MAX_PICTURE: u32 = 255;
 /// Maximum bytes of a slice's header: with all of its lists it has two thousand.
 const MAX_HEADER_BYTES: usize = 4096;
 
-/// What of a stream is too much.
+/// A value of a stream that exceeds a limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Excess {
     /// The pixels of a picture.
     Pixels { pixels: u64, limit: u64 },
     /// A number that the standard bounds.
-    Standard { count: u32, what: &'static str, limit: u32 },
+    Standard { count: u32, quantity: &'static str, limit: u32 },
 }
 
 impl Display for Excess {
@@ -117,12 +117,14 @@ impl Display for Excess {
             Self::Pixels { pixels, limit } => {
                 write!(f, "{pixels} pixels per picture (limit {limit})")
             }
-            Self::Standard { count, what, limit } => write!(f, "{count} {what} (limit {limit})"),
+            Self::Standard { count, quantity, limit } => {
+                write!(f, "{count} {quantity} (limit {limit})")
+            }
         }
     }
 }
 
-/// Refuses what would make a decoder take too much memory, before it is decoded.
+/// Refuses streams for which a decoder would allocate too much memory, before they are decoded.
 pub(crate) struct Limits {
     max_pixels: u64,
     sequences: BTreeMap<u32, Sps>,
@@ -135,10 +137,10 @@ impl Limits {
         Self { max_pixels, sequences: BTreeMap::new(), pictures: BTreeMap::new() }
     }
 
-    /// What of a unit is too much, if anything is. A damaged unit is left to the decoder.
+    /// The value of a unit that exceeds a limit, if any. A damaged unit is left to the decoder.
     pub(crate) fn excess(&mut self, unit: &NalUnit<'_>) -> Option<Excess> {
-        let beyond = |count: u32, what: &'static str, limit: u32| {
-            (count > limit).then_some(Excess::Standard { count, what, limit })
+        let beyond = |count: u32, quantity: &'static str, limit: u32| {
+            (count > limit).then_some(Excess::Standard { count, quantity, limit })
         };
         match unit.nal_unit_type {
             NalUnitType::Sps => {

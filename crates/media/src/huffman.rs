@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_tables_or_is_coded_otherwise_stays_as_it_is() {
+    fn files_with_tables_or_another_coding_are_not_changed() {
         let is_same = |file: &[u8]| matches!(with_tables(file), Cow::Borrowed(it) if it == file);
         assert!(is_same(&[&FILE[..2], &[0xff, 0xc4, 0, 2], &FILE[2..]].concat()));
         // Progressive, lossless, by arithmetic, and without a frame.

@@ -22,7 +22,7 @@ const MAX_FOLDER_DEPTH: usize = 16;
 /// Maximum bytes of a file beyond its pixels: thumbnails, colour profiles and comments.
 const MAX_METADATA_BYTES: u64 = 64 << 20;
 
-/// Why an image was not read, and what to do about it.
+/// Why an image was not read, and the remedy.
 #[derive(Debug, thiserror::Error)]
 pub enum ImageError {
     /// The system does not open a file or folder.
@@ -188,8 +188,8 @@ impl From<GrayImage> for StillImage {
     }
 }
 
-/// An image file (PNG or JPEG) in grey, as it is stored: whatever Exif's orientation is, it is as the sensor saw it, of which a
-/// camera's calibration is. Colours are weighted by ITU-R BT.601, 16-bit grey is scaled to the range it uses, transparent pixels are
+/// Reads an image file (PNG or JPEG) in grey, as it is stored. It is not turned by Exif's orientation, as a camera's calibration
+/// is of the sensor's pixels. Colours are weighted by ITU-R BT.601, 16-bit grey is scaled to the range it uses, transparent pixels are
 /// blended with white. With a `bayer` pattern, an image of one channel is a sensor's raw samples.
 ///
 /// # Errors

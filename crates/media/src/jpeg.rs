@@ -71,7 +71,7 @@ pub(crate) struct Segment<'a> {
     pub(crate) code: u8,
     /// Where its marker begins.
     pub(crate) at: usize,
-    /// What follows its length.
+    /// The bytes after its length.
     pub(crate) parameters: &'a [u8],
 }
 
@@ -108,7 +108,7 @@ fn next_segment(bytes: &[u8], mut at: usize) -> Option<(Segment<'_>, usize)> {
 /// Takes JPEG files out of a stream that comes in pieces of any size.
 #[derive(Debug, Default)]
 pub struct JpegScanner {
-    /// The file so far; before its start only what may be the first byte of an SOI marker.
+    /// The file so far; before its start only a byte that may be the first of an SOI marker.
     file: Vec<u8>,
     /// Where to look for the next marker.
     at: usize,

@@ -1,11 +1,11 @@
-//! Images, videos and calibration files, read into grey images and camera models; calibration files are written as well.
+//! Reads images, videos and calibration files into grey images and camera models; writes calibration files as well.
 //!
-//! The crate knows no marker, no camera that is connected, and no other process.
+//! The crate does not depend on markers, connected cameras or other processes.
 //!
-//! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, `huffman` gives them the tables that a camera leaves
-//! out, `scan` says whether their data are whole, [`image`] reads image files, [`video`] reads videos frame by frame, [`h264`]
-//! decodes what a camera streams, [`calibration`] reads and writes the calibration files of other programs, [`rectify`] takes a
-//! lens's distortion out of images, [`whole`] writes a file whole or not at all.
+//! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, `huffman` adds the tables that a camera leaves
+//! out, `scan` checks whether their data are complete, [`image`] reads image files, [`video`] reads videos frame by frame, [`h264`]
+//! decodes a camera's stream, [`calibration`] reads and writes the calibration files of other programs, [`rectify`] removes a
+//! lens's distortion from images, [`whole`] writes a file whole or not at all.
 
 mod boxes;
 mod budget;

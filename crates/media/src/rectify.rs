@@ -41,7 +41,7 @@ impl Rectifier {
     }
 
     /// Writes the image without distortion, row by row; black where the camera saw nothing. False, and nothing is written, when
-    /// the image or what it goes to is not of the camera's size.
+    /// the image or the output is not of the camera's size.
     #[must_use]
     pub fn rectify(&self, view: GrayView<'_>, out: &mut [u8]) -> bool {
         let size = [self.camera.width as usize, self.camera.height as usize];
@@ -49,7 +49,7 @@ impl Rectifier {
             return false;
         }
         for (level, [x, y]) in out.iter_mut().zip(&self.places) {
-            // The cast rounds after a half is added, and takes what is not a number to black.
+            // The cast rounds after a half is added, and converts NaN to black.
             *level = bilinear(view, f64::from(*x), f64::from(*y)).map_or(0, |it| (it + 0.5) as u8);
         }
         true
@@ -78,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_straight_in_the_scene_is_straight_in_the_image() {
+    fn straight_lines_of_the_scene_are_straight_in_the_image() {
         for lens in [
             Distortion::BrownConrady([-0.3, 0.1, 1e-3, -1e-3, 0.0, 0.0, 0.0, 0.0]),
             Distortion::KannalaBrandt([0.02, -0.01, 0.0, 0.0]),

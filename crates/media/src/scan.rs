@@ -1,5 +1,5 @@
-//! Whether the coded data of a JPEG file are whole: they are walked block by block without decoding a pixel, after ITU-T T.81,
-//! Annex F.2.2.
+//! Checks whether the coded data of a JPEG file are complete: it parses them block by block without decoding a pixel, after
+//! ITU-T T.81, Annex F.2.2.
 //!
 //! Where bytes are missing, a decoder takes the blocks behind the hole for those within it: the rest of the picture is sharp, and
 //! displaced. That there are fewer blocks than the picture has shows only in their number; or that there are more, where codes are
@@ -19,12 +19,12 @@ const MAX_COMPONENTS: usize = 4;
 const MAX_CODE: usize = 16;
 /// Bits that are looked up at once: longer codes are rare, and several short ones are skipped in one step.
 const LOOKUP: usize = 11;
-/// What a block's end adds to the place in it: more than all coefficients.
+/// The step of a block's end: more than all coefficients.
 const END_OF_BLOCK: u8 = 128;
 /// First of the eight restart markers.
 const RST0: u8 = 0xd0;
 
-/// What is wrong with the coded data.
+/// The error of the coded data.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum ScanFault {
     /// A marker, or the end of the file, comes before the last block.
@@ -97,14 +97,14 @@ struct Component {
     sampling: [u64; 2],
 }
 
-/// What the frame header says.
+/// The contents of the frame header.
 struct Frame {
     size: [u64; 2],
     components: [Option<Component>; MAX_COMPONENTS],
 }
 
 impl Frame {
-    /// From a header's parameters; `None` for other than 8 bits per sample, and for a height that is told behind the scan.
+    /// From a header's parameters; `None` for other than 8 bits per sample, and for a height that is given behind the scan.
     fn parse(parameters: &[u8]) -> Option<Self> {
         let (&[8, y0, y1, x0, x1, count], rest) = parameters.split_first_chunk()? else {
             return None;
@@ -132,7 +132,7 @@ impl Frame {
         self.components.iter().flatten()
     }
 
-    /// MCUs of a scan of all components. That of a single component is not interleaved: its MCU is one block, whatever its sampling.
+    /// MCUs of a scan of all components. That of a single component is not interleaved: its MCU is one block for any sampling.
     fn mcus(&self) -> u64 {
         let [across, down] = self.mcus_by_axis();
         across * down
@@ -171,13 +171,13 @@ struct Table {
     lengths: [u8; 1 << LOOKUP],
     /// By length: the first code behind those of that length, filled up with zeros to the most bits.
     limits: [u32; MAX_CODE + 1],
-    /// By length: what is added to a code for the place of its step, modulo 2^32.
+    /// By length: the number that is added to a code for the index of its step, modulo 2^32.
     offsets: [u32; MAX_CODE + 1],
     /// Over each code, in their order.
     steps: [Step; 256],
 }
 
-/// What a code and the value behind it take; no bits where there is no code.
+/// The length of a code and the value behind it; no bits where there is no code.
 #[derive(Clone, Copy, Default)]
 struct Step {
     bits: u8,
@@ -287,7 +287,7 @@ fn add_tables(mut parameters: &[u8], dc: &mut Tables, ac: &mut Tables) -> Option
     Some(())
 }
 
-/// What an MCU has of a component.
+/// An MCU's part of a component.
 #[derive(Clone, Copy)]
 struct Part {
     blocks: u64,
@@ -296,7 +296,7 @@ struct Part {
     ac: usize,
 }
 
-/// What an MCU has of each component, in the order of the data; `None` for a scan that lacks components of the frame.
+/// An MCU's part of each component, in the order of the data; `None` for a scan that lacks components of the frame.
 fn parts(frame: &Frame, parameters: &[u8]) -> Option<[Option<Part>; MAX_COMPONENTS]> {
     let (count, rest) = parameters.split_first()?;
     let (listed, _) = rest.as_chunks::<2>();
@@ -374,7 +374,7 @@ impl<'a> Scan<'a> {
                 Stop::Code => ScanFault::Code { block: before + 1, blocks },
             })?;
         }
-        if self.goes_on(bits) { Err(ScanFault::Beyond { blocks }) } else { Ok(()) }
+        if self.has_more_blocks(bits) { Err(ScanFault::Beyond { blocks }) } else { Ok(()) }
     }
 
     /// Skips an MCU, and counts its blocks in `before`.
@@ -390,9 +390,9 @@ impl<'a> Scan<'a> {
         Ok(())
     }
 
-    /// True when what follows the last block are blocks, too, and not those that fill up the picture: they end with an MCU where the data
-    /// do.
-    fn goes_on(&self, mut bits: Bits<'_>) -> bool {
+    /// True when the last block is followed by further blocks, other than those that fill up the picture: these end with an MCU
+    /// at the end of the data.
+    fn has_more_blocks(&self, mut bits: Bits<'_>) -> bool {
         if bits.is_at_marker() {
             return false;
         }
@@ -576,7 +576,7 @@ mod tests {
         for all in [[EMPTY; 6], [FULL; 6], [FULL, EMPTY, EMPTY, FULL, EMPTY, FULL]] {
             assert_eq!(check(&all), Ok(()));
             let ended = ScanFault::Ended { before: 5, blocks: BLOCKS };
-            // What fills up the last byte is no code.
+            // The padding of the last byte is not a code.
             assert_eq!(check(&[&all[..5], &["10"]].concat()), Err(ended));
         }
         let text = check(&[FULL; 3]).unwrap_err().to_string();
@@ -654,7 +654,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_judged_is_accepted() {
+    fn files_that_cannot_be_checked_are_accepted() {
         let (frame, scan) = (segment(SOF_BASELINE, GREY), segment(SOS, GREY_SCAN));
         let judged = |segments: &[Vec<u8>]| check_scan(&file(segments, EOI)).is_err();
         assert!(judged(&[frame.clone(), tables(), scan.clone()]));

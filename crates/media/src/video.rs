@@ -33,7 +33,7 @@ const TABLE_BYTES: u64 = 64 << 10;
 /// Frame rate of streams that do not state theirs, in hertz.
 const DEFAULT_RATE_HZ: f64 = 25.0;
 
-/// Why a video or one of its frames was not read, and what to do about it.
+/// Why a video or one of its frames was not read, and the remedy.
 #[derive(Debug, thiserror::Error)]
 pub enum VideoError {
     /// The system does not open or read a file.
@@ -46,21 +46,21 @@ pub enum VideoError {
     },
     /// A container or codec that is not supported.
     #[error(
-        "{path:?} is {what}; supported are Motion JPEG (.avi, .mjpeg) and 8-bit H.264 (.mp4, .mov, .h264). \
+        "{path:?} is {kind}; supported are Motion JPEG (.avi, .mjpeg) and 8-bit H.264 (.mp4, .mov, .h264). \
          Convert it with: ffmpeg -i {path:?} -c:v mjpeg -q:v 2 -an video.avi"
     )]
     Unsupported {
         /// The file.
         path: PathBuf,
-        /// What it is.
-        what: String,
+        /// Its kind.
+        kind: String,
     },
     /// Bytes that are not a valid video.
     #[error("{path:?} is damaged or cut short: {cause}")]
     Damaged {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The error.
         cause: String,
     },
 }
@@ -81,7 +81,7 @@ pub struct VideoFrame {
     pub image: VideoImage,
 }
 
-/// The image of a frame. JPEG files are decoded later, by whoever needs the pixels and on any thread.
+/// The image of a frame. JPEG files are decoded later, when the pixels are needed, on any thread.
 #[derive(Debug)]
 pub enum VideoImage {
     /// A JPEG file.
@@ -204,8 +204,8 @@ impl Problems<'_> {
         }
     }
 
-    fn unsupported(&self, what: &str) -> VideoError {
-        VideoError::Unsupported { path: self.path.to_owned(), what: what.to_owned() }
+    fn unsupported(&self, kind: &str) -> VideoError {
+        VideoError::Unsupported { path: self.path.to_owned(), kind: kind.to_owned() }
     }
 
     fn damaged(&self, cause: impl std::fmt::Display) -> VideoError {
@@ -240,7 +240,7 @@ enum AviChunk {
     End,
 }
 
-/// What the header says.
+/// The contents of the header.
 #[derive(Default)]
 struct AviHeader {
     period_us: u32,
@@ -500,7 +500,7 @@ impl H264 {
         Self { decoder, limits, source, ready, times, is_over: false }
     }
 
-    /// The next picture, and its time where the file tells it.
+    /// The next picture, and its time where the file gives it.
     fn next(
         &mut self,
         problems: &Problems<'_>,
@@ -568,7 +568,7 @@ fn next_unit<'a>(bytes: &'a [u8], at: &mut usize) -> Option<&'a [u8]> {
     rest.get(..len)
 }
 
-/// Refuses what would make the decoder take too much memory.
+/// Refuses videos for which the decoder would allocate too much memory.
 fn check(
     limits: &mut Limits,
     unit: &NalUnit<'_>,

@@ -73,13 +73,13 @@ fn coded_at(jpeg: &[u8]) -> usize {
     jpeg.len() - scan.len() + 2 + usize::from(u16::from_be_bytes([scan[2], scan[3]]))
 }
 
-/// What the decoder makes of a file, whole or not.
+/// The decoder's result for a complete or damaged file.
 fn shown(jpeg: &[u8]) -> RgbImage {
     load_from_memory(jpeg).unwrap().to_rgb8()
 }
 
 /// How many blocks of 8 x 8 pixels show something else in the second picture, not counting how bright they are; colours that cannot be
-/// shown tell nothing.
+/// shown are not compared.
 fn changed_blocks(pictures: [&RgbImage; 2]) -> usize {
     let (width, height) = pictures[0].dimensions();
     let columns = width / 8;
@@ -144,7 +144,7 @@ fn a_file_with_a_hole_is_refused_or_shows_everything_in_its_place() {
 }
 
 #[test]
-fn a_missing_restart_interval_is_told_by_the_markers() {
+fn a_missing_restart_interval_is_detected_by_the_markers() {
     let whole = files().into_iter().find(|(name, _)| name == "grey-restarts.jpg").unwrap().1;
     let marker = |number: u8| whole.windows(2).position(|w| w == [0xff, 0xd0 + number]).unwrap();
     let file = [&whole[..marker(1)], &whole[marker(2)..]].concat();

@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal, StandardUniform};
 
 /// The random stream number `stream` of a seed: streams of one seed are independent of each other, so a part
-/// of the world that draws more numbers does not change what the others see.
+/// of the world that draws more numbers does not change the numbers of the others.
 pub fn random_stream(seed: u64, stream: u64) -> ChaCha8Rng {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream(stream);
@@ -42,7 +42,7 @@ impl Drift {
         self.time_constant_s = time_constant_s;
     }
 
-    /// Lets `dt_s` pass; the result has the same distribution whatever the step.
+    /// Lets `dt_s` pass; the result has the same distribution for any step.
     pub fn step(&mut self, dt_s: f64, random: &mut ChaCha8Rng) -> f64 {
         let kept = (-dt_s / self.time_constant_s.max(1e-6)).exp();
         self.value =

@@ -138,7 +138,7 @@ pub struct VehicleTruth {
     pub angular_rate: Vector<Body>,
     /// True while the ground carries the vehicle.
     pub on_ground: bool,
-    /// Height of the vehicle over what is below it, in metres.
+    /// Height of the vehicle over the surface below it, in metres.
     pub height_m: f64,
     /// Downward speed at the latest touch of the ground, in m/s; none before the first.
     pub impact_m_s: Option<f64>,

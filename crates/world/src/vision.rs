@@ -13,9 +13,9 @@ use crate::drift::{normal, random_stream, uniform};
 /// The errors of a detector by the marker's size in the image.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct VisionModel {
-    /// Markers up to this size are never found, in pixels, and what it grows by per pixel of motion blur.
+    /// Markers up to this size are never found, in pixels, and the increase per pixel of motion blur.
     pub never_px: [f64; 2],
-    /// Markers from this size on are always found, but for `miss`, in pixels, and what it grows by per pixel
+    /// Markers from this size on are always found, but for `miss`, in pixels, and the increase per pixel
     /// of motion blur.
     pub always_px: [f64; 2],
     /// Part of the frames in which a large marker is missed.
@@ -195,8 +195,11 @@ mod tests {
         let wanted = RINGS.centre_px + RINGS.centre_per_blur;
         assert!((centre / wanted - 1.0).abs() < 0.3, "{centre} px for {wanted}");
         let range = rms(&|f| f.camera_from_marker.origin().z() - 5.0 * (1.0 + RINGS.range_bias));
-        let told = rms(&|f| f.covariance_m2.m33.sqrt());
-        assert!((range * RINGS.reported[1] / told - 1.0).abs() < 0.3, "{range} m, told {told}");
+        let stated = rms(&|f| f.covariance_m2.m33.sqrt());
+        assert!(
+            (range * RINGS.reported[1] / stated - 1.0).abs() < 0.3,
+            "{range} m, stated {stated}"
+        );
     }
 
     #[test]

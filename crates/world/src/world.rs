@@ -92,7 +92,7 @@ impl World {
     fn warm_up(&mut self) {
         let start = self.vehicle.truth();
         self.autopilot.start_in_air(0.0, &start);
-        // What is to begin at this height begins with the first step after it.
+        // Events of this height begin with the first step after it.
         let begin_height_m = std::mem::replace(&mut self.config.begin_height_m, f64::INFINITY);
         self.advance_to(WARM_UP_S);
         self.config.begin_height_m = begin_height_m;

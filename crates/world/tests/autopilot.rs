@@ -1,8 +1,8 @@
-//! The simulated autopilot against what was measured of ArduPilot Copter 4.5.4: intervals, acknowledgements,
+//! Compares the simulated autopilot with measurements of ArduPilot Copter 4.5.4: intervals, acknowledgements,
 //! arming, modes, take-off, velocity setpoints, landings and their times.
 
 #![allow(clippy::unwrap_used, reason = "a test says where it fails")]
-#![allow(deprecated, reason = "what real programs send is tested, superseded or not")]
+#![allow(deprecated, reason = "messages of real programs are tested, superseded or not")]
 
 mod bench;
 
@@ -450,7 +450,7 @@ fn body_frames_turn_with_the_yaw_only_and_down_stays_down() {
 }
 
 #[test]
-fn what_cannot_be_flown_is_a_stop() {
+fn setpoints_that_cannot_be_flown_stop_the_vehicle() {
     let nan = f32::NAN;
     let cases = [
         (MavFrame::MAV_FRAME_BODY_FRD, HOLD_HEADING, [0.5, 0.0, 0.0], 0.0),
@@ -601,8 +601,8 @@ fn the_touch_is_known_after_the_measured_delays() {
         assert!((1.58..=1.75).contains(&sure_s), "{sure_s}");
         let still_s = bench.wait(5.0, "disarm", |bench| !bench.world.autopilot().armed());
         assert!((0.28..=0.52).contains(&still_s), "{still_s}");
-        let told_s = bench.wait(1.1, "heartbeat", |bench| bench.heartbeat().0 == 81);
-        assert!(told_s <= 1.0 + STEP_S, "{told_s}");
+        let reported_s = bench.wait(1.1, "heartbeat", |bench| bench.heartbeat().0 == 81);
+        assert!(reported_s <= 1.0 + STEP_S, "{reported_s}");
     }
 }
 

@@ -4,7 +4,7 @@
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,
-    reason = "a test says what it found, and where it fails"
+    reason = "a test prints its measurements, and where it fails"
 )]
 
 use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage, TIMESYNC_DATA};
@@ -227,8 +227,8 @@ fn a_clock_round_trip_is_answered_with_the_time_of_its_arrival_and_milliseconds_
         let sent: Vec<u8> = pair.world.outgoing().flatten().collect();
         for packet in parser.push(&sent) {
             if let Some(MavMessage::ATTITUDE(attitude)) = packet.message {
-                let told_s = f64::from(attitude.time_boot_ms) * 1e-3;
-                assert!((before_s - 0.001..=now_s + 1e-5).contains(&told_s), "{told_s} at {now_s}");
+                let boot_s = f64::from(attitude.time_boot_ms) * 1e-3;
+                assert!((before_s - 0.001..=now_s + 1e-5).contains(&boot_s), "{boot_s} at {now_s}");
                 counted += 1;
             }
         }
@@ -237,12 +237,12 @@ fn a_clock_round_trip_is_answered_with_the_time_of_its_arrival_and_milliseconds_
 }
 
 #[test]
-fn a_px4_whose_events_came_too_early_tells_again_why_it_does_not_arm() {
+fn a_px4_whose_events_came_too_early_reports_again_why_it_does_not_arm() {
     let mut config = WorldConfig::default();
     config.autopilot.firmware = Firmware::Px4;
     config.autopilot.ready_after_s = 20.0;
     let mut world = World::new(&config, 4);
-    // Nobody hears it until it waits for its position.
+    // The client receives nothing until the autopilot waits for its position.
     world.advance_to(12.0);
     assert!(world.outgoing().count() > 0);
     let mut pair = Pair { world, ..Pair::new(&config, 4) };
@@ -253,8 +253,9 @@ fn a_px4_whose_events_came_too_early_tells_again_why_it_does_not_arm() {
     };
     run_to(&mut pair, 16.0);
     let why = pair.client.not_ready_because();
-    let is_told = |text: &String| text == "prearm: Navigation error: No valid position estimate";
-    assert!(why.iter().any(is_told), "{why:?}");
+    let is_reported =
+        |text: &String| text == "prearm: Navigation error: No valid position estimate";
+    assert!(why.iter().any(is_reported), "{why:?}");
     run_to(&mut pair, 25.0);
     assert_eq!(pair.client.not_ready_because(), [""; 0]);
 }

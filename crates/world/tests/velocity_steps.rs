@@ -3,7 +3,7 @@
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,
-    reason = "a test says what it found, and where it fails"
+    reason = "a test prints its measurements, and where it fails"
 )]
 
 mod bench;

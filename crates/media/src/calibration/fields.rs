@@ -26,16 +26,16 @@ pub(super) struct Problem {
     pub(super) expected: &'static str,
 }
 
-/// What is read of a file.
-pub(super) struct Held {
+/// The calibration in a file.
+pub(super) struct Parsed {
     pub(super) camera: CameraModel,
     pub(super) mode: SensorMode,
     pub(super) sensor_px: [u32; 2],
     pub(super) calibrated: SensorRegion,
 }
 
-/// What keys and values say of a camera; `None` where none of the keys of a calibration is there.
-pub(super) fn held(root: &Value) -> Option<Result<Held, Problem>> {
+/// Parses a camera's keys and values; `None` where there are none of the keys of a calibration.
+pub(super) fn parse(root: &Value) -> Option<Result<Parsed, Problem>> {
     if let Some(camera) = root.get("cam0") {
         Some(kalibr(camera).and_then(|image| in_noted_mode(camera, image)))
     } else if root.get("intrinsics").is_some() && root.get("camera_model").is_some() {
@@ -114,7 +114,7 @@ fn matrix_form(root: &Value) -> Result<CameraModel, Problem> {
 }
 
 /// The camera of the images that ROS' `binning_x`, `binning_y` and `roi` describe: the matrix is that of the whole sensor's.
-fn in_ros_mode(root: &Value, sensor: CameraModel) -> Result<Held, Problem> {
+fn in_ros_mode(root: &Value, sensor: CameraModel) -> Result<Parsed, Problem> {
     let expected = "it must be a whole number of pixels, both binnings the same, and the region within the image";
     let px = |at: &Value, key: &str| match at.get(key) {
         None => Ok(0),
@@ -147,21 +147,21 @@ fn in_ros_mode(root: &Value, sensor: CameraModel) -> Result<Held, Problem> {
             expected,
         });
     }
-    // What this program wrote says which part it saw; to others the matrix is that of the whole sensor.
+    // A file of this program states its part of the sensor; in other files the matrix is that of the whole sensor.
     let calibrated = if root.get("alight").is_some() { region } else { whole };
     let camera = if region == whole && binning == 1 { sensor } else { mode.of_images(&sensor) };
-    Ok(Held { camera, mode, sensor_px: [sensor.width, sensor.height], calibrated })
+    Ok(Parsed { camera, mode, sensor_px: [sensor.width, sensor.height], calibrated })
 }
 
 /// The mode that this program noted beside the intrinsics of images, in formats without keys for it.
-fn in_noted_mode(root: &Value, image: CameraModel) -> Result<Held, Problem> {
+fn in_noted_mode(root: &Value, image: CameraModel) -> Result<Parsed, Problem> {
     let whole = SensorRegion::whole(image.width, image.height);
     let none = Value::Null;
     let note = root.get("alight").unwrap_or(&none);
     let Some(sensor) = note.get("sensor") else {
         let mode = SensorMode { region: whole, binning: 1 };
         let sensor_px = [image.width, image.height];
-        return Ok(Held { camera: image, mode, sensor_px, calibrated: whole });
+        return Ok(Parsed { camera: image, mode, sensor_px, calibrated: whole });
     };
     let expected = "`sensor` [width, height], `region` [left, top, width, height] and `binning` must give the images' size";
     let problem =
@@ -182,7 +182,7 @@ fn in_noted_mode(root: &Value, image: CameraModel) -> Result<Held, Problem> {
     if !is_possible(&mode, &sensor) || mode.image_px() != [image.width, image.height] {
         return Err(problem());
     }
-    Ok(Held {
+    Ok(Parsed {
         camera: image,
         mode,
         sensor_px: [sensor_width, sensor_height],

@@ -46,7 +46,7 @@ impl std::fmt::Display for SensorRegion {
 /// How a camera's images come from its sensor.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct SensorMode {
-    /// What is read of the sensor.
+    /// The part of the sensor that is read.
     pub region: SensorRegion,
     /// One pixel of an image is the mean or the sum of so many pixels, across and down.
     pub binning: u32,
@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn what_reaches_beyond_does_not_lie_within() {
+    fn a_region_beyond_another_is_not_within_it() {
         let whole = SensorRegion::whole(640, 480);
         assert!(whole.lies_in(&whole));
         let at = |left, top, width, height| SensorRegion { left, top, width, height };

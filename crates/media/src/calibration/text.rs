@@ -1,11 +1,11 @@
-//! The text of a calibration file as keys and values: YAML, and what OpenCV writes as YAML, JSON or XML.
+//! Parses the text of a calibration file into keys and values: YAML, and OpenCV's YAML, JSON or XML.
 
 use serde_yaml_ng::{Mapping, Value};
 
 /// How deep elements of XML may be nested.
 const MAX_DEPTH: usize = 16;
 
-/// The keys and values of a text; an error says what is wrong with it.
+/// The keys and values of a text, or its error as text.
 pub(super) fn parse(text: &str) -> Result<Value, String> {
     let text = text.trim_start_matches('\u{feff}');
     if text.trim_start().starts_with('<') {
@@ -23,12 +23,12 @@ pub(super) fn parse(text: &str) -> Result<Value, String> {
     if root.is_mapping() { Ok(root) } else { Err("is not a list of keys and values".to_owned()) }
 }
 
-/// Reads the XML of OpenCV's `FileStorage`: elements with text or elements in them; attributes say nothing that is needed.
+/// Reads the XML of OpenCV's `FileStorage`: elements with text or elements in them; attributes are not needed.
 struct Xml<'a> {
     rest: &'a str,
 }
 
-/// What begins or ends at a place.
+/// A tag at the beginning or end of an element.
 enum Tag<'a> {
     Start { name: &'a str, is_empty: bool },
     End,
@@ -79,7 +79,7 @@ impl<'a> Xml<'a> {
         }
     }
 
-    /// What is in an element up to its end.
+    /// The content of an element up to its end.
     fn content(&mut self, depth: usize) -> Result<Value, String> {
         let deeper = depth.checked_sub(1).ok_or("it is nested too deeply")?;
         let (text, _) = self.rest.split_once('<').ok_or("an element does not end")?;
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_storage_is_refused() {
+    fn xml_other_than_a_storage_is_refused() {
         for (text, problem) in [
             ("<svg></svg>", "not `opencv_storage`"),
             ("<opencv_storage>", "does not end"),

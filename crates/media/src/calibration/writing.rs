@@ -20,12 +20,12 @@ pub enum CalibrationFormat {
     OpenCv,
 }
 
-/// What is kept beside the camera.
+/// Details stored next to the camera model.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CalibrationDetails {
     /// How the images come from the sensor; `None` where they are the whole sensor's.
     pub sensor: Option<OnSensor>,
-    /// What is said of the calibration, under a key that other programs ignore.
+    /// A note about the calibration, under a key that other programs ignore.
     pub note: Option<CalibrationNote>,
 }
 
@@ -38,7 +38,7 @@ pub struct OnSensor {
     pub mode: SensorMode,
 }
 
-/// Where a calibration comes from and what it is worth.
+/// The origin of a calibration and its uncertainty.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CalibrationNote {
     /// When it was made.
@@ -117,7 +117,7 @@ enum Syntax {
     Json,
 }
 
-/// Writes a camera in a format, over what is there only when all of it is written.
+/// Writes a camera in a format; an existing file is replaced only by a complete one.
 ///
 /// # Errors
 /// [`CalibrationWriteError`] where the format cannot hold the lens, the mode does not give such images, or the file cannot be
@@ -181,7 +181,7 @@ impl OnSensor {
     }
 }
 
-/// What other programs ignore; the mode where the format has no keys for it.
+/// Entries that other programs ignore; the mode where the format has no keys for it.
 fn own_entries(
     details: &CalibrationDetails,
     sensor: Option<OnSensor>,
@@ -468,7 +468,7 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(32))]
         #[test]
-        fn what_is_written_is_read_back_to_the_bit(
+        fn a_written_calibration_is_read_back_to_the_bit(
             numbers in proptest::array::uniform4(1e-3..5e3_f64),
             k in proptest::array::uniform8(-0.5..0.5_f64),
             tiny in -12..0_i32,

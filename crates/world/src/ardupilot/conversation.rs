@@ -30,7 +30,7 @@ fn accepted(yes: bool) -> MavResult {
 
 impl SimulatedAutopilot {
     /// Takes one packet from the link.
-    #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+    #[allow(deprecated, reason = "ground stations still send superseded messages")]
     pub fn handle(&mut self, now_s: f64, packet: &Packet) {
         let Some(message) = packet.message.as_ref().filter(|message| self.is_addressed(message))
         else {
@@ -95,7 +95,7 @@ impl SimulatedAutopilot {
         }
     }
 
-    /// Addressed to this autopilot, to all, or to nobody. PX4 takes no command that is addressed to all systems
+    /// Addressed to this autopilot, to all, or to none. PX4 takes no command that is addressed to all systems
     /// (`evaluate_target_ok` of its `mavlink_receiver.cpp`).
     fn is_addressed(&self, message: &MavMessage) -> bool {
         let sender = self.sender();
@@ -110,7 +110,7 @@ impl SimulatedAutopilot {
             && (component == 0 || component == sender.component)
     }
 
-    #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+    #[allow(deprecated, reason = "ground stations still send superseded messages")]
     fn command(&mut self, now_s: f64, from: Sender, command: MavCmd, values: [f32; 7]) {
         let [first, second, ..] = values;
         let result = match command {
@@ -205,9 +205,9 @@ impl SimulatedAutopilot {
             }
             return;
         }
-        let listens = self.parameters.get(Parameter::PrecisionLanding) == 1.0
+        let is_enabled = self.parameters.get(Parameter::PrecisionLanding) == 1.0
             && self.parameters.get(Parameter::PrecisionType) == 1.0;
-        if !listens {
+        if !is_enabled {
             return;
         }
         if target.frame != MavFrame::MAV_FRAME_BODY_FRD {

@@ -108,11 +108,11 @@ enum Guided {
 /// Motors are kept back after arming, in seconds, and need this long from takeoff to lift.
 const ARMING_DELAY_S: f64 = 2.0;
 const SPOOL_S: f64 = 1.36;
-/// From the touch to the certainty of it, in seconds: in LAND and in GUIDED, and what chance adds.
+/// Time from touchdown to its detection, in seconds: in LAND and in GUIDED, and its random spread.
 const CONFIRM_IN_LAND_S: f64 = 1.6;
 const CONFIRM_IN_GUIDED_S: f64 = 2.0;
 const CONFIRM_SPREAD_S: f64 = 0.1;
-/// From the certainty of the touch to still motors, in seconds, and what chance adds.
+/// Time from the detection of the touchdown to stopped motors, in seconds, and its random spread.
 const STILL_S: f64 = 0.35;
 const STILL_SPREAD_S: f64 = 0.15;
 /// A climb ends below this part of the climb speed.
@@ -258,7 +258,7 @@ impl Flight {
         true
     }
 
-    /// Stops and follows setpoints from now on, whatever was flown before.
+    /// Stops and follows setpoints from now on, after any other flight.
     pub(super) fn follow_setpoints(&mut self, now_s: f64, now: &Estimate) {
         self.set_mode(now_s, Mode::Guided, now);
         self.guided = Guided::Velocity(Setpoint::STOP, now_s);

@@ -287,7 +287,7 @@ impl SimulatedAutopilot {
         }
     }
 
-    /// Sends what is due.
+    /// Sends the messages that are due.
     fn send_due(&mut self) {
         if self.now_s + 5e-7 >= self.heartbeat_due_s {
             self.heartbeat_due_s += HEARTBEAT_S;

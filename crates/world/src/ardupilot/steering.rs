@@ -154,7 +154,7 @@ impl Steering {
         }
     }
 
-    /// Begins the path anew where the vehicle is, and keeps what was learnt of wind and weight.
+    /// Restarts the path at the vehicle's position, and keeps the estimates of wind and weight.
     pub(super) fn restart(&mut self, now: &Estimate) {
         let velocity = [now.velocity[0], now.velocity[1]];
         self.level =

@@ -3,7 +3,7 @@
 
 #![allow(dead_code, reason = "each test file uses its part of the bench")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test says where it fails")]
-#![allow(deprecated, reason = "what real programs send is tested, superseded or not")]
+#![allow(deprecated, reason = "messages of real programs are tested, superseded or not")]
 
 use autopilot::dialect::{
     COMMAND_LONG_DATA, MavCmd, MavFrame, MavMessage, PositionTargetTypemask,
