@@ -271,7 +271,7 @@ impl Inquiry {
     }
 
     /// A heartbeat, without which an autopilot forwards no answers to this program, and all questions without an answer.
-    #[expect(deprecated, reason = "older cameras know only the older commands")]
+    #[expect(deprecated, reason = "older cameras support only the older commands")]
     fn questions(&self, attempt: u8) -> Vec<Question> {
         let mut questions = Vec::new();
         if self.components.is_empty() {
@@ -431,7 +431,7 @@ mod tests {
     }
 
     /// A component that answers the old commands only, and the first questions not at all.
-    #[expect(deprecated, reason = "older cameras know only the older commands")]
+    #[expect(deprecated, reason = "older cameras support only the older commands")]
     fn play(port: u16, sender: Sender, mavtype: MavType, is_over: &AtomicBool) {
         let socket = BlockingSocket::bind("127.0.0.1:0").unwrap();
         socket.connect(("127.0.0.1", port)).unwrap();
@@ -460,7 +460,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_camera_that_answers_old_commands_only_is_found_beside_an_autopilot() {
+    async fn a_camera_that_answers_old_commands_only_is_found_next_to_an_autopilot() {
         let port = BlockingSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let is_over = Arc::new(AtomicBool::new(false));
         let autopilot = Sender { system: 1, component: 1 };

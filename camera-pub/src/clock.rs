@@ -4,11 +4,11 @@
 /// Time in which the quickest frame is looked for, in nanoseconds. Clocks that go apart by 50 in a million move by half a
 /// millisecond in two of these.
 const SPAN_NS: i64 = 5_000_000_000;
-/// Number of frames before the quickest is believed.
+/// Number of frames before the quickest is used.
 const MIN_FRAMES: u32 = 10;
 /// Offsets that differ by more than this are of a camera that was started again, or whose clock was set, in nanoseconds.
 const MAX_JUMP_NS: i64 = 500_000_000;
-/// Frames may be late by more than that for so long, where their stamps go on: they waited on their way, in nanoseconds.
+/// Frames may be late by more than that for so long, where their stamps continue: they were delayed on their way, in nanoseconds.
 const MAX_FAR_NS: i64 = 2_000_000_000;
 
 /// So many frames in a row that are all later than the quickest by so much are of a clock that was set, where nothing else delays
@@ -31,7 +31,7 @@ pub(crate) struct CameraClock {
     stamp_ns: Option<i64>,
     /// Since when all frames have been late by more than a jump.
     far_since_ns: Option<i64>,
-    /// Whether late frames say that the clock was set.
+    /// Whether late frames show that the clock was set.
     is_direct: bool,
     late: u32,
 }
@@ -70,7 +70,7 @@ impl CameraClock {
         Some(stamp_ns.saturating_add(offset_ns))
     }
 
-    /// Whether a frame that is later than the quickest by so much says that the clock is no longer the same.
+    /// Whether a frame that is later than the quickest by so much shows that the clock was changed.
     ///
     /// A frame that is early by a jump does, as none is quicker than the way allows. One that is late by a jump may only have
     /// waited, unless its stamp went back.
@@ -109,7 +109,7 @@ const MAX_WAIT_NS: i64 = 1_000_000_000;
 #[cfg(feature = "genicam")]
 impl UtcArrivals {
     /// The host's time at which something arrived that is read now. Where the system's clock was set meanwhile, it is now:
-    /// a little late does no harm, while early by the step would be believed for seconds.
+    /// a little late does no harm, while early by the step would last for seconds.
     pub(crate) fn host_ns(&mut self, arrival_utc_ns: i64, utc_ns: i64, now_ns: i64) -> i64 {
         let ahead_ns = utc_ns.saturating_sub(now_ns);
         let before_ns = self.ahead_ns.replace(ahead_ns);
@@ -213,9 +213,9 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_set_by_much_is_learnt_anew() {
+    fn a_clock_that_is_set_by_much_is_learnt_again() {
         // Ahead, at once; back, at once where the stamps show it, and after two seconds where the camera sent nothing meanwhile.
-        for (set_ns, pause_ns, anew) in
+        for (set_ns, pause_ns, after) in
             [(1000 * MS, 0, 9), (-1000 * MS, 0, 9), (-1000 * MS, 3000 * MS, 60)]
         {
             let mut clock = CameraClock::default();
@@ -229,12 +229,12 @@ mod tests {
                     first.get_or_insert(number - 100);
                 }
             }
-            assert_eq!(first, Some(anew), "{set_ns} {pause_ns}");
+            assert_eq!(first, Some(after), "{set_ns} {pause_ns}");
         }
     }
 
     #[test]
-    fn a_clock_that_begins_anew_is_learnt_anew() {
+    fn a_clock_that_begins_again_is_learnt_again() {
         let mut clock = CameraClock::default();
         for number in 0..100 {
             clock.host_ns(number * 40 * MS, 0, 50_000 * MS + number * 40 * MS);
@@ -242,7 +242,7 @@ mod tests {
         let hosts_ns: Vec<_> = (0..20)
             .map(|number| clock.host_ns(number * 40 * MS, 0, 60_000 * MS + number * 40 * MS))
             .collect();
-        assert_eq!(hosts_ns[8], None, "a restarted camera's stamps are not believed at once");
+        assert_eq!(hosts_ns[8], None, "a restarted camera's stamps are not used at once");
         assert_eq!(hosts_ns[19], Some(60_000 * MS + 19 * 40 * MS));
     }
 }

@@ -72,7 +72,7 @@ struct ExposureConfig {
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 enum ExposureControl {
-    /// The camera, as its controls say.
+    /// The camera, as its controls are set.
     Camera,
     /// This service, for the marker.
     Marker,
@@ -235,7 +235,7 @@ struct MountConfig {
 
 /// Maximum distance of a camera from the vehicle's origin along each axis, in metres.
 const MAX_MOUNT_M: f64 = 5.0;
-/// The values of `mount.roll_pitch_yaw_deg` and `mount.rotation_wxyz` in `camera-pub.toml`, which say nothing.
+/// The values of `mount.roll_pitch_yaw_deg` and `mount.rotation_wxyz` in `camera-pub.toml`, which mean that neither is set.
 const UNUSED_DEG: [f64; 3] = [0.0, 0.0, 90.0];
 const UNUSED_WXYZ: [f64; 4] = [1.0, 0.0, 0.0, 0.0];
 /// By how much of an eighth of a turn an angle in radians may be rounded: 1.57 is.
@@ -636,7 +636,7 @@ impl CalibrationConfig {
         check.parses("calibration.region_px", holds(has_file || is_whole, otherwise));
     }
 
-    /// The mode that the frames are taken in, as far as it is said.
+    /// The mode that the frames are taken in, as far as it is configured.
     fn wanted_mode(&self) -> WantedMode {
         let region = match *self.region_px.as_slice() {
             [left, top, width, height] => Some(SensorRegion { left, top, width, height }),

@@ -18,7 +18,7 @@ pub struct ConnectedDevice {
     pub link: Option<PathBuf>,
     /// Its formats and controls; `None` when it cannot be queried.
     pub description: Option<DeviceDescription>,
-    /// Why it cannot be asked.
+    /// Why it cannot be queried.
     pub problem: Option<String>,
 }
 
@@ -39,7 +39,7 @@ pub fn connected_devices(folder: &Path) -> Vec<ConnectedDevice> {
     let mut found: Vec<(u32, PathBuf)> =
         entries.map(|entry| entry.path()).filter_map(|path| Some((number(&path)?, path))).collect();
     found.sort();
-    let mut devices: Vec<_> = found.into_iter().map(|(_number, path)| ask(path)).collect();
+    let mut devices: Vec<_> = found.into_iter().map(|(_number, path)| query(path)).collect();
     let name = |device: &ConnectedDevice| {
         device.description.as_ref().filter(|it| it.is_camera).map(|it| it.card.clone())
     };
@@ -64,7 +64,7 @@ fn lasting_link(folder: &Path, path: &Path, has_twin: bool) -> Option<PathBuf> {
     })
 }
 
-fn ask(path: PathBuf) -> ConnectedDevice {
+fn query(path: PathBuf) -> ConnectedDevice {
     match KernelDevice::open(&path).and_then(|device| describe(&device)) {
         Ok(description) => {
             ConnectedDevice { path, link: None, description: Some(description), problem: None }

@@ -1,6 +1,7 @@
-//! Cameras of the GenICam standard, GigE Vision and USB3 Vision, read with the Aravis library (feature `genicam`).
+//! Reads cameras of the GenICam standard, GigE Vision and USB3 Vision, with the Aravis library (feature `genicam`).
 //!
-//! Modules in reading order: `camera` opens and reads a camera; `feed` goes on when it is lost. All run in tests against the camera that Aravis itself plays.
+//! Modules in reading order: `camera` opens and reads a camera; `feed` opens it again when it is lost. All run in tests
+//! against the camera that Aravis itself simulates.
 
 mod camera;
 pub(crate) mod feed;

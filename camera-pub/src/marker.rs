@@ -292,7 +292,7 @@ mod tests {
             }
         }
 
-        /// Reads frames for so long; a detector finds the pad where it says.
+        /// Reads frames for so long; a detector finds the pad at `pad_at`.
         fn run(&mut self, time_ns: i64, pad_at: impl Fn(i64) -> Option<[f64; 2]>) {
             let until_ns = self.fake.now_ns() + time_ns;
             let mut grey = vec![0; 640 * 480];

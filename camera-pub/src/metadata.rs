@@ -37,9 +37,9 @@ pub(crate) struct Metadata {
 /// One object of the stream.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) enum Record {
-    /// It says when the frame was exposed, and how long.
+    /// It states when the frame was exposed, and how long.
     Complete(Metadata),
-    /// It is cut or damaged, or says neither.
+    /// It is cut or damaged, or states neither.
     Torn,
 }
 

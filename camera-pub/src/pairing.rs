@@ -1,16 +1,16 @@
-//! Pairs each frame of a camera's program with its own record of metadata by arrival, number and delay, for its stamp; one whose
-//! record is in doubt stays without.
+//! Pairs each frame of a camera's program with its record of metadata by arrival, number and delay, for its stamp. A frame whose
+//! record is in doubt gets none.
 //!
 //! A program writes a frame and then, at once, its metadata, on two channels. Three things must agree before a record stamps a frame:
 //! the record arrived after the frame began and before the next one did; both have the same number, counted since the start; and the
 //! time from the record's stamp to the frame's arrival is that of the frames before. Once that time is known, a frame's record is
-//! found by it also where lines were lost or doubled, and where it changes for good, as with a busy processor, it is learnt anew from
+//! found by it also where lines were lost or doubled, and where it changes permanently, as with a busy processor, it is learnt again from
 //! records with their frames' numbers.
 
 use crate::exposure::{Exposure, Shutter};
 use crate::metadata::{Metadata, Record};
 
-/// Number of frames in a row whose records must agree before one is believed.
+/// Number of frames in a row whose records must agree before one is used.
 const AGREEING_FRAMES: u32 = 5;
 /// Number of records in a row with a stamp that cannot be their frame's after which the clock is refused.
 const IMPOSSIBLE_RECORDS: u32 = 5;

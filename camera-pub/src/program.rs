@@ -138,7 +138,7 @@ impl Program {
         Ok(Some(by_metadata.unwrap_or(by_arrival)))
     }
 
-    /// True when frames have metadata that say when they were exposed.
+    /// True when frames have metadata with their exposure.
     pub(crate) fn has_metadata(&self) -> bool {
         self.metadata.as_ref().is_some_and(SideChannel::has_agreed)
     }

@@ -90,7 +90,7 @@ impl Work {
         let mut checked = Instant::now();
         loop {
             tokio::select! {
-                // The end of the service first: the runtime's clock ends after it, and must not be asked any more.
+                // The end of the service first: the runtime's clock ends after it, and must not be used after that.
                 biased;
                 changed = self.offers.changed() => {
                     if changed.is_err() {

@@ -1,5 +1,5 @@
-//! A source that repeats its last picture as a new frame: a frame grabber without a signal, a player at a constant rate, a stream whose
-//! camera hangs. Such a frame is not of the time that it says.
+//! Detects a source that repeats its last picture as a new frame: a frame grabber without a signal, a player at a constant rate, a stream whose
+//! camera hangs. Such a frame is not of the time of its stamp.
 //!
 //! No two pictures of a sensor are alike to the last bit, as its noise differs; but those without any structure may be, in the dark or in
 //! the sun, and a coded video of a scene that does not move. A source that has only ever given one picture shows a still one, as on a
@@ -77,7 +77,7 @@ mod tests {
         assert_eq!((add(2, 5100), add(2, 5200)), (Picture::New, Picture::Repeated));
         assert_eq!((add(1, 5300), add(1, 6200)), (Picture::New, Picture::Repeated));
         assert_eq!((add(1, 6300), add(1, 9000)), (Picture::Stuck, Picture::Repeated));
-        // It goes on, and is stuck again.
+        // It continues, and is stuck again.
         assert_eq!((add(3, 9100), add(3, 10_100)), (Picture::New, Picture::Stuck));
         // One sample of them differs.
         let mut samples = [3; 3072];

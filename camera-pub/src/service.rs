@@ -40,7 +40,7 @@ use crate::v4l2::video::{Next, Port, Video};
 const MAX_MEASURED_IMAGES: usize = 1000;
 /// Maximum number of lost frames that are counted at once.
 const MAX_COUNTED: u64 = 1000;
-/// Time without a frame that can be read after which a device is opened again, in nanoseconds, beside three periods: to open it
+/// Time without a frame that can be read after which a device is opened again, in nanoseconds, in addition to three periods: to open it
 /// costs half a second.
 const UNREADABLE_NS: i64 = 1_000_000_000;
 /// Interval at which a service that waits for a subscriber looks for one.
@@ -703,8 +703,8 @@ impl Stream {
         }
     }
 
-    /// Publishes the frame of a camera and returns its number, but no picture a second time: it would not be of the time that
-    /// its stamp says.
+    /// Publishes the frame of a camera and returns its number, but no picture a second time: it would not be of the time of
+    /// its stamp.
     async fn publish_live(&mut self, frame: Prepared, exposure: Exposure) -> Option<u64> {
         let picture = self.pictures.add(&frame.pixels, Instant::now());
         if picture == Picture::New {
@@ -903,7 +903,7 @@ mod tests {
     }
 
     impl Viewer {
-        /// The device is held from now on: a subscriber keeps only the newest messages, and played time would else pass it by.
+        /// The device is held from now on: a subscriber keeps only the newest messages, and would otherwise miss some while the simulated time passes.
         async fn of(fake: Rc<Fake>, node: &Node) -> Self {
             fake.hold();
             Self {
@@ -921,7 +921,7 @@ mod tests {
                     return control;
                 }
                 self.fake.let_through();
-                // The first ones do not come, before each node knows of the other.
+                // The first ones do not arrive before the nodes have discovered each other.
                 let frame = tokio::time::timeout(FRAME_PATIENCE, self.frames.next());
                 let Ok(frame) = frame.await else { continue };
                 let centre_px = [320.0, 240.0];
@@ -1021,7 +1021,7 @@ mod tests {
     }
 
     #[tokio::test(flavor = "multi_thread")]
-    async fn a_subscriber_sees_that_the_exposure_is_as_it_is_configured() {
+    async fn a_subscriber_receives_the_configured_exposure() {
         let exposing = Exposing::new("camera").await;
         let (fake, viewer) = (Rc::clone(&exposing.fake), exposing.viewer.clone());
         let seeing = async {
@@ -1088,7 +1088,7 @@ mod tests {
     }
 
     #[tokio::test(flavor = "multi_thread")]
-    async fn damaged_frames_before_and_after_an_outage_are_not_taken_for_a_time_of_nothing_else() {
+    async fn damaged_frames_before_and_after_an_outage_are_not_one_period_of_damage() {
         let away = Happening::Unplugged(900 * MS);
         let script = [(20, Happening::Cut), (21, away), (22, Happening::Cut)];
         let mut opened = 0;

@@ -22,7 +22,7 @@ use crate::pairing::Pairing;
 pub(crate) const PLACEHOLDER: &str = "{metadata}";
 /// Maximum time to wait for a frame's metadata after its last byte; `rpicam-vid` writes them at once.
 const MAX_WAIT_NS: i64 = 10_000_000;
-/// Number of frames in a row without metadata after which this is said, and they are waited for only now and then.
+/// Number of frames in a row without metadata after which a warning is logged, and they are waited for only now and then.
 const SILENT_FRAMES: u32 = 60;
 /// Of so many frames from then on, those of one are waited for: a program may have held them back for a while.
 const RETRY_FRAMES: u32 = 30;
@@ -77,7 +77,7 @@ impl SideChannel {
         self.pairing.forget_unmatched();
     }
 
-    /// The frame that arrived at `arrival_ns` has been read: when it was exposed, if its metadata say so.
+    /// The frame that arrived at `arrival_ns` has been read: when it was exposed, if its metadata state it.
     ///
     /// # Errors
     /// The metadata are of another clock.

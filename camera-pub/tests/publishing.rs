@@ -12,7 +12,7 @@ use node::{Identity, Layers, Node, Shutdown, ZenohSource, now_ns};
 use testing::{ports, until};
 use tokio::time::timeout;
 
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 
 /// The local configuration with another rendezvous port.
 fn local(port: u16) -> ZenohSource {
@@ -72,11 +72,11 @@ async fn images_become_frames_in_order_and_unreadable_ones_are_counted() -> anyh
     let listening = async {
         let mut expected = None;
         for _ in 0..7 {
-            let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+            let frame = timeout(TIMEOUT, frames.next()).await?.context("a frame")?;
             let header = &frame.header;
             ensure!(header.camera == "down" && header.format == PixelFormat::Mono8);
             ensure!(header.stamp_ns <= now_ns());
-            // Only the newest frame is kept: a slow test may miss some.
+            // Only the newest frame is stored: a slow test may miss some.
             ensure!(expected.is_none_or(|expected| header.sequence >= expected));
             expected = Some(header.sequence + 1);
             let bytes = frame.bytes();
@@ -87,7 +87,7 @@ async fn images_become_frames_in_order_and_unreadable_ones_are_counted() -> anyh
             }
         }
         let infos = detector.subscriber(topic::CAMERA_INFO, &["down"]).await?;
-        let info = timeout(PATIENCE, infos.next()).await?.context("a camera info")?;
+        let info = timeout(TIMEOUT, infos.next()).await?.context("a camera info")?;
         ensure!(info.focal_px == Some([100.0, 100.0]) && (info.width, info.height) == (64, 48));
         ensure!(detector.alive("camera-pub", "*").await? == ["down"]);
         Ok(())
@@ -114,7 +114,7 @@ async fn raw_16_bit_bayer_samples_are_published_unchanged() -> anyhow::Result<()
     let config = config(folder.path(), &["source.rate_hz=50", "source.bayer=GBRG"])?;
     let service = tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
     let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await?;
-    let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+    let frame = timeout(TIMEOUT, frames.next()).await?.context("a frame")?;
     ensure!(frame.header.format == PixelFormat::Bayer16(BayerPattern::Gbrg));
     ensure!(frame.bytes().len() == 6 * 4 * 2 && frame.bytes()[2..4] == 1000_u16.to_le_bytes());
     ensure!(camera.health().report(camera.identity(), now_ns()).drops.is_empty());
@@ -131,10 +131,10 @@ async fn jpegs_are_made_while_there_is_a_subscriber() -> anyhow::Result<()> {
     let config = config(folder.path(), &["source.rate_hz=50"])?;
     let service = tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
     let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await?;
-    timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+    timeout(TIMEOUT, frames.next()).await?.context("a frame")?;
     ensure!(camera.health().percentiles("jpeg").is_none(), "a JPEG was made without a subscriber");
     let jpegs = viewer.frame_subscriber(topic::JPEG, &["down"]).await?;
-    let jpeg = timeout(PATIENCE, jpegs.next()).await?.context("a JPEG")?;
+    let jpeg = timeout(TIMEOUT, jpegs.next()).await?.context("a JPEG")?;
     ensure!(jpeg.header.format == PixelFormat::Jpeg && jpeg.header.width == 64);
     let decoded = image::load_from_memory(&jpeg.bytes())?.to_luma8();
     ensure!(decoded.dimensions() == (64, 48) && decoded.get_pixel(9, 9)[0].abs_diff(200) < 3);
@@ -147,7 +147,7 @@ async fn a_folder_is_published_once_without_repeat() -> anyhow::Result<()> {
     let folder = folder_of_images()?;
     let camera = open("camera-pub", free_port()?).await?;
     let config = config(folder.path(), &["source.rate_hz=1000", "source.repeat=false"])?;
-    timeout(PATIENCE, camera_pub::run(camera.clone(), config, Shutdown::on_signals()?)).await??;
+    timeout(TIMEOUT, camera_pub::run(camera.clone(), config, Shutdown::on_signals()?)).await??;
     let health = camera.health().report(camera.identity(), now_ns());
     ensure!(health.rates.iter().any(|r| r.name == "frames" && r.count == 3), "{health:?}");
     Ok(())
@@ -183,7 +183,7 @@ async fn a_start_without_images_is_an_error_with_its_reason() -> anyhow::Result<
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_rate_is_kept() -> anyhow::Result<()> {
+async fn the_rate_is_the_configured_one() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     for i in 0..60 {
         GrayImage::from_pixel(64, 48, Luma([i])).save(folder.path().join(format!("{i:02}.png")))?;
@@ -217,15 +217,15 @@ async fn frames_of_a_program_are_stamped_with_their_arrival() -> anyhow::Result<
     let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await?;
     let service = tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
     for _ in 0..3 {
-        let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+        let frame = timeout(TIMEOUT, frames.next()).await?.context("a frame")?;
         let (header, bytes) = (&frame.header, frame.bytes());
         ensure!(header.format == PixelFormat::Mono8 && (header.width, header.height) == (64, 48));
         ensure!(bytes.len() == 64 * 48 && bytes[63] == 63 && bytes[64] == 1 && bytes[3071] == 110);
         ensure!(header.stamp_ns <= now_ns() - 1_000_000_000, "the delay is not in the stamp");
-        ensure!(header.stamp_ns > now_ns() - 1_000_000_000 - PATIENCE.as_nanos() as i64);
+        ensure!(header.stamp_ns > now_ns() - 1_000_000_000 - TIMEOUT.as_nanos() as i64);
     }
     let infos = viewer.subscriber(topic::CAMERA_INFO, &["down"]).await?;
-    let info = timeout(PATIENCE, infos.next()).await?.context("a camera info")?;
+    let info = timeout(TIMEOUT, infos.next()).await?.context("a camera info")?;
     ensure!(info.focal_px == Some([100.0, 100.0]) && (info.width, info.height) == (64, 48));
     service.abort();
     camera.close().await;
@@ -256,7 +256,7 @@ async fn a_picture_that_is_repeated_is_published_once() -> anyhow::Result<()> {
     for level in [1, 1, 1, 2, 3] {
         show(level)?;
         let frame = loop {
-            let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+            let frame = timeout(TIMEOUT, frames.next()).await?.context("a frame")?;
             // Of the one before some may be on their way.
             if level != 2 || frame.bytes()[1] != 1 {
                 break frame;
@@ -270,7 +270,7 @@ async fn a_picture_that_is_repeated_is_published_once() -> anyhow::Result<()> {
             let repeats = || camera.health().failures("camera repeats one picture");
             let is_counted = async || repeats() + 1 >= u64::from(level);
             tokio::select! {
-                repeats = until("the repeated picture is counted", PATIENCE, is_counted) => repeats?,
+                repeats = until("the repeated picture is counted", TIMEOUT, is_counted) => repeats?,
                 _ = frames.next() => bail!("the repeated picture {level} is published again"),
             }
         }
@@ -292,7 +292,7 @@ async fn frame_of_samples(sample: u16, set: &[&str]) -> anyhow::Result<(PixelFor
     let (camera, viewer) = (open("camera-pub", port).await?, open("gcs-bridge", port).await?);
     let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await?;
     let service = tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
-    let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+    let frame = timeout(TIMEOUT, frames.next()).await?.context("a frame")?;
     let seen = (frame.header.format, frame.bytes().to_vec());
     service.abort();
     camera.close().await;
@@ -301,7 +301,7 @@ async fn frame_of_samples(sample: u16, set: &[&str]) -> anyhow::Result<(PixelFor
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn samples_of_10_to_14_bits_are_as_bright_as_their_bits_say() -> anyhow::Result<()> {
+async fn samples_of_10_to_14_bits_are_as_bright_as_their_value() -> anyhow::Result<()> {
     let behind_filters = PixelFormat::Bayer12(BayerPattern::Rggb);
     for (bits, bayer, expected, published) in [
         (10, "source.bayer=", PixelFormat::Mono10, 1_u16 << 9),
@@ -322,12 +322,12 @@ async fn samples_of_10_to_14_bits_are_as_bright_as_their_bits_say() -> anyhow::R
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_error_says_how_a_camera_program_ended() -> anyhow::Result<()> {
+async fn the_error_states_how_a_camera_program_ended() -> anyhow::Result<()> {
     let problem = async |command: &[&str], set: &[&str]| -> anyhow::Result<String> {
         let config = program(command, set)?;
         let camera = open("camera-pub", free_port()?).await?;
         let service = camera_pub::run(camera, config, Shutdown::on_signals()?);
-        let problem = timeout(PATIENCE, service).await?.err().context("an error")?;
+        let problem = timeout(TIMEOUT, service).await?.err().context("an error")?;
         Ok(format!("{problem:#}"))
     };
     let missing = problem(&["no-such-camera-program"], &[]).await?;
@@ -350,7 +350,7 @@ async fn the_error_says_how_a_camera_program_ended() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_device_that_is_not_there_or_no_camera_is_named() -> anyhow::Result<()> {
+async fn a_missing_device_and_one_other_than_a_camera_are_named() -> anyhow::Result<()> {
     for (device, reason) in [("/dev/video-none", "not connected"), ("/dev/null", "VIDIOC_QUERYCAP")]
     {
         let mut layers = Layers::default();
@@ -359,7 +359,7 @@ async fn a_device_that_is_not_there_or_no_camera_is_named() -> anyhow::Result<()
         let camera = open("camera-pub", free_port()?).await?;
         let config = layers.load::<Config>()?.settings;
         let service = camera_pub::run(camera, config, Shutdown::on_signals()?);
-        let problem = timeout(PATIENCE, service).await?.err().context("an error")?;
+        let problem = timeout(TIMEOUT, service).await?.err().context("an error")?;
         let problem = format!("{problem:#}");
         ensure!(problem.contains(device) && problem.contains(reason), "{problem}");
         ensure!(problem.contains("`source.device`"), "{problem}");
@@ -403,7 +403,7 @@ async fn stamps_are_exact(fault: &str, min_exact: u32) -> anyhow::Result<String>
     let (mut exact, mut inexact) = (0, 0);
     let mut worst_ns = 0;
     while exact + inexact < 40 {
-        let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+        let frame = timeout(TIMEOUT, frames.next()).await?.context("a frame")?;
         let bytes = frame.bytes();
         let number = u16::from_le_bytes([bytes[0], bytes[1]]);
         let sensor_ns = i64::from_le_bytes(bytes[2..10].try_into()?) - node::boot_ahead_ns();
@@ -431,7 +431,7 @@ async fn metadata_of_another_clock_are_refused() -> anyhow::Result<()> {
     let Some(config) = rpicam("clock")? else { return Ok(()) };
     let camera = open("camera-pub", free_port()?).await?;
     let service = camera_pub::run(camera, config, Shutdown::on_signals()?);
-    let problem = timeout(PATIENCE, service).await?.err().context("an error")?;
+    let problem = timeout(TIMEOUT, service).await?.err().context("an error")?;
     let problem = format!("{problem:#}");
     ensure!(problem.contains("SensorTimestamp is not of this machine's clock"), "{problem}");
     ensure!(
@@ -466,7 +466,7 @@ async fn ffmpeg_is_a_camera() -> anyhow::Result<()> {
         let service =
             tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
         for _ in 0..3 {
-            let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+            let frame = timeout(TIMEOUT, frames.next()).await?.context("a frame")?;
             let bytes = frame.bytes();
             // The high byte of two, or the only one. The range of video grey is 16 to 235, or full.
             let level = bytes.last().context("pixels")?;

@@ -16,7 +16,7 @@ static TARGET: OnceLock<Target> = OnceLock::new();
 /// Where panics began.
 static PANICS: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
 
-#[expect(clippy::panic, reason = "libFuzzer has no other way to say why it does not begin")]
+#[expect(clippy::panic, reason = "libFuzzer has no other way to report why it does not begin")]
 fn chosen() -> Target {
     // libFuzzer's own hook ends the process, also for panics that are caught, as those of foreign decoders are. A panic that
     // is not caught ends it nevertheless. Each position is printed once.

@@ -75,7 +75,7 @@ pub fn mavlink(input: &[u8]) {
     }
 }
 
-/// A frame of the air link: its header says which parts of it are JPEG files of which size.
+/// A frame of the air link: its header lists the parts that are JPEG files, with their sizes.
 pub fn airlink(input: &[u8]) {
     let Some((head, bytes)) = input.split_first_chunk::<4>() else { return };
     let [width, height, count, split] = *head;

@@ -41,7 +41,7 @@ pub fn configuration(input: &[u8]) {
 fn load<C: Settings>(layers: &Layers) {
     match layers.load::<C>() {
         Ok(_) => {}
-        // A refusal says something.
+        // A refusal has a reason.
         Err(problem) => assert!(!problem.to_string().is_empty()),
     }
 }

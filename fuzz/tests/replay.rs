@@ -14,7 +14,7 @@ const MAX_CORPUS_BYTES: u64 = 200_000;
 static OWN_PANICS: AtomicUsize = AtomicUsize::new(0);
 
 #[test]
-fn every_kept_input_is_read_without_a_panic_in_bounded_time_and_memory() -> anyhow::Result<()> {
+fn every_stored_input_is_read_without_a_panic_in_bounded_time_and_memory() -> anyhow::Result<()> {
     // The readers catch a decoder's panic, never one of their own.
     std::panic::set_hook(Box::new(|panic| {
         let place = panic.location().map(ToString::to_string).unwrap_or_default();
@@ -47,7 +47,7 @@ fn every_kept_input_is_read_without_a_panic_in_bounded_time_and_memory() -> anyh
     Ok(())
 }
 
-/// Mutations find no message by themselves whose type and version no input has.
+/// Mutations alone find no message whose type and version no input has.
 #[test]
 fn the_corpus_has_an_input_of_each_message_that_is_read_from_the_network() -> anyhow::Result<()> {
     let mut read = BTreeSet::new();

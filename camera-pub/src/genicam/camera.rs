@@ -20,7 +20,7 @@ use crate::exposure::{Exposure, Shutter, StampedAt};
 
 /// Number of frames that Aravis may hold.
 const BUFFERS: usize = 8;
-/// Bytes of a frame beside its pixels, at most: chunks.
+/// Maximum bytes of a frame besides its pixels: chunks.
 const MAX_EXTRA_BYTES: usize = 1 << 20;
 
 /// A camera of GenICam that answers.
@@ -36,7 +36,7 @@ pub struct GenicamCamera {
     pub address: String,
 }
 
-/// The cameras of GenICam in reach. It takes about a second, as they are asked over the network.
+/// The available cameras of GenICam. It takes about a second, as they are queried over the network.
 pub fn genicam_cameras() -> Vec<GenicamCamera> {
     // Aravis' list is one for the whole process.
     static ARAVIS: OnceLock<Option<Mutex<Aravis>>> = OnceLock::new();
@@ -65,9 +65,9 @@ pub(super) struct OpenCamera {
     arrivals: UtcArrivals,
     shutter: Shutter,
     delay_ns: i64,
-    /// The exposure time, where the camera does not change it by itself.
+    /// The exposure time, where the camera does not change it automatically.
     exposure_ns: Option<u32>,
-    /// Whether it says that it changes the exposure time by itself.
+    /// Whether it reports that it changes the exposure time automatically.
     is_metering: bool,
     size: FrameSize,
     is_gone: Arc<AtomicBool>,
@@ -235,7 +235,7 @@ impl OpenCamera {
         std::mem::take(&mut self.counts)
     }
 
-    /// When a frame's first packet arrived, by the host's clock. Aravis says it by the system's, which may be set.
+    /// When a frame's first packet arrived, by the host's clock. Aravis gives it by the system's, which may be set.
     fn arrival_ns(&mut self, buffer: &Buffer) -> i64 {
         let utc = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let utc_ns = i64::try_from(utc.as_nanos()).unwrap_or(i64::MAX);
@@ -281,7 +281,7 @@ fn set_format(camera: &Camera, bayer: Option<BayerPattern>) -> anyhow::Result<()
     camera.set_pixel_format_from_string(format).map_err(|problem| {
         let has = camera.dup_available_pixel_formats_as_strings().unwrap_or_default().join(", ");
         anyhow::anyhow!(
-            "the camera gives no `{format}` ({problem}); it has {has}. `source.bayer` says which colours its pixels have"
+            "the camera gives no `{format}` ({problem}); it has {has}. set `source.bayer` to the colours of its pixels"
         )
     })
 }

@@ -12,7 +12,7 @@ use crate::control::Configured;
 const RETRY_NS: i64 = 500_000_000;
 /// Maximum time to wait for a frame at once, so that a shutdown is noticed.
 const POLL: Duration = Duration::from_millis(50);
-/// Time without a frame, whole or torn, after which the camera has stalled, beside three periods.
+/// Time without a frame, complete or torn, after which the camera has stalled, in addition to three periods.
 const STALL_NS: i64 = 1_000_000_000;
 
 /// A camera, open or lost.
@@ -64,7 +64,7 @@ impl Feed {
         })
     }
 
-    /// The next frame, or the event instead of one. It waits briefly; while a lost camera is asked, for up to a few
+    /// The next frame, or the event instead of one. It waits briefly; while a lost camera is queried, for up to a few
     /// seconds.
     pub(crate) fn next(&mut self) -> Next {
         let Some(camera) = &mut self.camera else {

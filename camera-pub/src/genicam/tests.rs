@@ -46,7 +46,7 @@ fn config() -> GenicamConfig {
     }
 }
 
-/// How long the longest test lasts: `ALIGHT_GENICAM_SECONDS`, or a few seconds.
+/// The duration of the longest test: `ALIGHT_GENICAM_SECONDS`, or a few seconds.
 fn seconds() -> f64 {
     let wanted = std::env::var("ALIGHT_GENICAM_SECONDS").ok().and_then(|text| text.parse().ok());
     wanted.unwrap_or(5.0)

@@ -16,7 +16,7 @@ use crate::exposure::Exposure;
 
 /// Time between attempts to open the stream.
 const RETRY: Duration = Duration::from_millis(500);
-/// Time without a picture after which the camera has stalled, beside three periods.
+/// Time without a picture after which the camera has stalled, in addition to three periods.
 const STALL_S: f64 = 1.0;
 /// Time of pictures that give no frame after which the reason is logged, in nanoseconds.
 const FRAMELESS_NS: i64 = 5_000_000_000;
@@ -193,7 +193,7 @@ impl Feed {
                 );
                 return Ok(Next::Dropped("pictures before the camera sent its clock"));
             }
-            Stamp::NotBelieved { age_ns } => {
+            Stamp::OtherClock { age_ns } => {
                 let age_s = age_ns as f64 * 1e-9;
                 bail!(
                     "by the camera's clock its pictures are {age_s:.1} s old when they arrive, so that it is not this host's: \

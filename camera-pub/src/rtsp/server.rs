@@ -49,7 +49,7 @@ pub(super) struct Script {
     pub(super) clock_ahead_ns: Option<i64>,
     /// One of so many packets is lost; 0: none.
     pub(super) lose_every: u64,
-    /// The number of the picture after which it says nothing more, and that after which it closes.
+    /// The number of the picture after which it sends nothing more, and that after which it closes.
     pub(super) silent_after: u64,
     pub(super) closes_after: u64,
     /// The numbers of the pictures that are twice as wide.
@@ -285,7 +285,7 @@ struct Rtp {
 }
 
 impl Rtp {
-    /// A packet, as it stands between answers (RFC 2326, 10.12; RFC 3550, 5.1).
+    /// A packet, interleaved between answers (RFC 2326, 10.12; RFC 3550, 5.1).
     fn packet(&mut self, stamp: u32, is_last: bool, streamed: Streamed, payload: &[u8]) -> Vec<u8> {
         let kind = if streamed == Streamed::Jpeg { 26 } else { 96 };
         let mark = if is_last { 0x80 } else { 0 };
@@ -415,7 +415,7 @@ fn parameters(width: usize) -> Vec<u8> {
     bits.put(0, 1).put(0, 1).unit(0x67)
 }
 
-/// 7.3.2.2: no entropy but CAVLC, no deblocking unless a slice asks for it.
+/// 7.3.2.2: no entropy but CAVLC, no deblocking unless a slice requests it.
 fn picture_parameters() -> Vec<u8> {
     let mut bits = Bits::default();
     bits.golomb(0).golomb(0).put(0, 2).golomb(0).golomb(0).golomb(0);

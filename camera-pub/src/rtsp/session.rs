@@ -23,7 +23,7 @@ use tokio::time::timeout;
 
 use crate::config::RtspConfig;
 
-/// Time for all that is said until a stream begins.
+/// Time for all requests until a stream begins.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(5);
 /// Number of pictures of H.264 that wait to be decoded, as each refers to others: more of them mean that the decoder is slower
 /// than the camera. Of JPEG only the newest waits.

@@ -29,7 +29,7 @@ pub(super) enum Stamp {
     /// The camera has not sent its clock yet.
     Unknown,
     /// The camera's clock is another one: by it a picture is so old when it arrives.
-    NotBelieved {
+    OtherClock {
         /// In nanoseconds.
         age_ns: i64,
     },
@@ -40,14 +40,14 @@ impl StreamStamps {
         Self { by, delay_ns, quickest: CameraClock::default(), way_ns: None }
     }
 
-    /// The stream was opened again: its times may have begun anew.
+    /// The stream was opened again: its times may have begun again.
     pub(super) fn reopened(&mut self) {
         self.quickest = CameraClock::default();
     }
 
     /// The stamp of a picture, where UTC is `utc_ahead_ns` more than the host's clock.
     ///
-    /// A camera's clock that is set anew does not move the stamps: from then on they are those of the arrivals, less the way
+    /// A camera's clock that is set again does not move the stamps: from then on they are those of the arrivals, less the delay
     /// that was measured before.
     pub(super) fn stamp(&mut self, times: &Times, utc_ahead_ns: i64) -> Stamp {
         let Times { stream_ns, arrival_ns, report } = *times;
@@ -65,7 +65,7 @@ impl StreamStamps {
             self.way_ns = Some(quickest_ns.saturating_sub(camera_ns));
             Stamp::At(camera_ns.saturating_sub(self.delay_ns))
         } else {
-            self.way_ns.map_or(Stamp::NotBelieved { age_ns }, after)
+            self.way_ns.map_or(Stamp::OtherClock { age_ns }, after)
         }
     }
 }
@@ -119,11 +119,11 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_not_this_hosts_is_not_believed() {
+    fn a_clock_other_than_this_hosts_is_refused() {
         for clock_ahead_ns in [3600 * 1000 * MS, -3 * 1000 * MS, 200 * MS] {
             let mut stamps = StreamStamps::new(RtspStamps::Camera, 0);
             let stamp = stamps.stamp(&times(5, clock_ahead_ns).1, UTC_AHEAD_NS);
-            assert!(matches!(stamp, Stamp::NotBelieved { .. }), "{stamp:?}");
+            assert!(matches!(stamp, Stamp::OtherClock { .. }), "{stamp:?}");
         }
     }
 

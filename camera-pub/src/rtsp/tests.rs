@@ -189,7 +189,7 @@ async fn lost_packets_cost_pictures_until_the_next_key_frame_and_tear_none() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_camera_that_is_gone_or_says_nothing_is_back_within_two_seconds() {
+async fn a_camera_that_is_gone_or_silent_is_read_again_within_two_seconds() {
     for (silent_after, closes_after, reason) in
         [(60, u64::MAX, "camera stalled"), (u64::MAX, 60, "camera's stream ended")]
     {

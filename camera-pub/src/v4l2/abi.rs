@@ -9,7 +9,7 @@ use std::time::Duration;
 pub(crate) const VIDEO_CAPTURE: u32 = 1;
 /// Buffers of the driver that are mapped, `V4L2_MEMORY_MMAP`.
 pub(crate) const MEMORY_MMAP: u32 = 1;
-/// `V4L2_FIELD_NONE`: whole frames. Drivers that know nothing else may leave `V4L2_FIELD_ANY`.
+/// `V4L2_FIELD_NONE`: whole frames. Drivers that support nothing else may leave `V4L2_FIELD_ANY`.
 pub(crate) const FIELD_NONE: u32 = 1;
 pub(crate) const FIELD_ANY: u32 = 0;
 /// `V4L2_QUANTIZATION_FULL_RANGE`: luma from 0 to 255. The default is that for `V4L2_COLORSPACE_JPEG`, else limited range.

@@ -161,8 +161,8 @@ pub(crate) struct Capture<D: Device> {
     has_clock: bool,
     cut_in_a_row: u32,
     exposure_ns: u32,
-    /// Whether it said, when that was read, that it meters by itself.
-    says_metering: bool,
+    /// Whether it reported, when that was read, that it meters on its own.
+    reports_metering: bool,
     /// When `exposure_ns` was read, so long ago at first that it is read.
     exposure_read_ns: i64,
     exposer: Option<Exposer>,
@@ -205,7 +205,7 @@ impl<D: Device> Capture<D> {
                 )));
             }
             return Err(Lost::Refused(format!(
-                "`{card}` gives no frames; a camera has several devices, `alight cameras` says which to take"
+                "`{card}` gives no frames; a camera has several devices, `alight cameras` shows which to take"
             )));
         }
         let rows = set_format(&device, wanted)?;
@@ -234,7 +234,7 @@ impl<D: Device> Capture<D> {
             has_clock: false,
             cut_in_a_row: 0,
             exposure_ns: 0,
-            says_metering: false,
+            reports_metering: false,
             exposure_read_ns: i64::MIN,
             exposer: exposer.transpose()?,
             expose_again_ns: i64::MIN,
@@ -318,7 +318,7 @@ impl<D: Device> Capture<D> {
     /// How the device is exposed where the exposure does not follow the marker; `None` as long as it does not report that.
     pub(crate) fn configured(&self) -> Option<Configured> {
         match self.exposure_ns {
-            0 => self.says_metering.then_some(Configured::Metering),
+            0 => self.reports_metering.then_some(Configured::Metering),
             exposure_ns => Some(Configured::Fixed { exposure_ns }),
         }
     }
@@ -380,7 +380,7 @@ impl<D: Device> Capture<D> {
         let mut buffer = Buffer::of(0);
         match self.device.call(Call::DqBuf(&mut buffer)) {
             Ok(()) => {}
-            // Nothing there after all, or one frame was lost inside the driver, which goes on.
+            // Nothing there after all, or one frame was lost inside the driver, which continues.
             Err(cause) if matches!(cause.raw_os_error(), Some(libc::EAGAIN | libc::EIO)) => {
                 self.counts.damaged += u64::from(cause.raw_os_error() == Some(libc::EIO));
                 return Ok(None);
@@ -480,8 +480,8 @@ impl<D: Device> Capture<D> {
     /// driver does not report whether it meters.
     fn read_exposure(&mut self) {
         let auto = control_value(&self.device, CID_EXPOSURE_AUTO);
-        self.says_metering = matches!(auto, Ok(Some(auto)) if auto != EXPOSURE_MANUAL);
-        let is_manual = auto.is_ok() && !self.says_metering;
+        self.reports_metering = matches!(auto, Ok(Some(auto)) if auto != EXPOSURE_MANUAL);
+        let is_manual = auto.is_ok() && !self.reports_metering;
         let value = control_value(&self.device, CID_EXPOSURE_ABSOLUTE).ok().flatten();
         let units = value.filter(|_| is_manual).and_then(|value| u32::try_from(value).ok());
         self.exposure_ns = units.and_then(|units| units.checked_mul(100_000)).unwrap_or(0);

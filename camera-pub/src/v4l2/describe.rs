@@ -24,7 +24,7 @@ pub struct DeviceDescription {
     pub card: String,
     /// Where it is connected.
     pub bus: String,
-    /// True for a device that gives frames. A camera has others beside, for its metadata.
+    /// True for a device that gives frames. A camera has further devices for its metadata.
     pub is_camera: bool,
     /// True for a device that gives frames in several planes, each in memory of its own, which camera-pub does not read.
     pub is_multi_planar: bool,
@@ -204,7 +204,7 @@ pub(crate) fn controls(device: &impl Device) -> io::Result<Vec<ControlDescriptio
         let mut control = QueryExtCtrl { id, ..QueryExtCtrl::default() };
         device.call(Call::QueryExtCtrl(&mut control))?;
         if control.id <= last_id {
-            // A driver that does not go on would be asked for ever.
+            // A driver that does not advance would be queried for ever.
             return Err(io::Error::from_raw_os_error(libc::EINVAL));
         }
         last_id = control.id;

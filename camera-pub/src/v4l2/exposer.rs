@@ -33,7 +33,7 @@ pub(crate) struct ForMarker {
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) enum Order {
     Keep,
-    /// The camera meters by itself.
+    /// The camera meters on its own.
     OwnMetering,
     /// It does not any more; exposure and gain stay as it has chosen them.
     TakeOver,
@@ -134,7 +134,7 @@ impl Exposer {
     }
 
     /// Counts a frame, which had been read from the sensor then: one that was ready before the last change was ordered, and
-    /// waited in the driver's buffers, says nothing of it.
+    /// waited in the driver's buffers, does not show it.
     pub(crate) fn frame(&mut self, read_ns: Option<i64>) {
         if read_ns.is_none_or(|read_ns| read_ns >= self.ordered_ns) {
             self.frames = self.frames.saturating_add(1);
@@ -151,12 +151,12 @@ impl Exposer {
         self.setting
     }
 
-    /// Whether the camera can meter by itself.
+    /// Whether the camera can meter on its own.
     pub(crate) fn has_metering(&self) -> bool {
         self.metering.is_some()
     }
 
-    /// True when the camera certainly meters by itself.
+    /// True when the camera certainly meters on its own.
     pub(crate) fn is_metering(&self) -> bool {
         self.is_metering
     }
@@ -187,7 +187,7 @@ impl Exposer {
                     return Ok(None);
                 }
                 self.setting = None;
-                // Before the camera meters: it may refuse a gain that it then chooses by itself. It meters also with another one.
+                // Before the camera meters: it may refuse a gain that it then chooses on its own. It meters also with another one.
                 let put_back = self.put_gain_back(device);
                 if !self.is_metering {
                     set(device, CID_EXPOSURE_AUTO, value)?;
@@ -218,7 +218,7 @@ impl Exposer {
         }
     }
 
-    /// Sets the gain that the camera had. One that is refused is kept and tried again, a few times.
+    /// Sets the gain that the camera had. One that is refused is stored and tried again, a few times.
     fn put_gain_back(&mut self, device: &impl Device) -> std::io::Result<()> {
         let Some((gain, value)) = self.gain.zip(self.own_gain) else { return Ok(()) };
         let put_back = set(device, gain.id, value);

@@ -42,7 +42,7 @@ pub(crate) enum Stamps {
     /// As uvcvideo does: the first packet, when the first row is read.
     FirstPacket,
     FrameEnd,
-    /// It does not say on which clock.
+    /// It does not report its clock.
     Unknown,
 }
 
@@ -212,7 +212,7 @@ impl Fake {
         self.oddity.get() == Some(oddity)
     }
 
-    /// Lets the camera choose its exposure by itself.
+    /// Lets the camera meter on its own.
     pub(crate) fn meter(&self) {
         self.is_metering.set(true);
     }
@@ -287,7 +287,7 @@ impl Fake {
     }
 
     /// Puts another camera at another number.
-    pub(crate) fn put_beside(&self, other: &Rc<Self>) {
+    pub(crate) fn add_other(&self, other: &Rc<Self>) {
         self.others.borrow_mut().push(Rc::clone(other));
     }
 
@@ -671,7 +671,7 @@ fn at<T>(entries: &[T], index: u32) -> io::Result<&T> {
     entries.get(index as usize).ok_or_else(|| errno(libc::EINVAL))
 }
 
-/// The control after the one that is asked for.
+/// The control after the requested one.
 fn next_control(control: &mut QueryExtCtrl) -> io::Result<()> {
     let all = [
         (GAIN, "Gain", 1, 0, 255, 0),

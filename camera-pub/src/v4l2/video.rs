@@ -11,7 +11,7 @@ use super::capture::{Capture, Identity, Lost, Taken, Wanted};
 const RETRY_NS: i64 = 500_000_000;
 /// Maximum time to wait for a frame at once, so that a shutdown is noticed.
 const POLL: Duration = Duration::from_millis(50);
-/// Time without a frame after which the camera has stalled, beside three periods: drivers that recover take less.
+/// Time without a frame after which the camera has stalled, in addition to three periods: drivers that recover take less.
 const STALL_NS: i64 = 1_000_000_000;
 
 /// Where a camera is opened.
@@ -256,7 +256,7 @@ mod tests {
         gap_ns: i64,
     }
 
-    /// Reads frames until the fake's clock says so; each has its number in its pixels.
+    /// Reads frames until this time of the fake's clock; each has its number in its pixels.
     fn run(fake: &Rc<Fake>, video: &mut Video<Rc<Fake>>, until_ns: i64) -> Seen {
         let mut seen = Seen::default();
         let mut last_ns = fake.now_ns();
@@ -330,12 +330,12 @@ mod tests {
             assert!(seen.frames > 80);
             seen.frames - seen.exact
         };
-        // A driver that says nothing of its clock, and a camera that meters by itself.
+        // A driver that does not report its clock, and a camera that meters on its own.
         assert!(inexact(Fake::of("GREY", Stamps::Unknown, 0)) > 80);
         let metering = Fake::of("GREY", Stamps::ExposureStart, 0);
         metering.meter();
         assert!(inexact(metering) > 80);
-        // One that does not say whether it does.
+        // One that does not report whether it meters.
         let silent = Fake::of("GREY", Stamps::ExposureStart, 0);
         silent.meter();
         silent.hide(Some(CID_EXPOSURE_AUTO));
@@ -424,10 +424,10 @@ mod tests {
         assert!(run(&fake, &mut video, 200 * MS).frames > 10);
         let there = Fake::of("GREY", Stamps::ExposureStart, 0);
         there.plug_in_at(b"usb-0000:0e:00.0-2.2");
-        fake.put_beside(&there);
+        fake.add_other(&there);
         let other = Fake::of("GREY", Stamps::ExposureStart, 0);
         other.plug_in_at(b"usb-0000:0e:00.0-2.3");
-        fake.put_beside(&other);
+        fake.add_other(&other);
         fake.unplug(200 * MS);
         fake.plug_in_at(b"usb-0000:0e:00.0-2.1");
         assert_eq!(run(&fake, &mut video, 3000 * MS).frames, 0);

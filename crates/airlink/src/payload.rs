@@ -27,7 +27,7 @@ const MAX_PIXELS: u64 = 100_000_000;
 pub enum PayloadError {
     /// A part outside of its frame, or parts that do not match the bytes.
     #[error("the parts do not match the frame or its bytes")]
-    Misfit,
+    Mismatch,
     /// A size that a JPEG cannot have.
     #[error("a JPEG cannot have this size")]
     Size,
@@ -75,7 +75,8 @@ impl Packer {
         if scale == 0 || width.max(height) > MAX_EDGE_PX as usize {
             return Err(PayloadError::Size);
         }
-        let source = view.crop(x, y, width * scale, height * scale).ok_or(PayloadError::Misfit)?;
+        let source =
+            view.crop(x, y, width * scale, height * scale).ok_or(PayloadError::Mismatch)?;
         self.scratch.resize(width, height);
         for row in 0..height {
             let out = self.scratch.row_mut(row);
@@ -133,7 +134,7 @@ impl Unpacker {
         let mut rest = bytes;
         for (part, image) in parts.iter().zip(&mut self.images) {
             let (file, after) =
-                rest.split_at_checked(part.bytes as usize).ok_or(PayloadError::Misfit)?;
+                rest.split_at_checked(part.bytes as usize).ok_or(PayloadError::Mismatch)?;
             rest = after;
             // The decoder panics on some damaged files.
             catch_unwind(AssertUnwindSafe(|| decode(file, part, image)))
@@ -174,7 +175,7 @@ fn check(
         && parts.iter().all(fits)
         && pixels <= MAX_PIXELS
         && bytes == len as u64;
-    all_fit.then_some(parts).ok_or(PayloadError::Misfit)
+    all_fit.then_some(parts).ok_or(PayloadError::Mismatch)
 }
 
 fn decode(file: &[u8], part: &FramePart, image: &mut GrayImage) -> Result<(), PayloadError> {
@@ -187,7 +188,7 @@ fn decode(file: &[u8], part: &FramePart, image: &mut GrayImage) -> Result<(), Pa
     decoder.decode_headers().map_err(jpeg)?;
     let size = decoder.info().map(|info| (u32::from(info.width), u32::from(info.height)));
     if size != Some((part.width, part.height)) {
-        return Err(PayloadError::Misfit);
+        return Err(PayloadError::Mismatch);
     }
     image.resize(part.width as usize, part.height as usize);
     decoder.decode_into(image.pixels_mut()).map_err(jpeg)
@@ -283,7 +284,7 @@ mod tests {
         assert!(unpacker.unpack(&good, &bytes[1..]).is_err());
         let outside = plan(&[[60, 8, 16, 16, 2]]);
         let packed = Packer::default().pack(image.view().unwrap(), &header(64, 48), &outside);
-        assert_eq!(packed.map(|_| ()), Err(PayloadError::Misfit));
+        assert_eq!(packed.map(|_| ()), Err(PayloadError::Mismatch));
     }
 
     proptest! {

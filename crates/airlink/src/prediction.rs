@@ -296,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn the_landings_marker_has_a_track_beside_any_number_of_others() {
+    fn the_landings_marker_has_a_track_next_to_any_number_of_others() {
         let mut predictor = RoiPredictor::default();
         predictor.follow(&ControllerStatus { marker: "rings:20".into(), ..Default::default() });
         let of = |ids: std::ops::RangeInclusive<u32>| {

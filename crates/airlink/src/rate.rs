@@ -20,14 +20,14 @@ impl Rate {
         Self { period_ns: period_ns as i64, early_ns, due_ns: i64::MIN }
     }
 
-    /// Whether a frame of this time may be taken. One of a time before the last, as of a camera that began anew, begins anew.
+    /// Whether a frame of this time may be taken. A time before the last, as of a restarted camera, restarts the schedule.
     pub fn is_due(&self, now_ns: i64) -> bool {
         let first_ns = self.due_ns.saturating_sub(self.early_ns);
         now_ns >= first_ns || now_ns < first_ns.saturating_sub(self.period_ns)
     }
 
-    /// Notes that it is. The next one is due a period after this one was due: an early frame lets no further one in. After a
-    /// pause, or where times begin anew, it is due a period after this one.
+    /// Notes that it is taken. The next one is due a period after this one was due: an early frame allows no further one. After a
+    /// pause, or where times begin again, it is due a period after this one.
     pub fn take(&mut self, now_ns: i64) {
         let turn_ns =
             self.due_ns.saturating_sub(self.early_ns)..self.due_ns.saturating_add(self.period_ns);
@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn times_that_step_back_begin_anew() {
+    fn times_that_step_back_restart_the_schedule() {
         let mut rate = Rate::new(10.0);
         rate.take(5_000_000_000);
         assert!(!rate.is_due(4_990_000_000), "a little uneven");

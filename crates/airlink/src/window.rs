@@ -398,8 +398,8 @@ mod tests {
         assert!(window.is_open(2510 * MS).0, "the far one has been silent for too long");
     }
 
-    /// The size beside a receiver that is always late, on a link that carries 100 kB in time.
-    fn size_beside_a_slow_one(in_use: Option<&str>) -> usize {
+    /// The size next to a receiver that is always late, on a link that carries 100 kB in time.
+    fn size_next_to_a_slow_receiver(in_use: Option<&str>) -> usize {
         let mut window = window();
         window.use_receiver(in_use.map(str::to_owned));
         for sequence in 0..200 {
@@ -415,9 +415,9 @@ mod tests {
 
     #[test]
     fn a_slow_receiver_shrinks_frames_only_while_no_other_is_in_use() {
-        assert!((75_000..125_000).contains(&size_beside_a_slow_one(Some("good"))));
+        assert!((75_000..125_000).contains(&size_next_to_a_slow_receiver(Some("good"))));
         for in_use in [Some("slow"), None, Some("onboard, reads no JPEG")] {
-            assert_eq!(size_beside_a_slow_one(in_use), 8000, "{in_use:?}");
+            assert_eq!(size_next_to_a_slow_receiver(in_use), 8000, "{in_use:?}");
         }
     }
 

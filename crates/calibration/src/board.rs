@@ -252,7 +252,7 @@ mod tests {
         }
 
         #[test]
-        fn a_flaw_of_the_print_moves_the_points_as_its_slope_says(
+        fn a_flaw_of_the_print_moves_the_points_by_its_slope(
             x in -0.3..0.3f64, y in -0.3..0.3f64, z in 0.6..2.0f64, tilt in -0.7..0.7f64,
         ) {
             let lens = Lens::BrownConrady8;

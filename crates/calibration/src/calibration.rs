@@ -111,9 +111,9 @@ pub struct PlacementError {
 const MARKER_HALF: f64 = 0.05;
 /// Points that are farther from where they are expected, in deviations along an axis, do not show the lens.
 const MAX_FIT_SIGMAS: f64 = 4.0;
-/// Up to this multiple of the radius at which points were seen a lens's polynomial is believed.
+/// Up to this multiple of the radius at which points were seen a lens's polynomial is used.
 const MAX_BEYOND_SEEN: f64 = 1.05;
-/// Columns and rows of places that stand for the whole image.
+/// Columns and rows of the positions that represent the whole image.
 const COLUMNS: usize = 16;
 const ROWS: usize = 12;
 

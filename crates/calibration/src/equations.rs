@@ -30,7 +30,7 @@ pub(crate) struct Bundle<'a> {
     pub(crate) views: &'a [Vec<BoardPoint>],
     /// Residuals beyond this lose influence: the scale of Cauchy's loss.
     pub(crate) scale_px: f64,
-    /// The standard deviation that is expected of the bend, in metres, so that boards that say nothing about it stay flat.
+    /// The standard deviation that is expected of the bend, in metres, so that boards without information about it stay flat.
     pub(crate) bend_m: f64,
 }
 

@@ -19,9 +19,9 @@ pub struct Evidence {
     pub distance_ratio: f64,
     /// Where in the image points were seen.
     pub coverage: Coverage,
-    /// How much larger the tags are than said, against their spacing; `None` where the views do not show it.
+    /// How much larger the tags are than stated, against their spacing; `None` where the views do not show it.
     pub tag_scale: Option<Estimate>,
-    /// How much wider and lower the board is than said.
+    /// How much wider and lower the board is than stated.
     pub stretch: Option<Estimate>,
     /// How far the board is from square, in radians.
     pub shear: Option<Estimate>,
@@ -36,7 +36,7 @@ pub struct Evidence {
 pub struct Coverage {
     /// The share of the image's parts ([`Coverage::PARTS`]) in which there are any.
     pub covered: f64,
-    /// The quarter of the image with fewest, for people.
+    /// The quarter of the image with fewest, as text.
     pub emptiest: &'static str,
 }
 
@@ -51,7 +51,7 @@ pub struct Estimate {
 
 /// Columns and rows of the parts of the image for the residuals that depend on the place.
 const CELLS: [usize; 2] = [10, 8];
-/// Tags without which a part of the image says nothing about the lens, and a view nothing about motion.
+/// Number of tags below which a part of the image has no information about the lens, and a view none about motion.
 const MIN_CELL_TAGS: usize = 4;
 const MIN_VIEW_TAGS: usize = 12;
 

@@ -94,7 +94,7 @@ pub struct Drift {
     pub pixel_px: f64,
 }
 
-/// Why a flight says nothing of its camera.
+/// Why a flight gives no calibration of its camera.
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum FlightRefusal {
     /// Too few detections at times of which the vehicle's pose is known.
@@ -108,7 +108,7 @@ pub enum FlightRefusal {
     },
     /// Stamps and poses do not fit together.
     #[error(
-        "the frames' stamps seem to be {offset_s:+.2} s beside the autopilot's, which is more than {MAX_OFFSET_S} s: camera and \
+        "the frames' stamps seem to be {offset_s:+.2} s off the autopilot's, which is more than {MAX_OFFSET_S} s: camera and \
          autopilot are not stamped by one clock; `alight doctor` checks the camera's"
     )]
     Offset {
@@ -151,7 +151,7 @@ pub enum FlightRefusal {
 const SCALE: [Quantity; 2] = [Quantity::FocalScale, Quantity::K1];
 /// The fewest detections of a flight.
 pub const MIN_MARKERS: usize = 60;
-/// Largest time offset that is believed, in seconds.
+/// Largest time offset that is accepted, in seconds.
 pub const MAX_OFFSET_S: f64 = 1.0;
 /// How many deviations a value must be from the configured one to be changed.
 const MIN_DEVIATIONS: f64 = 3.0;
@@ -164,7 +164,7 @@ const ITERATIONS: usize = 30;
 /// From this iteration on only half of each step is taken: around some solutions whole ones go back and forth, as detections at the
 /// flight's ends come and go with the time offset.
 const HALF_FROM: usize = 12;
-/// How often the errors' sizes are estimated anew.
+/// How often the errors' sizes are estimated again.
 const NOISE_ROUNDS: usize = 2;
 /// A step that is smaller than this part of the deviations is the last.
 const CONVERGED: f64 = 0.02;

@@ -1,7 +1,7 @@
-//! Cross-validation: two halves of the views, solved apart.
+//! Cross-validates two halves of the views, solved separately.
 //!
 //! The projections of the two cameras are compared after the rotation between their frames that brings them nearest, as a
-//! calibration knows no other frame than its own (mrcal, "Differences in projection", has the idea).
+//! calibration defines no other frame than its own (mrcal, "Differences in projection", has the idea).
 
 use geometry::{CameraModel, Pixel, Point};
 use libm::fmax;

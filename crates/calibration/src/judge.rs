@@ -25,7 +25,7 @@ const MAX_POINTS: usize = 300_000;
 /// The camera that took these views, if they show it.
 ///
 /// # Errors
-/// Why they do not, in a sentence for people.
+/// Why they do not, in a sentence for users.
 pub fn calibrate(views: &[View], lens: Lens, options: &Options) -> Result<Calibration, Refusal> {
     let task = Task::new(views, MIN_VIEWS)?;
     // Where too little was seen a solver may find nothing at all, which would not name the reason.
@@ -42,7 +42,7 @@ pub fn calibrate(views: &[View], lens: Lens, options: &Options) -> Result<Calibr
     Ok(calibration)
 }
 
-/// As [`calibrate`], for sets that may be worth less than it asks for: refused only where there is no result.
+/// As [`calibrate`], for sets that may be worse than its limits: refused only where there is no result.
 ///
 /// # Errors
 /// Why there is none.
@@ -72,7 +72,7 @@ impl<'a> Task<'a> {
     }
 
     fn solve(&self, lens: Lens, options: &Options) -> Result<Calibration, Refusal> {
-        let max_px = MAX_MISFIT * f64::from(self.size.width.max(self.size.height));
+        let max_px = MAX_MEDIAN_RESIDUAL * f64::from(self.size.width.max(self.size.height));
         let solved = stages::solve(&self.sheet, lens, self.size, options.solve_bend);
         let noise_px = solved.as_ref().map_or(f64::INFINITY, |solved| solved.noise_px);
         let solved = solved.filter(|_| noise_px < max_px);
@@ -86,10 +86,10 @@ impl<'a> Task<'a> {
     }
 }
 
-/// Median misfit, by the image's width, beyond which nothing was found.
-const MAX_MISFIT: f64 = 0.01;
+/// Median residual, by the image's width, beyond which there is no solution.
+const MAX_MEDIAN_RESIDUAL: f64 = 0.01;
 
-/// The views' size, after all that can be said before anything is solved.
+/// The views' size, after all checks that are possible before a solution.
 fn common_size(views: &[View], min_views: usize) -> Result<ImageSize, Refusal> {
     let points = views.iter().map(|view| view.points.len()).sum();
     if points > MAX_POINTS {
@@ -144,7 +144,7 @@ mod limit {
     pub(super) const MIN_DISTANCE_RATIO: f64 = 1.2;
     /// Part of the image with points; the circle of a fisheye inscribed in the image covers three quarters.
     pub(super) const MIN_COVERED: f64 = 0.55;
-    /// Wrong size of the tags against their spacing, and standard deviations that make a flaw of the print believed.
+    /// Wrong size of the tags against their spacing, and standard deviations from which on a flaw of the print is accepted.
     pub(super) const MAX_TAG_SCALE: f64 = 0.003;
     pub(super) const MAX_DISTORTED: f64 = 0.004;
     pub(super) const BELIEVED: f64 = 10.0;
@@ -246,7 +246,7 @@ fn agreed_well(calibration: &Calibration) -> Result<(), Refusal> {
     Ok(())
 }
 
-/// The one of several comparisons that is the last to be believed.
+/// The worst of several comparisons.
 fn worst(comparisons: impl Iterator<Item = CrossValidation>) -> Option<CrossValidation> {
     comparisons.max_by(|a, b| excess(a).total_cmp(&excess(b)))
 }
@@ -264,7 +264,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_comparison_that_is_not_believed_hides_behind_no_other() {
+    fn the_worst_comparison_decides() {
         let halves =
             |difference_px: f64, expected_px| CrossValidation { difference_px, expected_px };
         // A hundred times its uncertainty, but small; large, but uncertain; and five times its uncertainty of 0.2 px.

@@ -48,7 +48,7 @@ impl Lens {
 
 /// Radii at which the lenses are compared.
 const RADII: usize = 60;
-/// Times that the equations are weighted anew.
+/// Times that the equations are weighted again.
 const ROUNDS: usize = 5;
 
 /// The numbers of Brown-Conrady that distort most like this fisheye up to `max_radius`, in focal lengths of an ideal image, with the

@@ -1,4 +1,4 @@
-//! Why a set of views gives no calibration, in sentences for people.
+//! Explains why a set of views gives no calibration, in sentences for users.
 
 use crate::lens::Lens;
 use crate::view::ImageSize;
@@ -57,7 +57,7 @@ pub enum Refusal {
     },
     /// The board is seen as in a mirror.
     #[error(
-        "{mirrored} of {views} views show the board as in a mirror: switch the camera's mirroring off, or print the board anew, \
+        "{mirrored} of {views} views show the board as in a mirror: switch the camera's mirroring off, or print the board again, \
          not from its back"
     )]
     Mirrored {
@@ -127,8 +127,8 @@ pub enum Refusal {
     },
     /// The board is not as described: the size of the tags against their spacing.
     #[error(
-        "the tags are {percent:+.2} % larger than said, against their spacing (limit {max_percent:.2} %): measure the side of \
-         a tag's black square and the gap between two, and say both"
+        "the tags are {percent:+.2} % larger than stated, against their spacing (limit {max_percent:.2} %): measure the side of \
+         a tag's black square and the gap between two, and state both"
     )]
     TagSize {
         /// How much larger.

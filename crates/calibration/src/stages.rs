@@ -111,7 +111,7 @@ impl Task<'_> {
             RIDGES.iter().filter_map(|ridge| brown_conrady_like(&camera, max_radius, *ridge));
         let mut found = starts.filter_map(|numbers| self.followed(numbers));
         let first = found.next()?;
-        // A minimum that leaves numbers undetermined is one where the fraction's poles cancel, beside the right one.
+        // A minimum that leaves numbers undetermined is one where the fraction's poles cancel, near the right one.
         if first.is_determined() {
             return Some(first);
         }

@@ -14,7 +14,7 @@ use crate::lens::{INTRINSICS, Lens};
 use crate::solve::{minimise, undistorted};
 use crate::view::ImageSize;
 
-/// Views that the focal length is guessed from: more say no more.
+/// Number of views from which the focal length is guessed: more add no information.
 const SCANNED_VIEWS: usize = 24;
 /// The focal lengths that are tried, in image widths: from wider than half a sphere to a long lens.
 const FOCAL_SHARES: std::ops::Range<i32> = -14..17;
@@ -132,8 +132,11 @@ pub(crate) fn focal_guesses(lens: Lens, size: ImageSize, views: &[Vec<BoardPoint
         .map(|share| {
             let focal_px = wide * libm::pow(FOCAL_RATIO, f64::from(share));
             let camera = lens.camera(size, &intrinsics(&undistorted(focal_px, size)));
-            let score =
-                views.iter().step_by(stride).map(|points| misfit(points, &camera, wide)).sum();
+            let score = views
+                .iter()
+                .step_by(stride)
+                .map(|points| pose_residual(points, &camera, wide))
+                .sum();
             Guess { focal_px, score }
         })
         .collect();
@@ -156,7 +159,7 @@ struct Guess {
 }
 
 /// How badly the pose in closed form explains a view's points; grows slowly with single bad views.
-fn misfit(points: &[BoardPoint], camera: &CameraModel, wide: f64) -> f64 {
+fn pose_residual(points: &[BoardPoint], camera: &CameraModel, wide: f64) -> f64 {
     let lost = (0.1 * wide) * (0.1 * wide);
     let mean = match first_pose(points, camera) {
         None => lost,
@@ -175,7 +178,7 @@ fn intrinsics(shared: &Shared) -> [f64; INTRINSICS] {
     std::array::from_fn(|i| shared[i])
 }
 
-/// Each view's pose for a camera, refined by itself; the view's pose from before, where there is no better.
+/// Each view's pose for a camera, refined separately; the view's pose from before, where there is no better.
 pub(crate) fn poses(bundle: &Bundle<'_>, shared: &Shared) -> Vec<Option<Isometry3<f64>>> {
     let camera = bundle.camera(shared);
     let wide = f64::from(bundle.size.width.max(bundle.size.height));
@@ -189,7 +192,7 @@ pub(crate) fn poses(bundle: &Bundle<'_>, shared: &Shared) -> Vec<Option<Isometry
         .collect()
 }
 
-/// A view's pose refined by itself.
+/// A view's pose, refined separately.
 fn refined(
     bundle: &Bundle<'_>,
     points: &Vec<BoardPoint>,

@@ -42,7 +42,7 @@ fn sixty_views_of_a_bent_board_give_the_camera() {
 }
 
 #[test]
-fn farther_out_than_the_board_was_seen_the_lens_is_not_known() {
+fn the_lens_is_unknown_farther_out_than_the_board_was_seen() {
     let truth = lenses()[0];
     let all =
         calibrate(&views(&truth.camera, &Taking::default(), 100), truth.lens, &Options::default());
@@ -78,7 +78,7 @@ fn tags_that_are_found_elsewhere_do_not_move_the_camera() {
 }
 
 #[test]
-fn good_sets_of_many_kinds_are_believed() {
+fn good_sets_of_many_kinds_are_accepted() {
     for (truth, seed) in lenses().into_iter().cycle().zip(400..412) {
         let views = views(&truth.camera, &Taking::good(seed), seed);
         let refusal = calibrate(&views, truth.lens, &Options::default()).err();

@@ -309,7 +309,7 @@ fn tilts_that_are_hardly_larger_than_the_attitudes_errors_correct_no_scale() {
 }
 
 #[test]
-fn a_focal_length_that_small_tilts_do_not_show_spoils_nothing_else() {
+fn a_focal_length_that_small_tilts_do_not_show_does_not_disturb_other_quantities() {
     for (seed, focal) in [(7100, 0.08), (7101, -0.08), (7102, 0.05)] {
         let truth = Truth { focal, ..WRONG };
         let flown = Flown { sway_m: 0.12, ..Flown::landing(seed) };
@@ -347,7 +347,7 @@ fn a_short_flight_is_refused() {
     assert_eq!(refusal, FlightRefusal::TooFew { found: 0 });
 }
 
-/// The same markers, this share of them of another pad, two metres beside.
+/// The same markers, this fraction of them of another pad, two metres away.
 fn with_another_pad(markers: &mut [MarkerSample], share: f64) {
     let mut random = ChaCha8Rng::seed_from_u64(9);
     for marker in markers {
@@ -358,7 +358,7 @@ fn with_another_pad(markers: &mut [MarkerSample], share: f64) {
 }
 
 #[test]
-fn a_few_detections_of_something_else_do_not_matter() {
+fn a_few_detections_of_another_pad_have_little_effect() {
     let (vehicle, mut markers) = flown(Flown::landing(15), &WRONG);
     with_another_pad(&mut markers, 0.03);
     let result = calibrate_flight(&configured(), &vehicle, &markers).unwrap();

@@ -2,7 +2,7 @@
 //! corners and ring centres solved as points of one plane.
 //!
 //! Far markers give the tilt that near ones cannot, and only the covariance changes when one of them leaves the view. Rings
-//! look the same in any rotation: beside other markers their centre is a point of the plane; alone they give the pad's pose
+//! look the same in any rotation: next to other markers their centre is a point of the plane; alone they give the pad's pose
 //! only when they lie at the landing point.
 
 use geometry::{

@@ -1,5 +1,5 @@
-//! The detector of all families: runs each family's detector and the fallback passes on an image, or reads one marker at its
-//! prediction, and joins the observations. It knows none of the families.
+//! Detects markers of all families: runs each family's detector and the fallback passes on an image, or reads one marker at its
+//! prediction, and joins the observations. It does not depend on any family.
 
 use geometry::CameraModel;
 use imaging::{GrayImage, GrayView};
@@ -250,7 +250,7 @@ impl Detector {
         stages: &mut impl StageObserver,
     ) -> Option<Observation> {
         self.trace.clear();
-        // A thorough search finds other markers beside it.
+        // A thorough search finds other markers next to it.
         if self.settings.thorough {
             return None;
         }

@@ -215,7 +215,7 @@ impl Plane<'_> {
             information[(axis, axis)] += ROTATION_PRIOR;
         }
         let mut covariance = information.cholesky()?.inverse();
-        covariance *= self.misfit(best.equations.cost);
+        covariance *= self.variance_factor(best.equations.cost);
         let other = other.filter(|other| self.is_other_minimum(&best, other));
         covariance.iter().all(|c| c.is_finite()).then_some(MarkerPose {
             camera_from_marker: Transform::from_isometry(best.place),
@@ -228,9 +228,9 @@ impl Plane<'_> {
         })
     }
 
-    /// The factor by which a pose is less sure than its points' covariances say, because they contradict each
-    /// other by more: 1 unless that is no chance.
-    fn misfit(&self, cost: f64) -> f64 {
+    /// The factor by which a pose's covariance exceeds that of its points, because they contradict each
+    /// other by more: 1 unless that is significant.
+    fn variance_factor(&self, cost: f64) -> f64 {
         const MAX_CHANCE: f64 = 6.0;
         let freedom = (2 * self.points.len()).saturating_sub(6).max(1) as f64;
         let ratio = cost / freedom;
@@ -469,7 +469,7 @@ mod tests {
     }
 
     #[test]
-    fn from_afar_the_other_tilt_is_kept_with_its_error() {
+    fn the_other_tilt_of_a_far_marker_is_reported_with_its_error() {
         let [camera, ..] = cameras();
         let truth = pose([0.5, 0.2, 8.0], 0.5, 1.0, 0.3);
         let found =

@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_of_good_measurements_is_kept_and_bad_ones_hardly_move_it() {
+    fn bad_measurements_hardly_move_the_mean_of_good_ones() {
         let mut memory = ResponseMemory::default();
         for k in 0..4 {
             memory.add(&estimate(1.0 + 0.02 * f64::from(k % 2), 0.03));

@@ -117,7 +117,7 @@ impl Trace {
         self.markers.reserve(Self::MAX_REFUSALS);
     }
 
-    /// Largest number of refusals, and of quads, that are kept.
+    /// Largest number of refusals, and of quads, that are stored.
     pub const MAX_REFUSALS: usize = 256;
 
     /// Forgets everything, and keeps the room.

@@ -601,7 +601,7 @@ mod tests {
     }
 
     #[test]
-    fn two_markers_of_one_name_are_kept_apart_by_position() {
+    fn two_markers_of_one_name_are_distinguished_by_position() {
         let images: Vec<(f64, Vec<Observation>)> = (0..3)
             .map(|i| (0.1 * f64::from(i), 10.0 * f64::from(i)))
             .map(|(time_s, x)| {

@@ -101,7 +101,7 @@ fn the_true_centre_and_range_at_four_by_four_binning() {
 /// Squared errors of the centre in units of its covariance, and of the place in space, over seeds of the noise, are those of
 /// two and three normal variables.
 #[test]
-fn errors_are_as_large_as_the_covariances_say() {
+fn errors_are_consistent_with_the_covariances() {
     let camera = CameraModel::pinhole(1296, 972, 1818.0);
     let marker = format!("rings:{SIZE_M}").parse().unwrap();
     let mut detector = Detector::new(&[marker], Settings::default()).unwrap();

@@ -120,7 +120,7 @@ fn all_markers_are_solved_together_however_they_are_turned() {
     assert_eq!((pad.used, pad.left_out), (4, 0));
     let pose = &pad.pose.camera_from_marker;
     assert!(apart(pose, &truth) < 0.001 && turned(pose, &truth) < 0.005, "{pad:?}");
-    // Each square alone says the same, less surely.
+    // Each square alone gives the same, with a larger covariance.
     for one in found.iter().filter(|it| it.corners.is_some()) {
         let alone = over.observe(std::slice::from_ref(one)).unwrap();
         let other = alone.pose.alternative.map(|other| turned(&other.camera_from_marker, &truth));

@@ -177,7 +177,7 @@ fn without_a_camera_there_is_a_centre_and_no_pose() {
 }
 
 #[test]
-fn with_its_middle_or_its_rim_covered_it_is_a_marker_only_where_one_is_followed() {
+fn a_marker_with_covered_centre_or_rim_is_found_only_where_one_is_tracked() {
     let marker = format!("rings:{SIZE_M}").parse().unwrap();
     for range_m in [0.8, 2.5] {
         for rim in [false, true] {
@@ -200,7 +200,7 @@ fn with_its_middle_or_its_rim_covered_it_is_a_marker_only_where_one_is_followed(
                 }
             }
             let name = format!("{} covered at {range_m} m", if rim { "rim" } else { "middle" });
-            // In a single image it may be a washer or a lamp beside something dark.
+            // In a single image it may be a washer or a lamp next to a dark object.
             assert_eq!(find(&image, &scene.camera), None, "{name}");
             let mut detector = Detector::new(&[marker], Settings::default()).unwrap();
             let mut tracker = Tracker::default();
@@ -321,7 +321,7 @@ fn targets_of_evenly_wide_rings_are_no_marker() {
 }
 
 #[test]
-fn targets_whose_middle_is_beyond_the_frame_are_no_marker() {
+fn targets_with_their_centre_beyond_the_frame_are_refused() {
     let camera = CameraModel::pinhole(1000, 800, 909.0);
     for radius_px in [90.0, 120.0, 160.0, 220.0] {
         for (beyond, flatness) in [(0.2, 1.0), (0.2, 1.3), (0.3, 1.0), (0.3, 1.15), (0.3, 1.3)] {
@@ -358,7 +358,7 @@ fn small_targets_of_evenly_wide_rings_are_no_marker_to_cameras() {
 }
 
 #[test]
-fn a_lone_ring_is_no_marker_when_the_others_would_be_seen() {
+fn a_single_ring_is_refused_when_the_others_would_be_seen() {
     // Grey values of a disc with a hole, of these radii, on white.
     let draw = |outer: f64, inner: f64| {
         let mut image = GrayImage::filled(1000, 800, 210);

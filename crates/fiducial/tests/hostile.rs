@@ -56,7 +56,7 @@ fn patterns_of_pixels() {
     look_at("dots", &image(&|x, y| black_or_white(x % 3 == 0 && y % 3 == 0)), width, height);
     look_at("stripes", &image(&|x, _| black_or_white(x % 2 == 0)), width, height);
     look_at("ramp", &image(&|x, y| ((x + y) % 256) as u8), width, height);
-    // Every side of these has dozens of others beside it.
+    // Every side of these has dozens of others next to it.
     for period in [6, 10, 24] {
         let squares =
             |x: usize, y: usize| x.abs_diff(648).max(y.abs_diff(486)) % period < period / 2;

@@ -131,7 +131,7 @@ fn a_drawing_without_noise_and_blur_has_a_pose_and_a_covariance_that_is_sane() {
 /// A drawing in whole pixels, as one that was resized without a filter: sides are up to half a pixel off, which no pixel shows. The side of a
 /// cell in pixels, and the turn.
 #[test]
-fn where_a_drawing_is_in_whole_pixels_its_covariance_says_so() {
+fn a_drawing_in_whole_pixels_has_their_covariance() {
     let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
     let (focal_px, size_m) = (800.0, 0.15);
     let camera = CameraModel::pinhole(300, 300, focal_px);
@@ -160,10 +160,10 @@ fn where_a_drawing_is_in_whole_pixels_its_covariance_says_so() {
     }
 }
 
-/// Views of a tag from the side beside another one in full view, by the pixels of its longer side and the ratio of the shorter one: squeezed
+/// Views of a tag from the side, next to another one in full view, by the pixels of its longer side and the ratio of the shorter one: squeezed
 /// along a side and, after a turn of 45 degrees, along a diagonal. AprilTag 3 without decimation reads such tags down to 0.15.
 #[test]
-fn tags_that_are_seen_from_the_side_are_read_beside_another_one() {
+fn tags_that_are_seen_from_the_side_are_read_next_to_another_one() {
     let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
     let (middle, other) = ([310.3, 300.7], [60.2, 560.8]);
     for (side_px, ratios) in
@@ -214,7 +214,7 @@ fn tags_that_are_seen_from_the_side_are_read_beside_another_one() {
 /// A grid of three by three tags whose gaps are three cells wide and have a black square at each of their crossings. The squares overlap
 /// the corners of all tags but the first, whose outline alone is closed; a lens bends the grid.
 #[test]
-fn the_tags_of_a_calibration_grid_are_read_beside_the_one_with_an_outline() {
+fn the_tags_of_a_calibration_grid_are_read_next_to_the_one_with_an_outline() {
     const STEP: f64 = 13.0;
     let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
     for (cell_px, angle, bend) in [(3.0, 0.1, 0.0), (4.5, 0.5, 0.04), (6.0, -0.3, -0.02)] {
@@ -331,7 +331,7 @@ fn ids(image: &GrayImage, markers: &[&str], settings: Settings) -> Vec<u32> {
 }
 
 #[test]
-fn a_covered_marker_is_found_beside_others_on_boards_and_where_it_is_asked_for() {
+fn a_covered_marker_is_found_next_to_others_on_boards_and_on_request() {
     let (quick, thorough) =
         (Settings::default(), Settings { thorough: true, ..Settings::default() });
     let any = ["aruco-4x4-50"];

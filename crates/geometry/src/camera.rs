@@ -519,7 +519,7 @@ mod tests {
 
     /// A calibration that was fitted too closely: its pixels turn back within the image.
     #[test]
-    fn beyond_its_reach_a_lens_model_says_nothing() {
+    fn a_lens_model_gives_no_result_beyond_its_range() {
         let distortion = Distortion::BrownConrady([
             -0.040062, 2.499804, 0.005404, -0.000658, -13.76708, 0.0, 0.0, 0.0,
         ]);

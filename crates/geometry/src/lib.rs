@@ -1,15 +1,15 @@
-//! Coordinate frames as types, rigid transforms, and camera models.
+//! Defines coordinate frames as types, rigid transforms, and camera models.
 //!
-//! A number that is a place says in its type where it is measured: `Point<Camera>` cannot be added to a
+//! A position has its coordinate frame in its type: `Point<Camera>` cannot be added to a
 //! `Vector<Ned>`. Transforms are named `to_from_from` and compose like fractions:
 //! `ned_from_body * body_from_camera * point_in_camera`.
 //!
-//! This crate knows no image, no marker, no clock and no file.
+//! This crate does not depend on images, markers, a clock or files.
 //!
 //! Modules in reading order: [`frame`] names the coordinate frames, [`transform`] moves between them,
 //! [`camera`] goes from the camera frame to pixels and back, [`roi`] from a region of an image to the whole,
 //! [`mod@homography`] from a plane to its image;
-//! [`arithmetic`] says which functions of numbers may be used.
+//! [`arithmetic`] has the functions of numbers that may be used.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
 

@@ -8,7 +8,7 @@ use crate::view::GrayView;
 ///
 /// White is connected across corners. The points are white pixels: an outer border's are the outermost of a
 /// white region, a hole's are those around a black region. Pixels beyond the image count as black. Of
-/// straight runs (vertical, horizontal, diagonal) only the ends are kept. Borders come in raster order from
+/// straight runs (vertical, horizontal, diagonal) only the ends are stored. Borders come in raster order from
 /// the top left; OpenCV lists them in reverse.
 #[derive(Clone, Debug, Default)]
 pub struct Contours {
@@ -40,7 +40,7 @@ pub struct Contour<'a> {
 pub struct Limits {
     /// Borders of fewer points are dropped.
     pub min_points: usize,
-    /// The search ends when the borders kept have this many points.
+    /// The search ends when the stored borders have this many points.
     pub max_points: usize,
 }
 

@@ -78,7 +78,7 @@ impl ContrastMap {
         0
     }
 
-    /// Whether the contrast is as large as this anywhere; true for an image too small to say.
+    /// Whether the contrast is as large as this anywhere; true for an image that is too small.
     pub fn reaches(&self, min_percent: u8) -> bool {
         self.percent.is_empty() || self.percent.iter().any(|percent| *percent >= min_percent)
     }
@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn an_image_too_small_to_say_has_contrast_everywhere() {
+    fn an_image_that_is_too_small_has_contrast_everywhere() {
         let map = map(&GrayImage::filled(100, 80, 9));
         assert!(map.reaches(255) && include(map.places(255), 50, 50, 0));
         assert!(!self::map(&GrayImage::filled(300, 300, 9)).reaches(1));

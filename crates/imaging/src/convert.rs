@@ -208,7 +208,7 @@ fn balance(view: GrayView<'_>, green: usize) -> [i32; 2] {
     })
 }
 
-/// The pixels about a red or blue one: of its own colour two steps away, and green ones beside it.
+/// The pixels about a red or blue one: of its own colour two steps away, and green ones next to it.
 struct Neighbours {
     here: i32,
     /// Left, right, above, below.

@@ -7,7 +7,7 @@ const LINES: usize = 200;
 /// Minimum slope of an edge, in grey levels per two pixels, and its minimum contrast, in grey levels: less may be noise.
 const MIN_SLOPE: i32 = 8;
 const MIN_CONTRAST: i32 = 40;
-/// Minimum number of edges of which something can be said.
+/// Minimum number of edges for a result.
 const MIN_EDGES: usize = 50;
 /// Noise that is left, in grey levels: of an image with more, so many lines are averaged that as much is left.
 const MAX_NOISE: f64 = 1.5;
@@ -21,7 +21,7 @@ const NARROW: f64 = 0.1;
 /// The width of an image's narrow edges in pixels: contrast by steepest slope, the first decile over rows and columns. A step
 /// that a Gaussian of deviation s blurs is 2.5 s wide. A camera in focus has 2 to 3 pixels. `None` where too little has contrast.
 ///
-/// Noise would cut a wide edge into narrow ones, so that lines beside each other are averaged where there is much of it.
+/// Noise would cut a wide edge into narrow ones, so neighbouring lines are averaged where there is much of it.
 pub fn edge_width_px(view: GrayView<'_>) -> Option<f64> {
     let (width, height) = (view.width(), view.height());
     let averaged = (noise(view) / MAX_NOISE).powi(2).ceil() as usize;
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn of_an_image_without_contrast_nothing_is_said() {
+    fn an_image_without_contrast_has_no_focus_value() {
         assert_eq!(edge_width_px(bars(3.0, 30.0).view().unwrap()), None);
         assert_eq!(edge_width_px(GrayImage::filled(1, 1, 7).view().unwrap()), None);
         let mut noise = GrayImage::filled(320, 240, 100);

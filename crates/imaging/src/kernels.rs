@@ -63,7 +63,7 @@ pub(crate) fn sharpen_row(above: &[u8], here: &[u8], below: &[u8], out: &mut [u8
     plain::sharpen_row(above, here, below, out, done..here.len());
 }
 
-/// Bit i of the words says whether pixel i is below its threshold. Bits beyond the row are 0.
+/// Bit i of the words is set when pixel i is below its threshold. Bits beyond the row are 0.
 pub(crate) fn below(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
     let mut done = 0;
     #[cfg(target_arch = "x86_64")]
@@ -79,7 +79,7 @@ pub(crate) fn below(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
     plain::below(pixels, thresholds, words, done);
 }
 
-/// Bit i of the words says whether pixel i is above its threshold. Bits beyond the row are 0.
+/// Bit i of the words is set when pixel i is above its threshold. Bits beyond the row are 0.
 pub(crate) fn above(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
     // Pixel above threshold is threshold below pixel.
     below(thresholds, pixels, words);

@@ -1,12 +1,13 @@
-//! Grey images as borrowed views, and the image processing of the detectors.
+//! Defines grey images as borrowed views, and the image processing of the detectors.
 //!
-//! This crate knows no marker, no camera, no file and no thread.
+//! This crate does not depend on markers, cameras, files or threads.
 //!
 //! Modules in reading order: [`view`] is an image, [`convert`] makes one of raw sensor data, [`mod@bin`] a smaller one, [`mod@filter`]
 //! smooths it, [`mod@threshold`] binarises it, [`contour`] follows the borders, [`ellipse`] fits ellipses to
 //! them, [`sample`] interpolates grey values. The fast path to regions of any size: [`pyramid`] halves an
 //! image again and again, [`binary`] binarises with a local threshold, [`outline`] follows the outlines of
-//! the regions, all or where [`contrast_map`] says that a marker may be. [`segment`] finds straight edge segments where regions are broken. [`focus`] says how sharp an image is.
+//! the regions, all or where a marker may be by [`contrast_map`]. [`segment`] finds straight edge segments where regions are broken.
+//! [`focus`] measures how sharp an image is.
 
 pub mod bin;
 pub mod binary;

@@ -30,8 +30,8 @@ pub struct Settings {
     pub min_contrast: u8,
     /// The same as a share of the brightest pixel, in percent, on all levels.
     pub min_contrast_percent: u8,
-    /// Where the threshold of level 0 lies within the range of 12 x 12 pixels, in 256ths: 128 in the middle. Paper stands out
-    /// from its ground above that, where black ink beside it makes the range larger.
+    /// Where the threshold of level 0 lies within the range of 12 x 12 pixels, in 256ths: 128 in the middle. Paper is separated
+    /// from its ground above that, where black ink next to it makes the range larger.
     pub threshold_256ths: u8,
     /// On levels 0 and 1, an outline is followed only if the grey values at its top step by as much of their
     /// range within 12 x 12 pixels as lies above the threshold (level 1: by half of its logarithm). This skips most of a texture.
@@ -306,7 +306,8 @@ fn sharpen(view: GrayView<'_>, out: &mut GrayImage) {
     }
 }
 
-/// On level 0 the arithmetic mean, or another share of the range, keeps lines of a pixel's width whole; on coarser levels shadows matter more.
+/// On level 0 the arithmetic mean, or another fraction of the range, keeps lines of a pixel's width connected; on coarser levels
+/// shadows are more important.
 fn contrast(settings: &Settings, level: usize) -> Contrast {
     let min = settings.min_contrast;
     Contrast {
@@ -432,7 +433,7 @@ mod tests {
     }
 
     #[test]
-    fn paper_stands_out_from_its_ground_beside_black_ink_above_the_middle() {
+    fn paper_next_to_black_ink_is_separated_from_its_ground_above_the_middle() {
         let inside = |x: usize, y: usize, margin: usize| {
             (margin..40 - margin).contains(&x) && (margin..40 - margin).contains(&y)
         };

@@ -2,7 +2,7 @@
 //! where the chain bends, fitted with lines.
 //!
 //! Where a threshold fails (the edge of a shadow, glare, an occluder), edges are still there, in pieces. A
-//! chain goes on while the gradient keeps its direction, and the lines are exact to a fraction of a pixel.
+//! chain continues while the gradient keeps its direction, and the lines are exact to a fraction of a pixel.
 //! This is edge drawing (Topal and Akinlar, 2012), with the direction of the gradient in place of its
 //! routing.
 
@@ -33,7 +33,7 @@ fn length([dx, dy]: [f32; 2]) -> f32 {
     (dx * dx + dy * dy).sqrt()
 }
 
-/// Which segments are kept.
+/// Which segments are retained.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct SegmentLimits {
     /// Minimum gradient, in grey levels per pixel.
@@ -320,7 +320,7 @@ fn strengths(across: &[i16], down: &[i16], out: &mut [i16]) {
 }
 
 /// Marks where the strength is at least `min_strength` and the largest along the axis the gradient is nearest
-/// to, and writes the gradient's direction, as [`EDGE`] says.
+/// to, and writes the gradient's direction, as [`EDGE`] defines.
 #[inline(always)]
 fn strongest(
     [across, down]: [&[i16]; 2],

@@ -143,7 +143,7 @@ impl<'a> GrayView<'a> {
         Some([*pixels.first()?, *pixels.get(right)?, *pixels.get(down)?, *pixels.last()?])
     }
 
-    /// As [`GrayView::square`], with the pixels right beside and below.
+    /// As [`GrayView::square`], with the pixels to the right and below.
     #[inline]
     pub(crate) fn four(&self, x: usize, y: usize) -> Option<[u8; 4]> {
         let first = y * self.stride + x;

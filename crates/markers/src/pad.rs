@@ -121,7 +121,7 @@ const ROUNDING_M: f64 = 1e-6;
 const MAX_MARKERS: usize = 32;
 
 impl Pad {
-    /// The name of the family under which pads are reported beside markers.
+    /// The name of the family under which pads are reported next to markers.
     pub const FAMILY: &'static str = "pad";
 
     /// The built-in pad of this name, or the one that the file of this name describes; `read` reads files.

@@ -1,9 +1,9 @@
-//! The codewords of the families, read from `data/*.bin`.
+//! Reads the codewords of the families from `data/*.bin`.
 //!
 //! A file has one byte for the bits of a codeword, one byte for the number of cells that follow (as many as bits, or none
 //! for STag), two bytes for each cell (column and row, signed, from the top left cell of the square that is detected; the
 //! most significant bit's cell first), then the codewords in the order of their ids, little-endian, each in the fewest
-//! bytes that hold its bits. `data/README.md` says where the numbers come from.
+//! bytes that hold its bits. `data/README.md` states the source of the numbers.
 
 use std::sync::OnceLock;
 

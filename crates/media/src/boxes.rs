@@ -1,9 +1,9 @@
-//! The boxes of an MP4 file (ISO/IEC 14496-12, 4.2), looked at before a parser reads them that asks for as much memory as they say.
+//! Checks the boxes of an MP4 file (ISO/IEC 14496-12, 4.2) before a parser reads them that allocates the memory that they state.
 
 use std::io::{Error, ErrorKind, Read, Result, Seek, SeekFrom};
 use std::ops::Range;
 
-/// Boxes of boxes on the way to those whose sizes the parser believes.
+/// Boxes of boxes on the way to those whose sizes the parser uses unchecked.
 const CONTAINERS: [&[u8; 4]; 4] = [b"moov", b"trak", b"udta", b"meta"];
 /// Maximum number of boxes within each other, and of those that are within others.
 const MAX_DEPTH: usize = 8;

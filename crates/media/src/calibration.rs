@@ -79,7 +79,7 @@ pub struct CalibrationFile {
     pub path: PathBuf,
     /// The camera of the images in `mode`.
     pub camera: CameraModel,
-    /// The mode that the file describes; where it says nothing the images are the whole sensor.
+    /// The mode that the file describes; where it has none the images are of the whole sensor.
     pub mode: SensorMode,
     /// Width and height of the sensor.
     pub sensor_px: [u32; 2],
@@ -186,10 +186,10 @@ impl CalibrationFile {
         let binning = (2..=8).find(|b| [all_width / b, all_height / b] == [width, height]);
         match binning {
             Some(binning) => format!(
-                "if the camera averages {binning} x {binning} pixels, say so (binning {binning}); otherwise calibrate at this size"
+                "if the camera averages {binning} x {binning} pixels, configure it (binning {binning}); otherwise calibrate at this size"
             ),
             None if width <= all_width && height <= all_height => {
-                "if they are a part of the sensor, say which (a region of left, top, width and height); otherwise calibrate at this \
+                "if they are a part of the sensor, configure it (a region of left, top, width and height); otherwise calibrate at this \
                  size"
                     .to_owned()
             }
@@ -328,7 +328,7 @@ distortion_coefficients: !!opencv-matrix
             refused([320, 240], None, None),
             "these have 320 x 240: if the camera averages 2 x 2",
         );
-        check(refused([600, 400], None, None), "if they are a part of the sensor, say which");
+        check(refused([600, 400], None, None), "if they are a part of the sensor, configure it");
         check(refused([1280, 960], None, None), "these have 1280 x 960: calibrate at this size");
         check(refused([320, 200], None, Some(2)), "gives images of 320 x 240");
         check(refused([320, 240], None, Some(0)), "no binning by 0");

@@ -49,7 +49,7 @@ impl LiveH264 {
     /// picture.
     ///
     /// # Errors
-    /// When it is damaged, too large, or in a format that the decoder does not know.
+    /// When it is damaged, too large, or in a format that the decoder does not support.
     pub fn decode(&mut self, picture: &[u8]) -> Result<Option<GrayImage>, H264Error> {
         let decoded = contained(|| self.decode_unchecked(picture), |cause| H264Error::new(cause));
         if decoded.is_err() {
@@ -92,7 +92,7 @@ fn luma(frame: &Frame) -> Result<GrayImage, H264Error> {
     Ok(image)
 }
 
-/// Maximum number of pictures that others may refer to, all of which are kept in memory, and of entries in a slice's list of them
+/// Maximum number of pictures that others may refer to, all of which are stored in memory, and of entries in a slice's list of them
 /// (ITU-T H.264, A.3.1 and 7.4.3).
 const MAX_REFERENCES: u32 = 16;
 const MAX_REFERENCE_LIST: u32 = 32;
@@ -215,7 +215,7 @@ mod tests {
         let is_list =
             |it: &Excess| matches!(it, Excess::Standard { limit: MAX_REFERENCE_LIST, .. });
         assert!(excess.iter().any(is_list), "{excess:?}");
-        // Far beyond, before the lists that are asked for are made.
+        // Far beyond, before the requested lists are allocated.
         let long = NalUnit { rbsp: vec![0xff; 5 << 20].into(), ..parse_annex_b(stream).remove(2) };
         assert!(limits.excess(&long).is_some());
     }

@@ -254,7 +254,7 @@ impl DecodedImage {
 
     /// As [`DecodedImage::decode`]; panics where the decoder does.
     fn decode_unchecked(path: &Path, bytes: &[u8], max_pixels: u64) -> Result<Self, ImageError> {
-        // The decoder knows the standard tables only behind the segment that the files of an AVI video have.
+        // The decoder uses the standard tables only behind the segment that the files of an AVI video have.
         let bytes = &*with_tables(bytes);
         let mut decoder = decoder(path, bytes, max_pixels)?;
         // The decoder fills the missing part of a JPEG with grey.
@@ -568,7 +568,7 @@ mod tests {
             for at in (0..whole.len()).step_by(11) {
                 let mut damaged = whole.clone();
                 damaged[at] ^= 0x5a;
-                // Some places do not matter: the test is that there is an answer.
+                // Some positions are unimportant: the test is that there is an answer.
                 drop(read_bytes(&damaged, 100_000));
             }
         }

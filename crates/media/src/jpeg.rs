@@ -41,7 +41,7 @@ pub(crate) fn next_jpeg<'a>(bytes: &'a [u8], at: &mut usize) -> Option<&'a [u8]>
 }
 
 /// Follows the segments from `at`, a place between segments or in coded data, to the end of the EOI marker.
-/// Where bytes are missing, `at` is the place to go on from once there are more.
+/// Where bytes are missing, `at` is the position to continue from once there are more.
 fn end_of_image(bytes: &[u8], at: &mut usize) -> Option<usize> {
     loop {
         let ahead = bytes.get(*at..)?;
@@ -159,7 +159,7 @@ impl JpegScanner {
         self.file.len()
     }
 
-    /// The file, as far as it has come; the scanner begins anew.
+    /// The file, as far as it has come; the scanner begins again.
     pub fn take(&mut self) -> Vec<u8> {
         std::mem::take(self).file
     }

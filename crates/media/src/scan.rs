@@ -43,7 +43,7 @@ pub(crate) enum ScanFault {
         /// The number of the next one.
         expected: u8,
     },
-    /// A restart interval whose data go on behind its last block.
+    /// A restart interval whose data continue behind its last block.
     #[error(
         "bytes are missing in it: restart marker {expected} was to come after {before} of {blocks} blocks"
     )]
@@ -508,7 +508,7 @@ impl Bits<'_> {
         self.marker().is_some()
     }
 
-    /// The second byte of the marker that comes next, behind the rest of a byte at most; the bits go on behind it.
+    /// The second byte of the marker that comes next, behind the rest of a byte at most; the bits continue behind it.
     fn marker(&mut self) -> Option<u8> {
         if self.count >= 8 {
             return None;
@@ -641,7 +641,7 @@ mod tests {
     }
 
     #[test]
-    fn components_have_as_many_blocks_as_their_sampling_says() {
+    fn components_have_as_many_blocks_as_their_sampling_requires() {
         // 33 x 17 pixels are 3 x 2 MCUs of 16 x 16, each of 4 + 1 + 1 blocks.
         let frame = [8, 0, 17, 0, 33, 3, 1, 0x22, 0, 2, 0x11, 0, 3, 0x11, 0];
         let scan = [3, 1, 0, 2, 0, 3, 0, 0, 63, 0];
@@ -684,7 +684,7 @@ mod tests {
             for byte in 0..=u8::MAX {
                 let mut damaged = whole.clone();
                 damaged[at] = byte;
-                // Some places do not matter: the test is that there is an answer.
+                // Some positions are unimportant: the test is that there is an answer.
                 drop(check_scan(&damaged));
             }
         }

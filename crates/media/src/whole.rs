@@ -32,7 +32,7 @@ pub fn write_whole(file: &Path, contents: &[u8]) -> Result<()> {
     // It may not be there.
     let _ = std::fs::remove_file(&new);
     match problem.kind() {
-        // The folder is another's or read-only, the file is mounted by itself, or the longer name is too long.
+        // The folder is another's or read-only, the file itself is a mount point, or the longer name is too long.
         ErrorKind::PermissionDenied
         | ErrorKind::ReadOnlyFilesystem
         | ErrorKind::ResourceBusy

@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 
 use messages::{ControllerStatus, Detection, Detections};
 
-/// Maximum age of the last detection, in nanoseconds. After it the camera meters by itself: a landing goes on without the
-/// pad for longer, but not with a guess of where it is.
+/// Maximum age of the last detection, in nanoseconds. After it the camera meters on its own: a landing continues without the
+/// pad for longer, but not with a guess of its position.
 const MAX_AGE_NS: i64 = 700_000_000;
 /// Time over which the fastest motion counts, in nanoseconds: a vehicle that sways is slow in between.
 const MOTION_NS: i64 = 500_000_000;
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn the_pad_goes_on_where_it_went_and_its_fastest_motion_counts() {
+    fn the_pad_is_predicted_along_its_motion_and_its_fastest_motion_counts() {
         let mut track = PadTrack::new("down");
         track.update(&message(0, vec![detection("rings", [100.0, 50.0], 40.0)]));
         assert_eq!(track.at(0).unwrap().motion_px_s, 0.0);

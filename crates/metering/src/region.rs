@@ -19,7 +19,7 @@ const TAIL: f64 = 0.05;
 pub struct Levels {
     /// The median of its bright half: its white where the light falls on it.
     pub white: f64,
-    /// The darkest level, beside noise: its black.
+    /// The darkest level, without noise: its black.
     pub black: f64,
 }
 
@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pad_beside_the_frame_or_a_few_pixels_wide_has_no_levels() {
+    fn a_pad_outside_the_frame_or_a_few_pixels_wide_has_no_levels() {
         let image = frame(|_, _| 100);
         let view = image.view().unwrap();
         for (centre_px, size_px) in

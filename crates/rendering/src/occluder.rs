@@ -68,7 +68,7 @@ pub enum Occluder {
         /// Grey levels added in front of it.
         levels: f32,
     },
-    /// A lamp beside the camera: the light falls off from a pixel.
+    /// A lamp next to the camera: the light falls off from a pixel.
     Lamp {
         /// Where it is brightest.
         centre: Pixel,

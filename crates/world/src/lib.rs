@@ -1,8 +1,8 @@
-//! A world to land in, faster than time: a vehicle and its autopilot, wind, a pad that may move, a camera's
-//! faults.
+//! Simulates a world to land in, faster than real time: a vehicle and its autopilot, wind, a pad that may move, a
+//! camera's faults.
 //!
 //! It is pure: seed, received packets and requested times determine everything, so a flight repeats to the
-//! bit. It knows no network, no clock, no image, and nothing of how a landing is decided.
+//! bit. It does not depend on network, clock or images, nor on how a landing is decided.
 //!
 //! Modules in reading order: [`world`] joins [`vehicle`], [`wind`], [`pad`] and [`ardupilot`], with [`drift`]
 //! for their slow errors; [`camera`] has the faults of frames, [`vision`] a model of the detector.

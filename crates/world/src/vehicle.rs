@@ -43,9 +43,9 @@ pub struct VehicleConfig {
     pub rotor_m: f64,
     /// Height of the rotors over the vehicle's lowest point, in metres.
     pub rotor_height_m: f64,
-    /// Where the vehicle stands at the start; the ground is the horizontal plane through it.
+    /// The vehicle's position on the ground at the start; the ground is the horizontal plane through it.
     pub start: Point<Ned>,
-    /// How high over it the vehicle hovers at the start, in metres; 0 stands.
+    /// How high over it the vehicle hovers at the start, in metres; 0 is on the ground.
     pub start_height_m: f64,
     /// Heading at the start, in radians from north to east.
     pub start_heading_rad: f64,
@@ -103,7 +103,7 @@ pub enum HeadingDemand {
     Rate(f64),
 }
 
-/// The surface below the vehicle, which supports it when it stands.
+/// The surface below the vehicle, which supports it after a landing.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Support {
     /// Where its surface is, in metres downwards.
@@ -115,7 +115,7 @@ pub struct Support {
 }
 
 impl Support {
-    /// Ground that lies still.
+    /// Stationary ground.
     pub fn ground(z_m: f64) -> Self {
         Self { z_m, velocity: Vector::zero(), turn_rad_s: 0.0 }
     }
@@ -203,7 +203,7 @@ pub struct Vehicle {
 }
 
 impl Vehicle {
-    /// A vehicle that stands on the ground, motors off, or hovers above it.
+    /// A vehicle on the ground, motors off, or hovering above it.
     pub fn new(config: VehicleConfig, seed: u64) -> Self {
         let mut random = random_stream(seed, 2);
         let mut drift = || Drift::new(config.unsteadiness_rad, 0.5, &mut random);
@@ -377,7 +377,7 @@ mod tests {
         Demand { thrust_m_s2: GRAVITY_M_S2, ..Demand::IDLE }
     }
 
-    /// A vehicle at some height, at rest.
+    /// A stationary vehicle at some height.
     fn flying() -> Vehicle {
         let mut vehicle =
             Vehicle::new(VehicleConfig { unsteadiness_rad: 0.0, ..VehicleConfig::default() }, 1);

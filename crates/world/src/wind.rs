@@ -39,7 +39,7 @@ pub struct WindConfig {
 pub struct Gust {
     /// When it begins, in seconds.
     pub start_s: f64,
-    /// How long it lasts, in seconds.
+    /// Its duration, in seconds.
     pub length_s: f64,
     /// Its peak, in m/s.
     pub peak_m_s: f64,
@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_wind_blows_from_where_it_says() {
+    fn the_mean_wind_blows_from_its_direction() {
         let config = WindConfig { mean_m_s: 5.0, from_rad: 0.3, ..WindConfig::default() };
         let wind = Wind::new(config, 1).step(DT_S, 10.0, None);
         let expected = Vector::new(-5.0 * 0.3f64.cos(), -5.0 * 0.3f64.sin(), 0.0);

@@ -49,7 +49,7 @@ impl Default for WorldConfig {
     }
 }
 
-/// Number of past states kept for cameras with a long exposure, in steps: one second.
+/// Number of past states stored for cameras with a long exposure, in steps: one second.
 const MAX_PAST: usize = 400;
 
 /// Vehicle, wind and autopilot. The same seed and the same packets at the same times give the same flight.

@@ -1,7 +1,7 @@
 //! Compares the simulated autopilot with measurements of ArduPilot Copter 4.5.4: intervals, acknowledgements,
 //! arming, modes, take-off, velocity setpoints, landings and their times.
 
-#![allow(clippy::unwrap_used, reason = "a test says where it fails")]
+#![allow(clippy::unwrap_used, reason = "a test prints where it fails")]
 #![allow(deprecated, reason = "messages of real programs are tested, superseded or not")]
 
 mod bench;
@@ -66,31 +66,31 @@ fn a_mode_change_brings_one_heartbeat_more() {
 }
 
 #[test]
-fn intervals_are_acknowledged_and_kept_exactly() {
+fn intervals_are_acknowledged_and_exact() {
     let mut bench = Bench::new(&WorldConfig::default(), 1);
     bench.run(2.5);
-    assert_eq!(bench.ask(30, 200.0), 0);
-    assert_eq!(bench.ask(32, 50.0), 0);
+    assert_eq!(bench.request(30, 200.0), 0);
+    assert_eq!(bench.request(32, 50.0), 0);
     bench.run(10.0 - STEP_S);
     assert_eq!(bench.of(30).count(), 2000);
     assert_eq!(bench.of(32).count(), 500);
     bench.step();
-    assert_eq!(bench.ask(30, -1.0), 0);
+    assert_eq!(bench.request(30, -1.0), 0);
     let sent = bench.of(30).count();
     bench.run(1.0);
     assert_eq!(bench.of(30).count(), sent);
-    assert_eq!(bench.ask(149, 5.0), 2);
+    assert_eq!(bench.request(149, 5.0), 2);
     assert!(bench.texts().contains(&"No ap_message for mavlink id (149)".to_owned()));
 }
 
 #[test]
-fn every_message_that_is_known_comes_when_asked() {
+fn every_known_message_is_sent_on_request() {
     let mut config = WorldConfig::default();
     config.autopilot.rangefinder = true;
     let mut bench = Bench::flying(&config, 1, 5.0);
     for id in [1, 2, 24, 30, 31, 32, 33, 49, 74, 85, 108, 132, 147, 164, 173, 193, 242, 245] {
         bench.velocity(LOCAL, HOLD_HEADING, [0.0; 3], [0.0; 2]);
-        assert_eq!(bench.ask(id, 10.0), 0, "{id}");
+        assert_eq!(bench.request(id, 10.0), 0, "{id}");
         let before = bench.of(id.into()).count();
         bench.run(0.98);
         assert_eq!(bench.of(id.into()).count() - before, 10, "{id}");
@@ -101,7 +101,7 @@ fn every_message_that_is_known_comes_when_asked() {
 fn a_data_stream_is_not_acknowledged_and_overwrites_intervals() {
     let mut bench = Bench::new(&WorldConfig::default(), 1);
     bench.run(2.5);
-    bench.ask(30, 50.0);
+    bench.request(30, 50.0);
     let sent = bench.log.len();
     bench.send(&MavMessage::REQUEST_DATA_STREAM(REQUEST_DATA_STREAM_DATA {
         req_message_rate: 4,
@@ -121,7 +121,7 @@ fn a_slow_start_is_ready_after_42_seconds() {
     let mut bench = Bench::new(&slow_start(), 1);
     bench.step();
     for id in [1, 32, 193] {
-        assert_eq!(bench.ask(id, 10.0), 0);
+        assert_eq!(bench.request(id, 10.0), 0);
     }
     bench.run(60.0);
     let prearm = |frame: &autopilot::Packet| whole(frame)[11] & 0x10 != 0;
@@ -187,7 +187,7 @@ fn takeoff_is_accepted_only_armed_on_the_ground_in_guided() {
         let z = |payload: Vec<u8>| f32::from_le_bytes(payload[12..16].try_into().unwrap());
         bench.latest(32).is_some_and(|payload| z(payload) <= -9.5)
     });
-    // Armed at the same moment, so the 2 s for which the motors are kept back come on top of the 7.4 s.
+    // Armed at the same moment, so the 2 s for which the motors are held are added to the 7.4 s.
     near(time_s, 7.4 + 2.0, 0.4);
     bench.wait(5.0, "the end of the climb", |bench| bench.landed_state() == Some(2));
     assert_eq!(bench.command(22, climb), Some(4));
@@ -197,7 +197,7 @@ fn takeoff_is_accepted_only_armed_on_the_ground_in_guided() {
 fn a_takeoff_some_time_after_arming_takes_the_measured_time() {
     let mut bench = Bench::new(&steady(), 1);
     bench.run(2.5);
-    bench.ask(245, 20.0);
+    bench.request(245, 20.0);
     bench.mode(4);
     bench.command(400, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
     bench.run(2.0);
@@ -363,7 +363,7 @@ fn a_time_synchronisation_is_answered() {
 #[test]
 fn the_true_state_can_be_asked_for() {
     let mut bench = Bench::flying(&steady(), 1, 10.0);
-    bench.ask(108, 50.0);
+    bench.request(108, 50.0);
     bench.fly(4.0, [1.0, -0.5, 0.0]);
     bench.step();
     let payload = bench.latest(108).unwrap();
@@ -591,10 +591,10 @@ fn the_fast_part_of_a_landing_is_as_fast_as_measured() {
 }
 
 #[test]
-fn the_touch_is_known_after_the_measured_delays() {
+fn the_touchdown_is_detected_after_the_measured_delays() {
     for seed in 0..5 {
         let mut bench = Bench::flying(&WorldConfig::default(), seed, 2.0);
-        bench.ask(245, 50.0);
+        bench.request(245, 50.0);
         bench.mode(9);
         bench.wait(20.0, "touch", |bench| bench.world.truth().on_ground);
         let sure_s = bench.wait(5.0, "landed", |bench| bench.landed_state() == Some(1));
@@ -616,7 +616,7 @@ fn low_landings_take_the_measured_times() {
         let from_m = bench.world.truth().height_m * 1.042;
         let [impact_s, ..] = land(&mut bench);
         println!("from {from_m:.2} m: {impact_s:.2} s, measured from {height_m} m: {measured_s}");
-        // The measurement names the height as the autopilot believed it.
+        // The measurement names the height as the autopilot estimated it.
         near(impact_s - (from_m - height_m) / 0.5, measured_s, 0.2);
     }
 }
@@ -656,7 +656,7 @@ fn landings_drift_as_little_as_measured() {
 #[test]
 fn landing_in_guided_disarms_late() {
     let mut bench = Bench::flying(&steady(), 1, 2.0);
-    bench.ask(245, 50.0);
+    bench.request(245, 50.0);
     while !bench.world.truth().on_ground {
         bench.fly(0.1, [0.0, 0.0, 0.3]);
     }

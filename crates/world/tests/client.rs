@@ -143,7 +143,7 @@ fn take_off_if_simulated(firmware: Firmware, says_simulated: bool) -> (TakeoffPr
 }
 
 #[test]
-fn a_simulated_vehicle_says_so_and_takes_off() {
+fn a_simulated_vehicle_reports_the_simulation_and_takes_off() {
     for firmware in [Firmware::ArduPilot, Firmware::Px4] {
         let (end, pair) = take_off_if_simulated(firmware, true);
         assert_eq!(end, TakeoffProgress::Done, "{firmware:?}");

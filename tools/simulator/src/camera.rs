@@ -170,7 +170,7 @@ impl SimCamera {
         let pose = |i: usize| {
             let aside_s = exposure_s * (i as f64 / (POSES - 1) as f64 - 0.5);
             let truth = truth_at(request.time_s + aside_s);
-            // The renderer's pad stands still, so the vehicle moves relative to it.
+            // The renderer's pad is stationary, so the vehicle moves relative to it.
             let carried = request.pad.velocity * -aside_s;
             Transform::<Ned, Body>::new(truth.ned_from_body, truth.position + carried)
         };
@@ -243,7 +243,7 @@ impl SimCamera {
                 }
             }
             OccluderKind::Shadow => {
-                // Turned against the marker's sides; the pad is in the shade when its edge is beside it.
+                // Turned against the marker's sides; the pad is in the shade when its edge is next to it.
                 let beside_px = beside_m * model.fx / camera_from_marker.origin().z();
                 let (sin, cos) = SHADOW_NORMAL.sin_cos();
                 let through = Pixel::new(centre.x - beside_px * cos, centre.y - beside_px * sin);

@@ -113,13 +113,13 @@ table! {
 pub enum OccluderKind {
     /// No effect.
     None,
-    /// A reflection beside the marker.
+    /// A reflection next to the marker.
     Glare,
     /// An object in front of a part of the marker.
     Cover,
     /// Low contrast.
     Haze,
-    /// A hard shadow, whose edge is beside the marker's middle or across it.
+    /// A hard shadow, whose edge is next to the marker's centre or across it.
     Shadow,
 }
 

@@ -112,7 +112,7 @@ impl ReportedVehicle {
         if !numbers.iter().chain(&rates).all(|n| n.is_finite()) {
             return;
         }
-        // Both are extension fields, which older autopilots leave out; the others know the place to half a metre only.
+        // Both are extension fields, which older autopilots leave out; the others give the position to half a metre only.
         if state.lat_int == 0 && state.lon_int == 0 {
             return;
         }

@@ -153,7 +153,7 @@ impl Simulation {
         (moved_s, self.pad.at(moved_s))
     }
 
-    /// Begins the scenario of a reported vehicle. That of a simulated one begins by itself.
+    /// Begins the scenario of a reported vehicle. That of a simulated one begins automatically.
     fn begin_when_high(&self, truth: &VehicleTruth) {
         if truth.height_m >= self.begin_height_m {
             let mut begun_s = self.begun_s.lock().unwrap_or_else(PoisonError::into_inner);
@@ -287,7 +287,7 @@ enum AutopilotSide {
     },
 }
 
-/// Whose truth is asked for: the autopilot's MAVLink system id, and the id of the message.
+/// The source of the requested truth: the autopilot's MAVLink system id, and the id of the message.
 #[derive(Copy, Clone)]
 struct TruthOf {
     system: u8,

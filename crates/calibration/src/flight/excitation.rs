@@ -24,7 +24,7 @@ pub struct Excitation {
 /// The tilt that shows time offset and mount yaw: ten times the error of an autopilot's attitude. The focal length needs more
 /// ([`Excitation::attenuation`]).
 const MIN_TILT_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
-/// By how much more errors of the attitude count than their variance says, as the position's drift explains slow tilts away. Focal
+/// By how much more errors of the attitude count than their variance, as the position's drift explains slow tilts away. Focal
 /// lengths came out too short by 2.5 to 3.2 times that part in flights of the tests with tilts from 0.5 to 2 degrees, by about
 /// once in simulated landings; this is between, as a deviation.
 const SLOW_TILTS: f64 = 2.0;
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turn_over_south_is_no_jump() {
+    fn a_turn_over_south_is_continuous() {
         let mut heading = Heading::default();
         for i in 0..40 {
             let yaw = 0.1 * f64::from(i);

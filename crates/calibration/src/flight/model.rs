@@ -44,8 +44,8 @@ const EXPLAINING_STEP_M: f64 = 1e-4;
 /// motion that shows the time offset to 2 ms by so many and the focal length to 2 %; more of them must not look like more.
 const MIN_APART_S: f64 = 0.045;
 const MAX_MARKERS: usize = 2000;
-/// Height over the marker from which on a detection is used, in metres: lower, the air and the ground move the vehicle otherwise
-/// than the autopilot knows, and a marker fills the image.
+/// Height over the marker from which on a detection is used, in metres: lower, the air and the ground move the vehicle in ways
+/// that the autopilot does not measure, and a marker fills the image.
 const MIN_DISTANCE_M: f64 = 0.5;
 
 /// A flight to explain.

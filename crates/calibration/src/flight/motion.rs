@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_known_outside_of_the_flight_and_in_gaps() {
+    fn there_is_no_pose_outside_of_the_flight_and_in_gaps() {
         let motion =
             Motion::new(&[sample(1.0, 0.0, 0.0), sample(1.1, 0.0, 0.0), sample(2.0, 0.0, 0.0)]);
         for t in [0.99, 1.5, 2.0, 2.1, f64::NAN] {
@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flight_during_a_gap_is_no_jump() {
+    fn a_flight_during_a_gap_is_not_taken_for_a_jump() {
         // From one hover to another, unseen.
         let motion = Motion::new(&[
             sample(1.0, 0.0, 0.0),

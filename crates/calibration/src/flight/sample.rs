@@ -3,7 +3,7 @@
 use geometry::{Body, Camera, CameraModel, Ned, Point, Rotation, Transform, Vector};
 use nalgebra::Matrix3;
 
-/// The vehicle at a moment, as its autopilot says.
+/// The vehicle at an instant, as reported by its autopilot.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct VehicleSample {
     /// When, in seconds of the clock of all samples.

@@ -37,7 +37,7 @@ impl Bad {
         Self::Refocused,
     ];
 
-    /// A set of this kind, and the lens that is asked for.
+    /// A set of this kind, and the lens that is requested.
     pub fn set(self, truth: &Truth, seed: u64) -> (Vec<View>, Lens) {
         let usual = Taking::default();
         let camera = &truth.camera;

@@ -225,9 +225,9 @@ mod tests {
 
     use super::*;
 
-    /// Noise on even ground, beside it blots, and a faint dark square of 24 pixels at (101..125, 99..123).
+    /// Noise on even ground, next to it blots, and a faint dark square of 24 pixels at (101..125, 99..123).
     #[test]
-    fn a_faint_square_is_outlined_beside_texture_and_noise_is_not() {
+    fn a_faint_square_is_outlined_next_to_texture_and_noise_is_not() {
         let mut image = GrayImage::filled(640, 480, 0);
         let mut random = 1_u32;
         for y in 0..480 {
@@ -251,7 +251,7 @@ mod tests {
             seen.iter().zip([101, 99, 125, 123]).map(|(seen, side)| (seen - side).abs()).max()
         };
         assert!(on_ground.iter().any(|seen| off(seen) <= Some(8)), "{on_ground:?}");
-        // Noise right beside the square has the square's contrast.
+        // Noise directly next to the square has the square's contrast.
         assert!(on_ground.iter().all(|seen| off(seen) <= Some(40)), "{on_ground:?}");
     }
 }

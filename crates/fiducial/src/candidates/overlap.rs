@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn the_best_of_each_place_is_kept() {
+    fn the_best_at_each_position_is_retained() {
         let mut found = vec![[0.0, 1.0], [10.0, 3.0], [0.4, 2.0], [10.3, 0.5]];
         suppress_non_maxima(&mut found, |f| f[1], |a, b| f64::abs(a[0] - b[0]) < 1.0);
         assert_eq!(found, [[10.0, 3.0], [0.4, 2.0]]);

@@ -1,4 +1,4 @@
-//! The quiet zone around a marker: quads of its white paper, and how evenly a border stands out from it.
+//! Finds the quiet zone around a marker: quads of its white paper, and how evenly a border contrasts with it.
 
 use geometry::Pixel;
 use imaging::pyramid::from_level_0;

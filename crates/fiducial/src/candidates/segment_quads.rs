@@ -39,7 +39,7 @@ impl Scale {
 }
 
 /// Smallest gradient of a marker's sides, in grey levels per pixel: this fraction of the image's brightest
-/// part, within these bounds. Textures have many weaker edges; so has a marker deep in the shade beside
+/// part, within these bounds. Textures have many weaker edges; so has a marker deep in the shade next to
 /// sunlit ground, which is then found only where it is sharp.
 const BRIGHTEST_PER_GRADIENT: u8 = 12;
 const MIN_GRADIENT: u8 = 6;
@@ -127,7 +127,7 @@ const MAX_SIDES: usize = 6000;
 const MAX_CORNERS: usize = 16_000;
 const MAX_CORNERS_PER_SIDE: usize = 6;
 const MAX_PROPOSALS: usize = 4000;
-/// Largest number of quads of either polarity, and of quads with two hidden corners beside those.
+/// Largest number of quads of either polarity, and of quads with two hidden corners in addition.
 const MAX_QUADS: usize = 150;
 const MAX_HIDDEN: usize = 60;
 /// Largest ratio of two sides of a quad.
@@ -135,7 +135,7 @@ const MAX_ASPECT: f32 = 4.0;
 
 /// Largest number of sides looked at beyond hidden corners.
 const MAX_LOOKS: usize = 200_000;
-/// Quads with two hidden corners: smallest length of the sides beside these, in pixels, largest ratio of two sides, and smallest
+/// Quads with two hidden corners: smallest length of the sides next to these, in pixels, largest ratio of two sides, and smallest
 /// share of the perimeter that is visible.
 const MIN_OPPOSITE_PX: f32 = 8.0;
 const MAX_HIDDEN_ASPECT: f32 = 2.5;

@@ -1,7 +1,7 @@
 //! Reads a square marker with hidden parts: each sampled cell is black, white or an erasure by the light on border and quiet
 //! zone, and the codeword is matched by the rest.
 //!
-//! Cells beside a border cell of the wrong colour are erasures as well. The codeword counts only with a low false-positive
+//! Cells next to a border cell of the wrong colour are erasures as well. The codeword counts only with a low false-positive
 //! rate.
 
 use imaging::GrayView;
@@ -79,7 +79,7 @@ impl CellImage {
         Some(Self { grid, colours, intact, r_squared, is_washed_out })
     }
 
-    /// The marker of one family that it shows. `ids` are those looked for; `None` stands for all.
+    /// The marker of one family that it shows. `ids` are those looked for; `None` means all.
     pub(crate) fn decode(&self, code: &SquareCode, ids: Option<&[u32]>) -> Option<Reading> {
         let found = decode_with_erasures(self.grid.word(&self.colours, code), code, ids)?;
         let reading = Reading {
@@ -471,7 +471,7 @@ pub(crate) struct BestCodeword {
 }
 
 impl ErasedWord {
-    /// With one bit more; `None` stands for an erasure.
+    /// With one bit more; `None` means an erasure.
     pub(crate) fn appended(self, bit: Option<bool>) -> Self {
         Self {
             bits: self.bits << 1 | u64::from(bit == Some(true)),

@@ -213,14 +213,14 @@ impl ReferenceCells {
 
     /// The illumination that explains the cells best; the square's middle is at `middle` on both axes.
     pub(crate) fn illumination(&self, middle: f32) -> Option<Illumination> {
-        let (mut best, mut misfit) = self.split(&self.project(0.0), f32::INFINITY)?;
-        // A small misfit needs no second light.
-        if misfit > 0.01 * self.count as f32 {
-            let limit = 0.6 * misfit;
+        let (mut best, mut residual) = self.split(&self.project(0.0), f32::INFINITY)?;
+        // A small residual needs no second light.
+        if residual > 0.01 * self.count as f32 {
+            let limit = 0.6 * residual;
             let others = [self.with_reflection(), with_vectors(|| self.with_shadow(middle))];
             for (light, here) in others.into_iter().flatten() {
-                if here < limit && here < misfit {
-                    (best, misfit) = (light, here);
+                if here < limit && here < residual {
+                    (best, residual) = (light, here);
                 }
             }
         }
@@ -240,7 +240,7 @@ impl ReferenceCells {
         projection
     }
 
-    /// Two lights on the sides of a shadow's edge, and their misfit. Edges all over the grid are tried, then
+    /// Two lights on the sides of a shadow's edge, and their residual. Edges all over the grid are tried, then
     /// edges near the best one.
     #[inline(always)]
     fn with_shadow(&self, middle: f32) -> Option<(Illumination, f32)> {
@@ -276,7 +276,7 @@ impl ReferenceCells {
         best
     }
 
-    /// The illumination with a shadow's edge at `offset` along a direction, and its misfit.
+    /// The illumination with a shadow's edge at `offset` along a direction, and its residual.
     #[inline(always)]
     fn split(&self, projection: &Projection, offset: f32) -> Option<(Illumination, f32)> {
         let beyond = self.beyond(projection, offset);
@@ -308,9 +308,12 @@ impl ReferenceCells {
                 [None, None] => return None,
             };
         }
-        let misfit = self.misfit(projection, offset, logs);
+        let residual = self.residual(projection, offset, logs);
         let levels = logs.map(|side| side.map(|log| log.exp() - STRAY_LIGHT));
-        Some((Illumination { normal: projection.normal, offset, levels, reflection: None }, misfit))
+        Some((
+            Illumination { normal: projection.normal, offset, levels, reflection: None },
+            residual,
+        ))
     }
 
     /// Number of black and of white cells beyond the edge, and the sums of their logarithms.
@@ -335,7 +338,7 @@ impl ReferenceCells {
     /// Sum of the bounded squared residuals, for these logarithms of black and white before and beyond the
     /// edge.
     #[inline(always)]
-    fn misfit(&self, projection: &Projection, offset: f32, levels: [[f32; 2]; 2]) -> f32 {
+    fn residual(&self, projection: &Projection, offset: f32, levels: [[f32; 2]; 2]) -> f32 {
         let mut sums = [0.0_f32; LANES];
         for from in (0..self.count).step_by(LANES) {
             let [position, log, black, white] =
@@ -350,7 +353,7 @@ impl ReferenceCells {
         sums.iter().sum()
     }
 
-    /// One light with a reflection, and its misfit.
+    /// One light with a reflection, and its residual.
     fn with_reflection(&self) -> Option<(Illumination, f32)> {
         // The darker cells of each colour are outside of the reflection.
         let plain = [false, true].map(|white| self.first_quartile(white));
@@ -376,14 +379,14 @@ impl ReferenceCells {
         }
         let reflection = Some([shape[0], shape[1], shape[2], shape[3]]);
         let light = Illumination { normal: [1.0, 0.0], offset: f32::INFINITY, levels, reflection };
-        let misfit = (0..self.count)
+        let residual = (0..self.count)
             .map(|i| {
                 let [black, white] = light.at([self.columns[i], self.rows[i]], 0);
                 let expected = if self.is_white(i) { white } else { black };
                 bounded_square(self.logs[i] - log(expected))
             })
             .sum();
-        Some((light, misfit))
+        Some((light, residual))
     }
 
     /// First quartile of the grey values of one colour.

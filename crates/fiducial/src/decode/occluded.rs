@@ -17,7 +17,7 @@ const MAX_FOUND: usize = 64;
 pub(crate) struct OccludedMarker<R> {
     pub(crate) quad: Quad,
     pub(crate) reading: R,
-    /// Of conflicting markers, the one with the highest score is kept.
+    /// Of conflicting markers, the one with the highest score is retained.
     pub(crate) score: f64,
 }
 
@@ -78,7 +78,7 @@ pub(crate) struct OccludedQuery<'a> {
     /// The caller's index of the family.
     pub(crate) family: usize,
     pub(crate) code: &'a SquareCode,
-    /// The ids; `None` stands for all.
+    /// The ids; `None` means all.
     pub(crate) ids: Option<&'a [u32]>,
 }
 

@@ -19,7 +19,7 @@ use crate::optics::homography::Homography;
 
 /// Units across the square; the border is one unit wide.
 const ACROSS: usize = 10;
-/// Places along each side, on the border and on the quiet zone beside it.
+/// Positions along each side, on the border and on the quiet zone next to it.
 const PER_SIDE: usize = 10;
 /// Their distance from the outline, in units.
 const DEPTH: f64 = 0.5;

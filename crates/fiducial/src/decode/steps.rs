@@ -1,7 +1,7 @@
 //! Reads markers in uneven light, as under leaves, by the steps at the edges between cells.
 //!
 //! Light hardly changes across the edge between two cells, and the ratio of black to white is that of the border to the quiet
-//! zone beside it wherever the light is. So each edge shows whether its cells differ, and which of them is white. The
+//! zone next to it in any light. So each edge shows whether its cells differ, and which of them is white. The
 //! codeword is the one that explains the edges best.
 
 use imaging::GrayView;
@@ -33,11 +33,11 @@ const MAX_COST: f32 = 0.25;
 const MIN_BIT_COST: f32 = 0.2;
 /// Smallest fraction of the border's edges that show a step.
 const MIN_INTACT: f32 = 0.7;
-/// Largest cost of a codeword, as a fraction of that of edges which say nothing, with strong evidence and with weak. In a thousand
+/// Largest cost of a codeword, as a fraction of that of edges without information, with strong evidence and with weak. In a thousand
 /// scenes of clutter and man-made circles no quad with these bounds showed a codeword; without a margin, and with evidence of 6 bits, 49
 /// did, all of them windows that look like one and the same codeword.
-const MAX_MISFIT: f32 = 0.25;
-const MAX_MISFIT_WEAK: f32 = 0.2;
+const MAX_RESIDUAL: f32 = 0.25;
+const MAX_RESIDUAL_WEAK: f32 = 0.2;
 /// Smallest evidence, in bits, and the evidence from which on it is strong.
 const MIN_EVIDENCE: f32 = 7.0;
 const STRONG_EVIDENCE: f32 = 8.0;
@@ -115,14 +115,14 @@ impl Steps {
             [-1.0, 0.0, 1.0].map(|at| edge.cost_of(at)).into_iter().fold(MAX_COST, f32::min)
         };
         let min_cost: f32 = steps.edges().map(min_cost).sum();
-        (min_cost <= MAX_MISFIT * MAX_COST * steps.count as f32).then_some(steps)
+        (min_cost <= MAX_RESIDUAL * MAX_COST * steps.count as f32).then_some(steps)
     }
 
     fn edges(&self) -> impl Iterator<Item = &Edge> {
         self.edges[..self.count].iter()
     }
 
-    /// The marker of one family that they show. `ids` are those looked for; `None` stands for all.
+    /// The marker of one family that they show. `ids` are those looked for; `None` means all.
     pub(crate) fn decode(&self, code: &SquareCode, ids: Option<&[u32]>) -> Option<Reading> {
         let all = code.codewords.len();
         let count = ids.map_or(all, <[u32]>::len);
@@ -163,7 +163,7 @@ impl Steps {
         let (cost, id, rotation) = best?;
         let codeword = *code.codewords.get(id as usize)?;
         let seen = seen(codeword, rotation);
-        let misfit = cost / (MAX_COST * self.count.max(1) as f32);
+        let residual = cost / (MAX_COST * self.count.max(1) as f32);
         let [known, hamming] = self.bits_read(seen, code);
         let erased = code.bits.len() as u32 - known;
         let correctable = u32::from(code.min_hamming).saturating_sub(erased + 1) / 2;
@@ -172,13 +172,13 @@ impl Steps {
         }
         let evidence = false_positive::evidence(code, codeword, count, known, hamming) as f32;
         let is_strong = evidence >= STRONG_EVIDENCE;
-        let max_misfit = if is_strong { MAX_MISFIT } else { MAX_MISFIT_WEAK };
-        (evidence >= MIN_EVIDENCE && misfit <= max_misfit).then_some(Reading {
+        let max_residual = if is_strong { MAX_RESIDUAL } else { MAX_RESIDUAL_WEAK };
+        (evidence >= MIN_EVIDENCE && residual <= max_residual).then_some(Reading {
             id,
             rotation,
             hamming: hamming as u8,
             intact: self.intact,
-            r_squared: 1.0 - misfit,
+            r_squared: 1.0 - residual,
             is_washed_out: false,
             evidence,
         })

@@ -112,7 +112,7 @@ struct SquareQuery {
 }
 
 impl SquareQuery {
-    /// The ids that a fallback looks for; `None` stands for all.
+    /// The ids that a fallback looks for; `None` means all.
     fn missing_ids(&self) -> Option<&[u32]> {
         (!self.query.has_any_id()).then_some(self.missing.as_slice())
     }

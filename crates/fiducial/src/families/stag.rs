@@ -47,7 +47,7 @@ const MAX_COMPARED: usize = 40;
 /// Bounds on the work in one image.
 const MAX_READ: usize = 400;
 const MAX_FOUND: usize = 64;
-/// Number of designs that are kept.
+/// Number of designs that are stored.
 const MAX_DESIGNS: usize = 32;
 
 /// Smallest R² of a marker, and smallest ratio of the second best codeword's unexplained variance to the best
@@ -571,7 +571,7 @@ fn is_certain(reading: &Reading) -> bool {
 
 /// Whether a quad is brighter around its middle than in its corners, as an STag's disc is.
 fn has_rim(input: ImageInput<'_>, quad: &Quad) -> bool {
-    // In tenths of the square: in the corners, beside the sides, and on the disc's rim.
+    // In tenths of the square: in the corners, next to the sides, and on the disc's rim.
     const CORNERS: [[f64; 2]; 4] = [[0.9, 0.9], [9.1, 0.9], [9.1, 9.1], [0.9, 9.1]];
     const OUTSIDE: [[f64; 2]; 4] = [[5.0, -0.8], [10.8, 5.0], [5.0, 10.8], [-0.8, 5.0]];
     const RIM: [[f64; 2]; 12] = [

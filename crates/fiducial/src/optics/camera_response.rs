@@ -41,7 +41,7 @@ impl CameraResponse {
     pub(crate) const ORDINARY: Self = Self { curve: 1.0, sharpening: 0.0 };
     /// The prior of the curve, before a marker gives an estimate: sRGB's is 1.1, that of a Raspberry Pi's camera module 3.
     pub(crate) const CURVE_PRIOR: Measured = Measured { value: 1.2, deviation: 0.7 };
-    /// Unsharp masks of cameras made for people have about 0.2 to 0.6.
+    /// Unsharp masks of consumer cameras have about 0.2 to 0.6.
     pub(crate) const SHARPENING_PRIOR: Measured = Measured { value: 0.4, deviation: 0.2 };
     /// The grey level of black ink as a share of white paper's: ink that reflects a twentieth of the light shows a tenth of it
     /// with a gamma of 1.25, a quarter with sRGB's curve; sharpening lowers it, glare lifts it.

@@ -135,7 +135,7 @@ pub(crate) trait Problem<const N: usize> {
     }
 
     /// Called after each step that was taken, with the number of steps tried before it. The equations may be
-    /// made anew.
+    /// built again.
     #[inline]
     fn after_step(
         &mut self,
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fit_without_a_step_fails_or_goes_on() {
+    fn a_fit_without_a_step_fails_or_continues() {
         let samples = [[0.0, 1.0], [1.0, 10.0]];
         // The minimum is a negative rate, which this problem does not allow.
         let mut problem = Decay { samples: &samples };

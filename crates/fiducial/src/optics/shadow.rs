@@ -92,7 +92,7 @@ impl Bend {
         [self.through[0] + along * ny + away * nx, self.through[1] - along * nx + away * ny]
     }
 
-    /// The same, moved to fit points (along, from the line) best; `None` where they do not say how.
+    /// The same, moved to fit points (along, from the line) best; `None` where they do not determine it.
     fn fitted(&self, points: impl Iterator<Item = [f64; 2]>) -> Option<Self> {
         let mut matrix = Matrix3::zeros();
         let mut right = Vector3::zeros();

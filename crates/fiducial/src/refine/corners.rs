@@ -21,7 +21,7 @@ const MIN_CELL_PX: f64 = 5.5;
 /// reach farther than a blur.
 const MIN_SHARPENED_CELL_PX: f64 = 7.5;
 const MIN_SHIFT_PX: f64 = 0.1;
-/// The same for a border without fine detail beside it.
+/// The same for a border without fine detail next to it.
 const MIN_BORDER_PX: f64 = 4.0;
 /// Sides that a lens bends by no more than this, in pixels, are straight.
 const MAX_BOW_PX: f64 = 0.1;

@@ -269,7 +269,7 @@ fn spread_samples(
     samples: &mut Vec<EdgeSample>,
 ) {
     samples.clear();
-    // The spacing goes on from edge to edge, so that short edges get their share.
+    // The spacing continues from edge to edge, so that short edges get their fraction.
     let mut next_px = 0.5 * spacing_px;
     let mut passed_px = 0.0;
     each_edge(pattern, |edge| {
@@ -491,7 +491,7 @@ impl EdgeFit<'_> {
             let Some(pixels) = pixels.get(..count).filter(|p| p.len() >= 5) else { continue };
             self.pixels += count;
             let is_saturated = |[_, grey]: &[f64; 2]| *grey <= 0.0 || *grey >= 255.0;
-            // Where only the halos are that sharpening puts beside an edge, black and white are seen beyond them.
+            // In the halos that sharpening adds next to an edge, black and white are seen beyond them.
             if pixels.first().is_some_and(is_saturated) || pixels.last().is_some_and(is_saturated) {
                 self.saturated += pixels.iter().filter(|pixel| is_saturated(pixel)).count();
             }

@@ -41,7 +41,7 @@ impl Pattern {
         Some(pattern)
     }
 
-    /// The marker of a family with this codeword. The quiet zone is one cell wide; the colour beside bits
+    /// The marker of a family with this codeword. The quiet zone is one cell wide; the colour next to bits
     /// outside of the square is known only where the bits leave no gaps.
     pub fn for_code(code: &SquareCode, word: u64) -> Option<Self> {
         Self::bordered(code, word, 0)

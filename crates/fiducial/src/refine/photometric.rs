@@ -24,7 +24,7 @@ const UNKNOWNS_PROCESSED: usize = 16;
 /// From when on a camera's processing is fitted.
 #[derive(Copy, Clone, Debug)]
 struct MinResponse {
-    /// One step towards it lowers the cost by this share; it is kept when the fit does.
+    /// One step towards it lowers the cost by this fraction; it is accepted when the fit does.
     gain: f64,
     /// Smaller values are errors of the model, also of the prior.
     response: f64,

@@ -6,7 +6,7 @@ use crate::binary::{Binarizer, BitImage};
 use crate::contrast_map::Places;
 use crate::view::GrayView;
 
-/// Bounds on time and memory of one level: pixel edges followed and points kept, per pixel of the level.
+/// Bounds on time and memory of one level: pixel edges followed and points stored, per pixel of the level.
 const MAX_STEPS_PER_PIXEL: f32 = 3.0;
 const MAX_POINTS_PER_PIXEL: f32 = 0.3;
 /// Added to both bounds, for tiny images.
@@ -281,14 +281,14 @@ impl Search<'_> {
         parts[0] = own;
         for down in 1..ROWS {
             rows[down] = row(down);
-            parts[down] = flood(rows[down], beside(parts[down - 1]) & rows[down]);
+            parts[down] = flood(rows[down], with_neighbours(parts[down - 1]) & rows[down]);
             // Most of a texture is joined right below. The end of a run shows whether it is flooded.
-            if down == 1 && is_of_other(upwards(rows[0], beside(parts[1]) & rows[0])) {
+            if down == 1 && is_of_other(upwards(rows[0], with_neighbours(parts[1]) & rows[0])) {
                 return true;
             }
         }
         for row in (0..ROWS - 1).rev() {
-            let touched = beside(parts[row + 1]) & rows[row];
+            let touched = with_neighbours(parts[row + 1]) & rows[row];
             if touched & !parts[row] != 0 {
                 parts[row] = flood(rows[row], touched | parts[row]);
             }
@@ -301,8 +301,8 @@ impl Search<'_> {
         }
         // A region that ends above the last row is known as a whole, if none of its pixels touches a further one.
         let is_whole = (1..ROWS).all(|row| {
-            let down = beside(parts[row - 1]) & rows[row] & !parts[row];
-            let up = beside(parts[row]) & rows[row - 1] & !parts[row - 1];
+            let down = with_neighbours(parts[row - 1]) & rows[row] & !parts[row];
+            let up = with_neighbours(parts[row]) & rows[row - 1] & !parts[row - 1];
             down | up == 0
         });
         let all = parts.iter().fold(0, |all, part| all | part);
@@ -477,7 +477,7 @@ fn window(words: &[u64], place: usize) -> u64 {
 
 /// The bits of the next row that ones touch.
 #[inline]
-fn beside(bits: u64) -> u64 {
+fn with_neighbours(bits: u64) -> u64 {
     bits | bits << 1 | bits >> 1
 }
 
@@ -549,7 +549,7 @@ mod tests {
                 let seeds = bits & seeds & seeds.rotate_left(7);
                 let (mut runs, mut ends) = (seeds, seeds);
                 for _ in 0..64 {
-                    runs |= beside(runs) & bits;
+                    runs |= with_neighbours(runs) & bits;
                     ends |= ends << 1 & bits;
                 }
                 prop_assert_eq!(flood(bits, seeds), runs);

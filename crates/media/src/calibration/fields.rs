@@ -103,7 +103,7 @@ fn matrix_form(root: &Value) -> Result<CameraModel, Problem> {
         (None, None) if coefficients.len() == 4 && coefficients.iter().any(|k| *k != 0.0) => {
             return Err(Problem {
                 key: distortion_key.to_owned(),
-                problem: "has four numbers, and nothing says of which lens".to_owned(),
+                problem: "has four numbers, and no lens model is stated".to_owned(),
                 expected: "add `fisheye_model: 1` for k1, k2, k3, k4 of OpenCV's fisheye, or `fisheye_model: 0` for k1, k2, p1, p2",
             });
         }
@@ -124,7 +124,7 @@ fn in_ros_mode(root: &Value, sensor: CameraModel) -> Result<Parsed, Problem> {
             expected,
         }),
     };
-    // 0 stands for 1, and for a whole image.
+    // 0 means 1, and a whole image.
     let [binning, other] = [px(root, "binning_x")?.max(1), px(root, "binning_y")?.max(1)];
     let none = Value::Null;
     let roi = root.get("roi").unwrap_or(&none);
@@ -153,7 +153,7 @@ fn in_ros_mode(root: &Value, sensor: CameraModel) -> Result<Parsed, Problem> {
     Ok(Parsed { camera, mode, sensor_px: [sensor.width, sensor.height], calibrated })
 }
 
-/// The mode that this program noted beside the intrinsics of images, in formats without keys for it.
+/// The mode that this program noted next to the intrinsics of images, in formats without keys for it.
 fn in_noted_mode(root: &Value, image: CameraModel) -> Result<Parsed, Problem> {
     let whole = SensorRegion::whole(image.width, image.height);
     let none = Value::Null;
@@ -344,7 +344,7 @@ fn wrong(key: &str, value: &Value, expected: &'static str) -> Problem {
     Problem { key: key.to_owned(), problem: format!("is {}", short(value)), expected }
 }
 
-/// A value as it stands in the file, cut to 60 characters.
+/// A value as in the file, cut to 60 characters.
 fn short(value: &Value) -> String {
     let text = serde_yaml_ng::to_string(value).unwrap_or_default();
     let line = text.split_whitespace().collect::<Vec<_>>().join(" ");

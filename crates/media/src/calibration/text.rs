@@ -152,8 +152,11 @@ mod tests {
             ("<", "without `>`"),
             ("<>", "no name"),
         ] {
-            let said = parse(text).unwrap_err();
-            assert!(said.contains("not valid XML") && said.contains(problem), "{text}: {said}");
+            let refusal = parse(text).unwrap_err();
+            assert!(
+                refusal.contains("not valid XML") && refusal.contains(problem),
+                "{text}: {refusal}"
+            );
         }
         let deep = format!("<opencv_storage>{}", "<a>".repeat(10_000));
         assert!(parse(&deep).unwrap_err().contains("too deeply"));

@@ -230,7 +230,7 @@ fn matrix(camera: &CameraModel) -> Entry {
     Entry::Matrix { columns: 3, data: vec![fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0] }
 }
 
-/// ROS has the whole sensor's matrix and size, and binning and region beside them.
+/// ROS has the whole sensor's matrix and size, and binning and region in addition.
 fn ros(image: &CameraModel, details: &CalibrationDetails) -> Entries {
     let camera = match details.sensor {
         Some(OnSensor { sensor_px, mode }) => mode.of_sensor(image, sensor_px),
@@ -410,7 +410,7 @@ fn joined(values: &[f64], separator: &str) -> String {
     values.iter().map(|value| number(*value)).collect::<Vec<_>>().join(separator)
 }
 
-/// The shortest text that reads back as the same number, with the point and the sign of the exponent that YAML 1.1 asks
+/// The shortest text that reads back as the same number, with the point and the sign of the exponent that YAML 1.1 requires
 /// for: without them Python reads text.
 fn number(value: f64) -> String {
     let text = format!("{value:?}");
@@ -497,7 +497,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mode_is_kept_in_every_format() {
+    fn every_format_stores_the_mode() {
         let camera = camera(Distortion::None, [1000.0, 1001.0, 639.0, 480.0]);
         let region = SensorRegion { left: 16, top: 8, width: 2561, height: 1920 };
         let mode = SensorMode { region, binning: 2 };

@@ -1,4 +1,4 @@
-"""Writes the JPEG files beside it with OpenCV: a grained picture of rings on paper, in colour and grey, with and without restart
+"""Writes the JPEG files next to it with OpenCV: a grained picture of rings on paper, in colour and grey, with and without restart
 intervals. OpenCV's encoder is libjpeg-turbo, with the standard Huffman tables."""
 
 import pathlib

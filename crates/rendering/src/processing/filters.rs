@@ -4,7 +4,7 @@
 const REACH: f32 = 3.0;
 
 /// Copies an image with `margin` more pixels on each side, which repeat the border; with a margin of 1 for a
-/// mosaic, `mirror` repeats the pixel beside it, which has the same colours.
+/// mosaic, `mirror` repeats the pixel next to it, which has the same colours.
 pub(super) fn pad(image: &[f32], width: usize, mirror: bool, padded: &mut Vec<f32>) {
     let height = image.len() / width.max(1);
     padded.clear();

@@ -47,7 +47,7 @@ impl Jpeg {
                 let columns = left..(left + EDGE).min(width);
                 let mut block = [[0.0; EDGE]; EDGE];
                 for (y, line) in block.iter_mut().enumerate() {
-                    // Below and beside the image its border goes on.
+                    // Below and to the side of the image its border is repeated.
                     let start = y.min(height.saturating_sub(1)) * width;
                     let row = rows.get(start + columns.start..start + columns.end).unwrap_or(&[]);
                     let last = row.last().copied().unwrap_or(0);

@@ -39,7 +39,7 @@ pub(super) fn interpolate(padded: &[f32], width: usize, grey: &mut [f32]) {
     for (v, row) in grey.chunks_exact_mut(width.max(1)).enumerate() {
         let Some(rows) = three_rows(padded, width, v) else { continue };
         let [[a, b, c], [d, e, f], [g, h, i]] = rows.map(beside);
-        // Every other pixel of a row is red, or blue in odd rows; those between are green, with that colour beside them
+        // Every other pixel of a row is red, or blue in odd rows; those between are green, with that colour next to them
         // and the third one above and below.
         let first = v % 2;
         let (own, other) = if first == 0 { (part(0), part(2)) } else { (part(2), part(0)) };

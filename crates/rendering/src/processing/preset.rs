@@ -54,7 +54,7 @@ impl Preset {
     pub fn processing(self) -> Processing {
         match self {
             Self::Linear => Processing::LINEAR,
-            // UVC cameras stand at gamma 100 (no curve beside that of the video standard) and at sharpness 2
+            // UVC cameras default to gamma 100 (no curve besides that of the video standard) and at sharpness 2
             // or 3 of 7; on pictures of real ones unsharp masks of up to 0.5 were measured.
             Self::Usb => Processing {
                 lens: Lens { curvature_px: 0.8, fringe_px: 0.5, flare: 0.01 },

@@ -43,7 +43,7 @@ const FINER: [i32; 3] = [4, 2, 1];
 /// Residuals of lower cost are not coded, of a quarter of a macroblock and of the whole (thresholds on the cost of coefficients, as in x264).
 const MIN_WORTH_OF_QUARTER: u32 = 4;
 const MIN_WORTH: u32 = 6;
-/// Bits that it costs to say how a macroblock is predicted: from the previous picture beside its motion, from its neighbours as a whole,
+/// Cost of coding how a macroblock is predicted, in bits: from the previous picture without its motion, from its neighbours as a whole,
 /// and block by block.
 const BITS_INTER: u32 = 1;
 const BITS_INTRA: u32 = 8;
@@ -485,7 +485,7 @@ mod tests {
     }
 
     #[test]
-    fn another_size_and_a_key_frame_begin_anew() {
+    fn another_size_and_a_key_frame_restart_the_stream() {
         let video = Video { quantiser: 26, key_frame_every: 2 };
         let coded = |coder: &mut VideoCoder, width: usize| {
             let mut pixels = scene([3.0, 5.0]);

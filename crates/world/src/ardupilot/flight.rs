@@ -105,7 +105,7 @@ enum Guided {
     Holding { z: f64 },
 }
 
-/// Motors are kept back after arming, in seconds, and need this long from takeoff to lift.
+/// Motors are held after arming for this time, in seconds, and need this long from takeoff to lift.
 const ARMING_DELAY_S: f64 = 2.0;
 const SPOOL_S: f64 = 1.36;
 /// Time from touchdown to its detection, in seconds: in LAND and in GUIDED, and its random spread.

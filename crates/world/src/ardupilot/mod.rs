@@ -1,6 +1,6 @@
-//! An autopilot that flies and speaks MAVLink as ArduPilot Copter 4.5.4 was measured to do.
+//! Simulates an autopilot that flies and speaks MAVLink as measured of ArduPilot Copter 4.5.4.
 //!
-//! It knows no socket: packets go in and come out, and time is an argument.
+//! It does not depend on sockets: packets are inputs and outputs, and time is an argument.
 //!
 //! Modules in reading order: `estimate` is its state estimate, `flight` decides, `steering` follows the
 //! smooth paths of `shaping` and the target of `precision`, `px4` has the rules of the other firmware,
@@ -60,7 +60,7 @@ pub struct AutopilotConfig {
     pub rangefinder: bool,
     /// True to forward the heartbeats of a ground station (255/190), as a real one with two links does.
     pub forward_ground_station: bool,
-    /// True when it says that it is a simulation, as simulated autopilots do and real ones do not.
+    /// True when it reports that it is a simulation, as simulated autopilots do and real ones do not.
     pub says_simulated: bool,
     /// Whose rules it keeps.
     pub firmware: Firmware,
@@ -173,7 +173,7 @@ impl SimulatedAutopilot {
         self.flight.start_in_air(now_s);
     }
 
-    /// Goes on from another place, as if the vehicle had always been there; in metres.
+    /// Continues from another position, as if the vehicle had always been there; in metres.
     pub fn carry(&mut self, by: Vector<Ned>) {
         self.flight.carry([by.x(), by.y(), by.z()]);
     }

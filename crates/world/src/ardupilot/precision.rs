@@ -22,8 +22,8 @@ impl Precision {
         if !place.iter().all(|metres| metres.is_finite()) {
             return;
         }
-        let lasts = self.steady.filter(|(_, last_s)| now_s - last_s < MAX_GAP_S);
-        let Some((since_s, last_s)) = lasts else {
+        let continuing = self.steady.filter(|(_, last_s)| now_s - last_s < MAX_GAP_S);
+        let Some((since_s, last_s)) = continuing else {
             self.place = place;
             self.steady = Some((now_s, now_s));
             return;
@@ -57,6 +57,6 @@ mod tests {
         assert_eq!(precision.target(2.0), Some([1.0, 2.0]));
         assert_eq!(precision.target(6.1), None);
         precision.take(6.2, [1.0, 2.0]);
-        assert_eq!(precision.target(6.3), None, "it begins anew");
+        assert_eq!(precision.target(6.3), None, "it begins again");
     }
 }

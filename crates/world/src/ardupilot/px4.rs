@@ -1,6 +1,6 @@
-//! The same vehicle under PX4's rules, taken from its documentation: modes by two numbers,
+//! Simulates the same vehicle under PX4's rules, taken from its documentation: modes by two numbers,
 //! OFFBOARD only with a stream of setpoints before and during
-//! (<https://docs.px4.io/main/en/flight_modes/offboard.html>), a takeoff to an altitude over the sea, a heartbeat that says so once a
+//! (<https://docs.px4.io/main/en/flight_modes/offboard.html>), a takeoff to an altitude over the sea, a heartbeat with the mode once a
 //! second, and events with the checks before arming that fail: after a change and on request. Measured with 1.17 in its own
 //! simulation: CURRENT_MODE, if it is requested, with each change and twice a second, the former mode once more after an accepted request,
 //! and OFFBOARD again when the motors stop after a landing.
@@ -73,8 +73,8 @@ impl Px4 {
     }
 
     pub(super) fn on_setpoint(&mut self, now_s: f64) {
-        let lasts = self.stream.filter(|(_, last_s)| now_s - last_s <= STREAM_GAP_S);
-        self.stream = Some((lasts.map_or(now_s, |(since_s, _)| since_s), now_s));
+        let continuing = self.stream.filter(|(_, last_s)| now_s - last_s <= STREAM_GAP_S);
+        self.stream = Some((continuing.map_or(now_s, |(since_s, _)| since_s), now_s));
     }
 
     /// The requested mode in ArduPilot's terms; `None` when it is refused.
@@ -174,7 +174,7 @@ mod tests {
         assert!(px4.has_lost_setpoints(2.2, 1.0), "its failsafe");
         assert_eq!(px4.shown(Mode::Loiter, Landed::InAir), FlightMode::AUTO_HOLD);
         px4.on_setpoint(5.0);
-        assert_eq!(px4.request(5.1, 6, 0), None, "a gap begins anew");
+        assert_eq!(px4.request(5.1, 6, 0), None, "a gap begins the stream again");
     }
 
     #[test]

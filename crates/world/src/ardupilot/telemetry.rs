@@ -121,7 +121,7 @@ pub struct Origin {
 }
 
 impl Default for Origin {
-    /// The field at Canberra where ArduPilot's simulation stands.
+    /// The field at Canberra, the default position of ArduPilot's simulation.
     fn default() -> Self {
         Self { latitude_deg: -35.363_262_0, longitude_deg: 149.165_237_0, altitude_m: 584.09 }
     }

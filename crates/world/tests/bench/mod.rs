@@ -2,7 +2,7 @@
 //! time is let pass and the received messages are read.
 
 #![allow(dead_code, reason = "each test file uses its part of the bench")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test says where it fails")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test prints where it fails")]
 #![allow(deprecated, reason = "messages of real programs are tested, superseded or not")]
 
 use autopilot::dialect::{
@@ -82,8 +82,8 @@ impl Bench {
     }
 
     pub(crate) fn take_off(&mut self, height_m: f32) {
-        self.ask(245, 10.0);
-        self.ask(32, 20.0);
+        self.request(245, 10.0);
+        self.request(32, 20.0);
         assert_eq!(self.mode(4), 0);
         assert_eq!(self.command(400, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), Some(0));
         assert_eq!(self.command(22, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height_m]), Some(0));
@@ -115,7 +115,7 @@ impl Bench {
         self.log.extend(frames.into_iter().map(|frame| (now_s, frame)));
     }
 
-    /// Lets time pass until something holds, and says how long it took.
+    /// Lets time pass until a condition holds, and returns the time.
     pub(crate) fn wait(&mut self, max_s: f64, what: &str, holds: impl Fn(&Self) -> bool) -> f64 {
         let start_s = self.now_s();
         while !holds(self) {
@@ -173,7 +173,7 @@ impl Bench {
     }
 
     /// SET_MESSAGE_INTERVAL; the result.
-    pub(crate) fn ask(&mut self, id: u16, rate_hz: f32) -> u8 {
+    pub(crate) fn request(&mut self, id: u16, rate_hz: f32) -> u8 {
         self.command(511, [f32::from(id), 1e6 / rate_hz, 0.0, 0.0, 0.0, 0.0, 0.0]).unwrap()
     }
 

@@ -630,7 +630,7 @@ mod tests {
                 assert!((shift_px - into_black_px).abs() < 0.03, "{shift_px} {into_black_px}");
             }
         }
-        // Were edges so far off by chance, each by itself, the circles would be far closer to each other.
+        // If edges were so far off by chance, each independently, the circles would be far closer to each other.
         let range_variance =
             |into_black_px| truth.covariance(&points(into_black_px), &camera).unwrap()[(2, 2)];
         let by_chance = (0.4f64 / MIN_EDGE_ERROR_PX).powi(2) * range_variance(0.0);

@@ -289,7 +289,7 @@ impl EdgeSearch<'_> {
         Some(*median)
     }
 
-    /// Whether the place of a ring's neighbour is covered: not white, as it is beside other rings.
+    /// Whether the position of a ring's neighbour is covered: not white, as it is next to other rings.
     pub(super) fn is_neighbour_covered(&self, pose: &CirclePose, kind: RingKind) -> Option<bool> {
         let neighbour = if kind == RingKind::Middle { RingKind::Outer } else { RingKind::Middle };
         let median_of = |(inner, outer): (f64, f64)| self.median_at(pose, (inner + outer) / 2.0);

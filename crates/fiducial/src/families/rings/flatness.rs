@@ -50,7 +50,7 @@ impl CirclePose {
         if wider.iter().all(|c| c.is_finite()) { wider } else { covariance }
     }
 
-    /// One step of a fit to a print that may be bent, beside one to a flat print.
+    /// One step of a fit to a print that may be bent, compared with a fit to a flat print.
     fn bent(&self, points: &[EdgePoint], camera: &CameraModel) -> Option<Bent> {
         let plane = self.plane(camera);
         let outer = points.iter().fold(0.0, |max: f64, point| max.max(point.radius));
@@ -130,7 +130,7 @@ impl CirclePose {
     }
 }
 
-/// A print that may be bent, beside a flat one.
+/// A print that may be bent, compared with a flat one.
 struct Bent {
     /// The inverse of the flat print's normal equations.
     inverse: SMatrix<f64, FLAT, FLAT>,
@@ -224,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bent_print_is_less_sure_by_how_far_it_is_off() {
+    fn the_covariance_of_a_bent_print_covers_its_error() {
         let bend = |height: f64| {
             move |x: f64, y: f64| height * RADII[0] * ((0.6 * x + 0.8 * y) / RADII[0]).powi(2)
         };
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folded_and_a_waved_print_are_less_sure() {
+    fn the_covariances_of_a_folded_and_a_waved_print_are_wider() {
         let fold = |x: f64, y: f64| 0.06 * (0.6 * x + 0.8 * y).abs();
         let waves = |x: f64, _: f64| 0.02 * RADII[0] * (4.7 * x / RADII[0]).sin();
         for (name, (error_px, alone, reported, wider)) in

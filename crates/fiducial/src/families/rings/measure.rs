@@ -233,8 +233,8 @@ impl EdgeSearch<'_> {
             .is_some_and(|it| it.share.abs() > MAX_EVENNESS)
     }
 
-    /// Whether edges beside a fit to grey values are nearer to those of a target of evenly wide rings than to the marker's, and
-    /// that is no matter of how exact they are. Of 757 such markers the largest was 0.14 beyond its deviation.
+    /// Whether edges next to a fit to grey values are nearer to those of a target of evenly wide rings than to the marker's, by
+    /// more than their uncertainty explains. Of 757 such markers the largest was 0.14 beyond its deviation.
     fn is_likely_target(&self, pose: &CirclePose, edges: &[EdgePoint]) -> bool {
         pose.evenness(edges, self.size_m, self.camera)
             .is_some_and(|it| it.share > MAX_EVENNESS + it.deviation)
@@ -437,7 +437,7 @@ impl EdgeSearch<'_> {
     }
 
     /// The marker of which only one ring is visible, because its neighbour is covered: a marker only where one is followed, as
-    /// in a single image a lamp or a wheel beside something dark is as much of one.
+    /// in a single image a lamp or a wheel next to a dark object looks as much like one.
     fn measure_single_ring(
         &self,
         start: &CirclePose,
@@ -580,8 +580,8 @@ fn is_marker_under_edge(fit: &PhotometricFit) -> bool {
         && has_marker_radii(fit)
 }
 
-/// Whether the image is nearer to a target of evenly wide rings, as people like to draw them, than to the marker, or to one of
-/// thin rings, and that is no matter of noise.
+/// Whether the image is nearer to a target of rings of equal width, as targets are often drawn, than to the marker, or to one of
+/// thin rings, by more than noise explains.
 fn has_other_widths(fit: &PhotometricFit) -> bool {
     fit.radii.is_some_and(|it| {
         let (place, deviation) = (it.evenness, it.evenness_deviation);

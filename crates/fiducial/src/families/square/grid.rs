@@ -1,8 +1,8 @@
-//! The tags of a calibration grid, each beside one that was found.
+//! Finds the tags of a calibration grid, each next to one that was found.
 //!
 //! In a grid of Kalibr's (Furgale, Rehder and Siegwart, "Unified temporal and spatial calibration for multi-sensor systems", 2013) black
-//! squares fill the gaps between the corners of the tags. Blur joins them to the tags, so that many a tag has no outline of its own, but
-//! lies where its neighbour says.
+//! squares fill the gaps between the corners of the tags. Blur joins them to the tags, so that many tags have no separate outline. Their
+//! positions follow from a neighbour.
 
 use geometry::Pixel;
 
@@ -22,7 +22,7 @@ const MAX_ALIGNED_IN_GRID: usize = 24;
 const ALIGNING_IN_GRID: [f64; 4] = [0.03, 0.02, 0.015, 0.01];
 
 impl SquareTagDetector {
-    /// Reads the other tags of a calibration grid, each beside one that was found.
+    /// Reads the other tags of a calibration grid, each next to one that was found.
     pub(super) fn decode_grid(&mut self, input: ImageInput<'_>, trace: &mut Trace) {
         (self.solved, self.aligned) = (0, 0);
         let mut index = 0;
@@ -31,12 +31,12 @@ impl SquareTagDetector {
             let query = &self.queries[known.query];
             let [_, wide] = query.layouts;
             let Some(layout) = wide.filter(|_| known.extra_border > 0) else { continue };
-            if beside(&known.corners).all(|quad| is_covered(&self.found, &quad)) {
+            if neighbours(&known.corners).all(|quad| is_covered(&self.found, &quad)) {
                 continue;
             }
             let refined = known.refined(query, input, false, &mut self.scratch);
             let corners = refined.map_or(known.corners, |refined| refined.corners);
-            for quad in beside(&corners) {
+            for quad in neighbours(&corners) {
                 if self.solved < MAX_SOLVED
                     && self.found.len() < MAX_FOUND
                     && !is_covered(&self.found, &quad)
@@ -75,8 +75,8 @@ impl SquareTagDetector {
     }
 }
 
-/// The quads of the four tags beside one with these outer corners; of those that are in front of the camera.
-fn beside(corners: &[Pixel; 4]) -> impl Iterator<Item = Quad> {
+/// The quads of the four tags next to one with these outer corners; of those that are in front of the camera.
+fn neighbours(corners: &[Pixel; 4]) -> impl Iterator<Item = Quad> {
     let square = Homography::from_square([0.0, 1.0], &corners.map(|c| [c.x, c.y]));
     const STEP: f64 = 1.0 + SPACING;
     [[STEP, 0.0], [0.0, STEP], [-STEP, 0.0], [0.0, -STEP]].into_iter().filter_map(

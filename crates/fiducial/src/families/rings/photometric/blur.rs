@@ -207,7 +207,7 @@ impl RadiusDistribution {
     /// The square of a circle's radius over the mean square of the distance, to the power of the distribution, and how
     /// many deviations the circle is from the mean.
     #[inline(always)]
-    fn beside_circle(&self, log_radius: f64) -> (f64, f64) {
+    fn next_to_circle(&self, log_radius: f64) -> (f64, f64) {
         let ratio = exp(self.power * (2.0 * log_radius - self.log_mean_square));
         (ratio, (ratio - self.mean) * self.inverse_deviation)
     }
@@ -222,7 +222,7 @@ impl RadiusDistribution {
             if sigmas.abs() > MAX_BLUR_SIGMAS {
                 return 0.0;
             }
-            let (ratio, z) = self.beside_circle(*log_radius);
+            let (ratio, z) = self.next_to_circle(*log_radius);
             let (_, density) = scene.edge.at(z, self.pixel_kurtosis);
             sign * density * ratio * 2.0 * self.power * self.inverse_deviation
         })
@@ -242,7 +242,7 @@ impl RadiusDistribution {
                 *inside = if sigmas > 0.0 { 1.0 } else { 0.0 };
                 continue;
             }
-            let (ratio, z) = self.beside_circle(log_radius);
+            let (ratio, z) = self.next_to_circle(log_radius);
             let (share, density) = scene.edge.at(z, self.pixel_kurtosis);
             *inside = share;
             by_distance += sign * density * self.by_distance * ratio;

@@ -57,7 +57,7 @@ pub(super) struct Scene<'a> {
     pub(super) extras: Extras,
     /// The mosaic from which the pixels were interpolated.
     pub(super) mosaic: Option<Mosaic>,
-    /// Whether the radii that fit best are asked for.
+    /// Whether the radii that fit best are requested.
     pub(super) radii_count: bool,
     /// Whether targets of evenly wide rings are fitted as well.
     pub(super) compares_targets: bool,

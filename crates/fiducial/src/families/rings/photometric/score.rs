@@ -84,7 +84,7 @@ impl RingModel {
 const CIRCLES: usize = 6;
 /// The unknowns of a fit in which radii are free as well.
 const UNKNOWNS_WITH_RADII: usize = UNKNOWNS_WITH_EXTRAS + FREE_RADII;
-/// The columns of both: the radii by themselves, and all of them together towards evenly wide rings.
+/// The columns of both: the radii separately, and all of them together towards evenly wide rings.
 const COLUMNS: usize = UNKNOWNS_WITH_RADII + 1;
 /// The unknowns of a fit in which the rings may become evenly wide.
 const UNKNOWNS_WITH_EVENNESS: usize = UNKNOWNS_WITH_EXTRAS + 1;
