@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 use anyhow::{Context, ensure};
 use clap::{Args, ValueEnum};
-use media::write_whole;
+use media::write_atomically;
 use report::{
     Figure, Flight, FlightReader, comparison, document, figures, marks, page, replay_tapes, summary,
 };
@@ -139,7 +139,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
             drawn.push((folder, figures));
         }
     }
-    write_whole(output, &written)
+    write_atomically(output, &written)
         .with_context(|| format!("writing {output:?}; name another file with `--output`"))?;
     for (folder, figures) in &drawn {
         write_figures(figures, folder)?;

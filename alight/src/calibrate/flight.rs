@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use calibration::{FlightCalibration, FlightEstimate, Quantity, calibrate_flight};
 use clap::Args;
-use media::write_whole;
+use media::write_atomically;
 use serde_json::{Value, json};
 
 use super::corrected::{self, Before, Changes};
@@ -69,7 +69,7 @@ pub(super) fn run(args: &FlightArgs) -> anyhow::Result<ExitCode> {
     write_error(&match output {
         Some(path) => {
             // Also where no key changes: a file that is replaced says nothing of another flight.
-            write_whole(path, changes.toml(&flight.camera).as_bytes())
+            write_atomically(path, changes.toml(&flight.camera).as_bytes())
                 .with_context(|| format!("writing {path:?}; name another file with `--output`"))?;
             match count {
                 0 => format!("{}: no key changes", path.display()),

@@ -5,8 +5,9 @@
 //! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, `huffman` adds the tables that a camera leaves
 //! out, `scan` checks whether their data are complete, [`image`] reads image files, [`video`] reads videos frame by frame, [`h264`]
 //! decodes a camera's stream, [`calibration`] reads and writes the calibration files of other programs, [`rectify`] removes a
-//! lens's distortion from images, [`whole`] writes a file whole or not at all.
+//! lens's distortion from images, [`atomic`] replaces a file by a complete one.
 
+pub mod atomic;
 mod boxes;
 mod budget;
 pub mod calibration;
@@ -18,8 +19,8 @@ pub mod jpeg;
 pub mod rectify;
 mod scan;
 pub mod video;
-pub mod whole;
 
+pub use atomic::{folder_of, write_atomically};
 pub use calibration::{
     CalibrationDetails, CalibrationError, CalibrationFile, CalibrationFormat, CalibrationNote,
     CalibrationWriteError, OnSensor, SensorMode, SensorRegion, WantedMode, read_calibration,
@@ -33,4 +34,3 @@ pub use image::{
 pub use jpeg::JpegScanner;
 pub use rectify::Rectifier;
 pub use video::{VIDEO_EXTENSIONS, Video, VideoError, VideoFrame, VideoImage, is_video};
-pub use whole::{folder_of, write_whole};

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use geometry::{CameraModel, Distortion};
 
 use super::mode::{SensorMode, SensorRegion};
-use crate::whole::write_whole;
+use crate::atomic::write_atomically;
 
 /// A format of calibration files.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -139,7 +139,7 @@ pub fn write_calibration(
         (CalibrationFormat::Ros | CalibrationFormat::Kalibr, _) => Syntax::Yaml,
     };
     let text = syntax.text(&entries(camera, format, details)?);
-    write_whole(path, text.as_bytes())
+    write_atomically(path, text.as_bytes())
         .map_err(|cause| CalibrationWriteError::Unwritable { path: path.to_owned(), cause })
 }
 

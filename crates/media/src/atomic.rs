@@ -1,4 +1,4 @@
-//! Files that are written whole or not at all.
+//! Writes files atomically: another program sees the old or the complete new contents.
 
 use std::fs::{File, Metadata};
 use std::io::{ErrorKind, Result, Write};
@@ -11,17 +11,17 @@ pub fn folder_of(file: &Path) -> &Path {
     folder.unwrap_or(Path::new("."))
 }
 
-/// Writes a file under another name first, so that what was there stays until all of the new one is. Where nothing can be put
-/// beside it or in its place it is written as it is.
+/// Writes a file under another name, and then renames it: the old contents stay until the new ones are complete. Where no file
+/// can be made next to it or renamed to it, it is written directly.
 ///
 /// # Errors
-/// When it cannot be written; unless that is while it is written as it is, what was there is there still.
-pub fn write_whole(file: &Path, contents: &[u8]) -> Result<()> {
-    // A device or a pipe is written as it is.
+/// When it cannot be written. The old contents then remain, unless the file was written directly.
+pub fn write_atomically(file: &Path, contents: &[u8]) -> Result<()> {
+    // A device or a pipe is written directly.
     if file.exists() && !file.is_file() {
         return std::fs::write(file, contents);
     }
-    // What a link leads to is written, not the link.
+    // The target of a link is written, not the link.
     let file = file.canonicalize().unwrap_or_else(|_| file.to_owned());
     let mut name = file.file_name().unwrap_or_default().to_owned();
     name.push(format!(".{}.new", std::process::id()));
@@ -60,15 +60,15 @@ mod tests {
     use std::os::unix::fs::PermissionsExt;
 
     #[test]
-    fn what_a_link_leads_to_is_replaced_and_nothing_else_is_left() {
+    fn the_target_of_a_link_is_replaced_and_no_other_file_is_left() {
         let folder = tempfile::tempdir().unwrap();
         let (file, link) = (folder.path().join("camera.yaml"), folder.path().join("link"));
         std::fs::write(&file, "old").unwrap();
         std::os::unix::fs::symlink(&file, &link).unwrap();
-        write_whole(&link, b"new").unwrap();
+        write_atomically(&link, b"new").unwrap();
         assert_eq!(std::fs::read(&file).unwrap(), b"new");
         assert!(link.is_symlink());
-        assert!(write_whole(&folder.path().join("missing/camera.yaml"), b"new").is_err());
+        assert!(write_atomically(&folder.path().join("missing/camera.yaml"), b"new").is_err());
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2);
     }
 
@@ -79,23 +79,23 @@ mod tests {
         std::fs::write(&file, "old").unwrap();
         std::fs::set_permissions(&file, Permissions::from_mode(0o604)).unwrap();
         let before = std::fs::metadata(&file).unwrap();
-        write_whole(&file, b"new").unwrap();
+        write_atomically(&file, b"new").unwrap();
         let after = std::fs::metadata(&file).unwrap();
         assert_eq!((after.mode(), after.uid()), (before.mode(), before.uid()));
         assert_ne!(after.ino(), before.ino());
     }
 
     #[test]
-    fn where_nothing_can_be_put_beside_a_file_it_is_written_as_it_is() {
+    fn a_file_that_cannot_be_renamed_to_is_written_directly() {
         let folder = tempfile::tempdir().unwrap();
         let long = folder.path().join("c".repeat(255));
-        write_whole(&long, b"new").unwrap();
+        write_atomically(&long, b"new").unwrap();
         assert_eq!(std::fs::read(&long).unwrap(), b"new");
         // Root may write into every folder, and replaces it.
         let file = folder.path().join("camera.yaml");
         std::fs::write(&file, "old").unwrap();
         std::fs::set_permissions(folder.path(), Permissions::from_mode(0o500)).unwrap();
-        write_whole(&file, b"new").unwrap();
+        write_atomically(&file, b"new").unwrap();
         std::fs::set_permissions(folder.path(), Permissions::from_mode(0o700)).unwrap();
         assert_eq!(std::fs::read(&file).unwrap(), b"new");
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2);
