@@ -8,7 +8,8 @@ const SPAN_NS: i64 = 5_000_000_000;
 const MIN_FRAMES: u32 = 10;
 /// Offsets that differ by more than this are of a camera that was started again, or whose clock was set, in nanoseconds.
 const MAX_JUMP_NS: i64 = 500_000_000;
-/// Frames may be late by more than that for so long, where their stamps continue: they were delayed on their way, in nanoseconds.
+/// Frames may be late by more than that for so long, where their stamps continue: they were delayed on their way, in
+/// nanoseconds.
 const MAX_FAR_NS: i64 = 2_000_000_000;
 
 /// So many frames in a row that are all later than the quickest by so much are of a clock that was set, where nothing else delays

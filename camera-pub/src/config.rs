@@ -1,4 +1,4 @@
-//! The camera service's configuration, `camera-pub.toml`: source (files, program, device, GenICam, RTSP), stamps,
+//! Defines the camera service's configuration, `camera-pub.toml`: source (files, program, device, GenICam, RTSP), stamps,
 //! exposure, calibration and mount; checked, and the size and format of frames.
 
 use std::path::{Path, PathBuf};

@@ -9,7 +9,7 @@
 //! picture that is delivered again. `rect` publishes frames without the lens' distortion where a subscriber requests them.
 //! `v4l2` reads cameras without a program, `genicam` (a feature) those of that standard, `rtsp` (a feature) those that stream
 //! over a network. `clock` converts a camera's time to the host's. `marker` decides how cameras are exposed for the marker,
-//! `control` publishes that. [`devices`] lists the cameras of this machine, [`announced`] those that are announced over MAVLink.
+//! `control` publishes that. [`devices`] lists the cameras of this machine, [`announced`] those announced over MAVLink.
 
 pub mod announced;
 #[cfg(any(feature = "genicam", feature = "rtsp"))]

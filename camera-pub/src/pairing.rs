@@ -1,11 +1,11 @@
-//! Pairs each frame of a camera's program with its record of metadata by arrival, number and delay, for its stamp. A frame whose
-//! record is in doubt gets none.
+//! Pairs each frame of a camera's program with its record of metadata by arrival, number and delay, for its stamp. A frame
+//! whose record is in doubt gets none.
 //!
 //! A program writes a frame and then, at once, its metadata, on two channels. Three things must agree before a record stamps a frame:
 //! the record arrived after the frame began and before the next one did; both have the same number, counted since the start; and the
 //! time from the record's stamp to the frame's arrival is that of the frames before. Once that time is known, a frame's record is
-//! found by it also where lines were lost or doubled, and where it changes permanently, as with a busy processor, it is learnt again from
-//! records with their frames' numbers.
+//! found by it also where lines were lost or doubled, and where it changes permanently, as with a busy processor, it is learnt
+//! again from records with their frames' numbers.
 
 use crate::exposure::{Exposure, Shutter};
 use crate::metadata::{Metadata, Record};
@@ -191,7 +191,8 @@ impl Pairing {
     fn matching(&self, arrival_ns: i64) -> Option<Placed> {
         let known_ns = self.delay_ns?;
         let of_frame = |placed: &Placed| {
-            // The records of two frames are a period apart. A number that agrees decides for records that are nearly half a period off.
+            // The records of two frames are a period apart. A number that agrees decides for records that are nearly half a
+            // period off.
             let is_next = placed.number - self.frames == self.shift;
             let max_ns = if is_next { self.period_ns / 5 * 2 } else { self.period_ns / 4 };
             let may_be_its = placed.read_in >= self.frames && (is_next || self.doubtful == 0);

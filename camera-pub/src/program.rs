@@ -1,4 +1,4 @@
-//! A camera read by another program (`rpicam-vid`, `ffmpeg`, `gst-launch-1.0`): frames from its standard
+//! Reads a camera through another program (`rpicam-vid`, `ffmpeg`, `gst-launch-1.0`): frames from its standard
 //! output, each with its time of arrival.
 //!
 //! Any camera with such a program can be used, and none of their libraries is needed here.
@@ -331,8 +331,8 @@ impl Queue {
 
     /// Whether the frame whose first byte is read at `stamp_ns`, after the read waited so long for it, was queued: one that
     /// follows sooner than a camera can deliver, and one that was there already and is later than it was due. Due
-    /// times are counted from the last frame that was waited for, so that the delay of a slow reader adds up. They are no sooner
-    /// than the end of a frame that was read as it was made.
+    /// times are counted from the last frame that was waited for, so that the delay of a slow reader adds up. They are no
+    /// sooner than the end of a frame that was read as it was made.
     fn has_held(&mut self, stamp_ns: i64, waited_ns: i64) -> bool {
         let quarter_ns = self.period_ns / 4;
         let due_ns = match self.last {

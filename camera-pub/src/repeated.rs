@@ -1,5 +1,5 @@
-//! Detects a source that repeats its last picture as a new frame: a frame grabber without a signal, a player at a constant rate, a stream whose
-//! camera hangs. Such a frame is not of the time of its stamp.
+//! Detects a source that repeats its last picture as a new frame: a frame grabber without a signal, a player at a constant
+//! rate, a stream whose camera hangs. Such a frame is not of the time of its stamp.
 //!
 //! No two pictures of a sensor are alike to the last bit, as its noise differs; but those without any structure may be, in the dark or in
 //! the sun, and a coded video of a scene that does not move. A source that has only ever given one picture shows a still one, as on a

@@ -1,5 +1,5 @@
-//! The camera service: frames of a program, a V4L2, GenICam or RTSP camera, or of image files at a constant rate, stamped and
-//! published raw, rectified and for the air link.
+//! Runs the camera service: frames of a program, a V4L2, GenICam or RTSP camera, or of image files at a constant rate, stamped
+//! and published raw, rectified and for the air link.
 
 use std::convert::Infallible;
 use std::path::{Path, PathBuf};
@@ -40,8 +40,8 @@ use crate::v4l2::video::{Next, Port, Video};
 const MAX_MEASURED_IMAGES: usize = 1000;
 /// Maximum number of lost frames that are counted at once.
 const MAX_COUNTED: u64 = 1000;
-/// Time without a frame that can be read after which a device is opened again, in nanoseconds, in addition to three periods: to open it
-/// costs half a second.
+/// Time without a frame that can be read after which a device is opened again, in nanoseconds, in addition to three periods: to
+/// open it costs half a second.
 const UNREADABLE_NS: i64 = 1_000_000_000;
 /// Interval at which a service that waits for a subscriber looks for one.
 const SUBSCRIBER_POLL: Duration = Duration::from_millis(20);
@@ -903,7 +903,8 @@ mod tests {
     }
 
     impl Viewer {
-        /// The device is held from now on: a subscriber keeps only the newest messages, and would otherwise miss some while the simulated time passes.
+        /// The device is held from now on: a subscriber keeps only the newest messages, and would otherwise miss some while the
+        /// simulated time passes.
         async fn of(fake: Rc<Fake>, node: &Node) -> Self {
             fake.hold();
             Self {

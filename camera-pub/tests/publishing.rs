@@ -1,4 +1,4 @@
-//! The camera service as its subscribers see it: folders of images, programs with raw frames and metadata,
+//! Tests the camera service from the side of its subscribers: folders of images, programs with raw frames and metadata,
 //! ffmpeg, repeated pictures, Bayer samples, JPEG, rates, and errors.
 
 use std::path::Path;

@@ -12,7 +12,8 @@ use messages::{
 /// Edges of the frames that an air-link payload is read for, in pixels.
 const MAX_EDGE_PX: u32 = 512;
 
-/// A payload of any topic: read as each type. The value is written, and must be read again. Returns the types that could read it.
+/// A payload of any topic: read as each type. The value is written, and must be read again. Returns the types that could read
+/// it.
 pub fn codec(input: &[u8]) -> Vec<&'static str> {
     let read = [
         again::<FrameHeader>(input),

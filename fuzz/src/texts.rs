@@ -1,4 +1,4 @@
-//! Names and settings.
+//! Parses names and settings.
 
 use markers::{Marker, Pad};
 use node::{Layers, Settings};

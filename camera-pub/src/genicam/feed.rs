@@ -1,4 +1,4 @@
-//! The frames of a GenICam camera that may be unplugged or stall: it is opened again until it is back.
+//! Delivers the frames of a GenICam camera; opens it again after it was unplugged or has stalled.
 
 use std::time::Duration;
 

@@ -1,4 +1,4 @@
-//! The feed of a GenICam camera against a camera of GigE Vision that Aravis plays on the loopback interface: whole frames,
+//! Tests the feed of a GenICam camera with a camera of GigE Vision that Aravis plays on the loopback interface: whole frames,
 //! stamps, lost packets, a slow reader, loss and return.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};

@@ -1,4 +1,4 @@
-//! A camera that is played: a server of RTSP with a script, which streams pictures of its own over TCP, or those that ffmpeg
+//! Simulates a camera: an RTSP server with a script, which streams pictures of its own over TCP, or those that ffmpeg
 //! pushes to it.
 //!
 //! Its H.264 has uncompressed macroblocks (I_PCM, 7.3.5 of the standard) and skipped ones, so that every pixel is known.

@@ -1,5 +1,5 @@
-//! An open RTSP stream of `retina`: coded pictures (H.264, JPEG) as they arrive, each with its RTP time, the camera's sender
-//! report and its arrival.
+//! Receives an RTSP stream by `retina`: coded pictures (H.264, JPEG) as they arrive, each with its RTP time, the camera's
+//! sender report and its arrival.
 
 use std::fmt::Display;
 use std::fs::File;

@@ -1,5 +1,5 @@
-//! The host's time at which a picture of an RTSP stream was taken: by sender reports of the camera's clock, or by RTP time and
-//! arrival.
+//! Computes the host's time at which a picture of an RTSP stream was taken: by sender reports of the camera's clock, or by RTP
+//! time and arrival.
 
 use super::session::Times;
 use crate::clock::CameraClock;

@@ -1,4 +1,4 @@
-//! The feed of an RTSP camera against the server that is played here, and against ffmpeg: pictures, stamps of each kind,
+//! Tests the feed of an RTSP camera with the simulated server, and with ffmpeg: pictures, stamps of each kind,
 //! damaged and lost streams.
 
 use std::os::unix::fs::PermissionsExt;

@@ -187,7 +187,8 @@ impl Exposer {
                     return Ok(None);
                 }
                 self.setting = None;
-                // Before the camera meters: it may refuse a gain that it then chooses on its own. It meters also with another one.
+                // Before the camera meters: it may refuse a gain that it then chooses on its own. It meters also with another
+                // one.
                 let put_back = self.put_gain_back(device);
                 if !self.is_metering {
                     set(device, CID_EXPOSURE_AUTO, value)?;

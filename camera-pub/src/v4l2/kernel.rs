@@ -1,4 +1,4 @@
-//! The ioctl, mmap and poll calls to a V4L2 device of the kernel, in the one file that makes them.
+//! Makes the ioctl, mmap and poll calls to a V4L2 device of the kernel; no other file makes system calls.
 #![allow(unsafe_code, reason = "ioctl, mmap and poll have no safe form; nothing else is here")]
 
 use std::fs::{File, OpenOptions};

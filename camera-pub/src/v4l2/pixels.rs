@@ -1,4 +1,4 @@
-//! The grey levels of a frame in a driver's buffer.
+//! Extracts the grey levels of a frame in a driver's buffer.
 
 use super::abi::fourcc;
 

@@ -1,4 +1,4 @@
-//! Configuration of the frames for the air link, the same for every camera.
+//! Defines the configuration of the frames for the air link, the same for every camera.
 
 use std::ops::RangeInclusive;
 

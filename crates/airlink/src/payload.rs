@@ -1,4 +1,4 @@
-//! The bytes of a JPEG frame: consecutive JPEG files, one per part in the header.
+//! Encodes and decodes the bytes of a JPEG frame: consecutive JPEG files, one per part in the header.
 //!
 //! Payloads are untrusted: all sizes are checked against the header before anything is decoded.
 

@@ -1,5 +1,5 @@
-//! A frame as a JPEG file or as 8-bit grey pixels, for the page, the recorder and viewers; and a debug image in colours as a JPEG
-//! file.
+//! Encodes a frame as a JPEG file or as 8-bit grey pixels, for the page, the recorder and viewers; and a debug image in colours
+//! as a JPEG file.
 
 use std::borrow::Cow;
 

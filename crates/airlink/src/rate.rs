@@ -26,8 +26,8 @@ impl Rate {
         now_ns >= first_ns || now_ns < first_ns.saturating_sub(self.period_ns)
     }
 
-    /// Notes that it is taken. The next one is due a period after this one was due: an early frame allows no further one. After a
-    /// pause, or where times begin again, it is due a period after this one.
+    /// Notes that it is taken. The next one is due a period after this one was due: an early frame allows no further one. After
+    /// a pause, or where times begin again, it is due a period after this one.
     pub fn take(&mut self, now_ns: i64) {
         let turn_ns =
             self.due_ns.saturating_sub(self.early_ns)..self.due_ns.saturating_add(self.period_ns);

@@ -1,4 +1,4 @@
-//! The camera's side: takes offered frames and sends those that the link has room for.
+//! Runs the camera's side: takes offered frames and sends those that the link has room for.
 //!
 //! Its thread, named `air`, does all the work, so that a slow link never blocks the camera or the frames in
 //! shared memory. A frame is copied only when it will be sent. This is the only module with a thread, a clock

@@ -1,4 +1,4 @@
-//! The air link's flow and congestion control: from acknowledgements of frames by each receiver to when the next
+//! Implements the air link's flow and congestion control: from acknowledgements of frames by each receiver to when the next
 //! frame may be sent, on which lane, and how large it may be.
 //!
 //! A frame is sent only while fewer than `window` others are in flight, so that nothing queues on the link;
@@ -42,7 +42,7 @@ const GROWTH: f64 = 1.04;
 const MIN_SHRINK: f64 = 0.75;
 /// Factor on the size for a lost frame.
 const LOSS_SHRINK: f64 = 0.6;
-/// Minimum share of the allowed size that a frame must use for the size to grow.
+/// Minimum fraction of the allowed size that a frame must use for the size to grow.
 const MIN_USE: f64 = 0.6;
 /// Maximum number of times that consecutive losses double the timeout.
 const MAX_DOUBLINGS: u32 = 3;

@@ -1,4 +1,4 @@
-//! Good and bad sets of views: how many are refused, and for which reason.
+//! Judges good and bad sets of views: counts how many are refused, and for which reason.
 #![expect(clippy::print_stdout, reason = "the table is its purpose")]
 
 use std::collections::BTreeMap;

@@ -1,4 +1,4 @@
-//! The board's points as the solver has them, and the pixel that is expected for each, with its derivatives.
+//! Models the board's points for the solver, and predicts the pixel of each, with its derivatives.
 //!
 //! Besides the intrinsics all views share the board's bend and, when a result is judged, flaws of its print: tags of another
 //! size, a stretch, a shear. The flaws are zero wherever something is linearised: only their slopes are needed.

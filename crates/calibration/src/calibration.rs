@@ -1,5 +1,5 @@
-//! The result of a calibration from a board: camera, covariance, residuals of each view, maps of residuals and of uncertainty,
-//! and by how much markers' poses are off.
+//! Defines the result of a calibration from a board: camera, covariance, residuals of each view, maps of residuals and of
+//! uncertainty, and by how much markers' poses are off.
 
 use geometry::{Board, Camera, CameraModel, Pixel, Point, Transform};
 use libm::{fmax, hypot};
@@ -201,7 +201,8 @@ impl Calibration {
         Some(fmax(covariance.trace() / 2.0, 0.0).sqrt())
     }
 
-    /// The 95th percentile, over the whole image, of the uncertainty by the covariance: if it is too large there are too few views.
+    /// The 95th percentile, over the whole image, of the uncertainty by the covariance: if it is too large there are too few
+    /// views.
     pub(crate) fn worst_formal_uncertainty_px(&self) -> f64 {
         let places = self.size().middles(COLUMNS, ROWS);
         percentile_95(places.filter_map(|pixel| self.formal_uncertainty_px(pixel)).collect())

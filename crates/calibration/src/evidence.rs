@@ -34,7 +34,7 @@ pub struct Evidence {
 /// Where in the image points were seen.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Coverage {
-    /// The share of the image's parts ([`Coverage::PARTS`]) in which there are any.
+    /// The fraction of the image's parts ([`Coverage::PARTS`]) in which there are any.
     pub covered: f64,
     /// The quarter of the image with fewest, as text.
     pub emptiest: &'static str,

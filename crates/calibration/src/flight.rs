@@ -1,11 +1,11 @@
 //! Estimates a camera's time offset, mount, focal length and first radial coefficient (k1) from a flight over a stationary pad.
 //!
 //! The pad has one position. Its position computed from the vehicle's attitude and position moves with the vehicle when the
-//! camera is not as configured: with the height and the heading under a mount that is off, with the tilt under a focal length or a k1 that is
-//! off, with every turn under stamps that are early or late. The autopilot's errors move it as well, slowly. They are
-//! estimated together with the camera, and their size is estimated from the flight itself, so that the deviations follow from
-//! the flight. Hovering shows nothing (Yang, Geneva, Eckenhoff, Huang, "Degenerate motion analysis for aided INS with online
-//! spatial and temporal sensor calibration", 2019).
+//! camera is not as configured: with the height and the heading under a mount that is off, with the tilt under a focal length
+//! or a k1 that is off, with every turn under stamps that are early or late. The autopilot's errors move it as well, slowly.
+//! They are estimated together with the camera, and their size is estimated from the flight itself, so that the deviations
+//! follow from the flight. Hovering shows nothing (Yang, Geneva, Eckenhoff, Huang, "Degenerate motion analysis for aided INS
+//! with online spatial and temporal sensor calibration", 2019).
 //!
 //! Stages in reading order: `sample` has the input, `quantity` the estimated quantities; `motion` is the vehicle's pose at any
 //! time, `model` predicts the detections, [`excitation`] measures which quantities are observable, `filter` eliminates the
@@ -269,8 +269,8 @@ fn deviation(result: &Filtered, index: usize) -> f64 {
     libm::fmax(result.covariance[(index, index)], 0.0).sqrt()
 }
 
-/// The variance of an estimate: of the flight's noise, of errors that no flight averages out, and of the remaining step where the
-/// solution oscillates.
+/// The variance of an estimate: of the flight's noise, of errors that no flight averages out, and of the remaining step where
+/// the solution oscillates.
 fn variance(result: &Filtered, quantity: Quantity) -> f64 {
     let i = quantity.index();
     let noise = libm::fmax(result.covariance[(i, i)], 0.0);

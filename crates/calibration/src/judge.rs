@@ -155,7 +155,8 @@ mod limit {
     /// Where the points are better than that, residuals that are mostly the lens's show already from here.
     pub(super) const MAX_CLEAR_STRUCTURE_PX: f64 = 0.05;
     pub(super) const MAX_CLEAR_LENS_SHARE: f64 = 0.5;
-    /// The part explained by the position in the image over that explained by the view, from which on the lens is wrong, not motion.
+    /// The part explained by the position in the image over that explained by the view, from which on the lens is wrong, not
+    /// motion.
     pub(super) const MIN_LENS_OF_VIEW: f64 = 0.3;
     /// Differences of two halves: in pixels, and in multiples of their stated uncertainty.
     pub(super) const MAX_DIFFERENCE_PX: f64 = 0.3;

@@ -118,7 +118,7 @@ pub enum Refusal {
          {missing}: move the board to there, and to all corners"
     )]
     PartOfImage {
-        /// The share of the image in which points are.
+        /// The fraction of the image in which points are.
         covered_percent: f64,
         /// Its limit.
         min_percent: f64,

@@ -13,7 +13,8 @@ pub(crate) struct Minimum {
     pub(crate) has_settled: bool,
 }
 
-/// Fraction of the cost that a step must gain, or the fit has converged: far below the cost of a thousandth of a standard deviation.
+/// Fraction of the cost that a step must gain, or the fit has converged: far below the cost of a thousandth of a standard
+/// deviation.
 const SETTLED: f64 = 1e-9;
 const MAX_DAMPING: f64 = 1e9;
 

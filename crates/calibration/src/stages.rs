@@ -1,4 +1,5 @@
-//! Leads from points to the minimum: a guess, the most important numbers, then all, with a loss that narrows to the noise found.
+//! Leads from points to the minimum: a guess, the most important numbers, then all, with a loss that narrows to the noise
+//! found.
 
 use geometry::Pixel;
 

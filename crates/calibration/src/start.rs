@@ -1,4 +1,4 @@
-//! The first guess: a focal length, and the board's pose in each view.
+//! Computes the first guess: a focal length, and the board's pose in each view.
 //!
 //! For a focal length a homography gives each view's pose (Zhang, "A flexible new technique for camera calibration", 2000,
 //! section 3.1), and the right focal length is the one whose poses explain the points best. The homography is to the plane

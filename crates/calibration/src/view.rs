@@ -1,4 +1,4 @@
-//! The input of a calibration: the points of a board that were found in images.
+//! Defines the input of a calibration: the points of a board that were found in images.
 
 use geometry::Pixel;
 

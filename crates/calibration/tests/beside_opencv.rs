@@ -1,4 +1,4 @@
-//! The same points calibrated here and by OpenCV.
+//! Compares calibrations of the same points by this crate and by OpenCV.
 
 mod opencv;
 mod synthetic;

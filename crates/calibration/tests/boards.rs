@@ -1,4 +1,4 @@
-//! The calibration from simulated views of boards, bent and noisy, against each camera's truth, its stated uncertainty,
+//! Tests the calibration from simulated views of boards, bent and noisy, against each camera's truth, its stated uncertainty,
 //! and bad sets of views that are refused. `examples/boards.rs` and `examples/judged.rs` do the same by the hundred.
 #![allow(clippy::panic, reason = "a calibration that is refused fails the test")]
 

@@ -1,4 +1,4 @@
-//! The calibration from simulated flights, telemetry and markers of cameras whose truth is known: time offset, mount,
+//! Tests the calibration from simulated flights, telemetry and markers of cameras whose truth is known: time offset, mount,
 //! focal length and k1 with honest deviations, and flights that are refused.
 
 use calibration::flight::{MIN_MARKERS, QUANTITIES, calibrate_flight};

@@ -1,5 +1,5 @@
-//! Whole detections in one frame of 1296 x 972 pixels with a textured ground, by family, and of an image without a marker;
-//! and a marker that is followed: `cargo bench -p fiducial`.
+//! Measures the time of detections in one frame of 1296 x 972 pixels with a textured ground, by family, and of an image without
+//! a marker; and a marker that is followed: `cargo bench -p fiducial`.
 #![allow(missing_docs, clippy::unwrap_used, reason = "a benchmark may stop anywhere")]
 
 use std::hint::black_box;

@@ -1,5 +1,5 @@
-//! The pose of a pad with its covariance, from its markers found in an image, but for those that contradict the others: their
-//! corners and ring centres solved as points of one plane.
+//! Estimates the pose of a pad with its covariance from its markers found in an image, without those that contradict the
+//! others: their corners and ring centres solved as points of one plane.
 //!
 //! Far markers give the tilt that near ones cannot, and only the covariance changes when one of them leaves the view. Rings
 //! look the same in any rotation: next to other markers their centre is a point of the plane; alone they give the pad's pose

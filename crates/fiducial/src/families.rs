@@ -1,4 +1,4 @@
-//! The detectors, one for each kind of marker.
+//! Contains the detectors, one for each kind of marker.
 
 pub(crate) mod family;
 pub(crate) mod query;

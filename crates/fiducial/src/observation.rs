@@ -1,5 +1,5 @@
-//! A marker as the detector reports it: name, centre with covariance, corners, size in pixels, wrong bits, confidence, pose and its
-//! alternative, the camera's response.
+//! Defines a marker as the detector reports it: name, centre with covariance, corners, size in pixels, wrong bits, confidence,
+//! pose and its alternative, the camera's response.
 
 use geometry::{Camera, Marker as MarkerFrame, Pixel, Roi, Transform};
 use markers::Family;

@@ -1,4 +1,4 @@
-//! The pose of a plane from the images of known points on it, as a square's corners: both solutions in closed
+//! Estimates the pose of a plane from the images of known points on it, as a square's corners: both solutions in closed
 //! form, refined to the smallest reprojection error, with covariance.
 //!
 //! Four or more points of a plane leave two poses: the plane tilted one way, and tilted the other way about

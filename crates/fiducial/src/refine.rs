@@ -1,4 +1,4 @@
-//! Sub-pixel corners with their covariance.
+//! Measures sub-pixel corners with their covariance.
 
 pub mod corners;
 pub(crate) mod drawing;

@@ -1,8 +1,8 @@
 //! Estimates the tone curve and the sharpening of a camera with their deviations from the markers of the last images; a setting
 //! can fix them.
 //!
-//! Every marker gives the tone curve and the sharpening of the camera that shows it, a small one badly. Those of a stream are the
-//! same camera's, so the next fit starts from the mean of the last markers, constrained to it as strongly as they agreed.
+//! Every marker gives the tone curve and the sharpening of the camera that shows it, a small one badly. Those of a stream are
+//! the same camera's, so the next fit starts from the mean of the last markers, constrained to it as strongly as they agreed.
 
 use std::fmt;
 use std::str::FromStr;

@@ -1,4 +1,4 @@
-//! Settings of the detector.
+//! Defines the settings of the detector.
 
 use crate::response::ResponseSetting;
 

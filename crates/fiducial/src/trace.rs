@@ -1,4 +1,4 @@
-//! The candidates of a detection and why they were refused, for debug images.
+//! Records the candidates of a detection and why they were refused, for debug images.
 
 use geometry::{Pixel, Roi};
 use imaging::Ellipse;

@@ -108,7 +108,7 @@ const MIN_UNCERTAINTY_RATIO: f64 = 0.1;
 /// Regions begin and end at multiples of this, in pixels. Values that are computed by tiles, such as thresholds, then have the
 /// same tiles as in the whole image.
 const TILE: usize = 16;
-/// Largest share of the image that regions may cover; above it the whole image is searched.
+/// Largest fraction of the image that regions may cover; above it the whole image is searched.
 const MAX_COVERED: f64 = 0.4;
 
 impl Tracker {

@@ -1,5 +1,5 @@
-//! Centre and range of the three-ring marker in renderings of the thesis' camera at both binnings against truth, range by range,
-//! and against the stated covariances.
+//! Compares centre and range of the three-ring marker in renderings of the thesis' camera at both binnings with the truth,
+//! range by range, and against the stated covariances.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the tests print their figures")]
 

@@ -1,4 +1,4 @@
-//! The pose of a pad of several markers in rendered pictures with truth, from 15 m to a hand's breadth, with markers
+//! Tests the pose of a pad of several markers in rendered pictures with truth, from 15 m to a hand's breadth, with markers
 //! turned, missing or wrong.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the tests print their figures")]

@@ -1,4 +1,4 @@
-//! The three-ring marker in hard rendered images, from 7 cm to 30 m: cut, tilted, dim, blurred, in shadow,
+//! Tests the three-ring marker in hard rendered images, from 7 cm to 30 m: cut, tilted, dim, blurred, in shadow,
 //! through a lens, covered, inverted; and rings of others that are no marker.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the tests print their figures")]

@@ -1,4 +1,4 @@
-//! The detector of all families and its debug drawings on images of odd shapes, patterns and noise and with
+//! Tests the detector of all families and its debug drawings on images of odd shapes, patterns and noise and with
 //! senseless camera models: no panic, no image beyond a minute.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 

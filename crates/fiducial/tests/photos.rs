@@ -1,4 +1,4 @@
-//! Real photographs, none of which shows the three-ring marker: nothing may fail, and next to nothing may be found.
+//! Tests real photographs, none of which shows the three-ring marker: nothing may fail, and next to nothing may be found.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 
 use std::collections::BTreeMap;

@@ -1,5 +1,5 @@
-//! Rings, square markers and STags in frames with tone curve, sharpening and JPEG, also under the edge of a shadow: how many
-//! are found, their errors, and the estimated response.
+//! Tests rings, square markers and STags in frames with tone curve, sharpening and JPEG, also under the edge of a shadow: how
+//! many are found, their errors, and the estimated response.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the tests print their figures")]
 

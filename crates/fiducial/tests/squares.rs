@@ -1,5 +1,5 @@
-//! Square markers drawn pixel by pixel: borders of two cells, tags seen from the side, calibration grids, scratched, covered, sharpened and
-//! small ones, boards of hundreds.
+//! Tests square markers drawn pixel by pixel: borders of two cells, tags seen from the side, calibration grids, scratched,
+//! covered, sharpened and small ones, boards of hundreds.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 
 use fiducial::{Detector, Observation, Settings};
@@ -160,8 +160,9 @@ fn a_drawing_in_whole_pixels_has_their_covariance() {
     }
 }
 
-/// Views of a tag from the side, next to another one in full view, by the pixels of its longer side and the ratio of the shorter one: squeezed
-/// along a side and, after a turn of 45 degrees, along a diagonal. AprilTag 3 without decimation reads such tags down to 0.15.
+/// Views of a tag from the side, next to another one in full view, by the pixels of its longer side and the ratio of the
+/// shorter one: squeezed along a side and, after a turn of 45 degrees, along a diagonal. AprilTag 3 without decimation reads
+/// such tags down to 0.15.
 #[test]
 fn tags_that_are_seen_from_the_side_are_read_next_to_another_one() {
     let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();

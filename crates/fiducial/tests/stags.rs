@@ -1,5 +1,5 @@
-//! STags as a camera sees them: from close up to where a dot is hardly wider than a pixel, in shadow, in glare, covered, cut,
-//! and printed the other way round.
+//! Tests STags as a camera sees them: from close up to where a dot is hardly wider than a pixel, in shadow, in glare, covered,
+//! cut, and printed the other way round.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop anywhere")]
 
 use fiducial::{Detector, Observation, Settings};

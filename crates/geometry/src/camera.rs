@@ -1,5 +1,5 @@
-//! Camera models (pinhole, Brown-Conrady, Kannala-Brandt): from points in the camera frame to pixels with derivatives, and
-//! from pixels back to rays.
+//! Defines camera models (pinhole, Brown-Conrady, Kannala-Brandt): from points in the camera frame to pixels with derivatives,
+//! and from pixels back to rays.
 //!
 //! Pixel coordinates: the centre of the top-left pixel is (0, 0), x right, y down.
 

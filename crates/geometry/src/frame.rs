@@ -1,4 +1,4 @@
-//! The coordinate frames of the system, as types.
+//! Defines the coordinate frames of the system, as types.
 
 /// A coordinate frame: a type without values that tags points, vectors and transforms.
 pub trait Frame: Copy + Clone + std::fmt::Debug + PartialEq + 'static {

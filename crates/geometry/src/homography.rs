@@ -1,4 +1,4 @@
-//! The projective map from a plane to its image.
+//! Computes the projective map from a plane to its image.
 
 use nalgebra::{SMatrix, SVector};
 

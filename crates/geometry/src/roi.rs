@@ -1,4 +1,4 @@
-//! A region of a frame, seen as an image of its own.
+//! Converts between a frame and a region of it that is used as an image.
 
 use crate::camera::{CameraModel, Pixel};
 

@@ -1,4 +1,4 @@
-//! Points, vectors, rotations and rigid transforms that carry their coordinate frames.
+//! Defines points, vectors, rotations and rigid transforms that carry their coordinate frames.
 
 use std::marker::PhantomData;
 use std::ops::{Add, Mul, Neg, Sub};

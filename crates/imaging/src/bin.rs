@@ -1,4 +1,4 @@
-//! Binning of raw images: square blocks of samples become one pixel.
+//! Bins raw images: square blocks of samples become one pixel.
 
 use crate::view::{GrayView, ViewError};
 

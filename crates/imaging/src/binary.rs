@@ -1,4 +1,4 @@
-//! Adaptive binarisation: which pixels are dark and which are bright, one bit each.
+//! Binarises with an adaptive threshold: which pixels are dark and which are bright, one bit each.
 
 use crate::kernels::{TILE, above, below, tile_extremes, with_vectors};
 use crate::view::GrayView;
@@ -91,7 +91,7 @@ pub enum Middle {
     /// wider than a pixel.
     Share(u8),
     /// The geometric mean. At a shadow's edge, white paper in the shade stays above it and black ink in the
-    /// sun below, as ink reflects a smaller share of the light than shade leaves.
+    /// sun below, as ink reflects a smaller fraction of the light than shade leaves.
     Ratio,
 }
 
@@ -102,7 +102,7 @@ pub struct Contrast {
     pub middle: Middle,
     /// Minimum range of grey levels; below it pixels are neither dark nor bright. Above the noise.
     pub min_levels: u8,
-    /// Minimum range as a share of the brightest, in percent.
+    /// Minimum range as a fraction of the brightest, in percent.
     pub min_percent: u8,
 }
 

@@ -1,5 +1,5 @@
-//! Maps where an image has contrast between regions as wide as markers' parts: a texture of dots and blades averages out there, paper
-//! and ink do not.
+//! Maps where an image has contrast between regions as wide as markers' parts: a texture of dots and blades averages out there,
+//! paper and ink do not.
 
 use crate::binary::spread;
 use crate::kernels::with_vectors;
@@ -64,7 +64,7 @@ impl ContrastMap {
         }
     }
 
-    /// The contrast in percent that is reached in this share of the image.
+    /// The contrast in percent that is reached in this fraction of the image.
     pub fn reached_in(&self, share: f32) -> u8 {
         let mut counts = [0_usize; 256];
         self.percent.iter().for_each(|percent| counts[usize::from(*percent)] += 1);

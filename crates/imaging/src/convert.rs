@@ -1,4 +1,4 @@
-//! Conversion of raw images (more than 8 bits, Bayer patterns) to 8-bit grey.
+//! Converts raw images (more than 8 bits, Bayer patterns) to 8-bit grey.
 
 use crate::view::{GrayImage, GrayView, ViewError};
 

@@ -1,4 +1,4 @@
-//! The bilateral filter of 5 x 5 pixels of the thesis' pre-processing, row by row.
+//! Applies the bilateral filter of 5 x 5 pixels of the thesis' pre-processing, row by row.
 
 use crate::view::{GrayImage, GrayView};
 

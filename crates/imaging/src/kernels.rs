@@ -1,5 +1,5 @@
-//! The innermost loops over rows of pixels, for AVX2, NEON and plain Rust: extremes of tiles, halving, sharpening, comparison
-//! with thresholds to bits.
+//! Contains the innermost loops over rows of pixels, for AVX2, NEON and plain Rust: extremes of tiles, halving, sharpening,
+//! comparison with thresholds to bits.
 //!
 //! The three give the same result to the bit. The plain one also serves the ends of rows, and processors with neither.
 #![allow(unsafe_code, reason = "vector instructions; each is tested against its plain twin")]

@@ -6,8 +6,8 @@
 //! smooths it, [`mod@threshold`] binarises it, [`contour`] follows the borders, [`ellipse`] fits ellipses to
 //! them, [`sample`] interpolates grey values. The fast path to regions of any size: [`pyramid`] halves an
 //! image again and again, [`binary`] binarises with a local threshold, [`outline`] follows the outlines of
-//! the regions, all or where a marker may be by [`contrast_map`]. [`segment`] finds straight edge segments where regions are broken.
-//! [`focus`] measures how sharp an image is.
+//! the regions, all or where a marker may be by [`contrast_map`]. [`segment`] finds straight edge segments where regions are
+//! broken. [`focus`] measures how sharp an image is.
 
 pub mod bin;
 pub mod binary;

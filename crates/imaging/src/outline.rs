@@ -28,7 +28,7 @@ pub struct Settings {
     /// Minimum range of grey levels within 12 x 12 pixels. Halved with each level from 2 on, as noise is,
     /// down to a third.
     pub min_contrast: u8,
-    /// The same as a share of the brightest pixel, in percent, on all levels.
+    /// The same as a fraction of the brightest pixel, in percent, on all levels.
     pub min_contrast_percent: u8,
     /// Where the threshold of level 0 lies within the range of 12 x 12 pixels, in 256ths: 128 in the middle. Paper is separated
     /// from its ground above that, where black ink next to it makes the range larger.
@@ -36,7 +36,8 @@ pub struct Settings {
     /// On levels 0 and 1, an outline is followed only if the grey values at its top step by as much of their
     /// range within 12 x 12 pixels as lies above the threshold (level 1: by half of its logarithm). This skips most of a texture.
     pub steep: bool,
-    /// Minimum share of its bounds that a region fills: a disc fills 0.79, a square 0.5 to 1, one seen from the side under 8 degrees
+    /// Minimum fraction of its bounds that a region fills: a disc fills 0.79, a square 0.5 to 1, one seen from the side under 8
+    /// degrees
     /// 0.14 along a diagonal.
     pub min_fill: f32,
     /// Maximum number of pixel edges of an outline over that of its bounds: 1 for convex outlines, more for
@@ -306,8 +307,8 @@ fn sharpen(view: GrayView<'_>, out: &mut GrayImage) {
     }
 }
 
-/// On level 0 the arithmetic mean, or another fraction of the range, keeps lines of a pixel's width connected; on coarser levels
-/// shadows are more important.
+/// On level 0 the arithmetic mean, or another fraction of the range, keeps lines of a pixel's width connected; on coarser
+/// levels shadows are more important.
 fn contrast(settings: &Settings, level: usize) -> Contrast {
     let min = settings.min_contrast;
     Contrast {

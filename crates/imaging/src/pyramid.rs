@@ -1,4 +1,4 @@
-//! Image pyramid: the image at half, a quarter, an eighth ... of its size.
+//! Builds the image pyramid: the image at half, a quarter, an eighth ... of its size.
 
 use crate::kernels::halve_rows;
 use crate::view::{GrayImage, GrayView};

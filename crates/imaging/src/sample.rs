@@ -1,4 +1,4 @@
-//! Grey values between pixels.
+//! Interpolates grey values between pixels.
 
 use crate::view::GrayView;
 

@@ -1,4 +1,4 @@
-//! Binarisation with one threshold.
+//! Binarises with one threshold.
 
 use crate::view::{GrayImage, GrayView};
 

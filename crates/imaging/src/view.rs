@@ -1,4 +1,4 @@
-//! Grey images: borrowed views and owned buffers, 8 bits a pixel.
+//! Defines grey images: borrowed views and owned buffers, 8 bits a pixel.
 
 /// Why bytes cannot be viewed as an image.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]

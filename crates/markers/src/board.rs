@@ -1,4 +1,4 @@
-//! A calibration board: rows of tags in known places, as Kalibr's AprilGrid without the squares between its tags.
+//! Defines a calibration board: rows of tags in known positions, as Kalibr's AprilGrid without the squares between its tags.
 //!
 //! The squares between Kalibr's tags touch their corners, where the outline of a tag would run on into the next one.
 

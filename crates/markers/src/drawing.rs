@@ -60,8 +60,8 @@ pub struct Drawing {
 }
 
 impl Marker {
-    /// Whether the print of two markers of one size is the same, also under two names: small ArUco dictionaries are the beginnings
-    /// of large ones.
+    /// Whether the print of two markers of one size is the same, also under two names: small ArUco dictionaries are the
+    /// beginnings of large ones.
     pub fn looks_like(&self, other: &Self) -> bool {
         let drawing = |marker: &Self| Drawing::new(marker, 1.0);
         match self.family == other.family {
@@ -72,8 +72,8 @@ impl Marker {
 }
 
 impl Drawing {
-    /// The drawing of `marker` at `size_m`, independent of the size that the marker itself states; `None` when the family has ids and
-    /// this is none of them.
+    /// The drawing of `marker` at `size_m`, independent of the size that the marker itself states; `None` when the family has
+    /// ids and this is none of them.
     pub fn new(marker: &Marker, size_m: f64) -> Option<Self> {
         match (marker.family, marker.id) {
             (Family::Rings | Family::RingsThesis, _) => Some(rings(size_m)),

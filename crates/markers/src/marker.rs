@@ -1,4 +1,4 @@
-//! A marker's family, id and size, written `family:id:size`.
+//! Defines a marker's family, id and size, written `family:id:size`.
 
 use std::fmt;
 use std::str::FromStr;

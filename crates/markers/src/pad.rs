@@ -1,4 +1,4 @@
-//! A pad: several markers in known positions around one landing point.
+//! Defines a pad: several markers in known positions around one landing point.
 //!
 //! A pad is described in TOML, positions in metres from the landing point on the printed face (x right, y up):
 //!

@@ -1,4 +1,4 @@
-//! The three rings of the thesis' marker.
+//! Defines the three rings of the thesis' marker.
 
 /// Inner and outer radius of the three rings, outer ring first, in units of `x`, the inner radius of the innermost ring
 /// (Table 3.1). The marker's size is twice the outermost radius.

@@ -1,4 +1,4 @@
-//! The drawings agree with the pictures of the reference libraries, cell by cell, for every id.
+//! Compares the drawings with the pictures of the reference libraries, cell by cell, for every id.
 //!
 //! `reference_drawings.txt` has a checksum for each family, written by `reference_drawings.py` from the libraries.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop anywhere")]

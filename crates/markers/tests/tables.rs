@@ -1,4 +1,4 @@
-//! The code tables are those of the reference implementations: counts, minimum Hamming distances and checksums.
+//! Compares the code tables with those of the reference implementations: counts, minimum Hamming distances and checksums.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 
 use markers::{Codebook, Family, SquareCode, stag_code};

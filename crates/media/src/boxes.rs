@@ -1,4 +1,5 @@
-//! Checks the boxes of an MP4 file (ISO/IEC 14496-12, 4.2) before a parser reads them that allocates the memory that they state.
+//! Checks the boxes of an MP4 file (ISO/IEC 14496-12, 4.2) before a parser reads them that allocates the memory that they
+//! state.
 
 use std::io::{Error, ErrorKind, Read, Result, Seek, SeekFrom};
 use std::ops::Range;

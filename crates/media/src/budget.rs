@@ -1,4 +1,4 @@
-//! A reader with a budget, for formats whose parser may read a small damaged file for ever.
+//! Limits the bytes of a reader, for formats whose parser may read a small damaged file for ever.
 
 use std::io::{Error, Read, Result, Seek, SeekFrom};
 use std::sync::Arc;

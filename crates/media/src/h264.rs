@@ -92,8 +92,8 @@ fn luma(frame: &Frame) -> Result<GrayImage, H264Error> {
     Ok(image)
 }
 
-/// Maximum number of pictures that others may refer to, all of which are stored in memory, and of entries in a slice's list of them
-/// (ITU-T H.264, A.3.1 and 7.4.3).
+/// Maximum number of pictures that others may refer to, all of which are stored in memory, and of entries in a slice's list of
+/// them (ITU-T H.264, A.3.1 and 7.4.3).
 const MAX_REFERENCES: u32 = 16;
 const MAX_REFERENCE_LIST: u32 = 32;
 /// Largest numbers of parameter sets, of sequences and of pictures (7.4.2).

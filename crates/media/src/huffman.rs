@@ -1,5 +1,5 @@
-//! The Huffman tables of a JPEG file, which a camera may leave out: Motion JPEG (among it that of UVC cameras) then means those of
-//! ITU-T T.81, Annex K.3.3.
+//! Adds the Huffman tables of a JPEG file, which a camera may leave out: Motion JPEG (among it that of UVC cameras) then means
+//! those of ITU-T T.81, Annex K.3.3.
 
 use std::borrow::Cow;
 

@@ -1,5 +1,5 @@
-//! Image files (PNG and JPEG): found in folders in order, decoded to 8-bit grey or to a frame's samples as they are stored, within
-//! a limit of pixels, and refused when damaged.
+//! Reads image files (PNG and JPEG): found in folders in order, decoded to 8-bit grey or to a frame's samples as they are
+//! stored, within a limit of pixels, and refused when damaged.
 
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
@@ -188,9 +188,9 @@ impl From<GrayImage> for StillImage {
     }
 }
 
-/// Reads an image file (PNG or JPEG) in grey, as it is stored. It is not turned by Exif's orientation, as a camera's calibration
-/// is of the sensor's pixels. Colours are weighted by ITU-R BT.601, 16-bit grey is scaled to the range it uses, transparent pixels are
-/// blended with white. With a `bayer` pattern, an image of one channel is a sensor's raw samples.
+/// Reads an image file (PNG or JPEG) in grey, as it is stored. It is not turned by Exif's orientation, as a camera's
+/// calibration is of the sensor's pixels. Colours are weighted by ITU-R BT.601, 16-bit grey is scaled to the range it uses,
+/// transparent pixels are blended with white. With a `bayer` pattern, an image of one channel is a sensor's raw samples.
 ///
 /// # Errors
 /// [`ImageError`] when the file cannot be read, is not a complete image, or has more than `max_pixels`.

@@ -1,5 +1,5 @@
-//! JPEG files in a stream of bytes: where one starts (SOI) and where it ends (EOI), and its segments, after ISO/IEC 10918-1,
-//! Annex B.
+//! Finds JPEG files in a stream of bytes: where one starts (SOI) and where it ends (EOI), and its segments, after ISO/IEC
+//! 10918-1, Annex B.
 
 /// Start-of-image marker.
 const SOI: [u8; 2] = [0xff, 0xd8];

@@ -3,9 +3,9 @@
 //! The crate does not depend on markers, connected cameras or other processes.
 //!
 //! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, `huffman` adds the tables that a camera leaves
-//! out, `scan` checks whether their data are complete, [`image`] reads image files, [`video`] reads videos frame by frame, [`h264`]
-//! decodes a camera's stream, [`calibration`] reads and writes the calibration files of other programs, [`rectify`] removes a
-//! lens's distortion from images, [`atomic`] replaces a file by a complete one.
+//! out, `scan` checks whether their data are complete, [`image`] reads image files, [`video`] reads videos frame by frame,
+//! [`h264`] decodes a camera's stream, [`calibration`] reads and writes the calibration files of other programs, [`rectify`]
+//! removes a lens's distortion from images, [`atomic`] replaces a file by a complete one.
 
 pub mod atomic;
 mod boxes;

@@ -1,4 +1,4 @@
-//! Videos, frame by frame: Motion JPEG (AVI, or a bare stream of JPEG files) and H.264 (MP4, or a bare
+//! Reads videos frame by frame: Motion JPEG (AVI, or a bare stream of JPEG files) and H.264 (MP4, or a bare
 //! stream).
 
 use std::cmp::Reverse;

@@ -1,4 +1,4 @@
-//! JPEG files as cameras send them, made by OpenCV (`jpeg/files.py` writes them) and by the crate `image`.
+//! Tests JPEG files as cameras send them, made by OpenCV (`jpeg/files.py` writes them) and by the crate `image`.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 
 use std::io::Cursor;

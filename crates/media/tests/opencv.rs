@@ -1,4 +1,4 @@
-//! Calibration files between this crate and OpenCV, and by the documented fields of ROS and Kalibr.
+//! Tests calibration files between this crate and OpenCV, and by the documented fields of ROS and Kalibr.
 
 use std::path::{Path, PathBuf};
 

@@ -1,5 +1,5 @@
-//! The exposure loop: from the levels of the pad's white in a frame, its motion and the camera's limits to the next exposure time and
-//! gain, with the reason.
+//! Implements the exposure loop: from the levels of the pad's white in a frame, its motion and the camera's limits to the next
+//! exposure time and gain, with the reason.
 
 use messages::ExposureReason;
 

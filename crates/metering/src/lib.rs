@@ -1,5 +1,5 @@
-//! Exposure for the marker: which exposure time and gain a camera's next frames need, so that the pad's white is bright,
-//! not clipped, and not blurred.
+//! Controls exposure for the marker: the exposure time and gain that a camera's next frames need, so that the pad's white is
+//! bright, not clipped, and not blurred.
 //!
 //! A camera's own metering weighs the complete frame: over dark ground it overexposes a white pad, against snow it
 //! underexposes it. This crate does not depend on a camera or a clock. It reads detections, which give the pad's position and

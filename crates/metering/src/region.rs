@@ -1,4 +1,4 @@
-//! The grey levels of the pad's white and black in a frame.
+//! Measures the grey levels of the pad's white and black in a frame.
 
 use imaging::GrayView;
 

@@ -1,4 +1,4 @@
-//! Why a scene or a frame cannot be drawn.
+//! Defines the errors of scenes and frames that cannot be drawn.
 
 /// Why a frame cannot be rendered.
 #[derive(Copy, Clone, Debug, PartialEq)]

@@ -1,4 +1,4 @@
-//! Effects between the scene and the sensor: shadows, glare, occlusion, haze, objects on a marker or dirt on the lens.
+//! Renders effects between the scene and the sensor: shadows, glare, occlusion, haze, objects on a marker or dirt on the lens.
 
 use geometry::Pixel;
 
@@ -83,7 +83,7 @@ pub enum Occluder {
         area: Disc,
         /// Size of the spots, in pixels.
         spot_px: [f32; 2],
-        /// The share of the grey level where it is least and where it is most.
+        /// The fraction of the grey level where it is least and where it is most.
         share: [f32; 2],
         /// The grey level.
         level: f32,

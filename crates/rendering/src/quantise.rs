@@ -1,4 +1,4 @@
-//! From light to whole grey levels.
+//! Rounds light to whole grey levels.
 
 /// The nearest grey level.
 pub(crate) fn quantise(level: f32) -> u8 {

@@ -154,7 +154,8 @@ impl Renderer {
 
     /// Renders frame `frame_index` into `out`, row by row. `poses` are `ned_from_body` during the exposure,
     /// evenly spaced in time from the opening of the first row to the closing of the last; with one pose the
-    /// vehicle is stationary. With [`crate::processing::Processing::video`] it also depends on the frames that were rendered before.
+    /// vehicle is stationary. With [`crate::processing::Processing::video`] it also depends on the frames that were rendered
+    /// before.
     ///
     /// # Errors
     /// [`RenderError`] when a pose is invalid or `out` does not have the size of the image.

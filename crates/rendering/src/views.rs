@@ -1,4 +1,4 @@
-//! The thesis' marker from above, at the reference positions of the thesis' experiment (Table 4.1): the
+//! Renders the thesis' marker from above, at the reference positions of the thesis' experiment (Table 4.1): the
 //! frames, their pixels and their truth.
 
 use std::f64::consts::TAU;

@@ -1,4 +1,4 @@
-//! The renderer against ray casting, the projection of the camera model and the statistics of noise: pixels,
+//! Compares the renderer with ray casting, the projection of the camera model and the statistics of noise: pixels,
 //! seams, lenses, rolling shutter, occluders, any pose and size.
 #![allow(
     clippy::unwrap_used,

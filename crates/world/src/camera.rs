@@ -1,4 +1,4 @@
-//! Faults of a camera's frames: they arrive late, not at all, twice, or with a wrong stamp.
+//! Simulates faults of a camera's frames: they arrive late, not at all, twice, or with a wrong stamp.
 
 use rand_chacha::ChaCha8Rng;
 

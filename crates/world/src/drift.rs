@@ -1,4 +1,4 @@
-//! Random numbers that change slowly, each from a stream of the one seed.
+//! Draws random numbers that change slowly, each from a stream of the one seed.
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;

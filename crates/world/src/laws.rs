@@ -1,4 +1,4 @@
-//! Small laws of motion that the vehicle and its autopilot share.
+//! Defines small laws of motion that the vehicle and its autopilot share.
 
 /// Share of a step that a first-order lag covers in `dt_s`.
 pub(crate) fn lag(dt_s: f64, time_constant_s: f64) -> f64 {

@@ -1,4 +1,4 @@
-//! The pad: where it is, and how it moves.
+//! Simulates the pad's position and motion.
 
 use std::f64::consts::TAU;
 

@@ -1,4 +1,4 @@
-//! The simulated multirotor: lags of attitude and thrust, drag in the wind, ground effect, and its contact
+//! Simulates the multirotor: lags of attitude and thrust, drag in the wind, ground effect, and its contact
 //! with ground or pad; the autopilot's demand in, the true motion out.
 //!
 //! Above the attitude loops everything is the autopilot's; below them the measured response of the real

@@ -1,4 +1,4 @@
-//! A model of the detector `rings`: detections with the errors that it makes in rendered frames, without the
+//! Models the detector `rings`: detections with the errors that it makes in rendered frames, without the
 //! frames.
 //!
 //! The numbers of [`RINGS`] are fitted by `cargo run --release -p experiments --example fit_vision`, which

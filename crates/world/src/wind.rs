@@ -1,4 +1,4 @@
-//! Wind: a mean, turbulence by the Dryden model, and the thesis' noise.
+//! Simulates wind: a mean, turbulence by the Dryden model, and the thesis' noise.
 //!
 //! The turbulence is that of MIL-F-8785C, section 3.7, at low altitude: lengths and intensities from the
 //! height and the wind at 6 m (20 ft), one coloured noise for each axis. The vehicle hovers, so the air that

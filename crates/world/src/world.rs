@@ -1,5 +1,5 @@
-//! The simulated world: vehicle, wind, pad and autopilot together in steps of one fixed length, the same for the same seed and
-//! packets.
+//! Runs the simulated world: vehicle, wind, pad and autopilot together in steps of one fixed length, the same for the same seed
+//! and packets.
 
 use std::collections::VecDeque;
 

@@ -1,4 +1,4 @@
-//! The client of the crate `autopilot` against the simulated autopilot, packet by packet: finds it, takes
+//! Tests the client of the crate `autopilot` with the simulated autopilot, packet by packet: finds it, takes
 //! off, flies by setpoints and lands; clocks, and PX4's commands and events.
 
 #![allow(

@@ -1,4 +1,4 @@
-//! The response to steps of the velocity setpoint, against the one measured on a real autopilot.
+//! Compares the response to steps of the velocity setpoint with the one measured on a real autopilot.
 
 #![allow(
     clippy::unwrap_used,

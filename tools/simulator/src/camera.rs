@@ -1,4 +1,4 @@
-//! The simulated camera as a function of the simulation: which frames it takes, how they are delayed, and
+//! Implements the simulated camera as a function of the simulation: which frames it takes, how they are delayed, and
 //! their pixels.
 
 use anyhow::Context;

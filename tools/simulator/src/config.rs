@@ -1,4 +1,4 @@
-//! The simulator's configuration, `simulator.toml`: vehicle, firmware, wind, pad, camera with its faults,
+//! Defines the simulator's configuration, `simulator.toml`: vehicle, firmware, wind, pad, camera with its faults,
 //! light, exposure, occluders; checked and made into settings of world and renderer.
 
 use airlink::AirConfig;

@@ -1,4 +1,4 @@
-//! A vehicle flown by a real autopilot: its motion from the autopilot's messages.
+//! Follows a vehicle flown by a real autopilot: its motion from the autopilot's messages.
 //!
 //! A simulated ArduPilot sends the truth in SIM_STATE, a simulated PX4 in HIL_STATE_QUATERNION, with the
 //! position in steps of about a centimetre and an accurate velocity; combined they give a smooth motion. Of

@@ -1,5 +1,5 @@
-//! The simulator's service: steps the world in real time, or follows a real autopilot's vehicle, exchanges MAVLink packets, renders the
-//! camera's frames, and publishes them with the truth.
+//! Runs the simulator's service: steps the world in real time, or follows a real autopilot's vehicle, exchanges MAVLink
+//! packets, renders the camera's frames, and publishes them with the truth.
 //!
 //! The simulation advances on a task of its own. The camera renders on a thread of its own, named `camera`,
 //! from the recent history of the simulation, so that neither blocks the other for longer than it takes to
@@ -47,7 +47,8 @@ const MAX_DELAYED: usize = 32;
 const TOO_LONG: &str = "frames that took too long to render";
 /// Time without the truth after which it is requested again.
 const REQUEST_PERIOD: Duration = Duration::from_secs(1);
-/// Ids of the messages with the truth of a simulated ArduPilot and PX4. ArduPilot warns the pilot of a request for an unknown id.
+/// Ids of the messages with the truth of a simulated ArduPilot and PX4. ArduPilot warns the pilot of a request for an unknown
+/// id.
 const SIM_STATE: f32 = 108.0;
 const HIL_STATE_QUATERNION: f32 = 115.0;
 /// Number of such requests without an answer after which a warning is logged.

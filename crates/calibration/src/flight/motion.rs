@@ -1,5 +1,5 @@
-//! The vehicle's pose, velocity and turn rate at any time of a flight, interpolated by cubics between the autopilot's samples,
-//! without jumps of the position.
+//! Computes the vehicle's pose, velocity and turn rate at any time of a flight, interpolated by cubics between the autopilot's
+//! samples, without jumps of the position.
 
 use geometry::{Body, Ned, Point, Rotation, Vector, squared};
 use nalgebra::Vector3;

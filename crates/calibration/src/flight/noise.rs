@@ -1,4 +1,4 @@
-//! Standard deviations of the autopilot's and the detector's errors.
+//! Defines the standard deviations of the autopilot's and the detector's errors.
 
 use nalgebra::{Matrix3, Vector3};
 

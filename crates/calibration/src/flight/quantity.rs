@@ -1,5 +1,5 @@
-//! The quantities that a flight gives of a camera (time offset, roll, pitch and yaw of the mount, focal length, k1), and the
-//! deviation up to which each counts.
+//! Defines the quantities that a flight gives of a camera (time offset, roll, pitch and yaw of the mount, focal length, k1),
+//! and the deviation up to which each counts.
 
 /// Where the quantities are among the parameters.
 pub(super) const OFFSET: usize = 0;

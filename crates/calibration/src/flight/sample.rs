@@ -1,4 +1,4 @@
-//! The input of a flight: the vehicle's poses and the markers' detections.
+//! Defines the input of a flight: the vehicle's poses and the markers' detections.
 
 use geometry::{Body, Camera, CameraModel, Ned, Point, Rotation, Transform, Vector};
 use nalgebra::Matrix3;

@@ -1,4 +1,4 @@
-//! OpenCV's calibration of the same points, and the sets of corners in photographs that it found.
+//! Runs OpenCV's calibration of the same points, and the sets of corners in photographs that it found.
 #![allow(dead_code, unreachable_pub, reason = "each of those that share this file uses a part")]
 #![allow(clippy::expect_used, reason = "missing data fail the test, or the table")]
 

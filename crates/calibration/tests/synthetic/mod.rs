@@ -82,7 +82,7 @@ pub struct Taking {
     pub motion_m: f64,
     /// By how much the bend changes from view to view, one standard deviation.
     pub floppy_m: f64,
-    /// The share of tags that are found elsewhere, by up to 20 px.
+    /// The fraction of tags that are found elsewhere, by up to 20 px.
     pub outliers: f64,
 }
 

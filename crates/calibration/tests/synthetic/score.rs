@@ -19,7 +19,7 @@ pub struct Score {
     pub turned_px: f64,
     /// The squared error of all intrinsics by their covariance, by their number: 1 where the covariance is honest.
     pub nees: f64,
-    /// The share of projections that are within one, and within 1.96, standard deviations along an axis.
+    /// The fraction of projections that are within one, and within 1.96, standard deviations along an axis.
     pub within: [f64; 2],
 }
 

@@ -1,4 +1,4 @@
-//! Ellipses among the outlines of regions, complete or in arcs: circles seen at an angle.
+//! Finds ellipses among the outlines of regions, complete or in arcs: circles seen at an angle.
 
 use std::f64::consts::TAU;
 

@@ -1,4 +1,4 @@
-//! The quads among the closed outlines of an image, for all families of square markers.
+//! Finds the quads among the closed outlines of an image, for all families of square markers.
 
 use imaging::{GrayView, Outlines};
 

@@ -1,4 +1,4 @@
-//! Rings in an image.
+//! Finds rings in an image.
 
 use geometry::Pixel;
 use imaging::Ellipse;

@@ -1,4 +1,4 @@
-//! The radial profile test: whether an ellipse, taken for one of the marker's circles, has the marker's bands
+//! Tests the radial profile: whether an ellipse, taken for one of the marker's circles, has the marker's bands
 //! around it.
 
 use std::f64::consts::TAU;
@@ -11,7 +11,7 @@ use crate::candidates::ellipses::EllipseCandidate;
 
 /// Smaller differences between bands, in grey levels, are noise.
 pub(crate) const MIN_STEP: f64 = 6.0;
-/// Minimum contrast between neighbouring bands, as a share of the brighter one.
+/// Minimum contrast between neighbouring bands, as a fraction of the brighter one.
 const MIN_STEP_RATIO: f64 = 0.12;
 /// Radii at which the bands are sampled and their widths, in marker sizes, from outside; white and black in
 /// turn.
@@ -20,7 +20,7 @@ const BANDS: [(f64, f64); 7] =
 /// Radius at which the white around the dot is sampled where the dot is large enough to be seen.
 const NEAR_DOT: f64 = 0.055;
 const RAYS: u32 = 32;
-/// Minimum share of neighbouring bands that differ as in the marker.
+/// Minimum fraction of neighbouring bands that differ as in the marker.
 pub(crate) const MIN_SCORE: f64 = 0.55;
 /// The same for white rings on black, which any hole in something dark resembles.
 const MIN_WHITE_ON_BLACK_SCORE: f64 = 0.8;
@@ -34,9 +34,9 @@ pub(crate) struct RingCandidate {
     /// The circle's radius in marker sizes.
     pub(crate) radius: f64,
     pub(crate) white_on_black: bool,
-    /// The share of the profile that is as it should be, from 0 to 1.
+    /// The fraction of the profile that is as it should be, from 0 to 1.
     pub(crate) score: f64,
-    /// Mean contrast of the bands, as a share of the brighter one.
+    /// Mean contrast of the bands, as a fraction of the brighter one.
     pub(crate) contrast: f64,
 }
 
@@ -79,7 +79,7 @@ pub(crate) fn add_ring_candidates(
     }
 }
 
-/// The grey value on a ray through a point `on` the ellipse, at this share of the distance.
+/// The grey value on a ray through a point `on` the ellipse, at this fraction of the distance.
 #[inline]
 fn sample(view: GrayView<'_>, centre: [f64; 2], on: [f64; 2], share: f64) -> Option<f64> {
     let along = |axis: usize| centre[axis] + (on[axis] - centre[axis]) * share;

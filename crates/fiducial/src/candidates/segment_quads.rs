@@ -135,15 +135,15 @@ const MAX_ASPECT: f32 = 4.0;
 
 /// Largest number of sides looked at beyond hidden corners.
 const MAX_LOOKS: usize = 200_000;
-/// Quads with two hidden corners: smallest length of the sides next to these, in pixels, largest ratio of two sides, and smallest
-/// share of the perimeter that is visible.
+/// Quads with two hidden corners: smallest length of the sides next to these, in pixels, largest ratio of two sides, and
+/// smallest share of the perimeter that is visible.
 const MIN_OPPOSITE_PX: f32 = 8.0;
 const MAX_HIDDEN_ASPECT: f32 = 2.5;
 const MIN_HIDDEN_VISIBLE: f32 = 0.65;
 /// How far hidden corners are searched, over the length of the longest side that is seen.
 const MAX_STRETCH: f32 = 1.3;
-/// Their border is looked at in twelve places, so deep inside of the quad and as far outside, as a share of its size; in so many of
-/// them it must stand out.
+/// Their border is looked at in twelve places, so deep inside of the quad and as far outside, as a fraction of its size; in so
+/// many of them it must stand out.
 const BORDER_DEPTH: f32 = 0.06;
 const MIN_BORDER_PLACES: usize = 7;
 

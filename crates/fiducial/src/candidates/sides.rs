@@ -1,4 +1,4 @@
-//! The straight sides of quads: segments, or several in one line, and their look-up by place.
+//! Finds the straight sides of quads, segments or several in one line, and looks them up by position.
 
 use imaging::Segment;
 

@@ -532,8 +532,8 @@ fn decode_with_erasures(
     if best.hamming > max_hamming || best.second <= best.hamming {
         return None;
     }
-    // In some families two ids differ in one or two bits: a reading that equals another one exactly is that one, even if not looked for,
-    // and where those bits are erased it may be either.
+    // In some families two ids differ in one or two bits: a reading that equals another one exactly is that one, even if not
+    // looked for, and where those bits are erased it may be either.
     let may_be_other = erased > 0 && code.min_hamming <= 2;
     if ids.is_some() && (best.hamming > 0 || may_be_other) {
         let all = of_all();

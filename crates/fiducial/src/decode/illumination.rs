@@ -1,4 +1,4 @@
-//! The illumination of a marker: one light, two on the sides of a shadow's edge, or one with a reflection.
+//! Estimates the illumination of a marker: one light, two on the sides of a shadow's edge, or one with a reflection.
 //!
 //! The cells that are known to be black or white, of the border and the quiet zone, determine it. By it every
 //! other grey value is judged.

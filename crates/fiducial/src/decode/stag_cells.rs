@@ -2,8 +2,8 @@
 //! codeword explains them.
 //!
 //! Where a dot is hardly wider than a pixel, a pixel shows several of them: the sum of the dots' values, weighted by their
-//! fractions of it through the blur. All that is always black is one more unknown, all that is always white another. The sums of
-//! the solution also give how well any codeword explains the pixels, even where dots cannot be distinguished from their
+//! fractions of it through the blur. All that is always black is one more unknown, all that is always white another. The sums
+//! of the solution also give how well any codeword explains the pixels, even where dots cannot be distinguished from their
 //! neighbours.
 
 use imaging::GrayView;
@@ -38,7 +38,7 @@ const BEYOND_PX: f64 = -0.4;
 /// Prior that pulls dots to the middle of black and white, as a fraction of a pixel's weight.
 const PRIOR: f64 = 0.05;
 
-/// The at most four unknowns that a small cell belongs to, with their shares.
+/// The at most four unknowns that a small cell belongs to, with their fractions.
 type Parts = [(u8, f32); 4];
 
 /// The normal equations of the dots, and their solution.
@@ -72,7 +72,7 @@ impl Default for Dots {
     }
 }
 
-/// The largest four shares of a small cell.
+/// The largest four fractions of a small cell.
 fn parts_of(cell: [usize; 2], dots: &[[f64; 2]; DOTS]) -> Parts {
     let mut counts = [0_usize; UNKNOWNS];
     let place = |cell: usize, sample: usize| {
@@ -91,7 +91,7 @@ fn parts_of(cell: [usize; 2], dots: &[[f64; 2]; DOTS]) -> Parts {
         *part = (unknown as u8, *count as f32 / (SAMPLES * SAMPLES) as f32);
         *count = 0;
     }
-    // Smaller shares are given to these.
+    // Smaller fractions are given to these.
     let kept: f32 = parts.iter().map(|(_, share)| share).sum();
     parts.map(|(unknown, share)| (unknown, share / kept))
 }
@@ -156,7 +156,7 @@ impl Dots {
         for (j, down) in rows.each() {
             for (i, along) in columns.each() {
                 let weight = down * along;
-                // The largest shares come first; most small cells belong to one unknown.
+                // The largest fractions come first; most small cells belong to one unknown.
                 let parts = &self.parts[j * ACROSS + i];
                 for (unknown, share) in parts.iter().take_while(|(_, share)| *share > 0.0) {
                     let slot = &mut weights[usize::from(*unknown)];
@@ -245,7 +245,7 @@ impl Dots {
         }
     }
 
-    /// An unknown's share of all pixels together.
+    /// An unknown's fraction of all pixels together.
     fn light(&self, unknown: usize) -> f64 {
         let row: f64 = (0..=unknown).map(|k| self.normal[(unknown, k)]).sum();
         let column: f64 = (unknown + 1..UNKNOWNS).map(|k| self.normal[(k, unknown)]).sum();
@@ -253,7 +253,7 @@ impl Dots {
     }
 }
 
-/// The shares of a pixel's light from small cells in a row.
+/// The fractions of a pixel's light from small cells in a row.
 struct Shares {
     first: usize,
     count: usize,

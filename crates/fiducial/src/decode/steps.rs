@@ -33,9 +33,9 @@ const MAX_COST: f32 = 0.25;
 const MIN_BIT_COST: f32 = 0.2;
 /// Smallest fraction of the border's edges that show a step.
 const MIN_INTACT: f32 = 0.7;
-/// Largest cost of a codeword, as a fraction of that of edges without information, with strong evidence and with weak. In a thousand
-/// scenes of clutter and man-made circles no quad with these bounds showed a codeword; without a margin, and with evidence of 6 bits, 49
-/// did, all of them windows that look like one and the same codeword.
+/// Largest cost of a codeword, as a fraction of that of edges without information, with strong evidence and with weak. In a
+/// thousand scenes of clutter and man-made circles no quad with these bounds showed a codeword; without a margin, and with
+/// evidence of 6 bits, 49 did, all of them windows that look like one and the same codeword.
 const MAX_RESIDUAL: f32 = 0.25;
 const MAX_RESIDUAL_WEAK: f32 = 0.2;
 /// Smallest evidence, in bits, and the evidence from which on it is strong.

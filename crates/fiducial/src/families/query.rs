@@ -21,7 +21,7 @@ const SEGMENT_CORNER_RATIO: f64 = 0.015;
 /// thousands is so by chance.
 const MIN_MISFIT: f64 = 4.0;
 
-/// Largest reprojection error of a square, in pixels or as a share of its diagonal, whichever is larger: bent paper and
+/// Largest reprojection error of a square, in pixels or as a fraction of its diagonal, whichever is larger: bent paper and
 /// rolling shutters stay below.
 const MAX_MISFIT_PX: f64 = 1.0;
 const MAX_MISFIT_RATIO: f64 = 0.02;

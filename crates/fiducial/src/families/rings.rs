@@ -1,4 +1,4 @@
-//! The detector of the three-ring marker: candidate ellipses, their radial profile, a pose by edges or by grey values, and the
+//! Detects the three-ring marker: candidate ellipses, their radial profile, a pose by edges or by grey values, and the
 //! checks that it is one, pass by pass.
 //!
 //! Ellipses among the outlines of dark regions ([`imaging::Outlines`], no threshold needed), complete or in

@@ -1,4 +1,4 @@
-//! The thesis' detector of the three-ring marker to the letter (section 3.1, Algorithms 1 to 15): bilateral
+//! Implements the thesis' detector of the three-ring marker exactly (section 3.1, Algorithms 1 to 15): bilateral
 //! filter, threshold, contours, valid ellipses, rings of equal orientation.
 //!
 //! Kept as a baseline. Its weakness is [`two_have_equal_orientation`]: seen head-on the ellipses are circles,
@@ -33,7 +33,7 @@ pub const T_ECCENTRICITY: f64 = 0.2;
 pub const T_ORIENTATION: f64 = 20.0 * PI / 180.0;
 /// Tolerance of the ratio of axes (Algorithm 5).
 pub const T_TYPE: f64 = 0.1;
-/// Minimum share of black pixels in a ring (Algorithm 6).
+/// Minimum fraction of black pixels in a ring (Algorithm 6).
 pub const T_BLACK: f64 = 0.8;
 
 /// Bounds on the time for any image, which the thesis does not have; far above the needs of its frames.
@@ -438,7 +438,7 @@ fn observe(rings: &[Ring], marker: &Marker, camera: Option<&CameraModel>) -> Obs
     }
 }
 
-/// Standard deviation of the centre in pixels, and the part from the perspective of tilted rings, as a share
+/// Standard deviation of the centre in pixels, and the part from the perspective of tilted rings, as a fraction
 /// of their size. The thesis' method estimates neither; these are upper bounds of the errors measured in
 /// renderings.
 const CENTRE_ERROR_PX: f64 = 0.1;

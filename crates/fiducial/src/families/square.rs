@@ -1,4 +1,4 @@
-//! The detector of AprilTag and ArUco markers: quads, also of tags in a grid, their cells, the codeword with its false-positive rate,
+//! Detects AprilTag and ArUco markers: quads, also of tags in a grid, their cells, the codeword with its false-positive rate,
 //! refined corners and pose; fallbacks for hidden and small ones.
 //!
 //! Fallbacks read quads of segments, of which a part may be hidden, and the quiet zones of markers whose border blur or a tone curve
@@ -30,8 +30,8 @@ use crate::refine::pattern::Pattern;
 use crate::schedule::FallbackStep;
 use crate::trace::{Reason, Trace};
 
-/// Bounds on the work in one image, far above the needs of frames with markers: layouts that are solved for in quads that are no
-/// markers, and markers, of which a calibration board has hundreds.
+/// Bounds on the work in one image, far above the needs of frames with markers: layouts that are solved for in quads that are
+/// no markers, and markers, of which a calibration board has hundreds.
 const MAX_SOLVED: usize = 500;
 const MAX_FOUND: usize = 1024;
 const MAX_DOUBTFUL: usize = 64;

@@ -1,4 +1,4 @@
-//! The detector of STags (a black square, a white disc in it, 48 dots in that): quads, their dots sampled or solved for, the codeword,
+//! Detects STags (a black square, a white disc in it, 48 dots in that): quads, their dots sampled or solved for, the codeword,
 //! the refined square and its pose. STags are those of Benligiray, Topal, Akinlar: "STag: A stable fiducial marker system", Image and
 //! Vision Computing 89, 2019.
 //!

@@ -2,7 +2,8 @@
 //! with derivatives.
 //!
 //! After an unknown monotonic curve and a symmetric kernel a blurred edge has another shape and another position. Both are
-//! those of every other edge between the same black and white, so that a marker that is not small gives both numbers on its own.
+//! those of every other edge between the same black and white, so that a marker that is not small gives both numbers on its
+//! own.
 
 use crate::response::{Measured, ResponseEstimate};
 
@@ -43,8 +44,8 @@ impl CameraResponse {
     pub(crate) const CURVE_PRIOR: Measured = Measured { value: 1.2, deviation: 0.7 };
     /// Unsharp masks of consumer cameras have about 0.2 to 0.6.
     pub(crate) const SHARPENING_PRIOR: Measured = Measured { value: 0.4, deviation: 0.2 };
-    /// The grey level of black ink as a share of white paper's: ink that reflects a twentieth of the light shows a tenth of it
-    /// with a gamma of 1.25, a quarter with sRGB's curve; sharpening lowers it, glare lifts it.
+    /// The grey level of black ink as a fraction of white paper's: ink that reflects a twentieth of the light shows a tenth of
+    /// it with a gamma of 1.25, a quarter with sRGB's curve; sharpening lowers it, glare lifts it.
     pub(crate) const BLACK_PRIOR: Measured = Measured { value: 0.2, deviation: 0.1 };
 
     /// As it is known before a fit.

@@ -1,4 +1,4 @@
-//! The edge spread function: a camera's image of a sharp edge between black and white.
+//! Computes the edge spread function: a camera's image of a sharp edge between black and white.
 
 use std::sync::LazyLock;
 

@@ -1,6 +1,6 @@
-//! Linear gain/offset fit with saturation: black and contrast of an image whose shares of white are known.
+//! Fits gain and offset with saturation: black and contrast of an image whose fractions of white are known.
 
-/// Least-squares line from the share of white that a pixel should see to the grey value it has.
+/// Least-squares line from the fraction of white that a pixel should see to the grey value it has.
 #[derive(Copy, Clone, Debug, Default)]
 struct Exposure {
     n: f64,
@@ -11,7 +11,7 @@ struct Exposure {
 }
 
 impl Exposure {
-    /// Adds a pixel: its share of white, from 0 to 1, and its grey value.
+    /// Adds a pixel: its fraction of white, from 0 to 1, and its grey value.
     fn add(&mut self, white: f64, grey: f64) {
         self.n += 1.0;
         self.white += white;
@@ -20,7 +20,7 @@ impl Exposure {
         self.white_grey += white * grey;
     }
 
-    /// Black, and white minus black, in grey levels; not finite when all pixels have the same share.
+    /// Black, and white minus black, in grey levels; not finite when all pixels have the same fraction.
     fn black_and_contrast(&self) -> [f64; 2] {
         let Self { n, white, white_white, grey, white_grey } = *self;
         let contrast = (n * white_grey - white * grey) / (n * white_white - white * white);

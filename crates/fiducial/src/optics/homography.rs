@@ -1,4 +1,4 @@
-//! The homography from a marker's plane to the image, its inverse and its derivatives.
+//! Computes the homography from a marker's plane to the image, its inverse and its derivatives.
 
 use geometry::homography::PlanePair;
 use imaging::GrayView;

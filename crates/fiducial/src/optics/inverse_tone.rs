@@ -1,4 +1,4 @@
-//! The light that a camera with a tone curve shows as a grey value.
+//! Computes the light that a camera with a tone curve shows as a grey value.
 
 use imaging::GrayView;
 
@@ -38,8 +38,8 @@ impl InverseTone {
         (white > black).then_some(Self { black, white, curve })
     }
 
-    /// The light of a grey value, as the grey value of a linear camera that shows black and white alike. Values beyond them, as a
-    /// brighter place of the quiet zone, counts as black or white.
+    /// The light of a grey value, as the grey value of a linear camera that shows black and white alike. Values beyond them, as
+    /// a brighter place of the quiet zone, counts as black or white.
     fn light(&self, grey: u8) -> f64 {
         let Self { black, white, curve } = *self;
         let shown = ((f64::from(grey) - black) / (white - black)).clamp(0.0, 1.0);

@@ -1,4 +1,4 @@
-//! Levenberg-Marquardt for a few unknowns, on the stack.
+//! Minimises by Levenberg-Marquardt for a few unknowns, on the stack.
 //!
 //! A [`Problem`] gives the normal equations at a point and the point after a step; [`minimise`] solves, damps
 //! and compares. A [`Schedule`] defines the end, the damping and the handling of a step that does not improve.
@@ -72,7 +72,7 @@ pub(crate) struct Damping {
 pub(crate) struct Schedule {
     pub(crate) max_steps: usize,
     pub(crate) damping: Damping,
-    /// A step has settled when it lowers the cost by less than this share of it ...
+    /// A step has settled when it lowers the cost by less than this fraction of it ...
     pub(crate) settled_ratio: f64,
     /// ... and this.
     pub(crate) settled_cost: f64,

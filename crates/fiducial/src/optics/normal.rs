@@ -1,4 +1,4 @@
-//! The standard normal distribution.
+//! Computes the standard normal distribution.
 
 use std::f64::consts::TAU;
 

@@ -47,8 +47,8 @@ const PLAIN_TO_PX: i32 = 12;
 /// Places along the line that are looked at, at most, and at least for a line to be one.
 const MAX_PLACES: usize = 400;
 const MIN_PLACES: usize = 30;
-/// Maximum difference of the step at a place from the median, also as a share of it, and of its place from the line, in pixels; of the places
-/// along the line across the whole image at least this share must be within.
+/// Maximum difference of the step at a place from the median, also as a fraction of it, and of its place from the line, in
+/// pixels; of the places along the line across the whole image at least this fraction must be within.
 const MAX_STEP_OFF: f64 = 0.3;
 const MAX_STEP_SHARE: f64 = 0.6;
 const MAX_PLACE_OFF_PX: f64 = 2.0;
@@ -115,7 +115,7 @@ pub(crate) struct ShadowEdge {
     /// By how much the logarithm of the grey value rises across it, and at how many places that was seen.
     step: f64,
     places: usize,
-    /// The share of the step that is made, at places from the dark side to the bright one.
+    /// The fraction of the step that is made, at places from the dark side to the bright one.
     profile: [f64; PROFILE],
 }
 

@@ -1,4 +1,4 @@
-//! Lens distortion around one marker: between pixels and the ideal image, in which straight lines are
+//! Removes lens distortion around one marker: converts between pixels and the ideal image, in which straight lines are
 //! straight.
 
 use geometry::{CameraModel, Distortion, Pixel, Point};

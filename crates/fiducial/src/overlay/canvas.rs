@@ -1,4 +1,4 @@
-//! A colour image to draw marks on.
+//! Provides a colour image on which marks are drawn.
 
 use std::f64::consts::PI;
 

@@ -1,4 +1,4 @@
-//! Debug images: the three of the thesis (valid ellipses, rings, the marker with the alignment circle), and the quads.
+//! Draws debug images: the three of the thesis (valid ellipses, rings, the marker with the alignment circle), and the quads.
 
 use geometry::Pixel;
 use imaging::GrayView;

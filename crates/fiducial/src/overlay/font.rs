@@ -1,4 +1,4 @@
-//! A font of 5 x 7 dots for images.
+//! Provides a font of 5 x 7 dots for images.
 
 /// The sign of metres, which is small among letters that are drawn as upper case.
 pub const METRES: char = '\u{ff4d}';

@@ -1,4 +1,4 @@
-//! Sub-pixel corners of a square marker, to a hundredth of a pixel.
+//! Measures sub-pixel corners of a square marker, to a hundredth of a pixel.
 //!
 //! All edges of the marker take part, those between its cells as well. There are two refinements. Where cells
 //! are wide, each edge is compared on its own, with its own black and white (`edges`). Where the blur of one

@@ -1,4 +1,4 @@
-//! Refinement along the edges of a larger marker, each edge in its own light.
+//! Refines a larger marker along its edges, each edge in its own light.
 //!
 //! At samples along every edge, the pixels across it are compared with the profile of a blurred step. Black
 //! and white belong to the sample, so that neither a gradient of the light nor the edge of a shadow moves
@@ -504,7 +504,7 @@ impl EdgeFit<'_> {
         let pixel_kurtosis = pixel_kurtosis(edge.normal, self.spread_px * self.spread_px);
         let mut model = [[0.0; 3]; MAX_PIXELS];
         let count = pixels.len() as f64;
-        // Sums for the linear regression of grey values on the share of white, and for its derivatives.
+        // Sums for the linear regression of grey values on the fraction of white, and for its derivatives.
         let (mut sf, mut sff, mut sg, mut sfg) = (0.0, 0.0, 0.0, 0.0);
         for ([distance, grey], point) in pixels.iter().zip(&mut model) {
             let z = distance / self.spread_px;

@@ -146,7 +146,7 @@ pub(crate) struct SmallCells<'a> {
     /// Cells across the square, and around it on each side.
     pub(crate) across: usize,
     pub(crate) margin: usize,
-    /// The share of white in each, row by row, those around the square included.
+    /// The fraction of white in each, row by row, those around the square included.
     pub(crate) white: &'a [f64],
 }
 

@@ -1,4 +1,4 @@
-//! Photometric refinement of a small square marker: the predicted grey value of every pixel is compared with the
+//! Refines a small square marker photometrically: the predicted grey value of every pixel is compared with the
 //! image.
 
 use nalgebra::{SMatrix, SVector};
@@ -33,7 +33,7 @@ struct MinResponse {
 const MIN_RESPONSE: MinResponse = MinResponse { gain: 0.15, response: 0.2 };
 /// The same where an outline was fitted alone, of which a weak tone curve changes the size as well; sharpening moves no edge.
 const MIN_RESPONSE_OF_OUTLINE: MinResponse = MinResponse { gain: 0.05, response: 0.1 };
-/// The form of a camera's tone curve is not quite the model's: each side of an STag may be off by this share of curve
+/// The form of a camera's tone curve is not quite the model's: each side of an STag may be off by this fraction of curve
 /// times blur, so that it looks larger or smaller; of codes of square cells edges of both senses hold the size. From `positions` of seed 7 in `raspberry-pi`,
 /// where STags were too small by 0.025 px beyond their noise.
 const CURVE_FORM_ERROR: f64 = 0.006;

@@ -1,8 +1,8 @@
-//! The predicted grey values of a marker: the share of white at a point of the image, and its derivatives.
+//! Predicts the grey values of a marker: the fraction of white at a point of the image, and its derivatives.
 //!
 //! The edges of all cells are predicted together, since through the blur of lens and pixels a cell of two pixels
 //! never shows its own black or white. In the square's coordinates the blur is a Gaussian whose axes are oblique
-//! because of the perspective. A cell's share of it is the product of two differences of edge responses, with the
+//! because of the perspective. A cell's fraction of it is the product of two differences of edge responses, with the
 //! terms of Mehler's series for the effect of the obliqueness where edges cross.
 
 use geometry::Pixel;
@@ -18,7 +18,7 @@ use crate::refine::pattern::{MAX_CELLS, Pattern};
 const MIN_PIXELS: usize = 28;
 /// Largest number of columns or rows of cells within the blur's reach.
 const MAX_BANDS: usize = 28;
-/// Largest share of a pixel's light from cells of unknown colour, and from beyond the pattern.
+/// Largest fraction of a pixel's light from cells of unknown colour, and from beyond the pattern.
 const MAX_UNKNOWN: f64 = 0.03;
 const MAX_BEYOND: f64 = 0.1;
 
@@ -53,7 +53,7 @@ pub(crate) struct PatternGrid<'a> {
     /// Cells from the middle to the square's side, and to the pattern's end.
     half: f64,
     middle: f64,
-    /// The share of white in each cell, row by row.
+    /// The fraction of white in each cell, row by row.
     white: &'a [f64],
     /// The same of unknown colour; empty where all are known.
     unknown: &'a [f64],
@@ -66,7 +66,7 @@ pub(crate) struct PatternGrid<'a> {
     response: EdgeResponse,
 }
 
-/// The shares of a blurred point's light that come from each column (or row) of cells, with the factors of
+/// The fractions of a blurred point's light that come from each column (or row) of cells, with the factors of
 /// their first and second derivatives, in units of the blur.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Bands {
@@ -88,7 +88,7 @@ pub(crate) struct Prediction {
     /// By the ideal image point, per pixel.
     pub(crate) by_place: [f64; 2],
     pub(crate) by_spread: f64,
-    /// The share of light from beyond the pattern.
+    /// The fraction of light from beyond the pattern.
     pub(crate) beyond: f64,
 }
 
@@ -364,7 +364,7 @@ impl<'a> PatternGrid<'a> {
         work
     }
 
-    /// The share of a point's light that comes from cells of unknown colour.
+    /// The fraction of a point's light that comes from cells of unknown colour.
     fn unknown_at(&self, point: &BlurredPoint, work: &mut [Bands; 2]) -> f64 {
         if self.unknown.is_empty() {
             return 0.0;
@@ -384,7 +384,7 @@ impl<'a> PatternGrid<'a> {
         sum
     }
 
-    /// The share of a point's light that comes from beyond the pattern.
+    /// The fraction of a point's light that comes from beyond the pattern.
     #[inline]
     fn beyond(&self, point: &BlurredPoint) -> f64 {
         let size = self.across as f64;

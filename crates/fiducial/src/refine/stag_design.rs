@@ -1,4 +1,4 @@
-//! The design of an STag for the refinement: small cells with their share of white, and edges.
+//! Defines the design of an STag for the refinement: small cells with their fraction of white, and edges.
 
 use markers::stag_code::{DISC_RADIUS, QUIET_ZONE};
 use markers::{Drawing, Family, Ink, Marker, Shape};
@@ -30,7 +30,7 @@ const RIM: f64 = 0.1;
 pub(crate) struct StagDesign {
     pub(crate) family: Family,
     pub(crate) id: u32,
-    /// The share of white in each cell, row by row, for each width of the cells.
+    /// The fraction of white in each cell, row by row, for each width of the cells.
     white: [Vec<f64>; SCALES],
     /// For black on white, and for white on black.
     edges: [Vec<[[f64; 2]; 2]>; 2],
@@ -73,7 +73,7 @@ const fn margin(cells: usize) -> usize {
     (cells as f64 * QUIET_ZONE) as usize
 }
 
-/// The share of white in each of the narrowest cells.
+/// The fraction of white in each of the narrowest cells.
 fn white(drawing: &Drawing) -> Vec<f64> {
     let mut fine = vec![true; FINE * FINE];
     let per_unit = (FINEST * SAMPLES) as f64;

@@ -1,4 +1,5 @@
-//! A small camera for tests: the marker on textured ground, sampled over each pixel's area, with lens blur and noise.
+//! Renders a small camera's frames for tests: the marker on textured ground, sampled over each pixel's area, with lens blur and
+//! noise.
 #![allow(dead_code, reason = "each test uses its own part of it")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop anywhere")]
 

@@ -1,4 +1,4 @@
-//! Errors of refined corners over many scenes.
+//! Collects errors of refined corners over many scenes.
 
 use std::time::Instant;
 
@@ -23,7 +23,7 @@ pub(crate) struct Errors {
     pub(crate) size: Vec<f64>,
     /// Squared errors of the corners in units of their covariance; 8 on average.
     pub(crate) normalised: Vec<f64>,
-    /// Of the pose's range, as a share.
+    /// Of the pose's range, as a fraction.
     pub(crate) range: Vec<f64>,
     pub(crate) corner_px: Vec<f64>,
     pub(crate) blur_px: Vec<f64>,

@@ -1,6 +1,6 @@
-//! An exact renderer for tests: pictures of square markers whose edges lie where they should to a few thousandths of a pixel: along each of many
-//! lines through a pixel the edges are found exactly, and the pixel's box and the lens' Gaussian are integrated in closed
-//! form.
+//! Renders exactly for tests: pictures of square markers whose edges lie where they should to a few thousandths of a pixel:
+//! along each of many lines through a pixel the edges are found exactly, and the pixel's box and the lens' Gaussian are
+//! integrated in closed form.
 #![allow(dead_code, reason = "each test uses its own part of it")]
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the tests print their figures")]
@@ -33,7 +33,7 @@ pub(crate) struct Scene {
     pub(crate) read_noise: f64,
     pub(crate) shot_noise: f64,
     pub(crate) seed: u64,
-    /// A straight shadow through the marker's middle takes this share of the light, over an edge two pixels wide.
+    /// A straight shadow through the marker's middle takes this fraction of the light, over an edge two pixels wide.
     pub(crate) shadow: f64,
     /// A grey patch hides the marker's first corner and a quarter of two of its sides.
     pub(crate) covered: bool,
@@ -223,7 +223,7 @@ impl Scene {
     }
 }
 
-/// The share of a line's light that a pixel `distance` rows away takes, per row.
+/// The fraction of a line's light that a pixel `distance` rows away takes, per row.
 fn pixel_share(distance: f64, blur: f64) -> f64 {
     normal((distance + 0.5) / blur) - normal((distance - 0.5) / blur)
 }

@@ -1,4 +1,4 @@
-//! Drawings of markers of square cells.
+//! Draws markers of square cells.
 
 use super::cover;
 use super::{Drawing, Ink, Layer, Shape};

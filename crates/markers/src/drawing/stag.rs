@@ -1,4 +1,4 @@
-//! Drawings of STags.
+//! Draws STags.
 
 use super::{Drawing, Ink, Layer, Shape};
 use crate::stag_code::{self, DISC_RADIUS, DOT_RADIUS, DOTS};

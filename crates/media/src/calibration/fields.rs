@@ -1,4 +1,4 @@
-//! From the keys and values of a calibration file of ROS, Kalibr or OpenCV to a camera model and sensor mode, or the key
+//! Converts the keys and values of a calibration file of ROS, Kalibr or OpenCV to a camera model and sensor mode, or the key
 //! that is wrong.
 
 use geometry::{CameraModel, Distortion};

@@ -1,4 +1,4 @@
-//! Modes of a camera: which part of the sensor its images show, and how many pixels of the sensor are one of theirs.
+//! Defines modes of a camera: which part of the sensor its images show, and how many pixels of the sensor are one of theirs.
 
 use geometry::{CameraModel, Roi};
 

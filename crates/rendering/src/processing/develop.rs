@@ -1,4 +1,4 @@
-//! From the light on the sensor, with its noise, to the camera's frame.
+//! Develops the light on the sensor, with its noise, into the camera's frame.
 
 use super::filters::{self, Gaussian};
 use super::jpeg::Jpeg;

@@ -1,4 +1,4 @@
-//! Filters of a few pixels: denoising and blur. The border is continued outwards.
+//! Applies filters of a few pixels: denoising and blur. The border is continued outwards.
 
 /// Half width of a blur, in standard deviations.
 const REACH: f32 = 3.0;

@@ -1,4 +1,4 @@
-//! Local adaptation of brightness.
+//! Adapts the brightness locally.
 
 use super::LocalTone;
 

@@ -1,4 +1,4 @@
-//! The processing of kinds of cameras, by name.
+//! Defines the processing of kinds of cameras, by name.
 
 use std::fmt;
 use std::str::FromStr;

@@ -1,4 +1,4 @@
-//! From linear light to grey levels.
+//! Converts linear light to grey levels with a tone curve.
 
 use serde::{Deserialize, Serialize};
 

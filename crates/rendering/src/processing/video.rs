@@ -2,11 +2,13 @@
 //! residual transformed and quantised, the edges deblocked.
 //!
 //! Only residuals larger than the quantiser's step are sent. So parts of a picture stay as they were, move with their
-//! surroundings, or are coded again, which no compression of single pictures shows. Motion compensation, the transform of 4 x 4 residuals,
-//! the quantiser and the deblocking filter are those of the format (ITU-T H.264); the free choices of an encoder are those of fast ones: one motion vector for each macroblock, found by descending the sum of absolute differences, intra prediction of whole macroblocks
-//! and of 4 x 4 blocks in five of its nine modes, and no blocks of single small levels. Left out are the coding of the numbers, which loses
-//! nothing, chroma, partitions, the transforms of 8 x 8 pixels and of the mean levels of a macroblock, the pixels above right of a block,
-//! and the control of the rate: the quantiser is the same everywhere. Fewer pixels stay as they were than with x264.
+//! surroundings, or are coded again, which no compression of single pictures shows. Motion compensation, the transform of 4 x 4
+//! residuals, the quantiser and the deblocking filter are those of the format (ITU-T H.264); the free choices of an encoder are
+//! those of fast ones: one motion vector for each macroblock, found by descending the sum of absolute differences, intra
+//! prediction of whole macroblocks and of 4 x 4 blocks in five of its nine modes, and no blocks of single small levels. Left
+//! out are the coding of the numbers, which loses nothing, chroma, partitions, the transforms of 8 x 8 pixels and of the mean
+//! levels of a macroblock, the pixels above right of a block, and the control of the rate: the quantiser is the same
+//! everywhere. Fewer pixels stay as they were than with x264.
 
 mod deblock;
 mod plane;
@@ -40,11 +42,12 @@ const KEY_FRAME_FINER: u8 = 3;
 /// Steps of the search for a motion: by two pixels, and then by each of these, in quarters.
 const MAX_STEPS: usize = 24;
 const FINER: [i32; 3] = [4, 2, 1];
-/// Residuals of lower cost are not coded, of a quarter of a macroblock and of the whole (thresholds on the cost of coefficients, as in x264).
+/// Residuals of lower cost are not coded, of a quarter of a macroblock and of the whole (thresholds on the cost of
+/// coefficients, as in x264).
 const MIN_WORTH_OF_QUARTER: u32 = 4;
 const MIN_WORTH: u32 = 6;
-/// Cost of coding how a macroblock is predicted, in bits: from the previous picture without its motion, from its neighbours as a whole,
-/// and block by block.
+/// Cost of coding how a macroblock is predicted, in bits: from the previous picture without its motion, from its neighbours as
+/// a whole, and block by block.
 const BITS_INTER: u32 = 1;
 const BITS_INTRA: u32 = 8;
 const BITS_INTRA_BLOCKS: u32 = 64;
@@ -334,8 +337,8 @@ fn place_in_macroblock(part: usize, at: usize) -> usize {
     (part / 4 * 4 + at / 4) * MACROBLOCK + part % 4 * 4 + at % 4
 }
 
-/// The approximate cost of predicting the blocks of a macroblock one by one: from the pixels of the picture itself, as the coded
-/// ones are not known before.
+/// The approximate cost of predicting the blocks of a macroblock one by one: from the pixels of the picture itself, as the
+/// coded ones are not known before.
 fn blocks_cost(block: &[u8; 256], source: &Plane, x: usize, y: usize) -> u32 {
     (0..16)
         .map(|part| {

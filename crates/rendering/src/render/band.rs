@@ -1,4 +1,4 @@
-//! A row of tiles on its way to pixels: how much paint covers the ground, and its light.
+//! Combines a row of tiles into pixels: how much paint covers the ground, and its light.
 
 use super::painter::Channels;
 use super::painting::Paint;

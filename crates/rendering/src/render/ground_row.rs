@@ -1,4 +1,4 @@
-//! The ground and the sky, row by row.
+//! Renders the ground and the sky, row by row.
 
 use geometry::{Camera, Ned, Transform};
 

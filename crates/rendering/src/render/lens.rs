@@ -1,4 +1,4 @@
-//! The direction of each pixel for the renderer, exact or from a table for a distorting lens, linear about a
+//! Computes the direction of each pixel for the renderer, exact or from a table for a distorting lens, linear about a
 //! tile; and the blur of lens and pixel area.
 
 use geometry::{CameraModel, Distortion, Pixel};

@@ -510,8 +510,8 @@ impl Outlines {
         }
     }
 
-    /// Multiplies the coverage with that of a strip between two nearly parallel edges. The part of the kernel beyond one edge is
-    /// completely behind the other, so the strip has the sum of both coverages, less one.
+    /// Multiplies the coverage with that of a strip between two nearly parallel edges. The part of the kernel beyond one edge
+    /// is completely behind the other, so the strip has the sum of both coverages, less one.
     fn strip_row(
         &self,
         plane: &HalfPlane,

@@ -1,4 +1,4 @@
-//! The paintings of a scene: its pads, and painted marks that are not markers.
+//! Makes the paintings of a scene: its pads, and painted marks that are not markers.
 
 use geometry::{Marker as MarkerFrame, Ned, Point, Rotation, Transform};
 use markers::{Ink, Shape};

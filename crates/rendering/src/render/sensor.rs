@@ -1,4 +1,4 @@
-//! From light to grey levels: vignetting, noise, quantisation.
+//! Converts light to grey levels: vignetting, noise, quantisation.
 
 use geometry::Distortion;
 use rand::SeedableRng;

@@ -1,4 +1,4 @@
-//! The simulated autopilot's handling of received MAVLink packets: commands and their acknowledgements, modes,
+//! Handles the MAVLink packets that the simulated autopilot receives: commands and their acknowledgements, modes,
 //! arming, intervals, parameters, setpoints, landing targets.
 
 use autopilot::dialect::{

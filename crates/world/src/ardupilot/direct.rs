@@ -1,4 +1,4 @@
-//! Reports and commands without packets, for a caller in the same process.
+//! Gives reports and takes commands without packets, for a caller in the same process.
 
 use geometry::{Body, Ned, Point, Rotation, Vector};
 

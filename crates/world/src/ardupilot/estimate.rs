@@ -1,4 +1,4 @@
-//! The simulated autopilot's estimate of the motion: the truth with slow errors of position, height, velocity,
+//! Computes the simulated autopilot's estimate of the motion: the truth with slow errors of position, height, velocity,
 //! tilt and heading, a wandering tilt, GNSS drift and jumps.
 
 use rand_chacha::ChaCha8Rng;

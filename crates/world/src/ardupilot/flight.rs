@@ -1,4 +1,4 @@
-//! The simulated autopilot's decisions: flight modes, arming and disarming, take-off, velocity setpoints and
+//! Implements the simulated autopilot's decisions: flight modes, arming and disarming, take-off, velocity setpoints and
 //! their timeout, LAND, contact with the ground.
 
 use rand_chacha::ChaCha8Rng;

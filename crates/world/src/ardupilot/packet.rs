@@ -1,4 +1,4 @@
-//! Messages that take more than the dialect's types: texts in parts, and acknowledgements of any number.
+//! Composes messages that need more than the dialect's types: texts in parts, and acknowledgements of any number.
 
 use autopilot::Sender;
 use autopilot::dialect::{

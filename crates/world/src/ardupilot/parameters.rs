@@ -1,4 +1,4 @@
-//! The few parameters that the simulated autopilot obeys, under the names, units and defaults of ArduPilot, and
+//! Defines the few parameters that the simulated autopilot obeys, under the names, units and defaults of ArduPilot, and
 //! one of PX4.
 
 use autopilot::dialect::MavParamType;

@@ -1,4 +1,4 @@
-//! ArduPilot's precision landing, as far as it was measured: it accepts a target after 2 s of reports without
+//! Implements ArduPilot's precision landing, as far as it was measured: it accepts a target after 2 s of reports without
 //! gaps, and moves over it while LAND descends.
 
 /// Minimum time of reports, and the longest gap between them, in seconds.

@@ -1,9 +1,9 @@
 //! Simulates the same vehicle under PX4's rules, taken from its documentation: modes by two numbers,
 //! OFFBOARD only with a stream of setpoints before and during
-//! (<https://docs.px4.io/main/en/flight_modes/offboard.html>), a takeoff to an altitude over the sea, a heartbeat with the mode once a
-//! second, and events with the checks before arming that fail: after a change and on request. Measured with 1.17 in its own
-//! simulation: CURRENT_MODE, if it is requested, with each change and twice a second, the former mode once more after an accepted request,
-//! and OFFBOARD again when the motors stop after a landing.
+//! (<https://docs.px4.io/main/en/flight_modes/offboard.html>), a takeoff to an altitude over the sea, a heartbeat with the mode
+//! once a second, and events with the checks before arming that fail: after a change and on request. Measured with 1.17 in its
+//! own simulation: CURRENT_MODE, if it is requested, with each change and twice a second, the former mode once more after an
+//! accepted request, and OFFBOARD again when the motors stop after a landing.
 
 use autopilot::FlightMode;
 use autopilot::dialect::{

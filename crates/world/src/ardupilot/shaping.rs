@@ -1,4 +1,4 @@
-//! ArduPilot's smoothing of setpoints: velocities become accelerations within limits of acceleration and
+//! Implements ArduPilot's smoothing of setpoints: velocities become accelerations within limits of acceleration and
 //! jerk.
 
 use crate::laws::square_root_law;

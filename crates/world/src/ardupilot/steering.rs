@@ -1,4 +1,4 @@
-//! The simulated autopilot's position controller (ArduPilot's `AC_PosControl` with its default gains): from a
+//! Implements the simulated autopilot's position controller (ArduPilot's `AC_PosControl` with its default gains): from a
 //! commanded motion to tilt, thrust and heading.
 
 use std::f64::consts::TAU;

@@ -1,5 +1,5 @@
-//! The simulated autopilot's MAVLink messages (attitude, positions, battery, estimator status, true state), each composed when
-//! it is due at its requested interval.
+//! Composes the simulated autopilot's MAVLink messages (attitude, positions, battery, estimator status, true state), each
+//! composed when it is due at its requested interval.
 
 use autopilot::FlightMode;
 use autopilot::dialect::{

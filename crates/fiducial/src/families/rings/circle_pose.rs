@@ -1,5 +1,5 @@
-//! The pose of concentric circles: two in closed form from an ellipse, the best by least squares from edge points, with covariance,
-//! tilt and its mirrored twin.
+//! Estimates the pose of concentric circles: two in closed form from an ellipse, the best by least squares from edge points,
+//! with covariance, tilt and its mirrored twin.
 
 use std::f64::consts::{PI, TAU};
 use std::ops::AddAssign;

@@ -12,7 +12,7 @@ const DIAMETERS_PX: std::ops::Range<f64> = 24.0..120.0;
 const DOT: [f64; 2] = [0.01, 0.03];
 /// Standard deviation of the blur of a lens in focus and the pixels, in pixels.
 const BLUR_PX: f64 = 0.8;
-/// Minimum depth of the dot as a share of a sharp image's. Out of focus it is a quarter; a white middle has none.
+/// Minimum depth of the dot as a fraction of a sharp image's. Out of focus it is a quarter; a white middle has none.
 const MIN_DEPTH: f64 = 0.15;
 
 impl EdgeSearch<'_> {

@@ -11,7 +11,7 @@ use crate::candidates::ring_profile::MIN_STEP;
 use crate::families::family::{PredictedShape, Prediction};
 use crate::families::rings::circle_pose::{CirclePose, EdgePoint, project};
 
-/// Minimum share of the visible places of an edge at which it is found: a third may be hidden.
+/// Minimum fraction of the visible places of an edge at which it is found: a third may be hidden.
 const MIN_EDGE_SHARE: f64 = 0.5;
 /// The same of an edge that is plain to see.
 const CLEAR_SHARE: f64 = 0.8;
@@ -30,7 +30,7 @@ pub(super) struct EdgeSearch<'a> {
     pub(super) camera: &'a CameraModel,
     /// The marker's size in metres.
     pub(super) size_m: f64,
-    /// Minimum contrast across an edge, as a share of the brighter side.
+    /// Minimum contrast across an edge, as a fraction of the brighter side.
     pub(super) min_contrast: f64,
     pub(super) white_on_black: bool,
     /// How far a camera's processing moves edges into the black, in pixels.
@@ -153,8 +153,8 @@ impl EdgeSearch<'_> {
         support
     }
 
-    /// Which edges are there at a pose. Edges that clutter shows as well are too few unless a marker is tracked there: one ring of
-    /// the two large ones, three circles of which the middle is beyond the frame, white rings on black with gaps.
+    /// Which edges are there at a pose. Edges that clutter shows as well are too few unless a marker is tracked there: one ring
+    /// of the two large ones, three circles of which the middle is beyond the frame, white rings on black with gaps.
     pub(super) fn completeness(
         &self,
         pose: &CirclePose,
@@ -409,7 +409,7 @@ impl Completeness {
     }
 }
 
-/// The mean share of the visible edges, from 0 to 1, reduced when few are visible.
+/// The mean fraction of the visible edges, from 0 to 1, reduced when few are visible.
 pub(super) fn confidence(support: &[EdgeSupport; 6]) -> f64 {
     let shares = support.iter().filter_map(EdgeSupport::share);
     let (count, sum) = shares.fold((0.0, 0.0), |(count, sum), share| (count + 1.0, sum + share));

@@ -1,4 +1,4 @@
-//! The focal length of an unknown camera, from a tilted marker.
+//! Estimates the focal length of an unknown camera from a tilted marker.
 
 use geometry::CameraModel;
 use imaging::GrayView;

@@ -1,5 +1,5 @@
-//! From a candidate circle to the three-ring marker or a refusal: its pose by edges or by grey values, the mirrored pose, covariance, and how it
-//! differs from targets and clutter.
+//! Measures a candidate circle as the three-ring marker, or refuses it: its pose by edges or by grey values, the mirrored pose,
+//! covariance, and how it differs from targets and clutter.
 
 use markers::RingKind;
 use nalgebra::Matrix6;
@@ -14,10 +14,10 @@ use crate::optics::camera_response::CameraResponse;
 use crate::response::ResponseEstimate;
 use crate::trace::Reason;
 
-/// Maximum photometric residual, as a share of the contrast. Something else in the image, such as a shadow's
+/// Maximum photometric residual, as a fraction of the contrast. Something else in the image, such as a shadow's
 /// edge, exceeds it.
 const MAX_RESIDUAL: f64 = 0.074;
-/// Minimum share of the variance that the model explains, by the marker's diameter. Inside a small marker's
+/// Minimum fraction of the variance that the model explains, by the marker's diameter. Inside a small marker's
 /// rim it is higher; with a tiny one, light from beyond the paper counts.
 const MIN_R_SQUARED: f64 = 0.95;
 const MIN_R_SQUARED_SMALL: f64 = 0.99;
@@ -31,13 +31,13 @@ const MIN_R_SQUARED_PROCESSED: f64 = 0.985;
 const MIN_R_SQUARED_PROCESSED_SMALL: f64 = 0.993;
 /// Darkness of the middle ring in units of the outer one where a camera's processing takes part.
 const BALANCE: std::ops::Range<f64> = 0.95..1.05;
-/// Minimum share that is explained of a small marker whose pixels were interpolated from a colour mosaic, up to this diameter in pixels and above
-/// it, ...
+/// Minimum fraction that is explained of a small marker whose pixels were interpolated from a colour mosaic, up to this
+/// diameter in pixels and above it, ...
 const MIN_R_SQUARED_INTERPOLATED: f64 = 0.88;
 const INTERPOLATED_PX: f64 = 20.0;
 const R_SQUARED_INTERPOLATED_PER_PX: f64 = 0.01;
-/// ... where the lens' blur is no larger than this share of the diameter, as rings that are a tenth of it wide run into each other
-/// (markers at the positions of the thesis have 0.058 at most, a target that passed 0.1)
+/// ... where the lens' blur is no larger than this fraction of the diameter, as rings that are a tenth of it wide run into each
+/// other (markers at the positions of the thesis have 0.058 at most, a target that passed 0.1)
 const MAX_BLUR_INTERPOLATED: f64 = 0.06;
 /// (or more than this is explained), ...
 const MIN_R_SQUARED_BLURRED: f64 = 0.975;
@@ -47,11 +47,12 @@ const MIN_CURVE: f64 = -0.1;
 /// ... the image lies below this between the marker (0) and a target of evenly wide rings (1) at two deviations (of other circles
 /// of 10 px and more in 4160 scenes the nearest that passes the other bounds had 0.58), ...
 const MAX_EVENNESS_INTERPOLATED: f64 = 0.4;
-/// ... the radii are known to this share of the marker's radius, and differ from its own by no more than [`MAX_RADII_OFF_CLEAR`] and two
-/// deviations.
+/// ... the radii are known to this fraction of the marker's radius, and differ from its own by no more than
+/// [`MAX_RADII_OFF_CLEAR`] and two deviations.
 const MAX_RADII_DEVIATION_INTERPOLATED: f64 = 0.05;
 const RADII_SIGMAS: f64 = 2.0;
-/// Maximum difference of the radii of other markers from their own, as a share of the radius, with this standard deviation, ...
+/// Maximum difference of the radii of other markers from their own, as a fraction of the radius, with this standard deviation,
+/// ...
 const MAX_RADII_OFF: f64 = 0.028;
 const MAX_RADII_DEVIATION: f64 = 0.03;
 /// ... or this one where the image is below [`MAX_EVENNESS`] at two deviations. A single radius is hardly seen through compression,
@@ -70,7 +71,7 @@ const KNOWN_DEVIATION: f64 = 0.05;
 /// the positions of the thesis the least was 1.89; far away, where blur leaves both alike, of 90 the least was 0.76. Of 72
 /// rendered targets of 9 to 26 px that pass the other bounds 33 have less.
 const MIN_TARGET_COST: f64 = 0.7;
-/// Maximum blackness beyond black of the ink, as a share of the contrast. Halos of sharpening give 0.13.
+/// Maximum blackness beyond black of the ink, as a fraction of the contrast. Halos of sharpening give 0.13.
 const MAX_BLACKNESS: f64 = 0.15;
 /// Minimum diameter in pixels of a marker that is recognised by one ring.
 const MIN_SINGLE_RING_PX: f64 = 90.0;
@@ -580,8 +581,8 @@ fn is_marker_under_edge(fit: &PhotometricFit) -> bool {
         && has_marker_radii(fit)
 }
 
-/// Whether the image is nearer to a target of rings of equal width, as targets are often drawn, than to the marker, or to one of
-/// thin rings, by more than noise explains.
+/// Whether the image is nearer to a target of rings of equal width, as targets are often drawn, than to the marker, or to one
+/// of thin rings, by more than noise explains.
 fn has_other_widths(fit: &PhotometricFit) -> bool {
     fit.radii.is_some_and(|it| {
         let (place, deviation) = (it.evenness, it.evenness_deviation);

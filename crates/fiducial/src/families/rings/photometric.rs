@@ -35,14 +35,14 @@ const EARLY_REJECT_RESIDUAL: [f64; 3] = [0.45, 0.4, 0.35];
 const MIN_EXTRAS_RESIDUAL: f64 = 0.03;
 /// ... and accepted when they lower the cost to this fraction or less.
 const MAX_EXTRAS_COST: f64 = 0.5;
-/// Between this residual and that, a camera's processing is tried when one step lowers the cost by this fraction, and accepted when
-/// the fit does.
+/// Between this residual and that, a camera's processing is tried when one step lowers the cost by this fraction, and accepted
+/// when the fit does.
 const MIN_RESPONSE_RESIDUAL: f64 = 0.008;
 const MIN_RESPONSE_GAIN: f64 = 0.2;
 /// Above this residual a colour mosaic is tried, and accepted when it lowers the cost to this fraction.
 const MIN_MOSAIC_RESIDUAL: f64 = 0.015;
 const MAX_MOSAIC_COST: f64 = 0.8;
-/// It is tried when one step with it costs less than this share of one without it, or, where a tone curve hides that, than
+/// It is tried when one step with it costs less than this fraction of one without it, or, where a tone curve hides that, than
 /// this fraction of the cost before.
 const MAX_MOSAIC_STEP: f64 = 0.85;
 const MAX_PROCESSED_STEP: f64 = 0.25;

@@ -1,8 +1,8 @@
 //! Finds the tags of a calibration grid, each next to one that was found.
 //!
 //! In a grid of Kalibr's (Furgale, Rehder and Siegwart, "Unified temporal and spatial calibration for multi-sensor systems", 2013) black
-//! squares fill the gaps between the corners of the tags. Blur joins them to the tags, so that many tags have no separate outline. Their
-//! positions follow from a neighbour.
+//! squares fill the gaps between the corners of the tags. Blur joins them to the tags, so that many tags have no separate
+//! outline. Their positions follow from a neighbour.
 
 use geometry::Pixel;
 
@@ -17,7 +17,7 @@ use crate::trace::Trace;
 /// The gap between tags, in sides of a tag: Kalibr's default `tagSpacing`.
 const SPACING: f64 = 0.3;
 
-/// Quads are moved to where their cells explain the pixels best, so many in an image, by these shares of their side.
+/// Quads are moved to where their cells explain the pixels best, so many in an image, by these fractions of their side.
 const MAX_ALIGNED_IN_GRID: usize = 24;
 const ALIGNING_IN_GRID: [f64; 4] = [0.03, 0.02, 0.015, 0.01];
 

@@ -1,4 +1,4 @@
-//! The filter across the edges of blocks, which is part of the format (ITU-T H.264, 8.7).
+//! Applies the filter across the edges of blocks, which is part of the format (ITU-T H.264, 8.7).
 
 use super::plane::{MACROBLOCK, Motion, Plane};
 

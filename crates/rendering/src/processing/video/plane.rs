@@ -1,4 +1,4 @@
-//! A coded picture with a margin, and its half and quarter pixels for motion compensation (ITU-T H.264, 8.4.2.2.1).
+//! Holds a coded picture with a margin, and its half and quarter pixels for motion compensation (ITU-T H.264, 8.4.2.2.1).
 
 /// Edge of a macroblock, in pixels.
 pub(super) const MACROBLOCK: usize = 16;

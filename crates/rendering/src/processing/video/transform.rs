@@ -1,4 +1,4 @@
-//! The transform of 4 x 4 residuals and its quantiser (ITU-T H.264, 8.5.12).
+//! Computes the transform of 4 x 4 residuals and its quantiser (ITU-T H.264, 8.5.12).
 
 /// A block of 4 x 4 values, by rows.
 pub(super) type Block = [i32; 16];

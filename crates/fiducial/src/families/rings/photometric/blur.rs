@@ -1,5 +1,5 @@
-//! The whiteness of one pixel of the three-ring marker through the blur of lens, motion and mosaic, from the distribution of
-//! radii about it, with derivatives.
+//! Predicts the whiteness of one pixel of the three-ring marker through the blur of lens, motion and mosaic, from the
+//! distribution of radii about it, with derivatives.
 
 use nalgebra::Vector3;
 
@@ -17,7 +17,7 @@ pub(super) const FREE_RADII: usize = 3;
 
 /// The model's response at one pixel, with its derivatives.
 pub(super) struct PixelResponse {
-    /// The shares of the pixel's light from inside each circle, the outermost first.
+    /// The fractions of the pixel's light from inside each circle, the outermost first.
     pub(super) inside: [f64; 6],
     /// How white the camera shows the pixel, from 0 (black) to 1; sharpened beyond them.
     pub(super) shown: f64,
@@ -135,7 +135,7 @@ pub(super) struct RadiusDistribution {
     /// deviation.
     mean: f64,
     inverse_deviation: f64,
-    /// Derivative of the share inside a circle by the pixel's distance from the centre.
+    /// Derivative of the fraction inside a circle by the pixel's distance from the centre.
     by_distance: f64,
     pixel_kurtosis: f64,
     /// Inverse of an upper bound of the blur, in metres: near the centre, tangential blur changes the

@@ -13,7 +13,7 @@ use crate::response::ResponseEstimate;
 pub(super) const MAX_GREY: f64 = 254.5;
 /// A root mean square residual above this, in units of the contrast, is not a marker's.
 pub(super) const MAX_RESIDUAL: f64 = 0.2;
-/// Maximum share of a plain disc's squared residuals that a marker's rings leave.
+/// Maximum fraction of a plain disc's squared residuals that a marker's rings leave.
 pub(super) const MAX_DISC_RATIO: f64 = 0.12;
 /// Pose (5), blur, black, white, and the gradient of white to the right and down.
 pub(super) const UNKNOWNS: usize = 10;
@@ -38,7 +38,7 @@ pub(super) struct Effort {
     pub(super) max_steps_from_other: usize,
     /// After this many steps the Huber limit follows the residuals.
     pub(super) rough_steps: Option<usize>,
-    /// A step that lowers the cost by a smaller share is the last one.
+    /// A step that lowers the cost by a smaller fraction is the last one.
     pub(super) min_gain: f64,
 }
 
@@ -68,7 +68,7 @@ pub(crate) struct PhotometricFit {
     pub(crate) covariance: SMatrix<f64, 5, 5>,
     /// Root mean square residual, in units of the contrast.
     pub(crate) residual: f64,
-    /// The share of the variance inside the marker that the model explains.
+    /// The fraction of the variance inside the marker that the model explains.
     pub(crate) r_squared: f64,
     /// Squared residuals of free rings over those of a plain disc.
     pub(crate) disc_ratio: f64,
@@ -128,7 +128,7 @@ pub(crate) struct PhotometricInput<'a> {
 /// How far the radii that would fit best are from the marker's: the three circles between the outermost and the dot.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Radii {
-    /// The largest difference, as a share of the marker's radius.
+    /// The largest difference, as a fraction of the marker's radius.
     pub(crate) off: f64,
     /// The largest standard deviation of a difference.
     pub(crate) deviation: f64,

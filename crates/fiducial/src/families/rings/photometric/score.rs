@@ -18,8 +18,9 @@ use crate::response::{Measured, ResponseEstimate};
 /// Prior standard deviation of the normal, in radians.
 const PRIOR_NORMAL: f64 = 0.6;
 
-/// The form of a camera's tone curve is not quite the model's: a marker's edge may be off by this share of curve times blur, so that it looks
-/// larger or smaller. From `positions` of seed 7 in `raspberry-pi`, where rings were too small by 0.012 px beyond their noise.
+/// The form of a camera's tone curve is not quite the model's: a marker's edge may be off by this fraction of curve times blur,
+/// so that it looks larger or smaller. From `positions` of seed 7 in `raspberry-pi`, where rings were too small by 0.012 px
+/// beyond their noise.
 const CURVE_FORM_ERROR: f64 = 0.0026;
 
 /// The figures that distinguish a marker from other things.

@@ -1,5 +1,5 @@
-//! The model of a three-ring marker's grey values (pose, blur, exposure, camera response) and its least-squares fit to pixel
-//! samples.
+//! Models a three-ring marker's grey values (pose, blur, exposure, camera response) and fits the model by least squares to
+//! pixel samples.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -21,7 +21,7 @@ const MIN_BLUR_PX: f64 = 0.3;
 const MAX_BLUR_PX: f64 = 6.0;
 /// Largest change of the blur in one step, in pixels.
 const MAX_BLUR_STEP_PX: f64 = 0.3;
-/// A single step that lowers the cost by a larger share than this is too long for the quadratic model.
+/// A single step that lowers the cost by a larger fraction than this is too long for the quadratic model.
 const MAX_GAIN: f64 = 0.5;
 /// The Huber limit in root mean square residuals, and in grey levels beyond that.
 const HUBER_SIGMAS: f64 = 3.0;
@@ -248,8 +248,8 @@ impl RingModel {
     }
 
     /// The prior of cameras in general, where this one's processing is fitted. The pixels of a small marker alone leave tone
-    /// curve, sharpening, blur and black nearly open: without a prior the fit explains noise by a camera that does not exist, and
-    /// then other radii fit best. `limit` is the Huber limit of the residuals, in grey levels.
+    /// curve, sharpening, blur and black nearly open: without a prior the fit explains noise by a camera that does not exist,
+    /// and then other radii fit best. `limit` is the Huber limit of the residuals, in grey levels.
     pub(super) fn priors(
         &self,
         scene: &Scene<'_>,
@@ -555,7 +555,7 @@ impl Scene<'_> {
         is_likely.then_some(mosaic)
     }
 
-    /// The share of a linear fit's cost that a camera's processing would explain, by the quadratic model.
+    /// The fraction of a linear fit's cost that a camera's processing would explain, by the quadratic model.
     pub(super) fn response_gain(&self, fit: &ModelFit) -> Option<f64> {
         let processed = Scene { extras: Extras::Response, has_prior: false, ..*self };
         let equations = fit.model.linearised(&processed, fit.huber_limit)?;
