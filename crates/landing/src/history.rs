@@ -18,8 +18,8 @@ const MAX_GAP_S: f64 = 0.5;
 /// metres, plus metres per second between the two states.
 const JUMP_M: f64 = 0.1;
 const JUMP_M_S: f64 = 0.5;
-/// Maximum gap over which a jump is told from a change of the velocity, in seconds: a vehicle that brakes by 2 m/s in a longer one has
-/// moved by metres less than the mean of its velocities says. Over a longer one only what no velocity explains is a jump: the
+/// Maximum gap over which a jump is distinguished from a change of the velocity, in seconds: a vehicle that brakes by 2 m/s in a longer
+/// one has moved by metres less than the mean of its velocities says. Over a longer one only what no velocity explains is a jump: the
 /// larger of the two, and so much more, in m/s.
 const MAX_JUMP_GAP_S: f64 = 1.0;
 const MARGIN_M_S: f64 = 1.0;

@@ -109,8 +109,8 @@ pub struct Lander {
     retry_to_m: Option<f64>,
     /// What an aborted landing does about its height.
     abort_climb: AbortClimb,
-    /// Since when an aborted vehicle is heard.
-    heard_since: Option<Timestamp>,
+    /// Since when states of an aborted vehicle are received.
+    received_since: Option<Timestamp>,
     /// Smallest angle from the image's centre to its edge, in radians.
     half_view_rad: Option<f64>,
     /// The expanding square that is being flown.
@@ -152,7 +152,7 @@ impl Lander {
             land_requested: None,
             retry_to_m: None,
             abort_climb: AbortClimb::default(),
-            heard_since: None,
+            received_since: None,
             half_view_rad: None,
             square: None,
             hover: None,
@@ -576,7 +576,7 @@ impl Lander {
         }
         if self.state_machine.phase() != Phase::Aborted {
             self.abort_climb = AbortClimb::default();
-            self.heard_since = None;
+            self.received_since = None;
         }
         if !guided && !handing_over && !retrying {
             self.guidance.reset();
@@ -755,7 +755,7 @@ impl Lander {
     }
 
     /// True while the vehicle still goes down although it holds because of its slow link: setpoints that were sent
-    /// before arrive after those that stop it, so it is told to climb until it no longer sinks.
+    /// before arrive after those that stop it, so it is commanded to climb until it no longer sinks.
     fn sinks_over_slow_link(&self, now: Timestamp) -> bool {
         self.state_machine.reason() == Reason::LinkSlow
             && self.history.newest().is_some_and(|vehicle| {

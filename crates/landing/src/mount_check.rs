@@ -1,7 +1,6 @@
-//! Measures in flight by how much the camera's mount, its focal length and the marker's size are off, from the apparent motion of a pad that
-//! stands still.
+//! Measures in flight by how much the camera's mount, its focal length and the marker's size are off, from the apparent motion of the pad.
 //!
-//! A pad that does not move has one place. Under a mount that is off by `θ` it moves by `θ` times the height as
+//! A pad that does not move has one position. Under a mount that is off by `θ` it moves by `θ` times the height as
 //! the height changes; under a focal length that is off it moves as the vehicle tilts, under a marker of another
 //! size as the vehicle moves sideways. A Kalman filter of parameters that hardly change (Bar-Shalom, Li,
 //! Kirubarajan: Estimation with Applications to Tracking and Navigation, section 7) explains the apparent
@@ -9,13 +8,13 @@
 //!
 //! | state | unit | what |
 //! |---|---|---|
-//! | `q`, `u` | m, m/s | the pad's place and the autopilot's drift, north and east |
+//! | `q`, `u` | m, m/s | the pad's position and the autopilot's drift, north and east |
 //! | `θ` | rad | error of mount and attitude about the body's axes |
 //! | `f`, `s` | | error of the focal length and of the marker's size, relative |
 //! | `τ` | s | how much later exposures are than their stamps |
 //!
 //! What else moves the pad, as an estimator that errs more in wind does, is not as random as the filter believes. An error
-//! of the mount, the focal length or the size is the same in each part of a flight, so the estimates of the parts by themselves
+//! of the mount, the focal length or the size is the same in each part of a flight, so the estimates of the single parts
 //! must agree: by as much as they scatter more than their deviations say, the deviation is larger (the ratio of Birge: Physical
 //! Review 40, 1932).
 //!
@@ -41,14 +40,14 @@ const TILT: usize = 4;
 const FOCAL: usize = 7;
 const SIZE: usize = 8;
 const OFFSET: usize = 9;
-/// Those that are told: roll, pitch, focal length and size.
-const TOLD: [usize; 4] = [TILT, TILT + 1, FOCAL, SIZE];
+/// Those that are reported: roll, pitch, focal length and size.
+const REPORTED: [usize; 4] = [TILT, TILT + 1, FOCAL, SIZE];
 
 /// Initial standard deviations, in the units of the states.
 const UNKNOWN: [f64; STATES] = [100.0, 100.0, 0.08, 0.08, 0.1, 0.1, 0.05, 0.1, 0.05, 0.05];
 
-/// Random walks in calm flight, in the units of the states per square root of a second. The heading's is larger: ArduPilot's swings by 3 degrees and
-/// back within 4 s in gusts.
+/// Random walks in calm flight, in the units of the states per square root of a second. The heading's is larger: ArduPilot's swings by 3
+/// degrees and back within 4 s in gusts.
 const WALK: [f64; STATES] = [0.008, 0.008, 0.004, 0.004, 5e-4, 5e-4, 3e-3, 0.0, 0.0, 1e-3];
 
 /// Change of the logarithm of the random walks per unit of excess NIS, the NIS per degree of freedom, above its
@@ -69,53 +68,54 @@ const MEAN_S: f64 = 10.0;
 const MAX_DEPTHS: u32 = 1000;
 const MIN_STEP_S: f64 = 1e-3;
 
-/// Longest time without a detection over which place and drift are carried on, in seconds.
+/// Longest time without a detection over which position and drift are predicted, in seconds.
 const MAX_GAP_S: f64 = 3.0;
 
-/// Largest time offset that is believed, in seconds.
+/// Largest accepted time offset, in seconds.
 const MAX_OFFSET_S: f64 = 0.15;
 
 /// Minimum height over the marker of a detection that is used, in metres: near the ground the air and the ground
-/// itself move the vehicle otherwise than the autopilot knows.
+/// itself move the vehicle in ways that the autopilot does not estimate.
 const MIN_HEIGHT_M: f64 = 0.5;
 
-/// Smallest horizontal speeds of motions that show the marker's size and the focal length, in m/s. The autopilot holds its own estimate of a hover
-/// still, whose drift the vehicle follows: what is seen then moves while the estimate does not, as of a marker of no size.
+/// Smallest horizontal speeds of motions that show the marker's size and the focal length, in m/s. The autopilot holds its own estimate of
+/// a hover still, whose drift the vehicle follows: what is seen then moves while the estimate does not, as of a marker of no size.
 const MIN_SIZE_SPEED_M_S: f64 = 0.3;
 const MIN_FOCAL_SPEED_M_S: f64 = 0.1;
 
-/// An error is told when it is larger than this many standard deviations and than a minimum, and its standard deviation
+/// An error is reported when it is larger than this many standard deviations and than a minimum, and its standard deviation
 /// is smaller than a part of that minimum, in this many detections in a row; and no longer when it is smaller than a part
 /// of both.
 const MIN_DEVIATIONS: f64 = 3.0;
 const MIN_RATIO_DEVIATIONS: f64 = 3.5;
 const MIN_ANGLE_RAD: f64 = 1.5 * std::f64::consts::PI / 180.0;
 const MIN_RATIO: f64 = 0.03;
-/// Standard deviation of the scale of the autopilot's motion over a few metres, and the smallest error of the marker's size that is told:
+/// Standard deviation of the scale of the autopilot's motion over a few metres, and the smallest reported error of the marker's size:
 /// both look the same, in each flight again. The estimate of ArduPilot 4.5 in SITL lags behind an approach of 2 m by 2 to 2.5 % and catches
 /// up in ten seconds: ten landings made it a marker that is 3.2 +- 0.6 % smaller.
 const MOTION_SCALE: f64 = 0.015;
 const MIN_SIZE_RATIO: f64 = 0.05;
 const MAX_DEVIATION: f64 = 0.5;
 const MIN_IN_A_ROW: u32 = 15;
-/// Length of a part of the flight whose estimate is compared with those of the others, in seconds, the smallest share of what
-/// is known that a part must bring to count, and the number of such parts without which roll, pitch, focal length and size are not told:
+/// Length of a part of the flight whose estimate is compared with those of the others, in seconds, the smallest fraction of the
+/// information that a part must bring to count, and the number of such parts without which no error is reported:
 /// fewer blame the mount for the wandering of ArduPilot's estimate in 8 m/s of wind with turbulence 3.
 const PART_S: f64 = 1.0;
-const MIN_SHARE: f64 = 0.01;
+const MIN_FRACTION: f64 = 0.01;
 const MIN_PARTS: [u32; 4] = [6, 6, 3, 3];
 /// Time constant with which the vehicle's lean is smoothed, in seconds.
 const LEAN_S: f64 = 5.0;
-/// Lean above which the wind is strong, in radians. In 8 m/s of wind SITL's vehicle leans by 0.37 to 0.5 rad, and the place of ArduPilot's estimate
-/// wanders by 0.1 m, its heading by 3 degrees, within seconds: descents made roll errors of up to 4.4 deviations of that.
+/// Lean above which the wind is strong, in radians. In 8 m/s of wind SITL's vehicle leans by 0.37 to 0.5 rad, and the position of
+/// ArduPilot's estimate wanders by 0.1 m, its heading by 3 degrees, within seconds: descents made roll errors of up to 4.4 deviations of
+/// that.
 const STRONG_LEAN_RAD: f64 = 0.28;
-/// By how many times more deviations an angle, focal length or size must be off to be told in such wind, per radian above that lean.
+/// By how many times more deviations an angle, focal length or size must be off to be reported in such wind, per radian above that lean.
 const STRICTER_PER_RAD: f64 = 6.0;
-/// Factor on the random walks above which nothing new is told: what moves the pad then is something else. It is smaller for
+/// Factor on the random walks above which no new error is reported: what moves the pad then is something else. It is smaller for
 /// focal length and size, which show in less motion than the mount.
-const MAX_TOLD_NOISE_SCALE: f64 = 3.0;
-const MAX_TOLD_RATIO_NOISE_SCALE: f64 = 1.5;
-const STILL_TOLD: f64 = 0.7;
+const MAX_REPORT_NOISE_SCALE: f64 = 3.0;
+const MAX_REPORT_RATIO_NOISE_SCALE: f64 = 1.5;
+/// Fraction of the limits of an error below which it is no longer reported.: f64 = 0.7;
 
 type Mean = SVector<f64, STATES>;
 type Covariance = SMatrix<f64, STATES, STATES>;
@@ -123,13 +123,13 @@ type Covariance = SMatrix<f64, STATES, STATES>;
 /// A measured error with its standard deviation.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Measured {
-    /// The error: what is true over what is configured.
+    /// The error of the true value relative to the configured one.
     pub value: f64,
     /// Its standard deviation.
     pub deviation: f64,
 }
 
-/// The errors that are certain; `None` for what may be as configured.
+/// The errors that are certain; `None` for values that may be as configured.
 #[derive(Copy, Clone, Debug, Default, PartialEq)]
 pub struct MountFindings {
     /// The camera is turned about the vehicle's forward axis by this much more than configured, in radians: it
@@ -137,9 +137,9 @@ pub struct MountFindings {
     pub roll_rad: Option<Measured>,
     /// The same about the axis to the right: it looks further forward.
     pub pitch_rad: Option<Measured>,
-    /// The focal length is larger than configured by this share.
+    /// The focal length is larger than configured by this fraction.
     pub focal_ratio: Option<Measured>,
-    /// The marker is larger than configured by this share.
+    /// The marker is larger than configured by this fraction.
     pub size_ratio: Option<Measured>,
 }
 
@@ -157,11 +157,11 @@ pub struct MountCheck {
     mean: Mean,
     covariance: Covariance,
     log_noise_scale: f64,
-    /// The pad's place downwards, in metres, its velocity there, in m/s, and the number of detections in both.
+    /// The pad's position downwards, in metres, its velocity there, in m/s, and the number of detections in both.
     pad_z: f64,
     pad_sinks_m_s: f64,
     depths: u32,
-    /// The mean of that place over a longer time, in metres.
+    /// The mean of that position over a longer time, in metres.
     mean_pad_z: f64,
     newest: Option<Timestamp>,
     mount: Option<Rotation<Body, Camera>>,
@@ -179,7 +179,7 @@ pub struct MountCheck {
 /// The estimates of one error by the parts of a flight.
 #[derive(Copy, Clone, Debug, Default)]
 struct Parts {
-    /// Since when the present one lasts, and the estimate before it.
+    /// The beginning of the present one, and the estimate before it.
     begin: Option<(Timestamp, Measured)>,
     count: u32,
     /// Sums of the weights, the inverse variances, and with them of the estimates and their squares.
@@ -188,11 +188,11 @@ struct Parts {
     squares: f64,
 }
 
-/// Whether one error is told.
+/// Whether one error is reported.
 #[derive(Copy, Clone, Debug, Default)]
 struct Suspicion {
     in_a_row: u32,
-    is_told: bool,
+    is_reported: bool,
 }
 
 impl Default for MountCheck {
@@ -245,7 +245,7 @@ impl MountCheck {
         TargetEstimate { deviation_m: hypot(target.deviation_m, off_m), ..target }
     }
 
-    /// Adds a marker's place with the vehicle's motion at the exposure.
+    /// Adds a marker's position with the vehicle's motion at the exposure.
     fn add(&mut self, frame: &FrameObservation, motion: &Motion, measurement: &Measurement) {
         // Another camera, or the same with another mount.
         if self.mount != frame.body_from_camera {
@@ -260,17 +260,17 @@ impl MountCheck {
             return;
         }
         if self.newest.is_none() || after_s > MAX_GAP_S {
-            self.place_anew(measurement);
+            self.reset_position(measurement);
         }
         self.smooth_lean(motion, after_s);
         self.newest = Some(measurement.stamp);
         self.predict(fmin(after_s, MAX_GAP_S));
         self.smooth_depth(measurement.position.z, after_s);
         let height_m = fmax(self.pad_z - motion.odometry.z(), MIN_HEIGHT_M);
-        // What errors are multiplied with is another height than that of the place: an error that both had would
+        // Errors are multiplied with another height than that of the position: an error that both had would
         // look like a mount that is off towards the marker.
         let lever = fmax(self.mean_pad_z - motion.odometry.z(), MIN_HEIGHT_M) / seen.z;
-        // Of the detection only the direction counts; its derivative at that height.
+        // Only the direction of the detection is used; its derivative at that height.
         let slope = seen.xy() / seen.z;
         let scale = height_m / seen.z;
         let direction = Matrix2x3::new(scale, 0.0, -scale * slope.x, 0.0, scale, -scale * slope.y);
@@ -290,13 +290,13 @@ impl MountCheck {
             h[(i, SIZE)] = seen[i] * lever;
             h[(i, OFFSET)] = slip[i] + self.mean[U + i];
         }
-        let place = motion.odometry.coords.coords.xy() + slope * height_m;
+        let position = motion.odometry.coords.coords.xy() + slope * height_m;
         let noise = direction * measurement.noise * direction.transpose()
             + slope * slope.transpose() * measurement.noise[(2, 2)];
         // The motion is that of the estimated time already.
         let expected = h * self.mean - h.column(OFFSET) * self.mean[OFFSET];
         let speed_m_s = motion.velocity.horizontal_norm();
-        self.update(&h, place - expected, noise, measurement, speed_m_s);
+        self.update(&h, position - expected, noise, measurement, speed_m_s);
     }
 
     /// Smooths the marker's depths. A line is fitted to those of the last second (the fading memory of Morrison:
@@ -332,7 +332,7 @@ impl MountCheck {
     pub fn findings(&self) -> MountFindings {
         let of = |suspicion: Suspicion, error: Measured| {
             // The configured value is what the filter's errors are relative to.
-            suspicion.is_told.then_some(Measured { value: -error.value, ..error })
+            suspicion.is_reported.then_some(Measured { value: -error.value, ..error })
         };
         let [roll, pitch, focal, size] = self.errors();
         MountFindings {
@@ -356,15 +356,15 @@ impl MountCheck {
 
     /// The same as the filter has them.
     fn estimates(&self) -> [Measured; 4] {
-        TOLD.map(|index| Measured { value: self.mean[index], deviation: self.deviation(index) })
+        REPORTED.map(|index| Measured { value: self.mean[index], deviation: self.deviation(index) })
     }
 
     fn deviation(&self, index: usize) -> f64 {
         fmax(self.covariance[(index, index)], 0.0).sqrt()
     }
 
-    /// Begins with another place of the pad, and keeps what is known of the camera.
-    fn place_anew(&mut self, measurement: &Measurement) {
+    /// Begins with another position of the pad, and keeps the estimates of the camera.
+    fn reset_position(&mut self, measurement: &Measurement) {
         for (i, unknown) in UNKNOWN.iter().enumerate().take(TILT) {
             self.covariance.row_mut(i).fill(0.0);
             self.covariance.column_mut(i).fill(0.0);
@@ -413,13 +413,13 @@ impl MountCheck {
         if !(0.0..=GATE).contains(&nis) {
             self.outliers = self.outliers.saturating_add(1);
             if self.outliers > MAX_OUTLIERS {
-                self.place_anew(measurement);
+                self.reset_position(measurement);
             }
             return;
         }
         self.outliers = 0;
         let mut gain = ph * inverse;
-        // What is not estimated keeps its part in the uncertainty (Schmidt: Application of State-Space Methods to Navigation
+        // A state that is not estimated keeps its part in the uncertainty (Schmidt: Application of State-Space Methods to Navigation
         // Problems, 1966).
         for (index, min_m_s) in [(FOCAL, MIN_FOCAL_SPEED_M_S), (SIZE, MIN_SIZE_SPEED_M_S)] {
             if speed_m_s < min_m_s {
@@ -446,12 +446,12 @@ impl MountCheck {
         }
         let [roll, pitch, focal, size] = self.errors();
         let is_calm = |max_scale: f64| self.log_noise_scale < log(max_scale);
-        let is_calm_for_ratios = is_calm(MAX_TOLD_RATIO_NOISE_SCALE);
-        let is_calm = is_calm(MAX_TOLD_NOISE_SCALE);
+        let is_calm_for_ratios = is_calm(MAX_REPORT_RATIO_NOISE_SCALE);
+        let is_calm = is_calm(MAX_REPORT_NOISE_SCALE);
         let stricter = 1.0 + STRICTER_PER_RAD * fmax(self.lean_rad - STRONG_LEAN_RAD, 0.0);
         let deviations = |suspicion: &Suspicion, min: f64| {
-            // What was found in calmer air stays found.
-            if suspicion.is_told { min } else { stricter * min }
+            // An error that was found in calmer air stays found.
+            if suspicion.is_reported { min } else { stricter * min }
         };
         for (suspicion, angle) in [(&mut self.roll, roll), (&mut self.pitch, pitch)] {
             let min_deviations = deviations(suspicion, MIN_DEVIATIONS);
@@ -475,7 +475,7 @@ impl Parts {
         self.begin = Some((stamp, all));
         let [weight_before, weight_all] = [before, all].map(|it| 1.0 / squared(it.deviation));
         let weight = weight_all - weight_before;
-        if weight > MIN_SHARE * weight_all && weight.is_finite() {
+        if weight > MIN_FRACTION * weight_all && weight.is_finite() {
             let value = (all.value * weight_all - before.value * weight_before) / weight;
             self.count = self.count.saturating_add(1);
             self.weight += weight;
@@ -496,12 +496,12 @@ impl Parts {
 
 impl Suspicion {
     fn follow(&mut self, error: Measured, min_deviations: f64, min: f64, is_calm: bool) {
-        let share = if self.is_told { STILL_TOLD } else { 1.0 };
+        let share = if self.is_reported { CLEAR_FRACTION } else { 1.0 };
         let limit = fmax(min_deviations * error.deviation, min) * share;
         let is_known = error.deviation < MAX_DEVIATION * min;
-        if error.value.abs() > limit && (self.is_told || is_known && is_calm) {
+        if error.value.abs() > limit && (self.is_reported || is_known && is_calm) {
             self.in_a_row = self.in_a_row.saturating_add(1);
-            self.is_told |= self.in_a_row >= MIN_IN_A_ROW;
+            self.is_reported |= self.in_a_row >= MIN_IN_A_ROW;
         } else {
             *self = Self::default();
         }
@@ -567,8 +567,8 @@ mod tests {
         }
     }
 
-    /// Approaches a pad 2 m aside at 6 m, sinks and stops, in each of so many flights; the marker is larger than configured by this
-    /// share, and the autopilot's position moves by this share of the way.
+    /// Approaches a pad 2 m to the side at 6 m, sinks and stops, in each of so many flights; the marker is larger than configured by this
+    /// fraction, and the autopilot's position moves by this fraction of the way.
     fn size_found(flights: u32, larger: f64, moved: f64) -> Option<Measured> {
         let mut check = MountCheck::default();
         for number in 0..flights {
@@ -581,10 +581,10 @@ mod tests {
                 let ((aside, speed), (down, sinks)) = (way(2.0, 3.0), way(5.0, 6.0));
                 let position = Point::new(2.0 * (aside - 1.0), 0.0, 5.0 * down - 6.0);
                 let seen = (Point::<Ned>::origin() - position) * (1.0 / (1.0 + larger));
-                let told = Point::new(2.0 * moved * (aside - 1.0), 0.0, position.z());
+                let reported = Point::new(2.0 * moved * (aside - 1.0), 0.0, position.z());
                 let motion = Motion {
                     velocity: Vector::new(2.0 * moved * speed, 0.0, 5.0 * sinks),
-                    ..Motion::still(Rotation::identity(), told)
+                    ..Motion::still(Rotation::identity(), reported)
                 };
                 let frame = frame(60.0 * f64::from(number) + t, Rotation::identity());
                 see(&mut check, &frame, &motion, Rotation::identity() * seen);
@@ -609,19 +609,19 @@ mod tests {
     }
 
     #[test]
-    fn who_leans_into_a_strong_wind_needs_more_to_blame_the_mount() {
-        for (lean_rad, off_rad, is_told) in
+    fn a_mount_error_needs_more_evidence_while_the_vehicle_leans_into_a_strong_wind() {
+        for (lean_rad, off_rad, is_reported) in
             [(0.0, 0.035, true), (0.28, 0.035, true), (0.4, 0.035, false), (0.4, 0.06, true)]
         {
             let mut check = MountCheck::default();
             descend_leaning(&mut check, 0.0, Rotation::identity(), off_rad, lean_rad);
             let found = check.findings().pitch_rad;
-            assert_eq!(found.is_some(), is_told, "{lean_rad}: {found:?} {:?}", check.errors());
+            assert_eq!(found.is_some(), is_reported, "{lean_rad}: {found:?} {:?}", check.errors());
         }
     }
 
     #[test]
-    fn what_was_found_in_calm_air_stays_found_in_a_strong_wind() {
+    fn an_error_found_in_calm_air_stays_found_in_a_strong_wind() {
         let mut check = MountCheck::default();
         let mount = Rotation::identity();
         descend(&mut check, 0.0, mount, 0.035);
@@ -631,7 +631,7 @@ mod tests {
     }
 
     #[test]
-    fn another_mount_is_measured_anew() {
+    fn another_mount_is_measured_from_the_start() {
         let mut check = MountCheck::default();
         let mount = Rotation::identity();
         descend(&mut check, 0.0, mount, 0.05);

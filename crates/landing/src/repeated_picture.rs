@@ -83,7 +83,7 @@ struct Sight {
 }
 
 impl RepeatedPicture {
-    /// Adds a marker, and tells whether its picture is an old one. Where its distance is not known the direction decides: then a
+    /// Adds a marker, and returns whether its picture is an old one. Where its distance is not known the direction decides: then a
     /// vehicle that moves and does not tilt may see it where it was. What a vehicle that `stands` sees stays.
     pub(crate) fn add(
         &mut self,
@@ -353,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_distance_a_direction_that_stays_while_the_vehicle_tilts_tells_it() {
+    fn without_a_distance_a_direction_that_stays_while_the_vehicle_tilts_shows_an_old_picture() {
         let seen_old = |follows: bool| {
             let mut check = RepeatedPicture::default();
             (0..20)

@@ -1,9 +1,9 @@
 //! Measures in flight whether the marker is as large as configured, from how much nearer it comes as the vehicle goes down.
 //!
 //! The distance to a marker is taken from its size: under one that is twice as large as configured all distances are half of the true
-//! ones. How high the pad lies is not known, so a distance by itself shows nothing; but where the vehicle goes down by a metre the
+//! ones. How high the pad lies is not known, so a single distance shows nothing; but where the vehicle goes down by a metre the
 //! marker must come nearer by a metre, on a roof as on a field. The slope of the marker's depth below the vehicle over the height that
-//! the autopilot reports is what is configured over what is true, wherever the vehicle is and however the pad lies aside.
+//! the autopilot reports is the configured over the true size, wherever the vehicle is and however far to the side the pad lies.
 //!
 //! The slope is that of a line fitted by least squares to the detections of the last seconds, whose weights fade (West: Updating Mean and
 //! Variance Estimates, 1979). Heights that do not fit one line, as of a pad that heaves, of two markers in turn, or of an autopilot whose
@@ -22,8 +22,8 @@ use crate::time::Timestamp;
 const MEMORY_S: f64 = 10.0;
 const MAX_GAP_S: f64 = 5.0;
 
-/// Minimum height over the marker of a detection that is used, as its size tells it, in metres: near the ground a barometer errs in the
-/// vehicle's own wind.
+/// Minimum height over the marker of a detection that is used, as computed from its size, in metres: near the ground a barometer errs in
+/// the vehicle's own wind.
 const MIN_DEPTH_M: f64 = 0.4;
 
 /// Minimum standard deviation of the heights, in metres, that of a descent of 1.2 m, and the number of detections without which the slope
@@ -31,23 +31,23 @@ const MIN_DEPTH_M: f64 = 0.4;
 const MIN_SPREAD_M: f64 = 0.35;
 const MIN_DETECTIONS: f64 = 15.0;
 
-/// Slopes beyond which something else than the marker's size is wrong, as a picture that stands still.
+/// Slopes beyond which something else than the marker's size is wrong, such as a frozen picture.
 const MIN_SLOPE: f64 = 0.03;
 const MAX_SLOPE: f64 = 30.0;
 
-/// Factors on the size from which it is told, and from which the landing stops. A barometer that is 8 % off and follows 8 s late made it
-/// seem 1.32 times as large in one of 30 flights to pads on roofs and in hollows, and never more.
-const TOLD: f64 = 1.4;
+/// Factors on the size from which it is reported, and from which the landing stops. A barometer that is 8 % off and follows 8 s late made
+/// it seem 1.32 times as large in one of 30 flights to pads on roofs and in hollows, and never more.
+const REPORTED: f64 = 1.4;
 const REFUSED: f64 = 1.5;
-/// Share of the logarithm of the first below which it is told no longer.
-const STILL_TOLD: f64 = 0.7;
+/// Fraction of the logarithm of the first below which it is no longer reported.
+const CLEAR_FRACTION: f64 = 0.7;
 
 /// Minimum number of standard deviations by which the slope differs from one, and the number of detections in a row that must show it.
 const MIN_DEVIATIONS: f64 = 2.0;
 const MIN_IN_A_ROW: u32 = 10;
 
-/// What the rest of the fit counts for in the deviation: its errors are alike over seconds.
-const REST: f64 = 0.5;
+/// Weight of the fit's residual in the deviation: its errors are alike over seconds.
+const RESIDUAL_WEIGHT: f64 = 0.5;
 /// Standard deviation of a pad's height by its heave, in metres per m/s of its largest speed, and by the slope of the ground under one that
 /// drives, in metres per m/s over the memory.
 const HEAVE_S: f64 = 0.5;
@@ -58,9 +58,9 @@ const GRADE_S: f64 = 0.1;
 pub(crate) struct SizeCheck {
     fit: Fit,
     mount: Option<Rotation<Body, Camera>>,
-    told_in_a_row: u32,
+    reportable_in_a_row: u32,
     refused_in_a_row: u32,
-    told: Option<f64>,
+    reported: Option<f64>,
     is_refused: bool,
 }
 
@@ -99,26 +99,26 @@ impl SizeCheck {
         if self.mount != frame.body_from_camera {
             *self = Self { mount: frame.body_from_camera, ..Self::default() };
         }
-        let place = motion.odometry.coords.coords;
-        let depth_m = seen.position.z - place.z;
-        if depth_m >= MIN_DEPTH_M && self.fit.add(frame.stamp, -place.z, depth_m) {
+        let position = motion.odometry.coords.coords;
+        let depth_m = seen.position.z - position.z;
+        if depth_m >= MIN_DEPTH_M && self.fit.add(frame.stamp, -position.z, depth_m) {
             self.judge(config);
         }
     }
 
-    /// Forgets the detections and keeps what they showed: the vehicle stands, or its height begins anew.
+    /// Forgets the detections and keeps what they showed: the vehicle stands, or its height restarts.
     pub(crate) fn interrupt(&mut self) {
         self.fit = Fit::default();
     }
 
-    /// Looks anew whether a landing on it is safe; what was told of it stays until then.
+    /// Checks again whether a landing on it is safe; the reported ratio stays until then.
     pub(crate) fn look_again(&mut self) {
-        *self = Self { mount: self.mount, told: self.told, ..Self::default() };
+        *self = Self { mount: self.mount, reported: self.reported, ..Self::default() };
     }
 
     /// How many times as large as configured the marker is, once that is certain and far from one.
     pub(crate) fn ratio(&self) -> Option<f64> {
-        self.told
+        self.reported
     }
 
     /// True once it is certainly so far from its configured size that no landing on it is safe.
@@ -128,7 +128,7 @@ impl SizeCheck {
 
     fn judge(&mut self, config: &EstimatorConfig) {
         let Some(slope) = self.fit.slope(config) else {
-            (self.told_in_a_row, self.refused_in_a_row) = (0, 0);
+            (self.reportable_in_a_row, self.refused_in_a_row) = (0, 0);
             return;
         };
         let off = fabs(log(slope.value));
@@ -136,13 +136,13 @@ impl SizeCheck {
         let count = |in_a_row: u32, factor: f64| {
             if is_certain && off > log(factor) { in_a_row.saturating_add(1) } else { 0 }
         };
-        self.told_in_a_row = count(self.told_in_a_row, TOLD);
+        self.reportable_in_a_row = count(self.reportable_in_a_row, REPORTED);
         self.refused_in_a_row = count(self.refused_in_a_row, REFUSED);
         self.is_refused |= self.refused_in_a_row >= MIN_IN_A_ROW;
-        if self.told_in_a_row >= MIN_IN_A_ROW {
-            self.told = Some(1.0 / slope.value);
-        } else if !self.is_refused && off < STILL_TOLD * log(TOLD) {
-            self.told = None;
+        if self.reportable_in_a_row >= MIN_IN_A_ROW {
+            self.reported = Some(1.0 / slope.value);
+        } else if !self.is_refused && off < CLEAR_FRACTION * log(REPORTED) {
+            self.reported = None;
         }
     }
 }
@@ -179,10 +179,10 @@ impl Fit {
             return None;
         }
         let value = self.products / self.heights;
-        let rest = fmax(self.depths - self.products * value, 0.0);
+        let residual = fmax(self.depths - self.products * value, 0.0);
         let pad_m = hypot(HEAVE_S * config.pad_heave_m_s, GRADE_S * config.pad_speed_m_s);
-        let rest_m = hypot(REST * (rest / self.weight).sqrt(), pad_m);
-        let deviation = rest_m / (self.heights / self.weight).sqrt();
+        let residual_m = hypot(RESIDUAL_WEIGHT * (residual / self.weight).sqrt(), pad_m);
+        let deviation = residual_m / (self.heights / self.weight).sqrt();
         (MIN_SLOPE..=MAX_SLOPE).contains(&value).then_some(Slope { value, deviation })
     }
 }
@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn a_marker_of_another_size_is_told_after_a_descent_of_two_metres_wherever_the_pad_lies() {
+    fn a_marker_of_another_size_is_reported_after_a_descent_of_two_metres_wherever_the_pad_lies() {
         for size in [0.5, 2.0, 10.0] {
             for roof_m in [-3.0, 0.0, 5.0] {
                 let check = descend(2.0, |height_m, _| (height_m - roof_m) / size);
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn a_marker_of_the_right_size_on_a_roof_is_never_told() {
+    fn a_marker_of_the_right_size_on_a_roof_is_never_reported() {
         for roof_m in [-20.0, -3.0, 0.0, 5.0] {
             for scale in [0.9, 1.0, 1.1] {
                 let check = descend(7.0, |height_m, _| scale * (height_m - roof_m));
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_is_forgotten() {
+    fn numbers_that_are_not_finite_are_forgotten() {
         let check = descend(
             4.0,
             |height_m, seconds| {

@@ -3,10 +3,10 @@
 //! The autopilot's position is that of its inertial sensors, which a real vehicle carries 10 to 30 cm above the ground. The
 //! estimate of the target is relative to the same point, so that its height on the ground is `standing_height_m`. The camera
 //! no longer sees the marker then, and the autopilot's height drifts near the ground: the error is 0.15 m at most in the
-//! tests. So it is told, and changes no landing: one that is too large would ask for LAND too high.
+//! tests. So it is only reported, and changes no landing: one that is too large would ask for LAND too high.
 //!
 //! And whether a vehicle may stand on the pad already, although its autopilot does not say so. A lander that takes over the
-//! landing of another one has not seen the pad: it is told where that one saw it, or, where nobody knows, a vehicle that is
+//! landing of another one has not seen the pad: it receives the position from that one, or, where no position is known, a vehicle that is
 //! quite still at the height of the local origin, near which it was armed, may stand: near the origin, and elsewhere only where its
 //! autopilot does not say that it flies, as the ground has another height there.
 
@@ -45,7 +45,7 @@ const MAX_STILL_HEIGHT_M: f64 = 0.5;
 /// comes seconds late.
 const MAX_ORIGIN_M: f64 = 3.0;
 /// Maximum time after taking over within which that is assumed, in seconds: an autopilot says by then that it stands.
-const MAX_UNTOLD_S: f64 = 10.0;
+const MAX_UNREPORTED_S: f64 = 10.0;
 /// Maximum distance from the pad of such a vehicle that stands beside it, in metres.
 const MAX_BESIDE_M: f64 = 2.0;
 
@@ -142,7 +142,7 @@ impl Resumed {
             let from_origin_m = (vehicle.position - Point::origin()).horizontal_norm();
             return is_still
                 && height_m.abs() <= MAX_STILL_HEIGHT_M
-                && known_s <= MAX_UNTOLD_S
+                && known_s <= MAX_UNREPORTED_S
                 && (from_origin_m <= MAX_ORIGIN_M || vehicle.landed != Landed::InAir);
         };
         let to_pad = pad.position - vehicle.position;

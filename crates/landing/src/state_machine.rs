@@ -233,7 +233,7 @@ impl StateMachine {
         self.reason
     }
 
-    /// The alarm or the operator's command for which it lands, or has landed, away from the marker. The reason tells that only
+    /// The alarm or the operator's command for which it lands, or has landed, away from the marker. The reason states that only
     /// until the autopilot is in LAND.
     pub fn cause(&self) -> Option<Reason> {
         self.cause

@@ -112,7 +112,7 @@ fn alternative() -> impl Strategy<Value = [f64; 3]> {
     prop_oneof![5 => near, 1 => any, 1 => Just([1e160; 3])]
 }
 
-/// A covariance as detectors tell it, or nine numbers that are none: negative, not a number, huge, denormal.
+/// A covariance as detectors report it, or nine numbers that are no covariance: negative, not a number, huge, denormal.
 fn covariance() -> impl Strategy<Value = [f64; 9]> {
     let diagonal = |x: f64, y: f64, z: f64| [x, 0.0, 0.0, 0.0, y, 0.0, 0.0, 0.0, z];
     let usual = (1e-8..1e-2f64, 1e-8..1e-2f64, 1e-8..1e-1f64);
@@ -231,12 +231,12 @@ fn event(kind: &Kind, now: Timestamp) -> Event {
     }
 }
 
-/// What an outside observer knows.
+/// The knowledge of an outside observer.
 #[derive(Default)]
 struct Watcher {
     newest_marker: Option<Timestamp>,
     pilot_flies: bool,
-    /// The mode that was told last is ours.
+    /// The mode that was reported last is ours.
     is_ours: bool,
     no_detector: bool,
 }
@@ -258,8 +258,8 @@ impl Watcher {
                     // A late frame is used as well, and is not the newest.
                     self.newest_marker = self.newest_marker.max(Some(frame.stamp));
                 }
-                Event::Vehicle(state) => self.hear(before, state.mode),
-                Event::Status(status) => self.hear(before, status.mode),
+                Event::Vehicle(state) => self.observe_mode(before, state.mode),
+                Event::Status(status) => self.observe_mode(before, status.mode),
                 Event::DetectorsAlive(alive) => self.no_detector = !alive,
                 Event::Operator(OperatorCommand::Start | OperatorCommand::LandHere) => {
                     self.pilot_flies = false;
@@ -302,7 +302,7 @@ impl Watcher {
         Ok(())
     }
 
-    fn hear(&mut self, before: Phase, mode: Mode) {
+    fn observe_mode(&mut self, before: Phase, mode: Mode) {
         self.is_ours = matches!(mode, Mode::Guided | Mode::Land);
         if mode == Mode::Other {
             self.pilot_flies |= !before.is_terminal();

@@ -1,5 +1,5 @@
-//! A lander fed one event after the other: which reports of ground, mode and position it believes, and how searches, retries, aborts and
-//! disputes of detectors climb, below the fence.
+//! A lander that handles one event after the other: which reports of ground, mode and position it accepts, and how it climbs in searches,
+//! retries, aborts and disputes of detectors, below the fence.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 
@@ -15,8 +15,8 @@ const FLYING: VehicleStatus =
     VehicleStatus { mode: Mode::Guided, armed: true, landed: Landed::InAir };
 const STEP_S: f64 = 0.025;
 
-/// A lander that is told of a vehicle 40 times a second.
-struct Told {
+/// A lander that receives the reports of a vehicle 40 times a second.
+struct Harness {
     lander: Lander,
     seconds: f64,
     status: VehicleStatus,
@@ -27,7 +27,7 @@ struct Told {
     decisions: Vec<(f64, Decision)>,
 }
 
-impl Told {
+impl Harness {
     fn new(config: Config, height_m: f64) -> Self {
         Self {
             lander: Lander::new(config).unwrap(),
@@ -41,17 +41,17 @@ impl Told {
     }
 
     fn started(config: Config, height_m: f64) -> Self {
-        let mut told = Self::new(config, height_m);
-        told.run(0.5, true);
-        told.tell(Event::Operator(OperatorCommand::Start));
-        told
+        let mut harness = Self::new(config, height_m);
+        harness.run(0.5, true);
+        harness.step(Event::Operator(OperatorCommand::Start));
+        harness
     }
 
     fn now(&self) -> Timestamp {
         Timestamp::from_seconds(self.seconds)
     }
 
-    fn tell(&mut self, event: Event) -> Decision {
+    fn step(&mut self, event: Event) -> Decision {
         let decision = self.lander.step(self.now(), event);
         self.decisions.push((self.seconds, decision));
         decision
@@ -72,7 +72,7 @@ impl Told {
 
     fn frame(&self, pad: Point<Ned>) -> FrameObservation {
         let offset = pad - self.position;
-        let place = Point::new(offset.x(), offset.y(), offset.z());
+        let position = Point::new(offset.x(), offset.y(), offset.z());
         FrameObservation {
             stamp: self.now(),
             image_size: (1296, 972),
@@ -82,7 +82,7 @@ impl Told {
                 centre: Pixel::new(648.0, 486.0),
                 body_from_marker: Some(Transform::<Body, Marker>::new(
                     Rotation::from_euler(std::f64::consts::PI, 0.0, 0.0),
-                    place,
+                    position,
                 )),
                 alternative: None,
                 covariance_m2: Some(Matrix3::identity() * 1e-6),
@@ -97,14 +97,14 @@ impl Told {
         for i in 0..(seconds / STEP_S).round() as u32 {
             self.seconds += STEP_S;
             if is_known {
-                self.tell(Event::Vehicle(self.state()));
+                self.step(Event::Vehicle(self.state()));
             } else {
-                self.tell(Event::Status(self.status));
+                self.step(Event::Status(self.status));
             }
             if let Some(pad) = self.pad.filter(|_| i.is_multiple_of(2)) {
-                self.tell(Event::Frame(self.frame(pad)));
+                self.step(Event::Frame(self.frame(pad)));
             }
-            self.tell(Event::Tick);
+            self.step(Event::Tick);
         }
     }
 
@@ -119,7 +119,7 @@ impl Told {
         self.run(0.5, true);
     }
 
-    /// The vehicle flies what it is told.
+    /// The vehicle flies the velocity that the lander commands.
     fn fly(&mut self, seconds: f64) {
         for _ in 0..(seconds / STEP_S).round() as u32 {
             self.run(STEP_S, true);
@@ -142,17 +142,17 @@ impl Told {
 
 #[test]
 fn a_climb_after_markers_that_the_estimate_refuses_goes_straight_up() {
-    // Two places in turn: neither is seen often enough to be taken for the pad.
-    let mut told = Told::started(Config::default(), 6.0);
-    told.pad = Some(Point::new(1.0, 0.0, 0.0));
-    told.fly(1.0);
-    assert!(matches!(told.phase(), Phase::Approach | Phase::Descend), "{:?}", told.phase());
+    // Two positions in turn: neither is seen often enough to be taken for the pad.
+    let mut harness = Harness::started(Config::default(), 6.0);
+    harness.pad = Some(Point::new(1.0, 0.0, 0.0));
+    harness.fly(1.0);
+    assert!(matches!(harness.phase(), Phase::Approach | Phase::Descend), "{:?}", harness.phase());
     let mut climbs = Vec::new();
     for i in 0..40 {
-        told.pad = Some(Point::new(1.0, if i % 2 == 0 { 0.8 } else { -0.8 }, 0.0));
-        let before = told.decisions.len();
-        told.fly(2.0 * STEP_S);
-        let new = told.decisions.iter().skip(before).map(|(_, decision)| *decision);
+        harness.pad = Some(Point::new(1.0, if i % 2 == 0 { 0.8 } else { -0.8 }, 0.0));
+        let before = harness.decisions.len();
+        harness.fly(2.0 * STEP_S);
+        let new = harness.decisions.iter().skip(before).map(|(_, decision)| *decision);
         climbs.extend(new.filter(|decision| decision.why == Reason::RetryingRefused));
     }
     assert!(climbs.len() > 10, "{} decisions", climbs.len());
@@ -166,20 +166,20 @@ fn a_climb_after_markers_that_the_estimate_refuses_goes_straight_up() {
 #[test]
 fn the_pilot_is_seen_without_a_position_and_keeps_the_vehicle() {
     for mode in [Mode::Other, Mode::Land] {
-        let mut told = Told::started(Config::default(), 5.0);
-        told.run(1.0, true);
-        told.run(1.0, false);
-        assert_eq!(told.phase(), Phase::Hold);
-        told.status.mode = mode;
-        told.run(0.1, false);
-        assert_eq!(told.phase(), Phase::PilotInCommand, "{mode:?}");
-        told.tell(Event::Alarm(Alarm::BatteryCritical));
-        told.run(5.0, false);
-        assert!(!told.has_asked_for_land());
-        told.status.mode = Mode::Guided;
-        told.run(5.0, true);
-        assert_eq!(told.phase(), Phase::PilotInCommand);
-        let after = told.decisions.iter().filter(|(seconds, _)| *seconds > 3.6);
+        let mut harness = Harness::started(Config::default(), 5.0);
+        harness.run(1.0, true);
+        harness.run(1.0, false);
+        assert_eq!(harness.phase(), Phase::Hold);
+        harness.status.mode = mode;
+        harness.run(0.1, false);
+        assert_eq!(harness.phase(), Phase::PilotInCommand, "{mode:?}");
+        harness.step(Event::Alarm(Alarm::BatteryCritical));
+        harness.run(5.0, false);
+        assert!(!harness.has_asked_for_land());
+        harness.status.mode = Mode::Guided;
+        harness.run(5.0, true);
+        assert_eq!(harness.phase(), Phase::PilotInCommand);
+        let after = harness.decisions.iter().filter(|(seconds, _)| *seconds > 3.6);
         assert!(after.clone().count() > 100);
         assert!(after.clone().all(|(_, decision)| decision.action == Action::None));
     }
@@ -187,79 +187,83 @@ fn the_pilot_is_seen_without_a_position_and_keeps_the_vehicle() {
 
 #[test]
 fn land_is_not_asked_for_while_the_mode_is_unknown() {
-    let mut told = Told::started(Config::default(), 5.0);
-    told.run(1.0, true);
-    told.status.mode = Mode::Unknown;
-    told.run(0.5, true);
-    assert_eq!(told.decisions.last().unwrap().1.why, Reason::ModeUnknown);
-    told.tell(Event::Alarm(Alarm::BatteryCritical));
-    told.run(10.0, true);
-    assert!(!told.has_asked_for_land());
-    assert_eq!(told.decisions.last().unwrap().1.action, Action::hover());
-    told.status.mode = Mode::Guided;
-    told.run(0.5, true);
-    assert!(told.has_asked_for_land(), "the heartbeat is back");
+    let mut harness = Harness::started(Config::default(), 5.0);
+    harness.run(1.0, true);
+    harness.status.mode = Mode::Unknown;
+    harness.run(0.5, true);
+    assert_eq!(harness.decisions.last().unwrap().1.why, Reason::ModeUnknown);
+    harness.step(Event::Alarm(Alarm::BatteryCritical));
+    harness.run(10.0, true);
+    assert!(!harness.has_asked_for_land());
+    assert_eq!(harness.decisions.last().unwrap().1.action, Action::hover());
+    harness.status.mode = Mode::Guided;
+    harness.run(0.5, true);
+    assert!(harness.has_asked_for_land(), "the heartbeat is back");
 }
 
 #[test]
-fn a_report_of_the_ground_is_not_believed_high_over_the_pad_or_in_motion() {
+fn a_report_of_the_ground_is_not_accepted_high_over_the_pad_or_in_motion() {
     let on_ground = VehicleStatus { landed: Landed::OnGround, ..FLYING };
     // High over the pad.
-    let mut told = Told::started(Config::default(), 6.0);
-    told.pad = Some(Point::origin());
-    told.run(3.0, true);
-    told.tell(Event::Status(on_ground));
-    told.status = on_ground;
-    told.run(6.0, true);
-    assert!(!told.has_asked_for_land());
+    let mut harness = Harness::started(Config::default(), 6.0);
+    harness.pad = Some(Point::origin());
+    harness.run(3.0, true);
+    harness.step(Event::Status(on_ground));
+    harness.status = on_ground;
+    harness.run(6.0, true);
+    assert!(!harness.has_asked_for_land());
     // High over the ground that it took off from.
-    let mut told = Told::new(Config::default(), 0.0);
-    told.status = on_ground;
-    told.run(1.0, true);
-    told.status = FLYING;
-    told.rise(6.0);
-    told.tell(Event::Operator(OperatorCommand::Start));
-    told.status = on_ground;
-    told.run(3.0, true);
-    assert!(!told.has_asked_for_land() && told.phase() == Phase::Search);
+    let mut harness = Harness::new(Config::default(), 0.0);
+    harness.status = on_ground;
+    harness.run(1.0, true);
+    harness.status = FLYING;
+    harness.rise(6.0);
+    harness.step(Event::Operator(OperatorCommand::Start));
+    harness.status = on_ground;
+    harness.run(3.0, true);
+    assert!(!harness.has_asked_for_land() && harness.phase() == Phase::Search);
     // In motion, with no height known.
-    let mut told = Told::started(Config::default(), 6.0);
-    told.velocity = Vector::new(0.0, 0.0, 1.0);
-    told.status = on_ground;
-    told.run(0.5, true);
-    assert!(!told.has_asked_for_land());
+    let mut harness = Harness::started(Config::default(), 6.0);
+    harness.velocity = Vector::new(0.0, 0.0, 1.0);
+    harness.status = on_ground;
+    harness.run(0.5, true);
+    assert!(!harness.has_asked_for_land());
     // Right over the pad it is.
-    let mut told = Told::started(Config::default(), 0.1);
-    told.pad = Some(Point::origin());
-    told.status = on_ground;
-    told.run(0.5, true);
-    assert!(told.has_asked_for_land());
+    let mut harness = Harness::started(Config::default(), 0.1);
+    harness.pad = Some(Point::origin());
+    harness.status = on_ground;
+    harness.run(0.5, true);
+    assert!(harness.has_asked_for_land());
 }
 
 #[test]
 fn a_vehicle_that_hovers_because_no_detector_is_left_does_not_stand() {
-    let mut told = Told::started(Config::default(), 3.0);
-    told.pad = Some(Point::origin());
-    told.fly(2.0);
+    let mut harness = Harness::started(Config::default(), 3.0);
+    harness.pad = Some(Point::origin());
+    harness.fly(2.0);
     for _ in 0..400 {
-        if told.position.z() > -0.35 {
+        if harness.position.z() > -0.35 {
             break;
         }
-        told.fly(STEP_S);
+        harness.fly(STEP_S);
     }
-    assert!(told.phase() == Phase::Descend && told.position.z() < -0.1, "{:?}", told.position);
-    told.pad = None;
-    told.tell(Event::DetectorsAlive(false));
-    let from_s = told.seconds;
-    told.velocity = Vector::zero();
-    told.run(5.0, true);
-    for (_, decision) in told.decisions.iter().filter(|(seconds, _)| *seconds > from_s) {
+    assert!(
+        harness.phase() == Phase::Descend && harness.position.z() < -0.1,
+        "{:?}",
+        harness.position
+    );
+    harness.pad = None;
+    harness.step(Event::DetectorsAlive(false));
+    let from_s = harness.seconds;
+    harness.velocity = Vector::zero();
+    harness.run(5.0, true);
+    for (_, decision) in harness.decisions.iter().filter(|(seconds, _)| *seconds > from_s) {
         assert_ne!(decision.phase, Phase::Final, "{decision:?}");
         if let Action::Velocity { velocity, .. } = decision.action {
             assert!(velocity.z() <= 0.0, "{decision:?}");
         }
     }
-    let why = told.decisions.iter().find(|(seconds, _)| *seconds > from_s).unwrap().1.why;
+    let why = harness.decisions.iter().find(|(seconds, _)| *seconds > from_s).unwrap().1.why;
     assert_eq!(why, Reason::NoDetector);
 }
 
@@ -267,18 +271,18 @@ fn a_vehicle_that_hovers_because_no_detector_is_left_does_not_stand() {
 fn a_search_climbs_over_the_ground_and_not_over_the_origin() {
     let config = Config::default();
     let climbed_m = |took_off: bool, ground_z_m: f64, height_m: f64| {
-        let mut told = Told::new(config, height_m - ground_z_m);
+        let mut harness = Harness::new(config, height_m - ground_z_m);
         if took_off {
-            told.position = Point::new(0.0, 0.0, ground_z_m);
-            told.status.landed = Landed::OnGround;
-            told.run(0.5, true);
-            told.status = FLYING;
-            told.rise(height_m);
+            harness.position = Point::new(0.0, 0.0, ground_z_m);
+            harness.status.landed = Landed::OnGround;
+            harness.run(0.5, true);
+            harness.status = FLYING;
+            harness.rise(height_m);
         }
-        told.run(0.5, true);
-        told.tell(Event::Operator(OperatorCommand::Start));
-        told.fly(25.0);
-        ground_z_m - told.position.z() - height_m
+        harness.run(0.5, true);
+        harness.step(Event::Operator(OperatorCommand::Start));
+        harness.fly(25.0);
+        ground_z_m - harness.position.z() - height_m
     };
     for ground_z_m in [-20.0, 0.0, 20.0] {
         let known_m = climbed_m(true, ground_z_m, 2.0);
@@ -295,116 +299,117 @@ fn an_abort_climbs_over_the_pad() {
     let mut config = Config::default();
     config.phases.on_abort = OnAbort::Climb;
     config.phases.abort_height_m = 8.0;
-    let mut told = Told::started(config, 9.0);
+    let mut harness = Harness::started(config, 9.0);
     // The pad lies 5 m over the origin.
-    told.pad = Some(Point::new(0.0, 0.0, -5.0));
-    told.run(2.0, true);
-    told.tell(Event::Operator(OperatorCommand::Abort));
-    told.fly(20.0);
-    assert!((told.position.z() + 13.0).abs() < 0.2, "{:?}", told.position);
+    harness.pad = Some(Point::new(0.0, 0.0, -5.0));
+    harness.run(2.0, true);
+    harness.step(Event::Operator(OperatorCommand::Abort));
+    harness.fly(20.0);
+    assert!((harness.position.z() + 13.0).abs() < 0.2, "{:?}", harness.position);
     config.phases.fence_height_m = 10.0;
-    let mut told = Told::started(config, 9.0);
-    told.pad = Some(Point::new(0.0, 0.0, -5.0));
-    told.run(2.0, true);
-    told.tell(Event::Operator(OperatorCommand::Abort));
-    told.fly(20.0);
-    assert!(told.position.z() > -10.2, "{:?}", told.position);
+    let mut harness = Harness::started(config, 9.0);
+    harness.pad = Some(Point::new(0.0, 0.0, -5.0));
+    harness.run(2.0, true);
+    harness.step(Event::Operator(OperatorCommand::Abort));
+    harness.fly(20.0);
+    assert!(harness.position.z() > -10.2, "{:?}", harness.position);
 }
 
 #[test]
 fn an_aborted_vehicle_that_cannot_be_asked_does_what_is_configured_once_it_can() {
     let mut config = Config::default();
     config.phases.on_abort = OnAbort::Land;
-    let mut told = Told::started(config, 9.0);
-    told.pad = Some(Point::origin());
-    told.run(2.0, true);
+    let mut harness = Harness::started(config, 9.0);
+    harness.pad = Some(Point::origin());
+    harness.run(2.0, true);
     // The link is lost until long after the hold has ended in an abort.
-    told.pad = None;
+    harness.pad = None;
     for _ in 0..75 {
-        told.seconds += 1.0;
-        told.tell(Event::Tick);
+        harness.seconds += 1.0;
+        harness.step(Event::Tick);
     }
-    assert_eq!(told.phase(), Phase::Aborted);
-    assert!(!told.has_asked_for_land());
-    told.run(0.5, true);
-    assert!(told.has_asked_for_land());
+    assert_eq!(harness.phase(), Phase::Aborted);
+    assert!(!harness.has_asked_for_land());
+    harness.run(0.5, true);
+    assert!(harness.has_asked_for_land());
     // By default it climbs, where it is low.
-    let mut told = Told::new(Config::default(), 0.0);
-    told.status.landed = Landed::OnGround;
-    told.run(0.5, true);
-    told.status = FLYING;
-    told.rise(6.0);
-    told.tell(Event::Operator(OperatorCommand::Start));
-    told.pad = Some(Point::origin());
-    while told.position.z() < -1.0 {
-        told.fly(STEP_S);
+    let mut harness = Harness::new(Config::default(), 0.0);
+    harness.status.landed = Landed::OnGround;
+    harness.run(0.5, true);
+    harness.status = FLYING;
+    harness.rise(6.0);
+    harness.step(Event::Operator(OperatorCommand::Start));
+    harness.pad = Some(Point::origin());
+    while harness.position.z() < -1.0 {
+        harness.fly(STEP_S);
     }
-    told.pad = None;
-    told.velocity = Vector::zero();
+    harness.pad = None;
+    harness.velocity = Vector::zero();
     for _ in 0..75 {
-        told.seconds += 1.0;
-        told.tell(Event::Tick);
+        harness.seconds += 1.0;
+        harness.step(Event::Tick);
     }
-    assert_eq!(told.phase(), Phase::Aborted);
-    told.fly(5.0);
-    assert!((told.position.z() + 2.5).abs() < 0.2, "{:?}", told.position);
+    assert_eq!(harness.phase(), Phase::Aborted);
+    harness.fly(5.0);
+    assert!((harness.position.z() + 2.5).abs() < 0.2, "{:?}", harness.position);
 }
 
 #[test]
 fn an_abort_that_climbs_does_not_lift_a_vehicle_that_may_stand() {
     let mut config = Config::default();
     config.phases.on_abort = OnAbort::Climb;
-    let mut told = Told::started(config, 2.0);
-    told.pad = Some(Point::origin());
-    while told.position.z() < -0.1 {
-        told.fly(STEP_S);
+    let mut harness = Harness::started(config, 2.0);
+    harness.pad = Some(Point::origin());
+    while harness.position.z() < -0.1 {
+        harness.fly(STEP_S);
     }
-    told.velocity = Vector::zero();
-    told.run(0.1, true);
-    told.tell(Event::Operator(OperatorCommand::Abort));
-    let from_s = told.seconds;
-    told.run(2.0, true);
+    harness.velocity = Vector::zero();
+    harness.run(0.1, true);
+    harness.step(Event::Operator(OperatorCommand::Abort));
+    let from_s = harness.seconds;
+    harness.run(2.0, true);
     let climbs = |decision: &Decision| matches!(decision.action, Action::Velocity { velocity, .. } if velocity.z() < 0.0);
-    assert_eq!(told.phase(), Phase::Aborted);
-    assert!(!told.decisions.iter().any(|(seconds, it)| *seconds > from_s && climbs(it)));
+    assert_eq!(harness.phase(), Phase::Aborted);
+    assert!(!harness.decisions.iter().any(|(seconds, it)| *seconds > from_s && climbs(it)));
     // It flies after all.
-    told.velocity = Vector::new(0.0, 0.0, -0.5);
-    told.run(0.1, true);
-    assert!(climbs(&told.decisions.last().unwrap().1));
+    harness.velocity = Vector::new(0.0, 0.0, -0.5);
+    harness.run(0.1, true);
+    assert!(climbs(&harness.decisions.last().unwrap().1));
 }
 
-/// The height over the ground drifts in a flight in which no marker is seen, by more than tells a vehicle that stands from one that flies.
+/// The height over the ground drifts in a flight in which no marker is seen, by more than the height that distinguishes a standing from a
+/// flying vehicle.
 #[test]
 fn the_ground_is_where_the_vehicle_stands_with_its_motors_off() {
     let on_ground = VehicleStatus { landed: Landed::OnGround, ..FLYING };
-    let mut told = Told::new(Config::default(), 0.0);
-    told.status = on_ground;
-    told.run(1.0, true);
-    told.status = FLYING;
-    told.rise(4.0);
+    let mut harness = Harness::new(Config::default(), 0.0);
+    harness.status = on_ground;
+    harness.run(1.0, true);
+    harness.status = FLYING;
+    harness.rise(4.0);
     // The pilot lands; the height reads 1.5 m.
-    told.position = Point::new(0.0, 0.0, -1.5);
-    told.status = VehicleStatus { armed: false, mode: Mode::Other, ..on_ground };
-    told.run(1.0, true);
-    told.status = FLYING;
-    told.rise(2.0);
-    told.tell(Event::Operator(OperatorCommand::Start));
-    told.fly(25.0);
-    let height_m = -1.5 - told.position.z();
+    harness.position = Point::new(0.0, 0.0, -1.5);
+    harness.status = VehicleStatus { armed: false, mode: Mode::Other, ..on_ground };
+    harness.run(1.0, true);
+    harness.status = FLYING;
+    harness.rise(2.0);
+    harness.step(Event::Operator(OperatorCommand::Start));
+    harness.fly(25.0);
+    let height_m = -1.5 - harness.position.z();
     assert!((height_m - 5.0).abs() < 0.2, "searched from {height_m} m over the ground");
 }
 
 #[test]
 fn a_landing_aborted_low_hovers_where_a_drift_does_not_touch_the_ground() {
     let hovers_m = |config, started_m, aborted_m: f64| {
-        let mut told = Told::started(config, started_m);
-        told.pad = Some(Point::origin());
-        while told.position.z() < -aborted_m {
-            told.fly(STEP_S);
+        let mut harness = Harness::started(config, started_m);
+        harness.pad = Some(Point::origin());
+        while harness.position.z() < -aborted_m {
+            harness.fly(STEP_S);
         }
-        told.tell(Event::Operator(OperatorCommand::Abort));
-        told.fly(4.5);
-        -told.position.z()
+        harness.step(Event::Operator(OperatorCommand::Abort));
+        harness.fly(4.5);
+        -harness.position.z()
     };
     let config = Config::default();
     assert!((hovers_m(config, 6.0, 0.8) - 2.5).abs() < 0.2);
@@ -418,92 +423,100 @@ fn a_landing_aborted_low_hovers_where_a_drift_does_not_touch_the_ground() {
     // A long climb is flown to its end, hovers as long as configured, and ends with a setpoint that stops.
     let mut high = config;
     high.phases.abort_hover_m = 7.0;
-    let mut told = Told::started(high, 9.0);
-    told.pad = Some(Point::origin());
-    while told.position.z() < -0.8 {
-        told.fly(STEP_S);
+    let mut harness = Harness::started(high, 9.0);
+    harness.pad = Some(Point::origin());
+    while harness.position.z() < -0.8 {
+        harness.fly(STEP_S);
     }
-    told.tell(Event::Operator(OperatorCommand::Abort));
-    told.fly(9.0);
-    assert!((told.position.z() + 7.0).abs() < 0.2, "{:?}", told.position);
-    told.fly(8.0);
-    assert!((told.position.z() + 7.0).abs() < 0.2, "{:?}", told.position);
-    assert_eq!(told.decisions.last().unwrap().1.action, Action::None);
+    harness.step(Event::Operator(OperatorCommand::Abort));
+    harness.fly(9.0);
+    assert!((harness.position.z() + 7.0).abs() < 0.2, "{:?}", harness.position);
+    harness.fly(8.0);
+    assert!((harness.position.z() + 7.0).abs() < 0.2, "{:?}", harness.position);
+    assert_eq!(harness.decisions.last().unwrap().1.action, Action::None);
 }
 
 #[test]
 fn a_vehicle_that_may_stand_is_not_lifted_by_an_abort() {
     for height_m in [0.0, 0.2, 0.45] {
-        let mut told = Told::started(Config::default(), 5.0);
-        told.pad = Some(Point::origin());
-        told.fly(2.0);
-        while told.position.z() < -height_m {
-            told.fly(STEP_S);
+        let mut harness = Harness::started(Config::default(), 5.0);
+        harness.pad = Some(Point::origin());
+        harness.fly(2.0);
+        while harness.position.z() < -height_m {
+            harness.fly(STEP_S);
         }
         // It stands on the pad, though its autopilot does not say so.
-        told.velocity = Vector::zero();
-        told.run(1.0, true);
-        told.tell(Event::Operator(OperatorCommand::Abort));
-        told.fly(4.5);
-        assert!((told.position.z() + height_m).abs() < 0.1, "{height_m}: {:?}", told.position);
+        harness.velocity = Vector::zero();
+        harness.run(1.0, true);
+        harness.step(Event::Operator(OperatorCommand::Abort));
+        harness.fly(4.5);
+        assert!(
+            (harness.position.z() + height_m).abs() < 0.1,
+            "{height_m}: {:?}",
+            harness.position
+        );
     }
     // One that sinks when it is aborted is lifted, though it is still for a moment when it turns.
-    let mut told = Told::started(Config::default(), 5.0);
-    told.pad = Some(Point::origin());
-    told.fly(2.0);
-    while told.position.z() < -0.52 {
-        told.fly(STEP_S);
+    let mut harness = Harness::started(Config::default(), 5.0);
+    harness.pad = Some(Point::origin());
+    harness.fly(2.0);
+    while harness.position.z() < -0.52 {
+        harness.fly(STEP_S);
     }
-    told.velocity = Vector::new(0.0, 0.0, 0.3);
-    told.run(STEP_S, true);
-    told.tell(Event::Operator(OperatorCommand::Abort));
-    told.position = Point::new(0.0, 0.0, -0.47);
-    told.velocity = Vector::zero();
-    told.run(STEP_S, true);
-    told.fly(4.5);
-    assert!((told.position.z() + 2.5).abs() < 0.2, "{:?}", told.position);
+    harness.velocity = Vector::new(0.0, 0.0, 0.3);
+    harness.run(STEP_S, true);
+    harness.step(Event::Operator(OperatorCommand::Abort));
+    harness.position = Point::new(0.0, 0.0, -0.47);
+    harness.velocity = Vector::zero();
+    harness.run(STEP_S, true);
+    harness.fly(4.5);
+    assert!((harness.position.z() + 2.5).abs() < 0.2, "{:?}", harness.position);
 }
 
 #[test]
 fn a_retry_stays_below_the_fence() {
     let mut config = Config::default();
     config.phases.fence_height_m = 4.0;
-    let mut told = Told::started(config, 6.0);
-    told.pad = Some(Point::origin());
-    told.fly(2.0);
+    let mut harness = Harness::started(config, 6.0);
+    harness.pad = Some(Point::origin());
+    harness.fly(2.0);
     for _ in 0..800 {
-        if told.position.z() > -3.5 {
+        if harness.position.z() > -3.5 {
             break;
         }
-        told.fly(STEP_S);
+        harness.fly(STEP_S);
     }
-    told.pad = None;
+    harness.pad = None;
     let mut highest_m = 0.0f64;
     let mut has_retried = false;
     for _ in 0..400 {
-        told.fly(STEP_S);
-        has_retried |= told.phase() == Phase::Retry;
-        highest_m = highest_m.max(-told.position.z());
+        harness.fly(STEP_S);
+        has_retried |= harness.phase() == Phase::Retry;
+        highest_m = highest_m.max(-harness.position.z());
     }
     assert!(has_retried && highest_m < 4.3, "{has_retried} {highest_m}");
 }
 
 /// The height to which a vehicle climbs that is 1 m over the pad when two detectors begin to differ, in metres.
 fn climbed_in_a_dispute_m(config: Config, started_m: f64) -> f64 {
-    let mut told = Told::started(config, started_m);
-    told.pad = Some(Point::origin());
+    let mut harness = Harness::started(config, started_m);
+    harness.pad = Some(Point::origin());
     for _ in 0..1200 {
-        if told.position.z() > -1.0 {
+        if harness.position.z() > -1.0 {
             break;
         }
-        told.fly(STEP_S);
+        harness.fly(STEP_S);
     }
-    assert!(told.position.z() > -1.0 && told.phase() == Phase::Descend, "{:?}", told.position);
-    told.tell(Event::Dispute(true));
+    assert!(
+        harness.position.z() > -1.0 && harness.phase() == Phase::Descend,
+        "{:?}",
+        harness.position
+    );
+    harness.step(Event::Dispute(true));
     let mut highest_m = 0.0f64;
     for _ in 0..400 {
-        told.fly(STEP_S);
-        highest_m = highest_m.max(-told.position.z());
+        harness.fly(STEP_S);
+        highest_m = highest_m.max(-harness.position.z());
     }
     highest_m
 }
@@ -523,12 +536,12 @@ fn the_climb_of_a_dispute_stays_below_the_fence_and_the_start() {
 
 #[test]
 fn a_dispute_over_a_pad_that_is_higher_than_the_start_lets_nothing_descend() {
-    let mut told = Told::started(Config::default(), 1.0);
-    told.rise(8.0);
-    told.tell(Event::Dispute(true));
-    told.pad = Some(Point::new(0.0, 0.0, -3.0));
-    told.fly(14.0);
-    let height_m = -told.position.z() - 3.0;
+    let mut harness = Harness::started(Config::default(), 1.0);
+    harness.rise(8.0);
+    harness.step(Event::Dispute(true));
+    harness.pad = Some(Point::new(0.0, 0.0, -3.0));
+    harness.fly(14.0);
+    let height_m = -harness.position.z() - 3.0;
     assert!((height_m - 2.5).abs() < 0.2, "{height_m} m");
 }
 
@@ -538,29 +551,29 @@ fn land_is_not_asked_for_above_the_height_of_a_dispute_while_detectors_disagree(
     let thesis = ThesisConfig { land_altitude_m: 3.0, ..ThesisConfig::default() };
     for guidance in [GuidanceConfig::Metric(metric), GuidanceConfig::Thesis(thesis)] {
         let config = Config { guidance, ..Config::default() };
-        let mut told = Told::started(config, 6.0);
-        told.pad = Some(Point::origin());
-        told.fly(1.0);
-        told.tell(Event::Dispute(true));
-        told.fly(14.0);
-        assert!(!told.has_asked_for_land() && told.phase() != Phase::Final);
-        assert!(told.position.z() < -2.3, "{:?}", told.position);
-        told.fly(16.0);
-        assert_eq!((told.phase(), told.has_asked_for_land()), (Phase::Hold, false));
-        told.tell(Event::Dispute(false));
-        told.fly(8.0);
-        assert!(told.has_asked_for_land(), "{:?} {:?}", told.phase(), told.position);
+        let mut harness = Harness::started(config, 6.0);
+        harness.pad = Some(Point::origin());
+        harness.fly(1.0);
+        harness.step(Event::Dispute(true));
+        harness.fly(14.0);
+        assert!(!harness.has_asked_for_land() && harness.phase() != Phase::Final);
+        assert!(harness.position.z() < -2.3, "{:?}", harness.position);
+        harness.fly(16.0);
+        assert_eq!((harness.phase(), harness.has_asked_for_land()), (Phase::Hold, false));
+        harness.step(Event::Dispute(false));
+        harness.fly(8.0);
+        assert!(harness.has_asked_for_land(), "{:?} {:?}", harness.phase(), harness.position);
     }
 }
 
 #[test]
 fn a_retry_that_cannot_rise_has_the_time_of_the_first_try() {
-    // The landing began so low that no retry rises above the height of waiting, and the pad stays aside.
-    let mut told = Told::started(Config::default(), 0.45);
-    told.pad = Some(Point::new(0.4, 0.0, 0.0));
-    told.run(60.0, true);
+    // The landing began so low that no retry rises above the height of waiting, and the pad stays to one side.
+    let mut harness = Harness::started(Config::default(), 0.45);
+    harness.pad = Some(Point::new(0.4, 0.0, 0.0));
+    harness.run(60.0, true);
     let mut retries = Vec::new();
-    for pair in told.decisions.windows(2) {
+    for pair in harness.decisions.windows(2) {
         if pair[0].1.phase != Phase::Retry && pair[1].1.phase == Phase::Retry {
             retries.push(pair[1].0);
         }
@@ -575,24 +588,24 @@ fn a_retry_that_cannot_rise_has_the_time_of_the_first_try() {
 fn a_search_that_may_not_climb_flies_its_legs() {
     let mut config = Config::default();
     config.envelope.climb_m_s = 0.0;
-    let mut told = Told::started(config, 2.0);
+    let mut harness = Harness::started(config, 2.0);
     let mut farthest_m = 0.0f64;
     for _ in 0..400 {
-        told.fly(STEP_S);
-        farthest_m = farthest_m.max(told.position.x().hypot(told.position.y()));
+        harness.fly(STEP_S);
+        farthest_m = farthest_m.max(harness.position.x().hypot(harness.position.y()));
     }
     assert!(farthest_m > 2.0, "{farthest_m} m");
-    assert!((told.position.z() + 2.0).abs() < 1e-9, "{:?}", told.position);
+    assert!((harness.position.z() + 2.0).abs() < 1e-9, "{:?}", harness.position);
 }
 
 #[test]
 fn numbers_of_a_detector_that_make_no_sense_are_refused() {
-    let mut told = Told::started(Config::default(), 5.0);
+    let mut harness = Harness::started(Config::default(), 5.0);
     let mut refused = |change: fn(&mut MarkerInFrame)| {
-        told.run(0.1, true);
-        let mut frame = told.frame(Point::origin());
+        harness.run(0.1, true);
+        let mut frame = harness.frame(Point::origin());
         frame.marker.iter_mut().for_each(change);
-        told.tell(Event::Frame(frame)).rejected
+        harness.step(Event::Frame(frame)).rejected
     };
     assert_eq!(refused(|_| {}), None);
     assert_eq!(
@@ -605,8 +618,8 @@ fn numbers_of_a_detector_that_make_no_sense_are_refused() {
     );
     assert_eq!(
         refused(|marker| {
-            let place = Point::new(0.0, 1e160, 5.0);
-            marker.alternative = Some(Transform::new(Rotation::identity(), place));
+            let position = Point::new(0.0, 1e160, 5.0);
+            marker.alternative = Some(Transform::new(Rotation::identity(), position));
         }),
         Some(Rejection::Implausible)
     );

@@ -19,7 +19,7 @@ struct Drifter {
     /// By how much the reported position is off.
     jump: Vector<Ned>,
     landed: Landed,
-    is_heard: bool,
+    has_states: bool,
 }
 
 impl Drifter {
@@ -33,7 +33,7 @@ impl Drifter {
             drift,
             jump: Vector::zero(),
             landed: Landed::InAir,
-            is_heard: true,
+            has_states: true,
         };
         drifter.fly(DT_S);
         drifter.command(OperatorCommand::Start);
@@ -64,7 +64,7 @@ impl Drifter {
                 armed: true,
                 landed: self.landed,
             };
-            let event = if self.is_heard { Event::Vehicle(state) } else { Event::Tick };
+            let event = if self.has_states { Event::Vehicle(state) } else { Event::Tick };
             wanted = match self.lander.step(self.now(), event).action {
                 Action::Velocity { velocity, .. } => velocity,
                 Action::None | Action::Guided | Action::Disarm | Action::Land => Vector::zero(),
@@ -125,9 +125,9 @@ fn without_a_state_it_stops_and_afterwards_it_stays_where_it_is() {
     let mut drifter = Drifter::searching(Vector::new(0.5, 0.0, 0.0), 0.2).unwrap();
     drifter.command(OperatorCommand::Hold);
     drifter.fly(20.0);
-    drifter.is_heard = false;
+    drifter.has_states = false;
     assert_eq!(drifter.fly(3.0), Vector::zero());
-    drifter.is_heard = true;
+    drifter.has_states = true;
     let after = drifter.place;
     drifter.fly(20.0);
     let away = drifter.place - after;

@@ -1,4 +1,4 @@
-//! Camera mounts and focal lengths that are off are measured in flight and told, and right ones never are.
+//! Camera mounts and focal lengths that are off are measured in flight and reported, and right ones never are.
 
 mod scene;
 
@@ -24,7 +24,7 @@ fn found(flight: &Flight, which: impl Fn(&MountFindings) -> Option<Measured>) ->
 }
 
 #[test]
-fn a_mount_that_is_off_is_told_in_flight_and_widens_the_estimate() {
+fn a_mount_that_is_off_is_reported_in_flight_and_widens_the_estimate() {
     for (name, scene) in CASES {
         for seed in SEEDS {
             for (axis, off_rad) in [(0, OFF_RAD), (1, OFF_RAD), (1, -OFF_RAD)] {
@@ -32,9 +32,11 @@ fn a_mount_that_is_off_is_told_in_flight_and_widens_the_estimate() {
                 mount_off_rad[axis] = off_rad;
                 let flight = Scene { mount_off_rad, ..scene(seed) }.fly();
                 let error = found(&flight, |f| [f.roll_rad, f.pitch_rad][axis]);
-                let told = flight.samples.iter().find(|sample| sample.mount.angle_rad() > 0.0);
-                let told = told.map(|sample| (sample.seconds, -sample.position.z()));
-                println!("{name}, seed {seed}, axis {axis}: {error:.4?} told at {told:.1?}");
+                let reported = flight.samples.iter().find(|sample| sample.mount.angle_rad() > 0.0);
+                let reported = reported.map(|sample| (sample.seconds, -sample.position.z()));
+                println!(
+                    "{name}, seed {seed}, axis {axis}: {error:.4?} reported at {reported:.1?}"
+                );
                 assert_eq!(flight.phase, Phase::Landed, "{name}, seed {seed}");
                 let degrees_off = error.map(|error| (error.value - off_rad).to_degrees());
                 let is_right = degrees_off.is_some_and(|degrees| degrees.abs() < 1.0);
@@ -52,8 +54,8 @@ fn a_mount_that_is_off_is_told_in_flight_and_widens_the_estimate() {
 }
 
 #[test]
-fn a_focal_length_that_is_off_is_told_in_flight() {
-    let (mut flights, mut told) = (0, 0);
+fn a_focal_length_that_is_off_is_reported_in_flight() {
+    let (mut flights, mut reported) = (0, 0);
     for (name, scene) in CASES {
         for seed in SEEDS {
             let flight = Scene { focal_ratio: 1.05, ..scene(seed) }.fly();
@@ -61,12 +63,12 @@ fn a_focal_length_that_is_off_is_told_in_flight() {
             println!("{name}, seed {seed}: {error:.4?}");
             flights += 1;
             let Some(error) = error else { continue };
-            told += 1;
+            reported += 1;
             let off = error.value - 0.05;
             assert!(off.abs() < 0.015, "{name}, seed {seed}: off by {off}");
         }
     }
-    assert!(told >= flights - 1, "{told} of {flights} are told");
+    assert!(reported >= flights - 1, "{reported} of {flights} are reported");
 }
 
 /// Held by the operator for a minute and a half.
@@ -84,7 +86,7 @@ const HELD: [Case; 2] = [
 ];
 
 #[test]
-fn what_is_as_configured_is_never_told() {
+fn a_camera_and_a_marker_as_configured_are_never_reported() {
     let cases = FAULTS.into_iter().filter(|(name, _)| !name.contains("larger"));
     let cases = cases.map(|case| (case, 6)).chain(WINDS.map(|case| (case, 20)));
     let mut flights = 0;
@@ -93,9 +95,9 @@ fn what_is_as_configured_is_never_told() {
     for ((name, scene), seeds) in cases.chain(others).chain(held) {
         for seed in 1000..1000 + seeds {
             let flight = scene(seed).fly();
-            let told = flight.samples.iter().find(|s| s.mount != MountFindings::default());
-            let told = told.map(|sample| (sample.seconds, sample.mount));
-            assert!(told.is_none(), "{name}, seed {seed}: {told:?}");
+            let reported = flight.samples.iter().find(|s| s.mount != MountFindings::default());
+            let reported = reported.map(|sample| (sample.seconds, sample.mount));
+            assert!(reported.is_none(), "{name}, seed {seed}: {reported:?}");
             flights += 1;
         }
     }
@@ -118,16 +120,16 @@ fn wandering(seed: u64) -> Scene {
     })
 }
 
-/// How many of the flights that were told something, by what it was about: mount, focal length, size.
-fn told(flights: impl Iterator<Item = Flight>) -> [u32; 3] {
+/// How many of the flights reported an error of the mount, the focal length and the size.
+fn count_reports(flights: impl Iterator<Item = Flight>) -> [u32; 3] {
     let mut counts = [0; 3];
     for flight in flights {
-        let told = |which: fn(&MountFindings) -> bool| {
+        let reported = |which: fn(&MountFindings) -> bool| {
             u32::from(flight.samples.iter().any(|sample| which(&sample.mount)))
         };
-        counts[0] += told(|f| f.angle_rad() > 0.0);
-        counts[1] += told(|f| f.focal_ratio.is_some());
-        counts[2] += told(|f| f.size_ratio.is_some());
+        counts[0] += reported(|f| f.angle_rad() > 0.0);
+        counts[1] += reported(|f| f.focal_ratio.is_some());
+        counts[2] += reported(|f| f.size_ratio.is_some());
     }
     counts
 }
@@ -139,8 +141,8 @@ fn in_wind_a_wandering_estimate_is_seldom_taken_for_a_wrong_camera() {
     let flights: Option<u64> = number("MOUNT_FLIGHTS");
     let first = number("MOUNT_SEED").unwrap_or(3000);
     let seeds = || first..first + flights.unwrap_or(200);
-    let as_configured = told(seeds().map(|seed| wandering(seed).fly()));
-    println!("of {} flights told of mount, focal length, size:", seeds().count());
+    let as_configured = count_reports(seeds().map(|seed| wandering(seed).fly()));
+    println!("of {} flights reported mount, focal length, size:", seeds().count());
     println!("as configured: {as_configured:?}");
     for (name, change) in [
         ("focal length 5 % larger", (|s: &mut Scene| s.focal_ratio = 1.05) as fn(&mut Scene)),
@@ -149,10 +151,10 @@ fn in_wind_a_wandering_estimate_is_seldom_taken_for_a_wrong_camera() {
         ("mount 3 degrees off", |s| s.mount_off_rad = [OFF_RAD, 0.0]),
     ] {
         if flights.is_some() {
-            let counts = told(seeds().map(|seed| wandering(seed).with(change).fly()));
+            let counts = count_reports(seeds().map(|seed| wandering(seed).with(change).fly()));
             println!("{name}: {counts:?}");
         }
     }
-    let share = as_configured.map(|count| f64::from(count) / seeds().count() as f64);
-    assert!(share[0] <= 0.15 && share[1] <= 0.04 && share[2] <= 0.04, "{as_configured:?}");
+    let fraction = as_configured.map(|count| f64::from(count) / seeds().count() as f64);
+    assert!(fraction[0] <= 0.15 && fraction[1] <= 0.04 && fraction[2] <= 0.04, "{as_configured:?}");
 }

@@ -33,7 +33,7 @@ fn check(winds_m_s: &[f64], durations_s: &[f64], change: impl Fn(&mut Scene)) {
         for for_s in durations_s {
             table += &format!("\nwind {wind_m_s} m/s, silent for {for_s} s:");
             for below_m in HEIGHTS_M {
-                let silence = Silence { below_m, for_s: *for_s, then: Then::GoesOn };
+                let silence = Silence { below_m, for_s: *for_s, then: Then::Continues };
                 let [sink, slide] =
                     worst((0..4).map(|seed| silent(seed, *wind_m_s, silence).with(&change).fly()));
                 is_safe &= sink <= MAX_SINK_M_S && slide <= MAX_SLIDE_M_S;
@@ -56,7 +56,7 @@ fn silence_at_any_height_ends_in_a_soft_touchdown_or_in_none() {
 fn after_a_long_silence_no_landing_is_asked_for_high_up() {
     for (below_m, for_s) in [(6.0, 7.0), (7.0, 8.0), (8.0, 8.0), (9.0, 9.0), (9.0, 12.0)] {
         for seed in 0..4 {
-            let silence = Silence { below_m, for_s, then: Then::GoesOn };
+            let silence = Silence { below_m, for_s, then: Then::Continues };
             let flight = silent(seed, 0.0, silence).fly();
             let lands = |it: &&Sample| it.decision.phase == landing::Phase::Final;
             let from_m = flight.samples.iter().find(lands).map(height_m);
@@ -118,7 +118,7 @@ fn check_stays_down(below_m: f64, then: Then, seeds: std::ops::Range<u64>) -> u3
         for for_s in [1.0, 2.0, 3.0, 5.0, 7.0] {
             for seed in seeds.clone() {
                 let flight = silent(seed, wind_m_s, Silence { below_m, for_s, then })
-                    .with(|scene| scene.is_ground_told_late = true)
+                    .with(|scene| scene.is_ground_reported_late = true)
                     .fly();
                 let mut pairs = flight.samples.windows(2);
                 let end = pairs.find(|pair| pair[1].seconds - pair[0].seconds > 0.5 * for_s);
@@ -149,13 +149,13 @@ fn check_stays_down(below_m: f64, then: Then, seeds: std::ops::Range<u64>) -> u3
 
 #[test]
 fn a_vehicle_that_touched_down_meanwhile_stays_on_the_ground() {
-    let stood = [0.3, 0.4, 0.5].map(|below_m| check_stays_down(below_m, Then::GoesOn, 0..16));
+    let stood = [0.3, 0.4, 0.5].map(|below_m| check_stays_down(below_m, Then::Continues, 0..16));
     assert!(stood.iter().sum::<u32>() > 100, "{stood:?}");
 }
 
 #[test]
 fn a_lander_that_takes_over_leaves_a_vehicle_on_the_ground_that_touched_down_meanwhile() {
-    for then in [Then::AnotherTold, Then::Another] {
+    for then in [Then::AnotherWithPad, Then::Another] {
         let stood = [0.3, 0.4, 0.5].map(|below_m| check_stays_down(below_m, then, 100..116));
         assert!(stood.iter().sum::<u32>() > 100, "{then:?}: {stood:?}");
     }

@@ -12,7 +12,7 @@ fn larger(scene: Scene, times: f64) -> Scene {
     scene.with(|scene| scene.vision.size_error = 1.0 / times - 1.0)
 }
 
-/// The height over the pad at which the landing stopped for it, in metres, and the factor that was told then.
+/// The height over the pad at which the landing stopped for it, in metres, and the factor that was reported then.
 fn stopped(flight: &Flight) -> Option<(f64, f64)> {
     let sample = flight.samples.iter().find(|it| it.decision.why == Reason::MarkerSize)?;
     Some(((sample.pad - sample.position).z(), sample.size?))
@@ -25,7 +25,7 @@ const CASES: [Case; 3] = [
 ];
 
 #[test]
-fn a_marker_of_another_size_holds_high_over_the_pad_and_is_told() {
+fn a_marker_of_another_size_holds_high_over_the_pad_and_is_reported() {
     for (times, min_m) in [(2.0, 1.5), (10.0, 1.5), (0.5, 1.0)] {
         let (mut flights, mut holds) = (0, 0);
         for (name, scene) in CASES {
@@ -35,10 +35,13 @@ fn a_marker_of_another_size_holds_high_over_the_pad_and_is_told() {
                 println!("{name}, seed {seed}, {times} times as large: {stopped:.2?}");
                 assert!(flight.touchdown.is_none(), "{name}, seed {seed}, {times}");
                 flights += 1;
-                let Some((height_m, told)) = stopped else { continue };
+                let Some((height_m, reported)) = stopped else { continue };
                 holds += 1;
                 assert!(height_m > min_m, "{name}, seed {seed}, {times}: {height_m} m");
-                assert!((told / times - 1.0).abs() < 0.15, "{name}, seed {seed}: {told}, {times}");
+                assert!(
+                    (reported / times - 1.0).abs() < 0.15,
+                    "{name}, seed {seed}: {reported}, {times}"
+                );
             }
         }
         // Where the detections contradict each other already in a hover there is no descent.
@@ -54,7 +57,7 @@ fn the_thesis_guidance_stops_as_well() {
 }
 
 #[test]
-fn an_operator_who_goes_on_has_the_size_looked_at_again() {
+fn a_resume_of_the_operator_repeats_the_size_check() {
     let commands = vec![(0.0, Start), (20.0, Resume)];
     let scene = Scene { commands, limit_s: 60.0, ..Scene::new(2) };
     let flight = larger(scene, 2.0).fly();
@@ -65,7 +68,7 @@ fn an_operator_who_goes_on_has_the_size_looked_at_again() {
     assert!(flight.touchdown.is_none());
 }
 
-/// A vehicle that is led over a pad on a roof, or far below the place of its start, by an autopilot whose heights are 8 % off.
+/// A vehicle that is led over a pad on a roof, or far below its start, by an autopilot whose heights are 8 % off.
 fn on_a_roof(seed: u64) -> Scene {
     anything(seed).with(|scene| {
         let roof_m = -6.0 + 9.0 * part(seed, 13);
@@ -79,24 +82,24 @@ fn on_a_roof(seed: u64) -> Scene {
 
 /// `SIZE_FLIGHTS=200 SIZE_SEED=965001` flies more, from another seed.
 #[test]
-fn a_marker_of_the_right_size_is_never_blamed() {
+fn a_marker_of_the_right_size_is_never_reported() {
     let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse().ok());
     let flights: u64 = number("SIZE_FLIGHTS").unwrap_or(8);
     let first = number("SIZE_SEED").unwrap_or(2000);
     let others: [Case; 2] = [("anything", anything), ("on a roof", on_a_roof)];
     let mut total = 0;
     for (name, scene) in WINDS.into_iter().chain(FAULTS).chain(MOVING).chain(others) {
-        let mut told = 0;
+        let mut reported = 0;
         for seed in first..first + flights {
             let flight = scene(seed).fly();
             let sample = flight.samples.iter().find(|sample| sample.size.is_some());
-            told += u32::from(sample.is_some());
+            reported += u32::from(sample.is_some());
             let stopped = stopped(&flight);
             assert!(stopped.is_none(), "{name}, seed {seed}: {stopped:?}");
             assert!(sample.is_none(), "{name}, seed {seed}: {:?}", sample.and_then(|it| it.size));
             total += 1;
         }
-        println!("{name}: told in {told} of {flights}");
+        println!("{name}: reported in {reported} of {flights}");
     }
     println!("{total} flights");
 }

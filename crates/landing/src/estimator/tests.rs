@@ -329,7 +329,7 @@ fn a_position_that_wanders_low_over_the_pad_is_followed() {
     };
     let (refused, error_m, nis) = fly(0.02);
     assert!(refused <= 2 && error_m < 0.02, "{refused} refused, {error_m} m off");
-    // What is followed is told to be as surprising as it was.
+    // A marker that is followed is reported with the NIS that it had.
     assert!(nis > 1.5 * EstimatorConfig::default().gate, "{nis}");
     // No autopilot's position is as quick as this.
     assert!(fly(0.2).0 > 10, "{:?}", fly(0.2));

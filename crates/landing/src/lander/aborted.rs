@@ -59,12 +59,12 @@ impl Lander {
             .is_some_and(|state| now.seconds_since(state.stamp) <= phases.stale_vehicle_s);
         let status = self.status.filter(|status| is_recent && status.mode != Mode::Unknown);
         let Some(status) = status else { return Action::None };
-        // One that could not be asked has its time from when it is heard again.
-        self.heard_since.get_or_insert(now);
+        // The time of a vehicle without a link counts from when its states are received again.
+        self.received_since.get_or_insert(now);
         if self.state_machine.is_released() || !status.armed || status.mode != Mode::Guided {
             return Action::None;
         }
-        let elapsed_s = self.heard_s(now);
+        let elapsed_s = self.received_s(now);
         match phases.on_abort {
             OnAbort::Hover => self.hover_aborted(now),
             OnAbort::Land if elapsed_s <= phases.land_timeout_s => self.request_land(now),
@@ -73,9 +73,9 @@ impl Lander {
         }
     }
 
-    /// For how long the aborted vehicle has been heard, in seconds.
-    fn heard_s(&self, now: Timestamp) -> f64 {
-        self.heard_since.map_or(0.0, |since| now.seconds_since(since))
+    /// For how long states of the aborted vehicle have been received, in seconds.
+    fn received_s(&self, now: Timestamp) -> f64 {
+        self.received_since.map_or(0.0, |since| now.seconds_since(since))
     }
 
     /// Requests the mode that follows setpoints, at once and at intervals.
@@ -91,7 +91,7 @@ impl Lander {
     /// drifts onto the ground. One that may stand is not lifted, until it moves.
     fn hover_aborted(&mut self, now: Timestamp) -> Action {
         let missing_m = self.missing_after_abort(now);
-        let is_late = self.heard_s(now) > CLIMB_AWAY_S;
+        let is_late = self.received_s(now) > CLIMB_AWAY_S;
         self.abort_climb = match self.abort_climb {
             AbortClimb::Hovers { since, .. }
                 if now.seconds_since(since) > self.config.phases.release_after_s =>

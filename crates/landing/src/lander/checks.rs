@@ -19,7 +19,7 @@ impl Lander {
         self.size_check.ratio()
     }
 
-    /// A vehicle that holds because of a mismatch and is told to go on looks at it again.
+    /// Repeats the checks of a vehicle that holds because of a mismatch, when the operator resumes the landing.
     pub fn repeat_checks(&mut self) {
         if self.axis_mismatch().is_some() {
             self.axis_check = AxisConsistencyCheck::default();
@@ -28,8 +28,8 @@ impl Lander {
         self.repeat_size_check();
     }
 
-    /// Looks at the size again after a landing that it has ended. What is seen of it before a landing, as in a take-off over the pad, counts
-    /// in that.
+    /// Looks at the size again after a landing that it has ended. What is seen of it before a landing, as in a take-off over the pad,
+    /// counts in that.
     pub(super) fn repeat_size_check(&mut self) {
         if self.size_check.is_refused() {
             self.size_check.look_again();

@@ -20,7 +20,7 @@ impl Lander {
             let config = &self.config.estimator;
             let stands = self.now.is_some_and(|now| self.landed(now) == Landed::OnGround);
             picture = self.repeated_picture.add(frame, marker, &motion, config, stands);
-            // Nothing was seen: neither the marker, nor that it is elsewhere; nor was it in the frames that told of this one.
+            // Nothing was seen: neither the marker, nor that it is elsewhere; nor was it in the earlier frames with this picture.
             if let Picture::Old(since) = picture {
                 self.target_filter.go_back();
                 self.sightings.forget_since(since);

@@ -32,7 +32,7 @@ pub(crate) const MAX_SLIDE_M_S: f64 = 0.3;
 const SETPOINT_PERIOD_S: f64 = 0.04;
 /// Age of a state on arrival, in seconds.
 const STATE_AGE_S: f64 = 0.005;
-/// Time until another lander is told to begin, in seconds: the autopilot is heard and identified first.
+/// Time until another lander begins, in seconds: the autopilot's packets are received and identified first.
 const RESUME_S: f64 = 0.5;
 /// Steps of the world between two states, and between two ticks.
 const STATE_STEPS: u32 = 8;
@@ -73,7 +73,7 @@ pub(crate) struct Scene {
     /// The lander falls silent in the descent.
     pub(crate) silence: Option<Silence>,
     /// The autopilot does not say in GUIDED that it is on the ground, as ArduPilot's for 7 s after the touchdown.
-    pub(crate) is_ground_told_late: bool,
+    pub(crate) is_ground_reported_late: bool,
     /// The autopilot's setpoint timeout, in seconds, and whether the lander knows it.
     pub(crate) setpoint_timeout_s: f64,
     pub(crate) is_timeout_known: bool,
@@ -88,22 +88,22 @@ pub(crate) struct Silence {
     pub(crate) below_m: f64,
     /// Its duration, in seconds.
     pub(crate) for_s: f64,
-    /// What comes after it.
+    /// The lander after it.
     pub(crate) then: Then,
 }
 
 /// The lander after its silence.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Then {
-    /// The same goes on.
-    GoesOn,
-    /// Another one takes over, which is told where the earlier one knew the pad.
-    AnotherTold,
-    /// Another one takes over, which knows nothing.
+    /// The same continues.
+    Continues,
+    /// Another one takes over, and receives the pad's position from the earlier one.
+    AnotherWithPad,
+    /// Another one takes over, without any position of the pad.
     Another,
 }
 
-/// What happened at one time.
+/// The state at one time.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Sample {
     pub(crate) seconds: f64,
@@ -113,7 +113,7 @@ pub(crate) struct Sample {
     pub(crate) pad: Point<Ned>,
     /// What is certain of the camera's mount.
     pub(crate) mount: MountFindings,
-    /// How many times as large as configured the marker is told to be.
+    /// How many times as large as configured the marker is according to the lander.
     pub(crate) size: Option<f64>,
     /// For how long it has been on the ground, in seconds.
     pub(crate) on_ground_s: f64,
@@ -184,7 +184,7 @@ impl Scene {
             pilot_s: None,
             disputed_below_m: f64::NEG_INFINITY,
             silence: None,
-            is_ground_told_late: false,
+            is_ground_reported_late: false,
             setpoint_timeout_s: 0.5,
             is_timeout_known: true,
             limit_s: 120.0,
@@ -241,11 +241,14 @@ impl Scene {
             if !is_silent {
                 left = lander.pad_to_remember().map(|seen| seen.pad).or(left);
             }
-            let then = self.silence.map_or(Then::GoesOn, |silence| silence.then);
-            if std::mem::replace(&mut was_silent, is_silent) && !is_silent && then != Then::GoesOn {
+            let then = self.silence.map_or(Then::Continues, |silence| silence.then);
+            if std::mem::replace(&mut was_silent, is_silent)
+                && !is_silent
+                && then != Then::Continues
+            {
                 let Ok(another) = Lander::new(self.config) else { return flight };
                 lander = another;
-                lander.resume(left.filter(|_| then == Then::AnotherTold));
+                lander.resume(left.filter(|_| then == Then::AnotherWithPad));
                 run.resume_s = Some(run.seconds() + RESUME_S);
             }
             for event in run.events(step).into_iter().filter(|_| !is_silent) {
@@ -352,7 +355,7 @@ struct Run<'a> {
     is_disputed: bool,
     /// When the silence began.
     silent_s: Option<f64>,
-    /// When another lander is told to begin.
+    /// When another lander begins.
     resume_s: Option<f64>,
 }
 
@@ -446,7 +449,7 @@ impl<'a> Run<'a> {
             armed: autopilot.armed(),
             landed: match autopilot.landed() {
                 ardupilot::Landed::OnGround
-                    if self.scene.is_ground_told_late
+                    if self.scene.is_ground_reported_late
                         && autopilot.mode() == ardupilot::Mode::Guided =>
                 {
                     Landed::InAir
