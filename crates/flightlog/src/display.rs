@@ -91,15 +91,16 @@ struct Offset {
 }
 
 impl Offset {
-    /// Whether it is of a clock of this name by which a message came so long after its stamp.
+    /// Whether it is of a clock of this name by which a message was received so long after its stamp.
     fn fits(&self, clock: Option<&str>, apart_ns: i64) -> bool {
-        let is_same = self.clock.as_deref().zip(clock).is_none_or(|(known, told)| known == told);
+        let is_same =
+            self.clock.as_deref().zip(clock).is_none_or(|(known, stated)| known == stated);
         is_same && self.ns.abs_diff(apart_ns) <= MAX_AGE_NS.unsigned_abs()
     }
 }
 
 impl VehicleClock {
-    /// For who receives by a clock of this name.
+    /// For a receiver whose clock has this name.
     pub fn new(own: Option<&str>) -> Self {
         Self { own: own.map(str::to_owned), ..Self::default() }
     }
@@ -111,7 +112,7 @@ impl VehicleClock {
         }
     }
 
-    /// A stamp by our clock: one of another, by the age of its first message. Clocks are told apart by their names; where one is not
+    /// A stamp by our clock: one of another, by the age of its first message. Clocks are distinguished by their names; where one is not
     /// known, a stamp that is far away is of another.
     pub fn ours(&mut self, received_ns: i64, stamp_ns: i64, clock: Option<&str>) -> i64 {
         let apart_ns = received_ns.saturating_sub(stamp_ns);
@@ -536,7 +537,7 @@ mod tests {
     }
 
     #[test]
-    fn clocks_are_told_apart_by_their_names() {
+    fn clocks_are_distinguished_by_their_names() {
         const S: i64 = 1_000_000_000;
         let health = |service: &str, clock: &str| Health {
             service: service.into(),

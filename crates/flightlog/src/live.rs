@@ -96,13 +96,13 @@ pub fn request(text: &str) -> Result<Request, String> {
     serde_json::from_str(text).map_err(|cause| cause.to_string())
 }
 
-/// The first message to a client: who serves, and since which `session`.
+/// The first message to a client: the name of the server and its `session`.
 pub fn server_info(name: &str, session: &str) -> String {
     json!({ "op": "serverInfo", "name": name, "capabilities": [], "sessionId": session })
         .to_string()
 }
 
-/// Tells of channels: number, topic and schema of each. Those without a description are left out.
+/// Announces channels: number, topic and schema of each. Those without a description are left out.
 pub fn advertise<'a>(channels: impl IntoIterator<Item = (u32, &'a str, Schema)>) -> String {
     let channels = channels.into_iter().filter_map(|(id, topic, schema)| {
         let it = schema.description()?;
@@ -118,7 +118,7 @@ pub fn advertise<'a>(channels: impl IntoIterator<Item = (u32, &'a str, Schema)>)
     json!({ "op": "advertise", "channels": channels.collect::<Vec<_>>() }).to_string()
 }
 
-/// A warning for the person in front of the viewer; a later one of the same `id` takes its place.
+/// A warning for the user of the viewer; a later one of the same `id` replaces it.
 pub fn warning(id: &str, message: &str) -> String {
     json!({ "op": "status", "level": WARNING, "message": message, "id": id }).to_string()
 }
@@ -144,8 +144,8 @@ mod tests {
     #[test]
     fn requests_are_read_as_the_specification_shows_them() {
         let text = r#"{ "op": "subscribe", "subscriptions": [{ "id": 0, "channelId": 3 }, { "id": 1, "channelId": 5 }] }"#;
-        let wanted = [(0, 3), (1, 5)].map(|(id, channel_id)| Subscription { id, channel_id });
-        assert_eq!(request(text), Ok(Request::Subscribe { subscriptions: wanted.into() }));
+        let expected = [(0, 3), (1, 5)].map(|(id, channel_id)| Subscription { id, channel_id });
+        assert_eq!(request(text), Ok(Request::Subscribe { subscriptions: expected.into() }));
         let text = r#"{ "op": "unsubscribe", "subscriptionIds": [0, 1] }"#;
         assert_eq!(request(text), Ok(Request::Unsubscribe { subscription_ids: vec![0, 1] }));
         assert_eq!(request(r#"{ "op": "getParameters" }"#), Ok(Request::Other));
@@ -161,18 +161,18 @@ mod tests {
     }
 
     #[test]
-    fn channels_are_told_with_their_types() {
+    fn channels_are_announced_with_their_types() {
         let channels = [
             (1, "wind", Schema::Json("Wind")),
             (2, "log", Schema::Protobuf(&LOG)),
             (3, "x", Schema::Raw),
         ];
-        let told: Value = serde_json::from_str(&advertise(channels)).unwrap();
+        let announced: Value = serde_json::from_str(&advertise(channels)).unwrap();
         assert_eq!(
-            (&told["op"], told["channels"].as_array().unwrap().len()),
+            (&announced["op"], announced["channels"].as_array().unwrap().len()),
             (&json!("advertise"), 2)
         );
-        let [wind, log] = [0, 1].map(|index| &told["channels"][index]);
+        let [wind, log] = [0, 1].map(|index| &announced["channels"][index]);
         assert_eq!(wind["schemaName"], "alight.Wind");
         assert_eq!(
             (&wind["encoding"], &wind["schemaEncoding"]),

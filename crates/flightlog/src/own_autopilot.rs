@@ -1,17 +1,17 @@
-//! Which packets on an autopilot's link are of the vehicle's own autopilot: others may be on it as well, of another vehicle, a gimbal, a
+//! Finds the packets of the vehicle's own autopilot on its link: others may be on it as well, of another vehicle, a gimbal or a
 //! companion.
 
 use autopilot::Packet;
 use autopilot::packet::AUTOPILOT;
 use messages::Configuration;
 
-/// Tells the packets of the vehicle's own autopilot from others, as the controller does.
+/// Distinguishes the packets of the vehicle's own autopilot from others, as the controller does.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct OwnAutopilot {
-    /// The system id of the controller's configuration, which may leave it open.
+    /// The system id of the controller's configuration, if it has one.
     configured: Option<u8>,
-    /// That of the first autopilot that was heard.
-    heard: Option<u8>,
+    /// That of the first autopilot whose heartbeat was received.
+    first_received: Option<u8>,
 }
 
 impl OwnAutopilot {
@@ -32,9 +32,9 @@ impl OwnAutopilot {
             return false;
         }
         if packet.is_heartbeat_of_autopilot() {
-            self.heard.get_or_insert(system);
+            self.first_received.get_or_insert(system);
         }
-        self.configured.or(self.heard) == Some(system)
+        self.configured.or(self.first_received) == Some(system)
     }
 }
 
@@ -65,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn the_own_autopilot_is_the_first_that_is_heard_or_the_configured_one() {
+    fn the_own_autopilot_is_the_first_with_a_heartbeat_or_the_configured_one() {
         let text = |system, component| {
             sent(system, component, &MavMessage::STATUSTEXT(STATUSTEXT_DATA::default()))
         };

@@ -104,8 +104,10 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
     }
     found.reading.is_ended = records.is_ended();
     if found.lost > 0 {
-        let text =
-            format!("{} messages are lost: what describes their channel is damaged", found.lost);
+        let text = format!(
+            "{} messages are lost: the description of their channel is damaged",
+            found.lost
+        );
         found.reading.damage.push(text);
     }
     if records.differs() && found.reading.damage.is_empty() {
@@ -114,7 +116,7 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
     Ok(found.reading)
 }
 
-/// When the first message of a file came that is no state from before: it tells the order of a recording's files.
+/// The time of a file's first message that is no state from before: it gives the order of a recording's files.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Begin {
     /// In nanoseconds of the recorder's clock; `None` before such a message.
@@ -279,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_recording_is_told_from_what_is_empty() {
+    fn other_files_and_empty_files_have_different_errors() {
         for (file, part) in [(&b""[..], "it is empty"), (b"text", "does not begin as MCAP files")] {
             let read = read(file, |_| ()).unwrap_err().to_string();
             let repaired = crate::repair(file, std::io::sink()).unwrap_err().to_string();
@@ -296,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn files_are_in_the_order_of_what_is_no_state_from_before() {
+    fn files_are_in_the_order_of_their_first_messages_other_than_earlier_states() {
         let file = |keys: &[&str], from_ns: i64| {
             let mut file = Vec::new();
             let mut recording = Writer::new(&mut file, &About::default()).unwrap();

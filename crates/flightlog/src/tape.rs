@@ -1,5 +1,5 @@
 //! Gathers the controllers' tapes from the messages of a recording, or of several files of one flight: parts in order, each once,
-//! and what could not be read.
+//! and the damage: parts that could not be read.
 
 use std::collections::BTreeMap;
 
@@ -8,12 +8,12 @@ use messages::{Tape, decode, topic};
 use crate::reader::{Entry, read};
 use crate::writer::Problem;
 
-/// The tape of one controller, as far as recordings have it.
+/// The tape of one controller, as far as recordings contain it.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RecordedTape {
     /// When it began, in nanoseconds of the controller's clock.
     pub begun_ns: i64,
-    /// Its parts, in order; some may be missing, which their numbers tell.
+    /// Its parts, in order; some may be missing, which their numbers show.
     pub parts: Vec<Tape>,
 }
 
@@ -27,7 +27,7 @@ pub struct TapeReader {
 }
 
 impl TapeReader {
-    /// Adds what is in a recording.
+    /// Adds the parts in a recording.
     ///
     /// # Errors
     /// When it is no MCAP file at all.

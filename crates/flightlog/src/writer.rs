@@ -18,20 +18,20 @@ use crate::display::{Display, Picture};
 
 /// Size at which a chunk is written, in bytes.
 const CHUNK_BYTES: u64 = 1 << 20;
-/// Name of the channel that counts what could not be kept.
+/// Name of the channel that counts messages that could not be recorded.
 pub const DROPPED_CHANNEL: &str = "recorder/dropped";
 /// Name of the metadata about a recording.
 pub const METADATA: &str = "alight";
-/// Name of the metadata that tell that the clock of UTC was set.
+/// Name of the metadata that state that the clock of UTC was set.
 pub const TIME_SET: &str = "alight-time-set";
 
-/// Why a recording cannot go on.
+/// Why a recording cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub enum Problem {
-    /// The file did not take it, or is none.
+    /// The file could not be written, or is no MCAP file.
     #[error("{0}")]
     Mcap(#[from] mcap::McapError),
-    /// Nothing is in it.
+    /// The file is empty.
     #[error("it is empty; was its recorder killed at once, or the disk full?")]
     Empty,
     /// It begins with other bytes than a recording.

@@ -214,8 +214,8 @@ fn the_spellings_of_variants_in_json_are_those_of_the_documentation() {
         Phase::PilotInCommand,
         Phase::Failed,
     ];
-    let told = include_str!("../../../docs/wire-format.md");
-    let (_, told) = told.split_once("## As JSON").unwrap();
+    let documented = include_str!("../../../docs/wire-format.md");
+    let (_, documented) = documented.split_once("## As JSON").unwrap();
     for (row, spelled) in [
         ("`format` of", spelled(&formats)),
         ("`set_by` of", spelled(&setters)),
@@ -228,7 +228,7 @@ fn the_spellings_of_variants_in_json_are_those_of_the_documentation() {
         ("`signing.state` of", spelled(&signing)),
     ] {
         let start = format!("| {row}");
-        let line = told.lines().find(|line| line.starts_with(&start)).unwrap();
+        let line = documented.lines().find(|line| line.starts_with(&start)).unwrap();
         let expected: Vec<String> = spelled.iter().map(|it| format!("`{it}`")).collect();
         assert!(line.contains(&format!("| {} |", expected.join(", "))), "{line}: {expected:?}");
     }
@@ -238,6 +238,6 @@ fn the_spellings_of_variants_in_json_are_those_of_the_documentation() {
         (spelled(&[LensModel::KannalaBrandt([0.0; 4])]), "{\"KannalaBrandt\":["),
         (spelled(&[RefusedShape::Quad([[0.0; 2]; 4])]), "{\"Quad\":["),
     ] {
-        assert!(value[0].starts_with(start) && told.contains(start), "{value:?}");
+        assert!(value[0].starts_with(start) && documented.contains(start), "{value:?}");
     }
 }
