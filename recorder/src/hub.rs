@@ -61,12 +61,12 @@ impl Hub {
         Self { state: Mutex::default(), max_clients }
     }
 
-    // Every state is a whole one, also when a thread panics.
+    // Every state is complete, also when a thread panics.
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A place for one more client, who is told of all channels; `None` when all are taken.
+    /// A place for one more client, to which all channels are announced; `None` when all places are taken.
     pub(crate) fn join(self: &Arc<Self>) -> Option<Place> {
         let mut state = self.lock();
         if state.clients.len() >= self.max_clients {
@@ -74,7 +74,7 @@ impl Hub {
         }
         state.has_begun |= state.clients.is_empty();
         let mut outbox = Outbox::default();
-        outbox.tell(advertise(state.numbered()));
+        outbox.announce(advertise(state.numbered()));
         let changed = Arc::new(Notify::new());
         let client = state.next_client;
         state.next_client += 1;
@@ -82,12 +82,12 @@ impl Hub {
         Some(Place { hub: Arc::clone(self), client, changed })
     }
 
-    /// Whether somebody follows.
+    /// Whether a client follows.
     pub(crate) fn is_followed(&self) -> bool {
         !self.lock().clients.is_empty()
     }
 
-    /// Whether somebody follows who was the first to come since this was asked.
+    /// Whether a client has joined a hub without clients since the last call.
     pub(crate) fn take_begun(&self) -> bool {
         std::mem::take(&mut self.lock().has_begun)
     }
@@ -102,8 +102,8 @@ impl Hub {
             dropped += client.outbox.push(number, max_waiting(schema), &message);
             client.changed.notify_one();
         }
-        let is_kept = is_state && message.data.len() <= MAX_STATE_BYTES;
-        if let Some(channel) = state.channels.get_mut(number as usize).filter(|_| is_kept) {
+        let is_retained = is_state && message.data.len() <= MAX_STATE_BYTES;
+        if let Some(channel) = state.channels.get_mut(number as usize).filter(|_| is_retained) {
             channel.last = Some(message);
         }
         dropped
@@ -116,7 +116,7 @@ impl State {
         (0..).zip(&self.channels).map(|(number, it)| (number, it.topic.as_str(), it.schema))
     }
 
-    /// The number and the schema of a record's channel, of which all are told when it is new. A channel is of one schema: a
+    /// The number and the schema of a record's channel, which is announced to all clients when it is new. A channel has one schema: a
     /// camera that starts again may send pictures of another kind.
     fn number(&mut self, record: &Record) -> Option<(u32, Schema)> {
         let is_its =
@@ -139,7 +139,7 @@ impl State {
         let number = self.channels.len() as u32;
         let Record { channel, schema, .. } = record;
         for client in self.clients.values_mut() {
-            client.outbox.tell(advertise([(number, channel.as_str(), *schema)]));
+            client.outbox.announce(advertise([(number, channel.as_str(), *schema)]));
         }
         self.numbers.insert(channel.clone(), number);
         self.channels.push(Channel { topic: channel.clone(), schema: *schema, last: None });
@@ -200,7 +200,7 @@ impl Drop for Place {
         let mut state = self.hub.lock();
         state.clients.remove(&self.client);
         if state.clients.is_empty() {
-            // Nobody listens for the values that follow.
+            // No client receives the values that follow.
             for channel in &mut state.channels {
                 channel.last = None;
             }
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn channels_are_told_when_they_come_and_are_bounded() {
+    fn new_channels_are_announced_and_their_number_is_bounded() {
         let hub = Arc::new(Hub::new(1));
         let place = hub.join().unwrap();
         for number in 0..=MAX_CHANNELS {

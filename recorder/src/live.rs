@@ -1,5 +1,5 @@
 //! Offers messages, and frames with a picture, to viewers who follow a flight over WebSocket; listens at the configured
-//! address, and does nothing while nobody follows.
+//! address, and does nothing while no viewer follows.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -21,24 +21,24 @@ use crate::server::{Server, serve};
 /// The reason for which a recorder that serves beyond this machine counts an error in its health.
 const INSECURE: &str = "insecure: anyone in reach can follow the flight";
 
-/// The reason for which one is counted whose viewers' address cannot be had.
+/// The reason for which a recorder counts an error that cannot listen at its address for viewers.
 const UNSERVED: &str = "viewers are not served";
-/// Period in which an address that cannot be had is tried again.
+/// Period in which such an address is tried again.
 const RETRY_PERIOD: Duration = Duration::from_secs(2);
 
-/// Offers messages while somebody follows; without anybody it costs nothing.
+/// Offers messages while a viewer follows; without a viewer it does no work.
 pub(crate) struct Live {
     hub: Arc<Hub>,
     health: Arc<HealthCounters>,
     records: flightlog::Live,
-    /// How many lost messages were told.
-    told_lost: Option<u64>,
+    /// How many lost messages were reported to the viewers.
+    reported_lost: Option<u64>,
     task: JoinHandle<()>,
 }
 
 impl Live {
     /// Listens where the configuration says so; `None` when it does not. A recording does not depend on it: where there is a
-    /// file, an address that cannot be had is tried again.
+    /// file, an address at which it cannot listen is tried again.
     ///
     /// # Errors
     /// When the address is taken or of another machine, and there is no file.
@@ -67,17 +67,17 @@ impl Live {
         };
         let failures = Arc::clone(&health);
         let task = tokio::spawn(async move {
-            // The recording goes on.
+            // The recording continues.
             if let Err(problem) = serve_at(address, listener, server, &failures).await {
                 failures.failed(UNSERVED);
                 tracing::error!(problem = format!("{problem:#}"), "No viewer is served any more");
             }
         });
         let records = flightlog::Live::new(0, clock_name());
-        Ok(Some(Self { hub, health, records, told_lost: None, task }))
+        Ok(Some(Self { hub, health, records, reported_lost: None, task }))
     }
 
-    /// Whether somebody follows; the first one gets the last values of all states.
+    /// Whether a client follows; the first one receives the last values of all states.
     pub(crate) fn is_followed<'a>(
         &mut self,
         utc_offset_ns: impl FnOnce() -> i64,
@@ -85,7 +85,7 @@ impl Live {
     ) -> bool {
         if self.hub.take_begun() {
             self.records = flightlog::Live::new(utc_offset_ns(), clock_name());
-            self.told_lost = None;
+            self.reported_lost = None;
             for state in states {
                 self.take(state, None);
             }
@@ -106,10 +106,10 @@ impl Live {
         }
     }
 
-    /// Tells what was lost, when that is news.
-    pub(crate) fn tell_lost(&mut self, lost: &BTreeMap<String, u64>) {
+    /// Reports the lost messages to the viewers, when their number has changed.
+    pub(crate) fn report_lost(&mut self, lost: &BTreeMap<String, u64>) {
         let sum = lost.values().sum();
-        if self.told_lost.replace(sum) != Some(sum) {
+        if self.reported_lost.replace(sum) != Some(sum) {
             self.offer(dropped(now_ns(), lost), now_ns(), true);
         }
     }
@@ -128,7 +128,7 @@ async fn bind(address: SocketAddr) -> anyhow::Result<TcpListener> {
     })
 }
 
-/// Serves viewers; without a listener once the address can be had.
+/// Serves viewers; without a listener, as soon as it can listen at the address.
 async fn serve_at(
     address: SocketAddr,
     listener: Option<TcpListener>,

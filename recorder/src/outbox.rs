@@ -57,7 +57,7 @@ pub(crate) enum Next {
 /// What waits to be sent to one client.
 #[derive(Debug, Default)]
 pub(crate) struct Outbox {
-    /// That there are channels: not more texts than channels.
+    /// Announcements of channels: not more texts than channels.
     texts: VecDeque<String>,
     /// By channel.
     subscribed: BTreeMap<u32, Subscribed>,
@@ -75,12 +75,12 @@ struct Subscribed {
 }
 
 impl Outbox {
-    /// Tells of channels.
-    pub(crate) fn tell(&mut self, text: String) {
+    /// Adds the announcement of channels.
+    pub(crate) fn announce(&mut self, text: String) {
         self.texts.push_back(text);
     }
 
-    /// From now on the client gets the messages of a channel; false when it does already, or uses the number for another.
+    /// From now on the client receives the messages of a channel; false when it does already, or uses the number for another.
     pub(crate) fn subscribe(&mut self, subscription: Subscription) -> bool {
         let Subscription { id, channel_id } = subscription;
         let is_free = !self.subscribed.contains_key(&channel_id)
@@ -91,7 +91,7 @@ impl Outbox {
         is_free
     }
 
-    /// The client gets no more of a subscription.
+    /// The client receives no more messages of a subscription.
     pub(crate) fn unsubscribe(&mut self, id: u32) {
         self.subscribed.retain(|_, it| it.id != id);
         let waiting = self.subscribed.values().flat_map(|it| &it.waiting);

@@ -104,12 +104,12 @@ async fn ping(socket: &mut WebSocket, window: &mut Window) -> anyhow::Result<()>
     send(socket, Message::Ping(number.to_le_bytes().to_vec().into())).await
 }
 
-/// Sends what a client subscribes to, until it goes.
+/// Sends the messages to which a client subscribes, until it disconnects.
 async fn follow(server: &Server, place: &Place, socket: &mut WebSocket) -> anyhow::Result<()> {
     send(socket, Message::Text(server_info(&server.name, &server.session).into())).await?;
     let mut window = Window::default();
     let mut look = interval(LOOK_PERIOD);
-    let mut told = 0;
+    let mut reported = 0;
     loop {
         // A message that finds the window full is sent after the pong.
         while window.has_room()
@@ -147,8 +147,8 @@ async fn follow(server: &Server, place: &Place, socket: &mut WebSocket) -> anyho
                 }
                 ping(socket, &mut window).await?;
                 let dropped = place.dropped();
-                if dropped > told {
-                    told = dropped;
+                if dropped > reported {
+                    reported = dropped;
                     let text = format!(
                         "{dropped} older messages were left out so far, as the connection or the viewer is too slow for all of them"
                     );
@@ -159,7 +159,7 @@ async fn follow(server: &Server, place: &Place, socket: &mut WebSocket) -> anyho
     }
 }
 
-/// Does what a client asks for, or says why not.
+/// Carries out a client's request, or sends why not.
 async fn answer(
     server: &Server,
     place: &Place,

@@ -27,11 +27,11 @@ const MAX_WAIT: Duration = Duration::from_millis(50);
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// Pause after a file that could not be opened or written, before another one is tried.
 const RETRY_PAUSE: Duration = Duration::from_secs(2);
-/// A disk that takes nothing for this time is told.
+/// A disk that takes nothing for this time is reported.
 const STALLED: Duration = Duration::from_secs(1);
 /// Time for the last messages of others that end at the same time, as a controller does that puts parameters back.
 const LAST_MESSAGES: Duration = Duration::from_millis(600);
-/// Time in which those are written that came before that and still wait.
+/// Time in which the messages are written that were received before that and still wait.
 const CATCH_UP: Duration = Duration::from_millis(200);
 /// Time from the last messages on in which the disk is to have the rest; `alight land` kills after 4 s.
 const END_PATIENCE: Duration = Duration::from_millis(1100);
@@ -44,11 +44,12 @@ const MAX_STATUS_PERIOD: Duration = Duration::from_secs(2);
 /// Maximum number of keys whose last values are remembered.
 const MAX_STATES: usize = 1024;
 
-/// Records until shutdown. A disk that fails ends nothing: it is told, what is lost is counted, and another file is tried.
+/// Records until shutdown. A disk that fails does not end it: the failure is reported, lost messages are counted, and another file is
+/// tried.
 ///
 /// # Errors
 /// When another recorder has this name, the address for viewers is taken and there is no file, the network session cannot be used, a
-/// file could not be ended, or messages that came are in no file.
+/// file could not be ended, or received messages are in no file.
 pub fn run(
     node: Node,
     config: Config,
@@ -61,11 +62,11 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     node.claim_unique_name(&config.id).await?;
     let frames = node::named(&config.frames).map_err(anyhow::Error::msg)?;
     let has_file = config.has_file();
-    let wanted = TOPICS.iter().copied().filter(|row| is_wanted(row, frames, has_file));
-    let wanted: Vec<Row> = wanted.collect();
+    let requested = TOPICS.iter().copied().filter(|row| is_wanted(row, frames, has_file));
+    let requested: Vec<Row> = requested.collect();
     let live = Live::listen(&node, &config).await?;
     let max_waiting_bytes = config.max_waiting_mb as usize * 1_000_000 / 2;
-    let tap = node.tap(&wanted, max_waiting_bytes).await?;
+    let tap = node.tap(&requested, max_waiting_bytes).await?;
     let publisher = node.publisher(topic::RECORDER_STATUS, &[&config.id]).await?;
     node.announce().await?;
     let status = RecorderStatus { recorder: config.id.clone(), ..RecorderStatus::default() };
@@ -364,7 +365,7 @@ impl Recorder {
         }
     }
 
-    /// What waits of the file before.
+    /// The bytes of the previous file that still wait.
     fn ending_bytes(&self) -> usize {
         self.ending.as_ref().map_or(0, |ending| ending.status().waiting_bytes)
     }
@@ -374,7 +375,7 @@ impl Recorder {
         if let Some(live) = &mut self.live
             && live.is_followed(utc_offset_ns, self.states.values())
         {
-            live.tell_lost(&self.lost.0);
+            live.report_lost(&self.lost.0);
         }
         if self.config.has_file() {
             self.write_file();
@@ -531,7 +532,7 @@ impl Recorder {
         if let Some(problem) = self.end_problem {
             bail!("{problem}");
         }
-        // Without a file only viewers missed them, who were told.
+        // Without a file only viewers missed them, to which they were reported.
         let is_lost = |(key, _): &(&String, &u64)| self.config.has_file() && !has_never_come(key);
         let lost: Vec<_> = self.lost.0.iter().filter(is_lost).collect();
         let keys: Vec<_> = lost.iter().map(|(key, count)| format!("{count} of {key}")).collect();
@@ -583,14 +584,14 @@ mod tests {
     }
 
     #[test]
-    fn a_recorder_that_lost_messages_or_the_end_of_a_file_says_so_at_its_end() {
+    fn a_recorder_that_lost_messages_or_the_end_of_a_file_reports_it_at_its_end() {
         ends(|_| {}).unwrap();
         ends(|it| it.lost.add("camera/down/frame (never came)", 7)).unwrap();
-        let told = ends(|it| it.lost.add("wind", 3)).unwrap_err();
-        assert!(told.contains("3 messages") && told.contains("3 of wind"), "{told}");
-        let told = ends(|it| it.end_problem = Some("the end is missing".to_owned())).unwrap_err();
-        assert!(told.contains("the end is missing"), "{told}");
-        // Who only serves viewers has told them.
+        let error = ends(|it| it.lost.add("wind", 3)).unwrap_err();
+        assert!(error.contains("3 messages") && error.contains("3 of wind"), "{error}");
+        let error = ends(|it| it.end_problem = Some("the end is missing".to_owned())).unwrap_err();
+        assert!(error.contains("the end is missing"), "{error}");
+        // A recorder that only serves viewers has reported the loss to them.
         ends(|it| {
             it.lost.add("wind", 3);
             it.config.file = std::path::PathBuf::new();

@@ -46,7 +46,7 @@ impl Unseen {
         if (1..=MAX_GAP).contains(&step) {
             numbers.missing += step - 1;
         } else if (1..=MAX_LATE).contains(&late) && sequence > 0 {
-            // Its number counted as missing. One that comes twice is taken for two, so that a gap may be told too small.
+            // Its number counted as missing. A frame that is received twice counts as two, so that the reported gap may be too small.
             numbers.missing = numbers.missing.saturating_sub(1);
             return;
         } else if step != 0 || late != 0 {
@@ -91,7 +91,7 @@ mod tests {
         }
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 3)]);
         assert_eq!(unseen.more(), []);
-        // The next two are dropped before they are looked at, and told by who dropped them.
+        // The next two are dropped before they are looked at, and counted where they were dropped.
         unseen.dropped(KEY, 2);
         assert_eq!(unseen.more(), []);
         unseen.take(KEY, 16);

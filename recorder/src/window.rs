@@ -1,7 +1,7 @@
-//! What is on its way to a client: not more than it has taken for some time.
+//! Bounds the bytes that are on their way to a client: not more than it has taken for some time.
 //!
 //! The systems between two programs take megabytes before a sender has to wait, which on a slow link are many seconds of
-//! flight. Every WebSocket answers a ping when it has taken what came before it, so pings tell what was taken.
+//! flight. Every WebSocket answers a ping when it has taken what came before it, so pings show what was taken.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};

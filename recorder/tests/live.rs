@@ -65,7 +65,7 @@ impl Served {
         Ok(Client { socket: client_async(request, stream).await?.0 })
     }
 
-    /// A client that was told who serves.
+    /// A client that has received the server's name.
     async fn client(&self) -> anyhow::Result<Client> {
         let mut client = self.connected(self.request(SUBPROTOCOLS[0])?).await?;
         let info = client.text("serverInfo").await?;
@@ -163,14 +163,14 @@ impl Client {
         Ok(self.socket.send(Message::text(request.to_string())).await?)
     }
 
-    /// Subscribes to a channel under this number, once there is one; what was told of it.
+    /// Subscribes to a channel under this number, once there is one; returns its announcement.
     async fn subscribe(&mut self, topic: &str, id: u32) -> anyhow::Result<Value> {
         loop {
-            let told = self.text("advertise").await?;
-            let channels = told["channels"].as_array().context("channels")?;
+            let announced = self.text("advertise").await?;
+            let channels = announced["channels"].as_array().context("channels")?;
             if let Some(channel) = channels.iter().find(|it| it["topic"] == topic) {
-                let wanted = json!([{ "id": id, "channelId": channel["id"] }]);
-                self.ask(&json!({ "op": "subscribe", "subscriptions": wanted })).await?;
+                let requested = json!([{ "id": id, "channelId": channel["id"] }]);
+                self.ask(&json!({ "op": "subscribe", "subscriptions": requested })).await?;
                 return Ok(channel.clone());
             }
         }
@@ -203,8 +203,11 @@ fn utc_ns() -> anyhow::Result<u64> {
     Ok(u64::try_from(SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos())?)
 }
 
-fn says(told: &Value, part: &str) -> anyhow::Result<()> {
-    ensure!(told["message"].as_str().is_some_and(|it| it.contains(part)), "no `{part}` in {told}");
+fn says(status: &Value, part: &str) -> anyhow::Result<()> {
+    ensure!(
+        status["message"].as_str().is_some_and(|it| it.contains(part)),
+        "no `{part}` in {status}"
+    );
     Ok(())
 }
 
