@@ -132,7 +132,7 @@ impl Facts {
         let toml = match &again.detector {
             Some(name) if !self.detectors.contains_key(name) && self.found.contains_key(name) => {
                 bail!(WrongDetector(format!(
-                    "only Alight's own detectors can search again: `{name}` is none, as it told no configuration; the recording has: {}",
+                    "only Alight's own detectors can search again: `{name}` is another one, as it published no configuration; the recording has: {}",
                     names()
                 )))
             }

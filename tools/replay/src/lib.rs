@@ -1,12 +1,12 @@
-//! A recording back into the controller's decisions, and its frames back into detections.
+//! Replays a recording: its tape gives the controller's decisions again, its frames the detections.
 //!
 //! The controller's tape has each event in the order in which it was handled. Here they are given to a flight that
-//! begins anew, without network and clock. What comes out of it is compared with what came out then.
+//! starts again, without network and clock. Its decisions are compared with the recorded ones.
 //!
 //! Modules in reading order: [`mod@run`] gives a tape to a flight, [`difference`] names what two results differ in,
 //! [`mod@verify`] finds the first difference, and [`mod@change`] sums up what another configuration would have done; [`frames`]
-//! searches the recorded pictures again, compares what is found with what was found then, by [`truth`] where there is one,
-//! [`brightness`] tells how bright they are, and [`mod@restamp`] gives messages the time at which they are published again.
+//! searches the recorded pictures again and compares the new detections with the recorded ones, by [`truth`] where there is one,
+//! [`brightness`] measures how bright they are, and [`mod@restamp`] gives messages the time at which they are published again.
 
 pub mod brightness;
 pub mod change;

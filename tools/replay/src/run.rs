@@ -218,8 +218,8 @@ pub(crate) fn configuration(tape: &RecordedTape) -> Option<String> {
     }
 }
 
-/// Says which settings `key=value` are of the guidance that a tape's landing is not flown with, under them; `None` where there are none
-/// and where the configuration cannot be read, which a replay tells.
+/// Reports which settings `key=value` are of the guidance that a tape's landing is not flown with, under them; `None` where there are none
+/// and where the configuration cannot be read, which a replay reports.
 pub fn of_unused_guidance(tape: &RecordedTape, set: &[String]) -> Option<String> {
     let config: controller::Config =
         configured("the recorded configuration", &configuration(tape)?, set).ok()?;
@@ -253,12 +253,12 @@ pub(crate) fn configured<T: Settings>(name: &str, toml: &str, set: &[String]) ->
 /// Whether a recorded configuration can be read as it is.
 ///
 /// # Errors
-/// When it cannot, in words only: whoever replays it has not configured it wrongly.
+/// When it cannot, in words only: the user who replays it has not configured it wrongly.
 fn check_recorded<T: Settings>(name: &str, toml: &str) -> anyhow::Result<()> {
     from_toml::<T>(name, toml, &[]).map(drop).map_err(|problem| anyhow!("{problem}"))
 }
 
-/// What a recorded configuration is that cannot be read, which settings have no part in.
+/// Describes a recorded configuration that cannot be read, whatever the settings are.
 fn recorded_by(program: &str) -> String {
     let ours = controller::tape::program();
     if program == ours {
@@ -272,7 +272,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_configuration_that_cannot_be_read_names_who_recorded_it_once() {
+    fn a_configuration_that_cannot_be_read_names_its_program_once() {
         let ours = controller::tape::program();
         assert_eq!(recorded_by(&ours).matches(&ours).count(), 1);
         let other = recorded_by("alight 9.9.9");
@@ -290,19 +290,21 @@ mod tests {
     }
 
     #[test]
-    fn a_setting_of_the_guidance_that_is_not_flown_is_told() {
-        let told = |configuration: &str, set: &[&str]| {
+    fn a_setting_of_the_guidance_that_is_not_flown_is_reported() {
+        let unused = |configuration: &str, set: &[&str]| {
             let set: Vec<String> = set.iter().map(|&it| it.to_owned()).collect();
             of_unused_guidance(&tape(configuration), &set)
         };
         let thesis = "guidance = \"thesis\"";
-        let said = told(thesis, &["metric.lateral_gain=0.9", "marker=rings"]).unwrap();
-        assert!(said.contains("`metric.lateral_gain` changes nothing"), "{said}");
-        assert!(said.contains("`metric` is not in use, but `thesis`"), "{said}");
-        assert!(told("", &["thesis.tolerance_px=200"]).unwrap().contains("`thesis` is not in use"));
-        assert_eq!(told("", &["metric.lateral_gain=0.9"]), None);
-        assert_eq!(told(thesis, &["guidance=metric", "metric.lateral_gain=0.9"]), None);
-        assert_eq!(told(thesis, &["metric.no_such_key=1"]), None);
+        let warning = unused(thesis, &["metric.lateral_gain=0.9", "marker=rings"]).unwrap();
+        assert!(warning.contains("`metric.lateral_gain` changes nothing"), "{warning}");
+        assert!(warning.contains("`metric` is not in use, but `thesis`"), "{warning}");
+        assert!(
+            unused("", &["thesis.tolerance_px=200"]).unwrap().contains("`thesis` is not in use")
+        );
+        assert_eq!(unused("", &["metric.lateral_gain=0.9"]), None);
+        assert_eq!(unused(thesis, &["guidance=metric", "metric.lateral_gain=0.9"]), None);
+        assert_eq!(unused(thesis, &["metric.no_such_key=1"]), None);
     }
 
     #[test]

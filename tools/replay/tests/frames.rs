@@ -227,7 +227,8 @@ fn pictures_that_were_compressed_are_searched_as_well_and_said_to_be_so() {
 }
 
 #[test]
-fn what_another_detector_does_not_find_is_told_and_changes_the_detections_of_the_tape() {
+fn markers_that_another_detector_does_not_find_are_reported_and_change_the_detections_of_the_tape()
+{
     let other = Again {
         of_detector: vec!["markers=[\"aruco-4x4-50:8:0.2\"]".to_owned()],
         ..Again::default()
@@ -261,14 +262,14 @@ fn errors_are_of_the_frames_in_which_both_found_the_marker() {
 }
 
 #[test]
-fn what_a_recording_lacks_is_named() {
+fn messages_that_a_recording_lacks_are_named() {
     let refusal = |recording: Vec<u8>, of: &Again| again(recording, of).unwrap_err().to_string();
     let without = refusal(recording(|_, _| Picture::None), &Again::default());
     assert!(without.contains("no picture of the 12 frames of camera `down`"), "{without}");
     let named = Again { detector: Some("other".to_owned()), ..Again::default() };
     let unknown = refusal(recording(pixels), &named);
     assert!(unknown.contains("`other`") && unknown.contains("it has: main"), "{unknown}");
-    // A detector of another make tells no configuration of Alight's.
+    // A detector of another make publishes no configuration of Alight's.
     let mut file = Vec::new();
     let mut writer = Writer::new(&mut file, &About::default()).unwrap();
     let found = Detections {
