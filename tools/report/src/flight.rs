@@ -271,12 +271,12 @@ impl FlightReader {
         self.flight.messages == 0 && self.tapes.is_empty()
     }
 
-    /// The begin of the first file: it tells the order of files.
+    /// The begin of the first file: it gives the order of files.
     pub fn begin(&self) -> Begin {
         self.begin
     }
 
-    /// True when another is of the same recording: a tape goes on in it, and its times are of the same clock. The ground's of the
+    /// True when another is of the same recording: a tape continues in it, and its times are of the same clock. The ground's of the
     /// same flight is another.
     pub fn goes_on_in(&self, other: &Self) -> bool {
         let clock = |reader: &Self| reader.flight.facts.get("clock").cloned();
@@ -346,7 +346,7 @@ impl Flight {
         self.zero_ns = started.unwrap_or_else(|| self.first_ns());
     }
 
-    /// The first time that anything tells, in nanoseconds of the vehicle's clock.
+    /// The first time in any message, in nanoseconds of the vehicle's clock.
     fn first_ns(&self) -> i64 {
         let firsts = [
             self.statuses.first().map(|it| it.stamp_ns),
@@ -358,15 +358,15 @@ impl Flight {
         firsts.into_iter().flatten().min().unwrap_or(0)
     }
 
-    /// The last status that tells of the landing, or of all where none tells of one: after a landing its controller may wait for the
+    /// The last status of the landing, or of all where none is of a landing: after a landing its controller may wait for the
     /// next flight, or be started again.
     pub fn last_status(&self) -> Option<&ControllerStatus> {
         let of_landing = self.statuses.iter().rev().find(|it| it.started_ns.is_some());
         of_landing.or(self.statuses.last())
     }
 
-    /// When the landing ended, in seconds since [`Flight::zero_ns`], with the moment after it. Later nothing happens for as long as
-    /// somebody watches.
+    /// When the landing ended, in seconds since [`Flight::zero_ns`], with the moment after it. Later nothing happens for as long as the
+    /// recording continues.
     pub fn end_s(&self) -> Option<f64> {
         let mut of_landing = self.statuses.iter().filter(|it| it.stamp_ns >= self.zero_ns);
         let finished = of_landing.find(|status| status.finished)?;
@@ -489,9 +489,9 @@ impl Flight {
             }
             ["gcs", "status"] => {
                 let status = self.decoded(topic::GCS_STATUS, key, payload);
-                let told =
+                let by_bridge =
                     |status: GcsStatus| (status.bridge.clone(), Bridge { received_ns, status });
-                self.bridges.extend(status.map(told));
+                self.bridges.extend(status.map(by_bridge));
             }
             ["mavlink", "from-autopilot"] => {
                 if let Some(MavlinkBytes { packet }) =
@@ -547,7 +547,8 @@ impl Flight {
         self.min_apart_ns = Some(self.min_apart_ns.map_or(apart_ns, |it| it.min(apart_ns)));
     }
 
-    /// What follows is of another start of the vehicle's computer. What is of the recording as a whole goes on, and what was told last.
+    /// The next messages are of another start of the vehicle's computer. Facts about the recording and the last configurations are
+    /// retained.
     fn begin_boot(&mut self) {
         let mut before = std::mem::take(self);
         self.take_over(&before);

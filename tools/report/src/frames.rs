@@ -173,9 +173,9 @@ fn stands(flight: &Flight, at_ns: i64) -> bool {
     truth.is_some_and(|it| it.on_ground) || rests(&flight.vehicle, at_ns)
 }
 
-/// Whether the autopilot says at a time that the vehicle stands, or the vehicle neither sinks nor climbs any more until it says so: an
+/// Whether the autopilot reports at a time that the vehicle stands, or the vehicle neither sinks nor climbs any more until it does: an
 /// autopilot takes a second or two to be sure, and nothing comes from the air to the ground without sinking. Where states are missing
-/// it may have sunk meanwhile, and another height tells that it has.
+/// it may have sunk meanwhile, and another height shows that it has.
 fn rests(vehicle: &[VehicleState], at_ns: i64) -> bool {
     let later = vehicle.partition_point(|it| it.stamp_ns <= at_ns);
     let from_now = later.checked_sub(1).and_then(|now| vehicle.get(now..)).unwrap_or_default();
@@ -184,15 +184,17 @@ fn rests(vehicle: &[VehicleState], at_ns: i64) -> bool {
         it.landed != LandedState::OnGround && down_m_s.abs() <= MAX_RESTING_M_S
     };
     let resting = from_now.iter().take_while(|it| rests(it)).count();
-    let told = from_now.get(resting).filter(|it| it.landed == LandedState::OnGround);
-    let (Some(told), Some(until_told)) = (told, from_now.get(..=resting)) else { return false };
+    let reported = from_now.get(resting).filter(|it| it.landed == LandedState::OnGround);
+    let (Some(reported), Some(until_reported)) = (reported, from_now.get(..=resting)) else {
+        return false;
+    };
     let down_m = |it: &VehicleState| {
         let [_, _, down_m] = it.position_ned_m;
         down_m
     };
-    let is_level = |it: &VehicleState| (down_m(it) - down_m(told)).abs() <= MAX_RISE_M;
-    let mut steps = until_told.iter().zip(until_told.iter().skip(1));
-    until_told.iter().all(is_level)
+    let is_level = |it: &VehicleState| (down_m(it) - down_m(reported)).abs() <= MAX_RISE_M;
+    let mut steps = until_reported.iter().zip(until_reported.iter().skip(1));
+    until_reported.iter().all(is_level)
         && steps.all(|(one, next)| next.stamp_ns.saturating_sub(one.stamp_ns) < GAP_NS)
 }
 
@@ -286,7 +288,7 @@ fn has_setpoint(packets: &[u8]) -> bool {
         && Parser::new().push(packets).iter().filter_map(|it| it.message.as_ref()).any(is_setpoint)
 }
 
-/// Without a tape: the estimates tell which frame was used last, and why the newest was refused.
+/// Without a tape: the estimates show which frame was used last, and why the newest was refused.
 fn of_messages(flight: &Flight, marker: Option<&str>) -> Vec<Handled> {
     let age_ns = |age_ms: f64| (age_ms * 1e6).round() as i64;
     let used: BTreeSet<i64> = flight
@@ -356,7 +358,7 @@ mod tests {
     #[test]
     fn a_vehicle_stands_from_when_it_rests_and_not_only_when_its_autopilot_says_so() {
         use LandedState::{InAir, Landing, OnGround};
-        // It hovers, sinks, touches down at 3 on a pad that moves, and is told to stand at 5.
+        // It hovers, sinks, touches down at 3 on a pad that moves, and is reported to stand at 5.
         let speeds = [(0, 0.0, InAir), (1, 0.0, InAir), (2, 0.4, Landing), (3, 0.03, Landing)];
         let mut vehicle: Vec<_> = speeds.map(|(at, down, landed)| state(at, down, landed)).into();
         vehicle.push(state(4, -0.04, Landing));
@@ -364,7 +366,7 @@ mod tests {
         flight.vehicle = vehicle;
         let standing =
             |flight: &Flight| (-1..8).filter(|at| stands(flight, *at)).collect::<Vec<_>>();
-        // Nobody says yet that it stands.
+        // No message reports yet that it stands.
         assert!(standing(&flight).is_empty());
         flight.vehicle.extend([state(5, 0.0, OnGround), state(6, 0.0, OnGround)]);
         assert_eq!(standing(&flight), [3, 4, 5, 6, 7]);

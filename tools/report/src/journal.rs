@@ -111,7 +111,7 @@ fn commands(flight: &Flight) -> Vec<Line> {
                 TapeEvent::Presence { detector, alive: false } => {
                     ("controller", true, format!("detector {detector} went"))
                 }
-                // It is told again until all that it takes is sent.
+                // It is recorded again until all that it takes is sent.
                 TapeEvent::Shutdown if !std::mem::replace(&mut has_ended, true) => {
                     ("controller", false, "the controller ends".to_owned())
                 }
@@ -213,13 +213,14 @@ mod tests {
             let (lines, left_out) = of(&flight);
             assert_eq!(lines.len(), MAX_LINES);
             assert!(left_out > 1000, "{left_out}");
-            let told = lines.iter().any(|line| line.who == "controller" && line.text == "landed");
-            assert!(told, "a landing after {landing_s} s");
+            let has_landing =
+                lines.iter().any(|line| line.who == "controller" && line.text == "landed");
+            assert!(has_landing, "a landing after {landing_s} s");
         }
     }
 
     #[test]
-    fn commands_and_the_end_are_those_of_the_landing_and_told_once() {
+    fn commands_and_the_end_are_those_of_the_landing_and_listed_once() {
         let mut tape = TapeWriter::new(0);
         let mut write = |now_ns, event: &TapeEvent<'_>| {
             tape.write(now_ns, event, &TapeOutput::default());
@@ -231,16 +232,16 @@ mod tests {
         let parts = tape.take().into_iter().collect();
         let mut flight = Flight::default();
         flight.tapes = vec![RecordedTape { begun_ns: 0, parts }];
-        let told = |flight: &Flight| -> Vec<String> {
+        let texts = |flight: &Flight| -> Vec<String> {
             commands(flight).into_iter().map(|line| line.text).collect()
         };
         let ends = "the controller ends".to_owned();
         let [start, hold] = ["Start", "Hold"].map(|it| format!("{it}: refused, "));
-        assert_eq!(told(&flight), [start.clone(), hold.clone(), ends.clone()]);
+        assert_eq!(texts(&flight), [start.clone(), hold.clone(), ends.clone()]);
         let mut of_landing = |time_ns| {
             let (number, of, detector_changes_before) = (1, 2, 0);
             flight.landing = Some(Landing { number, of, time_ns, detector_changes_before });
-            told(&flight)
+            texts(&flight)
         };
         assert_eq!(of_landing(i64::MIN..2 * S), [start]);
         assert_eq!(of_landing(2 * S..i64::MAX), [hold, ends]);

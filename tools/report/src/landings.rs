@@ -52,7 +52,7 @@ impl Flight {
         self.keep(from_ns..to_ns);
         let before = self.statuses.first().filter(|_| index > 0);
         let detector_changes_before = before.map_or(0, |status| status.detector_changes);
-        // A status before the begin still tells of the landing before.
+        // A status before the begin is still of the landing before.
         for status in &mut self.statuses {
             if status.started_ns != Some(begun_ns) {
                 (status.started_ns, status.disarmed_ns) = (None, None);

@@ -1,15 +1,15 @@
-//! A recorded flight, explained on one page.
+//! Reports on a recorded flight: a page, a summary and figures that show what happened and why.
 //!
-//! Recordings in, a page out: HTML that needs no network and no other file, with charts as SVG. This crate knows no
-//! files, no clock and no network, and decides nothing: what it says of a flight is in the recording.
+//! Recordings in, a page out: HTML that needs no network and no other file, with charts as SVG. This crate uses no
+//! files, no clock and no network, and decides nothing: all that it reports of a flight is in the recording.
 //!
 //! Modules in reading order: [`flight`] has what a recording holds, with the autopilot's [`packets`], and [`landings`] keeps
-//! one landing of it; [`frames`] tells
-//! what became of each frame, [`latency`] how long it took, [`light`] how bright the pictures were, [`track`] where the vehicle was, [`phases`] and [`journal`]
-//! what happened and why, [`losses`] what is missing, [`tape`] whether the tape
-//! gives the same again, and [`mod@summary`] all of it in numbers. [`difference`], over [`settings`], compares
-//! configurations. [`view`] joins these for the page: [`plots`] are its charts, drawn by [`chart`], [`sections`] its
-//! parts, in pieces of [`html`], and [`mod@page`] the whole, [`mod@document`] the same on the pages of a [`pdf`] file. [`mod@figures`] are the charts as files of their own.
+//! one landing of it; [`frames`] shows
+//! what became of each frame, [`latency`] how long it took, [`light`] how bright the pictures were, [`track`] where the vehicle was,
+//! [`phases`] and [`journal`] what happened and why, [`losses`] what is missing, [`tape`] whether the tape gives the same again, and
+//! [`mod@summary`] all of it in numbers. [`difference`], over [`settings`], compares configurations. [`view`] joins these for the page:
+//! [`plots`] are its charts, drawn by [`chart`], [`sections`] its parts, in pieces of [`html`], and [`mod@page`] the whole,
+//! [`mod@document`] the same on the pages of a [`pdf`] file. [`mod@figures`] are the charts as files of their own.
 
 pub mod chart;
 pub mod difference;

@@ -38,9 +38,9 @@ pub fn usual(pictures: &[Light]) -> Option<Usual> {
     })
 }
 
-/// What is wrong with the light, as sentences with what to do.
+/// Warnings about the light, as sentences with a remedy.
 pub fn warnings(flight: &Flight) -> Vec<String> {
-    let told = flight.light.iter().filter_map(|(camera, pictures)| {
+    let warnings = flight.light.iter().filter_map(|(camera, pictures)| {
         let Usual { mean, brightest, noise, exposure_ms } = usual(pictures)?;
         let exposed = exposure_ms.map_or_else(String::new, |ms| format!(", exposed for {ms:.1} ms"));
         let of_white = format!(
@@ -60,7 +60,7 @@ pub fn warnings(flight: &Flight) -> Vec<String> {
         };
         Some(format!("the pictures of camera `{camera}` are {how} for a marker: {of_white}; {remedy} (docs/camera.md)"))
     });
-    told.collect()
+    warnings.collect()
 }
 
 #[cfg(test)]
@@ -69,23 +69,23 @@ mod tests {
     use replay::Brightness;
 
     #[test]
-    fn dark_bright_and_noisy_pictures_are_told_with_their_numbers() {
-        let told = |mean: f64, brightest: f64, noise: f64, exposure_ms| {
+    fn dark_bright_and_noisy_pictures_are_reported_with_their_numbers() {
+        let warnings_of = |mean: f64, brightest: f64, noise: f64, exposure_ms| {
             let brightness = Brightness { mean, brightest, noise };
             let picture = Light { stamp_ns: 0, exposure_ms, brightness };
             let mut flight = Flight::default();
             flight.light.insert("down".to_owned(), vec![picture]);
             warnings(&flight)
         };
-        assert_eq!(told(0.4, 0.9, 0.01, None), Vec::<String>::new());
+        assert_eq!(warnings_of(0.4, 0.9, 0.01, None), Vec::<String>::new());
         assert_eq!(
-            told(0.012, 0.05, 0.01, Some(20.0)),
+            warnings_of(0.012, 0.05, 0.01, Some(20.0)),
             [
                 "the pictures of camera `down` are too dark for a marker: in the median their mean is 1.2 % of white, the brightest hundredth of the pixels reaches 5.0 %, and the noise is 1.0 %, exposed for 20.0 ms; light the pad, or give the camera a longer exposure or more gain (docs/camera.md)"
             ]
         );
-        assert!(told(0.97, 1.0, 0.0, None)[0].contains("too bright"));
-        assert!(told(0.3, 0.5, 0.06, None)[0].contains("too noisy, as in too little light"));
+        assert!(warnings_of(0.97, 1.0, 0.0, None)[0].contains("too bright"));
+        assert!(warnings_of(0.3, 0.5, 0.06, None)[0].contains("too noisy, as in too little light"));
         assert_eq!(warnings(&Flight::default()), Vec::<String>::new());
     }
 }

@@ -50,9 +50,9 @@ pub struct Packets {
     pub parameters: BTreeMap<String, f64>,
     /// The battery.
     pub power: Vec<Power>,
-    /// What it said.
+    /// Its status texts.
     pub texts: Vec<Text>,
-    /// Tells its packets from others on its link.
+    /// Distinguishes its packets from others on its link.
     pub(crate) own: OwnAutopilot,
     is_px4: bool,
 }

@@ -462,7 +462,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_legend_tells_areas_dots_crosses_and_lines_apart() {
+    fn a_legend_distinguishes_areas_dots_crosses_and_lines() {
         let drawn = |shape: Shape| {
             let mut pages = Pages::default();
             pages.sample(shape, Ink::Blue, [100.0, 100.0]);

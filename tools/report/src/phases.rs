@@ -26,7 +26,7 @@ pub struct Reason {
     pub why: String,
 }
 
-/// Whether two reasons differ in their numbers at most: a climb tells its height.
+/// Whether two reasons differ in their numbers at most: that of a climb contains its height.
 pub fn is_same(one: &str, other: &str) -> bool {
     let is_number = |c: &char| c.is_ascii_digit() || *c == '.';
     one.chars().filter(|c| !is_number(c)).eq(other.chars().filter(|c| !is_number(c)))

@@ -12,7 +12,7 @@ use crate::view::View;
 use crate::{journal, light, losses, plots};
 
 /// Age of a bridge's last status at the end beyond which it says nothing of the end, in nanoseconds; one comes every 2 s.
-const MAX_TOLD_AGE_NS: i64 = 5_000_000_000;
+const MAX_STATUS_AGE_NS: i64 = 5_000_000_000;
 
 /// A part of the page, for one flight.
 #[derive(Clone, Debug)]
@@ -154,7 +154,7 @@ fn detections(view: &View<'_>) -> Section {
     section.charts = plots::detections(view);
     if !view.frames.is_from_tape {
         section.before.push(paragraph(
-            "Without the controller's tape this is what its estimates tell: a frame that is not known may have been refused.",
+            "Without the controller's tape this is what its estimates show: a frame that is not known may have been refused.",
         ));
     }
     let mut counts: BTreeMap<(&Fate, &str), u64> = BTreeMap::new();
@@ -219,7 +219,7 @@ fn latency(view: &View<'_>) -> Section {
     section.charts = plots::latency(view);
     if !view.frames.is_from_tape {
         section.before.push(paragraph(
-            "Without the controller's tape the times are those at which the recorder had the detections; setpoints cannot be told apart.",
+            "Without the controller's tape the times are those at which the recorder had the detections; setpoints cannot be distinguished.",
         ));
     }
     let rows: Vec<Vec<Cell>> = stages
@@ -288,7 +288,7 @@ fn detectors(view: &View<'_>) -> Section {
     let flight = view.flight;
     let mut section = section("detectors", "Detectors", "");
     let Some(last) = flight.last_status() else {
-        section.before.push(missing("the controller's status, which tells the detector in use"));
+        section.before.push(missing("the controller's status, which names the detector in use"));
         return section;
     };
     let mut changes = Vec::new();
@@ -401,7 +401,7 @@ fn battery(view: &View<'_>) -> Section {
     section
 }
 
-/// Adds who was heard on the ground, and what of it was refused, by the last word of each bridge.
+/// Adds the ground stations whose packets were received, and the refused packets, by the last status of each bridge.
 fn ground(flight: &Flight, section: &mut Section) {
     if flight.bridges.is_empty() {
         let processes = flight.processes.values().map(|process| &process.last);
@@ -411,7 +411,7 @@ fn ground(flight: &Flight, section: &mut Section) {
                 "the ground stations: gcs-bridge {} ran, and its status was not recorded",
                 bridge.instance
             ),
-            None => "the ground stations: no gcs-bridge was heard".to_owned(),
+            None => "the ground stations: no message of a gcs-bridge was recorded".to_owned(),
         };
         section.before.push(missing(&why));
         return;
@@ -421,10 +421,10 @@ fn ground(flight: &Flight, section: &mut Section) {
     let mut stations = Vec::new();
     let mut refused = Vec::new();
     for (name, Bridge { received_ns, status: bridge }) in &flight.bridges {
-        let told_ns = flight.vehicle_ns(*received_ns);
-        let is_old = end_ns.saturating_sub(told_ns) > MAX_TOLD_AGE_NS;
+        let status_ns = flight.vehicle_ns(*received_ns);
+        let is_old = end_ns.saturating_sub(status_ns) > MAX_STATUS_AGE_NS;
         let unknown =
-            format!("unknown after {:.1} s: the bridge told no more", flight.at_s(told_ns));
+            format!("unknown after {:.1} s: the bridge published no more", flight.at_s(status_ns));
         let further = match bridge.unlisted {
             0 => String::new(),
             more => format!("; {} of further stations", counted(more, "packet", "packets")),
@@ -434,14 +434,14 @@ fn ground(flight: &Flight, section: &mut Section) {
             bridge.link, bridge.signing.state, bridge.ground_may
         )));
         stations.extend(bridge.stations.iter().map(|it| {
-            let heard = match it.silent {
+            let present = match it.silent {
                 true => "silent at the end",
                 false if is_old => unknown.as_str(),
                 false => "yes",
             };
             vec![
                 text(format!("{}/{} at {}", it.system, it.component, it.peer)),
-                text(heard),
+                text(present),
                 count(it.packets),
                 count(it.refused),
             ]
@@ -449,7 +449,7 @@ fn ground(flight: &Flight, section: &mut Section) {
         let of_bridge = bridge.refused.iter();
         refused.extend(of_bridge.map(|it| vec![text(&it.reason), count(it.count)]));
     }
-    let head = ["ground station (system/component)", "heard", "packets", "refused"];
+    let head = ["ground station (system/component)", "present", "packets", "refused"];
     section.after.push(table(&head, stations));
     section.after.push(table(&["packets from the ground that were refused", "times"], refused));
 }

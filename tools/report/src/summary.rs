@@ -94,7 +94,7 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
         flight.statuses.iter().find_map(|status| status.started_ns).map(|_| flight.at_s(stamp_ns))
     };
     let disarmed_ns = flight.statuses.iter().find_map(|status| status.disarmed_ns);
-    // A simulator tells the last touchdown until the next.
+    // A simulator publishes the last touchdown until the next.
     let touchdowns = flight.truth.iter().filter_map(|truth| truth.touchdown);
     let touchdown = touchdowns.into_iter().find(|it| it.stamp_ns >= flight.zero_ns);
     let of_landing = flight.vehicle.iter().filter(|it| it.stamp_ns >= flight.zero_ns);
@@ -106,7 +106,7 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
     let winds: Vec<f64> = flight.wind.iter().map(|wind| norm(wind.velocity_ned_m_s)).collect();
     let phases = phases::of(flight);
     let to_setpoint = latency.iter().find(|stage| stage.name == TO_SETPOINT);
-    let told = last.and_then(|status| status.latency_ms);
+    let of_controller = last.and_then(|status| status.latency_ms);
     Summary {
         name: match &flight.landing {
             Some(Landing { number, of, .. }) => {
@@ -141,8 +141,8 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
         frames_used: frames.count(&Fate::Used),
         frames_without_marker: frames.count(&Fate::NoMarker),
         frames_refused: frames.refused(),
-        latency_p50_ms: to_setpoint.map(|it| it.p50_ms).or(told.map(|[p50, _]| p50)),
-        latency_p99_ms: to_setpoint.map(|it| it.p99_ms).or(told.map(|[_, p99]| p99)),
+        latency_p50_ms: to_setpoint.map(|it| it.p50_ms).or(of_controller.map(|[p50, _]| p50)),
+        latency_p99_ms: to_setpoint.map(|it| it.p99_ms).or(of_controller.map(|[_, p99]| p99)),
         detector_changes: last.map(|status| {
             let before = flight.landing.as_ref().map_or(0, |it| it.detector_changes_before);
             status.detector_changes.saturating_sub(before)
@@ -180,8 +180,8 @@ pub fn tilt_deg(wxyz: [f64; 4]) -> f64 {
 
 fn max_tilt_deg(flight: &Flight) -> Option<f64> {
     let true_deg = flight.truth.iter().map(|truth| truth.max_tilt_rad.to_degrees());
-    let told_deg = flight.vehicle.iter().map(|state| tilt_deg(state.ned_from_body_wxyz));
-    true_deg.reduce(f64::max).or(told_deg.reduce(f64::max))
+    let estimated_deg = flight.vehicle.iter().map(|state| tilt_deg(state.ned_from_body_wxyz));
+    true_deg.reduce(f64::max).or(estimated_deg.reduce(f64::max))
 }
 
 fn battery_min(flight: &Flight) -> Option<f64> {
@@ -269,7 +269,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_controller_tells_after_a_landing_is_not_its_outcome() {
+    fn the_status_after_a_landing_is_not_its_outcome() {
         let status = |phase, started_ns, why: &str| ControllerStatus {
             phase,
             started_ns,

@@ -1,4 +1,4 @@
-//! The controller's tape, replayed: whether the same comes out again, and what was not recorded beside it.
+//! Replays the controller's tape: whether it gives the same decisions, and the status, estimates and states that were not recorded.
 
 use std::ops::ControlFlow;
 
@@ -22,14 +22,14 @@ pub fn replay_tapes(flight: &mut Flight) {
     let lacks = is_alone || flight.vehicle.is_empty() || flight.targets.is_empty();
     let mut rebuilt = Rebuilt::default();
     for tape in &flight.tapes {
-        let (is_whole, text) = match verify(tape, &[]) {
-            Ok(verdict) => (verdict.is_verified(), told(&verdict)),
+        let (is_valid, text) = match verify(tape, &[]) {
+            Ok(verdict) => (verdict.is_verified(), describe(&verdict)),
             Err(problem) => (false, format!("the tape cannot be replayed: {problem:#}")),
         };
-        is_verified &= is_whole;
+        is_verified &= is_valid;
         texts.push(text);
         if lacks {
-            // What does not verify was told above; what comes before it is rebuilt.
+            // A difference was reported above; the time before it is rebuilt.
             let _ = run(tape, &[], |step| {
                 rebuilt.take(step.recorded.now_ns, &step.recorded.event, step.flight);
                 ControlFlow::Continue(())
@@ -52,7 +52,7 @@ pub fn replay_tapes(flight: &mut Flight) {
     }
 }
 
-/// What a controller would have published.
+/// The messages that a controller would have published.
 #[derive(Default)]
 struct Rebuilt {
     statuses: Vec<ControllerStatus>,
@@ -87,7 +87,7 @@ impl Rebuilt {
 }
 
 /// A verdict as a sentence.
-fn told(verdict: &Verdict) -> String {
+fn describe(verdict: &Verdict) -> String {
     let Verdict { end, other_state } = verdict;
     let theirs = format!("{} {}", end.program, end.build);
     let ours = format!("{} {}", controller::tape::program(), controller::tape::build());
@@ -111,13 +111,13 @@ mod tests {
     use replay::{End, Stop};
 
     #[test]
-    fn only_what_is_the_same_to_its_end_is_told_without_a_but() {
+    fn only_a_tape_that_is_the_same_to_its_end_is_verified_without_a_reservation() {
         let end = End { events: 7, is_ended: true, ..End::default() };
         let whole = Verdict { end: end.clone(), other_state: None };
-        assert_eq!(told(&whole), "tape verified to the bit, 7 events");
+        assert_eq!(describe(&whole), "tape verified to the bit, 7 events");
         let open = Verdict { end: End { is_ended: false, ..end }, ..whole.clone() };
-        assert!(told(&open).contains("it has no end"), "{}", told(&open));
+        assert!(describe(&open).contains("it has no end"), "{}", describe(&open));
         let other = Verdict { other_state: Some(Stop::NoBeginning { first: 3 }), ..whole };
-        assert!(told(&other).starts_with("tape not verified: "), "{}", told(&other));
+        assert!(describe(&other).starts_with("tape not verified: "), "{}", describe(&other));
     }
 }

@@ -134,7 +134,7 @@ fn time(flight: &Flight, phases: &[phases::Phase]) -> Range<f64> {
     from_s..end_s.max(from_s + 1.0)
 }
 
-/// The setpoints: from the tape each, else those that the status tells.
+/// The setpoints: each one of the tape, else those in the status.
 fn setpoints(flight: &Flight) -> Vec<Setpoint> {
     const NONE: [f64; 3] = [f64::NAN; 3];
     let mut setpoints = Vec::new();

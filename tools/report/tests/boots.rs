@@ -52,7 +52,7 @@ fn twice(recording: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn what_a_bridge_said_before_a_start_of_the_vehicles_computer_is_not_told_of_the_time_after_it() {
+fn the_status_of_a_bridge_before_a_start_of_the_vehicles_computer_is_not_reported_after_it() {
     let about = About { program: "test".to_owned(), facts: [].into(), utc_offset_ns: 0 };
     let mut recording = Vec::new();
     let mut writer = Writer::new(&mut recording, &about).unwrap();
@@ -79,7 +79,7 @@ fn what_a_bridge_said_before_a_start_of_the_vehicles_computer_is_not_told_of_the
 }
 
 #[test]
-fn landings_before_and_after_a_start_of_the_vehicles_computer_are_told_apart() {
+fn landings_before_and_after_a_start_of_the_vehicles_computer_are_distinguished() {
     let recording = landing();
     let alone = summary(&read(&recording));
     let both = read(&twice(&recording));
@@ -100,8 +100,9 @@ fn landings_before_and_after_a_start_of_the_vehicles_computer_are_told_apart() {
         assert_eq!(found.touchdown_error_m, alone.touchdown_error_m);
         let shift_s = (kept.shift_ns - 7_000 * S) / S;
         assert_eq!(shift_s, if tapes == 1 { 0 } else { 1_001 });
-        let told = found.problems.iter().any(|it| it.contains("the vehicle's clock began anew"));
-        assert!(told, "{:?}", found.problems);
+        let is_reported =
+            found.problems.iter().any(|it| it.contains("the vehicle's clock began anew"));
+        assert!(is_reported, "{:?}", found.problems);
     }
     assert_eq!(both.clone().keep_landing(Some(3)), Err(2));
 }

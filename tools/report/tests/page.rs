@@ -168,7 +168,7 @@ fn a_page_has_the_ground_stations_and_what_was_refused() {
     };
     status.signing.state = SigningState::InForce;
     let without_bridge = page(&read(&landing().recording)).unwrap();
-    assert!(without_bridge.contains("no gcs-bridge was heard"));
+    assert!(without_bridge.contains("no message of a gcs-bridge was recorded"));
     let html = page(&read(&with_ground(&landing().recording, &status, 0))).unwrap();
     for part in [
         "gcs-bridge main, udpin:0.0.0.0:14550: packets are signed",
@@ -178,13 +178,13 @@ fn a_page_has_the_ground_stations_and_what_was_refused() {
     ] {
         assert!(html.contains(part), "no {part}");
     }
-    assert!(!html.contains("no gcs-bridge was heard"));
-    // Its bridge was gone before the end: nobody knows who was heard then.
+    assert!(!html.contains("no message of a gcs-bridge was recorded"));
+    // Its bridge was gone before the end: it is not known which stations were present then.
     status.stations[0].silent = false;
     for (before_ns, is_old) in [(4_000_000_000, false), (6_000_000_000, true)] {
         let html = page(&read(&with_ground(&landing().recording, &status, before_ns))).unwrap();
         assert_eq!(html.contains("<td>yes</td>"), !is_old, "{before_ns}");
-        assert_eq!(html.contains("the bridge told no more"), is_old, "{before_ns}");
+        assert_eq!(html.contains("the bridge published no more"), is_old, "{before_ns}");
     }
     // One whose status was not recorded did run.
     let health =
@@ -192,7 +192,7 @@ fn a_page_has_the_ground_stations_and_what_was_refused() {
     let recording = with(&landing().recording, "health/gcs-bridge/main", &encode(&health), 0);
     let html = page(&read(&recording)).unwrap();
     assert!(html.contains("gcs-bridge main ran, and its status was not recorded"));
-    assert!(!html.contains("no gcs-bridge was heard"));
+    assert!(!html.contains("no message of a gcs-bridge was recorded"));
 }
 
 #[test]
@@ -220,7 +220,7 @@ fn a_page_has_every_section_and_needs_nothing_else() {
 }
 
 #[test]
-fn the_wind_is_told_by_where_it_comes_from() {
+fn the_wind_is_named_by_where_it_comes_from() {
     let mut flight = read(&landing().recording);
     for wind in &mut flight.wind {
         wind.velocity_ned_m_s = [-4.0, 2.0, 0.0];
@@ -301,8 +301,8 @@ fn the_numbers_are_those_of_the_flight_itself() {
     let stage = found.latency.iter().find(|it| it.name == report::latency::TO_CONTROLLER).unwrap();
     near(Some(stage.p50_ms), node::stats::quantile(&times, 0.5), 1e-6);
     // The controller's own percentiles are of its last 512 frames.
-    let told = flight.statuses.iter().rev().find_map(|status| status.latency_ms).unwrap();
-    near(found.latency_p50_ms, Some(told[0]), 30.0);
+    let published = flight.statuses.iter().rev().find_map(|status| status.latency_ms).unwrap();
+    near(found.latency_p50_ms, Some(published[0]), 30.0);
     // The estimate's error is what its claimed deviation says, within reason.
     assert!(found.estimate_error_p50_m.unwrap() < 0.1, "{:?}", found.estimate_error_p50_m);
     let line = found.line();
@@ -329,7 +329,7 @@ fn recording_a_flight_changes_nothing_of_it() {
 }
 
 #[test]
-fn without_a_tape_the_estimates_tell_which_frames_were_used() {
+fn without_a_tape_the_estimates_show_which_frames_were_used() {
     let recording = without(&landing().recording, &["controller/tape"]);
     let flight = read(&recording);
     assert!(flight.tapes.is_empty());
@@ -344,7 +344,7 @@ fn without_a_tape_the_estimates_tell_which_frames_were_used() {
 }
 
 #[test]
-fn a_status_of_another_version_is_told_as_that() {
+fn a_status_of_another_version_is_reported_as_that() {
     let keys = ["controller/status", "controller/tape"];
     let mut flight = read(&of_other_version(&landing().recording, &keys));
     replay_tapes(&mut flight);
@@ -375,13 +375,13 @@ fn a_tape_alone_gives_status_and_estimates_again() {
     assert!(flight.statuses.is_empty() && flight.targets.is_empty());
     replay_tapes(&mut flight);
     assert!(flight.is_rebuilt && flight.replayed.as_ref().unwrap().is_verified);
-    let (told, again) = (summary(&whole), summary(&flight));
-    assert_eq!((again.landed, again.frames_used), (Some(true), told.frames_used));
-    near(again.time_to_disarm_s, told.time_to_disarm_s, 1e-9);
+    let (first, again) = (summary(&whole), summary(&flight));
+    assert_eq!((again.landed, again.frames_used), (Some(true), first.frames_used));
+    near(again.time_to_disarm_s, first.time_to_disarm_s, 1e-9);
     let names = |summary: &report::Summary| -> Vec<String> {
         summary.phases.iter().map(|phase| phase.name.clone()).collect()
     };
-    assert_eq!(names(&again), names(&told));
+    assert_eq!(names(&again), names(&first));
     for target in &whole.targets {
         assert!(flight.targets.contains(target), "{target:?}");
     }
@@ -392,7 +392,7 @@ fn a_tape_alone_gives_status_and_estimates_again() {
 }
 
 #[test]
-fn a_tape_with_a_gap_is_told() {
+fn a_tape_with_a_gap_is_reported() {
     let mut flight = read(&landing().recording);
     flight.tapes[0].parts.remove(9);
     replay_tapes(&mut flight);
@@ -466,7 +466,7 @@ fn of_a_recording_with_two_landings_each_has_its_own_numbers() {
     let first_touchdown = one.truth.last().unwrap().touchdown;
     both.truth.extend(one.truth.iter().cloned().map(|mut it| {
         it.stamp_ns += LATER_NS;
-        // The simulator tells the last touchdown until the next.
+        // The simulator publishes the last touchdown until the next.
         let own = it.touchdown.map(|mut own| {
             own.stamp_ns += LATER_NS;
             own.error_m += 1.0;
@@ -521,7 +521,7 @@ fn a_landing_that_follows_an_aborted_one_is_shown_whole() {
 }
 
 #[test]
-fn times_of_a_recorder_on_another_machine_are_told_by_the_names_of_the_clocks() {
+fn times_of_a_recorder_on_another_machine_are_distinguished_by_the_names_of_the_clocks() {
     const AHEAD_NS: i64 = 7_000_000_000;
     let recorded_by = |clock: &str, ahead_ns: i64| {
         let facts = [("clock".to_owned(), clock.to_owned())].into();
@@ -663,35 +663,35 @@ fn what_a_text_of_the_autopilot_says_stays_text() {
 }
 
 #[test]
-fn what_landed_by_a_command_was_not_led_to_the_marker() {
+fn a_vehicle_that_landed_by_a_command_was_not_led_to_the_marker() {
     let mut flight = read(&landing().recording);
     assert!(summary(&flight).is_on_the_pad());
     let why = "on the ground, disarmed: the operator's command to land here";
     why.clone_into(&mut flight.statuses.last_mut().unwrap().why);
-    let told = summary(&flight);
-    assert!(!told.is_on_the_pad());
+    let found = summary(&flight);
+    assert!(!found.is_on_the_pad());
     let outcome = "landed, but not led to the marker: the operator's command to land here";
-    assert_eq!(told.outcome(), outcome);
+    assert_eq!(found.outcome(), outcome);
     assert!(page(&flight).unwrap().contains("class=\"outcome bad\""));
 }
 
 #[test]
-fn what_touched_down_beside_the_pad_is_told() {
+fn a_touchdown_beside_the_pad_is_reported() {
     let mut flight = read(&landing().recording);
     let touchdowns = flight.truth.iter_mut().filter_map(|truth| truth.touchdown.as_mut());
     touchdowns.for_each(|touchdown| touchdown.error_m = 0.44);
-    let told = summary(&flight);
-    assert_eq!(told.outcome(), "landed, beside the pad: 0.440 m from its centre");
-    assert!(!told.is_on_the_pad());
+    let found = summary(&flight);
+    assert_eq!(found.outcome(), "landed, beside the pad: 0.440 m from its centre");
+    assert!(!found.is_on_the_pad());
     assert!(page(&flight).unwrap().contains("class=\"outcome bad\""));
 }
 
 #[test]
-fn a_setting_that_a_service_changed_is_told_with_its_time() {
+fn a_setting_that_a_service_changed_is_reported_with_its_time() {
     let about = About { program: "test".to_owned(), facts: BTreeMap::new(), utc_offset_ns: 0 };
     let mut recording = Vec::new();
     let mut writer = Writer::new(&mut recording, &about).unwrap();
-    let tell = |writer: &mut Writer<&mut Vec<u8>>, is_thorough: bool, received_ns: i64| {
+    let write = |writer: &mut Writer<&mut Vec<u8>>, is_thorough: bool, received_ns: i64| {
         let configuration = Configuration {
             service: "detector".to_owned(),
             instance: "main".to_owned(),
@@ -703,22 +703,22 @@ fn a_setting_that_a_service_changed_is_told_with_its_time() {
         writer.receive(Received { key, payload: &payload, attachment: b"", received_ns }).unwrap();
     };
     for (is_thorough, at_s) in [(false, 3), (false, 6), (true, 8), (true, 9)] {
-        tell(&mut writer, is_thorough, at_s * 1_000_000_000);
+        write(&mut writer, is_thorough, at_s * 1_000_000_000);
     }
     writer.finish().unwrap();
     let flight = read(&recording);
     let change = flight.changes.first().unwrap();
     assert_eq!((flight.changes.len(), change.received_ns), (1, 8_000_000_000));
     let (lines, _) = report::journal::of(&flight);
-    let told = lines.iter().find(|line| line.who == "detector/main").unwrap();
-    assert_eq!(told.text, "setting `thorough` changed from false to true");
-    assert!((told.time_s - flight.at_s(8_000_000_000)).abs() < 1e-9, "{told:?}");
+    let line = lines.iter().find(|line| line.who == "detector/main").unwrap();
+    assert_eq!(line.text, "setting `thorough` changed from false to true");
+    assert!((line.time_s - flight.at_s(8_000_000_000)).abs() < 1e-9, "{line:?}");
     assert!(page(&flight).unwrap().contains("setting `thorough` changed from false to true"));
 }
 
 #[test]
-fn pictures_in_which_it_was_too_dark_for_a_marker_are_told() {
-    let told = |level: u8| {
+fn pictures_in_which_it_was_too_dark_for_a_marker_are_reported() {
+    let report = |level: u8| {
         let about = About { program: "test".to_owned(), facts: BTreeMap::new(), utc_offset_ns: 0 };
         let mut recording = Vec::new();
         let mut writer = Writer::new(&mut recording, &about).unwrap();
@@ -751,7 +751,7 @@ fn pictures_in_which_it_was_too_dark_for_a_marker_are_told() {
         assert_eq!(flight.light["down"].len(), 3, "one of each second");
         (summary(&flight), page(&flight).unwrap())
     };
-    let (dark, html) = told(5);
+    let (dark, html) = report(5);
     let sentence = "the pictures of camera `down` are too dark for a marker: in the median their mean is 2.0 % of white";
     assert!(dark.light[0].starts_with(sentence), "{:?}", dark.light);
     assert!(dark.line().contains(sentence), "{}", dark.line());
@@ -760,7 +760,7 @@ fn pictures_in_which_it_was_too_dark_for_a_marker_are_told() {
             && html.contains("Brightness and noise of the pictures")
     );
     assert!(html.contains("20.0 ms"));
-    let (grey, html) = told(120);
+    let (grey, html) = report(120);
     assert_eq!(grey.light, Vec::<String>::new());
     assert!(html.contains("Brightness and noise of the pictures") && html.contains("47.1 %"));
 }
