@@ -1,4 +1,4 @@
-//! The lander's configuration: estimator, phases, envelope, checks, guidance, and what an abort or an alarm leads to,
+//! The lander's configuration: estimator, phases, envelope, checks, guidance, and the actions after an abort or an alarm,
 //! each number with default, unit and range.
 
 use serde::{Deserialize, Serialize};
@@ -12,7 +12,7 @@ pub(crate) const MAX_COUNTED_DETECTIONS: u32 = 30;
 /// All settings of a landing. Plain data: check it with [`Config::validate`].
 #[derive(Copy, Clone, Debug, PartialEq, Default)]
 pub struct Config {
-    /// What turns the target into a velocity.
+    /// The guidance law, which computes a velocity from the target.
     pub guidance: GuidanceConfig,
     /// Which detections are used, and the mean from which the thesis' guidance takes its height.
     pub target: TargetConfig,
@@ -24,7 +24,7 @@ pub struct Config {
     pub phases: PhaseConfig,
 }
 
-/// What turns the target into a velocity.
+/// The guidance law, which computes a velocity from the target.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub enum GuidanceConfig {
     /// The thesis' pixel controller (its section 3.2).
@@ -229,7 +229,7 @@ settings! {
         land_retry_s: f64 = 0.5, 0.1..=5.0;
         /// Maximum wait for the LAND mode, in s; then the landing is aborted.
         land_timeout_s: f64 = 5.0, 0.5..=60.0;
-        /// Maximum time in LAND, in s, in addition to what the autopilot's landing speed takes from its height; then the
+        /// Maximum time in LAND, in s, in addition to the duration of a descent at the autopilot's landing speed; then the
         /// landing is aborted.
         touchdown_timeout_s: f64 = 60.0, 5.0..=600.0;
         /// Descent speed without LAND, where the autopilot refuses it close to the ground, in m/s.
@@ -241,7 +241,7 @@ settings! {
         /// Height below which a start in LAND mode only monitors the touchdown, in m, over the same as
         /// `search_height_m`.
         watch_height_m: f64 = 2.0, 0.0..=20.0;
-        /// What an aborted landing does.
+        /// The action of an aborted landing.
         on_abort: OnAbort = OnAbort::Hover;
         /// Height to which an aborted landing climbs with `on_abort = "climb"`, in m, over the same as
         /// `search_height_m`.
@@ -262,7 +262,7 @@ settings! {
     }
 }
 
-/// What an aborted landing does.
+/// The action of an aborted landing.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum OnAbort {

@@ -1,11 +1,11 @@
-//! What the lander returns for an event: phase, action (velocity, GUIDED, LAND, disarm), reason, target estimate,
+//! The lander's result for an event: phase, action (velocity, GUIDED, LAND, disarm), reason, target estimate,
 //! and why a detection was rejected.
 
 use std::fmt;
 
 use geometry::{Ned, Point, Vector};
 
-/// What to do, and why.
+/// The lander's decision for an event, with its reason.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Decision {
     /// The present phase.
@@ -151,7 +151,7 @@ macro_rules! named {
 }
 
 named! {
-    /// Why the lander does what it does.
+    /// The reason for an action of the lander.
     Reason {
         /// No landing was requested.
         WaitingForStart = "waiting-for-start", "waiting for the start of a landing";
@@ -177,7 +177,8 @@ named! {
         TargetAging = "target-aging", "no recent detection that could be used, descent stopped";
         /// The marker is seen at two places, and it is undecided which is the pad.
         Ambiguous = "ambiguous", "the marker is seen at two places, descent stopped until one is seen in most frames";
-        /// Two detectors see the marker at two places, or with two headings where the vehicle turns to it, and nobody says which is right.
+        /// Two detectors see the marker at two positions, or with two headings where the vehicle turns to it, and it is not known which is
+        /// right.
         Disputed = "disputed", "detectors see the marker at two places or turned, not descending near the ground until they agree";
         /// Low over the marker, waiting for a small error and a small speed.
         Settling = "settling", "settling over the marker before the touchdown";
@@ -255,7 +256,7 @@ named! {
         TouchdownOverdue = "touchdown-overdue", "aborted: the autopilot reported no touchdown in the time allowed";
         /// The motors stopped during the landing.
         Disarmed = "disarmed", "aborted: disarmed before the touchdown";
-        /// The flight mode was changed by somebody else.
+        /// The flight mode was changed by the pilot or another program.
         PilotTookOver = "pilot-took-over", "the flight mode was changed, the pilot flies";
     }
 }

@@ -3,7 +3,7 @@
 //!
 //! It runs the `filter` in the odometry frame, the autopilot's local frame without its jumps
 //! ([`crate::history::Motion::odometry`]). There the autopilot's motion needs no integration between
-//! detections, and the filter estimates what velocity setpoints act on: in 160 recorded flights of ArduPilot
+//! detections, and the filter estimates the state on which velocity setpoints act: in 160 recorded flights of ArduPilot
 //! the reported position moved against the truth by 0.010 m over 2 s, the sum of the reported velocity by
 //! 0.032 m.
 //!
@@ -105,7 +105,7 @@ impl Estimator {
         Ok(())
     }
 
-    /// Keeps the estimate, for the case that what comes now is to be forgotten.
+    /// Stores the estimate, for the case that the next detections are to be forgotten.
     pub fn keep(&mut self) {
         self.kept = self.past.back().map(|newest| Kept {
             newest: newest.clone(),

@@ -1,4 +1,4 @@
-//! What the lander takes: vehicle state and status, frames with their marker, operator's commands, alarms,
+//! The lander's events: vehicle state and status, frames with their marker, operator's commands, alarms,
 //! delay of the link, the autopilot's limits, detectors that are alive or disagree, ticks.
 
 use std::fmt;
@@ -33,7 +33,7 @@ pub enum Event {
     LinkDelay(f64),
     /// How the autopilot follows setpoints has become known.
     Limits(AutopilotLimits),
-    /// Two detectors see the marker at two places or with two headings, and nobody says which is right; or no longer.
+    /// Two detectors see the marker at two positions or with two headings, and it is not known which is right; or no longer.
     Dispute(bool),
     /// Time has passed.
     Tick,
@@ -150,7 +150,7 @@ pub struct VehicleState {
     pub landed: Landed,
 }
 
-/// What holds of the vehicle wherever it is.
+/// The state of the vehicle that does not depend on its position.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct VehicleStatus {
     /// The flight mode.
@@ -168,9 +168,9 @@ pub enum Mode {
     Guided,
     /// The autopilot lands where it is.
     Land,
-    /// Somebody else flies.
+    /// The pilot or another program flies.
     Other,
-    /// Not reported for seconds: somebody else may fly.
+    /// Not reported for seconds: the pilot may fly.
     Unknown,
 }
 
@@ -189,7 +189,7 @@ pub enum Landed {
     Landing,
 }
 
-/// What a detector found in one image, with or without the marker.
+/// A detector's result for one image, with or without the marker.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct FrameObservation {
     /// Mid-exposure.
@@ -298,7 +298,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_what_can_be_a_covariance_is_one() {
+    fn only_valid_covariances_are_accepted() {
         let diagonal = |x, y, z| Matrix3::from_diagonal(&nalgebra::Vector3::new(x, y, z));
         let with = |row, column, value: f64| {
             let mut m = diagonal(1e-4, 1e-4, 1e-4);

@@ -1,5 +1,5 @@
-//! The extended Kalman filter of the pad's position, velocity, tilt error and time offset: prediction with adaptive process noise, innovation,
-//! update.
+//! The extended Kalman filter of the pad's position, velocity, tilt error and time offset: prediction with adaptive process noise,
+//! innovation, update.
 //!
 //! | state | unit | why |
 //! |---|---|---|
@@ -185,7 +185,7 @@ impl State {
     ) -> Fit {
         self.predict(config, dt_s);
         let nis = self.nis(measurement);
-        // What is not a number, and what a covariance that is none makes negative, is no inlier.
+        // Neither a NaN nor a negative value, as of an invalid covariance, is an inlier.
         let is_inlier = |nis: f64| (0.0..=config.gate).contains(&nis);
         let wander_s = fmin(dt_s, MAX_WANDER_S);
         let is_still = config.pad_speed_m_s <= 0.0;
@@ -193,7 +193,7 @@ impl State {
         let wander_m = WANDER_M + WANDER_M_S * wander_s + measurement.range_m * wander_rad;
         let innovation = self.innovation(measurement);
         let height_noise_m = fmax(measurement.noise[(2, 2)], 0.0).sqrt();
-        // A tilt lifts what is seen aside.
+        // A tilt raises a marker that is seen to the side.
         let height_wander_m = WANDER_M
             + (HEIGHT_WANDER_M_S + config.pad_heave_m_s) * wander_s
             + measurement.tilt.row(2).norm() * wander_rad

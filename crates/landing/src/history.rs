@@ -19,8 +19,8 @@ const MAX_GAP_S: f64 = 0.5;
 const JUMP_M: f64 = 0.1;
 const JUMP_M_S: f64 = 0.5;
 /// Maximum gap over which a jump is distinguished from a change of the velocity, in seconds: a vehicle that brakes by 2 m/s in a longer
-/// one has moved by metres less than the mean of its velocities says. Over a longer one only what no velocity explains is a jump: the
-/// larger of the two, and so much more, in m/s.
+/// one has moved by metres less than the mean of its velocities says. Over a longer one only a difference that no velocity explains is a
+/// jump: the larger of the two, and so much more, in m/s.
 const MAX_JUMP_GAP_S: f64 = 1.0;
 const MARGIN_M_S: f64 = 1.0;
 
@@ -244,7 +244,7 @@ mod tests {
 
     /// Over a long gap a vehicle may have braked; a new origin is further than it flies.
     #[test]
-    fn over_a_long_gap_only_what_no_velocity_explains_is_a_jump() {
+    fn over_a_long_gap_only_a_difference_that_no_velocity_explains_is_a_jump() {
         let at = |seconds: f64, down_m: f64, down_m_s: f64| VehicleState {
             position: Point::new(0.0, 0.0, down_m),
             velocity: Vector::new(0.0, 0.0, down_m_s),

@@ -2,7 +2,7 @@
 //!
 //! ArduPilot holds its place by itself while the commanded velocity is zero. PX4 holds that velocity as it estimates it: where the
 //! estimate errs, as in wind and with a wrong tilt, the vehicle drifts away as fast as it errs. So a hover commands a velocity back
-//! to its place in the odometry frame, in which the autopilot's jumps do not move it. What remains is the error of the velocity over
+//! to its position in the odometry frame, in which the autopilot's jumps do not move it. The remaining error is that of the velocity over
 //! `RETURN_PER_S`.
 
 use geometry::{Ned, Odometry, Point, Vector};
@@ -13,7 +13,7 @@ use crate::time::Timestamp;
 /// Velocity back to a place per metre from it, in 1/s: slower than an autopilot's velocity loop, which it must not excite.
 const RETURN_PER_S: f64 = 0.5;
 
-/// Maximum speed back to the place of a hover, in m/s: more than what an autopilot's velocity errs by.
+/// Maximum speed back to the position of a hover, in m/s: more than the error of an autopilot's velocity.
 const MAX_RETURN_M_S: f64 = 1.0;
 
 /// Speed below which a vehicle that brakes is where it stays, in m/s, and time after which it is at any speed, in seconds: back to
@@ -50,7 +50,7 @@ impl Hover {
     }
 
     /// The horizontal velocity in m/s of a vehicle that was at `place` at `stamp`, with this horizontal speed. After a silence of more
-    /// than `max_gap_s` the hover begins anew: nobody knows how it moved meanwhile.
+    /// than `max_gap_s` the hover restarts: its motion in the gap is not known.
     pub(crate) fn velocity(
         &mut self,
         stamp: Timestamp,

@@ -61,7 +61,7 @@ const MAX_CONTACT_M_S: f64 = 0.5;
 const MAX_LINK_DELAY_S: f64 = 0.7;
 const MAX_QUICK_DELAY_S: f64 = 0.5;
 
-/// Maximum age of the vehicle's state at which it descends, in seconds, beside the link's delay: what is late now
+/// Maximum age of the vehicle's state at which it descends, in seconds, in addition to the link's delay: a state that is late now
 /// comes over a link that has become slow, and setpoints will take as long.
 const MAX_DESCEND_AGE_S: f64 = 0.2;
 
@@ -88,7 +88,7 @@ pub struct Lander {
     /// Where the vehicle last stood on the ground.
     ground: Option<Point<Odometry>>,
     standing_height: StandingHeight,
-    /// What is known of the landing that this lander takes over, or takes up again after a silence, until it has seen the
+    /// The known facts about the landing that this lander takes over, or takes up again after a silence, until it has seen the
     /// marker.
     resumed: Option<Resumed>,
     /// Where the landing started.
@@ -107,7 +107,7 @@ pub struct Lander {
     land_requested: Option<Timestamp>,
     /// Height over the local origin to which a retry climbs, in metres.
     retry_to_m: Option<f64>,
-    /// What an aborted landing does about its height.
+    /// How an aborted landing changes its height.
     abort_climb: AbortClimb,
     /// Since when states of an aborted vehicle are received.
     received_since: Option<Timestamp>,
@@ -194,7 +194,7 @@ impl Lander {
         let operator =
             operator.or_else(|| self.is_dispute_over().then_some(OperatorCommand::Resume));
         let alarm = reaction(&self.config.phases, event).or_else(|| self.dispute_alarm(now));
-        // A dispute that is over goes on by itself; what else is wrong only an operator has looked at again.
+        // After a dispute the landing continues automatically; any other mismatch is checked again only on an operator's command.
         if matches!(event, Event::Operator(OperatorCommand::Resume)) {
             self.repeat_checks();
         }
@@ -250,7 +250,7 @@ impl Lander {
         Some(SeenPad { pad, height_m: target.height_m })
     }
 
-    /// Ends the landing without another action, as the autopilot began anew: what is known in its old frame is forgotten. A new one
+    /// Ends the landing without another action, as the autopilot restarted: positions in its old frame are forgotten. A new one
     /// may be started.
     pub fn stand_down(&mut self) {
         self.state_machine.stand_down(self.now.unwrap_or_default());
@@ -464,7 +464,7 @@ impl Lander {
         self.history.set_max_extrapolation(usual_s + one_way_s);
     }
 
-    /// What is asked of the autopilot changes its mode or its motors: only in our own mode.
+    /// Requests to the autopilot change its mode or its motors: only in our own mode.
     fn is_ours(&self) -> bool {
         self.status.is_some_and(|status| matches!(status.mode, Mode::Guided | Mode::Land))
     }

@@ -18,7 +18,7 @@
 //!   to stay at a place.
 //! - [`axis_check`]: are the axes of camera and autopilot consistent? [`mount_check`]: by how much are they off?
 //!   `size_check`: is the marker as large as configured? `standing`: how high does the vehicle stand, and does it?
-//!   `repeated_picture`: is what the camera shows an old picture?
+//!   `repeated_picture`: is the camera's picture an old one?
 //! - [`state_machine`]: the phases. [`envelope`]: the last check of a setpoint.
 //! - [`lander`] joins them.
 

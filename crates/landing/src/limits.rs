@@ -9,7 +9,7 @@ use std::ops::RangeInclusive;
 pub struct ConfigError {
     /// The key, with dots, as in `phases.hold_timeout_s`.
     pub key: &'static str,
-    /// What it was set to.
+    /// The value to which it was set.
     pub value: f64,
     /// The smallest value allowed.
     pub min: f64,

@@ -4,16 +4,16 @@
 //! the height changes; under a focal length that is off it moves as the vehicle tilts, under a marker of another
 //! size as the vehicle moves sideways. A Kalman filter of parameters that hardly change (Bar-Shalom, Li,
 //! Kirubarajan: Estimation with Applications to Tracking and Navigation, section 7) explains the apparent
-//! horizontal motion by them and by what else makes it:
+//! horizontal motion by them and by its other causes:
 //!
-//! | state | unit | what |
+//! | state | unit | meaning |
 //! |---|---|---|
 //! | `q`, `u` | m, m/s | the pad's position and the autopilot's drift, north and east |
 //! | `θ` | rad | error of mount and attitude about the body's axes |
 //! | `f`, `s` | | error of the focal length and of the marker's size, relative |
 //! | `τ` | s | how much later exposures are than their stamps |
 //!
-//! What else moves the pad, as an estimator that errs more in wind does, is not as random as the filter believes. An error
+//! Other apparent motions of the pad, as of an estimator that errs more in wind, are not as random as the filter assumes. An error
 //! of the mount, the focal length or the size is the same in each part of a flight, so the estimates of the single parts
 //! must agree: by as much as they scatter more than their deviations say, the deviation is larger (the ratio of Birge: Physical
 //! Review 40, 1932).
@@ -79,7 +79,7 @@ const MAX_OFFSET_S: f64 = 0.15;
 const MIN_HEIGHT_M: f64 = 0.5;
 
 /// Smallest horizontal speeds of motions that show the marker's size and the focal length, in m/s. The autopilot holds its own estimate of
-/// a hover still, whose drift the vehicle follows: what is seen then moves while the estimate does not, as of a marker of no size.
+/// a hover still, whose drift the vehicle follows: the seen marker then moves while the estimate does not, as one of size zero would.
 const MIN_SIZE_SPEED_M_S: f64 = 0.3;
 const MIN_FOCAL_SPEED_M_S: f64 = 0.1;
 
@@ -111,11 +111,12 @@ const LEAN_S: f64 = 5.0;
 const STRONG_LEAN_RAD: f64 = 0.28;
 /// By how many times more deviations an angle, focal length or size must be off to be reported in such wind, per radian above that lean.
 const STRICTER_PER_RAD: f64 = 6.0;
-/// Factor on the random walks above which no new error is reported: what moves the pad then is something else. It is smaller for
+/// Factor on the random walks above which no new error is reported: the pad's motion then has another cause. It is smaller for
 /// focal length and size, which show in less motion than the mount.
 const MAX_REPORT_NOISE_SCALE: f64 = 3.0;
 const MAX_REPORT_RATIO_NOISE_SCALE: f64 = 1.5;
-/// Fraction of the limits of an error below which it is no longer reported.: f64 = 0.7;
+/// Fraction of the limits of an error below which it is no longer reported.
+const CLEAR_FRACTION: f64 = 0.7;
 
 type Mean = SVector<f64, STATES>;
 type Covariance = SMatrix<f64, STATES, STATES>;
@@ -331,7 +332,7 @@ impl MountCheck {
     /// The errors that are certain.
     pub fn findings(&self) -> MountFindings {
         let of = |suspicion: Suspicion, error: Measured| {
-            // The configured value is what the filter's errors are relative to.
+            // The filter's errors are relative to the configured value.
             suspicion.is_reported.then_some(Measured { value: -error.value, ..error })
         };
         let [roll, pitch, focal, size] = self.errors();
@@ -496,8 +497,8 @@ impl Parts {
 
 impl Suspicion {
     fn follow(&mut self, error: Measured, min_deviations: f64, min: f64, is_calm: bool) {
-        let share = if self.is_reported { CLEAR_FRACTION } else { 1.0 };
-        let limit = fmax(min_deviations * error.deviation, min) * share;
+        let fraction = if self.is_reported { CLEAR_FRACTION } else { 1.0 };
+        let limit = fmax(min_deviations * error.deviation, min) * fraction;
         let is_known = error.deviation < MAX_DEVIATION * min;
         if error.value.abs() > limit && (self.is_reported || is_known && is_calm) {
             self.in_a_row = self.in_a_row.saturating_add(1);
@@ -642,7 +643,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_is_forgotten() {
+    fn numbers_that_are_not_finite_are_forgotten() {
         let mut check = MountCheck::default();
         let mount = Rotation::identity();
         for (i, wild) in

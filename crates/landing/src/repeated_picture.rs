@@ -28,7 +28,7 @@ const MIN_MOVED_SHARE: f64 = 0.01;
 /// The same where the link codes a repeated picture anew, in which the marker is found again less well: measured from one quality of
 /// JPEG to the next, 7e-4 at most. So much a marker may stay that moves along with the vehicle, or whose vehicle stays while the
 /// autopilot's position drifts: it must seem to move further and faster than that, to the side or up and down, within a time (in s and
-/// m/s, beside the speed and the heave of the configured pad). What has been found to be old is not of now by a larger change alone.
+/// m/s, in addition to the speed and the heave of the configured pad). A larger change alone does not make an old picture a new one.
 const MAX_CODED_CHANGE: f64 = 2e-3;
 const MAX_OLD_CHANGE: f64 = 5e-3;
 const MIN_CODED_MOVED_M: f64 = 0.1;
@@ -50,7 +50,7 @@ pub(crate) struct RepeatedPicture {
     coded: Option<First>,
 }
 
-/// What the picture of a frame is.
+/// Whether the picture of a frame is an old one.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Picture {
     /// Another one than before.
@@ -84,7 +84,7 @@ struct Sight {
 
 impl RepeatedPicture {
     /// Adds a marker, and returns whether its picture is an old one. Where its distance is not known the direction decides: then a
-    /// vehicle that moves and does not tilt may see it where it was. What a vehicle that `stands` sees stays.
+    /// vehicle that moves and does not tilt may see it where it was. The marker of a vehicle that `stands` does not move.
     pub(crate) fn add(
         &mut self,
         frame: &FrameObservation,
@@ -104,7 +104,7 @@ impl RepeatedPicture {
             let sight = Sight { stamp, in_body, has_distance: false };
             (sight, (motion.ned_from_body * in_body).coords, MIN_TURNED_RAD)
         };
-        // A frame that comes late says nothing of what has come since.
+        // A late frame gives no information about the frames since.
         if self.newest.is_some_and(|newest| stamp <= newest.stamp) {
             let old = [(self.first, MAX_CHANGE), (self.coded, MAX_OLD_CHANGE)];
             let old = old.into_iter().find_map(|(first, max_change)| {
@@ -305,7 +305,7 @@ mod tests {
     #[test]
     fn a_picture_that_is_coded_anew_is_noticed_after_a_hover_and_after_the_start() {
         let alternates = |number: u32| 7e-4 * f64::from(number % 2);
-        // A marker seen 5 m below, whose place changes by such a share.
+        // A marker seen 5 m below, whose position changes by such a fraction.
         let recoded = |frames, height_m: &dyn Fn(u32) -> f64, change: &dyn Fn(u32) -> f64| {
             old(frames, 3.0, height_m, |number| 5.0 * (1.0 + change(number)))
         };

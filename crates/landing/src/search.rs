@@ -14,7 +14,8 @@ use crate::time::Timestamp;
 /// Minimum tilt that shows the direction of the wind, in radians.
 const MIN_TILT_RAD: f64 = 0.02;
 
-/// Distance of the vehicle from the point that moves along the square, from which that point slows down, and at which it would stand, in metres.
+/// Distance of the vehicle from the point that moves along the square, from which that point slows down, and at which it would stand, in
+/// metres.
 const SLOW_LAG_M: f64 = 1.0;
 const MAX_LAG_M: f64 = 2.0;
 
@@ -149,7 +150,8 @@ fn upwind_m(config: &PhaseConfig, ned_from_body: Rotation<Ned, Body>, height_m: 
 mod tests {
     use super::*;
 
-    /// Flies the square from the origin in a wind that carries the vehicle away at this velocity; it takes half a second to fly as commanded.
+    /// Flies the square from the origin in a wind that carries the vehicle away at this velocity; it takes half a second to fly as
+    /// commanded.
     fn fly(config: &Config, wind: Vector<Ned>) -> Vec<Point<Odometry>> {
         let (begin, phases) = (Timestamp::from_seconds(5.0), &config.phases);
         let mut square = Square::new(config, begin, Point::origin(), Rotation::identity(), 5.0);
@@ -197,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wind_that_is_nearly_as_fast_as_the_search_carries_nobody_away() {
+    fn a_wind_that_is_nearly_as_fast_as_the_search_carries_no_vehicle_away() {
         let config = Config::default();
         let limit_m = config.phases.search_radius_m * std::f64::consts::SQRT_2 + MAX_LAG_M;
         for turn in 0..16 {
@@ -240,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn who_cannot_follow_still_sees_the_other_sides() {
+    fn a_vehicle_that_cannot_follow_still_sees_the_other_sides() {
         let config = Config::default();
         // The first leg goes north and the third south.
         let goes_south_after_s = |is_fenced: bool| {

@@ -106,7 +106,7 @@ pub struct SeenPad {
     pub height_m: f64,
 }
 
-/// What a lander knows that takes over the landing of another one, or takes its own up again after a silence.
+/// The knowledge of a lander that takes over the landing of another one, or resumes its own after a silence.
 #[derive(Copy, Clone, Debug, Default)]
 pub(crate) struct Resumed {
     pad: Option<RememberedPad>,
@@ -264,7 +264,7 @@ mod tests {
         }
     }
 
-    /// Where nobody knows the pad, a vehicle that hovers low beside a hill must not be landed there.
+    /// Where the pad is not known, a vehicle that hovers low next to a hill must not be landed there.
     #[test]
     fn a_vehicle_that_is_said_to_fly_far_from_the_origin_does_not_stand() {
         for (north_m, landed, expected) in [

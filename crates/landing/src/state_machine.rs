@@ -51,7 +51,7 @@
 //! | Approach, Descend | `approach_timeout_s`, `descend_timeout_s` | Hold |
 //! | Retry | `retry_timeout_s`, and `retries` times | Search |
 //! | Hold | `hold_timeout_s`, by the operator `operator_hold_timeout_s` | Aborted |
-//! | Final | `land_timeout_s` until LAND; until the ground `touchdown_timeout_s` and what the autopilot's landing speed takes from there | Aborted, Landed |
+//! | Final | `land_timeout_s` until LAND; until the ground `touchdown_timeout_s` and the descent at the autopilot's landing speed | Aborted, Landed |
 //! | all together until Final, and Final while the mode is not known | `landing_timeout_s` | Aborted |
 
 use crate::config::{AlarmAction, OnAbort, PhaseConfig};
@@ -68,15 +68,15 @@ const MIN_RETRY_S: f64 = 2.0;
 const MIN_LOOK_S: f64 = 1.0;
 
 /// Time after LAND has shown in which our own mode may show again, in seconds: on a link with jitter an older heartbeat comes
-/// late, and the next one follows in a second. Nothing is sent meanwhile, so a pilot who takes over waits for nothing.
+/// late, and the next one follows in a second. Nothing is sent meanwhile, so a pilot who takes over does not wait.
 const MAX_OVERTAKEN_S: f64 = 1.2;
 
 /// Time in which a mode that was asked for until then may still show, in seconds: LAND after an abort, our own mode after a recall from
 /// LAND. Heartbeats come each second, and one may be lost.
 const MAX_LATE_MODE_S: f64 = 2.5;
 
-/// Longest time by which LAND may exceed what its speed and the known height take while the vehicle still sinks, in seconds:
-/// the ground may lie far below the place where the vehicle took off.
+/// Longest time by which LAND may exceed the duration by its speed and the known height while the vehicle still sinks, in seconds:
+/// the ground may lie far below the position where the vehicle took off.
 const MAX_SINKING_S: f64 = 600.0;
 
 /// Wait for the report of the ground after the motors have stopped, in seconds: it may come later.
@@ -105,7 +105,7 @@ pub struct Inputs {
     pub target_refused: bool,
     /// The progress of the guidance.
     pub progress: Progress,
-    /// What shows that the axes of the camera or the marker's size are not as configured; `None` while nothing does.
+    /// The evidence that the axes of the camera or the marker's size are not as configured; `None` without any.
     pub mismatch: Option<Reason>,
     /// False while the check of the axes is still running.
     pub may_descend: bool,
@@ -148,7 +148,7 @@ pub struct StateMachine {
     landing: bool,
     /// Time in LAND until the touchdown is overdue, in seconds.
     touchdown_limit_s: f64,
-    /// Somebody has taken over the aborted vehicle, so it gets no setpoint any more.
+    /// The pilot has taken over the aborted vehicle, so it gets no setpoint any more.
     released: bool,
     /// The aborted vehicle is being commanded from LAND back to GUIDED.
     is_recalling: bool,
@@ -164,7 +164,7 @@ pub struct StateMachine {
     cause: Option<Reason>,
 }
 
-/// What ends a hold without a command.
+/// The event that ends a hold without a command.
 enum EndOfHold {
     /// The marker is seen.
     Marker,
@@ -176,7 +176,7 @@ enum EndOfHold {
     Agreement,
 }
 
-/// What ends a hold for this reason; `None` where only a command does.
+/// The event that ends a hold for this reason; `None` where only a command does.
 fn end_of_hold(reason: Reason) -> Option<EndOfHold> {
     match reason {
         Reason::TargetLost | Reason::TargetRefused | Reason::TargetNotFound => {
@@ -249,7 +249,7 @@ impl StateMachine {
         self.landing
     }
 
-    /// True when somebody has taken over the aborted vehicle.
+    /// True when the pilot has taken over the aborted vehicle.
     pub fn is_released(&self) -> bool {
         self.released
     }
@@ -410,8 +410,8 @@ impl StateMachine {
             self.is_recalling = true;
         }
         let in_time = !self.timed_out(inputs, self.config.land_timeout_s);
-        // One that would stop low over the ground, or on it with its motors running, is landed instead. Where it has taken what was asked
-        // of it before, it follows again.
+        // One that would stop low over the ground, or on it with its motors running, is landed instead. Where it has carried out the
+        // request of it before, it follows again.
         let is_low = !self.is_high(vehicle);
         if matches!(vehicle.mode, Mode::Guided | Mode::Other) {
             self.became_low = None;
@@ -510,7 +510,7 @@ impl StateMachine {
 
     /// Whether the vehicle is so high that it can still be called back from LAND.
     pub(crate) fn is_high(&self, vehicle: VehicleInputs) -> bool {
-        // Below the place where it took off nothing is known of the ground; what sinks flies, and what is not in LAND yet.
+        // Below the position where it took off the ground is not known; a vehicle that sinks flies, as does one that is not in LAND yet.
         let flies = vehicle.landed != Landed::OnGround && (vehicle.sinks || !self.landing);
         let is_in_valley = !vehicle.is_over_target && vehicle.height_m < 0.0 && flies;
         vehicle.height_m > self.config.no_return_height_m || is_in_valley
@@ -611,7 +611,7 @@ impl StateMachine {
         }
     }
 
-    /// True for a lost target whose place was out of the camera's view meanwhile.
+    /// True for a lost target whose position was out of the camera's view meanwhile.
     fn was_out_of_view(&self, inputs: &Inputs) -> bool {
         self.target_lost(inputs) && inputs.target_missed_s < inputs.target_age_s
     }

@@ -66,7 +66,7 @@ impl TargetFilter {
         }
     }
 
-    /// Keeps the estimate, for the case that what comes now is to be forgotten.
+    /// Stores the estimate, for the case that the next detections are to be forgotten.
     pub(crate) fn keep(&mut self) {
         if let Self::Kalman(estimator) = self {
             estimator.keep();
@@ -130,7 +130,7 @@ impl Sightings {
         is_recent && self.newest.is_none_or(|used| before > used)
     }
 
-    /// Notes a frame without a marker whose camera did not show the pad's place, and the time since the frame before it.
+    /// Notes a frame without a marker whose camera did not show the pad's position, and the time since the frame before it.
     pub(crate) fn miss_out_of_view(&mut self, after_s: f64) {
         let out_of_view_s = self.out_of_view_s + after_s.clamp(0.0, MAX_FRAME_GAP_S);
         self.out_of_view_s = libm::fmin(out_of_view_s, MAX_OUT_OF_VIEW_S);
@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn a_marker_whose_place_is_out_of_view_is_not_missed_for_a_while() {
+    fn a_marker_whose_position_is_out_of_view_is_not_missed_for_a_while() {
         let mut sightings = Sightings::default();
         assert!(sightings.missed_s(at(3.0)).is_infinite());
         sightings.miss_out_of_view(0.1);

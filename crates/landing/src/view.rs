@@ -22,7 +22,7 @@ pub(crate) struct View {
 
 impl View {
     /// The view of a frame's camera, when it is calibrated. With an unknown mount the camera is assumed to
-    /// look down, and only what is shown whatever its yaw counts.
+    /// look down, and only the area that is shown at every yaw counts.
     pub(crate) fn from_frame(frame: &FrameObservation) -> Option<Self> {
         let focal_px = frame.focal_px.filter(|focal_px| *focal_px > 1.0)?;
         let (width, height) = frame.image_size;
@@ -55,7 +55,7 @@ mod tests {
     use crate::time::Timestamp;
 
     #[test]
-    fn only_what_is_below_is_in_view() {
+    fn only_points_below_are_in_view() {
         let motion = Motion {
             ned_from_body: Rotation::identity(),
             position: Point::origin(),

@@ -1,5 +1,5 @@
 //! Counts memory allocations of a lander's steps (states, frames on time and late, ticks): none once a
-//! landing has begun. What it takes of time, `examples/step_time.rs` measures.
+//! landing has begun. `examples/step_time.rs` measures its computing time.
 
 use std::hint::black_box;
 

@@ -316,7 +316,7 @@ fn an_abort_climbs_over_the_pad() {
 }
 
 #[test]
-fn an_aborted_vehicle_that_cannot_be_asked_does_what_is_configured_once_it_can() {
+fn an_aborted_vehicle_without_a_link_does_the_configured_action_once_it_has_one() {
     let mut config = Config::default();
     config.phases.on_abort = OnAbort::Land;
     let mut harness = Harness::started(config, 9.0);

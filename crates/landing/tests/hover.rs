@@ -110,7 +110,7 @@ fn each_hover_has_the_place_where_its_vehicle_came_to_rest() {
 }
 
 #[test]
-fn a_jump_of_the_position_moves_nobody() {
+fn a_jump_of_the_position_moves_no_vehicle() {
     let mut drifter = Drifter::searching(Vector::zero(), 0.2).unwrap();
     drifter.command(OperatorCommand::Hold);
     drifter.fly(5.0);

@@ -87,7 +87,7 @@ fn events(i: u32) -> (Timestamp, Vec<Event>) {
 }
 
 #[test]
-fn the_thesis_decisions_are_what_they_were() {
+fn the_thesis_decisions_are_unchanged() {
     let guidance = GuidanceConfig::Thesis(ThesisConfig { seed: 5, ..ThesisConfig::default() });
     let mut lander = Lander::new(Config { guidance, ..Config::default() }).unwrap();
     let mut hash = 0xcbf2_9ce4_8422_2325;

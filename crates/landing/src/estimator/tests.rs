@@ -374,7 +374,7 @@ fn a_pad_far_below_is_followed_while_the_tilt_wanders() {
     };
     assert!(fly(0.008, 0.0) <= 5, "{} refused", fly(0.008, 0.0));
     assert_eq!(fly(0.0, 0.0), 0);
-    // What is seen from now on is another marker, until it is the one that is there.
+    // From now on another marker is seen, until it is the one that is there.
     assert!(fly(0.0, 1.0) >= 5, "{} refused", fly(0.0, 1.0));
 }
 

@@ -76,7 +76,7 @@ const LOW_HYSTERESIS_M: f64 = 0.2;
 /// gust.
 const MAX_STEADY_M_S: f64 = 0.3;
 
-/// Maximum lateral speed over the pad at which a low vehicle descends, in m/s: at the ground, what is added
+/// Maximum lateral speed over the pad at which a low vehicle descends, in m/s: at the ground, the increase
 /// per metre of height, and, after some seconds of waiting, per second; and the limit however long it waits.
 const TOUCHDOWN_M_S: f64 = 0.2;
 const TOUCHDOWN_PER_HEIGHT: f64 = 0.4;
@@ -87,12 +87,12 @@ const MAX_TOUCHDOWN_M_S: f64 = 0.3;
 /// Minimum descent speed at touchdown on a heaving pad, in m/s.
 const MIN_TOUCHDOWN_M_S: f64 = 0.3;
 
-/// Maximum speed down, in m/s, up to which a pad that does not heave and seems to sink is followed: a touch is at 0.8 m/s at most. A pad that
-/// sinks faster is a wrong estimate, as from frames with wrong stamps, and would be followed hard onto the ground; an autopilot's height that drifts
-/// down by 0.5 m/s, twice what any was measured to do, leaves 0.2 m/s of descent.
+/// Maximum speed down, in m/s, up to which a pad that does not heave and seems to sink is followed: a touch is at 0.8 m/s at most. A pad
+/// that sinks faster is a wrong estimate, as from frames with wrong stamps, and would be followed hard onto the ground; an autopilot's
+/// height that drifts down by 0.5 m/s, twice the largest measured error, leaves 0.2 m/s of descent.
 const MAX_FOLLOWING_M_S: f64 = 0.7;
-/// Within these it is followed, in m/s: by the first also in a faster descent, as the autopilot's height drifts there as well; by the second at most,
-/// also where the vehicle waits or is to climb, low and aside of the pad.
+/// Within these it is followed, in m/s: by the first also in a faster descent, as the autopilot's height drifts there as well; by the
+/// second at most, also where the vehicle waits or is to climb, low and aside of the pad.
 const MAX_DRIFT_DOWN_M_S: [f64; 2] = [0.2, 0.5];
 
 /// Time ahead for which the error of a low vehicle is predicted, in seconds.
@@ -109,11 +109,11 @@ const ROOM_GAIN: f64 = 2.0;
 const PUSHING_M_S: f64 = 0.15;
 const STANDING_S: [f64; 2] = [0.4, 0.9];
 
-/// A vehicle that leans by more than this, in radians, does not stand: a gust holds it in the air. ArduPilot's levels within 0.2 s of its touch;
-/// PX4's simulated one keeps its tilt there, 0.15 in 5 m/s of wind with a drag (`SIH_KDV`) of 0.3.
+/// A vehicle that leans by more than this, in radians, does not stand: a gust holds it in the air. ArduPilot's levels within 0.2 s of its
+/// touch; PX4's simulated one keeps its tilt there, 0.15 in 5 m/s of wind with a drag (`SIH_KDV`) of 0.3.
 const MAX_STANDING_TILT_RAD: f64 = 0.3;
-/// Maximum speed over the pad, in m/s, of a vehicle near the ground that leans and yet stands, as on an edge, and how long it must be that still,
-/// in seconds.
+/// Maximum speed over the pad, in m/s, of a vehicle near the ground that leans and yet stands, as on an edge, and how long it must be that
+/// still, in seconds.
 const MAX_RESTING_M_S: f64 = 0.1;
 const RESTING_S: f64 = 3.0;
 
@@ -123,7 +123,7 @@ const TOUCHING_S: f64 = 0.25;
 /// Maximum climb speed of a vehicle that may stand, in m/s: the reported one errs.
 const MAX_RISING_M_S: f64 = 0.1;
 
-/// Height below which a descent is no slower than what shows whether the vehicle stands, in metres.
+/// Height below which a descent is fast enough to show whether the vehicle stands, in metres.
 const PUSHING_HEIGHT_M: f64 = 0.1;
 /// Maximum time from the state in which a vehicle is bound to touch the ground to one in which it stays there, in seconds.
 const CONTACT_S: f64 = 0.3;
@@ -137,11 +137,11 @@ const COMMITTED: f64 = 1.5;
 const UNATTENDED_BRAKING: f64 = 0.9;
 
 /// Delay of the link, both ways together, in seconds, that is part of `dead_time_s`; and the delay beyond it at
-/// which the gains are halved: what is seen later must be answered more gently, or the vehicle sways.
+/// which the gains are halved: a longer delay needs smaller gains, or the vehicle sways.
 const USUAL_LINK_S: f64 = 0.05;
 const HALF_GAIN_S: f64 = 0.15;
 
-/// Minimum share of the lateral speed that is allowed at the touchdown over a slow link: what is not seen in time must be
+/// Minimum fraction of the lateral speed that is allowed at the touchdown over a slow link: errors that are not seen in time must be
 /// slower beforehand, but it has to land.
 const MIN_TOUCHDOWN_SHARE: f64 = 0.5;
 
@@ -176,7 +176,7 @@ impl Guidance for Metric {
             .is_some_and(|target| target.deviation_m <= KNOWN_M && target.age_s <= KNOWN_S)
     }
 
-    /// True when the vehicle is bound to touch the ground, or was and has stayed there. What is seen, or not seen any more, is
+    /// True when the vehicle is bound to touch the ground, or was and has stayed there. Detections, or their absence, are
     /// then no reason to climb: that would be from the ground, and the estimate of a vehicle that stands drifts.
     fn touches_down(&self, situation: &Situation<'_>) -> bool {
         let is_near = |it: &TargetEstimate| self.height_m(it).abs() <= NEAR_M;
@@ -427,10 +427,11 @@ impl Metric {
         self.touchdown_slide_m_s(situation, target) / (fmin(max_m_s, MAX_TOUCHDOWN_M_S) * share)
     }
 
-    /// The horizontal speed over the pad with which the vehicle touches the ground, in m/s: that of now or, should a gust end on the way, that
-    /// of then. A vehicle leans against a gust by following a path that is faster than the vehicle itself, and gets up to the path's speed once
-    /// the gust is over. One that stands leans against nothing, whatever path it is to follow. Of 3000 modelled flights with a gust of 5 m/s
-    /// (seeds from 880001, up to 8 m/s of wind) 16 touch faster than 0.3 m/s sideways by the speed of now alone, and 3 by this one.
+    /// The horizontal speed over the pad with which the vehicle touches the ground, in m/s: that of now or, should a gust end on the way,
+    /// that of then. A vehicle leans against a gust by following a path that is faster than the vehicle itself, and gets up to the path's
+    /// speed once the gust is over. One that stands leans against nothing, whatever path it is to follow. Of 3000 modelled flights with a
+    /// gust of 5 m/s (seeds from 880001, up to 8 m/s of wind) 16 touch faster than 0.3 m/s sideways by the speed of now alone, and 3 by
+    /// this one.
     fn touchdown_slide_m_s(&self, situation: &Situation<'_>, target: &TargetEstimate) -> f64 {
         let closing = self.closing(situation, target);
         let leaning = self.observer.filter(|_| leans(situation)).map_or(Vector::zero(), |it| {

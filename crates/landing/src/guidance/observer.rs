@@ -1,4 +1,4 @@
-//! What the metric guidance observes of the vehicle's motion: the autopilot's path, the bias of its velocity,
+//! Observes the vehicle's motion for the metric guidance: the autopilot's path, the bias of its velocity,
 //! and the tilt against the wind.
 
 use geometry::{Ned, Point, Vector, squared};

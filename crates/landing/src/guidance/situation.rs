@@ -49,7 +49,7 @@ pub enum Progress {
     Ready(Reason),
 }
 
-/// What steers the vehicle over the target and down.
+/// A guidance law: steers the vehicle over the target and down.
 pub trait Guidance {
     /// True when the vehicle may descend.
     fn may_descend(&self, situation: &Situation<'_>) -> bool;
@@ -59,7 +59,7 @@ pub trait Guidance {
         false
     }
 
-    /// True when the vehicle touches the ground, or is so low and fast that it will: what would have it climb comes too late.
+    /// True when the vehicle touches the ground, or is so low and fast that it will: a command to climb would come too late.
     fn touches_down(&self, _situation: &Situation<'_>) -> bool {
         false
     }
@@ -95,7 +95,7 @@ pub trait Guidance {
     /// A retry begins: it has the time of the first try, also where it cannot climb.
     fn begin_retry(&mut self) {}
 
-    /// Forgets what builds up while guiding: the vehicle is not guided now.
+    /// Resets the integrators of the guidance: the vehicle is not guided now.
     fn reset(&mut self);
 }
 

@@ -1,4 +1,5 @@
-//! The thesis' guidance: a PI controller from the marker's pixels and the altitude to a velocity, with wind noise (section 3.2, Algorithms 16 to 18).
+//! The thesis' guidance: a PI controller from the marker's pixels and the altitude to a velocity, with wind noise (section 3.2, Algorithms
+//! 16 to 18).
 //!
 //! # Where the text leaves a choice, and which reading was taken
 //!
@@ -20,7 +21,7 @@
 //! | end of the run | LAND at the first frame inside the tolerance below 80 cm | as listed |
 //!
 //! `K_p`: the printed 1e-6 m/s per pixel moves the vehicle by less than 0.7 mm/s at the edge of the image.
-//! What is left is an integrator that steers an integrator, without damping: it passes the pad after half a
+//! The remaining loop is an integrator that steers an integrator, without damping: it passes the pad after half a
 //! minute, swings further in pixels with every metre of descent, and the marker leaves the view; of 12 such
 //! flights none had landed after 200 s. With 1e-4 the LAND mode is reached after 78 s with an overshoot of
 //! 0.4 m, with 1e-3 after 50.4 s (and 2 s more to the ground, 2 s more until disarmed) with an overshoot of

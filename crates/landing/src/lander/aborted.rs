@@ -1,4 +1,4 @@
-//! What a lander does after an abort: it hovers, lands or climbs, and then leaves the vehicle to its autopilot.
+//! Flies after an abort: the vehicle hovers, lands or climbs, and then leaves the vehicle to its autopilot.
 
 use geometry::Vector;
 
@@ -19,7 +19,7 @@ pub(super) const MIN_FLYING_M: f64 = 0.5;
 /// Height that may be missing from the one at which an aborted landing hovers, in metres.
 const HOVER_TOLERANCE_M: f64 = 0.1;
 
-/// What an aborted landing does about its height.
+/// How an aborted landing changes its height.
 #[derive(Copy, Clone, Debug, Default, PartialEq)]
 pub(super) enum AbortClimb {
     /// It has just been aborted.

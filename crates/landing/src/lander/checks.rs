@@ -1,4 +1,4 @@
-//! What the lander checks of camera and marker before and while it descends: whether the axes of camera and autopilot agree, and whether
+//! Checks camera and marker before and during the descent: whether the axes of camera and autopilot agree, and whether
 //! the marker is as large as configured.
 
 use super::Lander;
@@ -8,7 +8,7 @@ use crate::decision::Reason;
 use crate::time::Timestamp;
 
 impl Lander {
-    /// What shows that camera or marker are not as configured, once that is certain: nothing may descend.
+    /// The evidence that camera or marker are not as configured, once that is certain: the vehicle may not descend.
     pub fn mismatch(&self) -> Option<Reason> {
         let size = self.size_check.is_refused().then_some(Reason::MarkerSize);
         self.axis_mismatch().or(size)
@@ -28,7 +28,7 @@ impl Lander {
         self.repeat_size_check();
     }
 
-    /// Looks at the size again after a landing that it has ended. What is seen of it before a landing, as in a take-off over the pad,
+    /// Repeats the size check after a landing that it has ended. Detections before a landing, as in a take-off over the pad,
     /// counts in that.
     pub(super) fn repeat_size_check(&mut self) {
         if self.size_check.is_refused() {

@@ -1,4 +1,4 @@
-//! What keeps a vehicle at its place that is commanded no velocity to the side: one that waits, holds, or climbs straight up.
+//! Keeps a vehicle at its position that is commanded no horizontal velocity: one that waits, holds, or climbs straight up.
 
 use geometry::Vector;
 
@@ -49,7 +49,7 @@ impl Lander {
         Action::Velocity { velocity, yaw_rate }
     }
 
-    /// True where the vehicle may stand: what the autopilot's position drifts by is then no way that it has moved, and a velocity to the
+    /// True where the vehicle may stand: a drift of the autopilot's position is then no motion of the vehicle, and a velocity to the
     /// side would tip it over.
     fn may_touch_ground(&self, now: Timestamp) -> bool {
         let is_low = self

@@ -1,4 +1,4 @@
-//! What a lander does while the marker is out of view or lost: where a retry climbs to, and the pad's place to remember over a
+//! Flies while the marker is out of view or lost: the height to which a retry climbs, and the pad's position to remember over a
 //! silence of the autopilot.
 
 use geometry::Vector;
@@ -12,7 +12,8 @@ use crate::time::Timestamp;
 use crate::view::View;
 
 /// Minimum height over the pad, in metres, and maximum standard deviation of its place, in metres, at which time without the marker
-/// in the camera's view is waiting time: what moves the vehicle meanwhile, and what is not known for much longer, is to be seen.
+/// in the camera's view is waiting time: below it a disturbance must be seen at once, and above that deviation the marker must be seen
+/// again.
 const MIN_WAIT_HEIGHT_M: f64 = 1.5;
 const MAX_WAIT_DEVIATION_M: f64 = 0.2;
 
@@ -20,7 +21,7 @@ const MAX_WAIT_DEVIATION_M: f64 = 0.2;
 const MIN_SILENCE_S: f64 = 0.6;
 
 impl Lander {
-    /// The pad's place before a silence that ends with a state of this time: what the estimate is after it, is less certain.
+    /// The pad's position before a silence that ends with a state of this time: the estimate after it is less certain.
     pub(super) fn pad_before_silence(&self, stamp: Timestamp) -> Option<RememberedPad> {
         let last = self.history.newest()?.stamp;
         let is_silence = stamp.seconds_since(last) > MIN_SILENCE_S;
@@ -43,7 +44,7 @@ impl Lander {
     }
 
     /// Stays where the marker must be in view, and climbs, never above the height where the landing started. After markers that
-    /// were too far from the estimate of a pad that stands it climbs where it is: the estimate may be what is wrong, and who follows
+    /// were too far from the estimate of a pad that stands it climbs where it is: the estimate may be wrong, and a vehicle that follows
     /// it leaves the marker behind.
     pub(super) fn retry(&mut self, now: Timestamp) -> Action {
         let Some(vehicle) = self.history.newest().copied() else { return Action::hover() };

@@ -215,7 +215,7 @@ fn an_abort_ends_land_only_while_the_vehicle_is_high() {
     assert_eq!(after(&[land(9.4, 3.0), at(9.6)]), (false, false), "it follows again");
     assert_eq!(after(&[land(15.0, 3.0)]), (false, true), "it did not come back");
     let low = land(10.0, 0.9);
-    assert_eq!(after(&[low]), (false, false), "it may have taken what was asked of it");
+    assert_eq!(after(&[low]), (false, false), "it may have carried out the request");
     assert_eq!(after(&[low, land(10.2, 1.1)]), (false, false), "it is asked no more");
     assert_eq!(
         after(&[low, land(10.2, 0.8), at(10.4), at(14.0)]),
@@ -239,7 +239,7 @@ fn an_abort_ends_land_only_while_the_vehicle_is_high() {
 }
 
 #[test]
-fn what_a_landing_is_for_is_kept_until_after_it() {
+fn the_cause_of_a_landing_is_kept_until_after_it() {
     let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
     let down = flown(20.0, |v| (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround));
     let alarm = Inputs { alarm: Some((AlarmAction::Land, Reason::BatteryCritical)), ..at(1.0) };
@@ -264,7 +264,7 @@ fn what_a_landing_is_for_is_kept_until_after_it() {
 }
 
 #[test]
-fn landing_here_is_kept_as_what_it_is_for_also_of_a_vehicle_that_lands_already() {
+fn landing_here_is_kept_as_the_cause_also_of_a_vehicle_that_lands_already() {
     let mut machine = StateMachine::new(PhaseConfig::default());
     let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
     let here = Inputs { operator: Some(OperatorCommand::LandHere), ..land(3.0) };

@@ -111,7 +111,7 @@ pub(crate) struct Sample {
     pub(crate) decision: Decision,
     /// Position of the pad.
     pub(crate) pad: Point<Ned>,
-    /// What is certain of the camera's mount.
+    /// The certain errors of the camera's mount.
     pub(crate) mount: MountFindings,
     /// How many times as large as configured the marker is according to the lander.
     pub(crate) size: Option<f64>,
@@ -462,7 +462,7 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// Sends what was decided, as the controller does.
+    /// Sends the decision, as the controller does.
     fn obey(&mut self, decision: Decision, is_frame: bool) {
         if self.world.link_is_lost() {
             return;

@@ -1,4 +1,4 @@
-//! What many flights have in common, as rows of a table.
+//! Statistics of many flights, as rows of a table.
 
 use super::Flight;
 

@@ -351,7 +351,8 @@ fn a_gust_that_lifts_a_vehicle_near_the_ground_leaves_it_steered_and_free_to_cli
 }
 
 #[test]
-fn what_leans_against_a_gust_waits_above_the_ground_and_touches_down_where_it_is_about_to() {
+fn a_vehicle_that_leans_against_a_gust_waits_above_the_ground_and_touches_down_where_it_is_about_to()
+ {
     let descent = |tilt_rad: f64, path_m_s: f64, height_m: f64| {
         let mut vehicle = sinking(0.0, 0.0, height_m, 0.3);
         vehicle.ned_from_body = Rotation::from_euler(0.0, -tilt_rad, 0.0);
@@ -368,7 +369,7 @@ fn what_leans_against_a_gust_waits_above_the_ground_and_touches_down_where_it_is
         (0.4, 0.2, 0.3, true),
         (0.4, 0.8, 0.3, false),
         (0.4, 0.8, 0.05, true),
-        // What is level leans against nothing.
+        // A level vehicle does not lean against a gust.
         (0.0, 0.8, 0.3, true),
     ] {
         let (descent_m_s, why) = descent(tilt_rad, path_m_s, height_m);
@@ -379,7 +380,7 @@ fn what_leans_against_a_gust_waits_above_the_ground_and_touches_down_where_it_is
 }
 
 #[test]
-fn a_vehicle_whose_path_goes_on_is_known_to_stand_where_its_height_reads_too_much() {
+fn a_vehicle_whose_path_continues_is_known_to_stand_where_its_height_reads_too_much() {
     for (tilt_rad, after_s) in [(0.0, 0.3..1.0), (0.15, 0.3..1.0), (0.4, 2.9..3.6)] {
         let mut metric = Metric::new(MetricConfig::default());
         let mut stands = None;

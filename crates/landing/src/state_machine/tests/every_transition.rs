@@ -5,7 +5,7 @@ use super::*;
 use std::collections::hash_map::Entry;
 use std::collections::{HashMap, VecDeque};
 
-/// What distinguishes two states.
+/// The values that distinguish two states.
 type Key = (Phase, Reason, [bool; 5], u32, [bool; 4], bool);
 
 const LONG_S: f64 = 1e6;
@@ -152,7 +152,7 @@ fn alphabet() -> Vec<Inputs> {
     all
 }
 
-/// What holds for every single step.
+/// Invariants of every single step.
 fn check_step(before: &StateMachine, inputs: &Inputs, after: &StateMachine) {
     let (from, to) = (before.phase, after.phase);
     let step = format!("{from} to {to} after {inputs:?}");
