@@ -1,10 +1,10 @@
-//! Cuts a recording of a megabyte at every byte, and flips bits in it: what is whole before the damage is recovered, and the
+//! Cuts a recording of a megabyte at every byte, and flips bits in it: complete chunks before the damage are recovered, and the
 //! damage is named.
 //!
 //! `cargo run --release -p flightlog --example damage [EVERY [FLIPS]]`: cuts at every so many bytes (1), so many flips
 //! (10000).
 
-#![expect(clippy::print_stdout, reason = "what was measured is for people to read")]
+#![expect(clippy::print_stdout, reason = "measurements are for people to read")]
 
 use std::time::Instant;
 
@@ -72,7 +72,7 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// Frames and what was found in them, a chunk for every three.
+/// Frames and their detections, a chunk for every three.
 fn recording() -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let mut writer = Writer::new(&mut bytes, &About::default())?;

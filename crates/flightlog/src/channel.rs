@@ -27,7 +27,7 @@ pub enum Schema {
     Protobuf(&'static MessageType),
 }
 
-/// What a schema says to programs that know nothing of it.
+/// The description of a schema for programs other than Alight.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Description {
     /// Its name.

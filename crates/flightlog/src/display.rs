@@ -36,14 +36,14 @@ const MAX_AGE_NS: i64 = 60_000_000_000;
 /// Maximum number of lines and files that are remembered in order not to repeat them; further ones are left out.
 const MAX_REMEMBERED: usize = 4096;
 
-/// What is kept of a frame.
+/// The part of a frame that is recorded.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Picture {
     /// Its header.
     None,
-    /// A JPEG file beside its header.
+    /// A JPEG file next to its header.
     Jpeg(Vec<u8>),
-    /// Its pixels beside its header.
+    /// Its pixels next to its header.
     Pixels,
 }
 
@@ -52,13 +52,13 @@ pub enum Picture {
 pub struct File {
     /// Its name.
     pub name: String,
-    /// What it holds, as a media type.
+    /// Its media type.
     pub media_type: &'static str,
     /// Its contents.
     pub data: Vec<u8>,
 }
 
-/// Turns messages into what is shown; remembers what was said.
+/// Turns messages into records for viewers; remembers the lines that were logged.
 #[derive(Debug, Default)]
 pub struct Display {
     /// Added to stamps, so that they count from 1970.
@@ -71,7 +71,7 @@ pub struct Display {
     files: BTreeMap<String, Vec<u8>>,
 }
 
-/// The vehicle's clock, as the one who receives its messages knows it.
+/// The vehicle's clock, as a receiver of its messages estimates it.
 #[derive(Clone, Debug, Default)]
 pub struct VehicleClock {
     /// The name of ours, where it is known.
@@ -81,7 +81,7 @@ pub struct VehicleClock {
     offset: Option<Offset>,
 }
 
-/// What makes stamps of another clock ours.
+/// The conversion of another clock's stamps to ours.
 #[derive(Clone, Debug)]
 struct Offset {
     /// The name of that clock, where it is known; it has another one after each start of its computer.
@@ -155,7 +155,7 @@ impl Display {
         [header_as_json(message, stamp_ns, header)].into_iter().chain(shown).collect()
     }
 
-    /// What is shown of a message.
+    /// The records that viewers show of a message.
     fn records(&mut self, message: Received<'_>) -> Vec<Record> {
         let Received { key, payload, received_ns, .. } = message;
         let is = |pattern: String| matches(&pattern, key);
@@ -205,7 +205,7 @@ impl Display {
         records.unwrap_or_default()
     }
 
-    /// What is kept of a message as a file, when it is new.
+    /// The part of a message that is recorded as a file, when it is new.
     pub(crate) fn file(&mut self, message: Received<'_>) -> Option<File> {
         let file = if matches(&topic::CONFIGURATION.key(&[]), message.key) {
             let Configuration { toml, .. } = decode(message.payload).ok()?;
@@ -272,7 +272,7 @@ impl Display {
         stamp_ns.saturating_add(self.utc_offset_ns)
     }
 
-    /// What a detector found, with the stamp of the frame.
+    /// A detector's detections, with the stamp of the frame.
     fn detections(&self, name: &str, stamp_ns: i64, found: &Detections) -> Vec<Record> {
         let outlines: Vec<Outline> = found
             .detections
@@ -417,12 +417,12 @@ impl Display {
         records
     }
 
-    /// The place that the vehicle's autopilot reports.
+    /// The position that the vehicle's autopilot reports.
     fn packet(&mut self, stamp_ns: i64, bytes: &MavlinkBytes) -> Vec<Record> {
         let mut packets = Parser::new().push(&bytes.packet);
         packets.retain(|packet| self.autopilot.has_sent(packet));
         let places = packets.iter().filter_map(|packet| match packet.message.as_ref()? {
-            // Zero is what it says before it knows.
+            // It reports zero before it has a position.
             MavMessage::GLOBAL_POSITION_INT(at) if at.lat != 0 || at.lon != 0 => Some(Place {
                 latitude_deg: f64::from(at.lat) * 1e-7,
                 longitude_deg: f64::from(at.lon) * 1e-7,

@@ -1,4 +1,4 @@
-//! Foxglove's well-known types, which its panels show without any set-up: pictures, what was found in them,
+//! Foxglove's well-known types, which its panels show without any set-up: pictures, the detections in them,
 //! calibrations, coordinate frames, poses, places on a map and a log.
 //!
 //! Names and field numbers are those of Foxglove's schemas; `tests/recording/read.py` compares them with its package
@@ -85,7 +85,7 @@ pub static RAW_IMAGE: MessageType = MessageType {
     enums: &[],
 };
 
-/// What a picture of a camera has.
+/// The contents of a camera's picture.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Image<'a> {
     /// A file, of [`COMPRESSED_IMAGE`].
@@ -94,7 +94,7 @@ pub enum Image<'a> {
     Pixels(&'a [u8]),
 }
 
-/// What is in a message of [`COMPRESSED_IMAGE`] or [`RAW_IMAGE`]; `None` for another.
+/// The contents of a message of [`COMPRESSED_IMAGE`] or [`RAW_IMAGE`]; `None` for another.
 pub fn image(message: &[u8]) -> Option<Image<'_>> {
     // The second field of pixels is their width, which is no bytes.
     let file = bytes_of(message, 2).map(Image::File);
@@ -152,7 +152,7 @@ static TEXT: MessageType = MessageType {
     enums: &[],
 };
 
-/// What is drawn over a picture of the same time.
+/// Drawings over a picture of the same time.
 pub static IMAGE_ANNOTATIONS: MessageType = MessageType {
     name: "foxglove.ImageAnnotations",
     fields: &[
@@ -284,9 +284,9 @@ pub static LOG: MessageType = MessageType {
 /// How grave a line of the log is.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Level {
-    /// What happens in order.
+    /// A normal event.
     Info,
-    /// What a person should know.
+    /// An event that the user should know.
     Warning,
 }
 
@@ -403,7 +403,7 @@ pub fn poses_in_frame(stamp_ns: i64, frame_id: &str, poses: &[Pose]) -> Vec<u8> 
         .finish()
 }
 
-/// A place as a [`LOCATION_FIX`] whose uncertainty is unknown.
+/// A position as a [`LOCATION_FIX`] whose uncertainty is unknown.
 pub fn location_fix(stamp_ns: i64, frame_id: &str, place: Place) -> Vec<u8> {
     Encoder::default()
         .double(1, place.latitude_deg)
@@ -423,7 +423,7 @@ pub struct Outline {
     pub corners_px: Option<[[f64; 2]; 4]>,
     /// Its extent in the image, in pixels.
     pub size_px: f64,
-    /// What is written beside it.
+    /// The text next to it.
     pub text: String,
 }
 

@@ -1,15 +1,14 @@
-//! What a recording is: its channels, their schemas, and the MCAP file.
+//! Writes and reads recordings: their channels, schemas, and the MCAP file.
 //!
-//! A recording keeps every message twice: byte for byte ([`channel::RAW`]), and as JSON or as one of Foxglove's
-//! well-known types, for programs that know nothing of Alight. This crate knows no network and no clock, and writes to
-//! whatever is given.
+//! A recording contains every message twice: byte for byte ([`channel::RAW`]), and as JSON or as one of Foxglove's
+//! well-known types, for programs other than Alight. This crate uses no network and no clock, and writes to
+//! any output.
 //!
 //! Modules in reading order: [`protobuf`] describes and encodes messages, [`foxglove`] has those of Foxglove,
-//! [`channel`] says what a record is and keeps messages as they came and as JSON, [`display`] as Foxglove shows them, with the packets of the
-//! vehicle's [`own_autopilot`] alone;
-//! [`live`] offers the latter to programs that follow a flight; [`writer`] puts both into a file; `records` goes through one,
-//! [`mod@repair`] ends a file properly whose writer was killed,
-//! [`reader`] reads one as far as it is whole, and [`tape`] the controllers' tapes.
+//! [`channel`] defines records and has messages as they were received and as JSON, [`display`] as Foxglove shows them, with the packets of
+//! the vehicle's [`own_autopilot`] alone; [`live`] offers the latter to programs that follow a flight; [`writer`] writes both into a file;
+//! `records` iterates over one, [`mod@repair`] ends a file properly whose writer was killed, [`reader`] reads one as far as it is valid,
+//! and [`tape`] the controllers' tapes.
 
 pub mod channel;
 pub mod display;

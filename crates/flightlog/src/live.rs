@@ -1,8 +1,8 @@
-//! A flight under way for programs that follow it: what is sent and asked for over the Foxglove WebSocket protocol,
+//! Serves a flight under way to programs that follow it: messages and requests of the Foxglove WebSocket protocol,
 //! version 1, without the network.
 //!
 //! The channels are those of a recording with the same types, but for messages as they came
-//! ([`RAW_PREFIX`](crate::channel::RAW_PREFIX)), of which no viewer makes anything.
+//! ([`RAW_PREFIX`](crate::channel::RAW_PREFIX)), which no viewer can show.
 //!
 //! Reference: `docs/spec.md` of <https://github.com/foxglove/ws-protocol>, version 1, and the handshake of
 //! <https://github.com/foxglove/foxglove-sdk>, whose name for the same protocol is another one.
@@ -57,7 +57,7 @@ impl Live {
     }
 }
 
-/// What a client asks for.
+/// A client's request.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(tag = "op", rename_all = "camelCase")]
 pub enum Request {
@@ -78,7 +78,7 @@ pub enum Request {
     Other,
 }
 
-/// That a client wants the messages of a channel.
+/// A client's subscription to the messages of a channel.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Subscription {
@@ -88,7 +88,7 @@ pub struct Subscription {
     pub channel_id: u32,
 }
 
-/// What a client's text asks for.
+/// The request in a client's text.
 ///
 /// # Errors
 /// Why it is no request.
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn a_message_is_made_of_what_came() {
+    fn a_message_is_made_of_the_received_bytes() {
         let mut live = Live::new(1_000, "clock");
         let payload = encode(&Wind { velocity_ned_m_s: [1.0, 0.0, 0.0], stamp_ns: 7 });
         let received = Received { key: "wind", payload: &payload, attachment: b"", received_ns: 9 };

@@ -39,13 +39,13 @@ pub struct Field {
     pub name: &'static str,
     /// Its number.
     pub number: u32,
-    /// What it holds.
+    /// The type of its value.
     pub kind: Kind,
-    /// Whether it holds any number of them.
+    /// Whether it is a list of such values.
     pub is_repeated: bool,
 }
 
-/// What a field holds.
+/// The type of a field's value.
 #[derive(Debug)]
 pub enum Kind {
     /// A float of 64 bits.
@@ -190,7 +190,7 @@ pub fn bytes_of(message: &[u8], field: u32) -> Option<&[u8]> {
     }
 }
 
-/// A number of variable length, and what follows it.
+/// A number of variable length, and the bytes after it.
 fn varint(bytes: &[u8]) -> Option<(u64, &[u8])> {
     let mut value = 0;
     for (index, byte) in bytes.iter().enumerate().take(10) {
@@ -216,7 +216,7 @@ fn collect(message: &'static MessageType, found: &mut Vec<&'static MessageType>)
             collect(inner, found);
         }
     }
-    // What a file imports comes before it.
+    // The imports of a file come before it.
     if found.iter().all(|it| it.name != message.name) {
         found.push(message);
     }

@@ -15,23 +15,23 @@ use crate::records::{Records, check_begin, contained, records_of};
 use crate::repair::DIFFERS;
 use crate::writer::{DROPPED_CHANNEL, METADATA, Problem, TIME_SET};
 
-/// Something that a recording has.
+/// An entry of a recording.
 #[derive(Clone, Debug)]
 pub enum Entry<'a> {
     /// Facts about the recording, by name; before everything else.
     About(BTreeMap<String, String>),
     /// A message as it came. Of a frame only the attachment, which is its header.
     Message(Received<'a>),
-    /// What was kept of a frame's picture, after the frame's own message.
+    /// The recorded picture of a frame, after the frame's own message.
     Picture {
         /// The frame's header, with the format that these bytes have.
         header: FrameHeader,
         /// A JPEG file, or the pixels.
         bytes: &'a [u8],
-        /// When the frame came, in nanoseconds of the recorder's clock.
+        /// When the frame was received, in nanoseconds of the recorder's clock.
         received_ns: i64,
     },
-    /// Messages that the recorder could not keep, since its start, by key.
+    /// Messages that the recorder could not record, since its start, by key.
     Dropped(BTreeMap<String, u64>),
     /// The clock of UTC was set while the file was open: to so many nanoseconds more than the file's own times say.
     TimeSet(i64),
@@ -44,11 +44,11 @@ pub struct Reading {
     pub is_ended: bool,
     /// Messages that were read as they came.
     pub messages: u64,
-    /// What could not be read, as sentences.
+    /// The parts that could not be read, as sentences.
     pub damage: Vec<String>,
 }
 
-/// Reads a recording; `each` gets what is in it, in order.
+/// Reads a recording; `each` receives its entries, in order.
 ///
 /// # Errors
 /// When it is no MCAP file at all.
@@ -151,7 +151,7 @@ pub fn in_order(files: &[Vec<u8>]) -> Result<Vec<&[u8]>, Problem> {
     Ok(parts.into_iter().map(|(_, file)| file).collect())
 }
 
-/// What was found so far.
+/// The entries that were found so far.
 struct Found<F> {
     /// Keys by channel.
     keys: BTreeMap<u16, String>,
@@ -259,7 +259,7 @@ mod tests {
         file
     }
 
-    /// When the messages came, and what else there is.
+    /// The reception times of the messages, and the number of other entries.
     fn times(file: &[u8]) -> (Vec<i64>, usize, Reading) {
         let (mut times, mut others) = (Vec::new(), 0);
         let reading = read(file, |entry| match entry {
@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_follows_its_frame_with_what_was_kept_of_it() {
+    fn a_recorded_picture_follows_its_frame() {
         let mut file = Vec::new();
         let mut recording = Writer::new(&mut file, &About::default()).unwrap();
         let kept = [Picture::Jpeg(b"file".to_vec()), Picture::None, Picture::Pixels];
@@ -393,7 +393,7 @@ mod tests {
         let (_, _, whole) = times(&file);
         // Where the record that ends the data begins, which has no checksum itself.
         let end = mcap::read::footer(&file).unwrap().summary_start as usize - 13;
-        // The magic bytes say what it is; every sixth bit, so that each place of a byte is among them.
+        // The magic bytes identify the file; every sixth bit, so that each place of a byte is among them.
         for bit in (8 * mcap::MAGIC.len()..8 * end).step_by(7) {
             let mut flipped = file.clone();
             flipped[bit / 8] ^= 1 << (bit % 8);

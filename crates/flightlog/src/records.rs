@@ -11,7 +11,7 @@ use crate::writer::Problem;
 /// Length of the record that ends the data: its kind, its length, its checksum.
 const DATA_END_BYTES: usize = 1 + 8 + 4;
 
-/// The records of the data, as far as the length of each leads to the next: the kind of each, and what it says.
+/// The records of the data, as far as the length of each leads to the next: the kind of each, and its contents.
 pub(crate) struct Records<'a> {
     recording: &'a [u8],
     at: usize,
@@ -40,7 +40,7 @@ impl<'a> Records<'a> {
         self.is_ended
     }
 
-    /// Whether the checksum at the end is another than that of what is before it.
+    /// Whether the checksum at the end differs from that of the data before it.
     pub(crate) fn differs(&self) -> bool {
         self.differs
     }
@@ -94,7 +94,7 @@ pub(crate) fn records_of(header: ChunkHeader, data: &[u8]) -> Result<Vec<Record<
     contained(|| ChunkReader::new(header, data)?.collect())
 }
 
-/// What `read` returns; an error too when the reader panics, as it does on some damage.
+/// The result of `read`; an error too when the reader panics, as it does on some damage.
 pub(crate) fn contained<T>(read: impl FnOnce() -> Result<T, McapError>) -> Result<T, Problem> {
     let read = catch_unwind(AssertUnwindSafe(read));
     read.map_err(|_| Problem::Senseless)?.map_err(Problem::from)

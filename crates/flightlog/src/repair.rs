@@ -1,4 +1,4 @@
-//! Ends a recording properly whose writer was killed, and says what is lost.
+//! Ends a recording properly whose writer was killed, and reports the losses.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io::Write;
@@ -13,20 +13,20 @@ use crate::writer::Problem;
 
 /// The damage of a file of which nothing else is known to be damaged.
 pub(crate) const DIFFERS: &str =
-    "something before its end is damaged, by its checksum; what it is could not be found";
+    "the data before its end are damaged, by their checksum; the damaged record could not be found";
 
-/// What a repair found.
+/// The result of a repair.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Repaired {
-    /// Messages that were kept.
+    /// Messages that were copied.
     pub messages: u64,
-    /// Chunks that were kept.
+    /// Chunks that were copied.
     pub chunks: u64,
-    /// What is damaged or missing; nothing for a whole file.
+    /// The damaged and missing parts; empty for a complete file.
     pub damage: Vec<String>,
 }
 
-/// Copies every whole chunk of a recording into `output`, and ends it.
+/// Copies every complete chunk of a recording into `output`, and ends it.
 ///
 /// A channel is described once, in the first chunk that has messages of it, and again in the index of a recording that
 /// was ended. Where both are damaged or missing, the messages of the channel are lost, and counted.
@@ -63,7 +63,7 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
                 media_type: header.media_type,
                 data,
             })?,
-            // The index is made anew.
+            // The index is written again.
             Ok(Record::Header(_) | Record::MessageIndex(_)) => {}
             // Everything else is inside of chunks.
             Ok(_) => {
@@ -78,12 +78,14 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
     }
     let Copy { mut mcap, lost, mut found, .. } = copy;
     found.damage.extend(lost.into_iter().map(|(channel, messages)| {
-        format!("{messages} messages of channel {channel} are lost: what describes it is damaged")
+        format!(
+            "{messages} messages of channel {channel} are lost: the description of it is damaged"
+        )
     }));
     if !records.is_ended() {
         let chunks = found.chunks;
         found.damage.push(format!(
-            "not ended: what came after {chunks} whole chunks is missing; of a recorder that was killed that is half a second"
+            "not ended: the messages after {chunks} complete chunks are missing; of a recorder that was killed these are half a second"
         ));
     } else if index.is_none() {
         found.damage.push("its index is damaged or missing".to_owned());
@@ -102,7 +104,7 @@ struct Copy<'a, W: Write> {
     in_index: Option<&'a HashMap<u16, Arc<Channel<'static>>>>,
     /// The channels that the copy has.
     channels: BTreeSet<u16>,
-    /// Messages of channels that nothing describes.
+    /// Messages of channels without a description.
     lost: BTreeMap<u16, u64>,
     found: Repaired,
 }
@@ -113,7 +115,7 @@ impl<W: Write> Copy<'_, W> {
         for record in records {
             match self.record(record) {
                 Err(problem @ McapError::Io(_)) => return Err(problem),
-                // It contradicts what came before.
+                // It contradicts earlier records.
                 Err(problem) => {
                     let text = format!("a description of a channel is damaged: {problem}");
                     if !self.found.damage.contains(&text) {

@@ -22,7 +22,7 @@ pub struct RecordedTape {
 pub struct TapeReader {
     /// By their begin, and the number of each part's first record.
     parts: BTreeMap<i64, BTreeMap<u64, Tape>>,
-    /// What could not be read.
+    /// The parts that could not be read.
     damage: Vec<String>,
 }
 
@@ -92,7 +92,7 @@ impl TapeReader {
         })
     }
 
-    /// What could not be read, as sentences.
+    /// The parts that could not be read, as sentences.
     pub fn damage(&self) -> &[String] {
         &self.damage
     }

@@ -1,7 +1,7 @@
 //! Writes a recording's MCAP file, append-only: schemas, channels, messages as they came, as JSON and as Foxglove shows them,
-//! frames, and counts of what was lost.
+//! frames, and counts of lost messages.
 //!
-//! Chunks are gathered in memory and written whole, so a killed writer loses what came after the last
+//! Chunks are gathered in memory and written in one piece, so a killed writer loses the messages after the last
 //! [`Writer::flush`] and nothing before it.
 
 use std::borrow::Cow;
@@ -42,7 +42,7 @@ pub enum Problem {
     Senseless,
 }
 
-/// What a recording is of.
+/// The source of a recording.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct About {
     /// The program and its version.

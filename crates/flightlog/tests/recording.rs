@@ -78,7 +78,7 @@ fn pictures_of_another_kind_get_a_channel_of_their_own() {
 }
 
 #[test]
-fn what_was_flushed_survives_a_kill_and_is_ended_by_a_repair() {
+fn flushed_messages_survive_a_kill_and_are_ended_by_a_repair() {
     let killed = recording(true);
     assert!(mcap::Summary::read(&killed).map_or(true, |summary| summary.is_none()));
     let mut mended = Vec::new();
@@ -125,7 +125,7 @@ fn flipped_bits_are_named_and_lose_no_other_chunk() {
         let Ok(found) = repair(&damaged, &mut mended) else { continue };
         named += usize::from(!found.damage.is_empty());
         let before = chunks.iter().filter(|chunk| chunk.end <= bit / 8).count();
-        // What says where a record ends is not repeated: whatever comes after it is lost.
+        // The length of a record is not repeated: all data after a damaged one are lost.
         let is_in_chunk = chunks.iter().any(|chunk| chunk.contains(&(bit / 8)));
         let min = if is_in_chunk { MESSAGES - 10 } else { 10 * before };
         assert!(numbers(&mended).len() >= min, "bit {bit}: {found:?}");
