@@ -1,4 +1,4 @@
-//! The recorder's configuration, `recorder.toml`: file and its size, what is kept of frames, address and
+//! The recorder's configuration, `recorder.toml`: file and its size, the recorded part of frames, address and
 //! origins of viewers.
 
 use std::net::SocketAddr;
@@ -17,13 +17,13 @@ pub struct Config {
     pub id: String,
     /// The recording.
     pub file: PathBuf,
-    /// What is kept of frames, a [`Frames`].
+    /// The recorded part of frames, a [`Frames`].
     pub frames: String,
     /// Quality of pictures, 1 to 100.
     pub jpeg_quality: u8,
     /// Maximum rate of pictures of a camera, in Hz.
     pub max_picture_hz: f64,
-    /// What may wait for a slow disk, in MB.
+    /// Messages that may wait for a slow disk, in MB.
     pub max_waiting_mb: u32,
     /// Size at which a new file is begun, in MB.
     pub max_file_mb: u32,
@@ -46,7 +46,7 @@ impl Config {
     }
 }
 
-/// What is kept of frames.
+/// The recorded part of frames.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Frames {
@@ -95,7 +95,7 @@ fn check_address(serve: &str, insecure: bool) -> Result<(), &'static str> {
         Err(_) => Err("it must be IP:PORT, such as 127.0.0.1:8765"),
         Ok(address) if insecure || address.ip().is_loopback() => Ok(()),
         Ok(_) => Err(
-            "beyond this machine anyone in reach can follow the flight, pictures included. `ssh -L 8765:127.0.0.1:8765 HOST` brings 127.0.0.1:8765 there; or allow it with `insecure = true` (`--insecure`)",
+            "beyond this machine every computer in the network can follow the flight, pictures included. `ssh -L 8765:127.0.0.1:8765 HOST` brings 127.0.0.1:8765 there; or allow it with `insecure = true` (`--insecure`)",
         ),
     }
 }
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn strangers_follow_a_flight_only_where_that_was_decided() {
+    fn other_machines_follow_a_flight_only_where_that_is_configured() {
         assert!(load_all(&["serve=0.0.0.0:8765", "insecure=true"]).is_ok());
         assert!(load_all(&["serve=127.0.0.1:8765", "file="]).is_ok_and(|it| !it.has_file()));
     }

@@ -1,4 +1,4 @@
-//! The disk: a thread of its own opens a file under a name that is free, appends to it and syncs it, so that nobody waits for it.
+//! Writes to the disk: a separate thread opens a file under a free name, appends to it and syncs it. No other thread waits for the disk.
 
 use std::collections::VecDeque;
 use std::fs::{File, OpenOptions};
@@ -25,7 +25,7 @@ struct Shared {
 
 #[derive(Debug, Default)]
 struct State {
-    /// What waits, and its bytes with those that are being written.
+    /// The bytes that wait, and their number with those that are being written.
     waiting: VecDeque<Vec<u8>>,
     waiting_bytes: usize,
     /// Since when the oldest of it waits.
@@ -76,7 +76,7 @@ impl Disk {
         Ok(Self { shared })
     }
 
-    /// Hands over what is to be written.
+    /// Hands over bytes to be written.
     pub(crate) fn append(&self, bytes: Vec<u8>) {
         let mut state = self.shared.lock();
         state.since.get_or_insert_with(Instant::now);
@@ -97,9 +97,9 @@ impl Disk {
     }
 
     /// Waits until it has ended; how it is doing then.
-    pub(crate) fn wait(&self, patience: Duration) -> DiskStatus {
-        let goes_on = |state: &mut State| !state.status.has_ended;
-        let waited = self.shared.changed.wait_timeout_while(self.shared.lock(), patience, goes_on);
+    pub(crate) fn wait(&self, limit: Duration) -> DiskStatus {
+        let is_running = |state: &mut State| !state.status.has_ended;
+        let waited = self.shared.changed.wait_timeout_while(self.shared.lock(), limit, is_running);
         waited.unwrap_or_else(PoisonError::into_inner).0.status()
     }
 }
@@ -115,7 +115,7 @@ impl State {
 }
 
 impl Shared {
-    // Every state is a whole one, also when a thread panics.
+    // Every state is complete, also when a thread panics.
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -123,7 +123,7 @@ impl Shared {
     /// Writes until everything is there.
     fn write_all(&self, wanted: &Path) -> anyhow::Result<()> {
         let (path, mut file) = create(wanted)?;
-        // Asked for by this thread, as a disk that stands still does not answer.
+        // Asked for by this thread, as a disk that hangs does not answer.
         let room_bytes = free_bytes(&file);
         let mut state = self.lock();
         state.status.path = Some(path.clone());
@@ -163,7 +163,7 @@ impl Shared {
         }
     }
 
-    /// Waits for what is to be written; nothing once everything is.
+    /// Waits for bytes to be written; empty once everything is.
     fn next(&self) -> VecDeque<Vec<u8>> {
         let is_idle = |state: &mut State| state.waiting.is_empty() && !state.is_complete;
         let state = self.changed.wait_while(self.lock(), is_idle);
@@ -171,13 +171,13 @@ impl Shared {
     }
 }
 
-/// The cause first, as a ground station may show no more; then what was done, and what to do.
+/// The cause first, as a ground station may show no more; then the failed action, and the remedy.
 fn in_words(problem: &anyhow::Error) -> String {
     let (cause, whole) = (problem.root_cause().to_string(), problem.to_string());
     if cause == whole { whole } else { format!("{cause}, {whole}") }
 }
 
-/// A file that was removed, or whose disk was, takes bytes for ever.
+/// A file that was removed, or whose disk was, accepts bytes without an error.
 fn is_still_there(path: &Path, file: &File) -> anyhow::Result<()> {
     let ours = file.metadata()?;
     let found = std::fs::metadata(path).map_err(|_cause| anyhow!("the file was removed"))?;
@@ -187,7 +187,7 @@ fn is_still_there(path: &Path, file: &File) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What this user may still write to the disk of a file.
+/// The bytes that this user may still write to the disk of a file.
 fn free_bytes(file: &File) -> Option<u64> {
     let about = fstatvfs(file).ok()?;
     // A file system without a bound has no blocks.

@@ -1,4 +1,4 @@
-//! Messages for the file and for those who follow: frames with the picture that is kept of them.
+//! Makes frames for the file and for viewers, with the picture that is recorded of them.
 
 use std::collections::BTreeMap;
 
@@ -13,15 +13,15 @@ use crate::config::{Config, Frames};
 /// Maximum number of cameras whose last pictures are remembered.
 const MAX_CAMERAS: usize = 1024;
 
-/// What is kept of a frame.
+/// The recorded part of a frame.
 #[derive(Clone, Debug)]
 pub(crate) struct Frame {
     /// Its header.
     pub(crate) header: FrameHeader,
     /// Its picture, as configured.
     pub(crate) picture: Picture,
-    /// Whether that is all that is configured: pixels that are no whole image make no picture.
-    pub(crate) is_whole: bool,
+    /// Whether that is all that is configured: pixels that are no complete image make no picture.
+    pub(crate) is_complete: bool,
 }
 
 /// Makes the pictures.
@@ -55,13 +55,13 @@ impl Pictures {
             Frames::Raw if is_due => Some(Picture::Pixels),
             Frames::Jpeg | Frames::Raw | Frames::None => Some(Picture::None),
         };
-        let is_whole = picture.is_some();
+        let is_complete = picture.is_some();
         let picture = picture.unwrap_or(Picture::None);
         if picture != Picture::None && is_remembered {
             rate.take(header.stamp_ns);
             self.rates.insert(message.key.clone(), rate);
         }
-        Frame { header, picture, is_whole }
+        Frame { header, picture, is_complete }
     }
 }
 

@@ -1,4 +1,4 @@
-//! Who may follow a flight, by what a browser says of the page that asks.
+//! Decides which clients may follow a flight, by the origin that a browser states for the page.
 //!
 //! Any web site that is open in a browser can connect to this machine. It cannot hide its origin; programs other than
 //! browsers have none.

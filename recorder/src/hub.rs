@@ -1,5 +1,5 @@
-//! The channels offered to viewers and the viewers' places: who is subscribed to which channel, the last values for whoever
-//! comes, and a bound on their number.
+//! The channels offered to viewers and the viewers' places: each client's subscriptions, the last values for a client that
+//! joins, and a bound on their number.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -12,7 +12,7 @@ use crate::outbox::{Message, Next, Outbox, max_waiting};
 
 /// Maximum number of channels; further ones are not offered.
 const MAX_CHANNELS: usize = 1024;
-/// Maximum size of the last value of a state that is kept for clients to come, in bytes.
+/// Maximum size of the last value of a state that is stored for later clients, in bytes.
 const MAX_STATE_BYTES: usize = 100_000;
 
 /// The channels and the clients.
@@ -29,7 +29,7 @@ struct State {
     numbers: BTreeMap<String, u32>,
     clients: BTreeMap<u64, Client>,
     next_client: u64,
-    /// Whether nobody followed before.
+    /// Whether there was no client before the last one joined.
     has_begun: bool,
 }
 
@@ -37,7 +37,7 @@ struct State {
 struct Channel {
     topic: String,
     schema: Schema,
-    /// The last value of a state, for those who subscribe later.
+    /// The last value of a state, for clients that subscribe later.
     last: Option<Message>,
 }
 
@@ -92,7 +92,7 @@ impl Hub {
         std::mem::take(&mut self.lock().has_begun)
     }
 
-    /// Offers a message to those who subscribe to its channel; how many messages clients miss for that.
+    /// Offers a message to the clients that subscribe to its channel; how many messages clients miss for that.
     pub(crate) fn offer(&self, record: Record, log_time_ns: u64, is_state: bool) -> u64 {
         let mut state = self.lock();
         let Some((number, schema)) = state.number(&record) else { return 0 };
@@ -153,7 +153,7 @@ impl Place {
         self.changed.notified().await;
     }
 
-    /// What is to be sent next.
+    /// The next text or message to be sent.
     pub(crate) fn next(&self) -> Option<Next> {
         self.hub.lock().clients.get_mut(&self.client)?.outbox.next()
     }
@@ -163,7 +163,7 @@ impl Place {
         self.hub.lock().clients.get(&self.client).map_or(0, |it| it.outbox.dropped())
     }
 
-    /// From now on the client gets the messages of a channel, of a state first the last value.
+    /// From now on the client receives the messages of a channel, of a state first the last value.
     ///
     /// # Errors
     /// Why it does not.
@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn who_comes_later_gets_the_last_value_of_a_state() {
+    fn a_later_client_receives_the_last_value_of_a_state() {
         let hub = Arc::new(Hub::new(2));
         assert!(!hub.is_followed() && !hub.take_begun());
         let first = hub.join().unwrap();

@@ -1,14 +1,14 @@
-//! Topics to a file, and to viewers that follow a flight.
+//! Records topics to a file, and serves them to viewers that follow a flight.
 //!
-//! The service keeps every message that is published, byte for byte and as other programs read it, in an MCAP file. It
-//! subscribes like anyone, so no other service knows of it or waits for it; of itself it publishes health, configuration
-//! and what it has kept. A file whose writer is killed is read up to its last half second.
+//! The service records every message that is published, byte for byte and as other programs read it, in an MCAP file. It
+//! subscribes like any client, so no other service depends on it or waits for it; it publishes its own health, configuration
+//! and counts of recorded messages. A file whose writer is killed is read up to its last half second.
 //!
 //! Modules in reading order: [`config`]; [`service`] takes messages, `frame` makes pictures, `unseen` counts the frames
 //! that never came; `recording` is one
-//! file as MCAP with its `name`, and `disk` the thread that writes it. `live` offers messages to those who follow: `hub` has
-//! channels and clients, `outbox` and `window` what waits for one and is on its way to it, `guard` who may be one, and `server`
-//! answers them.
+//! file as MCAP with its `name`, and `disk` the thread that writes it. `live` offers messages to viewers: `hub` has
+//! channels and clients, `outbox` and `window` bound the messages that wait for one and are on their way to it, `guard` decides which
+//! clients are allowed, and `server` answers them.
 
 pub mod config;
 mod disk;

@@ -19,7 +19,7 @@ use crate::hub::Hub;
 use crate::server::{Server, serve};
 
 /// The reason for which a recorder that serves beyond this machine counts an error in its health.
-const INSECURE: &str = "insecure: anyone in reach can follow the flight";
+const INSECURE: &str = "insecure: every computer in the network can follow the flight";
 
 /// The reason for which a recorder counts an error that cannot listen at its address for viewers.
 const UNSERVED: &str = "viewers are not served";
@@ -148,7 +148,7 @@ async fn serve_at(
     tracing::info!("Foxglove and Lichtblick follow the flight at ws://{address}");
     if !address.ip().is_loopback() && health.failed(INSECURE) {
         tracing::warn!(
-            "INSECURE: anyone in reach of {address} can follow the flight, pictures included"
+            "INSECURE: every computer that reaches {address} can follow the flight, pictures included"
         );
     }
     match serve(listener, server).await {}

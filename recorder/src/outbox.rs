@@ -1,6 +1,6 @@
-//! What waits to be sent to one client: for each channel that it asked for the newest messages, and no more.
+//! Queues the messages to one client: of each channel to which it subscribes only the newest.
 //!
-//! A client that is too slow misses the oldest; nobody waits for it.
+//! A client that is too slow misses the oldest; the recorder does not wait for it.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::mem::size_of;
@@ -10,7 +10,7 @@ use flightlog::Schema;
 use flightlog::foxglove::{COMPRESSED_IMAGE, LOG, RAW_IMAGE};
 use flightlog::live::Subscription;
 
-/// Maximum size of what waits, in bytes, unless it is one message.
+/// Maximum size of the waiting messages, in bytes, unless it is one message.
 const MAX_BYTES: usize = 2_000_000;
 /// Maximum number of pictures of a camera that wait.
 const MAX_PICTURES: usize = 1;
@@ -22,9 +22,9 @@ const MAX_LINES: usize = 256;
 /// A message of a channel.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Message {
-    /// When it came, in nanoseconds since 1970.
+    /// When it was received, in nanoseconds since 1970.
     pub(crate) log_time_ns: u64,
-    /// Its bytes, shared by all to whom it is sent.
+    /// Its bytes, shared by all clients to which it is sent.
     pub(crate) data: Bytes,
 }
 
@@ -45,7 +45,7 @@ pub(crate) fn max_waiting(schema: Schema) -> usize {
     }
 }
 
-/// What is to be sent next.
+/// The next text or message to be sent.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Next {
     /// A text.
@@ -54,7 +54,7 @@ pub(crate) enum Next {
     Message(u32, Message),
 }
 
-/// What waits to be sent to one client.
+/// The texts and messages that wait to be sent to one client.
 #[derive(Debug, Default)]
 pub(crate) struct Outbox {
     /// Announcements of channels: not more texts than channels.
@@ -98,7 +98,7 @@ impl Outbox {
         self.bytes = waiting.map(|(_, message)| message.bytes()).sum();
     }
 
-    /// Adds a message, if the client wants it; how many it misses for that.
+    /// Adds a message, if the client subscribes to its channel; how many it misses for that.
     pub(crate) fn push(&mut self, channel: u32, max_waiting: usize, message: &Message) -> u64 {
         let Some(subscribed) = self.subscribed.get_mut(&channel) else { return 0 };
         self.bytes += message.bytes();
@@ -135,7 +135,7 @@ impl Outbox {
         self.dropped += u64::from(self.take(channel).is_some());
     }
 
-    /// What is to be sent next, in the order in which it came.
+    /// The next text or message, in the order of reception.
     pub(crate) fn next(&mut self) -> Option<Next> {
         if let Some(text) = self.texts.pop_front() {
             return Some(Next::Text(text));
@@ -166,7 +166,7 @@ mod tests {
         outbox
     }
 
-    /// Subscription and time of all that waits.
+    /// Subscription and time of all waiting messages.
     fn rest(outbox: &mut Outbox) -> Vec<(u32, u64)> {
         let next = || match outbox.next()? {
             Next::Message(id, message) => Some((id, message.log_time_ns)),
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn what_waits_is_bounded_in_bytes_unless_it_is_one_message() {
+    fn waiting_messages_are_bounded_in_bytes_unless_there_is_only_one() {
         let mut outbox = outbox(&[1, 2]);
         for time in 0..40 {
             outbox.push(1, MAX_MESSAGES, &message(time, 200_000));

@@ -34,13 +34,13 @@ pub(crate) struct Ending {
     unsynced: VecDeque<Batch>,
 }
 
-/// The messages up to a place in the file, by key.
+/// The messages up to a position in the file, by key.
 struct Batch {
     end_bytes: u64,
     written: BTreeMap<String, u64>,
 }
 
-/// What the format's writer has written and the disk has not got yet.
+/// The bytes that the format's writer has written and the disk does not have yet.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Buffer {
     bytes: Arc<Mutex<Vec<u8>>>,

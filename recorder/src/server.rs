@@ -23,14 +23,14 @@ use crate::hub::{Hub, Place};
 use crate::outbox::Next;
 use crate::window::Window;
 
-/// Maximum size of what a client sends, in bytes: it subscribes to all channels at once.
+/// Maximum size of a client's request, in bytes: it may subscribe to all channels at once.
 const MAX_REQUEST_BYTES: usize = 100_000;
-/// What a client does not take within this time is given up with its connection.
+/// A message that a client does not take within this time is dropped, and its connection closed.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
-/// Period in which a client is looked after: a ping, and what it missed.
+/// Period in which a client receives a ping and a report of missed messages.
 const LOOK_PERIOD: Duration = Duration::from_secs(2);
 
-/// What the answers need.
+/// The state of the server.
 pub(crate) struct Server {
     pub(crate) hub: Arc<Hub>,
     pub(crate) health: Arc<HealthCounters>,
@@ -42,7 +42,7 @@ pub(crate) struct Server {
     pub(crate) origins: Vec<String>,
 }
 
-/// Answers whoever connects.
+/// Answers each client that connects.
 pub(crate) async fn serve(listener: TcpListener, server: Server) -> Infallible {
     let health = Arc::clone(&server.health);
     let router = Router::new().fallback(any(connect)).with_state(Arc::new(server));

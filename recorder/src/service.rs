@@ -1,5 +1,5 @@
 //! The recorder's service: writes messages and frames of the topics to a recording and, when that is full or fails, to the next one,
-//! offers them to viewers, counts what is kept, lost or never came by key.
+//! offers them to viewers, and counts recorded, lost and never received messages by key.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -34,7 +34,7 @@ const LAST_MESSAGES: Duration = Duration::from_millis(600);
 /// Time in which the messages are written that were received before that and still wait.
 const CATCH_UP: Duration = Duration::from_millis(200);
 /// Time from the last messages on in which the disk is to have the rest; `alight land` kills after 4 s.
-const END_PATIENCE: Duration = Duration::from_millis(1100);
+const END_TIMEOUT: Duration = Duration::from_millis(1100);
 /// A change of the clock of UTC that is noted in the file, in nanoseconds; corrections of NTP are smaller.
 const TIME_SET_NS: i64 = 100_000_000;
 /// Minimum time between two statuses.
@@ -121,7 +121,8 @@ fn is_due(last: Option<&RecorderStatus>, now: &RecorderStatus, now_ns: i64) -> b
 }
 
 /// Whether a topic is subscribed to. JPEG and rectified frames, a detector's refusals and its debug images are made only while
-/// somebody subscribes, and would cost those time. The tape, which a controller keeps for the first who asks, is of use in a file only.
+/// a client subscribes, and would cost their publishers time. The tape, which a controller stores for the first client, is of use in a file
+/// only.
 fn is_wanted(row: &Row, frames: Frames, has_file: bool) -> bool {
     let is_tape = row.key == topic::TAPE.key(&[]);
     let is_frame = row.key == topic::FRAME.key(&["{camera}"]);
@@ -163,9 +164,9 @@ fn about(node: &Node) -> About {
 struct Recorder {
     config: Config,
     pictures: Pictures,
-    /// Those who follow, where they are served.
+    /// The viewers, where they are served.
     live: Option<Live>,
-    /// What may wait for the disk; as much may wait before it is looked at.
+    /// Bytes that may wait for the disk; as many may wait before they are handled.
     max_waiting_bytes: usize,
     about: About,
     health: Arc<HealthCounters>,
@@ -185,7 +186,7 @@ struct Recorder {
     unseen: Unseen,
     /// Messages that were lost.
     lost: Counts,
-    /// How many the file says.
+    /// How many of them the file states.
     lost_in_file: Option<u64>,
     /// When the messages by key were last put into the status: this thread looks after the file far more often than a status is due.
     listed: Option<Instant>,
@@ -207,13 +208,13 @@ impl Last {
         Self { at: Instant::now() + LAST_MESSAGES, at_ns: now_ns().saturating_add(after_ns) }
     }
 
-    /// Whether a message came in that time: others that go on publish for ever.
+    /// Whether a message was received in that time: other processes may publish without end.
     fn has(self, message: &Tapped) -> bool {
         message.received_ns <= self.at_ns
     }
 }
 
-/// Numbers of messages by key; of the keys that came first, as many as a status may have, and of all others together.
+/// Numbers of messages by key; of the first keys, as many as a status may have, and of all others together.
 #[derive(Debug, Default)]
 struct Counts(BTreeMap<String, u64>);
 
@@ -291,9 +292,9 @@ impl Recorder {
                 self.count_dropped(tap);
                 self.look_after_file();
             }
-            // Those that still wait and came in time are behind it in the queue.
-            let patience = if is_empty { Duration::ZERO } else { CATCH_UP };
-            if let Some(last) = last.filter(|last| Instant::now() >= last.at + patience) {
+            // Those that still wait and were received in time are behind it in the queue.
+            let wait = if is_empty { Duration::ZERO } else { CATCH_UP };
+            if let Some(last) = last.filter(|last| Instant::now() >= last.at + wait) {
                 while let Some(message) = tap.next(Duration::ZERO) {
                     if last.has(&message) {
                         self.take_number(&message);
@@ -301,7 +302,7 @@ impl Recorder {
                     }
                 }
                 self.count_dropped(tap);
-                return self.end(last.at + END_PATIENCE);
+                return self.end(last.at + END_TIMEOUT);
             }
         }
     }
@@ -324,7 +325,7 @@ impl Recorder {
         Some(header)
     }
 
-    /// Keeps a message, or counts it as lost; offers it to those who follow.
+    /// Records a message, or counts it as lost; offers it to the viewers.
     fn take(&mut self, message: Tapped) {
         let header = self.take_number(&message);
         let before_bytes = self.ending_bytes();
@@ -352,7 +353,7 @@ impl Recorder {
             self.health.dropped(if is_slow { "the disk is too slow" } else { "no file" });
             self.lost.add(&message.key, 1);
         }
-        if frame.as_ref().is_some_and(|frame| !frame.is_whole) {
+        if frame.as_ref().is_some_and(|frame| !frame.is_complete) {
             self.health.dropped("a picture that is no whole image");
         }
         if let Some(live) = self.live.as_mut().filter(|_| is_followed) {
@@ -640,7 +641,7 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_after_the_last_moment_is_of_no_recording() {
+    fn messages_after_the_last_moment_are_not_recorded() {
         let last = Last::from_now();
         let message = |received_ns| Tapped { received_ns, ..Tapped::default() };
         assert!(last.has(&message(now_ns())) && last.has(&message(last.at_ns)));

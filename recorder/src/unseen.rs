@@ -1,5 +1,5 @@
-//! Frames that never came, by their numbers: a recorder that had no processor for a while does not see what was lost on the
-//! way to it.
+//! Counts frames that were never received, by their numbers: a recorder that had no processor for a while does not see which were lost on
+//! the way to it.
 
 use std::collections::BTreeMap;
 
@@ -7,10 +7,10 @@ use messages::NEVER_CAME;
 
 /// Maximum number of cameras whose frames are counted.
 const MAX_CAMERAS: usize = 1024;
-/// Maximum number of frames that one gap is believed to have; a larger one is a camera that numbers them anew.
+/// Maximum plausible number of frames in one gap; a larger one is a camera that restarts its numbers.
 const MAX_GAP: u64 = 100_000;
-/// By so many numbers a frame may come late, as one that a link delayed; one that is further behind is of a camera that began
-/// anew.
+/// By so many numbers a frame may be late, as one that a link delayed; one that is further behind is of a camera that
+/// restarted.
 const MAX_LATE: u64 = 64;
 
 /// The numbers of each camera's frames.

@@ -1,7 +1,7 @@
 //! Bounds the bytes that are on their way to a client: not more than it has taken for some time.
 //!
 //! The systems between two programs take megabytes before a sender has to wait, which on a slow link are many seconds of
-//! flight. Every WebSocket answers a ping when it has taken what came before it, so pings show what was taken.
+//! flight. Every WebSocket answers a ping when it has taken all messages before it, so pings show the taken messages.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -10,10 +10,10 @@ use std::time::{Duration, Instant};
 const MAX_UNACKNOWLEDGED: usize = 150_000;
 /// A ping follows so many bytes.
 const PING_BYTES: usize = 32_000;
-/// A client that answers no ping for this time is given up.
-const PATIENCE: Duration = Duration::from_secs(15);
+/// A client that answers no ping for this time is disconnected.
+const PONG_TIMEOUT: Duration = Duration::from_secs(15);
 
-/// What is on its way to one client.
+/// The bytes on their way to one client.
 #[derive(Debug, Default)]
 pub(crate) struct Window {
     pings: VecDeque<Ping>,
@@ -37,7 +37,7 @@ impl Window {
         self.bytes < MAX_UNACKNOWLEDGED
     }
 
-    /// Notes what was sent; true when a ping is due.
+    /// Notes the sent bytes; true when a ping is due.
     pub(crate) fn sent(&mut self, bytes: usize) -> bool {
         self.bytes += bytes;
         self.after_ping += bytes;
@@ -61,7 +61,7 @@ impl Window {
 
     /// Whether a client takes nothing any more.
     pub(crate) fn is_stuck(&self, now: Instant) -> bool {
-        self.pings.front().is_some_and(|ping| now.duration_since(ping.at) > PATIENCE)
+        self.pings.front().is_some_and(|ping| now.duration_since(ping.at) > PONG_TIMEOUT)
     }
 }
 
@@ -87,11 +87,11 @@ mod tests {
     #[test]
     fn a_client_that_answers_no_ping_is_given_up() {
         let (mut window, now) = (Window::default(), Instant::now());
-        assert!(!window.is_stuck(now + 2 * PATIENCE));
+        assert!(!window.is_stuck(now + 2 * PONG_TIMEOUT));
         let ping = window.ping(now);
-        assert!(!window.is_stuck(now + PATIENCE));
-        assert!(window.is_stuck(now + PATIENCE + Duration::from_millis(1)));
+        assert!(!window.is_stuck(now + PONG_TIMEOUT));
+        assert!(window.is_stuck(now + PONG_TIMEOUT + Duration::from_millis(1)));
         window.pong(ping);
-        assert!(!window.is_stuck(now + 2 * PATIENCE));
+        assert!(!window.is_stuck(now + 2 * PONG_TIMEOUT));
     }
 }

@@ -1,7 +1,7 @@
 //! The recorder's WebSocket for viewers, with clients of the Foxglove protocol and a camera made up here: channels, refused
 //! pages, a slow client, an address that is taken.
 
-#![expect(clippy::print_stdout, reason = "what was measured is for people to read")]
+#![expect(clippy::print_stdout, reason = "measurements are for people to read")]
 
 use std::net::SocketAddr;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -268,9 +268,9 @@ async fn messages_are_served_without_a_file_under_both_names_of_the_protocol() -
 async fn pages_of_other_sites_and_too_many_clients_are_refused() -> anyhow::Result<()> {
     let served = Served::start(&["file=", "max_clients=2"]).await?;
     ensure!(served.refusal(served.request("mqtt")?).await? == 400);
-    let mut stranger = served.request(SUBPROTOCOLS[0])?;
-    stranger.headers_mut().insert("origin", HeaderValue::from_static("https://evil.example"));
-    ensure!(served.refusal(stranger).await? == 403);
+    let mut foreign_page = served.request(SUBPROTOCOLS[0])?;
+    foreign_page.headers_mut().insert("origin", HeaderValue::from_static("https://evil.example"));
+    ensure!(served.refusal(foreign_page).await? == 403);
     let mut page = served.request(SUBPROTOCOLS[0])?;
     page.headers_mut().insert("origin", HeaderValue::from_static("https://app.foxglove.dev"));
     let _first = served.connected(page).await?;
@@ -291,7 +291,7 @@ async fn a_slow_client_gets_the_newest_and_slows_neither_another_nor_the_recordi
     with_second_try(one_is_slow).await
 }
 
-/// A client takes nothing for three seconds, beside one that takes everything.
+/// A client takes nothing for three seconds, in parallel with one that takes everything.
 async fn one_is_slow() -> anyhow::Result<()> {
     const PAUSE_NS: u64 = 3_000_000_000;
     let folder = tempfile::tempdir()?;
@@ -314,14 +314,14 @@ async fn one_is_slow() -> anyhow::Result<()> {
         }
     };
     ensure!(pictures > 20, "the quick one got {pictures} pictures in 3 s");
-    // What was on its way when it stopped, then at once the newest.
+    // The messages on their way when it stopped, then at once the newest.
     let mut old = 0;
     while slow.message().await?.time_ns + PAUSE_NS / 3 < end_ns {
         old += 1;
     }
     let missed = served.dropped("a viewer is too slow");
     println!(
-        "{pictures} pictures in 3 s beside a client that took none: it missed {missed}, and got {old} old ones"
+        "{pictures} pictures in 3 s in parallel with a client that took none: it missed {missed}, and got {old} old ones"
     );
     ensure!(old <= 3 && missed > pictures / 2, "{old} old, {missed} missed of {pictures}");
     says(&slow.text("status").await?, "left out")?;
