@@ -1,4 +1,4 @@
-//! What the tape costs a flight: the events of a flight with a fault, handled with a tape and without.
+//! Measures the cost of the tape for a flight: the events of a flight with a fault, handled with a tape and without.
 //!
 //! With `with` or `without` and a number it only handles them so, so many times, for a profiler that counts instructions: of
 //! two numbers the difference is that of the flights alone.

@@ -1,4 +1,4 @@
-//! How bright and how noisy the recorded pictures are: whether a camera saw anything is not in what detectors publish.
+//! Measures brightness and noise of recorded pictures: detectors do not publish whether a camera saw anything.
 
 use airlink::Unpacker;
 use imaging::{Converter, GrayView};
@@ -6,7 +6,7 @@ use messages::{FrameHeader, PixelFormat};
 
 /// Every so many rows and columns are counted.
 const STEP: usize = 4;
-/// Share of the pixels that are brighter than [`Brightness::brightest`].
+/// Fraction of the pixels that are brighter than [`Brightness::brightest`].
 const BRIGHTEST: f64 = 0.01;
 
 /// How bright a picture is, from 0, black, to 1, white.
@@ -14,7 +14,7 @@ const BRIGHTEST: f64 = 0.01;
 pub struct Brightness {
     /// Mean of its pixels.
     pub mean: f64,
-    /// What the brightest hundredth of them reaches.
+    /// The 99th percentile of its pixels.
     pub brightest: f64,
     /// Standard deviation of the noise from pixel to pixel, in the same unit.
     pub noise: f64,
@@ -70,7 +70,7 @@ fn brightness(view: GrayView<'_>) -> Option<Brightness> {
 /// slopes (J. Immerkaer, "Fast Noise Variance Estimation", 1996), and the median of its size little of a fine texture. Every second
 /// pixel counts: a camera's colour mosaic, its denoising and JPEG make the noise of neighbours alike.
 fn noise(view: GrayView<'_>) -> Option<f64> {
-    /// What the mask makes of a deviation of 1.
+    /// The mask's output deviation for a deviation of 1.
     const MASK: f64 = 6.0;
     /// Median of the size of a normal deviate.
     const MEDIAN: f64 = 0.6745;

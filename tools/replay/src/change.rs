@@ -22,7 +22,7 @@ pub struct Begun {
     pub why: String,
 }
 
-/// What came out of a replay, and how it differs from what was recorded.
+/// The result of a replay, and how it differs from the recorded one.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Change {
     /// How far it came.
@@ -45,7 +45,7 @@ pub struct Change {
     pub max_target_m: f64,
 }
 
-/// Replays a tape, under its configuration with some settings `key=value` over it, and sums up what is different.
+/// Replays a tape, under its configuration with some settings `key=value` over it, and summarises the differences.
 ///
 /// # Errors
 /// As [`crate::run()`].

@@ -1,4 +1,4 @@
-//! Names the first value in which what came out of an event differs from what came out then.
+//! Names the first value in which the replayed result of an event differs from the recorded one.
 
 use autopilot::Parser;
 use messages::{TapeDecision, TapeEvent, TapeRecord};
@@ -12,9 +12,9 @@ const MAX_SHOWN: usize = 120;
 pub struct Difference {
     /// Its name.
     pub field: String,
-    /// What it was then.
+    /// Its recorded value.
     pub recorded: String,
-    /// What it is now.
+    /// Its replayed value.
     pub replayed: String,
 }
 
@@ -26,7 +26,7 @@ pub struct Comparison {
 }
 
 impl Comparison {
-    /// The first difference between what came out then and now; `None` when it is the same to the bit.
+    /// The first difference between the recorded and the replayed result; `None` when they are the same to the bit.
     pub fn next(
         &mut self,
         recorded: &TapeRecord<'_>,

@@ -1,4 +1,4 @@
-//! Searches the frames of a recording again, and compares what is found with what was found then.
+//! Searches the frames of a recording again, and compares the new detections with the recorded ones.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -19,7 +19,7 @@ use crate::change::{Change, change_with};
 use crate::run::{configuration, configured};
 use crate::truth::{Truths, is_in_picture};
 
-/// What is searched again, and how.
+/// The detector and the settings of a second search.
 #[derive(Clone, Debug, Default)]
 pub struct Again {
     /// The detector whose frames and configuration are taken; `None` for the only one of the recording.
@@ -42,7 +42,7 @@ impl fmt::Display for WrongDetector {
 
 impl std::error::Error for WrongDetector {}
 
-/// What was found of the marker that the controller wants, in the frames that were searched then and now.
+/// The detections of the marker that the controller lands on, in the frames of both searches.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Found {
     /// That marker, `FAMILY` or `FAMILY:ID`.
@@ -58,7 +58,7 @@ pub struct Found {
     pub times_ms: Vec<f64>,
 }
 
-/// What a second search of the frames found.
+/// The result of a second search of the frames.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Searched {
     /// The detector.
@@ -69,7 +69,7 @@ pub struct Searched {
     pub looked_for: Vec<String>,
     /// Whether the pictures lost something when they were recorded (JPEG).
     pub is_lossy: bool,
-    /// Frames that were searched then, as far as the recording has what was found.
+    /// Frames that were searched in flight, as far as the recording has their detections.
     pub searched_then: usize,
     /// Frames that were searched now: those of them whose picture was recorded and can be read.
     pub searched: usize,
@@ -77,9 +77,9 @@ pub struct Searched {
     pub showing_the_pad: Option<usize>,
     /// Frames whose picture cannot be read.
     pub unreadable: usize,
-    /// What was found then.
+    /// The recorded detections.
     pub then: Found,
-    /// What is found now.
+    /// The new detections.
     pub now: Found,
     /// Frames in which the marker was found then and not now.
     pub lost: usize,
@@ -87,11 +87,11 @@ pub struct Searched {
     pub gained: usize,
     /// Distances between both, in metres in space; where the truth is known, of the frames whose errors are.
     pub apart_m: Vec<f64>,
-    /// What the controller decides on the new detections, for each tape.
+    /// The controller's decisions on the new detections, for each tape.
     pub changes: Vec<Change>,
 }
 
-/// What a recording says of a detector's frames.
+/// The messages of a recording about a detector's frames.
 #[derive(Default)]
 struct Facts {
     detectors: BTreeMap<String, String>,
@@ -168,10 +168,10 @@ impl Facts {
 }
 
 /// Searches the frames of a recording, which may be several files in any order, again: those that the detector searched then, one
-/// after the other. The tapes, of the same recording, are replayed with what is found.
+/// after the other. The tapes, of the same recording, are replayed with the new detections.
 ///
 /// # Errors
-/// When the recording lacks what it takes, a setting is refused (a [`node::ConfigError`]), the detector cannot be meant (a
+/// When the recording lacks necessary messages, a setting is refused (a [`node::ConfigError`]), the detector cannot be meant (a
 /// [`WrongDetector`]), or a file is no recording.
 pub fn search(
     files: &[Vec<u8>],
@@ -251,7 +251,7 @@ struct Frames {
     search: Search,
     info: Option<CameraInfo>,
     truths: Truths,
-    /// What was found then and is found now, by the frame's stamp.
+    /// The recorded and the new detections, by the frame's stamp.
     then: BTreeMap<i64, Detections>,
     now: BTreeMap<i64, Detections>,
     converter: Converter,
@@ -285,7 +285,7 @@ impl Frames {
         self.now.insert(stamp_ns, now);
     }
 
-    /// What is in a picture, and the clock of its search; `None` when it cannot be read.
+    /// The detections in a picture, and the clock of its search; `None` when it cannot be read.
     fn found(
         &mut self,
         header: &FrameHeader,
@@ -337,7 +337,7 @@ impl Frames {
             [None, Some(_)] => searched.gained += 1,
             [Some(one), Some(other)] => {
                 let apart_m = (other - one).norm();
-                // A vehicle on the pad is a few centimetres from it and does not move: such frames would be most of what is compared.
+                // A vehicle on the pad is a few centimetres from it and does not move: such frames would be most of the comparison.
                 let is_compared = searched.showing_the_pad.is_none() || is_visible;
                 if !is_compared || !apart_m.is_finite() {
                     return;

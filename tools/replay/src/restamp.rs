@@ -228,7 +228,7 @@ mod tests {
         let again_status = again(&mut restamp, "controller/status", &status);
         assert_eq!(again_status.stamp_ns, 5_000_000_000_000 - 7);
         assert_eq!(again_status.started_ns, Some(5_000_000_000_000 - 100_000_000_000));
-        // The stamps of a vehicle whose clock began anew: by the age of the first message.
+        // The stamps of a vehicle whose clock restarted: by the age of the first message.
         let again_truth = again(&mut restamp, "truth", &truth(50));
         assert_eq!(again_truth.stamp_ns, 5_000_000_000_000);
         assert_eq!(again_truth.touchdown.unwrap().stamp_ns, 5_000_000_000_000 - 3);
@@ -238,7 +238,7 @@ mod tests {
 
     #[test]
     fn every_topic_whose_message_has_a_stamp_is_known() {
-        // Beside those that are not published again, and those of bytes and of frames.
+        // Apart from those that are not published again, and those of bytes and of frames.
         const WITHOUT: [&str; 10] = [
             "CameraInfo",
             "CameraResponse",

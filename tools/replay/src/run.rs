@@ -1,5 +1,5 @@
 //! Replays a tape: a new flight with the recorded configuration, or some settings over it, handles each recorded
-//! event, and what comes out is handed on.
+//! event, and its results are handed on.
 
 use std::fmt;
 use std::ops::ControlFlow;
@@ -16,9 +16,9 @@ use node::{Settings, from_toml};
 /// An event that was replayed.
 #[derive(Copy, Clone)]
 pub struct Replayed<'a> {
-    /// What the tape says of it.
+    /// Its record on the tape.
     pub recorded: &'a TapeRecord<'a>,
-    /// What came out now.
+    /// The result of the replay.
     pub replayed: &'a TapeRecord<'a>,
     /// The flight after it.
     pub flight: &'a Flight,
@@ -47,7 +47,7 @@ pub enum Stop {
     Damaged {
         /// Its number.
         number: u64,
-        /// What it is, as far as it can be read.
+        /// Its kind, as far as it can be read.
         event: Option<&'static str>,
         /// When, since the begin, in seconds.
         time_s: f64,
@@ -56,7 +56,7 @@ pub enum Stop {
     Different {
         /// Its number.
         number: u64,
-        /// What it is.
+        /// Its kind.
         event: &'static str,
         /// When, since the begin, in seconds.
         time_s: f64,
@@ -74,7 +74,7 @@ pub enum Stop {
 pub struct End {
     /// The program that wrote it, with its version.
     pub program: String,
-    /// For what that was built.
+    /// The target for which that was built.
     pub build: String,
     /// Events that were replayed, the beginning included.
     pub events: u64,
@@ -82,7 +82,7 @@ pub struct End {
     pub flight_s: f64,
     /// Whether the last of them is the controller's end.
     pub is_ended: bool,
-    /// Why it went no further; `None` at the end of the tape.
+    /// Why it stopped; `None` at the end of the tape.
     pub stop: Option<Stop>,
 }
 
@@ -91,7 +91,7 @@ impl fmt::Display for Stop {
         match self {
             Self::NoBeginning { first } => write!(
                 f,
-                "not replayable: the tape begins with event {first}, what came before is missing; name the earlier files of this recording as well, or record from the start"
+                "not replayable: the tape begins with event {first}, the events before it are missing; name the earlier files of this recording as well, or record from the start"
             ),
             Self::Gap { from, missing, time_s } => write!(
                 f,

@@ -8,12 +8,12 @@ use messages::TapeEvent;
 use crate::difference::{Comparison, Difference};
 use crate::run::{End, Stop, run};
 
-/// What a verification found.
+/// The result of a verification.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Verdict {
-    /// How far it came, and why it went no further.
+    /// How far it came, and why it stopped.
     pub end: End,
-    /// The first state of the controller that is another one, a [`Stop::Different`]. What comes out may still be the same.
+    /// The first state of the controller that is another one, a [`Stop::Different`]. The results may still be the same.
     pub other_state: Option<Stop>,
 }
 

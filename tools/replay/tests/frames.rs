@@ -1,5 +1,5 @@
-//! The second search of a recording's frames, on pictures drawn here: the same detections for the same search, what
-//! another detector does not find, compressed and missing pictures.
+//! The second search of a recording's frames, on pictures drawn here: the same detections for the same search, markers
+//! that another detector does not find, compressed and missing pictures.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 
@@ -87,7 +87,7 @@ fn truth(sequence: u64, stamp_ns: i64) -> Truth {
     Truth {
         stamp_ns,
         position_ned_m: [-pad.x(), -pad.y(), -pad.z()],
-        // The first frame shows the pad as well, and counts for nobody: on the ground only a part of it may be seen.
+        // The first frame shows the pad as well, and is not counted: on the ground only a part of it may be seen.
         on_ground: sequence == 0,
         frames: sequence,
         ..Truth::sample()
@@ -104,7 +104,7 @@ fn controller_config() -> String {
     to_toml(&Layers { file: None, set }.load::<controller::Config>().unwrap().settings)
 }
 
-/// A recording of the frames, with what the detector found in them, its tape, and truth.
+/// A recording of the frames, with the detections in them, its tape, and truth.
 fn recording(kept: impl Fn(&FrameHeader, &[u8]) -> Picture) -> Vec<u8> {
     let mut file = Vec::new();
     let mut writer = Writer::new(&mut file, &About::default()).unwrap();
@@ -291,7 +291,7 @@ fn messages_that_a_recording_lacks_are_named() {
 }
 
 #[test]
-fn only_what_was_asked_for_now_can_be_wrong_to_ask() {
+fn only_settings_of_the_replay_are_configuration_errors() {
     let refusal = |of: &Again| again(recording(pixels), of).unwrap_err();
     let named = Again { detector: Some("other".to_owned()), ..Again::default() };
     assert!(refusal(&named).is::<replay::WrongDetector>());

@@ -1,4 +1,4 @@
-//! Flights with faults, replayed to the bit; and what was changed in a tape or in the configuration, found.
+//! Flights with faults, replayed to the bit; changes of a tape or of the configuration are found.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 
@@ -171,7 +171,7 @@ fn a_tape_names_the_clock_whose_frames_its_flight_used() {
     let first = tape.parts[0].records().next().unwrap().unwrap();
     let TapeEvent::Begin { configuration, .. } = &first.event else { panic!("{first:?}") };
     assert!(configuration.contains(node::clock_name()), "{configuration}");
-    // On a machine with another clock the frames would be refused, if the tape did not say whose they are.
+    // On a machine with another clock the frames would be refused, if the tape did not name their clock.
     let verdict = verify(&tape, &["clock=another".into()]).unwrap();
     assert!(matches!(verdict.end.stop, Some(Stop::Different { .. })), "{verdict:?}");
 }
