@@ -31,17 +31,17 @@ const DOT_STEP: f64 = 3.0;
 /// A colour, which has one value in light and one in dark (`style.css`).
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Ink {
-    /// What is meant most often: the estimate.
+    /// The main curve: the estimate.
     Blue,
-    /// What it is compared with: truth, response.
+    /// Its reference: truth, response.
     Orange,
     /// A third curve.
     Green,
-    /// What is bad.
+    /// Errors and refusals.
     Red,
     /// A fourth curve.
     Purple,
-    /// What stands back.
+    /// Secondary curves.
     Grey,
     /// Axes and texts.
     Text,
@@ -137,7 +137,7 @@ pub fn at(x: f64, y: f64) -> At {
 /// Points of one kind.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layer {
-    /// What they are, for the legend; empty for none.
+    /// Their name in the legend; empty for none.
     pub name: String,
     /// Their colour.
     pub ink: Ink,
@@ -161,19 +161,19 @@ pub struct Band {
 /// A chart.
 #[derive(Clone, Debug)]
 pub struct Chart {
-    /// What it shows.
+    /// Its title.
     pub title: String,
-    /// What its axes are.
+    /// Its axes.
     pub axes: Axes,
     /// Stretches of time behind the layers.
     pub bands: Vec<Band>,
-    /// What it shows, the hindmost first.
+    /// Its layers, the hindmost first.
     pub layers: Vec<Layer>,
     /// Names of rows instead of numbers on the left axis, the lowest first at 0.
     pub rows: Vec<String>,
     /// Height in pixels as shown.
     pub height: u32,
-    /// What to know about it, as sentences; may be empty.
+    /// Remarks, as sentences; may be empty.
     pub note: String,
 }
 
@@ -184,22 +184,22 @@ pub struct Axes {
     pub x_name: String,
     /// Name and unit of the left one.
     pub y_name: String,
-    /// What the lower one spans.
+    /// Range of the lower one.
     pub x: Range<f64>,
-    /// What the left one spans.
+    /// Range of the left one.
     pub y: Range<f64>,
     /// Whether both have the same scale.
     pub is_equal: bool,
 }
 
-/// A layer. Numbers beyond all reason are left out of it, as are those that are none.
+/// A layer. Numbers that are too large or not finite are left out of it.
 pub fn layer(name: &str, ink: Ink, shape: Shape, points: impl IntoIterator<Item = At>) -> Layer {
     let sane =
         |it: At| if it.x.abs().max(it.y.abs()) < MAX_NUMBER { it } else { at(f64::NAN, f64::NAN) };
     Layer { name: name.to_owned(), ink, shape, points: points.into_iter().map(sane).collect() }
 }
 
-/// What values span, with some room; from `at_least` on.
+/// The range of values, with some room; it contains `at_least`.
 pub fn span(values: impl Iterator<Item = f64>, at_least: Range<f64>) -> Range<f64> {
     let all = values.filter(|value| value.abs() < MAX_NUMBER);
     let (low, high) = all.fold((at_least.start, at_least.end), |(low, high), value| {
@@ -264,7 +264,7 @@ impl Chart {
     /// Draws it into an area of this size, in pixels of the drawing.
     ///
     /// # Errors
-    /// When what it is drawn on fails.
+    /// When the drawing backend fails.
     pub fn draw<Backend: DrawingBackend<ErrorType: 'static>>(
         &self,
         area: &DrawingArea<Backend, plotters::coord::Shift>,

@@ -1,4 +1,4 @@
-//! What two flights differ in: configurations and the autopilot's parameters.
+//! Compares two flights: configurations and the autopilot's parameters.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -60,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_differs_is_listed_by_its_whole_name() {
+    fn only_differences_are_listed_by_their_full_names() {
         let one =
             flight("marker = \"rings\"\n[metric]\nlateral_gain = 1.8", &[("WPNAV_SPEED", 5.0)]);
         let other = flight(

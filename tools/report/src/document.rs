@@ -1,4 +1,4 @@
-//! The report as a PDF document, for who needs one: the page's sections on A4, with what a page shows once it is opened left
+//! Writes the report as a PDF document: the page's sections on A4; the parts that a page shows once they are opened are left
 //! out where it is long.
 
 use crate::chart::{Chart, Ink, Shape, WIDTH};
@@ -11,9 +11,9 @@ use crate::sections::{self, Section};
 use crate::summary::Summary;
 use crate::view::View;
 
-/// Space around what is on a page, in units of 1/72 inch, as all sizes here.
+/// Space around the content of a page, in units of 1/72 inch, as all sizes here.
 const MARGIN: f64 = 40.0;
-/// Width of what is on a page.
+/// Width of the content of a page.
 const COLUMN: f64 = PAGE[0] - 2.0 * MARGIN;
 /// Where a page ends.
 const FOOT: f64 = PAGE[1] - MARGIN;
@@ -128,7 +128,7 @@ impl Writer {
         self.heading_before(text, 70.0);
     }
 
-    /// A heading with so much of what follows on its page: not alone at the foot of one.
+    /// A heading with so much of the next content on its page: not alone at the foot of one.
     fn heading_before(&mut self, text: &str, height: f64) {
         self.needs(40.0 + height);
         self.skip(8.0);
@@ -254,8 +254,8 @@ impl Writer {
     fn block(&mut self, block: &Block) {
         match block {
             Block::Paragraph(text) => self.line(text, PLAIN),
-            Block::Missing(what) => {
-                self.line(&format!("Not recorded: {what}"), Type { rgb: QUIET, ..PLAIN });
+            Block::Missing(messages) => {
+                self.line(&format!("Not recorded: {messages}"), Type { rgb: QUIET, ..PLAIN });
             }
             Block::Warning(text) => self.line(text, Type { rgb: RED, ..BOLD }),
             Block::Table { head, rows } => self.table(head, rows),
@@ -305,7 +305,7 @@ impl Writer {
                 .map(|cell| {
                     let rgb = if matches!(cell, Cell::Warning(_)) { RED } else { TEXT };
                     Set {
-                        text: cell.said(),
+                        text: cell.text(),
                         of: Type { rgb, ..SMALL },
                         is_number: matches!(cell, Cell::Number(_)),
                     }
@@ -350,14 +350,14 @@ fn widths(head: &[String], rows: &[Vec<Cell>]) -> Vec<f64> {
     let bold = Type { font: Font::Bold, ..SMALL };
     let mut widths: Vec<f64> = (0..columns)
         .map(|column| {
-            let cells = rows.iter().filter_map(|row| row.get(column)).map(Cell::said);
+            let cells = rows.iter().filter_map(|row| row.get(column)).map(Cell::text);
             let widest = cells.map(|text| SMALL.font.width(SMALL.size, text)).fold(0.0, f64::max);
             let name = head.get(column).map_or(0.0, |name| bold.font.width(bold.size, name));
             widest.max(name)
         })
         .collect();
     let room = COLUMN - CELL_GAP * columns.saturating_sub(1) as f64;
-    // The widest is cut to what the others leave, or to the next widest.
+    // The widest is cut to the width that the others leave, or to the next widest.
     for _ in 0..2 * columns {
         let sum: f64 = widths.iter().sum();
         if sum <= room {

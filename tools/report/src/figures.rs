@@ -24,7 +24,7 @@ const SAMPLE: f64 = 44.0;
 pub struct Figure {
     /// The file's name: the section, the chart's number in it, its title.
     pub name: String,
-    /// What is in the file.
+    /// The contents of the file.
     pub svg: String,
 }
 
@@ -75,7 +75,7 @@ fn figure(chart: &Chart) -> anyhow::Result<String> {
     Ok(svg)
 }
 
-/// What the layers are.
+/// The legend of the layers.
 struct Legend {
     svg: String,
     lines: u32,

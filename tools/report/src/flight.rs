@@ -19,23 +19,23 @@ use crate::settings::{self, Difference};
 /// Longest gap over which a position is interpolated, in nanoseconds.
 const MAX_GAP_NS: i64 = 500_000_000;
 
-/// How much later after its stamp than the one before a message may come, in nanoseconds; beyond this the vehicle's clock began anew.
+/// How much later after its stamp than the one before a message may be received, in nanoseconds; beyond this the vehicle's clock restarted.
 const MAX_LATE_NS: i64 = 60_000_000_000;
 
-/// What still belongs to a landing after its end, in seconds.
+/// The time after a landing's end that still belongs to it, in seconds.
 const AFTER_END_S: f64 = 2.0;
 
 /// Time between pictures that are measured, in nanoseconds.
 const LIGHT_PERIOD_NS: u64 = 1_000_000_000;
 
-/// Detections as they came.
+/// Detections as they were received.
 #[derive(Clone, Debug)]
 pub struct Found {
     /// The detector on whose key they came.
     pub detector: String,
-    /// When the recorder got them, in nanoseconds of the recorder's clock.
+    /// When the recorder received them, in nanoseconds of the recorder's clock.
     pub received_ns: i64,
-    /// What came.
+    /// The message.
     pub message: Detections,
 }
 
@@ -99,7 +99,7 @@ pub struct Change {
     pub setting: Difference,
 }
 
-/// What a replay of its tape found.
+/// The result of a replay of its tape.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Replayed {
     /// Whether every event gives the same result again.
@@ -108,7 +108,7 @@ pub struct Replayed {
     pub text: String,
 }
 
-/// A start of the vehicle's computer, with which its clock begins anew.
+/// A start of the vehicle's computer, with which its clock restarts.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub struct Boot {
     /// Its number, from 1 on.
@@ -124,13 +124,13 @@ pub struct Landing {
     pub number: usize,
     /// How many the recording has.
     pub of: usize,
-    /// What belongs to it, in nanoseconds of the vehicle's clock: until the next one.
+    /// The time that belongs to it, in nanoseconds of the vehicle's clock: until the next one.
     pub time_ns: Range<i64>,
     /// How often the controller had changed the detector before it.
     pub detector_changes_before: u64,
 }
 
-/// A flight as its recording has it: what was not recorded is empty. All of it is of one start of the vehicle's computer.
+/// A flight as its recording has it: messages that were not recorded are empty. All of it is of one start of the vehicle's computer.
 #[derive(Clone, Debug, Default)]
 pub struct Flight {
     /// The name of its file.
@@ -143,7 +143,7 @@ pub struct Flight {
     pub messages: u64,
     /// How far the clock of UTC was set ahead of a file's own times while it was open, each time, in seconds.
     pub time_set_s: Vec<f64>,
-    /// What could not be read of its files, as sentences.
+    /// The parts of its files that could not be read, as sentences.
     pub damage: Vec<String>,
     /// Messages that could not be read, by key.
     pub unreadable: BTreeMap<String, Unreadable>,
@@ -153,7 +153,7 @@ pub struct Flight {
     pub statuses: Vec<ControllerStatus>,
     /// The estimates of the landing point.
     pub targets: Vec<TargetEstimate>,
-    /// The vehicle as the autopilot says.
+    /// The vehicle's state as the autopilot reports it.
     pub vehicle: Vec<VehicleState>,
     /// The truth, of a simulation.
     pub truth: Vec<Truth>,
@@ -173,23 +173,23 @@ pub struct Flight {
     pub changes: Vec<Change>,
     /// Detectors by name.
     pub detectors: BTreeMap<String, DetectorInfo>,
-    /// The last word of each bridge to the ground stations, by its name.
+    /// The last status of each bridge to the ground stations, by its name.
     pub bridges: BTreeMap<String, Bridge>,
-    /// When the recorder got the last message, in nanoseconds of its clock.
+    /// When the recorder received the last message, in nanoseconds of its clock.
     pub last_received_ns: i64,
     /// Cameras by name.
     pub cameras: BTreeMap<String, CameraInfo>,
     /// The recorder's last status.
     pub recorder: Option<RecorderStatus>,
-    /// What the autopilot's packets say.
+    /// The contents of the autopilot's packets.
     pub packets: Packets,
     /// The controllers' tapes.
     pub tapes: Vec<RecordedTape>,
-    /// What a replay of the tapes found; `None` when none was tried.
+    /// The result of a replay of the tapes; `None` when none was tried.
     pub replayed: Option<Replayed>,
     /// Whether status, estimates and the vehicle's state were computed again from the tapes.
     pub is_rebuilt: bool,
-    /// What the recorder's clock is ahead of the vehicle's, in nanoseconds.
+    /// The time by which the recorder's clock is ahead of the vehicle's, in nanoseconds.
     pub shift_ns: i64,
     /// When the landing began, or else the recording, in nanoseconds of the vehicle's clock.
     pub zero_ns: i64,
@@ -197,7 +197,7 @@ pub struct Flight {
     pub landing: Option<Landing>,
     /// Which start of the vehicle's computer it is of.
     pub boot: Boot,
-    /// What the recording has of other starts of the vehicle's computer.
+    /// The flights of other starts of the vehicle's computer in the recording.
     pub(crate) other_boots: Vec<Flight>,
     /// Minimum time from a stamp of the vehicle's clock to the reception of its message, in nanoseconds.
     min_apart_ns: Option<i64>,
@@ -535,10 +535,10 @@ impl Flight {
         }
     }
 
-    /// Notes how much later than its stamp a message came, and whether the vehicle's clock began anew after the last of its kind.
+    /// Notes how much later than its stamp a message was received, and whether the vehicle's clock restarted after the last of its kind.
     fn note_stamp(&mut self, received_ns: i64, stamp_ns: i64, last_ns: Option<i64>) {
         let apart_ns = received_ns.saturating_sub(stamp_ns);
-        // What was only held up on the way has no earlier stamp.
+        // A message that was only delayed has no earlier stamp.
         let is_later = apart_ns > self.last_apart_ns.saturating_add(MAX_LATE_NS);
         if last_ns.is_some_and(|last_ns| stamp_ns < last_ns) && is_later {
             self.begin_boot();
@@ -561,12 +561,12 @@ impl Flight {
         self.other_boots.push(before);
     }
 
-    /// Whether all of its recording could be read, up to its end. What the recorder lost before is another matter.
-    pub fn is_whole(&self) -> bool {
+    /// Whether all of its recording could be read, up to its end. Messages that the recorder lost do not count here.
+    pub fn is_complete(&self) -> bool {
         self.is_ended && self.damage.is_empty() && self.unreadable.is_empty()
     }
 
-    /// Takes over what another one knows of the recording as a whole.
+    /// Takes over the facts of another one about the recording.
     fn take_over(&mut self, other: &Self) {
         (self.is_ended, self.messages) = (other.is_ended, other.messages);
         self.facts.clone_from(&other.facts);
@@ -577,7 +577,7 @@ impl Flight {
         self.recorder.clone_from(&other.recorder);
     }
 
-    /// Puts all in order when it is there.
+    /// Completes the flight after the last message.
     fn settle(&mut self) {
         self.set_shift();
         self.sort();
@@ -590,8 +590,8 @@ impl Flight {
         }
     }
 
-    /// Notes what the recorder's clock is ahead of the vehicle's: nothing on one machine, and else what the quickest
-    /// message says.
+    /// Sets the time by which the recorder's clock is ahead of the vehicle's: zero on one machine, and else that of the quickest
+    /// message.
     fn set_shift(&mut self) {
         let own = self.facts.get("clock");
         let controllers = self.processes.values().map(|it| &it.last);
@@ -602,7 +602,7 @@ impl Flight {
         self.shift_ns = self.min_apart_ns.filter(|_| is_other).unwrap_or(0);
     }
 
-    /// Puts everything in order: a second file begins with what the first one had.
+    /// Puts everything in order: a second file begins with states of the first one.
     fn sort(&mut self) {
         fn order<T>(samples: &mut Vec<T>, stamp_ns: impl Fn(&T) -> i64) {
             samples.sort_by_key(&stamp_ns);

@@ -1,4 +1,4 @@
-//! What became of each frame that a detector searched: used, refused and why, or without a marker; and when.
+//! Classifies each frame that a detector searched: used, refused and why, or without a marker; and when.
 
 use std::collections::BTreeSet;
 
@@ -24,12 +24,12 @@ const MAX_RISE_M: f64 = 0.2;
 /// Phases in which nothing is landing.
 const OUTSIDE: [&str; 5] = ["idle", "takeoff", "landed", "aborted", "pilot-in-command"];
 
-/// What became of a frame.
+/// The outcome of a frame.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Fate {
     /// The estimate used it.
     Used,
-    /// The wanted marker was not in it.
+    /// The configured marker was not in it.
     NoMarker,
     /// Its marker was refused, for this reason.
     Refused(String),
@@ -77,7 +77,7 @@ impl Fate {
     }
 }
 
-/// What a refusal's short name means.
+/// The meaning of a refusal's short name.
 fn refusal(name: &str) -> &str {
     match name {
         "stale" => "refused: too old when it arrived",
@@ -105,7 +105,7 @@ pub struct Handled {
     pub exposed_ns: i64,
     /// When the controller had the detections, in nanoseconds of its clock; without a tape when the recorder had them.
     pub handled_ns: i64,
-    /// What became of it.
+    /// Its outcome.
     pub fate: Fate,
     /// How long each stage of the detector took.
     pub stages: Vec<StageTime>,
@@ -156,7 +156,7 @@ impl Frames {
         self.all.iter().filter(|frame| is_needed(&frame.fate)).count()
     }
 
-    /// What became of frames, the best first.
+    /// The outcomes of frames, the best first.
     pub fn fates(&self) -> BTreeSet<Fate> {
         self.all.iter().map(|frame| frame.fate.clone()).collect()
     }

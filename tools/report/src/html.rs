@@ -12,7 +12,7 @@ pub fn escaped(text: &str) -> String {
             '>' => html.push_str("&gt;"),
             '"' => html.push_str("&quot;"),
             '\'' => html.push_str("&#39;"),
-            // What a page may not contain.
+            // A page may not contain control characters.
             c if c.is_control() && c != '\n' && c != '\t' => html.push(' '),
             c => html.push(c),
         }
@@ -59,8 +59,8 @@ pub fn count(value: u64) -> Cell {
 }
 
 impl Cell {
-    /// What it says.
-    pub fn said(&self) -> &str {
+    /// Its text.
+    pub fn text(&self) -> &str {
         match self {
             Self::Text(text) | Self::Number(text) | Self::Warning(text) => text,
         }
@@ -72,7 +72,7 @@ impl Cell {
 pub enum Block {
     /// A paragraph.
     Paragraph(String),
-    /// What was not recorded.
+    /// Messages that were not recorded.
     Missing(String),
     /// A sentence that warns.
     Warning(String),
@@ -85,11 +85,11 @@ pub enum Block {
     },
     /// A text as it is, line by line.
     Lines(String),
-    /// What a page shows once it is opened.
+    /// A part that a page shows once it is opened.
     Details {
         /// Its title.
         title: String,
-        /// What it holds.
+        /// Its contents.
         block: Box<Self>,
     },
 }
@@ -99,8 +99,8 @@ impl Block {
     pub fn html(&self) -> String {
         match self {
             Self::Paragraph(text) => format!("<p>{}</p>", escaped(text)),
-            Self::Missing(what) => {
-                format!("<p class=\"missing\">Not recorded: {}</p>", escaped(what))
+            Self::Missing(messages) => {
+                format!("<p class=\"missing\">Not recorded: {}</p>", escaped(messages))
             }
             Self::Warning(text) => format!("<p class=\"warning\">{}</p>", escaped(text)),
             Self::Table { head, rows } => table_as_html(head, rows),
@@ -149,7 +149,7 @@ fn table_as_html(head: &[String], rows: &[Vec<Cell>]) -> String {
                 Cell::Number(_) => " class=\"number\"",
                 Cell::Warning(_) => " class=\"warning\"",
             };
-            let _ = write!(html, "<td{class}>{}</td>", escaped(cell.said()));
+            let _ = write!(html, "<td{class}>{}</td>", escaped(cell.text()));
         }
         html.push_str("</tr>");
     }
@@ -157,9 +157,9 @@ fn table_as_html(head: &[String], rows: &[Vec<Cell>]) -> String {
     html
 }
 
-/// A sentence on what was not recorded.
-pub fn missing(what: &str) -> Block {
-    Block::Missing(what.to_owned())
+/// A sentence about messages that were not recorded.
+pub fn missing(messages: &str) -> Block {
+    Block::Missing(messages.to_owned())
 }
 
 /// A paragraph.
@@ -167,7 +167,7 @@ pub fn paragraph(text: &str) -> Block {
     Block::Paragraph(text.to_owned())
 }
 
-/// What is shown once it is opened.
+/// A block that is shown once it is opened.
 pub fn details(title: &str, block: Block) -> Block {
     Block::Details { title: title.to_owned(), block: Box::new(block) }
 }
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_recording_says_stays_text() {
+    fn texts_of_a_recording_stay_text() {
         let cells = vec![text("<script>alert('1')</script> & \u{7}"), number(None, 1, "m")];
         let html = table(&["name", "value"], vec![cells]).html();
         assert!(!html.contains("<script") && html.contains("&lt;script&gt;"), "{html}");

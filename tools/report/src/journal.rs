@@ -7,7 +7,7 @@ use crate::flight::{Change, Flight, Process};
 use crate::phases;
 use crate::settings::Difference;
 
-/// Maximum number of lines: the last until the landing's end, and what still has room of those after it; others are counted.
+/// Maximum number of lines: the last until the landing's end, and as many as possible of those after it; others are counted.
 const MAX_LINES: usize = 2000;
 
 /// A line of the log.
@@ -15,11 +15,11 @@ const MAX_LINES: usize = 2000;
 pub struct Line {
     /// When, in seconds since the landing began.
     pub time_s: f64,
-    /// Who said it.
-    pub who: String,
+    /// Its source: a process, the autopilot, the operator or the truth.
+    pub source: String,
     /// Whether it is a warning.
     pub is_warning: bool,
-    /// What.
+    /// Its text.
     pub text: String,
 }
 
@@ -46,7 +46,7 @@ fn controller(flight: &Flight) -> Vec<Line> {
     for status in &flight.statuses {
         let time_s = flight.at_s(status.stamp_ns);
         let mut say = |is_warning: bool, text: String| {
-            lines.push(Line { time_s, who: "controller".to_owned(), is_warning, text });
+            lines.push(Line { time_s, source: "controller".to_owned(), is_warning, text });
         };
         let is_same = |last: &messages::ControllerStatus| {
             last.phase == status.phase && phases::is_same(&last.why, &status.why)
@@ -78,7 +78,7 @@ fn controller(flight: &Flight) -> Vec<Line> {
             touched = true;
             lines.push(Line {
                 time_s: flight.at_s(touchdown.stamp_ns),
-                who: "truth".to_owned(),
+                source: "truth".to_owned(),
                 is_warning: false,
                 text: format!(
                     "touchdown, {:.3} m from the pad, {:.2} m/s down, {:.2} m/s aside",
@@ -97,7 +97,7 @@ fn commands(flight: &Flight) -> Vec<Line> {
         let mut has_ended = false;
         let records = tape.parts.iter().flat_map(messages::Tape::records).flatten();
         for record in records.filter(|record| flight.has(record.now_ns)) {
-            let (who, is_warning, text) = match &record.event {
+            let (source, is_warning, text) = match &record.event {
                 TapeEvent::Command(command) => {
                     let reply = record.reply.as_ref();
                     let accepted = reply.is_some_and(|reply| reply.accepted);
@@ -118,7 +118,7 @@ fn commands(flight: &Flight) -> Vec<Line> {
                 _ => continue,
             };
             let time_s = flight.at_s(record.now_ns);
-            lines.push(Line { time_s, who: who.to_owned(), is_warning, text });
+            lines.push(Line { time_s, source: source.to_owned(), is_warning, text });
         }
     }
     lines
@@ -127,7 +127,7 @@ fn commands(flight: &Flight) -> Vec<Line> {
 fn autopilot(flight: &Flight) -> Vec<Line> {
     let line = |text: &crate::packets::Text| Line {
         time_s: flight.at_s(flight.vehicle_ns(text.received_ns)),
-        who: "autopilot".to_owned(),
+        source: "autopilot".to_owned(),
         is_warning: text.is_warning,
         text: text.text.clone(),
     };
@@ -136,7 +136,7 @@ fn autopilot(flight: &Flight) -> Vec<Line> {
     for state in &flight.vehicle {
         let time_s = flight.at_s(state.stamp_ns);
         let mut say = |text: String| {
-            lines.push(Line { time_s, who: "autopilot".to_owned(), is_warning: false, text });
+            lines.push(Line { time_s, source: "autopilot".to_owned(), is_warning: false, text });
         };
         if last.is_none_or(|last| last.mode != state.mode) {
             say(format!("mode {}", state.mode));
@@ -154,7 +154,7 @@ fn processes(flight: &Flight) -> Vec<Line> {
         let health = &process.first;
         Line {
             time_s: flight.at_s(flight.vehicle_ns(process.first_ns)),
-            who: health.service.clone(),
+            source: health.service.clone(),
             is_warning: false,
             text: format!(
                 "{} is process {} on {}, alight {}",
@@ -172,7 +172,7 @@ fn changes(flight: &Flight) -> Vec<Line> {
         let Difference { name, one, other } = &change.setting;
         Line {
             time_s: flight.at_s(flight.vehicle_ns(change.received_ns)),
-            who: change.service.clone(),
+            source: change.service.clone(),
             is_warning: false,
             text: format!("setting `{name}` changed from {} to {}", value(one), value(other)),
         }
@@ -214,7 +214,7 @@ mod tests {
             assert_eq!(lines.len(), MAX_LINES);
             assert!(left_out > 1000, "{left_out}");
             let has_landing =
-                lines.iter().any(|line| line.who == "controller" && line.text == "landed");
+                lines.iter().any(|line| line.source == "controller" && line.text == "landed");
             assert!(has_landing, "a landing after {landing_s} s");
         }
     }

@@ -1,11 +1,11 @@
-//! The landings in a recording, and one of them alone.
+//! Finds the landings in a recording, and reduces a flight to one of them.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
 
 use crate::flight::{Flight, Landing};
 
-/// What belongs to a landing before its begin, in nanoseconds.
+/// The time before a landing's begin that belongs to it, in nanoseconds.
 const BEFORE_NS: i64 = 2_000_000_000;
 
 /// When each landing of a flight began, in nanoseconds of the vehicle's clock.
@@ -67,7 +67,7 @@ impl Flight {
         Ok(())
     }
 
-    /// Becomes what the recording has of this start of the vehicle's computer.
+    /// Becomes the flight of this start of the vehicle's computer.
     fn turn_to(&mut self, number: usize) {
         if let Some(boot) = self.other_boots.iter_mut().find(|it| it.boot.number == number) {
             *self = std::mem::take(boot);

@@ -28,7 +28,7 @@ pub struct Stage {
 pub const TO_CONTROLLER: &str = "exposure to detections at the controller";
 /// Name of the stage from exposure to the setpoint.
 pub const TO_SETPOINT: &str = "exposure to setpoint";
-/// Name of what is not the detector's.
+/// Name of the time outside the detector.
 pub const ON_THE_WAY: &str = "exposure, image transport, waiting, message";
 
 /// Time between two stamps in milliseconds.

@@ -1,14 +1,14 @@
-//! How bright a flight's pictures were, and whether that explains that no marker was seen.
+//! Measures how bright a flight's pictures were, and whether that explains missing detections.
 
 use node::stats::quantile;
 
 use crate::flight::{Flight, Light};
 
-/// Pictures whose brightest hundredth does not reach this share of white are dark: of a marker's white not enough is left over its black.
+/// Pictures whose brightest hundredth does not reach this fraction of white are dark: a marker's white is not bright enough over its black.
 const DARK: f64 = 0.2;
-/// Noise above this share of white leaves nothing of small markers.
+/// Noise above this fraction of white hides small markers.
 const NOISY: f64 = 0.03;
-/// Pictures whose mean is above this share of white show little else than white.
+/// Pictures whose mean is above this fraction of white are overexposed.
 const BRIGHT: f64 = 0.9;
 
 /// The pictures of a camera, in medians.
@@ -16,7 +16,7 @@ const BRIGHT: f64 = 0.9;
 pub struct Usual {
     /// Mean of a picture's pixels, from 0, black, to 1, white.
     pub mean: f64,
-    /// What the brightest hundredth of them reaches.
+    /// The 99th percentile of its pixels.
     pub brightest: f64,
     /// Standard deviation of the noise from pixel to pixel.
     pub noise: f64,

@@ -1,4 +1,4 @@
-//! What was lost on the way: frames, messages, packets; and what the recording itself lacks.
+//! Counts lost frames, messages and packets, and names the gaps of the recording.
 
 use std::collections::BTreeMap;
 
@@ -9,17 +9,17 @@ use crate::flight::{Boot, Flight};
 /// Something of which a part was lost.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Loss {
-    /// Where.
+    /// The place of the loss.
     pub place: String,
-    /// What.
-    pub what: String,
+    /// The kind of the lost items.
+    pub kind: String,
     /// How many.
     pub count: u64,
     /// Of how many, where that is known.
     pub of: Option<u64>,
 }
 
-/// Numbers that fall by more than this begin anew, with a publisher that started again; by less they came late.
+/// Numbers that fall by more than this restart, with a publisher that started again; by less they were late.
 const MAX_LATE: u64 = 100;
 
 /// Frames by their numbers.
@@ -29,7 +29,7 @@ struct Numbers {
     first: u64,
     /// The largest since then.
     last: u64,
-    /// How many came.
+    /// How many were received.
     count: u64,
     /// How many there were before the publisher started again.
     before: u64,
@@ -71,7 +71,7 @@ pub fn frames(flight: &Flight) -> Vec<Loss> {
         if let Some(numbers) = Numbers::of(frames.iter().map(|frame| frame.sequence)) {
             losses.push(Loss {
                 place: format!("camera {camera}"),
-                what: "frames that are not in the recording".to_owned(),
+                kind: "frames that are not in the recording".to_owned(),
                 count: numbers.missing(),
                 of: Some(numbers.all()),
             });
@@ -85,7 +85,7 @@ pub fn frames(flight: &Flight) -> Vec<Loss> {
         if let Some(numbers) = Numbers::of(sequences.into_iter()) {
             losses.push(Loss {
                 place: format!("detector {detector}"),
-                what: "frames without detections: not searched, overtaken, or their message lost"
+                kind: "frames without detections: not searched, overtaken, or their message lost"
                     .to_owned(),
                 count: numbers.missing(),
                 of: Some(numbers.all()),
@@ -95,14 +95,14 @@ pub fn frames(flight: &Flight) -> Vec<Loss> {
     losses
 }
 
-/// What each process counted, but for refused detections.
+/// The counts of each process, except refused detections.
 pub fn processes(flight: &Flight) -> Vec<Loss> {
     let mut losses = Vec::new();
     for (name, process) in &flight.processes {
         let drops = process.last.drops.iter().chain(&process.last.errors);
         losses.extend(drops.filter(|drop| drop.count > 0).map(|drop| Loss {
             place: name.clone(),
-            what: drop.reason.clone(),
+            kind: drop.reason.clone(),
             count: drop.count,
             of: None,
         }));
@@ -110,12 +110,12 @@ pub fn processes(flight: &Flight) -> Vec<Loss> {
     losses
 }
 
-/// What the recorder lost, by key. Frames that never came to it are among [`frames`].
+/// The messages that the recorder lost, by key. Frames that it never received are among [`frames`].
 pub fn recorder(flight: &Flight) -> Vec<Loss> {
     let lost = flight.lost.iter().filter(|(key, count)| **count > 0 && !has_never_come(key));
     lost.map(|(key, count)| Loss {
         place: "recorder".to_owned(),
-        what: format!("messages of {key}"),
+        kind: format!("messages of {key}"),
         count: *count,
         of: None,
     })
@@ -133,7 +133,7 @@ pub fn tape(flight: &Flight) -> Vec<Loss> {
         }
         losses.push(Loss {
             place: "controller's tape".to_owned(),
-            what: "events".to_owned(),
+            kind: "events".to_owned(),
             count: missing,
             of: Some(next),
         });
@@ -141,7 +141,7 @@ pub fn tape(flight: &Flight) -> Vec<Loss> {
     losses
 }
 
-/// What the recording itself lacks, as sentences.
+/// The gaps of the recording, as sentences.
 pub fn recording(flight: &Flight) -> Vec<String> {
     let mut lines = flight.damage.clone();
     if !flight.is_ended {
@@ -155,7 +155,7 @@ pub fn recording(flight: &Flight) -> Vec<String> {
     }
     for set_s in &flight.time_set_s {
         lines.push(format!(
-            "the clock was set while the recording went on: UTC is {set_s:+.3} s from what the file's own times say after it"
+            "the clock was set during the recording: UTC is {set_s:+.3} s from the file's own times after it"
         ));
     }
     for (key, unreadable) in &flight.unreadable {

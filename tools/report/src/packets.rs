@@ -41,7 +41,7 @@ pub struct Text {
     id: u16,
 }
 
-/// What the autopilot's packets say.
+/// The contents of the autopilot's packets.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Packets {
     /// Each of them.
@@ -112,7 +112,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_others_on_the_link_say_is_left_out() {
+    fn texts_of_other_systems_on_the_link_are_left_out() {
         let mut packets = Packets::default();
         for (system, component) in [(7, 1), (8, 1), (7, 154)] {
             let text = MavMessage::STATUSTEXT(STATUSTEXT_DATA {

@@ -1,5 +1,5 @@
 //! The report as one file of HTML that needs nothing else: title and outcome, numbers, sections; of one
-//! flight, or of two side by side with what they differ in.
+//! flight, or of two side by side with their differences.
 
 use std::fmt::Write as _;
 
@@ -32,7 +32,7 @@ pub fn page(flight: &Flight) -> anyhow::Result<String> {
     Ok(html(&view.summary.name, &body, "one", &marks(&[flight])))
 }
 
-/// The page of two flights side by side, with what they differ in.
+/// The page of two flights side by side, with their differences.
 ///
 /// # Errors
 /// When a chart cannot be drawn.
@@ -144,11 +144,11 @@ static FIGURES: [Figure; 18] = [
     figure("messages lost", |s| Some(s.messages_lost as f64), 0, ""),
 ];
 
-/// The numbers of a flight, by name; `Err` with what is said instead of one.
+/// The numbers of a flight, by name; `Err` with the text that is shown instead of one.
 pub(crate) fn in_numbers(
     summary: &Summary,
 ) -> impl Iterator<Item = (&'static str, Result<String, &'static str>)> {
-    // What an aborted landing did not come to is not missing in its recording.
+    // The later phases of an aborted landing are not missing in its recording.
     let none =
         if summary.landed == Some(true) || summary.phase.is_none() { "not recorded" } else { "-" };
     FIGURES.iter().map(move |Figure { name, of, digits, unit }| {
@@ -192,7 +192,7 @@ pub(crate) fn compared(one: &Summary, other: &Summary) -> Block {
     table(&["", "A", "B", "B less A"], rows)
 }
 
-/// What two flights differ in: the services' configurations, then the autopilot's parameters.
+/// The differences of two flights: the services' configurations, then the autopilot's parameters.
 pub(crate) fn differing(first: &Flight, second: &Flight) -> [Vec<Block>; 2] {
     let rows = |differences: Vec<Difference>| -> Vec<Vec<Cell>> {
         let value = |value: Option<String>| text(value.unwrap_or_else(|| "-".to_owned()));
@@ -215,7 +215,7 @@ pub(crate) fn differing(first: &Flight, second: &Flight) -> [Vec<Block>; 2] {
     let [one, other] = [first, second].map(|flight| flight.packets.parameters.len());
     if one == 0 || other == 0 {
         of_autopilot.push(missing(
-            "parameters of both flights; the file has those that somebody asked the autopilot for",
+            "parameters of both flights; the file has those that were requested from the autopilot",
         ));
     } else {
         let rows = rows(parameters(first, second));
@@ -257,7 +257,7 @@ fn links(sections: &[Section], is_comparison: bool) -> String {
     html
 }
 
-/// Charts without anything to show are left out: the section says what was not recorded.
+/// Charts without anything to show are left out: the section states which messages were not recorded.
 fn one(section: &Section) -> anyhow::Result<String> {
     let mut html = begin(section);
     html.push_str(&all_as_html(&section.before));

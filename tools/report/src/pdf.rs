@@ -15,13 +15,13 @@ use crate::chart::{Chart, Ink, SIZE_FACTOR, Shape, WIDTH};
 
 /// Size of a page, in units of 1/72 inch.
 pub const PAGE: [f64; 2] = [595.28, 841.89];
-/// Width of what a legend shows of a layer.
+/// Width of a layer's sample in a legend.
 pub const SAMPLE: f64 = 11.0;
 /// Steps of opacity.
 const ALPHAS: u8 = 20;
 /// Distance of the control points of a quarter circle's Bezier curve along the tangent, in radii.
 const QUARTER_CIRCLE: f64 = 0.552_285;
-/// What a size of the drawing library is larger than that of a font; for SVG it has 1.24, but charts are smaller here.
+/// Ratio of the drawing library's text size to a font's size; for SVG it has 1.24, but charts are smaller here.
 const FONT_FACTOR: f64 = 1.05;
 /// Widths of the letters of Helvetica from the space on, in thousandths of its size (Adobe's font metrics).
 const WIDTHS: [u16; 95] = [
@@ -118,7 +118,7 @@ impl Pages {
         self.done.len() + 1
     }
 
-    /// Writes a line of text, whose foot is at a place.
+    /// Writes a line of text, whose foot is at a position.
     pub fn text(&mut self, [left, foot]: [f64; 2], of: Type, text: &str) {
         let Type { font, size, rgb: [red, green, blue] } = of;
         let [red, green, blue] = [red, green, blue].map(|it| f32::from(it) / 255.0);
@@ -161,7 +161,7 @@ impl Pages {
         drawn.map_err(|problem| anyhow!("{}: {problem}", chart.title))
     }
 
-    /// Draws how a layer is drawn, for a legend whose text's foot is at this place: [`SAMPLE`] wide.
+    /// Draws how a layer is drawn, for a legend whose text's foot is at this position: [`SAMPLE`] wide.
     pub fn sample(&mut self, shape: Shape, ink: Ink, [left, foot]: [f64; 2]) {
         let [red, green, blue] = ink.channels();
         let colour = RGBColor(red, green, blue);
@@ -254,7 +254,7 @@ fn alpha_name(step: u8) -> String {
     format!("A{step}")
 }
 
-/// A text in the encoding of the standard fonts; what that lacks becomes a question mark.
+/// A text in the encoding of the standard fonts; other letters become a question mark.
 fn encoded(text: &str) -> Vec<u8> {
     let byte = |letter: char| match letter {
         '\u{2013}' => 0x96,

@@ -18,7 +18,7 @@ const HEIGHT: u32 = 270;
 const MAX_SECOND: f64 = 1e6;
 /// Number of ellipses of uncertainty in the view from above.
 const CIRCLES: usize = 14;
-/// Largest radius of one that is drawn, relative to what the picture spans without them.
+/// Largest radius of one that is drawn, relative to the extent of the picture without them.
 const MAX_CIRCLE: f64 = 0.5;
 /// Names of the axes of local NED.
 const NED: [&str; 3] = ["north", "east", "down"];
@@ -168,7 +168,7 @@ pub fn height(view: &View<'_>) -> Vec<Chart> {
         deviation.push(at(last.x, 0.0));
     }
     let error = view.curve(&view.errors, |it| Some(at(it.time_s, it.horizontal_m)));
-    // What the estimate claims before it knows much would flatten the rest.
+    // The large first deviations of the estimate would flatten the rest.
     let max = span(error.iter().map(|it| it.y), 0.0..0.05).end;
     let max = if error.is_empty() { f64::INFINITY } else { 2.0 * max };
     let is_cut = deviation.iter().any(|point| point.y > max);
@@ -194,7 +194,7 @@ pub fn height(view: &View<'_>) -> Vec<Chart> {
     charts
 }
 
-/// Setpoints against what the vehicle did.
+/// Setpoints against the vehicle's response.
 pub fn velocity(view: &View<'_>) -> Vec<Chart> {
     let flight = view.flight;
     let axis = |axis: usize, name: &str| {
@@ -224,7 +224,7 @@ pub fn velocity(view: &View<'_>) -> Vec<Chart> {
     charts
 }
 
-/// What became of each frame over time.
+/// The outcome of each frame over time.
 pub fn detections(view: &View<'_>) -> Vec<Chart> {
     let fates: Vec<Fate> = view.frames.fates().into_iter().rev().collect();
     let mut layers = Vec::new();
@@ -242,7 +242,7 @@ pub fn detections(view: &View<'_>) -> Vec<Chart> {
         let points = points.filter(|it| view.is_shown(it.x));
         layers.push(layer("", ink, Shape::Dots, points));
     }
-    let mut chart = over_time(view, "What became of each frame", "", layers);
+    let mut chart = over_time(view, "Outcome of each frame", "", layers);
     chart.axes.y = -0.6..fates.len().max(1) as f64 - 0.1;
     chart.rows = fates.iter().map(|fate| fate.name().to_owned()).collect();
     chart.height = 150 + 26 * fates.len() as u32;
@@ -306,7 +306,7 @@ pub fn latency(view: &View<'_>) -> Vec<Chart> {
         layer("exposure to setpoint", Ink::Orange, Shape::LargeDots, setpoints),
         layer("exposure to detections at the controller", Ink::Blue, Shape::Dots, detected),
     ];
-    let mut chart = over_time(view, "Age of what is used", "ms", layers);
+    let mut chart = over_time(view, "Age of used detections", "ms", layers);
     // A single frame, as the first after a start, would flatten the rest: it stands at the upper edge.
     let ages: Vec<f64> =
         chart.layers.iter().flat_map(|it| &it.points).map(|point| point.y).collect();

@@ -1,5 +1,5 @@
 //! The sections of the report, from landing, phases and height to log, configuration and recording: the charts and tables
-//! of each for one flight, and what of it was not recorded.
+//! of each for one flight, and the messages that were not recorded.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,7 +11,7 @@ use crate::summary::counted;
 use crate::view::View;
 use crate::{journal, light, losses, plots};
 
-/// Age of a bridge's last status at the end beyond which it says nothing of the end, in nanoseconds; one comes every 2 s.
+/// Age of a bridge's last status at the end beyond which it does not hold for the end, in nanoseconds; one comes every 2 s.
 const MAX_STATUS_AGE_NS: i64 = 5_000_000_000;
 
 /// A part of the page, for one flight.
@@ -21,13 +21,13 @@ pub struct Section {
     pub id: &'static str,
     /// Its title.
     pub title: &'static str,
-    /// What it shows, for who has not seen one before; may be empty.
+    /// Its contents, for a reader who has not seen one before; may be empty.
     pub lead: &'static str,
     /// Its charts.
     pub charts: Vec<Chart>,
-    /// What comes before the charts.
+    /// The blocks before the charts.
     pub before: Vec<Block>,
-    /// What comes after the charts.
+    /// The blocks after the charts.
     pub after: Vec<Block>,
 }
 
@@ -73,7 +73,7 @@ fn phases(view: &View<'_>) -> Section {
     let mut section = section(
         "phases",
         "Phases and reasons",
-        "What the controller did, and why. Times count from the begin of the landing.",
+        "The controller's phases, with their reasons. Times count from the begin of the landing.",
     );
     let mut rows = Vec::new();
     for phase in &view.summary.phases {
@@ -90,7 +90,7 @@ fn phases(view: &View<'_>) -> Section {
     }
     if view.flight.is_rebuilt {
         section.before.push(missing(
-            "the controller's status; what stands here and below is what a replay of its tape gives",
+            "the controller's status; the texts here and below are from a replay of its tape",
         ));
     }
     section.after.push(match rows.is_empty() {
@@ -104,7 +104,7 @@ fn height(view: &View<'_>) -> Section {
     let mut section = section(
         "height",
         "Height, distance and the estimate's error",
-        "The error is that of the vehicle's place relative to the pad: estimated less true, horizontally.",
+        "The error is that of the vehicle's position relative to the pad: estimated less true, horizontally.",
     );
     section.charts = plots::height(view);
     let summary = &view.summary;
@@ -125,7 +125,7 @@ fn velocity(view: &View<'_>) -> Section {
     let mut section = section(
         "setpoints",
         "Setpoints and response",
-        "What the controller asked for, and what the vehicle did by its autopilot's word.",
+        "The controller's setpoints, and the vehicle's response as its autopilot reports it.",
     );
     section.charts = plots::velocity(view);
     if view.flight.vehicle.is_empty() {
@@ -145,7 +145,7 @@ fn detections(view: &View<'_>) -> Section {
     let mut section = section(
         "detections",
         "Detections and refusals",
-        "Every frame that a detector searched, by what became of it.",
+        "Every frame that a detector searched, by its outcome.",
     );
     if view.frames.all.is_empty() {
         section.before.push(missing("detections"));
@@ -154,7 +154,7 @@ fn detections(view: &View<'_>) -> Section {
     section.charts = plots::detections(view);
     if !view.frames.is_from_tape {
         section.before.push(paragraph(
-            "Without the controller's tape this is what its estimates show: a frame that is not known may have been refused.",
+            "Without the controller's tape the outcomes are those that its estimates show: a frame that is not known may have been refused.",
         ));
     }
     let mut counts: BTreeMap<(&Fate, &str), u64> = BTreeMap::new();
@@ -246,14 +246,14 @@ fn lost(view: &View<'_>) -> Section {
     let mut section = section(
         "losses",
         "Losses",
-        "What is missing, as the file itself counts it. Counts of a process are since its start.",
+        "Missing messages, as the file itself counts them. Counts of a process are since its start.",
     );
     let rows = |losses: Vec<losses::Loss>| -> Vec<Vec<Cell>> {
         losses
             .into_iter()
             .map(|loss| {
                 let of = loss.of.map_or("-".to_owned(), |of| of.to_string());
-                vec![text(loss.place), text(loss.what), count(loss.count), Cell::Number(of)]
+                vec![text(loss.place), text(loss.kind), count(loss.count), Cell::Number(of)]
             })
             .collect()
     };
@@ -268,7 +268,7 @@ fn lost(view: &View<'_>) -> Section {
         let all: u64 = by_recorder.iter().map(|loss| loss.count).fold(0, u64::saturating_add);
         section.after.push(details(
             &format!("{all} messages that the recorder lost, by key"),
-            table(&["where", "what", "missing", "of"], rows(by_recorder)),
+            table(&["where", "kind", "missing", "of"], rows(by_recorder)),
         ));
     }
     counted.extend(rows(losses::tape(flight)));
@@ -277,9 +277,9 @@ fn lost(view: &View<'_>) -> Section {
     }
     let processes = rows(losses::processes(flight));
     if flight.processes.is_empty() {
-        section.before.push(missing("the health of the processes, with what they dropped"));
+        section.before.push(missing("the health of the processes, with their dropped messages"));
     }
-    section.after.insert(0, table(&["where", "what", "missing", "of"], counted));
+    section.after.insert(0, table(&["where", "kind", "missing", "of"], counted));
     section.after.push(table(&["process", "dropped or failed", "times", "of"], processes));
     section
 }
@@ -464,11 +464,11 @@ fn log(view: &View<'_>) -> Section {
     let rows: Vec<Vec<Cell>> = lines
         .into_iter()
         .map(|line| {
-            let said = if line.is_warning { Cell::Warning(line.text) } else { text(line.text) };
-            vec![number(Some(line.time_s), 2, "s"), text(line.who), said]
+            let message = if line.is_warning { Cell::Warning(line.text) } else { text(line.text) };
+            vec![number(Some(line.time_s), 2, "s"), text(line.source), message]
         })
         .collect();
-    section.after.push(table(&["at", "who", "said"], rows));
+    section.after.push(table(&["at", "source", "text"], rows));
     if left_out > 0 {
         section.after.push(paragraph(&format!(
             "{left_out} lines that are farther from the landing are left out."
@@ -501,10 +501,10 @@ fn configuration(view: &View<'_>) -> Section {
     }
     let changed: BTreeSet<&str> = flight.changes.iter().map(|it| it.service.as_str()).collect();
     for service in changed {
-        let what = format!(
-            "The configuration of {service} was changed (the log says when); this is the last."
+        let note = format!(
+            "The configuration of {service} was changed (the log states when); this is the last."
         );
-        section.before.push(paragraph(&what));
+        section.before.push(paragraph(&note));
     }
     for (service, toml) in &flight.configurations {
         section.after.push(details(service, Block::Lines(toml.clone())));
@@ -512,7 +512,7 @@ fn configuration(view: &View<'_>) -> Section {
     let parameters = &flight.packets.parameters;
     if parameters.is_empty() {
         section.before.push(missing(
-            "parameters of the autopilot: nobody asked for any (a ground station asks for all)",
+            "parameters of the autopilot: none were requested (a ground station requests all)",
         ));
     } else {
         let rows: Vec<Vec<Cell>> = parameters

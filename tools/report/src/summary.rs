@@ -10,7 +10,7 @@ use crate::frames::{Fate, Frames};
 use crate::latency::{Stage, TO_SETPOINT, budget};
 use crate::{light, losses, phases, track};
 
-/// A flight in numbers. What was not recorded is `None`.
+/// A flight in numbers. Values that were not recorded are `None`.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Summary {
     /// The name of its file.
@@ -76,9 +76,9 @@ pub struct Summary {
     pub tape_verified: Option<bool>,
     /// The tape's verdict as a sentence.
     pub tape: Option<String>,
-    /// What the recording lacks, as sentences.
+    /// The gaps of the recording, as sentences.
     pub problems: Vec<String>,
-    /// What is wrong with the light, as sentences, where most frames had no marker.
+    /// Warnings about the light, as sentences, where most frames had no marker.
     pub light: Vec<String>,
     /// The latency budget.
     pub latency: Vec<Stage>,
@@ -224,8 +224,8 @@ impl Summary {
 
     /// The line for a bug report.
     pub fn line(&self) -> String {
-        let number = |value: Option<f64>, digits: usize, unit: &str, what: &str| {
-            value.map(|value| format!("{value:.digits$} {unit}{what}"))
+        let number = |value: Option<f64>, digits: usize, unit: &str, suffix: &str| {
+            value.map(|value| format!("{value:.digits$} {unit}{suffix}"))
         };
         let latency = self.latency_p50_ms.zip(self.latency_p99_ms);
         let parts = [

@@ -100,7 +100,7 @@ fn describe(verdict: &Verdict) -> String {
     }
     let no_end = match end.is_ended {
         true => "",
-        false => ", but it has no end: what came after is not known",
+        false => ", but it has no end: later events are not known",
     };
     format!("tape verified to the bit, {} events{no_end}{other}", end.events)
 }

@@ -1,4 +1,4 @@
-//! A flight with what the report computes from it: frames, track, setpoints, phases as bands, and curves over
+//! Computes the values of the report from a flight: frames, track, setpoints, phases as bands, and curves over
 //! time with gaps.
 
 use std::ops::Range;
@@ -19,17 +19,17 @@ const MIN_GAP_S: f64 = 0.5;
 /// Time shown before the first phase of a landing, in seconds.
 const BEFORE_S: f64 = 1.0;
 
-/// Period in which a setpoint that stays is drawn again, in seconds: less than what is drawn as missing.
+/// Period in which a setpoint that stays is drawn again, in seconds: less than the gap that is drawn as missing.
 const SETPOINT_PERIOD_S: f64 = 0.2;
 
-/// A flight with what is computed from it.
+/// A flight with the values computed from it.
 #[derive(Clone, Debug)]
 pub struct View<'a> {
     /// The flight.
     pub flight: &'a Flight,
     /// It in numbers.
     pub summary: Summary,
-    /// What became of each frame.
+    /// The outcome of each frame.
     pub frames: Frames,
     /// Where the vehicle truly was.
     pub truth: Vec<Place>,
@@ -39,7 +39,7 @@ pub struct View<'a> {
     pub errors: Vec<EstimateError>,
     /// The velocity setpoints.
     pub setpoints: Vec<Setpoint>,
-    /// What is shown of the time, in seconds since the landing began.
+    /// The shown time, in seconds since the landing began.
     pub time: Range<f64>,
 }
 
@@ -119,7 +119,7 @@ pub fn component(vector: [f64; 3], axis: usize) -> f64 {
     vector.get(axis).copied().unwrap_or(f64::NAN)
 }
 
-/// From before the first phase of the flight to the end of what is known.
+/// From before the first phase of the flight to the last known time.
 fn time(flight: &Flight, phases: &[phases::Phase]) -> Range<f64> {
     let lasts = [
         flight.statuses.last().map(|it| it.stamp_ns),

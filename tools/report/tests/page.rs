@@ -150,7 +150,7 @@ fn with(recording: &[u8], key: &str, payload: &[u8], before_ns: i64) -> Vec<u8> 
 }
 
 #[test]
-fn a_page_has_the_ground_stations_and_what_was_refused() {
+fn a_page_has_the_ground_stations_and_the_refused_packets() {
     let station = GroundStation {
         silent: true,
         packets: 300,
@@ -213,7 +213,7 @@ fn a_page_has_every_section_and_needs_nothing_else() {
         html.matches("http").count(),
         html.matches("http://www.w3.org/2000/svg").count() + 1
     );
-    // What lock-step has not got.
+    // Lock-step does not record the health of processes.
     assert!(html.contains("Not recorded: the health of the processes"), "health");
     assert!(html.contains("descending over the marker"), "reasons");
     assert!(html.len() < 2_000_000, "{} bytes", html.len());
@@ -285,7 +285,7 @@ fn the_numbers_are_those_of_the_flight_itself() {
     let outside = [Fate::Standby, Fate::NotNeeded, Fate::OnGround].map(|it| frames.count(&it));
     assert!(outside[2] > 0, "no frame was searched on the ground");
     let outside: usize = outside.iter().sum();
-    // What no longer shows the marker as from above, once it has touched down, is nobody's refusal.
+    // Frames after the touchdown, which no longer show the marker as from above, do not count as refusals.
     let touchdown = flight.truth.iter().find_map(|truth| truth.touchdown).unwrap();
     let after = frames.all.iter().filter(|it| it.handled_ns > touchdown.stamp_ns + 20_000_000);
     let unused =
@@ -303,7 +303,7 @@ fn the_numbers_are_those_of_the_flight_itself() {
     // The controller's own percentiles are of its last 512 frames.
     let published = flight.statuses.iter().rev().find_map(|status| status.latency_ms).unwrap();
     near(found.latency_p50_ms, Some(published[0]), 30.0);
-    // The estimate's error is what its claimed deviation says, within reason.
+    // The estimate's error agrees with its stated deviation.
     assert!(found.estimate_error_p50_m.unwrap() < 0.1, "{:?}", found.estimate_error_p50_m);
     let line = found.line();
     assert!(line.contains("landed; ") && line.contains("frames of the landing used"), "{line}");
@@ -350,13 +350,13 @@ fn a_status_of_another_version_is_reported_as_that() {
     replay_tapes(&mut flight);
     let found = summary(&flight);
     let line = found.line();
-    for (what, wanted) in [
+    for (text, version) in [
         ("the status of the controller is", ControllerStatus::VERSION),
         ("a part of a tape is", Tape::VERSION),
     ] {
-        let found = wanted - 1;
-        let said = format!("{what} of another version ({found}; this program reads {wanted})");
-        assert!(line.contains(&said), "`{said}` is not in: {line}");
+        let found = version - 1;
+        let warning = format!("{text} of another version ({found}; this program reads {version})");
+        assert!(line.contains(&warning), "`{warning}` is not in: {line}");
     }
     assert!(!line.contains("no status"), "{line}");
     assert_eq!(serde_json::to_value(&found).unwrap()["landed"], serde_json::Value::Null);
@@ -387,7 +387,7 @@ fn a_tape_alone_gives_status_and_estimates_again() {
     }
     let html = page(&flight).unwrap();
     has_all_sections(&html);
-    assert!(html.contains("what a replay of its tape gives"), "said");
+    assert!(html.contains("from a replay of its tape"), "missing status");
     assert!(html.contains("tape verified to the bit"), "verified");
 }
 
@@ -404,15 +404,16 @@ fn a_tape_with_a_gap_is_reported() {
 }
 
 #[test]
-fn what_was_not_recorded_is_said() {
+fn missing_messages_are_named() {
     let keys = ["truth", "wind", "controller/tape", "mavlink/from-autopilot"];
     let flight = read(&without(&landing().recording, &keys));
     let html = page(&flight).unwrap();
     has_all_sections(&html);
-    for what in ["truth, which only", "the true wind", "packets", "parameters of the autopilot"] {
-        let said = html.contains(&format!("Not recorded: {what}"))
-            || html.contains(&format!("Not recorded: the autopilot&#39;s {what}"));
-        assert!(said, "{what}");
+    for messages in ["truth, which only", "the true wind", "packets", "parameters of the autopilot"]
+    {
+        let is_named = html.contains(&format!("Not recorded: {messages}"))
+            || html.contains(&format!("Not recorded: the autopilot&#39;s {messages}"));
+        assert!(is_named, "{messages}");
     }
     assert_eq!(summary(&flight).touchdown_error_m, None);
     // Nothing but frames.
@@ -425,7 +426,7 @@ fn what_was_not_recorded_is_said() {
 }
 
 #[test]
-fn damaged_recordings_give_what_is_left_of_them() {
+fn damaged_recordings_give_their_remaining_messages() {
     let recording = &landing().recording;
     let flight = read(&recording[..recording.len() / 2]);
     let html = page(&flight).unwrap();
@@ -602,11 +603,11 @@ fn no_recording_is_refused() {
     let mut reader = FlightReader::new("text");
     assert!(reader.add(b"this is no recording at all").is_err());
     assert!(FlightReader::new("empty").is_empty());
-    assert!(page(&Flight::default()).is_ok(), "an empty flight has a page of what is missing");
+    assert!(page(&Flight::default()).is_ok(), "an empty flight has a page of missing messages");
 }
 
 #[test]
-fn two_flights_stand_side_by_side_with_what_they_differ_in() {
+fn two_flights_stand_side_by_side_with_their_differences() {
     let other = flown(&planned(0.0, "none", &["controller.metric.max_descend_m_s=0.7"]));
     let (one, other) = (read(&landing().recording), read(&other.recording));
     let html = comparison(&one, &other).unwrap();
@@ -642,7 +643,7 @@ fn a_document_has_every_section_and_chart_on_pages_of_a4() {
 }
 
 #[test]
-fn a_document_of_two_flights_has_each_chart_twice_and_what_they_differ_in() {
+fn a_document_of_two_flights_has_each_chart_twice_and_their_differences() {
     let one = read(&landing().recording);
     let other =
         read(&flown(&planned(0.0, "none", &["controller.metric.max_descend_m_s=0.7"])).recording);
@@ -654,7 +655,7 @@ fn a_document_of_two_flights_has_each_chart_twice_and_what_they_differ_in() {
 }
 
 #[test]
-fn what_a_text_of_the_autopilot_says_stays_text() {
+fn texts_of_the_autopilot_stay_text() {
     let mut flight = read(&landing().recording);
     flight.name = "<b>name</b>".to_owned();
     flight.statuses.iter_mut().for_each(|status| status.why = "<script>alert(1)</script>".into());
@@ -710,7 +711,7 @@ fn a_setting_that_a_service_changed_is_reported_with_its_time() {
     let change = flight.changes.first().unwrap();
     assert_eq!((flight.changes.len(), change.received_ns), (1, 8_000_000_000));
     let (lines, _) = report::journal::of(&flight);
-    let line = lines.iter().find(|line| line.who == "detector/main").unwrap();
+    let line = lines.iter().find(|line| line.source == "detector/main").unwrap();
     assert_eq!(line.text, "setting `thorough` changed from false to true");
     assert!((line.time_s - flight.at_s(8_000_000_000)).abs() < 1e-9, "{line:?}");
     assert!(page(&flight).unwrap().contains("setting `thorough` changed from false to true"));
