@@ -145,7 +145,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
         write_figures(figures, folder)?;
     }
     write_error(&format!("the page: {}", output.display()));
-    let are_whole = flights.iter().all(Flight::is_whole);
+    let are_whole = flights.iter().all(Flight::is_complete);
     Ok(if are_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
