@@ -33,7 +33,7 @@ pub struct Config {
     pub serve: String,
     /// Whether that may be beyond this machine.
     pub insecure: bool,
-    /// Origins of web pages that may follow, beside those of this machine.
+    /// Origins of web pages that may follow, in addition to those of this machine.
     pub origins: Vec<String>,
     /// Maximum number of viewers.
     pub max_clients: u32,
@@ -143,8 +143,8 @@ mod tests {
             ("origins=[\"app.example\"]", "is not an origin"),
             ("max_clients=0", "from 1 to 16"),
         ] {
-            let problem = load(setting).unwrap_err();
-            assert!(problem.contains(part), "{setting}: {problem}");
+            let error = load(setting).unwrap_err();
+            assert!(error.contains(part), "{setting}: {error}");
         }
         assert!(load("serve=[::1]:8765").is_ok());
     }

@@ -48,7 +48,7 @@ pub(crate) struct DiskStatus {
     pub(crate) waiting_bytes: usize,
     /// How long the oldest of them wait.
     pub(crate) stalled: Duration,
-    /// Everything is on the disk, or a problem ended it.
+    /// Everything is on the disk, or an error ended it.
     pub(crate) has_ended: bool,
     /// Why the file takes no more.
     pub(crate) problem: Option<String>,
@@ -59,16 +59,16 @@ impl Disk {
     ///
     /// # Errors
     /// When no thread can be started.
-    pub(crate) fn open(wanted: PathBuf) -> anyhow::Result<Self> {
+    pub(crate) fn open(requested: PathBuf) -> anyhow::Result<Self> {
         let shared = Arc::new(Shared::default());
         let writer = Arc::clone(&shared);
         // The thread ends with its file; one that hangs in the system ends with the process.
         std::thread::Builder::new()
             .name("disk".to_owned())
             .spawn(move || {
-                let result = writer.write_all(&wanted);
+                let result = writer.write_all(&requested);
                 let mut state = writer.lock();
-                state.status.problem = result.err().map(|problem| in_words(&problem));
+                state.status.problem = result.err().map(|error| in_words(&error));
                 state.status.has_ended = true;
                 writer.changed.notify_all();
             })
@@ -121,8 +121,8 @@ impl Shared {
     }
 
     /// Writes until everything is there.
-    fn write_all(&self, wanted: &Path) -> anyhow::Result<()> {
-        let (path, mut file) = create(wanted)?;
+    fn write_all(&self, requested: &Path) -> anyhow::Result<()> {
+        let (path, mut file) = create(requested)?;
         // Asked for by this thread, as a disk that hangs does not answer.
         let room_bytes = free_bytes(&file);
         let mut state = self.lock();
@@ -172,9 +172,9 @@ impl Shared {
 }
 
 /// The cause first, as a ground station may show no more; then the failed action, and the remedy.
-fn in_words(problem: &anyhow::Error) -> String {
-    let (cause, whole) = (problem.root_cause().to_string(), problem.to_string());
-    if cause == whole { whole } else { format!("{cause}, {whole}") }
+fn in_words(error: &anyhow::Error) -> String {
+    let (cause, context) = (error.root_cause().to_string(), error.to_string());
+    if cause == context { context } else { format!("{cause}, {context}") }
 }
 
 /// A file that was removed, or whose disk was, accepts bytes without an error.
@@ -195,8 +195,8 @@ fn free_bytes(file: &File) -> Option<u64> {
 }
 
 /// Creates a file, and the directories that it is in.
-fn create(wanted: &Path) -> anyhow::Result<(PathBuf, File)> {
-    let path = free(wanted);
+fn create(requested: &Path) -> anyhow::Result<(PathBuf, File)> {
+    let path = free(requested);
     let doing = || {
         format!("creating {path:?}; choose a file on a disk with room that this user may write to")
     };
@@ -221,18 +221,18 @@ fn free(path: &Path) -> PathBuf {
 mod tests {
     use super::*;
 
-    const PATIENCE: Duration = Duration::from_secs(20);
+    const TIMEOUT: Duration = Duration::from_secs(20);
 
     #[test]
     fn a_file_that_is_there_is_not_written_over() {
         let folder = tempfile::tempdir().unwrap();
-        let wanted = folder.path().join("deep/flight.mcap");
+        let requested = folder.path().join("deep/flight.mcap");
         for name in ["deep/flight.mcap", "deep/flight-2.mcap"] {
-            let disk = Disk::open(wanted.clone()).unwrap();
+            let disk = Disk::open(requested.clone()).unwrap();
             disk.append(b"ab".to_vec());
             disk.append(b"c".to_vec());
             disk.complete();
-            let status = disk.wait(PATIENCE);
+            let status = disk.wait(TIMEOUT);
             assert_eq!((status.bytes, status.waiting_bytes, status.problem), (3, 0, None));
             assert!(status.free_bytes.is_some_and(|bytes| bytes > 0), "{:?}", status.free_bytes);
             assert_eq!(status.path, Some(folder.path().join(name)));
@@ -251,7 +251,7 @@ mod tests {
         }
         std::fs::remove_file(&path).unwrap();
         disk.append(b"cd".to_vec());
-        let problem = disk.wait(PATIENCE).problem.unwrap();
+        let problem = disk.wait(TIMEOUT).problem.unwrap();
         assert!(problem.contains("removed"), "{problem}");
     }
 
@@ -266,7 +266,7 @@ mod tests {
         std::fs::write(folder.path().join("other"), b"theirs").unwrap();
         std::fs::rename(folder.path().join("other"), &path).unwrap();
         disk.append(b"ab".to_vec());
-        let problem = disk.wait(PATIENCE).problem.unwrap();
+        let problem = disk.wait(TIMEOUT).problem.unwrap();
         assert!(problem.contains("another file"), "{problem}");
         assert_eq!(std::fs::read(&path).unwrap(), b"theirs");
     }
@@ -276,8 +276,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let taken = folder.path().join("taken");
         std::fs::write(&taken, b"").unwrap();
-        let problem =
-            Disk::open(taken.join("flight.mcap")).unwrap().wait(PATIENCE).problem.unwrap();
+        let problem = Disk::open(taken.join("flight.mcap")).unwrap().wait(TIMEOUT).problem.unwrap();
         assert!(problem.contains("taken/flight.mcap") && problem.contains("choose"), "{problem}");
     }
 
@@ -287,7 +286,7 @@ mod tests {
         let mut file = OpenOptions::new().write(true).open("/dev/full").unwrap();
         let shared = Shared::default();
         shared.lock().waiting.push_back(b"ab".to_vec());
-        let problem = shared.write(Path::new("/dev/full"), &mut file).unwrap_err();
-        assert!(format!("{problem:#}").contains("No space left"), "{problem:#}");
+        let error = shared.write(Path::new("/dev/full"), &mut file).unwrap_err();
+        assert!(format!("{error:#}").contains("No space left"), "{error:#}");
     }
 }

@@ -1,4 +1,4 @@
-//! The channels offered to viewers and the viewers' places: each client's subscriptions, the last values for a client that
+//! The channels offered to viewers and the viewers' slots: each client's subscriptions, the last values for a client that
 //! joins, and a bound on their number.
 
 use std::collections::BTreeMap;
@@ -24,7 +24,7 @@ pub(crate) struct Hub {
 
 #[derive(Debug, Default)]
 struct State {
-    /// A channel's number is its place here.
+    /// A channel's number is its index here.
     channels: Vec<Channel>,
     numbers: BTreeMap<String, u32>,
     clients: BTreeMap<u64, Client>,
@@ -47,9 +47,9 @@ struct Client {
     changed: Arc<Notify>,
 }
 
-/// A client's place, which is free again once this is dropped.
+/// A client's slot, which is free again once this is dropped.
 #[derive(Debug)]
-pub(crate) struct Place {
+pub(crate) struct Slot {
     hub: Arc<Hub>,
     client: u64,
     changed: Arc<Notify>,
@@ -66,8 +66,8 @@ impl Hub {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A place for one more client, to which all channels are announced; `None` when all places are taken.
-    pub(crate) fn join(self: &Arc<Self>) -> Option<Place> {
+    /// A slot for one more client, to which all channels are announced; `None` when all slots are taken.
+    pub(crate) fn join(self: &Arc<Self>) -> Option<Slot> {
         let mut state = self.lock();
         if state.clients.len() >= self.max_clients {
             return None;
@@ -79,7 +79,7 @@ impl Hub {
         let client = state.next_client;
         state.next_client += 1;
         state.clients.insert(client, Client { outbox, changed: Arc::clone(&changed) });
-        Some(Place { hub: Arc::clone(self), client, changed })
+        Some(Slot { hub: Arc::clone(self), client, changed })
     }
 
     /// Whether a client follows.
@@ -147,7 +147,7 @@ impl State {
     }
 }
 
-impl Place {
+impl Slot {
     /// Waits until something may be there to be sent.
     pub(crate) async fn changed(&self) {
         self.changed.notified().await;
@@ -167,15 +167,15 @@ impl Place {
     ///
     /// # Errors
     /// Why it does not.
-    pub(crate) fn subscribe(&self, wanted: Subscription) -> Result<(), String> {
-        let Subscription { id, channel_id } = wanted;
+    pub(crate) fn subscribe(&self, requested: Subscription) -> Result<(), String> {
+        let Subscription { id, channel_id } = requested;
         let mut state = self.hub.lock();
         let State { channels, clients, .. } = &mut *state;
         let Some(channel) = channels.get(channel_id as usize) else {
             return Err(format!("there is no channel {channel_id}"));
         };
         let Some(client) = clients.get_mut(&self.client) else { return Ok(()) };
-        if !client.outbox.subscribe(wanted) {
+        if !client.outbox.subscribe(requested) {
             return Err(format!(
                 "channel {channel_id} is subscribed to already, or subscription {id} is in use"
             ));
@@ -195,7 +195,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for Slot {
     fn drop(&mut self) {
         let mut state = self.hub.lock();
         state.clients.remove(&self.client);
@@ -221,9 +221,9 @@ mod tests {
         }
     }
 
-    fn messages(place: &Place) -> Vec<u8> {
+    fn messages(slot: &Slot) -> Vec<u8> {
         let next = || loop {
-            match place.next()? {
+            match slot.next()? {
                 Next::Message(_, message) => return message.data.first().copied(),
                 Next::Text(_) => {}
             }
@@ -239,34 +239,34 @@ mod tests {
         assert!(hub.is_followed() && hub.take_begun() && !hub.take_begun());
         hub.offer(wind(1), 0, true);
         hub.offer(wind(2), 0, true);
-        let wanted = Subscription { id: 5, channel_id: 0 };
-        first.subscribe(wanted).unwrap();
+        let requested = Subscription { id: 5, channel_id: 0 };
+        first.subscribe(requested).unwrap();
         hub.offer(wind(3), 0, true);
         assert_eq!(messages(&first), [2, 3]);
-        assert!(first.subscribe(wanted).unwrap_err().contains("already"));
+        assert!(first.subscribe(requested).unwrap_err().contains("already"));
         let unknown = Subscription { id: 6, channel_id: 1 };
         assert!(first.subscribe(unknown).unwrap_err().contains("no channel 1"));
         let second = hub.join().unwrap();
         assert!(hub.join().is_none() && !hub.take_begun());
-        second.subscribe(wanted).unwrap();
+        second.subscribe(requested).unwrap();
         assert_eq!(messages(&second), [3]);
         drop((first, second));
         let third = hub.join().unwrap();
         assert!(hub.take_begun());
-        third.subscribe(wanted).unwrap();
+        third.subscribe(requested).unwrap();
         assert!(messages(&third).is_empty());
     }
 
     #[test]
     fn new_channels_are_announced_and_their_number_is_bounded() {
         let hub = Arc::new(Hub::new(1));
-        let place = hub.join().unwrap();
+        let slot = hub.join().unwrap();
         for number in 0..=MAX_CHANNELS {
             let channel = format!("channel/{number}");
             hub.offer(Record { channel, ..wind(0) }, 0, false);
         }
         let mut texts = Vec::new();
-        while let Some(Next::Text(text)) = place.next() {
+        while let Some(Next::Text(text)) = slot.next() {
             texts.push(text);
         }
         assert_eq!(texts.len(), 1 + MAX_CHANNELS);

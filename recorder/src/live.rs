@@ -37,7 +37,7 @@ pub(crate) struct Live {
 }
 
 impl Live {
-    /// Listens where the configuration says so; `None` when it does not. A recording does not depend on it: where there is a
+    /// Listens at the configured address; `None` without one. A recording does not depend on it: where there is a
     /// file, an address at which it cannot listen is tried again.
     ///
     /// # Errors
@@ -50,12 +50,12 @@ impl Live {
         let health = node.shared_health();
         let listener = match bind(address).await {
             Ok(listener) => Some(listener),
-            Err(problem) if config.has_file() => {
+            Err(error) if config.has_file() => {
                 health.failed(UNSERVED);
-                tracing::error!(problem = format!("{problem:#}"), "No viewer is served yet");
+                tracing::error!(problem = format!("{error:#}"), "No viewer is served yet");
                 None
             }
-            Err(problem) => return Err(problem),
+            Err(error) => return Err(error),
         };
         let hub = Arc::new(Hub::new(config.max_clients as usize));
         let server = Server {
@@ -68,9 +68,9 @@ impl Live {
         let failures = Arc::clone(&health);
         let task = tokio::spawn(async move {
             // The recording continues.
-            if let Err(problem) = serve_at(address, listener, server, &failures).await {
+            if let Err(error) = serve_at(address, listener, server, &failures).await {
                 failures.failed(UNSERVED);
-                tracing::error!(problem = format!("{problem:#}"), "No viewer is served any more");
+                tracing::error!(problem = format!("{error:#}"), "No viewer is served any more");
             }
         });
         let records = flightlog::Live::new(0, clock_name());

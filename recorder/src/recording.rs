@@ -90,7 +90,7 @@ impl Recording {
         }
     }
 
-    /// Hands whole chunks to the disk, and every [`FLUSH_PERIOD`] everything; true when it did so.
+    /// Hands complete chunks to the disk, and every [`FLUSH_PERIOD`] everything; true when it did so.
     pub(crate) fn hand_over(&mut self) -> anyhow::Result<bool> {
         let is_due = self.flushed.elapsed() >= FLUSH_PERIOD;
         if is_due {
@@ -155,8 +155,8 @@ impl Ending {
     }
 
     /// Waits until it has ended; how it is doing then.
-    pub(crate) fn wait(&self, patience: Duration) -> DiskStatus {
-        self.disk.wait(patience)
+    pub(crate) fn wait(&self, limit: Duration) -> DiskStatus {
+        self.disk.wait(limit)
     }
 
     /// The messages that are not on the disk, by key.

@@ -19,7 +19,7 @@ use tokio::net::TcpListener;
 use tokio::time::{interval, timeout};
 
 use crate::guard::may_follow;
-use crate::hub::{Hub, Place};
+use crate::hub::{Hub, Slot};
 use crate::outbox::Next;
 use crate::window::Window;
 
@@ -78,7 +78,7 @@ async fn connect(
             "The Foxglove WebSocket protocol is spoken here: foxglove.sdk.v1 or foxglove.websocket.v1.",
         );
     }
-    let Some(place) = server.hub.join() else {
+    let Some(slot) = server.hub.join() else {
         return refuse(
             StatusCode::SERVICE_UNAVAILABLE,
             "too many clients",
@@ -86,9 +86,9 @@ async fn connect(
         );
     };
     upgrade.on_upgrade(async move |mut socket| {
-        // A client that goes is no failure.
-        if let Err(problem) = follow(&server, &place, &mut socket).await {
-            tracing::debug!(%problem, "A client has gone");
+        // A client that disconnects is no failure.
+        if let Err(error) = follow(&server, &slot, &mut socket).await {
+            tracing::debug!(problem = %error, "A client has gone");
         }
     })
 }
@@ -105,7 +105,7 @@ async fn ping(socket: &mut WebSocket, window: &mut Window) -> anyhow::Result<()>
 }
 
 /// Sends the messages to which a client subscribes, until it disconnects.
-async fn follow(server: &Server, place: &Place, socket: &mut WebSocket) -> anyhow::Result<()> {
+async fn follow(server: &Server, slot: &Slot, socket: &mut WebSocket) -> anyhow::Result<()> {
     send(socket, Message::Text(server_info(&server.name, &server.session).into())).await?;
     let mut window = Window::default();
     let mut look = interval(LOOK_PERIOD);
@@ -113,7 +113,7 @@ async fn follow(server: &Server, place: &Place, socket: &mut WebSocket) -> anyho
     loop {
         // A message that finds the window full is sent after the pong.
         while window.has_room()
-            && let Some(next) = place.next()
+            && let Some(next) = slot.next()
         {
             let (message, bytes) = match next {
                 Next::Text(text) => (Message::Text(text.into()), 0),
@@ -129,9 +129,9 @@ async fn follow(server: &Server, place: &Place, socket: &mut WebSocket) -> anyho
             }
         }
         tokio::select! {
-            () = place.changed() => {}
+            () = slot.changed() => {}
             received = socket.recv() => match received.context("it closed the connection")?? {
-                Message::Text(text) => answer(server, place, socket, &text).await?,
+                Message::Text(text) => answer(server, slot, socket, &text).await?,
                 Message::Pong(number) => {
                     if let Ok(number) = <[u8; 8]>::try_from(&*number) {
                         window.pong(u64::from_le_bytes(number));
@@ -146,7 +146,7 @@ async fn follow(server: &Server, place: &Place, socket: &mut WebSocket) -> anyho
                     bail!("it takes nothing");
                 }
                 ping(socket, &mut window).await?;
-                let dropped = place.dropped();
+                let dropped = slot.dropped();
                 if dropped > reported {
                     reported = dropped;
                     let text = format!(
@@ -162,24 +162,24 @@ async fn follow(server: &Server, place: &Place, socket: &mut WebSocket) -> anyho
 /// Carries out a client's request, or sends why not.
 async fn answer(
     server: &Server,
-    place: &Place,
+    slot: &Slot,
     socket: &mut WebSocket,
     text: &str,
 ) -> anyhow::Result<()> {
-    let problems: Vec<String> = match request(text) {
+    let errors: Vec<String> = match request(text) {
         Ok(Request::Subscribe { subscriptions }) => {
-            subscriptions.into_iter().filter_map(|it| place.subscribe(it).err()).collect()
+            subscriptions.into_iter().filter_map(|it| slot.subscribe(it).err()).collect()
         }
         Ok(Request::Unsubscribe { subscription_ids }) => {
-            subscription_ids.into_iter().for_each(|id| place.unsubscribe(id));
+            subscription_ids.into_iter().for_each(|id| slot.unsubscribe(id));
             Vec::new()
         }
         Ok(Request::Other) => vec!["only subscribing and unsubscribing are offered".to_owned()],
-        Err(problem) => vec![problem],
+        Err(error) => vec![error],
     };
-    if let Some(problem) = problems.first() {
+    if let Some(error) = errors.first() {
         server.health.dropped("wrong request");
-        let text = format!("this was not done: {problem}");
+        let text = format!("this was not done: {error}");
         send(socket, Message::Text(warning("request", &text).into())).await?;
     }
     Ok(())

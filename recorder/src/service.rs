@@ -346,7 +346,7 @@ impl Recorder {
                     self.kept.add(&message.key, 1);
                     self.health.count("messages");
                 }
-                Err(problem) => self.give_up(&format!("{problem:#}")),
+                Err(error) => self.give_up(&format!("{error:#}")),
             }
         } else if self.config.has_file() {
             let is_slow = self.recording.is_some();
@@ -354,7 +354,7 @@ impl Recorder {
             self.lost.add(&message.key, 1);
         }
         if frame.as_ref().is_some_and(|frame| !frame.is_complete) {
-            self.health.dropped("a picture that is no whole image");
+            self.health.dropped("a picture that is no complete image");
         }
         if let Some(live) = self.live.as_mut().filter(|_| is_followed) {
             live.take(&message, frame.as_ref());
@@ -371,7 +371,7 @@ impl Recorder {
         self.ending.as_ref().map_or(0, |ending| ending.status().waiting_bytes)
     }
 
-    /// Opens, flushes, ends and replaces the file, and says how it is doing.
+    /// Opens, flushes, ends and replaces the file, and publishes its state.
     fn look_after_file(&mut self) {
         if let Some(live) = &mut self.live
             && live.is_followed(utc_offset_ns, self.states.values())
@@ -392,7 +392,7 @@ impl Recorder {
     fn write_file(&mut self) {
         match self.write_out() {
             Ok(()) => {}
-            Err(problem) => self.give_up(&format!("{problem:#}")),
+            Err(error) => self.give_up(&format!("{error:#}")),
         }
         if let Some(ended) = self.ending.take_if(|ending| ending.status().has_ended) {
             let problem = ended.status().problem;
@@ -408,7 +408,7 @@ impl Recorder {
         if self.recording.is_none() && is_due {
             match self.begin() {
                 Ok(recording) => self.recording = Some(recording),
-                Err(problem) => self.give_up(&format!("{problem:#}")),
+                Err(error) => self.give_up(&format!("{error:#}")),
             }
         }
     }
@@ -445,7 +445,7 @@ impl Recorder {
             recording.writer.time_set(now_ns(), utc_offset_ns)?;
             let set_s = utc_offset_ns.saturating_sub(self.utc_offset_ns) as f64 * 1e-9;
             tracing::warn!(
-                "The clock was set by {set_s:+.1} s; the times of this recording go on as they began"
+                "The clock was set by {set_s:+.1} s; the times of this recording continue as they began"
             );
             self.utc_offset_ns = utc_offset_ns;
         }
@@ -479,7 +479,7 @@ impl Recorder {
         drop(status);
         let max_bytes = u64::from(self.config.max_file_mb) * 1_000_000;
         let max_age = Duration::from_secs_f64(60.0 * self.config.max_file_minutes);
-        // A second file would not be written sooner, and wait beside the first.
+        // A second file would not be written sooner, and wait next to the first.
         if self.ending.is_none()
             && !stalls
             && recording.is_full(max_bytes, max_age)
@@ -493,7 +493,7 @@ impl Recorder {
     /// The file failed: it stays as it is, for `alight record --repair`, and another one is tried later.
     fn give_up(&mut self, problem: &str) {
         if self.health.failed("the file failed") || self.retry.is_none() {
-            tracing::error!(problem, "Not recording; trying again, and the flight goes on");
+            tracing::error!(problem, "Not recording; trying again, and the flight continues");
         }
         let unsynced = self.recording.take().map(Recording::unsynced).unwrap_or_default();
         self.count_unsynced(unsynced);
@@ -581,7 +581,7 @@ mod tests {
         let mut recorder = recorder(&folder);
         change(&mut recorder);
         let ended = recorder.end(Instant::now() + Duration::from_secs(20));
-        ended.map_err(|problem| format!("{problem:#}"))
+        ended.map_err(|error| format!("{error:#}"))
     }
 
     #[test]

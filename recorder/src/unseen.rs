@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn drops_before_a_camera_begins_anew_hide_no_gap_after_it() {
+    fn drops_before_a_restart_of_a_camera_hide_no_gap_after_it() {
         let mut unseen = Unseen::default();
         unseen.take(KEY, 900);
         unseen.dropped(KEY, 3);
@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_begins_anew_left_nothing_out() {
+    fn a_camera_that_restarts_has_no_gap() {
         let mut unseen = Unseen::default();
         for sequence in [900, 0, 1, u64::MAX, 0, 5, 5] {
             unseen.take(KEY, sequence);

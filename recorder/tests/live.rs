@@ -22,7 +22,7 @@ use tokio_tungstenite::tungstenite::http::{HeaderValue, Request};
 use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{WebSocketStream, client_async};
 
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 /// The size of the camera's frames: pictures of 90 kB.
 const WIDTH: u32 = 300;
 const HEIGHT: u32 = 300;
@@ -45,7 +45,7 @@ impl Served {
         let node = open("recorder", meet).await?;
         let task = tokio::spawn(recorder::run(node.clone(), config, Shutdown::on_signals()?));
         let address = SocketAddr::new("127.0.0.1".parse()?, port);
-        until("the recorder listens", PATIENCE, async || TcpStream::connect(address).await.is_ok())
+        until("the recorder listens", TIMEOUT, async || TcpStream::connect(address).await.is_ok())
             .await?;
         Ok(Self { meet, address, node, task })
     }
@@ -77,7 +77,7 @@ impl Served {
     async fn refusal(&self, request: Request<()>) -> anyhow::Result<u16> {
         match self.connected(request).await {
             Err(Error::Http(response)) => Ok(response.status().as_u16()),
-            Err(problem) => Err(problem.into()),
+            Err(error) => Err(error.into()),
             Ok(_) => bail!("it was not refused"),
         }
     }
@@ -144,7 +144,7 @@ struct Client {
 
 impl Client {
     async fn next(&mut self) -> anyhow::Result<Message> {
-        Ok(timeout(PATIENCE, self.socket.next()).await?.context("the connection was closed")??)
+        Ok(timeout(TIMEOUT, self.socket.next()).await?.context("the connection was closed")??)
     }
 
     /// The next text with this `op`.
@@ -203,7 +203,7 @@ fn utc_ns() -> anyhow::Result<u64> {
     Ok(u64::try_from(SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos())?)
 }
 
-fn says(status: &Value, part: &str) -> anyhow::Result<()> {
+fn check_status(status: &Value, part: &str) -> anyhow::Result<()> {
     ensure!(
         status["message"].as_str().is_some_and(|it| it.contains(part)),
         "no `{part}` in {status}"
@@ -221,12 +221,12 @@ async fn an_address_that_is_taken_costs_no_recording_and_is_tried_again() -> any
     let config = Layers { file: None, set }.load::<Config>()?.settings;
     let node = open("recorder", meet).await?;
     let task = tokio::spawn(recorder::run(node.clone(), config, Shutdown::on_signals()?));
-    until("the recorder makes a file", PATIENCE, async || path.is_file()).await?;
+    until("the recorder makes a file", TIMEOUT, async || path.is_file()).await?;
     let errors = node.health().report(node.identity(), 0).errors;
     ensure!(errors.iter().any(|it| it.reason.contains("viewers")), "{errors:?}");
     drop(taken);
     let is_reached = async || TcpStream::connect(("127.0.0.1", port)).await.is_ok();
-    until("the recorder listens", PATIENCE, is_reached).await?;
+    until("the recorder listens", TIMEOUT, is_reached).await?;
     ensure!(!task.is_finished(), "the recorder ended");
     task.abort();
     Ok(())
@@ -254,10 +254,10 @@ async fn messages_are_served_without_a_file_under_both_names_of_the_protocol() -
         }
         client.ask(&json!({ "op": "unsubscribe", "subscriptionIds": [42] })).await?;
         client.ask(&json!({ "op": "getParameters", "parameterNames": [] })).await?;
-        says(&client.text("status").await?, "only subscribing")?;
+        check_status(&client.text("status").await?, "only subscribing")?;
         let unknown = json!([{ "id": 1, "channelId": 999 }]);
         client.ask(&json!({ "op": "subscribe", "subscriptions": unknown })).await?;
-        says(&client.text("status").await?, "no channel 999")?;
+        check_status(&client.text("status").await?, "no channel 999")?;
         client.socket.close(None).await?;
     }
     wind.abort();
@@ -278,7 +278,7 @@ async fn pages_of_other_sites_and_too_many_clients_are_refused() -> anyhow::Resu
     ensure!(served.refusal(served.request(SUBPROTOCOLS[0])?).await? == 503);
     drop(second);
     let is_free = async || served.client().await.is_ok();
-    until("the place of a client that has gone is free", PATIENCE, is_free).await?;
+    until("the place of a client that disconnected is free", TIMEOUT, is_free).await?;
     for reason in ["other protocol", "wrong Origin", "too many clients"] {
         ensure!(served.dropped(reason) >= 1, "{reason}");
     }
@@ -324,9 +324,9 @@ async fn one_is_slow() -> anyhow::Result<()> {
         "{pictures} pictures in 3 s in parallel with a client that took none: it missed {missed}, and got {old} old ones"
     );
     ensure!(old <= 3 && missed > pictures / 2, "{old} old, {missed} missed of {pictures}");
-    says(&slow.text("status").await?, "left out")?;
+    check_status(&slow.text("status").await?, "left out")?;
     let status = loop {
-        let status = timeout(PATIENCE, statuses.next()).await?.context("the status")?;
+        let status = timeout(TIMEOUT, statuses.next()).await?.context("the status")?;
         let kept = status.kept.iter().find(|kept| kept.key == "camera/down/frame");
         if kept.is_some_and(|kept| kept.count > pictures) && status.free_bytes.is_some() {
             break status;

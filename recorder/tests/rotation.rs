@@ -11,7 +11,7 @@ use recorder::Config;
 use testing::{ports, until, with_second_try};
 use tokio::time::sleep;
 
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 /// Bytes of a frame, of which a file of 1 MB has eleven.
 const EDGE: u32 = 300;
 const WINDS: u32 = 3000;
@@ -21,7 +21,7 @@ async fn open(service: &'static str, meet: u16) -> anyhow::Result<Node> {
     Node::open(Identity { service, instance: "main".into() }, &source).await
 }
 
-/// The winds in a file, which count; and whether it is whole.
+/// The winds in a file, which are counted; and whether it is complete.
 fn winds(file: &Path) -> anyhow::Result<(Vec<u32>, bool)> {
     let (mut winds, mut vehicle) = (Vec::new(), None);
     let reading = read(&std::fs::read(file)?, |entry| {
@@ -41,10 +41,10 @@ fn winds(file: &Path) -> anyhow::Result<(Vec<u32>, bool)> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn nothing_is_lost_when_a_full_file_is_followed_by_the_next() -> anyhow::Result<()> {
-    with_second_try(is_whole).await
+    with_second_try(is_complete).await
 }
 
-async fn is_whole() -> anyhow::Result<()> {
+async fn is_complete() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let path = folder.path().join("flight-{time}.mcap");
     let ([meet], _, _) = ports::free()?;
@@ -54,7 +54,7 @@ async fn is_whole() -> anyhow::Result<()> {
     let task = tokio::spawn(recorder::run(node.clone(), config, Shutdown::on_signals()?));
     let is_begun =
         async || std::fs::read_dir(folder.path()).is_ok_and(|mut files| files.next().is_some());
-    until("the recorder makes a file", PATIENCE, is_begun).await?;
+    until("the recorder makes a file", TIMEOUT, is_begun).await?;
     let source = open("simulator", meet).await?;
     let wind = source.publisher(topic::WIND, &[]).await?;
     let bytes = (EDGE * EDGE) as usize;
@@ -86,11 +86,11 @@ async fn is_whole() -> anyhow::Result<()> {
     let mut seen = Vec::new();
     let mut ended = 0;
     for file in &files {
-        let (winds, is_whole) = winds(file)?;
+        let (winds, is_complete) = winds(file)?;
         // A file begins with the last value of each state.
         let last = seen.last().copied();
         seen.extend(winds.into_iter().filter(|wind| last != Some(*wind)));
-        ended += usize::from(is_whole);
+        ended += usize::from(is_complete);
     }
     ensure!(files.len() > 5 && ended + 1 >= files.len(), "{ended} of {} files", files.len());
     let is_gapless = seen.windows(2).all(|pair| pair[1] == pair[0] + 1);

@@ -21,31 +21,34 @@ fn main() -> Result<()> {
     let mut arguments = std::env::args().skip(1).map(|text| text.parse::<usize>());
     let every = arguments.next().unwrap_or(Ok(1))?.max(1);
     let flips = arguments.next().unwrap_or(Ok(10_000))?;
-    let whole = recording()?;
-    let ends = chunk_ends(&whole);
-    println!("{} bytes in {} chunks", whole.len(), ends.len());
+    let complete = recording()?;
+    let ends = chunk_ends(&complete);
+    println!("{} bytes in {} chunks", complete.len(), ends.len());
     let began = Instant::now();
     let mut cuts = 0;
-    for length in (mcap::MAGIC.len()..whole.len()).step_by(every) {
-        let found = repair(&whole[..length], std::io::sink())?;
+    for length in (mcap::MAGIC.len()..complete.len()).step_by(every) {
+        let found = repair(&complete[..length], std::io::sink())?;
         let before = ends.iter().filter(|end| **end <= length).count() as u64;
         if found.chunks < before {
-            return Err(format!("cut at {length}: {found:?}, {before} are whole").into());
+            return Err(format!("cut at {length}: {found:?}, {before} are complete").into());
         }
         cuts += 1;
     }
-    println!("{cuts} cuts: every whole chunk recovered ({:.0} s)", began.elapsed().as_secs_f64());
+    println!(
+        "{cuts} cuts: every complete chunk recovered ({:.0} s)",
+        began.elapsed().as_secs_f64()
+    );
     let began = Instant::now();
     let mut random = 1_u64;
     let (mut named, mut refused, mut unchanged) = (0, 0, 0);
     let mut first = Vec::new();
-    let all = repair(&whole, &mut first)?;
+    let all = repair(&complete, &mut first)?;
     for _ in 0..flips {
         // Numerical Recipes' generator: any will do.
         random =
             random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        let bit = (random >> 16) as usize % (8 * whole.len());
-        let mut damaged = whole.clone();
+        let bit = (random >> 16) as usize % (8 * complete.len());
+        let mut damaged = complete.clone();
         damaged[bit / 8] ^= 1 << (bit % 8);
         let mut copy = Vec::new();
         let Ok(found) = repair(&damaged, &mut copy) else {
@@ -61,7 +64,7 @@ fn main() -> Result<()> {
         }
         let before = ends.iter().filter(|end| **end <= bit / 8).count() as u64;
         if found.chunks < before {
-            return Err(format!("bit {bit}: {found:?}, {before} are whole").into());
+            return Err(format!("bit {bit}: {found:?}, {before} are complete").into());
         }
     }
     println!(

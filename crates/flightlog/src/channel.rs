@@ -13,7 +13,7 @@ use crate::protobuf::{MessageType, descriptor_set};
 pub const RAW: &str = "alight";
 /// Prefix of the channels with messages as they came.
 pub const RAW_PREFIX: &str = "raw/";
-/// A JSON schema that allows any object: the messages' own types say more, and are in the documents.
+/// A JSON schema that allows any object: the messages' own types are more exact, and are in the documents.
 const ANY_OBJECT: &[u8] = br#"{"type":"object"}"#;
 
 /// How a record's bytes are read.
@@ -112,7 +112,7 @@ struct JsonTopic {
 
 fn json<M: Message>(payload: &[u8]) -> Result<Vec<u8>, DecodeError> {
     let message = decode::<M>(payload)?;
-    // Numbers that are not finite become null; the bytes beside it have them.
+    // Numbers that are not finite become null; the bytes next to it have them.
     Ok(serde_json::to_vec(&message).unwrap_or_default())
 }
 
@@ -141,10 +141,11 @@ static JSON_TOPICS: [JsonTopic; 16] = [
 
 /// True when a key matches a pattern, in which `*` or a name in braces stands for one part.
 pub(crate) fn matches(pattern: &str, key: &str) -> bool {
-    let mut wanted = pattern.split('/');
-    let is_any = |wanted: &str| wanted == "*" || wanted.starts_with('{');
-    let is_same = key.split('/').all(|part| wanted.next().is_some_and(|w| is_any(w) || w == part));
-    is_same && wanted.next().is_none()
+    let mut expected = pattern.split('/');
+    let is_any = |expected: &str| expected == "*" || expected.starts_with('{');
+    let is_same =
+        key.split('/').all(|part| expected.next().is_some_and(|w| is_any(w) || w == part));
+    is_same && expected.next().is_none()
 }
 
 /// Whether a message is the last value of a state: with those a file begins, though they are from before.

@@ -13,7 +13,9 @@ use messages::{
 };
 
 use crate::channel::{Received, Record, Schema, as_json, header_as_json, matches};
-use crate::foxglove::{self, Calibration, FrameTransform, Level, Outline, Pixels, Place, Pose};
+use crate::foxglove::{
+    self, Calibration, FrameTransform, GeoPosition, Level, Outline, Pixels, Pose,
+};
 use crate::own_autopilot::OwnAutopilot;
 use crate::protobuf::MessageType;
 
@@ -67,7 +69,7 @@ pub struct Display {
     autopilot: OwnAutopilot,
     status: Option<(Phase, String)>,
     warnings: Vec<String>,
-    said: BTreeSet<String>,
+    logged: BTreeSet<String>,
     files: BTreeMap<String, Vec<u8>>,
 }
 
@@ -136,7 +138,7 @@ impl Display {
         Self { utc_offset_ns, vehicle_clock: VehicleClock::new(clock), ..Self::default() }
     }
 
-    /// A message for programs that know nothing of Alight: as JSON, and as it is shown.
+    /// A message for programs other than Alight: as JSON, and as it is shown.
     pub(crate) fn message(&mut self, message: Received<'_>) -> Vec<Record> {
         as_json(message).into_iter().chain(self.records(message)).collect()
     }
@@ -421,18 +423,20 @@ impl Display {
     fn packet(&mut self, stamp_ns: i64, bytes: &MavlinkBytes) -> Vec<Record> {
         let mut packets = Parser::new().push(&bytes.packet);
         packets.retain(|packet| self.autopilot.has_sent(packet));
-        let places = packets.iter().filter_map(|packet| match packet.message.as_ref()? {
+        let positions = packets.iter().filter_map(|packet| match packet.message.as_ref()? {
             // It reports zero before it has a position.
-            MavMessage::GLOBAL_POSITION_INT(at) if at.lat != 0 || at.lon != 0 => Some(Place {
-                latitude_deg: f64::from(at.lat) * 1e-7,
-                longitude_deg: f64::from(at.lon) * 1e-7,
-                altitude_m: f64::from(at.alt) * 1e-3,
-            }),
+            MavMessage::GLOBAL_POSITION_INT(at) if at.lat != 0 || at.lon != 0 => {
+                Some(GeoPosition {
+                    latitude_deg: f64::from(at.lat) * 1e-7,
+                    longitude_deg: f64::from(at.lon) * 1e-7,
+                    altitude_m: f64::from(at.alt) * 1e-3,
+                })
+            }
             _ => None,
         });
-        places
-            .map(|place| {
-                let data = foxglove::location_fix(self.utc(stamp_ns), BODY, place);
+        positions
+            .map(|position| {
+                let data = foxglove::location_fix(self.utc(stamp_ns), BODY, position);
                 shown("vehicle/location".to_owned(), &foxglove::LOCATION_FIX, stamp_ns, data)
             })
             .collect()
@@ -445,7 +449,7 @@ impl Display {
 
     /// A line that is not repeated.
     fn once(&mut self, stamp_ns: i64, level: Level, name: &str, text: &str) -> Option<Record> {
-        if self.said.len() >= MAX_REMEMBERED || !self.said.insert(text.to_owned()) {
+        if self.logged.len() >= MAX_REMEMBERED || !self.logged.insert(text.to_owned()) {
             return None;
         }
         Some(self.line(stamp_ns, level, name, text))
@@ -557,7 +561,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_comes_from_the_own_autopilots_position() {
+    fn a_position_on_the_map_comes_from_the_own_autopilots_position() {
         let mut display = Display::default();
         let mut shown = |system, component, message: &MavMessage| {
             let packet = packet::encode(Sender { system, component }, 0, message);

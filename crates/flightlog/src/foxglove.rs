@@ -1,5 +1,5 @@
 //! Foxglove's well-known types, which its panels show without any set-up: pictures, the detections in them,
-//! calibrations, coordinate frames, poses, places on a map and a log.
+//! calibrations, coordinate frames, poses, positions on a map and a log.
 //!
 //! Names and field numbers are those of Foxglove's schemas; `tests/recording/read.py` compares them with its package
 //! `foxglove-schemas-protobuf`.
@@ -240,7 +240,7 @@ static COVARIANCE_TYPE: EnumType = EnumType {
     ],
 };
 
-/// A place on the map.
+/// A position on the map.
 pub static LOCATION_FIX: MessageType = MessageType {
     name: "foxglove.LocationFix",
     fields: &[
@@ -312,9 +312,9 @@ pub struct Pose {
     pub orientation_wxyz: [f64; 4],
 }
 
-/// A place on the map.
+/// A position on the map.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub struct Place {
+pub struct GeoPosition {
     /// Degrees, north positive.
     pub latitude_deg: f64,
     /// Degrees, east positive.
@@ -404,11 +404,11 @@ pub fn poses_in_frame(stamp_ns: i64, frame_id: &str, poses: &[Pose]) -> Vec<u8> 
 }
 
 /// A position as a [`LOCATION_FIX`] whose uncertainty is unknown.
-pub fn location_fix(stamp_ns: i64, frame_id: &str, place: Place) -> Vec<u8> {
+pub fn location_fix(stamp_ns: i64, frame_id: &str, position: GeoPosition) -> Vec<u8> {
     Encoder::default()
-        .double(1, place.latitude_deg)
-        .double(2, place.longitude_deg)
-        .double(3, place.altitude_m)
+        .double(1, position.latitude_deg)
+        .double(2, position.longitude_deg)
+        .double(3, position.altitude_m)
         .message(6, timestamp(stamp_ns))
         .text(7, frame_id)
         .finish()

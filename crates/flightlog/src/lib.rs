@@ -29,4 +29,4 @@ pub use own_autopilot::OwnAutopilot;
 pub use reader::{Begin, Entry, Reading, in_order, read};
 pub use repair::{Repaired, repair};
 pub use tape::{RecordedTape, TapeReader};
-pub use writer::{About, Problem, Writer};
+pub use writer::{About, Error, Writer};

@@ -1,5 +1,5 @@
 //! Protocol buffers, as far as recordings need them: message types as tables, which describe a type in a file
-//! (`FileDescriptorSet`) and say how its fields are encoded.
+//! (`FileDescriptorSet`) and encode their fields.
 //!
 //! Reference: the wire format and `descriptor.proto` of Protocol Buffers, version 3.
 

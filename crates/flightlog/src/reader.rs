@@ -1,4 +1,4 @@
-//! Reads the messages, facts and files in an MCAP recording as far as it is whole, names its damage, and puts the
+//! Reads the messages, facts and files in an MCAP recording as far as it is valid, names its damage, and puts the
 //! files of one recording in order.
 
 use std::collections::{BTreeMap, HashMap};
@@ -13,7 +13,7 @@ use crate::display::picture_channel;
 use crate::foxglove::{self, Image};
 use crate::records::{Records, check_begin, contained, records_of};
 use crate::repair::DIFFERS;
-use crate::writer::{DROPPED_CHANNEL, METADATA, Problem, TIME_SET};
+use crate::writer::{DROPPED_CHANNEL, Error, METADATA, TIME_SET};
 
 /// An entry of a recording.
 #[derive(Clone, Debug)]
@@ -33,7 +33,7 @@ pub enum Entry<'a> {
     },
     /// Messages that the recorder could not record, since its start, by key.
     Dropped(BTreeMap<String, u64>),
-    /// The clock of UTC was set while the file was open: to so many nanoseconds more than the file's own times say.
+    /// The clock of UTC was set while the file was open: to so many nanoseconds more than the file's own times.
     TimeSet(i64),
 }
 
@@ -52,7 +52,7 @@ pub struct Reading {
 ///
 /// # Errors
 /// When it is no MCAP file at all.
-pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Problem> {
+pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Error> {
     check_begin(recording)?;
     let summary = contained(|| Summary::read(recording)).ok().flatten();
     let mut found = Found {
@@ -79,8 +79,8 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
                 chunks += 1;
                 match records_of(header, &data) {
                     Ok(records) => records.iter().for_each(|record| found.record(record)),
-                    Err(problem) => {
-                        let text = format!("chunk {chunks} is damaged: {problem}");
+                    Err(error) => {
+                        let text = format!("chunk {chunks} is damaged: {error}");
                         found.reading.damage.push(text);
                     }
                 }
@@ -96,8 +96,8 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
                 let text = format!("an unexpected record ({opcode}) after {chunks} chunks");
                 found.reading.damage.push(text);
             }
-            Err(problem) => {
-                let text = format!("a record after {chunks} chunks is damaged: {problem}");
+            Err(error) => {
+                let text = format!("a record after {chunks} chunks is damaged: {error}");
                 found.reading.damage.push(text);
             }
         }
@@ -136,7 +136,7 @@ impl Begin {
 ///
 /// # Errors
 /// When one is no MCAP file at all.
-pub fn in_order(files: &[Vec<u8>]) -> Result<Vec<&[u8]>, Problem> {
+pub fn in_order(files: &[Vec<u8>]) -> Result<Vec<&[u8]>, Error> {
     let mut parts = Vec::new();
     for file in files {
         let mut begin = Begin::default();
@@ -393,7 +393,7 @@ mod tests {
         let (_, _, whole) = times(&file);
         // Where the record that ends the data begins, which has no checksum itself.
         let end = mcap::read::footer(&file).unwrap().summary_start as usize - 13;
-        // The magic bytes identify the file; every sixth bit, so that each place of a byte is among them.
+        // The magic bytes identify the file; every sixth bit, so that each bit of a byte is among them.
         for bit in (8 * mcap::MAGIC.len()..8 * end).step_by(7) {
             let mut flipped = file.clone();
             flipped[bit / 8] ^= 1 << (bit % 8);

@@ -6,7 +6,7 @@ use mcap::McapError;
 use mcap::read::{ChunkReader, footer, parse_record};
 use mcap::records::{ChunkHeader, Record};
 
-use crate::writer::Problem;
+use crate::writer::Error;
 
 /// Length of the record that ends the data: its kind, its length, its checksum.
 const DATA_END_BYTES: usize = 1 + 8 + 4;
@@ -47,7 +47,7 @@ impl<'a> Records<'a> {
 }
 
 impl<'a> Iterator for Records<'a> {
-    type Item = (u8, Result<Record<'a>, Problem>);
+    type Item = (u8, Result<Record<'a>, Error>);
 
     fn next(&mut self) -> Option<Self::Item> {
         let start = self.at;
@@ -78,10 +78,10 @@ impl<'a> Iterator for Records<'a> {
 ///
 /// # Errors
 /// When it does not.
-pub(crate) fn check_begin(recording: &[u8]) -> Result<(), Problem> {
+pub(crate) fn check_begin(recording: &[u8]) -> Result<(), Error> {
     match recording {
-        [] => Err(Problem::Empty),
-        _ if !recording.starts_with(mcap::MAGIC) => Err(Problem::Foreign),
+        [] => Err(Error::Empty),
+        _ if !recording.starts_with(mcap::MAGIC) => Err(Error::Foreign),
         _ => Ok(()),
     }
 }
@@ -90,14 +90,14 @@ pub(crate) fn check_begin(recording: &[u8]) -> Result<(), Problem> {
 ///
 /// # Errors
 /// When it is damaged.
-pub(crate) fn records_of(header: ChunkHeader, data: &[u8]) -> Result<Vec<Record<'_>>, Problem> {
+pub(crate) fn records_of(header: ChunkHeader, data: &[u8]) -> Result<Vec<Record<'_>>, Error> {
     contained(|| ChunkReader::new(header, data)?.collect())
 }
 
 /// The result of `read`; an error too when the reader panics, as it does on some damage.
-pub(crate) fn contained<T>(read: impl FnOnce() -> Result<T, McapError>) -> Result<T, Problem> {
+pub(crate) fn contained<T>(read: impl FnOnce() -> Result<T, McapError>) -> Result<T, Error> {
     let read = catch_unwind(AssertUnwindSafe(read));
-    read.map_err(|_| Problem::Senseless)?.map_err(Problem::from)
+    read.map_err(|_| Error::Senseless)?.map_err(Error::from)
 }
 
 /// The next record's kind and bytes; `None` where it does not end.

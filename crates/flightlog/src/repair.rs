@@ -9,7 +9,7 @@ use mcap::write::{NoSeek, WriteOptions};
 use mcap::{Attachment, Channel, McapError, Summary};
 
 use crate::records::{Records, check_begin, contained, records_of};
-use crate::writer::Problem;
+use crate::writer::Error;
 
 /// The damage of a file of which nothing else is known to be damaged.
 pub(crate) const DIFFERS: &str =
@@ -33,7 +33,7 @@ pub struct Repaired {
 ///
 /// # Errors
 /// When `recording` is no MCAP file at all, or the output does not take it.
-pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem> {
+pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Error> {
     check_begin(recording)?;
     let index = contained(|| Summary::read(recording)).ok().flatten();
     let options = WriteOptions::new().compression(None).disable_seeking(true);
@@ -50,10 +50,10 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
         match record {
             Ok(Record::Chunk { header, data }) => match records_of(header, &data) {
                 Ok(records) => copy.chunk(records)?,
-                Err(problem) => copy
+                Err(error) => copy
                     .found
                     .damage
-                    .push(format!("the chunk after {chunks} whole ones is damaged: {problem}")),
+                    .push(format!("the chunk after {chunks} complete ones is damaged: {error}")),
             },
             Ok(Record::Metadata(metadata)) => copy.mcap.write_metadata(&metadata)?,
             Ok(Record::Attachment { header, data, .. }) => copy.mcap.attach(&Attachment {
@@ -67,11 +67,12 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
             Ok(Record::Header(_) | Record::MessageIndex(_)) => {}
             // Everything else is inside of chunks.
             Ok(_) => {
-                let text = format!("an unexpected record ({opcode}) after {chunks} whole chunks");
+                let text =
+                    format!("an unexpected record ({opcode}) after {chunks} complete chunks");
                 copy.found.damage.push(text);
             }
-            Err(problem) => {
-                let text = format!("a record after {chunks} whole chunks is damaged: {problem}");
+            Err(error) => {
+                let text = format!("a record after {chunks} complete chunks is damaged: {error}");
                 copy.found.damage.push(text);
             }
         }
@@ -114,10 +115,10 @@ impl<W: Write> Copy<'_, W> {
         self.found.chunks += 1;
         for record in records {
             match self.record(record) {
-                Err(problem @ McapError::Io(_)) => return Err(problem),
+                Err(error @ McapError::Io(_)) => return Err(error),
                 // It contradicts earlier records.
-                Err(problem) => {
-                    let text = format!("a description of a channel is damaged: {problem}");
+                Err(error) => {
+                    let text = format!("a description of a channel is damaged: {error}");
                     if !self.found.damage.contains(&text) {
                         self.found.damage.push(text);
                     }

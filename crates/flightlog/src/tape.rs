@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use messages::{Tape, decode, topic};
 
 use crate::reader::{Entry, read};
-use crate::writer::Problem;
+use crate::writer::Error;
 
 /// The tape of one controller, as far as recordings contain it.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -31,7 +31,7 @@ impl TapeReader {
     ///
     /// # Errors
     /// When it is no MCAP file at all.
-    pub fn read(&mut self, recording: &[u8]) -> Result<(), Problem> {
+    pub fn read(&mut self, recording: &[u8]) -> Result<(), Error> {
         let key = topic::TAPE.key(&[]);
         let reading = read(recording, |entry| match entry {
             Entry::Message(message) if message.key == key => {
@@ -51,14 +51,14 @@ impl TapeReader {
                 self.push(tape);
                 Some(begun_ns)
             }
-            Err(problem) => {
-                self.note(format!("a part of a tape {}", problem.in_recording()));
+            Err(error) => {
+                self.note(format!("a part of a tape {}", error.in_recording()));
                 None
             }
         }
     }
 
-    /// Adds a part of a tape. Of two that are of the same place in it, and differ, the first is kept.
+    /// Adds a part of a tape. Of two at the same position in it that differ, the first is used.
     pub fn push(&mut self, tape: Tape) {
         let begun_ns = tape.begun_ns;
         let parts = self.parts.entry(begun_ns).or_default();
@@ -155,7 +155,7 @@ mod tests {
             reader
         };
         let one = reader(3, &[0, 5], b"one");
-        assert!(one.shares_tape_with(&reader(3, &[5, 9], b"one")), "it goes on with it");
+        assert!(one.shares_tape_with(&reader(3, &[5, 9], b"one")), "it continues it");
         assert!(one.shares_tape_with(&reader(3, &[9], b"other")), "no part is in both");
         assert!(!one.shares_tape_with(&reader(3, &[0], b"other")), "another flight");
         assert!(!one.shares_tape_with(&reader(4, &[0, 5], b"one")));

@@ -27,7 +27,7 @@ pub const TIME_SET: &str = "alight-time-set";
 
 /// Why a recording cannot continue.
 #[derive(Debug, thiserror::Error)]
-pub enum Problem {
+pub enum Error {
     /// The file could not be written, or is no MCAP file.
     #[error("{0}")]
     Mcap(#[from] mcap::McapError),
@@ -84,7 +84,7 @@ impl<W: Write> Writer<W> {
     ///
     /// # Errors
     /// When the output does not take it.
-    pub fn new(output: W, about: &About) -> Result<Self, Problem> {
+    pub fn new(output: W, about: &About) -> Result<Self, Error> {
         let options = WriteOptions::new()
             .compression(None)
             .chunk_size(Some(CHUNK_BYTES))
@@ -109,7 +109,7 @@ impl<W: Write> Writer<W> {
     ///
     /// # Errors
     /// When the output does not take it; the recording is then at its end.
-    pub fn receive(&mut self, message: Received<'_>) -> Result<(), Problem> {
+    pub fn receive(&mut self, message: Received<'_>) -> Result<(), Error> {
         if let Some(file) = self.display.file(message) {
             let log_time = self.utc(message.received_ns);
             self.mcap.attach(&Attachment {
@@ -136,7 +136,7 @@ impl<W: Write> Writer<W> {
         message: Received<'_>,
         header: &FrameHeader,
         picture: &Picture,
-    ) -> Result<(), Problem> {
+    ) -> Result<(), Error> {
         self.write(message.received_ns, &channel::raw(Received { payload: b"", ..message }))?;
         for record in self.display.frame(message, header, picture) {
             self.write(message.received_ns, &record)?;
@@ -148,16 +148,16 @@ impl<W: Write> Writer<W> {
     ///
     /// # Errors
     /// As [`Writer::receive`].
-    pub fn dropped(&mut self, now_ns: i64, so_far: &BTreeMap<String, u64>) -> Result<(), Problem> {
+    pub fn dropped(&mut self, now_ns: i64, so_far: &BTreeMap<String, u64>) -> Result<(), Error> {
         self.write(now_ns, &dropped(now_ns, so_far))
     }
 
     /// Notes that the clock of UTC was set while the file is open: from `now_ns` of the stamps' clock on, UTC is ahead of that by
-    /// `utc_offset_ns`. The file's own times go on as before, so that they stay in order.
+    /// `utc_offset_ns`. The file's own times continue as before: they stay in order.
     ///
     /// # Errors
     /// As [`Writer::receive`].
-    pub fn time_set(&mut self, now_ns: i64, utc_offset_ns: i64) -> Result<(), Problem> {
+    pub fn time_set(&mut self, now_ns: i64, utc_offset_ns: i64) -> Result<(), Error> {
         let facts = [
             ("file_time_ns", self.utc(now_ns).to_string()),
             ("utc_offset_ns", utc_offset_ns.to_string()),
@@ -172,7 +172,7 @@ impl<W: Write> Writer<W> {
     ///
     /// # Errors
     /// As [`Writer::receive`].
-    pub fn flush(&mut self) -> Result<(), Problem> {
+    pub fn flush(&mut self) -> Result<(), Error> {
         Ok(self.mcap.flush()?)
     }
 
@@ -180,13 +180,13 @@ impl<W: Write> Writer<W> {
     ///
     /// # Errors
     /// As [`Writer::receive`].
-    pub fn finish(mut self) -> Result<(), Problem> {
+    pub fn finish(mut self) -> Result<(), Error> {
         self.mcap.finish()?;
         Ok(())
     }
 
     /// Adds a record that came at `received_ns`.
-    fn write(&mut self, received_ns: i64, record: &Record) -> Result<(), Problem> {
+    fn write(&mut self, received_ns: i64, record: &Record) -> Result<(), Error> {
         let (log_time, publish_time) = (self.utc(received_ns), self.utc(record.stamp_ns));
         let channel = self.channel(record)?;
         channel.sequence = channel.sequence.wrapping_add(1);
@@ -203,7 +203,7 @@ impl<W: Write> Writer<W> {
         u64::try_from(stamp_ns.saturating_add(self.utc_offset_ns)).unwrap_or(0)
     }
 
-    fn channel(&mut self, record: &Record) -> Result<&mut Open, Problem> {
+    fn channel(&mut self, record: &Record) -> Result<&mut Open, Error> {
         let name = record.schema.name();
         // A camera that starts again may send pictures of another kind: they get a channel of the same name.
         if self.open.get(&record.channel).is_none_or(|open| open.schema != name) {

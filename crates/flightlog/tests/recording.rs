@@ -94,32 +94,35 @@ fn flushed_messages_survive_a_kill_and_are_ended_by_a_repair() {
 
 #[test]
 fn whatever_is_cut_the_whole_chunks_before_it_are_recovered() {
-    let whole = recording(false);
-    let chunks = chunks(&whole);
+    let complete = recording(false);
+    let chunks = chunks(&complete);
     assert_eq!(chunks.len(), MESSAGES / 10);
-    for length in mcap::MAGIC.len()..whole.len() {
+    for length in mcap::MAGIC.len()..complete.len() {
         let mut mended = Vec::new();
-        let found = repair(&whole[..length], &mut mended).unwrap();
+        let found = repair(&complete[..length], &mut mended).unwrap();
         let before = chunks.iter().filter(|chunk| chunk.end <= length).count();
-        assert!(found.chunks as usize >= before, "{length}: {found:?}, {before} chunks are whole");
+        assert!(
+            found.chunks as usize >= before,
+            "{length}: {found:?}, {before} chunks are complete"
+        );
         assert_eq!(numbers(&mended).len(), 10 * found.chunks as usize, "{length}");
-        assert!(!found.damage.is_empty(), "cut at {length} of {}", whole.len());
+        assert!(!found.damage.is_empty(), "cut at {length} of {}", complete.len());
     }
-    assert!(repair(&whole[..4], &mut Vec::new()).is_err());
+    assert!(repair(&complete[..4], &mut Vec::new()).is_err());
 }
 
 #[test]
 fn flipped_bits_are_named_and_lose_no_other_chunk() {
-    let whole = recording(false);
-    let chunks = chunks(&whole);
+    let complete = recording(false);
+    let chunks = chunks(&complete);
     let mut random = 1_u64;
     let mut named = 0;
     for _ in 0..10_000 {
         // Numerical Recipes' generator: any will do.
         random =
             random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        let bit = (random >> 16) as usize % (8 * whole.len());
-        let mut damaged = whole.clone();
+        let bit = (random >> 16) as usize % (8 * complete.len());
+        let mut damaged = complete.clone();
         damaged[bit / 8] ^= 1 << (bit % 8);
         let mut mended = Vec::new();
         let Ok(found) = repair(&damaged, &mut mended) else { continue };

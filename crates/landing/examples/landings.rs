@@ -39,15 +39,15 @@ fn without_samples(flight: Flight) -> Flight {
 fn main() {
     let mut arguments = std::env::args().skip(1);
     let flights = arguments.next().and_then(|n| n.parse().ok()).unwrap_or(100);
-    let wanted = arguments.next().unwrap_or_default();
+    let desired = arguments.next().unwrap_or_default();
     println!("{HEADER}");
     for (name, scene) in WINDS.into_iter().chain(FAULTS).chain(MOVING) {
-        if name.contains(&wanted) {
+        if name.contains(&desired) {
             println!("{}", row(name, &fly(flights, scene)));
         }
     }
     let name = "wind 0-8 m/s, offset 0-4 m, height 5-15 m, latency 20-300 ms";
-    if name.contains(&wanted) {
+    if name.contains(&desired) {
         let all = fly(10 * flights, anything);
         println!("{}", row(name, &all));
         for (seed, flight) in all.iter().enumerate() {

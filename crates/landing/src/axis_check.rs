@@ -1,10 +1,10 @@
 //! Checks before the descent whether the axes of camera and autopilot match, by the scatter of the pad's
-//! place under the configured mount beside that under turned and mirrored ones.
+//! position under the configured mount and under turned and mirrored ones.
 //!
-//! A pad that does not move has one place whatever the vehicle does, if attitude, position and camera mount
+//! A pad that does not move has one position whatever the vehicle does, if attitude, position and camera mount
 //! are as configured. If the camera is turned about the vertical, its image is mirrored, or roll or pitch has
 //! the wrong sign, the pad appears to move with every motion of the vehicle, unless the error is undone. So
-//! the place of the pad is computed under each of a few dozen alternatives, and the one with the smallest
+//! the position of the pad is computed under each of a few dozen alternatives, and the one with the smallest
 //! scatter is compared with the configured one: a likelihood ratio that needs no motion of its own, only
 //! enough of any.
 
@@ -20,7 +20,7 @@ const YAWS: usize = 16;
 const ALTERNATIVES: usize = 2 * YAWS + 2;
 /// Time constant with which past detections are forgotten, in seconds.
 const MEMORY_S: f64 = 3.0;
-/// Expected scatter of a pad's place, in metres, and per metre of range.
+/// Expected scatter of a pad's position, in metres, and per metre of range.
 const NOISE_M: f64 = 0.015;
 const NOISE_PER_M: f64 = 0.003;
 /// Minimum number of detections for a verdict.
@@ -71,7 +71,7 @@ pub struct AxisConsistencyCheck {
     verdict: Verdict,
 }
 
-/// A weighted mean of horizontal places and the sum of squares around it.
+/// A weighted mean of horizontal positions and the sum of squares around it.
 #[derive(Copy, Clone, Debug, Default)]
 struct Sum {
     north: f64,
@@ -93,7 +93,7 @@ impl Default for AxisConsistencyCheck {
 }
 
 impl AxisConsistencyCheck {
-    /// Adds a marker's place in the body, by the configured mount, with the vehicle's motion at the exposure.
+    /// Adds a marker's position in the body, by the configured mount, with the vehicle's motion at the exposure.
     pub fn add(&mut self, stamp: Timestamp, motion: &Motion, in_body: Point<Body>) {
         let after_s = self.newest.map_or(0.0, |newest| stamp.seconds_since(newest));
         if after_s < 0.0 {
@@ -106,7 +106,7 @@ impl AxisConsistencyCheck {
         let noise_m = NOISE_M + NOISE_PER_M * self.range_m;
         let weight = 1.0 / (noise_m * noise_m);
         self.weight = self.weight * keep + weight;
-        let share = weight / self.weight;
+        let fraction = weight / self.weight;
         let (roll, pitch, yaw) = motion.ned_from_body.euler();
         for (index, sum) in self.sums.iter_mut().enumerate() {
             let from_vehicle = match Alternative::from_index(index) {
@@ -116,7 +116,7 @@ impl AxisConsistencyCheck {
                 Alternative::Roll => Rotation::from_euler(-roll, pitch, yaw) * seen,
                 Alternative::Pitch => Rotation::from_euler(roll, -pitch, yaw) * seen,
             };
-            sum.add(motion.odometry + from_vehicle, keep, weight, share);
+            sum.add(motion.odometry + from_vehicle, keep, weight, fraction);
         }
         self.detections = self.detections.saturating_add(1);
         self.decide();
@@ -153,12 +153,12 @@ impl AxisConsistencyCheck {
 
 impl Sum {
     /// West's algorithm for a weighted variance, with forgetting.
-    fn add(&mut self, place: Point<Odometry>, keep: f64, weight: f64, share: f64) {
-        let (north, east) = (place.x() - self.north, place.y() - self.east);
-        self.north += share * north;
-        self.east += share * east;
+    fn add(&mut self, position: Point<Odometry>, keep: f64, weight: f64, fraction: f64) {
+        let (north, east) = (position.x() - self.north, position.y() - self.east);
+        self.north += fraction * north;
+        self.east += fraction * east;
         let apart = north * north + east * east;
-        self.squares = keep * self.squares + weight * (1.0 - share) * apart;
+        self.squares = keep * self.squares + weight * (1.0 - fraction) * apart;
     }
 }
 
@@ -192,7 +192,7 @@ impl Alternative {
     }
 }
 
-/// The true place of the marker in the body if the camera is turned by `turn` more than configured.
+/// The true position of the marker in the body if the camera is turned by `turn` more than configured.
 fn undone(seen: Vector<Body>, turn: f64, mirrored: bool) -> Vector<Body> {
     let (sin, cos) = sincos(turn);
     let y = if mirrored { -seen.y() } else { seen.y() };

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::limits::{ConfigError, check, settings};
 
-/// Upper bound of a hypothesis' detection count, so that a place seen for minutes is replaced as fast as one
+/// Upper bound of a hypothesis' detection count, so that a position seen for minutes is replaced as fast as one
 /// seen for seconds. Also the largest `estimator.restart_after` that can be reached.
 pub(crate) const MAX_COUNTED_DETECTIONS: u32 = 30;
 
@@ -135,8 +135,8 @@ settings! {
         /// Normalised innovation squared (NIS) beyond which a detection is an outlier; chi-square with 3
         /// degrees of freedom exceeds 16.3 once in a thousand times.
         gate: f64 = 16.3, 7.0..=100.0;
-        /// Outliers in agreement that start a new estimate, when the marker is found in a larger share of the
-        /// frames that show their place than of those that show the estimate's place.
+        /// Outliers in agreement that start a new estimate, when the marker is found in a larger fraction of the
+        /// frames that show their position than of those that show the estimate's position.
         restart_after: u32 = 8, 2.0..=f64::from(MAX_COUNTED_DETECTIONS);
         /// Minimum time over which such outliers must come, in s.
         restart_s: f64 = 1.5, 0.0..=10.0;
@@ -165,7 +165,7 @@ settings! {
         /// Maximum age of the newest detection for the marker to count as visible, in s.
         stale_target_s: f64 = 0.4, 0.1..=5.0;
         /// Age of the newest detection beyond which the marker is lost and the vehicle holds or retries, in
-        /// s. More than 1.5 m over the pad, up to 2 s in which the camera does not show the pad's place do not
+        /// s. More than 1.5 m over the pad, up to 2 s in which the camera does not show the pad's position do not
         /// count.
         lost_target_s: f64 = 1.0, 0.1..=10.0;
         /// Age of the vehicle's state beyond which the vehicle holds, in s.
@@ -220,7 +220,7 @@ settings! {
         /// Maximum duration of a retry, in s; then the search starts.
         retry_timeout_s: f64 = 8.0, 1.0..=60.0;
         /// Height over the target above which the vehicle stays while two detectors see the marker at two
-        /// places, in m; from below it climbs back, but not above the height where the landing started. 0 lets it
+        /// positions, in m; from below it climbs back, but not above the height where the landing started. 0 lets it
         /// descend.
         dispute_height_m: f64 = 2.5, 0.0..=50.0;
         /// Maximum time there until the vehicle holds, in s.
@@ -267,7 +267,7 @@ settings! {
 #[serde(rename_all = "kebab-case")]
 pub enum OnAbort {
     /// Hover for `release_after_s`, at `abort_hover_m` or higher, then stop sending setpoints: the autopilot holds its
-    /// position by itself.
+    /// position on its own.
     Hover,
     /// Land where it is, by the autopilot's LAND mode.
     Land,
@@ -325,7 +325,7 @@ settings! {
         stale_target_s: f64 = 0.7, 0.1..=5.0;
         /// Minimum time left until the ground at the present speed, in s, for gusts to be seen and countered.
         gust_time_s: f64 = 2.0, 0.1..=10.0;
-        /// Time for which the autopilot is assumed to follow the last setpoint where it does not say so, in s.
+        /// Time for which the autopilot is assumed to follow the last setpoint where it does not report it, in s.
         /// The descent is so slow that the vehicle, should setpoints stop, still brakes before the ground.
         setpoint_loss_s: f64 = 3.0, 0.1..=60.0;
         /// Height over the target at which LAND takes over, in m.

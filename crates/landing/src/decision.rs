@@ -175,7 +175,7 @@ named! {
         DescendingUnseen = "descending-unseen", "descending on the estimate, the marker is out of view";
         /// No recent detection was used: the descent stops until there is one.
         TargetAging = "target-aging", "no recent detection that could be used, descent stopped";
-        /// The marker is seen at two places, and it is undecided which is the pad.
+        /// The marker is seen at two positions, and it is undecided which is the pad.
         Ambiguous = "ambiguous", "the marker is seen at two places, descent stopped until one is seen in most frames";
         /// Two detectors see the marker at two positions, or with two headings where the vehicle turns to it, and it is not known which is
         /// right.
@@ -276,7 +276,7 @@ named! {
         NoAttitude = "no-attitude", "the vehicle's attitude at its stamp is not known";
         /// The guidance needs metres and the detector gave none.
         NoPose = "no-pose", "it has no pose";
-        /// The pose puts the marker beside or above the vehicle, or out of range.
+        /// The pose puts the marker to the side of or above the vehicle, or out of range.
         Implausible = "implausible", "its pose is not below the vehicle";
         /// The covariance is not one: not symmetric, not positive semi-definite, or huge.
         BadCovariance = "bad-covariance", "its covariance is not valid: not symmetric, not positive semi-definite or larger than any range";

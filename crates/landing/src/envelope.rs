@@ -13,40 +13,48 @@ const FENCE_LEAD_S: f64 = 1.0;
 /// setpoint that is not finite becomes a stop.
 pub fn clamp_setpoint(
     config: &EnvelopeConfig,
-    wanted: Vector<Ned>,
+    desired: Vector<Ned>,
     may_descend: bool,
 ) -> Vector<Ned> {
-    if !wanted.is_finite() {
+    if !desired.is_finite() {
         return Vector::zero();
     }
-    let speed = wanted.horizontal_norm();
+    let speed = desired.horizontal_norm();
     let scale = if speed > config.horizontal_m_s { config.horizontal_m_s / speed } else { 1.0 };
     let max_down = if may_descend { config.descend_m_s } else { 0.0 };
     let clamped = Vector::new(
-        wanted.x() * scale,
-        wanted.y() * scale,
-        wanted.z().clamp(-config.climb_m_s, max_down),
+        desired.x() * scale,
+        desired.y() * scale,
+        desired.z().clamp(-config.climb_m_s, max_down),
     );
     // Finite components can have an infinite length.
     if clamped.is_finite() { clamped } else { Vector::zero() }
 }
 
 /// The velocity without its components that lead out of the fence; the way back stays open.
-pub fn clamp_to_fence(phases: &PhaseConfig, place: Point<Ned>, wanted: Vector<Ned>) -> Vector<Ned> {
-    let ahead = place + wanted * FENCE_LEAD_S;
+pub fn clamp_to_fence(
+    phases: &PhaseConfig,
+    position: Point<Ned>,
+    desired: Vector<Ned>,
+) -> Vector<Ned> {
+    let ahead = position + desired * FENCE_LEAD_S;
     let far = |p: Point<Ned>| hypot(p.x(), p.y());
     let radius_m = phases.fence_radius_m;
-    let leaves = radius_m > 0.0 && far(ahead) > radius_m && far(ahead) > far(place);
-    let (x, y) = if leaves { (0.0, 0.0) } else { (wanted.x(), wanted.y()) };
-    below_fence(phases, place, Vector::new(x, y, wanted.z()))
+    let leaves = radius_m > 0.0 && far(ahead) > radius_m && far(ahead) > far(position);
+    let (x, y) = if leaves { (0.0, 0.0) } else { (desired.x(), desired.y()) };
+    below_fence(phases, position, Vector::new(x, y, desired.z()))
 }
 
 /// The velocity without a climb that leads over the fence.
-pub fn below_fence(phases: &PhaseConfig, place: Point<Ned>, wanted: Vector<Ned>) -> Vector<Ned> {
-    let ahead = place + wanted * FENCE_LEAD_S;
+pub fn below_fence(
+    phases: &PhaseConfig,
+    position: Point<Ned>,
+    desired: Vector<Ned>,
+) -> Vector<Ned> {
+    let ahead = position + desired * FENCE_LEAD_S;
     let is_high = phases.fence_height_m > 0.0 && -ahead.z() > phases.fence_height_m;
-    let z = if is_high { fmax(wanted.z(), 0.0) } else { wanted.z() };
-    Vector::new(wanted.x(), wanted.y(), z)
+    let z = if is_high { fmax(desired.z(), 0.0) } else { desired.z() };
+    Vector::new(desired.x(), desired.y(), z)
 }
 
 #[cfg(test)]
@@ -70,8 +78,8 @@ mod tests {
 
     #[test]
     fn a_setpoint_inside_is_not_changed() {
-        let wanted = Vector::new(0.3, -0.4, 0.5);
-        assert_eq!(clamp_setpoint(&EnvelopeConfig::default(), wanted, true), wanted);
-        assert_eq!(clamp_setpoint(&EnvelopeConfig::default(), wanted, false).z(), 0.0);
+        let desired = Vector::new(0.3, -0.4, 0.5);
+        assert_eq!(clamp_setpoint(&EnvelopeConfig::default(), desired, true), desired);
+        assert_eq!(clamp_setpoint(&EnvelopeConfig::default(), desired, false).z(), 0.0);
     }
 }

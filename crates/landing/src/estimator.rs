@@ -1,4 +1,4 @@
-//! The estimator of the landing point's place and motion: fuses each detection at its own stamp, also late
+//! The estimator of the landing point's position and motion: fuses each detection at its own stamp, also late
 //! ones, and refuses outliers by their innovation.
 //!
 //! It runs the `filter` in the odometry frame, the autopilot's local frame without its jumps
@@ -80,7 +80,7 @@ impl Estimator {
     }
 
     /// Counts a frame without the marker. It alone never makes the competing hypothesis the estimate: a pad
-    /// that blinks must not lose to a place out of view.
+    /// that blinks must not lose to a position out of view.
     pub fn miss(&mut self, frame: &FrameObservation, history: &History) {
         self.hypotheses.set_view(frame);
         if let Some(motion) = history.at(frame.stamp) {
@@ -124,7 +124,7 @@ impl Estimator {
             (kept.detections, kept.heading, kept.hypotheses);
     }
 
-    /// The estimate relative to a vehicle at `vehicle`, at `now`, with the odometry frame's present place.
+    /// The estimate relative to a vehicle at `vehicle`, at `now`, with the odometry frame's present position.
     pub fn estimate(
         &self,
         vehicle: Point<Ned>,
@@ -141,8 +141,8 @@ impl Estimator {
             moved.z = velocity.z * HEAVE_S * (1.0 - left);
             velocity.z *= left;
         }
-        let place = state.position() + moved;
-        let position = ned_from_odometry * Point::new(place.x, place.y, place.z);
+        let moved = state.position() + moved;
+        let position = ned_from_odometry * Point::new(moved.x, moved.y, moved.z);
         let offset = position - vehicle;
         Some(TargetEstimate {
             position,
@@ -163,15 +163,15 @@ impl Estimator {
         self.past.back().map(|fused| fused.measurement.stamp)
     }
 
-    /// The estimated place at a time.
-    fn place_at(&self, stamp: Timestamp) -> Option<Point<Odometry>> {
+    /// The estimated position at a time.
+    fn position_at(&self, stamp: Timestamp) -> Option<Point<Odometry>> {
         let newest = self.past.back()?;
         Some(newest.state.position_after(stamp.seconds_since(newest.measurement.stamp)))
     }
 
     fn count(&mut self, stamp: Timestamp, motion: &Motion, supported: Option<Supported>) {
-        let place = self.place_at(stamp);
-        self.hypotheses.count(stamp, motion, place, supported);
+        let position = self.position_at(stamp);
+        self.hypotheses.count(stamp, motion, position, supported);
     }
 
     /// Inserts a detection at its stamp, and fuses those after it again.
@@ -185,11 +185,11 @@ impl Estimator {
             self.hypotheses.restart(stamp);
             return Ok(());
         }
-        let place = self.past.partition_point(|fused| fused.measurement.stamp < stamp);
-        if self.past.get(place).is_some_and(|fused| fused.measurement.stamp == stamp) {
+        let index = self.past.partition_point(|fused| fused.measurement.stamp < stamp);
+        if self.past.get(index).is_some_and(|fused| fused.measurement.stamp == stamp) {
             return Err(Rejection::Duplicate);
         }
-        let Some(before) = place.checked_sub(1).and_then(|index| self.past.get(index)) else {
+        let Some(before) = index.checked_sub(1).and_then(|index| self.past.get(index)) else {
             return Err(Rejection::Stale);
         };
         let mut state = before.state.clone();
@@ -197,8 +197,8 @@ impl Estimator {
         let fit = state.predict_to(&self.config, dt_s, &measurement);
         self.nis = Some(fit.nis);
         if !fit.is_inlier {
-            let place = self.place_at(stamp);
-            self.hypotheses.count_outlier(&self.config, &measurement, motion, place);
+            let position = self.position_at(stamp);
+            self.hypotheses.count_outlier(&self.config, &measurement, motion, position);
             return if self.resolve(stamp) { Ok(()) } else { Err(Rejection::Outlier) };
         }
         self.count(stamp, motion, Some(Supported::Estimate));
@@ -210,9 +210,9 @@ impl Estimator {
         if self.past.len() == MEMORY {
             self.past.pop_front();
         }
-        let place = self.past.partition_point(|fused| fused.measurement.stamp < stamp);
-        self.past.insert(place, FusedMeasurement { measurement, state });
-        self.fuse_again(place + 1);
+        let index = self.past.partition_point(|fused| fused.measurement.stamp < stamp);
+        self.past.insert(index, FusedMeasurement { measurement, state });
+        self.fuse_again(index + 1);
         Ok(())
     }
 

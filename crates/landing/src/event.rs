@@ -108,14 +108,14 @@ impl Default for AutopilotLimits {
 }
 
 impl AutopilotLimits {
-    /// Smallest and largest value that is believed of each limit; ArduPilot's own ranges are narrower.
-    const BELIEVED: std::ops::RangeInclusive<f64> = 0.05..=60.0;
+    /// Smallest and largest plausible value of each limit; ArduPilot's own ranges are narrower.
+    const PLAUSIBLE: std::ops::RangeInclusive<f64> = 0.05..=60.0;
 
     /// The limits, with the defaults in place of values that no vehicle has.
     #[must_use]
     pub fn plausible(self) -> Self {
         let or = |value: f64, default: f64| {
-            if Self::BELIEVED.contains(&value) { value } else { default }
+            if Self::PLAUSIBLE.contains(&value) { value } else { default }
         };
         let default = Self::default();
         Self {

@@ -62,7 +62,7 @@ const HEIGHT_WANDER_M_S: f64 = 0.2;
 const WANDER_RAD: f64 = 0.004;
 const WANDER_RAD_S: f64 = 0.01;
 
-/// Share of the configured time offset by which it walks, per square root of a second.
+/// Fraction of the configured time offset by which it walks, per square root of a second.
 const OFFSET_CHANGE: f64 = 0.02;
 
 type Mean = SVector<f64, STATES>;
@@ -174,7 +174,7 @@ impl State {
     }
 
     /// Advances the state by `dt_s` to a detection, and returns how it fits. A detection beyond the gate that
-    /// is as near as the autopilot's position and tilt may have wandered since the last one is none of another place: the covariance of
+    /// is as near as the autopilot's position and tilt may have wandered since the last one is not of another position: the covariance of
     /// position and velocity is widened by the factor by which it is beyond (a fading factor: Xia, Rao, Ying, Shen: Adaptive Fading
     /// Kalman Filter with an Application, Automatica 30, 1994).
     pub(crate) fn predict_to(

@@ -1,4 +1,4 @@
-//! The vehicle's last states in the order of their stamps, and its motion (pose, velocity, turn rate, place in the odometry frame)
+//! The vehicle's last states in the order of their stamps, and its motion (pose, velocity, turn rate, position in the odometry frame)
 //! interpolated at any time.
 
 use std::collections::VecDeque;
@@ -19,7 +19,7 @@ const MAX_GAP_S: f64 = 0.5;
 const JUMP_M: f64 = 0.1;
 const JUMP_M_S: f64 = 0.5;
 /// Maximum gap over which a jump is distinguished from a change of the velocity, in seconds: a vehicle that brakes by 2 m/s in a longer
-/// one has moved by metres less than the mean of its velocities says. Over a longer one only a difference that no velocity explains is a
+/// one has moved by metres less than by the mean of its velocities. Over a longer one only a difference that no velocity explains is a
 /// jump: the larger of the two, and so much more, in m/s.
 const MAX_JUMP_GAP_S: f64 = 1.0;
 const MARGIN_M_S: f64 = 1.0;
@@ -55,7 +55,7 @@ impl Motion {
         Rotation::from_quaternion(self.ned_from_body.quaternion)
     }
 
-    /// At rest, its odometry that of the position.
+    /// Stationary, its odometry that of the position.
     #[cfg(test)]
     pub(crate) fn still(ned_from_body: Rotation<Ned, Body>, position: Point<Ned>) -> Self {
         Self {

@@ -1,6 +1,6 @@
-//! Staying at a place: which one a vehicle that hovers stays at, and the velocity back to it.
+//! Holds a hovering vehicle at its position: chooses the position, and computes the velocity back to it.
 //!
-//! ArduPilot holds its place by itself while the commanded velocity is zero. PX4 holds that velocity as it estimates it: where the
+//! ArduPilot holds its position on its own while the commanded velocity is zero. PX4 holds that velocity as it estimates it: where the
 //! estimate errs, as in wind and with a wrong tilt, the vehicle drifts away as fast as it errs. So a hover commands a velocity back
 //! to its position in the odometry frame, in which the autopilot's jumps do not move it. The remaining error is that of the velocity over
 //! `RETURN_PER_S`.
@@ -10,7 +10,7 @@ use libm::{fmax, fmin};
 
 use crate::time::Timestamp;
 
-/// Velocity back to a place per metre from it, in 1/s: slower than an autopilot's velocity loop, which it must not excite.
+/// Velocity back to a position per metre from it, in 1/s: slower than an autopilot's velocity loop, which it must not excite.
 const RETURN_PER_S: f64 = 0.5;
 
 /// Maximum speed back to the position of a hover, in m/s: more than the error of an autopilot's velocity.
@@ -21,7 +21,7 @@ const MAX_RETURN_M_S: f64 = 1.0;
 const MAX_REST_M_S: f64 = 0.3;
 const MAX_BRAKING_S: f64 = 2.0;
 
-/// The horizontal velocity of a vehicle to a place that is so far from it, in m/s, at most as fast as `max_m_s`.
+/// The horizontal velocity of a vehicle to a position that is so far from it, in m/s, at most as fast as `max_m_s`.
 pub(crate) fn back(offset: Vector<Odometry>, max_m_s: f64) -> Vector<Ned> {
     let back = Vector::<Ned>::new(offset.x(), offset.y(), 0.0) * RETURN_PER_S;
     let scale = fmin(1.0, max_m_s / fmax(back.horizontal_norm(), f64::MIN_POSITIVE));
@@ -35,26 +35,26 @@ pub(crate) struct Hover {
     /// The time of the vehicle's newest state.
     newest: Timestamp,
     /// Where it stays, once it has braked.
-    place: Option<Point<Odometry>>,
+    position: Option<Point<Odometry>>,
 }
 
 impl Hover {
     /// A hover that begins with a state of this time.
     pub(crate) fn new(stamp: Timestamp) -> Self {
-        Self { began: stamp, newest: stamp, place: None }
+        Self { began: stamp, newest: stamp, position: None }
     }
 
     /// Where the vehicle stays; `None` while it brakes.
-    pub(crate) fn place(&self) -> Option<Point<Odometry>> {
-        self.place
+    pub(crate) fn position(&self) -> Option<Point<Odometry>> {
+        self.position
     }
 
-    /// The horizontal velocity in m/s of a vehicle that was at `place` at `stamp`, with this horizontal speed. After a silence of more
+    /// The horizontal velocity in m/s of a vehicle that was at `position` at `stamp`, with this horizontal speed. After a silence of more
     /// than `max_gap_s` the hover restarts: its motion in the gap is not known.
     pub(crate) fn velocity(
         &mut self,
         stamp: Timestamp,
-        place: Point<Odometry>,
+        position: Point<Odometry>,
         speed_m_s: f64,
         max_gap_s: f64,
     ) -> Vector<Ned> {
@@ -64,9 +64,9 @@ impl Hover {
         self.newest = stamp;
         let rests = speed_m_s < MAX_REST_M_S || stamp.seconds_since(self.began) >= MAX_BRAKING_S;
         if rests {
-            self.place.get_or_insert(place);
+            self.position.get_or_insert(position);
         }
-        self.place.map_or(Vector::zero(), |stays_at| back(stays_at - place, MAX_RETURN_M_S))
+        self.position.map_or(Vector::zero(), |stays_at| back(stays_at - position, MAX_RETURN_M_S))
     }
 }
 
@@ -80,17 +80,17 @@ mod tests {
     /// The way of a vehicle that hovers from the origin on, at first with this velocity. The autopilot's velocity errs by `drift`; the
     /// vehicle takes half a second to fly as commanded, and `delay_s` until it begins to.
     fn fly(from: Vector<Odometry>, drift: Vector<Odometry>, delay_s: f64) -> Vec<Point<Odometry>> {
-        let (mut place, mut flown, mut path) = (Point::<Odometry>::origin(), from, Vec::new());
+        let (mut position, mut flown, mut path) = (Point::<Odometry>::origin(), from, Vec::new());
         let mut sent: VecDeque<_> = (0..(delay_s / DT_S) as u32).map(|_| Vector::zero()).collect();
         let mut hover = Hover::new(Timestamp::from_seconds(0.0));
         for step in 0..2000 {
             let now = Timestamp::from_seconds(f64::from(step) * DT_S);
-            sent.push_back(hover.velocity(now, place, flown.horizontal_norm(), 0.5));
-            let wanted = sent.pop_front().unwrap_or(Vector::zero());
-            assert!(wanted.norm() <= MAX_RETURN_M_S + 1e-9, "{wanted:?}");
-            flown = flown + (Vector::from_coords(wanted.coords) - flown) * (DT_S / 0.5);
-            place = place + (flown + drift) * DT_S;
-            path.push(place);
+            sent.push_back(hover.velocity(now, position, flown.horizontal_norm(), 0.5));
+            let desired = sent.pop_front().unwrap_or(Vector::zero());
+            assert!(desired.norm() <= MAX_RETURN_M_S + 1e-9, "{desired:?}");
+            flown = flown + (Vector::from_coords(desired.coords) - flown) * (DT_S / 0.5);
+            position = position + (flown + drift) * DT_S;
+            path.push(position);
         }
         path
     }
@@ -101,7 +101,7 @@ mod tests {
     }
 
     fn farthest_m(path: &[Point<Odometry>], from: Point<Odometry>) -> f64 {
-        path.iter().map(|place| (*place - from).horizontal_norm()).fold(0.0, f64::max)
+        path.iter().map(|position| (*position - from).horizontal_norm()).fold(0.0, f64::max)
     }
 
     #[test]
@@ -140,7 +140,7 @@ mod tests {
     fn one_that_is_never_slow_stays_where_it_is_after_two_seconds() {
         let mut hover = Hover::new(Timestamp::from_seconds(0.0));
         for tenths in 0..=20 {
-            assert_eq!(hover.place(), None);
+            assert_eq!(hover.position(), None);
             let seconds = 0.1 * f64::from(tenths);
             hover.velocity(
                 Timestamp::from_seconds(seconds),
@@ -149,6 +149,6 @@ mod tests {
                 0.5,
             );
         }
-        assert_eq!(hover.place(), Some(Point::new(2.0, 0.0, 0.0)));
+        assert_eq!(hover.position(), Some(Point::new(2.0, 0.0, 0.0)));
     }
 }

@@ -1,13 +1,13 @@
-//! Two hypotheses of where the pad is: the estimate, and a competing place at which outliers agree.
+//! Two hypotheses of where the pad is: the estimate, and a competing position at which outliers agree.
 //!
-//! Detections of one place alone do not decide between the two, because the other may just be out of view:
-//! low over the ground, or while the vehicle tilts into the wind. So support is the share of the frames
-//! showing a place in which the marker was there, and a place out of view keeps its support for a while. The
-//! competing place becomes the estimate, and the estimate the competing place, once its share is clearly
-//! larger over a long enough time. A pad that is moved is found again within seconds where its old place is
+//! Detections of one position alone do not decide between the two, because the other may just be out of view:
+//! low over the ground, or while the vehicle tilts into the wind. So support is the fraction of the frames
+//! showing a position in which the marker was there, and a position out of view keeps its support for a while. The
+//! competing position becomes the estimate, and the estimate the competing position, once its fraction is clearly
+//! larger over a long enough time. A pad that is moved is found again within seconds where its old position is
 //! in view, and a second marker is not accepted just because the first is out of view. An estimate with few
 //! detections is replaced at once. While the marker is elsewhere in most of the frames that show the
-//! estimate's place, the estimate is ambiguous, and the vehicle does not descend.
+//! estimate's position, the estimate is ambiguous, and the vehicle does not descend.
 
 use geometry::{Odometry, Point};
 use libm::{exp, fmax, fmin};
@@ -20,16 +20,16 @@ use crate::measurement::Measurement;
 use crate::time::Timestamp;
 use crate::view::View;
 
-/// Time constant with which frames that show the place are forgotten, in seconds.
+/// Time constant with which frames that show the position are forgotten, in seconds.
 const SHOWN_S: f64 = 2.0;
 
-/// Time constant with which a place out of view loses its support, in seconds.
+/// Time constant with which a position out of view loses its support, in seconds.
 const UNSHOWN_S: f64 = 6.0;
 
 /// Longest interval between two frames that is counted, in seconds.
 const MAX_GAP_S: f64 = 0.2;
 
-/// Difference of the shares from which one hypothesis is clearly better than the other.
+/// Difference of the fractions from which one hypothesis is clearly better than the other.
 const MAJORITY: f64 = 0.2;
 
 /// Gate for associating an outlier with the competing hypothesis, in metres, in addition to both
@@ -39,10 +39,10 @@ const ASSOCIATION_GATE_M: f64 = 0.15;
 /// A competing hypothesis with fewer detections than this is replaced by the next outlier.
 const MIN_DETECTIONS: f64 = 0.5;
 
-/// The estimate is ambiguous when the competing hypothesis has this many detections and the estimate's share
+/// The estimate is ambiguous when the competing hypothesis has this many detections and the estimate's fraction
 /// is below the second number.
 const AMBIGUOUS_DETECTIONS: f64 = 2.5;
-const AMBIGUOUS_SHARE: f64 = 0.5;
+const AMBIGUOUS_FRACTION: f64 = 0.5;
 
 /// Which hypothesis a frame's marker supports.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -54,17 +54,17 @@ pub(crate) enum Supported {
 /// The frames that support one hypothesis, older ones with less weight.
 #[derive(Copy, Clone, Debug, PartialEq)]
 struct HypothesisSupport {
-    /// Frames showing the place with the marker there, and all frames showing the place.
+    /// Frames showing the position with the marker there, and all frames showing the position.
     seen: f64,
     shown: f64,
     /// All detections there, including those at the image's edge.
     detections: f64,
-    /// Share of the support that is left after a time out of view.
+    /// Fraction of the support that is left after a time out of view.
     trust: f64,
     newest: Timestamp,
 }
 
-/// A place at which outliers agree.
+/// A position at which outliers agree.
 #[derive(Copy, Clone, Debug)]
 struct Hypothesis {
     newest: Measurement,
@@ -94,7 +94,7 @@ impl Hypotheses {
         self.competitor = None;
     }
 
-    /// Counts a frame for both hypotheses; `estimate` is the estimated place at its stamp.
+    /// Counts a frame for both hypotheses; `estimate` is the estimated position at its stamp.
     pub(crate) fn count(
         &mut self,
         stamp: Timestamp,
@@ -103,14 +103,15 @@ impl Hypotheses {
         supported: Option<Supported>,
     ) {
         let view = self.view;
-        let is_shown = |place: Point<Odometry>| view.is_none_or(|view| view.shows(place, motion));
-        if let (Some(support), Some(place)) = (&mut self.estimate, estimate) {
-            support.count(stamp, is_shown(place), supported == Some(Supported::Estimate));
+        let is_shown =
+            |position: Point<Odometry>| view.is_none_or(|view| view.shows(position, motion));
+        if let (Some(support), Some(position)) = (&mut self.estimate, estimate) {
+            support.count(stamp, is_shown(position), supported == Some(Supported::Estimate));
         }
         if let Some(competitor) = &mut self.competitor {
-            let place = point(competitor.newest.position);
+            let position = point(competitor.newest.position);
             let is_seen = supported == Some(Supported::Competitor);
-            competitor.support.count(stamp, is_shown(place), is_seen);
+            competitor.support.count(stamp, is_shown(position), is_seen);
         }
     }
 
@@ -123,7 +124,8 @@ impl Hypotheses {
         motion: &Motion,
         estimate: Option<Point<Odometry>>,
     ) {
-        let agrees = self.competitor.is_some_and(|it| is_same_place(config, outlier, &it.newest));
+        let agrees =
+            self.competitor.is_some_and(|it| is_same_position(config, outlier, &it.newest));
         self.count(outlier.stamp, motion, estimate, agrees.then_some(Supported::Competitor));
         match &mut self.competitor {
             Some(competitor) if agrees => {
@@ -142,10 +144,10 @@ impl Hypotheses {
         }
     }
 
-    /// True while it is undecided which of two places is the pad.
+    /// True while it is undecided which of two positions is the pad.
     pub(crate) fn is_ambiguous(&self) -> bool {
         self.competitor.is_some_and(|it| it.support.detections >= AMBIGUOUS_DETECTIONS)
-            && self.estimate.is_some_and(|support| support.share() < AMBIGUOUS_SHARE)
+            && self.estimate.is_some_and(|support| support.fraction() < AMBIGUOUS_FRACTION)
     }
 
     /// Swaps the hypotheses when the competing one is clearly better; returns the measurement from which the
@@ -175,7 +177,7 @@ impl Hypotheses {
 }
 
 impl HypothesisSupport {
-    /// A place seen in one frame.
+    /// A position seen in one frame.
     fn new(stamp: Timestamp) -> Self {
         Self { seen: 1.0, shown: 1.0, detections: 1.0, trust: 1.0, newest: stamp }
     }
@@ -201,18 +203,18 @@ impl HypothesisSupport {
         self.trust = 1.0;
     }
 
-    /// Share of the frames showing the place in which the marker was there, from 0 to 1.
-    fn share(&self) -> f64 {
+    /// Fraction of the frames showing the position in which the marker was there, from 0 to 1.
+    fn fraction(&self) -> f64 {
         self.trust * self.seen / fmax(self.shown, 1.0)
     }
 
-    /// True when the marker is clearly more often here than at the other place.
+    /// True when the marker is clearly more often here than at the other position.
     fn beats(&self, other: &Self) -> bool {
-        self.share() > other.share() + MAJORITY
+        self.fraction() > other.fraction() + MAJORITY
     }
 }
 
-fn is_same_place(config: &EstimatorConfig, one: &Measurement, other: &Measurement) -> bool {
+fn is_same_position(config: &EstimatorConfig, one: &Measurement, other: &Measurement) -> bool {
     let gap_s = one.stamp.seconds_since(other.stamp).abs();
     let reach_m = ASSOCIATION_GATE_M
         + 3.0 * (one.noise.trace() + other.noise.trace()).sqrt()
@@ -237,15 +239,15 @@ mod tests {
     }
 
     #[test]
-    fn the_share_is_that_of_the_frames_that_show_the_place() {
+    fn the_fraction_is_that_of_the_frames_that_show_the_position() {
         let third = counted(150, true, |i| i % 3 == 0);
         let rest = counted(150, true, |i| i % 3 != 0);
-        assert!((third.share() - 0.33).abs() < 0.05 && (rest.share() - 0.67).abs() < 0.05);
+        assert!((third.fraction() - 0.33).abs() < 0.05 && (rest.fraction() - 0.67).abs() < 0.05);
         assert!(rest.beats(&third) && !third.beats(&rest));
     }
 
     #[test]
-    fn a_place_out_of_view_keeps_its_support_for_seconds() {
+    fn a_position_out_of_view_keeps_its_support_for_seconds() {
         let mut pad = counted(60, true, |_| true);
         let mut other = HypothesisSupport::new(Timestamp::from_seconds(4.0));
         for i in 0..60 {
@@ -253,19 +255,19 @@ mod tests {
             pad.count(stamp, false, false);
             other.count(stamp, true, i % 3 == 0);
         }
-        assert!(pad.share() > 0.5 && !other.beats(&pad), "{pad:?}");
+        assert!(pad.fraction() > 0.5 && !other.beats(&pad), "{pad:?}");
     }
 
     #[test]
-    fn a_place_seen_for_minutes_is_forgotten_as_soon_as_one_seen_for_seconds() {
+    fn a_position_seen_for_minutes_is_forgotten_as_soon_as_one_seen_for_seconds() {
         let left_after_s = |frames: u32| {
-            let mut place = counted(frames, true, |_| true);
+            let mut position = counted(frames, true, |_| true);
             let start_s = f64::from(frames) / 15.0;
             for i in 0..15 * 30 {
                 let stamp = Timestamp::from_seconds(start_s + f64::from(i) / 15.0);
-                place.count(stamp, true, false);
+                position.count(stamp, true, false);
             }
-            place.detections
+            position.detections
         };
         assert!((left_after_s(15 * 600) - left_after_s(15 * 3)).abs() < 1e-6);
         assert!(left_after_s(15 * 600) < 0.5, "{}", left_after_s(15 * 600));

@@ -53,7 +53,7 @@ const MAX_DISPUTED_LAND_M: f64 = 0.3;
 /// believed: estimates of the height err by decimetres.
 const MAX_CONTACT_M: f64 = 1.0;
 
-/// Maximum vertical speed at which that report is believed, in m/s, in addition to the pad's heave.
+/// Maximum vertical speed at which that report is accepted, in m/s, in addition to the pad's heave.
 const MAX_CONTACT_M_S: f64 = 0.5;
 
 /// Maximum delay of the link to the autopilot, both ways together, in seconds, at which the vehicle is steered;
@@ -115,11 +115,11 @@ pub struct Lander {
     half_view_rad: Option<f64>,
     /// The expanding square that is being flown.
     square: Option<Square>,
-    /// The hover that goes on.
+    /// The present hover.
     hover: Option<Hover>,
     /// How the autopilot follows setpoints.
     limits: AutopilotLimits,
-    /// Since when two detectors see the marker at two places.
+    /// Since when two detectors see the marker at two positions.
     disputed: Option<Timestamp>,
 }
 
@@ -224,10 +224,10 @@ impl Lander {
             self.guidance = ActiveGuidance::new(self.config.guidance);
             self.standing_height = StandingHeight::default();
             self.begin_checks();
-            self.start = self.place().unwrap_or(Point::origin());
+            self.start = self.position().unwrap_or(Point::origin());
         }
         let (action, why) = self.act(now);
-        let action = self.keep_place(now, action);
+        let action = self.keep_position(now, action);
         Decision {
             phase: self.state_machine.phase(),
             action,
@@ -237,12 +237,12 @@ impl Lander {
         }
     }
 
-    /// The next landing is one that an earlier controller began; with the pad's place as that one knew it.
+    /// The next landing is one that an earlier controller began; with the pad's position as that one knew it.
     pub fn resume(&mut self, pad: Option<RememberedPad>) {
         self.resumed = Some(Resumed::new(pad));
     }
 
-    /// The pad's place for a controller that has to take over this landing; `None` where it is not known well.
+    /// The pad's position for a controller that has to take over this landing; `None` where it is not known well.
     pub fn pad_to_remember(&self) -> Option<SeenPad> {
         let target = self.target(self.now?)?;
         let is_active = !self.phase().is_terminal() && !self.pad_moves();
@@ -264,7 +264,7 @@ impl Lander {
         self.state_machine.phase()
     }
 
-    /// True while a landing that began goes on only by a command: it was aborted, or held for a reason that does not pass by itself.
+    /// True while a landing that began continues only by a command: it was aborted, or held for a reason that does not end on its own.
     pub fn waits_for_operator(&self) -> bool {
         self.state_machine.waits_for_operator()
     }
@@ -313,7 +313,7 @@ impl Lander {
         let is_standing =
             self.landed(now) == Landed::OnGround && state.velocity.norm() <= MAX_STANDING_M_S;
         if is_standing {
-            self.ground = self.place();
+            self.ground = self.position();
             let is_of_landing = self.phase() == Phase::Final && !self.pad_moves();
             self.standing_height.observe(is_of_landing.then(|| self.target(now)).flatten());
         }
@@ -321,13 +321,13 @@ impl Lander {
     }
 
     /// Where the vehicle is, apart from the jumps of the autopilot's position.
-    fn place(&self) -> Option<Point<Odometry>> {
+    fn position(&self) -> Option<Point<Odometry>> {
         Some(self.history.ned_from_odometry().inverse() * self.history.newest()?.position)
     }
 
-    /// Height over the local origin of a place, in metres.
-    fn altitude_of(&self, place: Point<Odometry>) -> f64 {
-        -(self.history.ned_from_odometry() * place).z()
+    /// Height over the local origin of a position, in metres.
+    fn altitude_of(&self, position: Point<Odometry>) -> f64 {
+        -(self.history.ned_from_odometry() * position).z()
     }
 
     fn recent_target(&self, now: Timestamp) -> Option<TargetEstimate> {
@@ -610,7 +610,7 @@ impl Lander {
         is_held && self.disputed.is_none()
     }
 
-    /// The hold after too long a wait over the target while detectors see the marker at two places.
+    /// The hold after too long a wait over the target while detectors see the marker at two positions.
     fn dispute_alarm(&self, now: Timestamp) -> Option<(AlarmAction, Reason)> {
         let phases = &self.config.phases;
         let since = self.disputed?;
@@ -629,22 +629,22 @@ impl Lander {
             && !self.guidance.touches_down(situation)
     }
 
-    /// The velocity while detectors see the marker at two places: not below a height from which the vehicle
+    /// The velocity while detectors see the marker at two positions: not below a height from which the vehicle
     /// can still be led to either, and back up to it, but neither over the fence nor over the height where the
     /// landing started.
     fn disputed_velocity(
         &self,
-        place: Point<Ned>,
+        position: Point<Ned>,
         target: &TargetEstimate,
-        wanted: Vector<Ned>,
+        desired: Vector<Ned>,
     ) -> Vector<Ned> {
         let phases = &self.config.phases;
         let above_m = target.height_m - phases.dispute_height_m;
-        let below_start_m = libm::fmax(self.altitude_of(self.start) + place.z(), 0.0);
+        let below_start_m = libm::fmax(self.altitude_of(self.start) + position.z(), 0.0);
         let max_climb_m_s = libm::fmin(phases.retry_climb_m_s, below_start_m);
         let down_m_s = libm::fmax(above_m, -max_climb_m_s);
-        let level = Vector::new(wanted.x(), wanted.y(), libm::fmin(wanted.z(), down_m_s));
-        envelope::below_fence(phases, place, level)
+        let level = Vector::new(desired.x(), desired.y(), libm::fmin(desired.z(), down_m_s));
+        envelope::below_fence(phases, position, level)
     }
 
     fn guided(&mut self, now: Timestamp) -> (Action, Reason) {
@@ -652,21 +652,21 @@ impl Lander {
             return (Action::hover(), Reason::VehicleStale);
         };
         let situation = self.situation(now, &vehicle);
-        let (mut wanted, mut why) = self.guidance.velocity(&situation);
+        let (mut desired, mut why) = self.guidance.velocity(&situation);
         if self.waits_for_agreement(&situation)
             && let Some(target) = situation.target
         {
-            let level = self.disputed_velocity(vehicle.position, &target, wanted);
-            if level.z() < wanted.z() {
-                (wanted, why) = (level, Reason::Disputed);
+            let level = self.disputed_velocity(vehicle.position, &target, desired);
+            if level.z() < desired.z() {
+                (desired, why) = (level, Reason::Disputed);
             }
         }
         let may_descend =
             self.guidance.may_descend(&situation) && situation.level_because.is_none();
-        if let Some(reason) = situation.level_because.filter(|_| wanted.z() > 0.0) {
+        if let Some(reason) = situation.level_because.filter(|_| desired.z() > 0.0) {
             why = reason;
         }
-        let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, may_descend);
+        let velocity = envelope::clamp_setpoint(&self.config.envelope, desired, may_descend);
         let yaw_rate = self.guidance.yaw_rate(&situation);
         self.guidance.on_setpoint_sent(velocity);
         (Action::Velocity { velocity, yaw_rate }, why)
@@ -675,7 +675,7 @@ impl Lander {
     /// Climbs to where the legs overlap in the camera's view, as far as the fence allows, and flies the
     /// expanding square.
     fn search(&mut self, now: Timestamp) -> Action {
-        let (Some(vehicle), Some(place)) = (self.history.newest(), self.place()) else {
+        let (Some(vehicle), Some(position)) = (self.history.newest(), self.position()) else {
             return Action::hover();
         };
         let phases = &self.config.phases;
@@ -695,20 +695,25 @@ impl Lander {
         let up = envelope::clamp_setpoint(&self.config.envelope, up, false);
         let is_low = altitude_m < self.altitude_m(now, phases.search_height_m);
         let height_m = self.height_m(now);
-        let wanted = if self.square.is_none() && is_low && up.z() < 0.0 {
+        let desired = if self.square.is_none() && is_low && up.z() < 0.0 {
             up
         } else {
-            // About where the search began, if the wind keeps the vehicle beside it.
-            let centre = self.hover.and_then(|hover| hover.place()).unwrap_or(place);
+            // About where the search began, if the wind keeps the vehicle next to it.
+            let centre = self.hover.and_then(|hover| hover.position()).unwrap_or(position);
             let square = self.square.get_or_insert_with(|| {
                 Square::new(&self.config, now, centre, vehicle.ned_from_body, height_m)
             });
-            let legs = square.velocity(phases, place);
-            let wanted = envelope::clamp_to_fence(phases, vehicle.position, legs);
-            square.move_on(phases, now, place, wanted.horizontal_norm() < legs.horizontal_norm());
-            wanted
+            let legs = square.velocity(phases, position);
+            let desired = envelope::clamp_to_fence(phases, vehicle.position, legs);
+            square.move_on(
+                phases,
+                now,
+                position,
+                desired.horizontal_norm() < legs.horizontal_norm(),
+            );
+            desired
         };
-        let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
+        let velocity = envelope::clamp_setpoint(&self.config.envelope, desired, false);
         Action::Velocity { velocity, yaw_rate: 0.0 }
     }
 
@@ -726,8 +731,8 @@ impl Lander {
         if !is_recent {
             return Action::hover();
         }
-        let wanted = Vector::new(0.0, 0.0, self.config.phases.refused_descend_m_s);
-        let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, true);
+        let desired = Vector::new(0.0, 0.0, self.config.phases.refused_descend_m_s);
+        let velocity = envelope::clamp_setpoint(&self.config.envelope, desired, true);
         Action::Velocity { velocity, yaw_rate: 0.0 }
     }
 
@@ -768,9 +773,9 @@ impl Lander {
     /// Climbs, as far as the fence allows.
     fn climb(&self, climb_m_s: f64) -> Action {
         let Some(vehicle) = self.history.newest() else { return Action::hover() };
-        let wanted = Vector::new(0.0, 0.0, -climb_m_s);
-        let wanted = envelope::below_fence(&self.config.phases, vehicle.position, wanted);
-        let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
+        let desired = Vector::new(0.0, 0.0, -climb_m_s);
+        let desired = envelope::below_fence(&self.config.phases, vehicle.position, desired);
+        let velocity = envelope::clamp_setpoint(&self.config.envelope, desired, false);
         Action::Velocity { velocity, yaw_rate: 0.0 }
     }
 

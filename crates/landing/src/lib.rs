@@ -6,7 +6,7 @@
 //! position and motion, and steers by one of two guidances. The same events give the same decisions, to the
 //! bit.
 //!
-//! This crate knows no clock, network, file, thread, log or message, and no autopilot protocol.
+//! This crate uses no clock, network, file, thread, log or message, and no autopilot protocol.
 //!
 //! Modules in reading order:
 //!
@@ -15,7 +15,7 @@
 //! - `measurement`, `filter`, `view`, `hypotheses`, [`estimator`]: from detections to the landing point; [`mean_target`] for
 //!   the thesis' guidance; `target_filter` is the one that is needed.
 //! - [`guidance`]: from the target to a velocity. [`search`]: where to look for the marker. `hover`: how
-//!   to stay at a place.
+//!   to stay at a position.
 //! - [`axis_check`]: are the axes of camera and autopilot consistent? [`mount_check`]: by how much are they off?
 //!   `size_check`: is the marker as large as configured? `standing`: how high does the vehicle stand, and does it?
 //!   `repeated_picture`: is the camera's picture an old one?

@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn an_outlier_is_refused_and_a_steady_new_place_accepted() {
+    fn an_outlier_is_refused_and_a_steady_new_position_accepted() {
         let mut scene = Scene::new();
         for _ in 0..10 {
             scene.see(Point::new(1.0, 0.0, 0.0)).unwrap();

@@ -138,7 +138,7 @@ fn noise_in_body(
     let range_m = in_body.norm();
     let along = in_body.coords / fmax(range_m, 1e-6);
     if let Some(covariance) = marker.covariance_m2 {
-        // A detector knows its pixels, not how large the marker was printed.
+        // A detector measures pixels, not how large the marker was printed.
         let floor = squared(config.range_floor_ratio * range_m);
         return (covariance + covariance.transpose()) * 0.5 + along * along.transpose() * floor;
     }

@@ -15,7 +15,7 @@
 //!
 //! Other apparent motions of the pad, as of an estimator that errs more in wind, are not as random as the filter assumes. An error
 //! of the mount, the focal length or the size is the same in each part of a flight, so the estimates of the single parts
-//! must agree: by as much as they scatter more than their deviations say, the deviation is larger (the ratio of Birge: Physical
+//! must agree: by as much as they scatter more than by their deviations, the deviation is larger (the ratio of Birge: Physical
 //! Review 40, 1932).
 //!
 //! Heights are left out: a barometer errs by as much as a focal length that is 4 % off. The random walks grow
@@ -99,7 +99,7 @@ const MAX_DEVIATION: f64 = 0.5;
 const MIN_IN_A_ROW: u32 = 15;
 /// Length of a part of the flight whose estimate is compared with those of the others, in seconds, the smallest fraction of the
 /// information that a part must bring to count, and the number of such parts without which no error is reported:
-/// fewer blame the mount for the wandering of ArduPilot's estimate in 8 m/s of wind with turbulence 3.
+/// fewer attribute to the mount the wandering of ArduPilot's estimate in 8 m/s of wind with turbulence 3.
 const PART_S: f64 = 1.0;
 const MIN_FRACTION: f64 = 0.01;
 const MIN_PARTS: [u32; 4] = [6, 6, 3, 3];
@@ -319,14 +319,14 @@ impl MountCheck {
         if after_s > MIN_STEP_S {
             self.pad_sinks_m_s += fmin(trend, 1.0) * difference / after_s;
         }
-        let share = fmax(1.0 / n, fmin(after_s / MEAN_S, 1.0));
-        self.mean_pad_z += share * (measured_z - self.mean_pad_z);
+        let fraction = fmax(1.0 / n, fmin(after_s / MEAN_S, 1.0));
+        self.mean_pad_z += fraction * (measured_z - self.mean_pad_z);
     }
 
     fn smooth_lean(&mut self, motion: &Motion, after_s: f64) {
         let lean_rad = acos(motion.ned_from_body.down_axis().z().clamp(-1.0, 1.0));
-        let share = if self.newest.is_none() { 1.0 } else { 1.0 - exp(-after_s / LEAN_S) };
-        self.lean_rad += share * (lean_rad - self.lean_rad);
+        let fraction = if self.newest.is_none() { 1.0 } else { 1.0 - exp(-after_s / LEAN_S) };
+        self.lean_rad += fraction * (lean_rad - self.lean_rad);
     }
 
     /// The errors that are certain.
@@ -485,7 +485,7 @@ impl Parts {
         }
     }
 
-    /// By how much more than their deviations say the estimates of the parts scatter; infinite for fewer than a minimum.
+    /// By how much more than by their deviations the estimates of the parts scatter; infinite for fewer than a minimum.
     fn scatter(&self, min_parts: u32) -> f64 {
         if self.count < min_parts {
             return f64::INFINITY;
@@ -576,8 +576,11 @@ mod tests {
             for i in 0..180 {
                 let t = f64::from(i) / 15.0;
                 let way = |from_s: f64, for_s: f64| {
-                    let share = ((t - from_s) / for_s).clamp(0.0, 1.0);
-                    (share * share * (3.0 - 2.0 * share), 6.0 * share * (1.0 - share) / for_s)
+                    let fraction = ((t - from_s) / for_s).clamp(0.0, 1.0);
+                    (
+                        fraction * fraction * (3.0 - 2.0 * fraction),
+                        6.0 * fraction * (1.0 - fraction) / for_s,
+                    )
                 };
                 let ((aside, speed), (down, sinks)) = (way(2.0, 3.0), way(5.0, 6.0));
                 let position = Point::new(2.0 * (aside - 1.0), 0.0, 5.0 * down - 6.0);
@@ -649,8 +652,8 @@ mod tests {
         for (i, wild) in
             [1e300, f64::INFINITY, f64::NAN, -1e300].into_iter().cycle().take(40).enumerate()
         {
-            let place = Point::new(0.0, 0.0, -8.0);
-            let motion = Motion::still(Rotation::identity(), place);
+            let position = Point::new(0.0, 0.0, -8.0);
+            let motion = Motion::still(Rotation::identity(), position);
             let frame = frame(0.01 * i as f64, mount);
             let seen = Measurement {
                 stamp: frame.stamp,

@@ -2,8 +2,8 @@
 //! that moves.
 //!
 //! The pad then seems to move along, and to sink before a vehicle that goes down. No two pictures of a camera are alike, as its noise
-//! differs, and no vehicle holds its place over a marker to a fraction of a millimetre. So a marker that stays, while the autopilot's
-//! position and attitude change, is an old one. Where a link codes the picture anew for each frame it stays less exactly, and must seem
+//! differs, and no vehicle holds its position over a marker to a fraction of a millimetre. So a marker that stays, while the autopilot's
+//! position and attitude change, is an old one. Where a link codes the picture again for each frame it stays less exactly, and must seem
 //! to move further.
 
 use geometry::{Body, Camera, Pixel, Point, Rotation, Vector};
@@ -15,24 +15,24 @@ use crate::event::{FrameObservation, MarkerInFrame};
 use crate::history::Motion;
 use crate::time::Timestamp;
 
-/// Largest change of the marker's place relative to the vehicle from one frame to the next, as a share of its distance: a detector
+/// Largest change of the marker's position relative to the vehicle from one frame to the next, as a fraction of its distance: a detector
 /// that remembers more of the camera with each frame finds the same marker again to within a third of it (measured: 6e-6).
 const MAX_CHANGE: f64 = 2e-5;
 
 /// Number of such changes in a row, and how far the marker must seem to have moved over the ground meanwhile, in metres and as a
-/// share of its distance.
+/// fraction of its distance.
 const MIN_ALIKE: u32 = 2;
 const MIN_MOVED_M: f64 = 0.05;
-const MIN_MOVED_SHARE: f64 = 0.01;
+const MIN_MOVED_FRACTION: f64 = 0.01;
 
-/// The same where the link codes a repeated picture anew, in which the marker is found again less well: measured from one quality of
+/// The same where the link codes a repeated picture again, in which the marker is found again less well: measured from one quality of
 /// JPEG to the next, 7e-4 at most. So much a marker may stay that moves along with the vehicle, or whose vehicle stays while the
 /// autopilot's position drifts: it must seem to move further and faster than that, to the side or up and down, within a time (in s and
 /// m/s, in addition to the speed and the heave of the configured pad). A larger change alone does not make an old picture a new one.
 const MAX_CODED_CHANGE: f64 = 2e-3;
 const MAX_OLD_CHANGE: f64 = 5e-3;
 const MIN_CODED_MOVED_M: f64 = 0.1;
-const MIN_CODED_MOVED_SHARE: f64 = 0.02;
+const MIN_CODED_MOVED_FRACTION: f64 = 0.02;
 const MIN_CODED_M_S: f64 = 0.2;
 const CODED_S: f64 = 2.0;
 
@@ -46,7 +46,7 @@ pub(crate) struct RepeatedPicture {
     /// The first of those that are alike, and how many came after it.
     first: Option<First>,
     alike: u32,
-    /// The first of those in which the marker stays as it does in pictures that were coded anew.
+    /// The first of those in which the marker stays as it does in pictures that were coded again.
     coded: Option<First>,
 }
 
@@ -67,7 +67,7 @@ struct First {
     sight: Sight,
     /// Where the marker was over the ground, in the odometry frame, in metres, and when; of one whose distance is not known the
     /// direction.
-    place: Vector3<f64>,
+    position: Vector3<f64>,
     placed: Timestamp,
     /// Those after it are old pictures.
     is_old: bool,
@@ -94,11 +94,11 @@ impl RepeatedPicture {
         stands: bool,
     ) -> Picture {
         let stamp = frame.stamp;
-        let (sight, place, min_moved) = if let Some(pose) = marker.body_from_marker {
+        let (sight, position, min_moved) = if let Some(pose) = marker.body_from_marker {
             let in_body = pose.origin() - Point::origin();
-            let place = motion.odometry.coords.coords + (motion.ned_from_body * in_body).coords;
+            let position = motion.odometry.coords.coords + (motion.ned_from_body * in_body).coords;
             let sight = Sight { stamp, in_body, has_distance: true };
-            (sight, place, MIN_MOVED_M + MIN_MOVED_SHARE * in_body.norm())
+            (sight, position, MIN_MOVED_M + MIN_MOVED_FRACTION * in_body.norm())
         } else {
             let in_body = direction(frame, marker.centre);
             let sight = Sight { stamp, in_body, has_distance: false };
@@ -112,7 +112,7 @@ impl RepeatedPicture {
             });
             return old.map_or(Picture::Alike, |first| Picture::Old(first.sight.stamp));
         }
-        let same = self.add_same(sight, place, min_moved);
+        let same = self.add_same(sight, position, min_moved);
         if stands {
             self.coded = None;
         }
@@ -120,44 +120,44 @@ impl RepeatedPicture {
             return same;
         }
         let slack_m_s = [config.pad_speed_m_s, config.pad_heave_m_s];
-        match (self.add_coded(sight, place, slack_m_s), same) {
+        match (self.add_coded(sight, position, slack_m_s), same) {
             (Picture::Old(coded), Picture::Old(same)) => Picture::Old(same.min(coded)),
             (_, Picture::Old(since)) | (Picture::Old(since), _) => Picture::Old(since),
             (coded, _) => coded,
         }
     }
 
-    fn add_same(&mut self, sight: Sight, place: Vector3<f64>, min_moved: f64) -> Picture {
+    fn add_same(&mut self, sight: Sight, position: Vector3<f64>, min_moved: f64) -> Picture {
         let is_alike = self.newest.is_some_and(|newest| newest.is_like(&sight, MAX_CHANGE));
         self.newest = Some(sight);
         let Some(mut first) = self.first.filter(|_| is_alike) else {
-            (self.first, self.alike) = (Some(First::new(sight, place)), 0);
+            (self.first, self.alike) = (Some(First::new(sight, position)), 0);
             return Picture::Other;
         };
         self.alike = self.alike.saturating_add(1);
-        first.is_old |= self.alike >= MIN_ALIKE && (place - first.place).norm() > min_moved;
+        first.is_old |= self.alike >= MIN_ALIKE && (position - first.position).norm() > min_moved;
         self.first = Some(first);
         first.picture()
     }
 
-    /// The same for a picture that may have been coded anew; a pad may move by so much to the side, and up and down.
-    fn add_coded(&mut self, sight: Sight, place: Vector3<f64>, pad_m_s: [f64; 2]) -> Picture {
+    /// The same for a picture that may have been coded again; a pad may move by so much to the side, and up and down.
+    fn add_coded(&mut self, sight: Sight, position: Vector3<f64>, pad_m_s: [f64; 2]) -> Picture {
         let max_change =
             |first: &First| if first.is_old { MAX_OLD_CHANGE } else { MAX_CODED_CHANGE };
         let first = self.coded.filter(|first| first.sight.is_like(&sight, max_change(first)));
         let Some(mut first) = first else {
-            self.coded = Some(First::new(sight, place));
+            self.coded = Some(First::new(sight, position));
             return Picture::Other;
         };
-        let moved = place - first.place;
+        let moved = position - first.position;
         let after_s = sight.stamp.seconds_since(first.placed);
-        let [aside, down] = pad_m_s.map(|pad_m_s| {
-            let error_m = MIN_CODED_MOVED_M + MIN_CODED_MOVED_SHARE * sight.in_body.norm();
+        let [max_side_m, max_down_m] = pad_m_s.map(|pad_m_s| {
+            let error_m = MIN_CODED_MOVED_M + MIN_CODED_MOVED_FRACTION * sight.in_body.norm();
             error_m + (MIN_CODED_M_S + pad_m_s) * after_s
         });
-        first.is_old |= hypot(moved.x, moved.y) > aside || moved.z.abs() > down;
+        first.is_old |= hypot(moved.x, moved.y) > max_side_m || moved.z.abs() > max_down_m;
         if after_s > CODED_S {
-            (first.place, first.placed) = (place, sight.stamp);
+            (first.position, first.placed) = (position, sight.stamp);
         }
         self.coded = Some(first);
         first.picture()
@@ -165,8 +165,8 @@ impl RepeatedPicture {
 }
 
 impl First {
-    fn new(sight: Sight, place: Vector3<f64>) -> Self {
-        Self { sight, place, placed: sight.stamp, is_old: false }
+    fn new(sight: Sight, position: Vector3<f64>) -> Self {
+        Self { sight, position, placed: sight.stamp, is_old: false }
     }
 
     fn picture(&self) -> Picture {
@@ -207,16 +207,17 @@ mod tests {
         }
     }
 
-    /// A marker in one of 15 frames in a second, `late_s` earlier: at this place relative to the vehicle, or where only the pixel is
+    /// A marker in one of 15 frames in a second, `late_s` earlier: at this position relative to the vehicle, or where only the pixel is
     /// known.
     fn frame(
         (number, late_s): (u32, f64),
-        place: Option<Point<Body>>,
+        position: Option<Point<Body>>,
         centre: Pixel,
     ) -> (FrameObservation, MarkerInFrame) {
         let marker = MarkerInFrame {
             centre,
-            body_from_marker: place.map(|place| Transform::new(Rotation::identity(), place)),
+            body_from_marker: position
+                .map(|position| Transform::new(Rotation::identity(), position)),
             alternative: None,
             covariance_m2: None,
             size_px: None,
@@ -236,10 +237,10 @@ mod tests {
         check: &mut RepeatedPicture,
         at: (u32, f64),
         motion: &Motion,
-        place: Option<Point<Body>>,
+        position: Option<Point<Body>>,
         centre: Pixel,
     ) -> bool {
-        let (frame, marker) = frame(at, place, centre);
+        let (frame, marker) = frame(at, position, centre);
         let picture = check.add(&frame, &marker, motion, &EstimatorConfig::default(), false);
         matches!(picture, Picture::Old(_))
     }
@@ -281,17 +282,17 @@ mod tests {
         // From the fifth on, found again to within a few millionths.
         let stays = |number: u32| true_m(number.min(5)) * (1.0 + 5e-6 * f64::from(number % 2));
         assert_eq!(repeated(20, true_m, stays), (7..20).collect::<Vec<_>>());
-        // It goes on.
+        // It continues.
         let goes_on = |number: u32| if number < 12 { stays(number) } else { true_m(number) };
         assert_eq!(repeated(20, true_m, goes_on), (7..12).collect::<Vec<_>>());
-        // The vehicle comes back to where it was, and above.
+        // The vehicle returns to where it was, and above.
         let height_m = |number: u32| true_m(number.min(24 - number.min(24)));
         assert_eq!(repeated(24, height_m, stays), (7..24).collect::<Vec<_>>());
         // As a camera's noise has it, the vehicle may stay over a pad while the autopilot's height drifts.
         let noise = |number: u32| 5.0 * (1.0 + 3e-5 * f64::from(number % 2));
         let drifts_m = |number: u32| 5.0 - 0.01 * f64::from(number);
         assert_eq!(repeated(100, drifts_m, noise), Vec::<u32>::new());
-        // It is coded anew for each frame: it moves further than errors and a drift of the position explain.
+        // It is coded again for each frame: it moves further than errors and a drift of the position explain.
         let coded = |number: u32| true_m(number.min(5)) * (1.0 + 5e-4 * f64::from(number % 2));
         assert_eq!(repeated(20, true_m, coded), (8..20).collect::<Vec<_>>());
     }
@@ -303,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_that_is_coded_anew_is_noticed_after_a_hover_and_after_the_start() {
+    fn a_picture_that_is_coded_again_is_noticed_after_a_hover_and_after_the_start() {
         let alternates = |number: u32| 7e-4 * f64::from(number % 2);
         // A marker seen 5 m below, whose position changes by such a fraction.
         let recoded = |frames, height_m: &dyn Fn(u32) -> f64, change: &dyn Fn(u32) -> f64| {
@@ -323,14 +324,14 @@ mod tests {
         let hops = |number: u32| alternates(number) + if number > 930 { 3e-3 } else { 0.0 };
         let old = recoded(975, &hovers, &hops);
         assert!(goes_on_from(&old, 975), "{old:?}");
-        // The camera goes on.
+        // The camera continues.
         let is_back = |number: u32| number > 930;
         let back = |number: u32| {
             if is_back(number) { hovers(number) / 5.0 - 1.0 } else { alternates(number) }
         };
         let old = recoded(975, &hovers, &back);
         assert!(goes_on_from(&old, 931), "{old:?}");
-        // A slow drift of the autopilot's height over a vehicle that stays is none.
+        // A slow drift of the autopilot's height over a vehicle that stays is no repetition.
         let drifts = |number: u32| 5.0 + 0.1 * f64::from(number) / 15.0;
         assert_eq!(recoded(3000, &drifts, &alternates), Vec::<u32>::new());
     }

@@ -1,4 +1,4 @@
-//! The search for the marker: an expanding square about the place where the search started, flown along its
+//! The search for the marker: an expanding square about the position where the search started, flown along its
 //! lines over the ground in wind as well.
 //!
 //! A camera that is fixed to the vehicle looks downwind, because the vehicle tilts into the wind: a marker
@@ -19,7 +19,7 @@ const MIN_TILT_RAD: f64 = 0.02;
 const SLOW_LAG_M: f64 = 1.0;
 const MAX_LAG_M: f64 = 2.0;
 
-/// Minimum speed of that point, as a share of the square's: a vehicle that does not get through the wind must see the other sides, too.
+/// Minimum speed of that point, as a fraction of the square's: a vehicle that does not get through the wind must see the other sides, too.
 const MIN_PACE: f64 = 0.25;
 
 /// Longest time over which that point moves on at once, in seconds.
@@ -64,13 +64,14 @@ impl Square {
         }
     }
 
-    /// The velocity of a vehicle at `place`, in m/s, at most twice the speed along the square; at the end of the last leg it stays there.
-    pub fn velocity(&self, config: &PhaseConfig, place: Point<Odometry>) -> Vector<Ned> {
+    /// The velocity of a vehicle at `position`, in m/s, at most twice the speed along the square; at the end of the last leg it stays
+    /// there.
+    pub fn velocity(&self, config: &PhaseConfig, position: Point<Odometry>) -> Vector<Ned> {
         let onwards = match self.length_m(config) {
-            Some(_) => self.direction() * (self.speed_m_s * self.pace(place)),
+            Some(_) => self.direction() * (self.speed_m_s * self.pace(position)),
             None => Vector::zero(),
         };
-        Vector::from_coords(onwards.coords) + back(self.lag(place), self.speed_m_s)
+        Vector::from_coords(onwards.coords) + back(self.lag(position), self.speed_m_s)
     }
 
     /// Moves its point on until `now`, the slower the farther the vehicle is from it, but not for one whose fence keeps it from following.
@@ -78,12 +79,12 @@ impl Square {
         &mut self,
         config: &PhaseConfig,
         now: Timestamp,
-        place: Point<Odometry>,
+        position: Point<Odometry>,
         is_fenced: bool,
     ) {
         let after_s = now.seconds_since(self.moved).clamp(0.0, MAX_STEP_S);
         self.moved = now;
-        let pace = if is_fenced { 1.0 } else { self.pace(place) };
+        let pace = if is_fenced { 1.0 } else { self.pace(position) };
         self.along_m += self.speed_m_s * after_s * pace;
         while let Some(length_m) = self.length_m(config)
             && self.along_m >= length_m
@@ -97,15 +98,15 @@ impl Square {
         }
     }
 
-    /// The share of the speed at which the square's point moves for a vehicle at `place`.
-    fn pace(&self, place: Point<Odometry>) -> f64 {
-        let lag_m = self.lag(place).horizontal_norm();
+    /// The fraction of the speed at which the square's point moves for a vehicle at `position`.
+    fn pace(&self, position: Point<Odometry>) -> f64 {
+        let lag_m = self.lag(position).horizontal_norm();
         ((MAX_LAG_M - lag_m) / (MAX_LAG_M - SLOW_LAG_M)).clamp(MIN_PACE, 1.0)
     }
 
     /// From the vehicle to the square's point, horizontally.
-    fn lag(&self, place: Point<Odometry>) -> Vector<Odometry> {
-        let offset = self.corner + self.direction() * self.along_m - place;
+    fn lag(&self, position: Point<Odometry>) -> Vector<Odometry> {
+        let offset = self.corner + self.direction() * self.along_m - position;
         Vector::new(offset.x(), offset.y(), 0.0)
     }
 
@@ -155,23 +156,23 @@ mod tests {
     fn fly(config: &Config, wind: Vector<Ned>) -> Vec<Point<Odometry>> {
         let (begin, phases) = (Timestamp::from_seconds(5.0), &config.phases);
         let mut square = Square::new(config, begin, Point::origin(), Rotation::identity(), 5.0);
-        let (mut place, mut flown, mut path) = (Point::origin(), Vector::zero(), Vec::new());
+        let (mut position, mut flown, mut path) = (Point::origin(), Vector::zero(), Vec::new());
         let dt_s = 0.02;
         for i in 0..(phases.search_timeout_s / dt_s) as u32 {
             let now = begin.plus_seconds(f64::from(i) * dt_s);
-            square.move_on(phases, now, place, false);
-            let velocity = square.velocity(phases, place);
+            square.move_on(phases, now, position, false);
+            let velocity = square.velocity(phases, position);
             assert!(velocity.norm() <= 2.0 * phases.search_speed_m_s + 1e-9, "{velocity:?}");
             flown = flown + (velocity - flown) * (dt_s / 0.5);
-            place = place + Vector::from_coords((flown + wind).coords) * dt_s;
-            path.push(place);
+            position = position + Vector::from_coords((flown + wind).coords) * dt_s;
+            path.push(position);
         }
         path
     }
 
     /// The greatest distance from the origin, in metres.
     fn farthest_m(path: &[Point<Odometry>]) -> f64 {
-        path.iter().map(|place| place.x().hypot(place.y())).fold(0.0, f64::max)
+        path.iter().map(|position| position.x().hypot(position.y())).fold(0.0, f64::max)
     }
 
     #[test]
@@ -184,10 +185,15 @@ mod tests {
             let limit_m = radius_m * std::f64::consts::SQRT_2 + 1.0;
             assert!(farthest_m(&path) <= limit_m, "{north} {east}: {}", farthest_m(&path));
             // Every point within the square is within the spacing of the path.
-            let reach = radius_m - 0.5 * spacing_m;
-            for (x, y) in
-                [(0.0, 0.0), (reach, 0.0), (0.0, reach), (-reach, 0.0), (0.0, -reach), (2.5, -3.5)]
-            {
+            let extent = radius_m - 0.5 * spacing_m;
+            for (x, y) in [
+                (0.0, 0.0),
+                (extent, 0.0),
+                (0.0, extent),
+                (-extent, 0.0),
+                (0.0, -extent),
+                (2.5, -3.5),
+            ] {
                 let nearest =
                     path.iter().map(|p| (p.x() - x).hypot(p.y() - y)).fold(f64::MAX, f64::min);
                 assert!(
@@ -238,7 +244,7 @@ mod tests {
         assert!((last - before).norm() < 0.01, "{before:?} {last:?}");
         config.phases.search_radius_m = 0.0;
         let path = fly(&config, Vector::new(0.1, 0.0, 0.0));
-        assert!(path.iter().all(|place| (*place - Point::origin()).norm() < 0.3), "it holds");
+        assert!(path.iter().all(|position| (*position - Point::origin()).norm() < 0.3), "it holds");
     }
 
     #[test]

@@ -163,10 +163,10 @@ impl Fit {
         let (by_height, by_depth) = (height_m - self.height_m, depth_m - self.depth_m);
         self.height_m += by_height / self.weight;
         self.depth_m += by_depth / self.weight;
-        let share = 1.0 - 1.0 / self.weight;
-        self.heights = keep * self.heights + share * by_height * by_height;
-        self.products = keep * self.products + share * by_height * by_depth;
-        self.depths = keep * self.depths + share * by_depth * by_depth;
+        let fraction = 1.0 - 1.0 / self.weight;
+        self.heights = keep * self.heights + fraction * by_height * by_height;
+        self.products = keep * self.products + fraction * by_height * by_depth;
+        self.depths = keep * self.depths + fraction * by_depth * by_depth;
         if !(self.heights + self.depths).is_finite() {
             *self = Self::default();
         }

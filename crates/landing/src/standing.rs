@@ -5,10 +5,10 @@
 //! no longer sees the marker then, and the autopilot's height drifts near the ground: the error is 0.15 m at most in the
 //! tests. So it is only reported, and changes no landing: one that is too large would ask for LAND too high.
 //!
-//! And whether a vehicle may stand on the pad already, although its autopilot does not say so. A lander that takes over the
+//! And whether a vehicle may stand on the pad already, although its autopilot does not report it. A lander that takes over the
 //! landing of another one has not seen the pad: it receives the position from that one, or, where no position is known, a vehicle that is
 //! quite still at the height of the local origin, near which it was armed, may stand: near the origin, and elsewhere only where its
-//! autopilot does not say that it flies, as the ground has another height there.
+//! autopilot does not report that it flies, as the ground has another height there.
 
 use std::ops::RangeInclusive;
 
@@ -24,17 +24,17 @@ use crate::time::Timestamp;
 pub(crate) const MAX_STANDING_M_S: f64 = 0.2;
 /// Maximum height over the one it stands with, in metres, distance from the pad, and standard deviation of that, in metres,
 /// at which a still vehicle may stand on the pad. From there LAND is safe if it does not. The height of a vehicle that the guidance
-/// steers, which notices a touchdown by itself, is less: in wind LAND is led by a velocity that may err.
+/// steers, which notices a touchdown on its own, is less: in wind LAND is led by a velocity that may err.
 const MAX_STANDING_M: f64 = 0.3;
 const MAX_STEERED_STANDING_M: f64 = 0.15;
-const MAX_STANDING_ASIDE_M: f64 = 0.3;
+const MAX_STANDING_LATERAL_M: f64 = 0.3;
 const MAX_STANDING_DEVIATION_M: f64 = 0.2;
 /// How much more or less height per second since the newest detection: the autopilot's height drifts, in m/s, for as long as an
-/// autopilot may take to say that it stands, in seconds.
+/// autopilot may take to report that it stands, in seconds.
 const STANDING_DRIFT_M_S: f64 = 0.02;
 const MAX_DRIFT_S: f64 = 15.0;
 
-/// Maximum age of a pad's place, in seconds: the autopilot's position drifts.
+/// Maximum age of a pad's position, in seconds: the autopilot's position drifts.
 const MAX_REMEMBERED_S: f64 = 60.0;
 /// Maximum speed of a vehicle that stands where no pad is known, in m/s, its minimum duration, in seconds, and the maximum
 /// height over the local origin, in metres: a barometer drifts by so much in a flight.
@@ -44,9 +44,9 @@ const MAX_STILL_HEIGHT_M: f64 = 0.5;
 /// Maximum distance from the local origin, in metres, at which the autopilot's report that such a vehicle flies counts for nothing: it
 /// comes seconds late.
 const MAX_ORIGIN_M: f64 = 3.0;
-/// Maximum time after taking over within which that is assumed, in seconds: an autopilot says by then that it stands.
+/// Maximum time after taking over within which that is assumed, in seconds: an autopilot reports by then that it stands.
 const MAX_UNREPORTED_S: f64 = 10.0;
-/// Maximum distance from the pad of such a vehicle that stands beside it, in metres.
+/// Maximum distance from the pad of such a vehicle that stands next to it, in metres.
 const MAX_BESIDE_M: f64 = 2.0;
 
 /// Heights that a vehicle may have and that are above the error of the measurement, in metres.
@@ -55,18 +55,18 @@ const PLAUSIBLE_M: RangeInclusive<f64> = 0.15..=1.0;
 const MAX_AGE_S: f64 = 8.0;
 /// Maximum standard deviation of the target's horizontal position, in metres.
 const MAX_DEVIATION_M: f64 = 0.1;
-/// Maximum distance from the target, in metres: beside the pad the ground may have another height.
+/// Maximum distance from the target, in metres: next to the pad the ground may have another height.
 const MAX_LATERAL_M: f64 = 0.3;
 
 /// The height with which a landing ends.
 #[derive(Copy, Clone, Debug, Default)]
 pub(crate) struct StandingHeight {
-    /// The smallest one, as the autopilot may say too early that it stands.
+    /// The smallest one, as the autopilot may report too early that it stands.
     lowest_m: Option<f64>,
 }
 
 impl StandingHeight {
-    /// The autopilot says that the vehicle stands on the ground, and LAND was asked for; with this estimate of the pad.
+    /// The autopilot reports that the vehicle stands on the ground, and LAND was requested; with this estimate of the pad.
     pub(crate) fn observe(&mut self, target: Option<TargetEstimate>) {
         let is_sound = |target: &TargetEstimate| {
             !target.ambiguous
@@ -86,10 +86,10 @@ impl StandingHeight {
     }
 }
 
-/// The place of the pad, as the lander of an earlier controller knew it.
+/// The position of the pad, as the lander of an earlier controller knew it.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct RememberedPad {
-    /// Its place, in metres from the autopilot's local origin.
+    /// Its position, in metres from the autopilot's local origin.
     pub position: Point<Ned>,
     /// Standard deviation of its horizontal position, in metres.
     pub deviation_m: f64,
@@ -97,10 +97,10 @@ pub struct RememberedPad {
     pub stamp: Timestamp,
 }
 
-/// The place of the pad, and where the vehicle is over it.
+/// The position of the pad, and where the vehicle is over it.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct SeenPad {
-    /// The place.
+    /// The position.
     pub pad: RememberedPad,
     /// Height of the vehicle over it, in metres.
     pub height_m: f64,
@@ -184,7 +184,7 @@ pub(crate) fn may_stand(situation: &Situation<'_>, config: &Config, is_steered: 
     is_sound && is_right_over(situation, config, &below, max_m)
 }
 
-/// The pad's place, for a lander that has to take over; `None` where it is not known well.
+/// The pad's position, for a lander that has to take over; `None` where it is not known well.
 pub(crate) fn to_remember(now: Timestamp, target: &TargetEstimate) -> Option<RememberedPad> {
     let is_sound = !target.ambiguous
         && target.age_s <= MAX_AGE_S
@@ -206,7 +206,7 @@ fn is_right_over(
     let max_m_s = MAX_STANDING_M_S + situation.pad_heave_m_s;
     let is_still = (situation.vehicle.velocity - below.velocity).norm() <= max_m_s;
     let is_over_pad =
-        below.lateral_m <= MAX_STANDING_ASIDE_M && below.deviation_m <= MAX_STANDING_DEVIATION_M;
+        below.lateral_m <= MAX_STANDING_LATERAL_M && below.deviation_m <= MAX_STANDING_DEVIATION_M;
     is_recent(situation, config) && is_still && is_low(config, below, max_height_m) && is_over_pad
 }
 
@@ -266,7 +266,7 @@ mod tests {
 
     /// Where the pad is not known, a vehicle that hovers low next to a hill must not be landed there.
     #[test]
-    fn a_vehicle_that_is_said_to_fly_far_from_the_origin_does_not_stand() {
+    fn a_vehicle_that_is_reported_to_fly_far_from_the_origin_does_not_stand() {
         for (north_m, landed, expected) in [
             (0.0, Landed::InAir, true),
             (2.5, Landed::InAir, true),

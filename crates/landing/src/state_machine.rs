@@ -9,12 +9,12 @@
 //!     Search --> Hold: not found
 //!     Approach --> Descend: inside the funnel
 //!     Descend --> Approach: outside, or marker out of the camera's view
-//!     Approach --> Retry: marker lost, its place known
-//!     Descend --> Retry: marker lost or not settling, its place known
+//!     Approach --> Retry: marker lost, its position known
+//!     Descend --> Retry: marker lost or not settling, its position known
 //!     Retry --> Approach: marker visible
 //!     Retry --> Search: not visible in time
-//!     Approach --> Hold: marker lost with its place, no progress
-//!     Descend --> Hold: marker lost with its place, no progress
+//!     Approach --> Hold: marker lost with its position, no progress
+//!     Descend --> Hold: marker lost with its position, no progress
 //!     Approach --> Aborted: no retry left
 //!     Descend --> Aborted: no retry left
 //!     Descend --> Final: at `land_height_m`
@@ -95,11 +95,11 @@ pub struct Inputs {
     pub vehicle: Option<VehicleInputs>,
     /// Age of the newest detection used, in seconds; infinite without one.
     pub target_age_s: f64,
-    /// The same without the time for which the camera did not show the pad's place, up to a limit.
+    /// The same without the time for which the camera did not show the pad's position, up to a limit.
     pub target_missed_s: f64,
     /// True when there were enough detections without a long gap.
     pub target_confirmed: bool,
-    /// True when the marker's place is known well enough to wait for it there.
+    /// True when the marker's position is known well enough to wait for it there.
     pub target_known: bool,
     /// True when the marker is being seen, and its detections are refused.
     pub target_refused: bool,
@@ -172,7 +172,7 @@ enum EndOfHold {
     Vehicle,
     /// The link to the autopilot is quick enough.
     Link,
-    /// Two detectors agree again: the lander goes on for the operator then.
+    /// Two detectors agree again: then the lander continues without a command of the operator.
     Agreement,
 }
 
@@ -259,7 +259,7 @@ impl StateMachine {
         self.is_recalling
     }
 
-    /// True while a landing that began goes on only by a command: after an abort, and in a hold that does not end by itself.
+    /// True while a landing that began continues only by a command: after an abort, and in a hold that does not end on its own.
     pub fn waits_for_operator(&self) -> bool {
         match self.phase {
             Phase::Aborted => true,
@@ -622,7 +622,7 @@ impl StateMachine {
         self.was_out_of_view(inputs) && inputs.target_missed_s <= self.config.lost_target_s
     }
 
-    /// A retry while one is left; a hold where the marker's place is unknown.
+    /// A retry while one is left; a hold where the marker's position is unknown.
     fn retry_or_abort(&mut self, inputs: &Inputs, reason: Reason) -> (Phase, Reason) {
         let (lost, reason) = match reason {
             Reason::Retrying if inputs.target_refused => {
@@ -714,7 +714,7 @@ impl StateMachine {
         if !self.timed_out(inputs, self.touchdown_limit_s + more_s) {
             return None;
         }
-        // Some autopilots are configured never to disarm by themselves.
+        // Some autopilots are configured never to disarm on their own.
         let down = inputs.vehicle.is_some_and(|vehicle| vehicle.landed == Landed::OnGround);
         Some(if down {
             (Phase::Landed, Reason::TouchedDown)

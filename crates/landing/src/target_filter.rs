@@ -19,7 +19,7 @@ pub(crate) enum TargetFilter {
     Kalman(Estimator),
 }
 
-/// Maximum time for which a marker is not missed while its place is out of the camera's view, in seconds, and maximum time
+/// Maximum time for which a marker is not missed while its position is out of the camera's view, in seconds, and maximum time
 /// between two frames for which that is known.
 const MAX_OUT_OF_VIEW_S: f64 = 2.0;
 const MAX_FRAME_GAP_S: f64 = 0.2;
@@ -30,7 +30,7 @@ pub(crate) struct Sightings {
     pub(crate) newest: Option<Timestamp>,
     /// Number of markers without a long gap.
     pub(crate) in_a_row: u32,
-    /// For how long since then the camera did not show the pad's place, in seconds.
+    /// For how long since then the camera did not show the pad's position, in seconds.
     out_of_view_s: f64,
     /// When one was last seen too far from the estimate to be used, and when before that.
     refused: [Option<Timestamp>; 2],
@@ -136,7 +136,7 @@ impl Sightings {
         self.out_of_view_s = libm::fmin(out_of_view_s, MAX_OUT_OF_VIEW_S);
     }
 
-    /// For how long the marker was not seen, without the time for which its place was out of view, in seconds.
+    /// For how long the marker was not seen, without the time for which its position was out of view, in seconds.
     pub(crate) fn missed_s(&self, now: Timestamp) -> f64 {
         self.age_s(now) - self.out_of_view_s
     }

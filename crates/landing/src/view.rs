@@ -1,4 +1,4 @@
-//! Whether a marker at a place on the ground is in the field of view of a frame's camera, by the vehicle's
+//! Whether a marker at a position on the ground is in the field of view of a frame's camera, by the vehicle's
 //! pose.
 
 use geometry::{Body, Camera, Odometry, Point, Rotation, Vector};
@@ -34,10 +34,10 @@ impl View {
         ))
     }
 
-    /// True when a marker at this place is in view as a whole.
-    pub(crate) fn shows(&self, place: Point<Odometry>, motion: &Motion) -> bool {
+    /// True when a marker at this position is in view as a whole.
+    pub(crate) fn shows(&self, position: Point<Odometry>, motion: &Motion) -> bool {
         let in_body: Vector<Body> =
-            motion.odometry_from_body().inverse() * (place - motion.odometry);
+            motion.odometry_from_body().inverse() * (position - motion.odometry);
         let in_camera = self.body_from_camera.inverse() * in_body;
         let is_inside = |offset_m: f64, half_rad: f64| {
             atan2(offset_m.abs() + MARGIN_M, in_camera.z()) < half_rad - MARGIN_RAD

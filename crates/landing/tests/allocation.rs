@@ -26,7 +26,7 @@ fn frame(now: Timestamp, ago_s: f64) -> Event {
     let attitude = Rotation::<Ned, Body>::from_euler(0.01, 0.02, 0.3);
     let from_vehicle = Vector::new(0.5 - 0.05 * stamp.seconds().sin(), 0.3, 5.0);
     let in_body = attitude.inverse() * from_vehicle;
-    let place = Point::new(in_body.x(), in_body.y(), in_body.z());
+    let position = Point::new(in_body.x(), in_body.y(), in_body.z());
     Event::Frame(FrameObservation {
         stamp,
         image_size: (1296, 972),
@@ -34,7 +34,7 @@ fn frame(now: Timestamp, ago_s: f64) -> Event {
         body_from_camera: None,
         marker: Some(MarkerInFrame {
             centre: Pixel::new(650.0, 480.0),
-            body_from_marker: Some(Transform::new(Rotation::identity(), place)),
+            body_from_marker: Some(Transform::new(Rotation::identity(), position)),
             alternative: None,
             covariance_m2: None,
             size_px: Some(50.0),

@@ -71,11 +71,11 @@ fn landed() -> impl Strategy<Value = Landed> {
 }
 
 fn vehicle() -> impl Strategy<Value = Kind> {
-    let place =
+    let position =
         (number(0.0, 1.0), number(0.0, 1.0), number(-1.5, 1.4)).prop_map(|(x, y, z)| [x, y, z]);
     let speed =
         (number(0.0, 0.2), number(0.0, 0.2), number(0.0, 0.5)).prop_map(|(x, y, z)| [x, y, z]);
-    (age(), place, speed, mode(), prop::bool::weighted(0.995), landed()).prop_map(
+    (age(), position, speed, mode(), prop::bool::weighted(0.995), landed()).prop_map(
         |(age_s, position, velocity, mode, armed, landed)| Kind::Vehicle {
             age_s,
             position,

@@ -288,7 +288,7 @@ fn a_search_climbs_over_the_ground_and_not_over_the_origin() {
         let known_m = climbed_m(true, ground_z_m, 2.0);
         assert!((known_m - 3.0).abs() < 0.2, "{ground_z_m}: {known_m} m");
     }
-    // A lander that begins in the air does not know the ground.
+    // A lander that begins in the air has no height of the ground.
     assert!((climbed_m(false, 0.0, 2.0) - 3.0).abs() < 0.2);
     assert!(climbed_m(false, -20.0, 2.0).abs() < 0.2);
     assert!((climbed_m(false, 20.0, 2.0) - 5.0).abs() < 0.2, "at most that far over the start");
@@ -445,7 +445,7 @@ fn a_vehicle_that_may_stand_is_not_lifted_by_an_abort() {
         while harness.position.z() < -height_m {
             harness.fly(STEP_S);
         }
-        // It stands on the pad, though its autopilot does not say so.
+        // It stands on the pad, though its autopilot does not report it.
         harness.velocity = Vector::zero();
         harness.run(1.0, true);
         harness.step(Event::Operator(OperatorCommand::Abort));

@@ -330,7 +330,7 @@ fn the_operator_can_hold_resume_and_abort() {
     let commands = vec![(0.0, OperatorCommand::Start), (3.0, OperatorCommand::Abort)];
     let flight = Scene { commands, limit_s: 20.0, ..Scene::new(1) }.fly();
     assert_eq!(flight.phase, Phase::Aborted);
-    // Straight down where it is, beside the marker.
+    // Straight down where it is, next to the marker.
     let commands = vec![(0.0, OperatorCommand::Start), (3.0, OperatorCommand::LandHere)];
     let flight = Scene { commands, ..Scene::new(1) }.fly();
     let land_s = flight.land_s.unwrap();

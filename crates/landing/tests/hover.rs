@@ -13,7 +13,7 @@ const DT_S: f64 = 0.02;
 struct Drifter {
     lander: Lander,
     steps: u32,
-    place: Point<Ned>,
+    position: Point<Ned>,
     flown: Vector<Ned>,
     drift: Vector<Ned>,
     /// By how much the reported position is off.
@@ -28,7 +28,7 @@ impl Drifter {
         let mut drifter = Self {
             lander: Lander::new(Config::default()).ok()?,
             steps: 0,
-            place: Point::new(0.0, 0.0, -8.0),
+            position: Point::new(0.0, 0.0, -8.0),
             flown: Vector::zero(),
             drift,
             jump: Vector::zero(),
@@ -52,56 +52,56 @@ impl Drifter {
 
     /// Flies on; the last velocity that was commanded.
     fn fly(&mut self, seconds: f64) -> Vector<Ned> {
-        let mut wanted = Vector::zero();
+        let mut desired = Vector::zero();
         for _ in 0..(seconds / DT_S).round() as u32 {
             self.steps += 1;
             let state = VehicleState {
                 stamp: self.now(),
                 ned_from_body: Rotation::identity(),
-                position: self.place + self.jump,
+                position: self.position + self.jump,
                 velocity: self.flown,
                 mode: Mode::Guided,
                 armed: true,
                 landed: self.landed,
             };
             let event = if self.has_states { Event::Vehicle(state) } else { Event::Tick };
-            wanted = match self.lander.step(self.now(), event).action {
+            desired = match self.lander.step(self.now(), event).action {
                 Action::Velocity { velocity, .. } => velocity,
                 Action::None | Action::Guided | Action::Disarm | Action::Land => Vector::zero(),
             };
-            self.flown = self.flown + (wanted - self.flown) * (DT_S / 0.5);
-            self.place = self.place + (self.flown + self.drift) * DT_S;
+            self.flown = self.flown + (desired - self.flown) * (DT_S / 0.5);
+            self.position = self.position + (self.flown + self.drift) * DT_S;
         }
-        wanted
+        desired
     }
 }
 
 #[test]
-fn a_hold_stays_at_its_place_whatever_the_autopilot_takes_for_its_velocity() {
+fn a_hold_stays_at_its_position_whatever_the_autopilot_takes_for_its_velocity() {
     for drift_m_s in [0.3, 0.5, 0.8] {
         for (north, east) in [(1.0, 0.0), (-0.6, 0.8), (0.0, -1.0)] {
             let mut drifter =
                 Drifter::searching(Vector::new(north, east, 0.0) * drift_m_s, 0.2).unwrap();
-            let began = drifter.place;
+            let began = drifter.position;
             drifter.command(OperatorCommand::Hold);
             drifter.fly(60.0);
-            let away_m = (drifter.place - began).horizontal_norm();
+            let away_m = (drifter.position - began).horizontal_norm();
             assert!(away_m < 2.1 * drift_m_s, "{drift_m_s} m/s: {away_m} m");
-            assert!((drifter.place.z() - began.z()).abs() < 0.1, "{:?}", drifter.place);
+            assert!((drifter.position.z() - began.z()).abs() < 0.1, "{:?}", drifter.position);
         }
     }
 }
 
 #[test]
-fn each_hover_has_the_place_where_its_vehicle_came_to_rest() {
+fn each_hover_has_the_position_where_its_vehicle_stopped() {
     let mut drifter = Drifter::searching(Vector::zero(), 6.0).unwrap();
     for _ in 0..3 {
-        let began = drifter.place;
+        let began = drifter.position;
         let flown = drifter.flown;
         assert!(flown.horizontal_norm() > 0.5, "{flown:?}");
         drifter.command(OperatorCommand::Hold);
         drifter.fly(20.0);
-        let moved = drifter.place - began;
+        let moved = drifter.position - began;
         assert!((0.1..0.8).contains(&moved.horizontal_norm()), "{moved:?}");
         assert!(moved.x() * flown.x() + moved.y() * flown.y() > 0.0, "it swung back: {moved:?}");
         drifter.command(OperatorCommand::Resume);
@@ -114,10 +114,10 @@ fn a_jump_of_the_position_moves_no_vehicle() {
     let mut drifter = Drifter::searching(Vector::zero(), 0.2).unwrap();
     drifter.command(OperatorCommand::Hold);
     drifter.fly(5.0);
-    let before = drifter.place;
+    let before = drifter.position;
     drifter.jump = Vector::new(3.0, -4.0, 0.0);
     drifter.fly(20.0);
-    assert!((drifter.place - before).norm() < 0.05, "{:?}", drifter.place - before);
+    assert!((drifter.position - before).norm() < 0.05, "{:?}", drifter.position - before);
 }
 
 #[test]
@@ -128,9 +128,9 @@ fn without_a_state_it_stops_and_afterwards_it_stays_where_it_is() {
     drifter.has_states = false;
     assert_eq!(drifter.fly(3.0), Vector::zero());
     drifter.has_states = true;
-    let after = drifter.place;
+    let after = drifter.position;
     drifter.fly(20.0);
-    let away = drifter.place - after;
+    let away = drifter.position - after;
     assert!((0.5..1.1).contains(&away.x()), "{away:?}");
 }
 

@@ -50,7 +50,7 @@ fn silence_at_any_height_ends_in_a_soft_touchdown_or_in_none() {
     check(&[0.0, 5.0], &[f64::INFINITY, 0.5, 2.0, 5.0], |_| {});
 }
 
-/// A vehicle that brakes in a long silence has moved by less than its velocities before and after say. That is no jump of the
+/// A vehicle that brakes in a long silence has moved by less than by its velocities before and after. That is no jump of the
 /// autopilot's position, after which the pad would seem to be right below.
 #[test]
 fn after_a_long_silence_no_landing_is_asked_for_high_up() {
@@ -74,7 +74,7 @@ fn an_autopilot_with_a_long_timeout_is_descended_with_slowly() {
 }
 
 #[test]
-fn an_autopilot_that_does_not_say_its_timeout_is_taken_for_the_slowest() {
+fn an_autopilot_that_does_not_report_its_timeout_is_taken_for_the_slowest() {
     check(&[0.0], &[f64::INFINITY], |scene| {
         scene.setpoint_timeout_s = 3.0;
         scene.is_timeout_known = false;
@@ -93,7 +93,7 @@ fn a_short_timeout_costs_no_time() {
     assert!(short_s < 13.0 && short_s < long_s - 1.5, "{short_s} {long_s}");
 }
 
-/// Height over the place of the first touchdown that no flight has left the ground with, in metres.
+/// Height over the position of the first touchdown that no flight has left the ground with, in metres.
 const MAX_HOP_M: f64 = 0.15;
 
 /// Time on the ground after which a vehicle stands, in seconds.
@@ -109,7 +109,7 @@ fn climbs(sample: &Sample) -> bool {
 }
 
 /// Flights whose lander is silent below this height: vehicles that stand at its end must stay on the ground. One that hovers so
-/// low that wind lets it touch the ground may fly on: a lander that knows of no pad has it climb, where wind has lifted it before.
+/// low that wind lets it touch the ground may fly on: a lander without a position of the pad has it climb, where wind has lifted it before.
 /// Returns how many stood.
 fn check_stays_down(below_m: f64, then: Then, seeds: std::ops::Range<u64>) -> u32 {
     let mut table = String::new();

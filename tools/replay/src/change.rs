@@ -92,11 +92,11 @@ pub fn change_with(
         }
         let target = |decision: Option<TapeDecision<'_>>| decision.and_then(|it| it.target);
         if let (Some(then), Some(now)) = (target(then), target(now)) {
-            let place = |target: TapeTarget| {
+            let position = |target: TapeTarget| {
                 let [north_m, east_m, _] = target.position_ned_m;
                 [north_m, east_m]
             };
-            let away_m = distance(&place(then), &place(now));
+            let away_m = distance(&position(then), &position(now));
             change.max_target_m = change.max_target_m.max(away_m);
         }
         ControlFlow::Continue(())

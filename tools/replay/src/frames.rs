@@ -319,9 +319,9 @@ impl Frames {
             *showing += usize::from(is_visible);
         }
         let then_ms = then.stages.iter().map(|it| f64::from(it.micros)).sum::<f64>() * 1e-3;
-        let mut places = [None, None];
+        let mut positions = [None, None];
         let sides = [(&mut searched.then, then, then_ms), (&mut searched.now, now, took_ms)];
-        for ((side, message, ms), place) in sides.into_iter().zip(&mut places) {
+        for ((side, message, ms), position) in sides.into_iter().zip(&mut positions) {
             side.times_ms.push(ms);
             let Some(seen) = message.first_of(&side.marker) else { continue };
             side.frames += 1;
@@ -330,9 +330,9 @@ impl Frames {
                 Some(pose) => pose.camera_from_marker.translation_m,
                 None => [f64::NAN; 3],
             };
-            *place = Some(Point::new(x, y, z));
+            *position = Some(Point::new(x, y, z));
         }
-        match places {
+        match positions {
             [Some(_), None] => searched.lost += 1,
             [None, Some(_)] => searched.gained += 1,
             [Some(one), Some(other)] => {

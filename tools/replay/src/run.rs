@@ -244,9 +244,9 @@ pub fn of_unused_guidance(tape: &RecordedTape, set: &[String]) -> Option<String>
 /// # Errors
 /// When it cannot be read: a [`node::ConfigError`] where that is for a setting of now alone.
 pub(crate) fn configured<T: Settings>(name: &str, toml: &str, set: &[String]) -> anyhow::Result<T> {
-    from_toml(name, toml, set).map(|config| config.settings).or_else(|problem| {
+    from_toml(name, toml, set).map(|config| config.settings).or_else(|error| {
         check_recorded::<T>(name, toml)?;
-        Err(problem.into())
+        Err(error.into())
     })
 }
 
@@ -255,7 +255,7 @@ pub(crate) fn configured<T: Settings>(name: &str, toml: &str, set: &[String]) ->
 /// # Errors
 /// When it cannot, in words only: the user who replays it has not configured it wrongly.
 fn check_recorded<T: Settings>(name: &str, toml: &str) -> anyhow::Result<()> {
-    from_toml::<T>(name, toml, &[]).map(drop).map_err(|problem| anyhow!("{problem}"))
+    from_toml::<T>(name, toml, &[]).map(drop).map_err(|error| anyhow!("{error}"))
 }
 
 /// Describes a recorded configuration that cannot be read, whatever the settings are.
@@ -309,14 +309,14 @@ mod tests {
 
     #[test]
     fn only_a_setting_of_now_is_a_wrong_configuration() {
-        let problem = |configuration: &str, set: &[&str]| {
+        let error = |configuration: &str, set: &[&str]| {
             let set: Vec<String> = set.iter().map(|&it| it.to_owned()).collect();
             run(&tape(configuration), &set, |_| ControlFlow::Continue(())).unwrap_err()
         };
-        let recorded = problem("no_such_key = 3", &[]);
+        let recorded = error("no_such_key = 3", &[]);
         assert!(!recorded.is::<node::ConfigError>(), "{recorded:#}");
         assert!(format!("{recorded:#}").contains("no_such_key"), "{recorded:#}");
-        let given = problem("", &["no_such_key=3"]);
+        let given = error("", &["no_such_key=3"]);
         assert!(given.is::<node::ConfigError>(), "{given:#}");
     }
 }

@@ -216,7 +216,7 @@ fn a_pad_that_is_looked_for_is_named_as_the_controller_names_it() {
 }
 
 #[test]
-fn pictures_that_were_compressed_are_searched_as_well_and_said_to_be_so() {
+fn compressed_pictures_are_searched_as_well_and_marked_as_lossy() {
     let kept =
         |header: &FrameHeader, pixels: &[u8]| Picture::Jpeg(jpeg(header, pixels, 80).unwrap());
     let searched = again(recording(kept), &Again::default()).unwrap();
@@ -311,7 +311,7 @@ fn only_settings_of_the_replay_are_configuration_errors() {
     };
     put(&mut writer, topic::CONFIGURATION, "detector", 0, &configuration);
     writer.finish().unwrap();
-    let problem = search(&[recording(pixels), file], &[], &named).unwrap_err();
-    assert!(format!("{problem:#}").contains("key_of_another_version"), "{problem:#}");
-    assert!(!problem.is::<node::ConfigError>(), "{problem:#}");
+    let error = search(&[recording(pixels), file], &[], &named).unwrap_err();
+    assert!(format!("{error:#}").contains("key_of_another_version"), "{error:#}");
+    assert!(!error.is::<node::ConfigError>(), "{error:#}");
 }

@@ -53,7 +53,7 @@ fn flights_with_faults_give_the_same_results_to_the_bit() {
     assert!(events > 50_000 && flight_s > 300.0, "{events} events, {flight_s} s");
 }
 
-/// The packet with which a ground station says that it is there.
+/// The heartbeat of a ground station.
 fn ground_packet() -> autopilot::Packet {
     let ground = Sender { system: 255, component: 190 };
     let heartbeat = HEARTBEAT_DATA { mavtype: MavType::MAV_TYPE_GCS, ..Default::default() };

@@ -18,7 +18,7 @@ const MIN_STEP: f64 = 2.0;
 /// Width of a chart in pixels as shown.
 pub const WIDTH: u32 = 560;
 /// Space for the names left of an axis, and below one, in pixels of the drawing: left for the longest number, as in -0.015, with the unit
-/// beside it.
+/// next to it.
 const LEFT: u32 = 144;
 const LEFT_OF_ROWS: u32 = 250;
 const BELOW: u32 = 78;
@@ -226,8 +226,8 @@ impl Chart {
         {
             let size = [WIDTH, self.height].map(|pixels| pixels * SIZE_FACTOR);
             let area = SVGBackend::with_string(&mut svg, size.into()).into_drawing_area();
-            self.draw(&area, size).map_err(|problem| anyhow!("{}: {problem}", self.title))?;
-            area.present().map_err(|problem| anyhow!("{}: {problem}", self.title))?;
+            self.draw(&area, size).map_err(|error| anyhow!("{}: {error}", self.title))?;
+            area.present().map_err(|error| anyhow!("{}: {error}", self.title))?;
         }
         // The page's style gives it the width of its column.
         let label =
@@ -255,8 +255,8 @@ impl Chart {
         let up = f64::from(height.saturating_sub(BELOW + 2 * MARGIN));
         let per_pixel = ((x.end - x.start) / across).max((y.end - y.start) / up);
         let stretched = |range: Range<f64>, pixels: f64| {
-            let (middle, half) = (0.5 * (range.start + range.end), 0.5 * per_pixel * pixels);
-            middle - half..middle + half
+            let (centre, half) = (0.5 * (range.start + range.end), 0.5 * per_pixel * pixels);
+            centre - half..centre + half
         };
         (stretched(x, across), stretched(y, up))
     }
@@ -317,9 +317,9 @@ impl Chart {
             let room = (to - from) * f64::from(size[0] - self.left()) / (x.end - x.start);
             // About half its size is a letter's width.
             if room > 0.55 * f64::from(FONT) * band.name.len() as f64 {
-                let middle = (0.5 * (from + to), y.end);
+                let centre = (0.5 * (from + to), y.end);
                 let style = style(FONT - 3).pos(anchor);
-                chart.draw_series([Text::new(band.name.clone(), middle, style)])?;
+                chart.draw_series([Text::new(band.name.clone(), centre, style)])?;
             }
         }
         Ok(())
@@ -410,8 +410,8 @@ fn draw_layer<Backend: DrawingBackend<ErrorType: 'static>>(
 
 /// A range that can be drawn.
 fn drawable(range: Range<f64>) -> Range<f64> {
-    let reach = range.start.abs().max(range.end.abs());
-    let is_sane = reach < 1e3 * MAX_NUMBER && range.end - range.start > 1e-9 * reach;
+    let extent = range.start.abs().max(range.end.abs());
+    let is_sane = extent < 1e3 * MAX_NUMBER && range.end - range.start > 1e-9 * extent;
     if is_sane { range } else { 0.0..1.0 }
 }
 
@@ -530,12 +530,12 @@ mod tests {
             .skip(1)
             .map(|text| {
                 let x = text.split("x=\"").nth(1).unwrap().split('"').next().unwrap();
-                let said = text.split('>').nth(1).unwrap().split('<').next().unwrap().trim();
-                (x.parse().unwrap(), said)
+                let label = text.split('>').nth(1).unwrap().split('<').next().unwrap().trim();
+                (x.parse().unwrap(), label)
             })
             .collect();
-        let unit = texts.iter().find(|(_, said)| *said == "m").unwrap().0;
-        let (end, longest) = texts.iter().find(|(_, said)| *said == "-0.015").unwrap();
+        let unit = texts.iter().find(|(_, label)| *label == "m").unwrap().0;
+        let (end, longest) = texts.iter().find(|(_, label)| *label == "-0.015").unwrap();
         let begin = end - 0.6 * f64::from(FONT) * longest.len() as f64;
         assert!(unit + f64::from(FONT) < begin, "the unit at {unit}, the number from {begin}");
     }

@@ -14,10 +14,10 @@ pub fn configurations(one: &Flight, other: &Flight) -> Vec<Difference> {
 
 /// The parameters of the autopilot in which two flights differ, of those that both recorded.
 pub fn parameters(one: &Flight, other: &Flight) -> Vec<Difference> {
-    let texts = |flight: &Flight, beside: &Flight| -> BTreeMap<String, String> {
+    let texts = |flight: &Flight, other_flight: &Flight| -> BTreeMap<String, String> {
         let parameters = flight.packets.parameters.iter();
         parameters
-            .filter(|(name, _)| beside.packets.parameters.contains_key(*name))
+            .filter(|(name, _)| other_flight.packets.parameters.contains_key(*name))
             .map(|(name, value)| (name.clone(), value.to_string()))
             .collect()
     };
@@ -39,8 +39,8 @@ fn settings(flight: &Flight) -> BTreeMap<String, String> {
             Ok(table) => flatten("", &Value::Table(table), &mut |path, value| {
                 settings.insert(format!("{service}: {path}"), value);
             }),
-            Err(problem) => {
-                settings.insert(format!("{service}: "), format!("cannot be read: {problem}"));
+            Err(error) => {
+                settings.insert(format!("{service}: "), format!("cannot be read: {error}"));
             }
         }
     }

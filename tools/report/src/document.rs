@@ -20,7 +20,7 @@ const FOOT: f64 = PAGE[1] - MARGIN;
 /// Space between two charts, and between columns of a table.
 const GAP: f64 = 12.0;
 const CELL_GAP: f64 = 8.0;
-/// Width of one of two charts beside each other.
+/// Width of one of two charts side by side.
 const CHART: f64 = (COLUMN - GAP) / 2.0;
 /// Width of a legend's sample with the space before its name.
 const SAMPLE_WITH_GAP: f64 = SAMPLE + 3.5;
@@ -115,7 +115,7 @@ impl Writer {
         self.top += height;
     }
 
-    /// Text over the whole width, in as many lines as it takes.
+    /// Text over the full width, in as many lines as necessary.
     fn line(&mut self, text: &str, of: Type) {
         for line in wrapped(text, of, COLUMN) {
             self.needs(LEADING * of.size);
@@ -215,7 +215,7 @@ impl Writer {
         }
     }
 
-    /// Up to two charts beside each other.
+    /// Up to two charts side by side.
     fn charts(&mut self, charts: [Option<&Chart>; 2], letters: [&str; 2]) -> anyhow::Result<()> {
         let width = CHART;
         let height = height_of(charts);
@@ -408,7 +408,7 @@ fn shape(chart: &Chart, width: f64) -> f64 {
     width * f64::from(chart.height) / f64::from(WIDTH)
 }
 
-/// Height of charts beside each other, with title and legend; 0 of none.
+/// Height of charts side by side, with title and legend; 0 of none.
 fn height_of(charts: [Option<&Chart>; 2]) -> f64 {
     let width = CHART;
     let heights = charts.map(|chart| {

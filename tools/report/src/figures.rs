@@ -10,11 +10,11 @@ use crate::view::View;
 
 /// Size of texts, in pixels of the drawing.
 const FONT: u32 = 28;
-/// Width of a letter, on average, as a share of the size of texts.
+/// Width of a letter, on average, as a fraction of the size of texts.
 const LETTER: f64 = 0.56;
 /// Height of a line of texts, in pixels of the drawing.
 const LINE: u32 = 44;
-/// Space beside the drawing and between names, in pixels of the drawing.
+/// Space around the drawing and between names, in pixels of the drawing.
 const GAP: f64 = 28.0;
 /// Length of the sample in front of a name, in pixels of the drawing.
 const SAMPLE: f64 = 44.0;

@@ -229,7 +229,7 @@ impl FlightReader {
     ///
     /// # Errors
     /// When it is no MCAP file at all.
-    pub fn add(&mut self, recording: &[u8]) -> Result<(), flightlog::Problem> {
+    pub fn add(&mut self, recording: &[u8]) -> Result<(), flightlog::Error> {
         let Self { flight, tapes, boot_of_tape, meter, begin, lost_by_run } = self;
         let tape_key = topic::TAPE.key(&[]);
         let mut lost = BTreeMap::new();
@@ -294,8 +294,8 @@ impl FlightReader {
         boots.iter_mut().for_each(|boot| boot.take_over(&flight));
         boots.push(flight);
         for tape in tapes.tapes() {
-            let place = boot_of_tape.get(&tape.begun_ns);
-            if let Some(boot) = place.and_then(|place| boots.get_mut(*place)) {
+            let index = boot_of_tape.get(&tape.begun_ns);
+            if let Some(boot) = index.and_then(|index| boots.get_mut(*index)) {
                 boot.tapes.push(tape);
             }
         }
@@ -383,7 +383,7 @@ impl Flight {
         stamp_ns.saturating_sub(self.zero_ns) as f64 * 1e-9
     }
 
-    /// Position of the vehicle as the autopilot says, in local NED, in metres.
+    /// Position of the vehicle as the autopilot reports it, in local NED, in metres.
     pub fn position_at(&self, stamp_ns: i64) -> Option<[f64; 3]> {
         interpolated(&self.vehicle, stamp_ns, |it| (it.stamp_ns, it.position_ned_m))
     }
@@ -513,11 +513,11 @@ impl Flight {
     fn decoded_as<M: Message>(&mut self, key: &str, payload: &[u8]) -> Option<M> {
         match decode(payload) {
             Ok(message) => Some(message),
-            Err(problem) => {
+            Err(error) => {
                 let unreadable = self
                     .unreadable
                     .entry(key.to_owned())
-                    .or_insert_with(|| Unreadable { count: 0, why: problem.in_recording() });
+                    .or_insert_with(|| Unreadable { count: 0, why: error.in_recording() });
                 unreadable.count += 1;
                 None
             }

@@ -41,7 +41,7 @@ pub enum Fate {
     OnGround,
     /// The controller refused it before the estimate, or another frame had overtaken it.
     NotTaken,
-    /// The recording does not say.
+    /// The recording does not show it.
     Unknown,
 }
 
@@ -64,7 +64,7 @@ impl Fate {
     pub fn meaning(&self) -> String {
         match self {
             Self::Used => "the estimate used it".to_owned(),
-            Self::NoMarker => "the wanted marker was not found in it".to_owned(),
+            Self::NoMarker => "the configured marker was not found in it".to_owned(),
             Self::Refused(why) => refusal(why).to_owned(),
             Self::Standby => "another detector was in use".to_owned(),
             Self::NotNeeded => "no landing was under way".to_owned(),
@@ -72,7 +72,7 @@ impl Fate {
             Self::NotTaken => "overtaken by another frame, or refused before the estimate: of another clock or camera, or by \
                                another detector's name (the controller's losses count those)"
                 .to_owned(),
-            Self::Unknown => "the recording does not say".to_owned(),
+            Self::Unknown => "the recording does not show it".to_owned(),
         }
     }
 }
@@ -204,7 +204,7 @@ fn newest<T>(messages: &[T], at_ns: i64, stamp_ns: impl Fn(&T) -> i64) -> Option
     messages.get(later.checked_sub(1)?)
 }
 
-/// Whether the wanted marker is in a frame; without its name, whether any is.
+/// Whether the configured marker is in a frame; without its name, whether any is.
 fn has_marker(message: &Detections, marker: Option<&str>) -> bool {
     let Some(marker) = marker else { return !message.detections.is_empty() };
     let (family, id) = match marker.split_once(':') {
@@ -250,7 +250,7 @@ fn of_tape(tape: &RecordedTape, marker: Option<&str>) -> Vec<Handled> {
                 _ if !has_marker(message, marker) => Fate::NoMarker,
                 Some(why) => Fate::Refused(why.clone()),
                 None if is_new && latest.used > before => Fate::Used,
-                // A landing that begins anew counts anew.
+                // A landing that starts again is counted from its start.
                 None if is_new && latest.used > 0 && latest.used < before => Fate::Used,
                 None => Fate::NotTaken,
             };

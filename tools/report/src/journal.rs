@@ -45,31 +45,31 @@ fn controller(flight: &Flight) -> Vec<Line> {
     let mut touched = false;
     for status in &flight.statuses {
         let time_s = flight.at_s(status.stamp_ns);
-        let mut say = |is_warning: bool, text: String| {
+        let mut log = |is_warning: bool, text: String| {
             lines.push(Line { time_s, source: "controller".to_owned(), is_warning, text });
         };
         let is_same = |last: &messages::ControllerStatus| {
             last.phase == status.phase && phases::is_same(&last.why, &status.why)
         };
         if !last.is_some_and(is_same) {
-            say(false, status.sentence());
+            log(false, status.sentence());
         }
         if last.is_none_or(|last| last.autopilot != status.autopilot) {
-            say(false, format!("link to the autopilot: {}", status.autopilot));
+            log(false, format!("link to the autopilot: {}", status.autopilot));
         }
         if last.is_none_or(|last| last.active_detector != status.active_detector)
             && let Some(detector) = &status.active_detector
         {
             let is_change = last.is_some_and(|last| last.active_detector.is_some());
-            say(is_change, format!("detector in use: {detector} ({})", status.detector_why));
+            log(is_change, format!("detector in use: {detector} ({})", status.detector_why));
         }
         let known = last.map(|last| last.warnings.as_slice()).unwrap_or_default();
         let is_in = |all: &[String], text: &str| all.iter().any(|it| phases::is_same(it, text));
         for warning in status.warnings.iter().filter(|warning| !is_in(known, warning)) {
-            say(true, warning.clone());
+            log(true, warning.clone());
         }
         for over in known.iter().filter(|warning| !is_in(&status.warnings, warning)) {
-            say(false, format!("over: {over}"));
+            log(false, format!("over: {over}"));
         }
         last = Some(status);
     }
@@ -135,14 +135,14 @@ fn autopilot(flight: &Flight) -> Vec<Line> {
     let mut last: Option<&messages::VehicleState> = None;
     for state in &flight.vehicle {
         let time_s = flight.at_s(state.stamp_ns);
-        let mut say = |text: String| {
+        let mut log = |text: String| {
             lines.push(Line { time_s, source: "autopilot".to_owned(), is_warning: false, text });
         };
         if last.is_none_or(|last| last.mode != state.mode) {
-            say(format!("mode {}", state.mode));
+            log(format!("mode {}", state.mode));
         }
         if last.is_none_or(|last| last.armed != state.armed) {
-            say(format!("motors {}", if state.armed { "armed" } else { "disarmed" }));
+            log(format!("motors {}", if state.armed { "armed" } else { "disarmed" }));
         }
         last = Some(state);
     }

@@ -150,7 +150,7 @@ pub fn recording(flight: &Flight) -> Vec<String> {
     let Boot { number, of } = flight.boot;
     if of > 1 {
         lines.push(format!(
-            "the vehicle's clock began anew while the recording went on, as with a start of its computer: of {of} such parts this shows number {number} alone"
+            "the vehicle's clock restarted during the recording, as with a start of its computer: of {of} such parts this shows number {number} alone"
         ));
     }
     for set_s in &flight.time_set_s {
@@ -165,7 +165,7 @@ pub fn recording(flight: &Flight) -> Vec<String> {
         ));
     }
     if let Some(problem) = flight.recorder.as_ref().and_then(|status| status.problem.as_ref()) {
-        lines.push(format!("the recorder's last word: {problem}"));
+        lines.push(format!("the recorder's last problem: {problem}"));
     }
     lines
 }

@@ -94,7 +94,7 @@ pub struct Type {
     pub rgb: [u8; 3],
 }
 
-/// The pages so far. Places are from a page's left upper corner to the right and down, in units of 1/72 inch.
+/// The pages so far. Positions are from a page's left upper corner to the right and down, in units of 1/72 inch.
 pub struct Pages {
     done: Vec<Vec<u8>>,
     content: Content,
@@ -158,7 +158,7 @@ impl Pages {
             chart.draw(&area, size)
         };
         self.content.restore_state();
-        drawn.map_err(|problem| anyhow!("{}: {problem}", chart.title))
+        drawn.map_err(|error| anyhow!("{}: {error}", chart.title))
     }
 
     /// Draws how a layer is drawn, for a legend whose text's foot is at this position: [`SAMPLE`] wide.
@@ -167,8 +167,8 @@ impl Pages {
         let colour = RGBColor(red, green, blue);
         self.content.save_state();
         // A tenth of a unit is one of the drawing, which counts downwards.
-        let place = [0.1, 0.0, 0.0, -0.1, left, PAGE[1] - foot];
-        self.content.transform(place.map(|it| it as f32));
+        let transform = [0.1, 0.0, 0.0, -0.1, left, PAGE[1] - foot];
+        self.content.transform(transform.map(|it| it as f32));
         let right = (10.0 * SAMPLE) as i32;
         let (centre, middle) = (right / 2, -24);
         let mut drawing = Drawing { content: &mut self.content, size: [right.unsigned_abs(), 60] };

@@ -9,7 +9,7 @@ use crate::chart::{At, Axes, Chart, Ink, Layer, Shape, at, layer, span};
 use crate::flight::Light;
 use crate::frames::Fate;
 use crate::latency::between_ms;
-use crate::track::Place;
+use crate::track::TrackPoint;
 use crate::view::{View, component, unbridged};
 
 /// Height of a chart over time, as shown, in pixels.
@@ -49,27 +49,27 @@ fn over_time(view: &View<'_>, title: &str, unit: &str, layers: Vec<Layer>) -> Ch
 /// The landing in one picture: from above, and from the side.
 pub fn landing(view: &View<'_>) -> Vec<Chart> {
     // From the begin of the landing on: where the vehicle came from does not matter.
-    let landing = |places: &[Place]| -> Vec<Place> {
-        let shown = places.iter().filter(|it| it.time_s >= 0.0 && view.is_shown(it.time_s));
+    let landing = |positions: &[TrackPoint]| -> Vec<TrackPoint> {
+        let shown = positions.iter().filter(|it| it.time_s >= 0.0 && view.is_shown(it.time_s));
         shown.copied().collect()
     };
     let (truth, estimated) = (landing(&view.truth), landing(&view.estimated));
-    let places = || truth.iter().chain(&estimated);
-    let away = |it: &Place| at(it.east_m, it.north_m);
+    let positions = || truth.iter().chain(&estimated);
+    let away = |it: &TrackPoint| at(it.east_m, it.north_m);
     let mut above = Vec::new();
-    let reach = span(places().flat_map(|it| [it.east_m, it.north_m]), -0.3..0.3);
+    let extent = span(positions().flat_map(|it| [it.east_m, it.north_m]), -0.3..0.3);
     let step = estimated.len().div_ceil(CIRCLES).max(1);
-    // A circle is whole or not there: those of moderate size make the picture larger, the others would make the rest small.
-    let max_radius_m = MAX_CIRCLE * (reach.end - reach.start);
+    // A circle is drawn completely or not at all: those of moderate size make the picture larger, the others would make the rest small.
+    let max_radius_m = MAX_CIRCLE * (extent.end - extent.start);
     // An estimate without a deviation, as the thesis' guidance has none, is not a sure one.
     let with_deviation = || estimated.iter().filter(|it| it.deviation_m > 0.0);
-    let (drawn, left_out): (Vec<&Place>, Vec<&Place>) =
+    let (drawn, left_out): (Vec<&TrackPoint>, Vec<&TrackPoint>) =
         with_deviation().step_by(step).partition(|it| SIGMAS * it.deviation_m <= max_radius_m);
     let circles: Vec<At> = drawn.into_iter().flat_map(circle).collect();
     let around = circles.iter().flat_map(|it| [it.x, it.y]).filter(|it| it.is_finite());
-    let reach = span(around, reach);
+    let extent = span(around, extent);
     above.push(layer("circles: 2 standard deviations", Ink::Blue, Shape::Thin, circles));
-    let from_above = |places: &[Place]| unbridged(places, |it| it.time_s, away);
+    let from_above = |positions: &[TrackPoint]| unbridged(positions, |it| it.time_s, away);
     above.push(layer("truth", Ink::Orange, Shape::Wide, from_above(&truth)));
     above.push(layer("estimate", Ink::Blue, Shape::Line, from_above(&estimated)));
     above.push(layer("pad", Ink::Text, Shape::Crosses, [at(0.0, 0.0)]));
@@ -85,11 +85,11 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
         }
         _ => (1.0, 0.0),
     };
-    let along = |it: &Place| it.north_m * toward_north + it.east_m * toward_east;
-    let side = |it: &Place| at(along(it), it.height_m);
-    let from_the_side = |places: &[Place]| unbridged(places, |it| it.time_s, side);
-    let x = span(places().map(along), -0.3..0.3);
-    let edge = |it: &Place, sign: f64| {
+    let along = |it: &TrackPoint| it.north_m * toward_north + it.east_m * toward_east;
+    let side = |it: &TrackPoint| at(along(it), it.height_m);
+    let from_the_side = |positions: &[TrackPoint]| unbridged(positions, |it| it.time_s, side);
+    let x = span(positions().map(along), -0.3..0.3);
+    let edge = |it: &TrackPoint, sign: f64| {
         let x_m = along(it) + sign * SIGMAS * it.deviation_m;
         at(x_m.clamp(x.start, x.end), it.height_m)
     };
@@ -106,8 +106,8 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
         axes: Axes {
             x_name: "east, m".to_owned(),
             y_name: "north, m".to_owned(),
-            x: reach.clone(),
-            y: reach,
+            x: extent.clone(),
+            y: extent,
             is_equal: true,
         },
         bands: Vec::new(),
@@ -126,7 +126,7 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
             x_name: "past the pad, m (the two axes have scales of their own)".to_owned(),
             y_name: "height over the pad, m".to_owned(),
             x,
-            y: span(places().map(|it| it.height_m), 0.0..1.0),
+            y: span(positions().map(|it| it.height_m), 0.0..1.0),
             is_equal: false,
         },
         layers,
@@ -136,12 +136,12 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
     vec![from_above, from_the_side]
 }
 
-/// The circle of a place's uncertainty, and a gap after it.
-fn circle(place: &Place) -> Vec<At> {
-    let radius_m = SIGMAS * place.deviation_m;
+/// The circle of a position's uncertainty, and a gap after it.
+fn circle(point: &TrackPoint) -> Vec<At> {
+    let radius_m = SIGMAS * point.deviation_m;
     let around = (0..=24).map(|part| {
         let (sin, cos) = (TAU * f64::from(part) / 24.0).sin_cos();
-        at(place.east_m + radius_m * sin, place.north_m + radius_m * cos)
+        at(point.east_m + radius_m * sin, point.north_m + radius_m * cos)
     });
     around.chain([at(f64::NAN, f64::NAN)]).collect()
 }
@@ -152,8 +152,9 @@ pub fn height(view: &View<'_>) -> Vec<Chart> {
     let target = |of: fn(&messages::TargetEstimate) -> Option<f64>| {
         view.curve(&flight.targets, |it| Some(at(flight.at_s(it.stamp_ns), of(it)?)))
     };
-    let truth = |of: fn(&Place) -> f64| view.curve(&view.truth, |it| Some(at(it.time_s, of(it))));
-    let distance = |it: &Place| it.north_m.hypot(it.east_m);
+    let truth =
+        |of: fn(&TrackPoint) -> f64| view.curve(&view.truth, |it| Some(at(it.time_s, of(it))));
+    let distance = |it: &TrackPoint| it.north_m.hypot(it.east_m);
     let height = vec![
         layer("truth", Ink::Orange, Shape::Wide, truth(|it| it.height_m)),
         layer("estimate", Ink::Blue, Shape::Line, target(|it| it.height_m)),
@@ -258,7 +259,7 @@ pub fn detections(view: &View<'_>) -> Vec<Chart> {
         "Surprise of each detection (normalised innovation squared)",
         "",
         vec![layer(
-            "mean 3: as sure as it says, less: more careful; cut at 30",
+            "mean 3: errors as large as stated, less: smaller; cut at 30",
             Ink::Blue,
             Shape::Dots,
             nis,
@@ -490,7 +491,7 @@ fn trajectories(vehicle: Curve<'_>, pad: Curve<'_>) -> Vec<Chart> {
     views.map(|(name, across, up, y_name)| trajectory(name, across, up, y_name)).into()
 }
 
-/// Gives charts that stand beside each other the same axes.
+/// Gives charts that stand side by side the same axes.
 pub fn share_axes(one: &mut Chart, other: &mut Chart) {
     if one.is_empty() || other.is_empty() {
         return;

@@ -59,7 +59,7 @@ fn landing(view: &View<'_>) -> Section {
     let mut section = section("landing", "The landing in one picture", "");
     section.charts = plots::landing(view);
     if view.truth.is_empty() {
-        section.before.push(missing("truth, which only a simulation knows"));
+        section.before.push(missing("truth, which only a simulation has"));
     }
     if view.estimated.is_empty() {
         section
@@ -209,7 +209,7 @@ fn latency(view: &View<'_>) -> Section {
     let mut section = section(
         "latency",
         "Latency budget",
-        "From the middle of a frame's exposure to the setpoint that uses it, stage by stage.",
+        "From mid-exposure of a frame to the setpoint that uses it, stage by stage.",
     );
     let stages = &view.summary.latency;
     if stages.is_empty() {
@@ -311,7 +311,7 @@ fn detectors(view: &View<'_>) -> Section {
         if last.preference.is_empty() { "nothing" } else { &last.preference }
     )));
     section.after.push(table(&["at", "from", "to", "why"], changes));
-    // Each detector by the last status that knows it.
+    // Each detector by the last status that contains it.
     let mut known = BTreeMap::new();
     for candidate in flight.statuses.iter().flat_map(|status| &status.candidates) {
         known.insert(candidate.detector.as_str(), candidate);
@@ -349,7 +349,7 @@ fn wind(view: &View<'_>) -> Section {
                 .before
                 .push(paragraph(&format!("{mean:.1} m/s in the mean, {max:.1} m/s at most.")));
         }
-        _ => section.before.push(missing("the true wind, which only a simulation knows")),
+        _ => section.before.push(missing("the true wind, which only a simulation has")),
     }
     if !has_estimate {
         section.before.push(missing("the controller's estimate of the wind from the tilt"));
@@ -547,12 +547,12 @@ fn recording(view: &View<'_>) -> Section {
     rows.extend(flight.facts.iter().map(|(name, value)| vec![text(name), text(value)]));
     for (name, process) in &flight.processes {
         let wall_s = process.last.uptime_s - process.first.uptime_s;
-        let share = (wall_s > 0.0)
+        let cpu = (wall_s > 0.0)
             .then(|| 100.0 * (process.last.cpu_s - process.first.cpu_s) / wall_s)
-            .map_or(String::new(), |share| format!(", {share:.0} % of a core"));
+            .map_or(String::new(), |percent| format!(", {percent:.0} % of a core"));
         let health = &process.last;
-        let said = format!("alight {} on {}{share}", health.version, health.host);
-        rows.push(vec![text(name), text(said)]);
+        let program = format!("alight {} on {}{cpu}", health.version, health.host);
+        rows.push(vec![text(name), text(program)]);
     }
     section.after.push(table(&[], rows));
     section

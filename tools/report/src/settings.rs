@@ -1,10 +1,10 @@
-//! Settings by their whole names, and in which of them two configurations differ.
+//! Flattens settings to their full names, and finds those in which two configurations differ.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use toml::Value;
 
-/// A value that two flights, or two configurations, do not share.
+/// A value in which two flights, or two configurations, differ.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Difference {
     /// Its name: service and key, or parameter.

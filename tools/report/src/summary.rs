@@ -285,8 +285,8 @@ mod tests {
             let found = of(&flight, &Frames::default());
             (found.landed, found.outcome())
         };
-        let whole = outcome(&[&again, &descent, &landed, &again, &again]);
-        assert_eq!(whole, (Some(true), "landed".to_owned()));
+        let complete = outcome(&[&again, &descent, &landed, &again, &again]);
+        assert_eq!(complete, (Some(true), "landed".to_owned()));
         let none = outcome(&[&again]);
         assert_eq!(none, (Some(false), "idle: waiting until the vehicle flies".to_owned()));
     }

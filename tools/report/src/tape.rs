@@ -24,7 +24,7 @@ pub fn replay_tapes(flight: &mut Flight) {
     for tape in &flight.tapes {
         let (is_valid, text) = match verify(tape, &[]) {
             Ok(verdict) => (verdict.is_verified(), describe(&verdict)),
-            Err(problem) => (false, format!("the tape cannot be replayed: {problem:#}")),
+            Err(error) => (false, format!("the tape cannot be replayed: {error:#}")),
         };
         is_verified &= is_valid;
         texts.push(text);
@@ -95,8 +95,8 @@ fn describe(verdict: &Verdict) -> String {
         true => String::new(),
         false => format!(" (recorded by {theirs}, replayed by {ours})"),
     };
-    if let Some(problem) = end.stop.as_ref().or(other_state.as_ref()) {
-        return format!("tape not verified: {problem}{other}");
+    if let Some(difference) = end.stop.as_ref().or(other_state.as_ref()) {
+        return format!("tape not verified: {difference}{other}");
     }
     let no_end = match end.is_ended {
         true => "",
@@ -113,11 +113,11 @@ mod tests {
     #[test]
     fn only_a_tape_that_is_the_same_to_its_end_is_verified_without_a_reservation() {
         let end = End { events: 7, is_ended: true, ..End::default() };
-        let whole = Verdict { end: end.clone(), other_state: None };
-        assert_eq!(describe(&whole), "tape verified to the bit, 7 events");
-        let open = Verdict { end: End { is_ended: false, ..end }, ..whole.clone() };
+        let complete = Verdict { end: end.clone(), other_state: None };
+        assert_eq!(describe(&complete), "tape verified to the bit, 7 events");
+        let open = Verdict { end: End { is_ended: false, ..end }, ..complete.clone() };
         assert!(describe(&open).contains("it has no end"), "{}", describe(&open));
-        let other = Verdict { other_state: Some(Stop::NoBeginning { first: 3 }), ..whole };
+        let other = Verdict { other_state: Some(Stop::NoBeginning { first: 3 }), ..complete };
         assert!(describe(&other).starts_with("tape not verified: "), "{}", describe(&other));
     }
 }

@@ -10,7 +10,7 @@ use crate::flight::Flight;
 use crate::frames::Frames;
 use crate::phases;
 use crate::summary::{self, Summary};
-use crate::track::{self, EstimateError, Place};
+use crate::track::{self, EstimateError, TrackPoint};
 
 /// Number of usual periods without a sample over which no line is drawn.
 const MAX_GAP_PERIODS: f64 = 5.0;
@@ -32,9 +32,9 @@ pub struct View<'a> {
     /// The outcome of each frame.
     pub frames: Frames,
     /// Where the vehicle truly was.
-    pub truth: Vec<Place>,
+    pub truth: Vec<TrackPoint>,
     /// Where it was by the estimate.
-    pub estimated: Vec<Place>,
+    pub estimated: Vec<TrackPoint>,
     /// The error of the estimate.
     pub errors: Vec<EstimateError>,
     /// The velocity setpoints.

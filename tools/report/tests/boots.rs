@@ -1,4 +1,4 @@
-//! A recording that goes on while the vehicle's computer is started again, with which its clock begins anew.
+//! A recording that continues while the vehicle's computer is started again, with which its clock restarts.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 
@@ -101,7 +101,7 @@ fn landings_before_and_after_a_start_of_the_vehicles_computer_are_distinguished(
         let shift_s = (kept.shift_ns - 7_000 * S) / S;
         assert_eq!(shift_s, if tapes == 1 { 0 } else { 1_001 });
         let is_reported =
-            found.problems.iter().any(|it| it.contains("the vehicle's clock began anew"));
+            found.problems.iter().any(|it| it.contains("the vehicle's clock restarted"));
         assert!(is_reported, "{:?}", found.problems);
     }
     assert_eq!(both.clone().keep_landing(Some(3)), Err(2));

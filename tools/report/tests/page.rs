@@ -239,8 +239,8 @@ fn circles_of_the_deviation_are_whole_and_the_large_ones_are_left_out_aloud() {
     let flight = read(&landing().recording);
     let mut view = View::new(&flight);
     let end_s = view.estimated.last().unwrap().time_s;
-    for place in &mut view.estimated {
-        place.deviation_m = if place.time_s < 0.5 * end_s { 50.0 } else { 0.2 };
+    for point in &mut view.estimated {
+        point.deviation_m = if point.time_s < 0.5 * end_s { 50.0 } else { 0.2 };
     }
     let charts = plots::landing(&view);
     let (axes, circles) = (&charts[0].axes, &charts[0].layers[0].points);
@@ -361,7 +361,7 @@ fn a_status_of_another_version_is_reported_as_that() {
     assert!(!line.contains("no status"), "{line}");
     assert_eq!(serde_json::to_value(&found).unwrap()["landed"], serde_json::Value::Null);
     has_all_sections(&page(&flight).unwrap());
-    // And where there was none.
+    // And where no status was recorded.
     let none = summary(&read(&without(&landing().recording, &keys)));
     assert_eq!((none.landed, none.unreadable_status.is_none()), (None, true));
     assert!(none.line().contains("no status of a controller was recorded"), "{}", none.line());
@@ -369,20 +369,20 @@ fn a_status_of_another_version_is_reported_as_that() {
 
 #[test]
 fn a_tape_alone_gives_status_and_estimates_again() {
-    let whole = read(&landing().recording);
-    let beside = ["controller/status", "controller/target", "vehicle/state", "truth", "wind"];
-    let mut flight = read(&without(&landing().recording, &beside));
+    let complete = read(&landing().recording);
+    let others = ["controller/status", "controller/target", "vehicle/state", "truth", "wind"];
+    let mut flight = read(&without(&landing().recording, &others));
     assert!(flight.statuses.is_empty() && flight.targets.is_empty());
     replay_tapes(&mut flight);
     assert!(flight.is_rebuilt && flight.replayed.as_ref().unwrap().is_verified);
-    let (first, again) = (summary(&whole), summary(&flight));
+    let (first, again) = (summary(&complete), summary(&flight));
     assert_eq!((again.landed, again.frames_used), (Some(true), first.frames_used));
     near(again.time_to_disarm_s, first.time_to_disarm_s, 1e-9);
     let names = |summary: &report::Summary| -> Vec<String> {
         summary.phases.iter().map(|phase| phase.name.clone()).collect()
     };
     assert_eq!(names(&again), names(&first));
-    for target in &whole.targets {
+    for target in &complete.targets {
         assert!(flight.targets.contains(target), "{target:?}");
     }
     let html = page(&flight).unwrap();
@@ -433,8 +433,8 @@ fn damaged_recordings_give_their_remaining_messages() {
     has_all_sections(&html);
     assert!(!flight.is_ended && html.contains("the recording has no end"), "no end");
     let mut flipped = recording.clone();
-    for place in [1, 2, 3] {
-        flipped[place * recording.len() / 5] ^= 1;
+    for fifth in [1, 2, 3] {
+        flipped[fifth * recording.len() / 5] ^= 1;
     }
     let flight = read(&flipped);
     assert!(!flight.damage.is_empty());

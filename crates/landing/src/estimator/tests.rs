@@ -85,7 +85,7 @@ impl Scene {
         let seen: Vector<Body> = Rotation::<Body, Body>::from_euler(roll, pitch, 0.0) * in_body;
         let noise = self.noise_m;
         let [x, y, z] = noise.map(|sigma| sigma * self.normal());
-        let place = Point::new(seen.x() + x, seen.y() + y, seen.z() + z);
+        let position = Point::new(seen.x() + x, seen.y() + y, seen.z() + z);
         let heading = Rotation::<Ned, Marker>::from_euler(
             std::f64::consts::PI,
             0.0,
@@ -93,7 +93,7 @@ impl Scene {
         );
         let marker = MarkerInFrame {
             centre: Pixel::new(0.0, 0.0),
-            body_from_marker: Some(Transform::new(ned_from_body.inverse() * heading, place)),
+            body_from_marker: Some(Transform::new(ned_from_body.inverse() * heading, position)),
             alternative: None,
             covariance_m2: Some(Matrix3::from_diagonal(&noise.map(|s| s * s).into())),
             size_px: None,
@@ -173,7 +173,7 @@ fn normalised_innovations_are_chi_square() {
 }
 
 #[test]
-fn errors_are_as_large_as_the_covariance_says() {
+fn errors_are_as_large_as_the_covariance_states() {
     let mut squares = 0.0;
     let n = 60;
     for seed in 0..n {
@@ -281,7 +281,7 @@ fn the_process_noise_grows_only_for_an_autopilot_that_wanders() {
         let home = scene.pad;
         let (mut refused, mut worst_m) = (0, 0.0f64);
         for i in 0..300 {
-            // The reported position moves away and comes back, and the reported attitude tilts as that
+            // The reported position moves away and returns, and the reported attitude tilts as that
             // velocity changes.
             let (sin, cos) = (1.2 * scene.seconds).sin_cos();
             scene.pad = home + Vector::new(wander_m_s / 1.2 * sin, 0.0, 0.0);
@@ -405,7 +405,7 @@ fn only_a_steady_majority_becomes_the_target() {
 }
 
 #[test]
-fn a_pad_that_blinks_does_not_lose_to_a_place_out_of_view() {
+fn a_pad_that_blinks_does_not_lose_to_a_position_out_of_view() {
     let mut scene = Scene::new(EstimatorConfig::default(), 10);
     scene.focal_px = Some(1818.0);
     let home = scene.pad;

@@ -51,7 +51,7 @@ use crate::time::Timestamp;
 /// Multiple of the funnel's radius outside of which a descent becomes an approach again.
 const FUNNEL_HYSTERESIS: f64 = 1.2;
 
-/// Share of the lateral acceleration that is planned for braking before the target.
+/// Fraction of the lateral acceleration that is planned for braking before the target.
 const BRAKING: f64 = 0.7;
 
 /// The target's position is known while its standard deviation, in metres, and the age of its newest
@@ -81,7 +81,7 @@ const MAX_STEADY_M_S: f64 = 0.3;
 const TOUCHDOWN_M_S: f64 = 0.2;
 const TOUCHDOWN_PER_HEIGHT: f64 = 0.4;
 const TOUCHDOWN_WAIT_S: f64 = 1.0;
-const TOUCHDOWN_PATIENCE_M_S2: f64 = 0.1;
+const TOUCHDOWN_RELAXATION_M_S2: f64 = 0.1;
 const MAX_TOUCHDOWN_M_S: f64 = 0.3;
 
 /// Minimum descent speed at touchdown on a heaving pad, in m/s.
@@ -92,7 +92,7 @@ const MIN_TOUCHDOWN_M_S: f64 = 0.3;
 /// height that drifts down by 0.5 m/s, twice the largest measured error, leaves 0.2 m/s of descent.
 const MAX_FOLLOWING_M_S: f64 = 0.7;
 /// Within these it is followed, in m/s: by the first also in a faster descent, as the autopilot's height drifts there as well; by the
-/// second at most, also where the vehicle waits or is to climb, low and aside of the pad.
+/// second at most, also where the vehicle waits or is to climb, low and to the side of the pad.
 const MAX_DRIFT_DOWN_M_S: [f64; 2] = [0.2, 0.5];
 
 /// Time ahead for which the error of a low vehicle is predicted, in seconds.
@@ -103,7 +103,7 @@ const LOW_LEAD_S: f64 = 0.4;
 const ROOM_M_S: f64 = 0.5;
 const ROOM_GAIN: f64 = 2.0;
 
-/// A vehicle that is commanded to descend at this speed, in m/s, and stands still this long, in seconds, is
+/// A vehicle that is commanded to descend at this speed, in m/s, and is stationary this long, in seconds, is
 /// on the ground: the first where it should be near the ground, the second where it may also just be turning
 /// from a climb.
 const PUSHING_M_S: f64 = 0.15;
@@ -133,7 +133,7 @@ const CONTACT_S: f64 = 0.3;
 const NEAR_M: f64 = 0.3;
 const COMMITTED: f64 = 1.5;
 
-/// Share of the autopilot's vertical acceleration with which it is expected to brake when setpoints stop.
+/// Fraction of the autopilot's vertical acceleration with which it is expected to brake when setpoints stop.
 const UNATTENDED_BRAKING: f64 = 0.9;
 
 /// Delay of the link, both ways together, in seconds, that is part of `dead_time_s`; and the delay beyond it at
@@ -143,7 +143,7 @@ const HALF_GAIN_S: f64 = 0.15;
 
 /// Minimum fraction of the lateral speed that is allowed at the touchdown over a slow link: errors that are not seen in time must be
 /// slower beforehand, but it has to land.
-const MIN_TOUCHDOWN_SHARE: f64 = 0.5;
+const MIN_TOUCHDOWN_FRACTION: f64 = 0.5;
 
 /// Longest interval between two steps that is counted, in seconds.
 const MAX_STEP_S: f64 = 0.1;
@@ -162,11 +162,11 @@ pub struct Metric {
 }
 
 impl Guidance for Metric {
-    /// True when the target is recent, or low below and well known, and no other place may be the pad; or when the vehicle
+    /// True when the target is recent, or low below and well known, and no other position may be the pad; or when the vehicle
     /// touches down in any case.
     fn may_descend(&self, situation: &Situation<'_>) -> bool {
         let is_ambiguous = situation.target.is_some_and(|target| target.ambiguous);
-        let is_sure = !is_ambiguous && self.knows_target(situation);
+        let is_sure = !is_ambiguous && self.is_target_known(situation);
         situation.level_because.is_none() && (is_sure || self.touches_down(situation))
     }
 
@@ -316,7 +316,7 @@ impl Metric {
         }
     }
 
-    fn knows_target(&self, situation: &Situation<'_>) -> bool {
+    fn is_target_known(&self, situation: &Situation<'_>) -> bool {
         self.is_visible(situation) || self.may_descend_blind(situation)
     }
 
@@ -327,12 +327,12 @@ impl Metric {
     fn may_descend_blind(&self, situation: &Situation<'_>) -> bool {
         situation.target.is_some_and(|target| {
             let height_m = self.height_m(&target);
-            let patience = if height_m <= NEAR_M { COMMITTED } else { 1.0 };
+            let relaxation = if height_m <= NEAR_M { COMMITTED } else { 1.0 };
             // A vehicle that presses on something does not climb before it is known to stand there.
             let stands = self.standing_since.or(self.resting_since).is_some() && height_m <= NEAR_M;
             height_m <= self.config.blind_height_m
                 && situation.age_s <= self.config.stale_target_s + self.config.blind_s
-                && (stands || target.deviation_m <= self.config.blind_deviation_m * patience)
+                && (stands || target.deviation_m <= self.config.blind_deviation_m * relaxation)
         })
     }
 
@@ -380,11 +380,11 @@ impl Metric {
             return Vector::zero();
         };
         let height_m = self.height_m(target);
-        let share = (height_m / config.view_height_m - 1.0).clamp(0.0, 1.0);
+        let fraction = (height_m / config.view_height_m - 1.0).clamp(0.0, 1.0);
         let seen_m = height_m * tan(view_rad - config.view_margin_rad) - config.view_margin_m;
         let axis = observer.tilt * height_m;
         let excess_m = axis.norm() - fmax(seen_m, 0.0);
-        if excess_m <= 0.0 { Vector::zero() } else { axis * (share * excess_m / axis.norm()) }
+        if excess_m <= 0.0 { Vector::zero() } else { axis * (fraction * excess_m / axis.norm()) }
     }
 
     fn height_m(&self, target: &TargetEstimate) -> f64 {
@@ -399,10 +399,10 @@ impl Metric {
     fn funnel_error(&self, situation: &Situation<'_>, target: &TargetEstimate) -> f64 {
         let config = &self.config;
         let height_m = fmax(self.height_m(target), 0.0);
-        let patience = (self.waited_s(situation) / config.settle_s).clamp(0.0, 1.0);
+        let relaxation = (self.waited_s(situation) / config.settle_s).clamp(0.0, 1.0);
         let widest_m = fmax(config.funnel_m, config.blind_error_m);
         let radius_m = config.funnel_m
-            + (widest_m - config.funnel_m) * patience
+            + (widest_m - config.funnel_m) * relaxation
             + config.funnel_per_height * height_m;
         let error = self.error(situation, target);
         if height_m > LOW_M {
@@ -422,9 +422,9 @@ impl Metric {
         }
         let max_m_s = TOUCHDOWN_M_S
             + TOUCHDOWN_PER_HEIGHT * height_m
-            + TOUCHDOWN_PATIENCE_M_S2 * fmax(self.waited_s(situation) - TOUCHDOWN_WAIT_S, 0.0);
-        let share = fmax(gentleness(extra_delay_s(situation)), MIN_TOUCHDOWN_SHARE);
-        self.touchdown_slide_m_s(situation, target) / (fmin(max_m_s, MAX_TOUCHDOWN_M_S) * share)
+            + TOUCHDOWN_RELAXATION_M_S2 * fmax(self.waited_s(situation) - TOUCHDOWN_WAIT_S, 0.0);
+        let fraction = fmax(gentleness(extra_delay_s(situation)), MIN_TOUCHDOWN_FRACTION);
+        self.touchdown_slide_m_s(situation, target) / (fmin(max_m_s, MAX_TOUCHDOWN_M_S) * fraction)
     }
 
     /// The horizontal speed over the pad with which the vehicle touches the ground, in m/s: that of now or, should a gust end on the way,
@@ -444,7 +444,7 @@ impl Metric {
         fmax(closing.norm(), (closing + gust * gained).norm())
     }
 
-    /// Notes since when the vehicle is low, since when it stands still although commanded down, and whether it is bound to
+    /// Notes since when the vehicle is low, since when it is stationary although commanded down, and whether it is bound to
     /// touch the ground.
     fn note_waiting(&mut self, situation: &Situation<'_>, target: &TargetEstimate) {
         let height_m = self.height_m(target);
@@ -510,11 +510,11 @@ impl Metric {
     fn stands(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {
         let height_m = self.height_m(target);
         let enough_s = STANDING_S[usize::from(height_m > NEAR_M)];
-        let lasts = |since: Option<Timestamp>, enough_s: f64| {
+        let persists = |since: Option<Timestamp>, enough_s: f64| {
             since.is_some_and(|since| situation.now.seconds_since(since) >= enough_s)
         };
         height_m <= LOW_M
-            && (lasts(self.standing_since, enough_s) || lasts(self.resting_since, RESTING_S))
+            && (persists(self.standing_since, enough_s) || persists(self.resting_since, RESTING_S))
     }
 
     fn lateral(
@@ -540,9 +540,9 @@ impl Metric {
         let braking_m_s = (2.0 * BRAKING * config.lateral_acceleration_m_s2 * left_m).sqrt();
         let speed_m_s =
             fmin(fmin(gentle * config.lateral_gain * left_m, braking_m_s), config.max_lateral_m_s);
-        let wanted = if left_m > 1e-9 { left * (speed_m_s / left_m) } else { Vector::zero() };
+        let desired = if left_m > 1e-9 { left * (speed_m_s / left_m) } else { Vector::zero() };
         let acceleration = limited(
-            (wanted - closing) * (gentle * config.velocity_gain),
+            (desired - closing) * (gentle * config.velocity_gain),
             config.lateral_acceleration_m_s2,
         );
         limited(
@@ -558,7 +558,7 @@ impl Metric {
         if target.ambiguous && !touches_down {
             return (0.0, Reason::Ambiguous);
         }
-        if !self.knows_target(situation) && !touches_down {
+        if !self.is_target_known(situation) && !touches_down {
             return (0.0, Reason::TargetAging);
         }
         let error = self.funnel_error(situation, target);
@@ -608,7 +608,7 @@ impl Metric {
     }
 
     /// The fastest descent from which the vehicle, should no setpoint follow, reaches the ground no faster than
-    /// `end_m_s`: for the autopilot's setpoint timeout it goes on as it is, then it brakes.
+    /// `end_m_s`: for the autopilot's setpoint timeout it continues unchanged, then it brakes.
     fn unattended_m_s(&self, situation: &Situation<'_>, height_m: f64, end_m_s: f64) -> f64 {
         let limits = &situation.limits;
         let timeout_s = limits.setpoint_timeout_s.unwrap_or(self.config.setpoint_loss_s);
@@ -657,9 +657,9 @@ fn gentleness(delay_s: f64) -> f64 {
     HALF_GAIN_S / (HALF_GAIN_S + delay_s)
 }
 
-/// From `last` towards `wanted` by at most `step`; a descent ends at once, because the autopilot smooths it.
-fn approach_speed(last: f64, wanted: f64, step: f64) -> f64 {
-    if wanted < last { wanted } else { fmin(wanted, last + step) }
+/// From `last` towards `desired` by at most `step`; a descent ends at once, because the autopilot smooths it.
+fn approach_speed(last: f64, desired: f64, step: f64) -> f64 {
+    if desired < last { desired } else { fmin(desired, last + step) }
 }
 
 #[cfg(test)]

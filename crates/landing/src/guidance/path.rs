@@ -53,9 +53,9 @@ impl Path {
         while self.remainder_s >= STEP_S {
             self.remainder_s -= STEP_S;
             self.setpoint += (setpoint - self.setpoint) * (STEP_S / SETPOINT_LAG_S);
-            let wanted = (self.setpoint - self.velocity) / time_constant_s(limits);
-            let wanted = limited(wanted, limits.acceleration_m_s2);
-            self.acceleration += limited(wanted - self.acceleration, limits.jerk_m_s3 * STEP_S);
+            let desired = (self.setpoint - self.velocity) / time_constant_s(limits);
+            let desired = limited(desired, limits.acceleration_m_s2);
+            self.acceleration += limited(desired - self.acceleration, limits.jerk_m_s3 * STEP_S);
             self.velocity += self.acceleration * STEP_S;
         }
     }
@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn a_steady_motion_goes_on_and_limits_hold() {
+    fn a_steady_motion_continues_and_limits_hold() {
         let steady = Vector::new(0.4, -0.2, 0.0);
         let mut path = Path::new(steady);
         let limits = AutopilotLimits::default();

@@ -36,7 +36,7 @@ impl Lander {
         }
     }
 
-    /// Looks at the axes anew for a landing that has just started.
+    /// Restarts the axis check for a landing that has just started.
     pub(super) fn begin_checks(&mut self) {
         if self.axis_mismatch().is_some() {
             self.axis_check = AxisConsistencyCheck::default();

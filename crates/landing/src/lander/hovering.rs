@@ -17,7 +17,7 @@ const MAX_SUNK_M: f64 = 1.0;
 impl Lander {
     /// The same action, but a vehicle that is to hover or to climb straight up is led back to where that began. A request of a mode
     /// does not end a hover. The thesis' guidance hovers as the thesis' program did.
-    pub(super) fn keep_place(&mut self, now: Timestamp, action: Action) -> Action {
+    pub(super) fn keep_position(&mut self, now: Timestamp, action: Action) -> Action {
         let Action::Velocity { velocity, yaw_rate } = action else {
             if action == Action::None {
                 self.hover = None;
@@ -30,7 +30,8 @@ impl Lander {
             || velocity.horizontal_norm() > 0.0
             || velocity.z() > 0.0
             || matches!(self.phase(), Phase::Approach | Phase::Descend);
-        let (Some(vehicle), Some(place)) = (self.history.newest().copied(), self.place()) else {
+        let (Some(vehicle), Some(position)) = (self.history.newest().copied(), self.position())
+        else {
             return action;
         };
         let max_age_s = self.config.phases.stale_vehicle_s;
@@ -40,11 +41,11 @@ impl Lander {
         }
         let mut hover = before.unwrap_or(Hover::new(vehicle.stamp));
         let speed_m_s = vehicle.velocity.horizontal_norm();
-        let back = hover.velocity(vehicle.stamp, place, speed_m_s, max_age_s);
+        let back = hover.velocity(vehicle.stamp, position, speed_m_s, max_age_s);
         self.hover = Some(hover);
-        let wanted = Vector::new(back.x(), back.y(), velocity.z());
-        let wanted = envelope::clamp_to_fence(&self.config.phases, vehicle.position, wanted);
-        let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
+        let desired = Vector::new(back.x(), back.y(), velocity.z());
+        let desired = envelope::clamp_to_fence(&self.config.phases, vehicle.position, desired);
+        let velocity = envelope::clamp_setpoint(&self.config.envelope, desired, false);
         self.guidance.on_setpoint_sent(velocity);
         Action::Velocity { velocity, yaw_rate }
     }

@@ -11,7 +11,7 @@ use crate::standing::{RememberedPad, to_remember};
 use crate::time::Timestamp;
 use crate::view::View;
 
-/// Minimum height over the pad, in metres, and maximum standard deviation of its place, in metres, at which time without the marker
+/// Minimum height over the pad, in metres, and maximum standard deviation of its position, in metres, at which time without the marker
 /// in the camera's view is waiting time: below it a disturbance must be seen at once, and above that deviation the marker must be seen
 /// again.
 const MIN_WAIT_HEIGHT_M: f64 = 1.5;
@@ -29,7 +29,7 @@ impl Lander {
         to_remember(last, &self.target(last).filter(|_| is_active)?)
     }
 
-    /// True when the place of a pad that does not move is well known, and the camera of a vehicle that is not low over it did not
+    /// True when the position of a pad that does not move is well known, and the camera of a vehicle that is not low over it did not
     /// show it: low down, one that waits to see it is moved by a gust meanwhile.
     pub(super) fn is_out_of_view(&self, frame: &FrameObservation) -> bool {
         let (Some(view), Some(motion), Some(target)) =
@@ -37,10 +37,10 @@ impl Lander {
         else {
             return false;
         };
-        let place = self.history.ned_from_odometry().inverse() * target.position;
+        let position = self.history.ned_from_odometry().inverse() * target.position;
         let is_known = self.has_target(frame.stamp) && target.deviation_m <= MAX_WAIT_DEVIATION_M;
         let is_low = target.height_m <= MIN_WAIT_HEIGHT_M;
-        is_known && !is_low && !self.pad_moves() && !view.shows(place, &motion)
+        is_known && !is_low && !self.pad_moves() && !view.shows(position, &motion)
     }
 
     /// Stays where the marker must be in view, and climbs, never above the height where the landing started. After markers that
@@ -57,15 +57,15 @@ impl Lander {
         }
         let to_m = *self.retry_to_m.get_or_insert(climbed_m);
         let situation = self.situation(now, &vehicle);
-        let (wanted, _) = self.guidance.velocity(&situation);
+        let (desired, _) = self.guidance.velocity(&situation);
         let climb_m_s = self.climb_speed(to_m - altitude_m);
         let aside = match self.state_machine.reason() {
             Reason::RetryingRefused if !self.pad_moves() => Vector::zero(),
-            _ => wanted,
+            _ => desired,
         };
-        let wanted = Vector::new(aside.x(), aside.y(), -climb_m_s);
-        let wanted = envelope::below_fence(&phases, vehicle.position, wanted);
-        let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
+        let desired = Vector::new(aside.x(), aside.y(), -climb_m_s);
+        let desired = envelope::below_fence(&phases, vehicle.position, desired);
+        let velocity = envelope::clamp_setpoint(&self.config.envelope, desired, false);
         self.guidance.on_setpoint_sent(velocity);
         Action::Velocity { velocity, yaw_rate: 0.0 }
     }

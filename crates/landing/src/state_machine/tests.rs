@@ -213,7 +213,7 @@ fn an_abort_ends_land_only_while_the_vehicle_is_high() {
     assert_eq!(after(&[]), (true, false));
     assert_eq!(after(&[land(9.4, 3.0)]), (true, false));
     assert_eq!(after(&[land(9.4, 3.0), at(9.6)]), (false, false), "it follows again");
-    assert_eq!(after(&[land(15.0, 3.0)]), (false, true), "it did not come back");
+    assert_eq!(after(&[land(15.0, 3.0)]), (false, true), "it did not return");
     let low = land(10.0, 0.9);
     assert_eq!(after(&[low]), (false, false), "it may have carried out the request");
     assert_eq!(after(&[low, land(10.2, 1.1)]), (false, false), "it is asked no more");
@@ -334,7 +334,7 @@ fn land_from_high_up_has_the_time_that_its_speed_takes() {
         check(&[a, b, from(0.0), from(limit_s - 0.1)], lands.0, lands.1);
         check(&[a, b, from(0.0), from(limit_s + 0.1)], overdue.0, overdue.1);
     }
-    // The ground is far below the place where it took off: while it sinks it lands.
+    // The ground is far below the position where it took off: while it sinks it lands.
     let valley = |seconds, sinks| land(2.0 + seconds, -40.0, 0.5, sinks);
     check(&[a, b, valley(0.0, true), valley(120.0, true)], lands.0, lands.1);
     check(&[a, b, valley(0.0, true), valley(120.0, false)], overdue.0, overdue.1);
@@ -342,7 +342,7 @@ fn land_from_high_up_has_the_time_that_its_speed_takes() {
 }
 
 #[test]
-fn below_the_place_of_its_take_off_a_vehicle_that_sinks_is_called_back_from_land() {
+fn below_the_position_of_its_take_off_a_vehicle_that_sinks_is_called_back_from_land() {
     let here = [start(), commanded(1.0, OperatorCommand::LandHere)];
     let aborted = |height_m: f64, is_over_target, sinks| {
         let land = flown(2.0, move |v| {
@@ -449,7 +449,7 @@ fn a_vehicle_that_may_stand_on_the_pad_does_not_climb() {
     check(&[a, b, c, stale, low], Phase::Final, Reason::MayStand);
     check(&[a, b, c, Inputs { may_stand: false, ..known }], Phase::Retry, Reason::Retrying);
     check(&[a, b, c, known], Phase::Final, Reason::MayStand);
-    // It waits for the vehicle's state, and a hold by the operator lasts.
+    // It waits for the vehicle's state, and a hold by the operator persists.
     check(
         &[a, b, c, stale, Inputs { may_stand: true, ..stale }],
         Phase::Hold,

@@ -77,8 +77,8 @@ impl Eyes {
         for after_s in [Some(passage.arrives_after_s), passage.again_after_s].into_iter().flatten()
         {
             let arrives_s = now_s + after_s;
-            let place = self.in_transit.partition_point(|(at, _)| *at <= arrives_s);
-            self.in_transit.insert(place, (arrives_s, frame));
+            let index = self.in_transit.partition_point(|(at, _)| *at <= arrives_s);
+            self.in_transit.insert(index, (arrives_s, frame));
         }
     }
 

@@ -68,11 +68,11 @@ pub(crate) struct Scene {
     pub(crate) refuses_land: bool,
     /// The pilot takes over at this time.
     pub(crate) pilot_s: Option<f64>,
-    /// From this height over the pad down, in metres, two detectors see the marker at two places.
+    /// From this height over the pad down, in metres, two detectors see the marker at two positions.
     pub(crate) disputed_below_m: f64,
     /// The lander falls silent in the descent.
     pub(crate) silence: Option<Silence>,
-    /// The autopilot does not say in GUIDED that it is on the ground, as ArduPilot's for 7 s after the touchdown.
+    /// The autopilot does not report in GUIDED that it is on the ground, as ArduPilot's for 7 s after the touchdown.
     pub(crate) is_ground_reported_late: bool,
     /// The autopilot's setpoint timeout, in seconds, and whether the lander knows it.
     pub(crate) setpoint_timeout_s: f64,

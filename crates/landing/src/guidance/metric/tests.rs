@@ -24,8 +24,8 @@ fn largest_bias(times: impl Iterator<Item = (f64, f64)>, north: impl Fn(f64) -> 
     let mut metric = Metric::new(MetricConfig::default());
     let mut largest_m_s = 0.0f64;
     for (stamp_s, now_s) in times {
-        let place = Point::new(north(stamp_s), 0.5 * stamp_s, -5.0);
-        let vehicle = vehicle(stamp_s, place, Vector::new(0.0, 0.5, 0.0));
+        let position = Point::new(north(stamp_s), 0.5 * stamp_s, -5.0);
+        let vehicle = vehicle(stamp_s, position, Vector::new(0.0, 0.5, 0.0));
         let now = Timestamp::from_seconds(now_s);
         let _ = metric.velocity(&Situation { now, ..situation(&vehicle) });
         largest_m_s = largest_m_s.max(metric.observer.unwrap().bias.norm());
@@ -87,7 +87,7 @@ fn vehicle(seconds: f64, position: Point<Ned>, velocity: Vector<Ned>) -> Vehicle
     }
 }
 
-/// One that sinks this far aside of its target.
+/// One that sinks this far to the side of its target.
 pub(crate) fn sinking(s: f64, aside_m: f64, height_m: f64, down_m_s: f64) -> VehicleState {
     vehicle(s, Point::new(aside_m, 0.0, -height_m), Vector::new(0.0, 0.0, down_m_s))
 }
@@ -122,7 +122,7 @@ pub(crate) fn situation(vehicle: &VehicleState) -> Situation<'_> {
     }
 }
 
-/// A vehicle that stays beside its target at heights that change with time.
+/// A vehicle that stays next to its target at heights that change with time.
 fn hovered(aside_m: f64, seconds: f64, height_m: impl Fn(f64) -> f64) -> Progress {
     let mut metric = Metric::new(MetricConfig::default());
     let mut progress = Progress::Unchanged;
@@ -151,7 +151,7 @@ fn a_retry_has_the_time_of_the_first_try_at_the_height_of_waiting_as_well() {
     let mut metric = Metric::new(MetricConfig::default());
     let mut stuck = Vec::new();
     for i in 0..1200u32 {
-        // Always beside its target, and low.
+        // Always next to its target, and low.
         let s = f64::from(i) / 40.0;
         let vehicle = vehicle(s, Point::new(0.6, 0.0, -0.4), Vector::zero());
         let situation = situation(&vehicle);
@@ -260,10 +260,10 @@ fn a_pad_that_seems_to_sink_is_not_followed_hard_onto_the_ground() {
     assert!(touchdown_m_s(0.1, 0.0) > 0.59, "the autopilot's height drifts");
     assert!(touchdown_m_s(-0.3, 0.0) < 0.21, "or rises");
     assert!(touchdown_m_s(0.45, 0.4) > 0.74, "a pad that heaves is followed");
-    // A slow descent goes on also where the autopilot's height drifts down quickly.
+    // A slow descent continues also where the autopilot's height drifts down quickly.
     let slow = MetricConfig { touchdown_descend_m_s: 0.2, ..config };
     assert!(touchdown(&slow, 0.4, 0.0) > 0.59);
-    // One that is too far aside to touch down follows it by 0.5 m/s at most.
+    // One that is too far to the side to touch down follows it by 0.5 m/s at most.
     let mut metric = Metric::new(config);
     for i in 0..=40u32 {
         let vehicle = sinking(f64::from(i) / 40.0, 1.0, 0.3, 0.0);
@@ -279,7 +279,7 @@ fn a_pad_that_seems_to_sink_is_not_followed_hard_onto_the_ground() {
 fn a_height_that_is_wrong_ends_the_descent_of_a_vehicle_that_was_to_touch_down() {
     let mut metric = Metric::new(MetricConfig::default());
     for i in 0..80u32 {
-        // The ground is lower than the estimate says, and the pad was not seen for long.
+        // The ground is lower than the estimate, and the pad was not seen for long.
         let s = f64::from(i) / 40.0;
         let height_m = 0.5 - 0.5 * s;
         let vehicle = sinking(s, 0.0, height_m, 0.5);
@@ -359,7 +359,7 @@ fn a_vehicle_that_leans_against_a_gust_waits_above_the_ground_and_touches_down_w
         let situation = situation(&vehicle);
         let mut metric = Metric::new(MetricConfig::default());
         let mut observer = Observer::new(&situation);
-        // Faster than the vehicle, which stands still over the pad.
+        // Faster than the vehicle, which is stationary over the pad.
         observer.path = Path::new(Vector::new(path_m_s, 0.0, 0.0));
         metric.observer = Some(observer);
         metric.descent(&situation, &situation.target.unwrap())

@@ -159,7 +159,7 @@ fn check_step(before: &StateMachine, inputs: &Inputs, after: &StateMachine) {
     if from.is_terminal() {
         let started =
             matches!(inputs.operator, Some(OperatorCommand::Start | OperatorCommand::LandHere));
-        assert!(from == to || started, "left by itself: {step}");
+        assert!(from == to || started, "left without a command: {step}");
         return;
     }
     let vehicle = inputs.vehicle;
@@ -201,8 +201,8 @@ fn every_transition_is_allowed_and_every_phase_ends() {
                 after.advance(inputs);
                 check_step(&waited, inputs, &after);
                 let key = key(&after);
-                if let Entry::Vacant(place) = found.entry(key) {
-                    place.insert(after.clone());
+                if let Entry::Vacant(entry) = found.entry(key) {
+                    entry.insert(after.clone());
                     open.push_back(after);
                 }
             }
