@@ -30,7 +30,7 @@ struct State {
     waiting_bytes: usize,
     /// Since when the oldest of it waits.
     since: Option<Instant>,
-    /// Nothing more will come.
+    /// No more bytes will be handed over.
     is_complete: bool,
     status: DiskStatus,
 }

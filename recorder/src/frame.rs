@@ -71,7 +71,7 @@ pub(crate) fn header(message: &Tapped) -> Option<FrameHeader> {
     decode(&message.attachment).ok()
 }
 
-/// A message as it came.
+/// A message as it was received.
 pub(crate) fn received(message: &Tapped) -> Received<'_> {
     Received {
         key: &message.key,

@@ -5,7 +5,7 @@
 
 use std::net::IpAddr;
 
-/// Whether one may follow: no page of a browser, one of this machine or of the address that is asked, or one of `allowed`.
+/// Whether a client may follow: no page of a browser, one of this machine or of the address that is requested, or one of `allowed`.
 pub(crate) fn may_follow(origin: Option<&str>, host: Option<&str>, allowed: &[String]) -> bool {
     let Some(origin) = origin else { return true };
     if allowed.iter().any(|it| it.eq_ignore_ascii_case(origin)) {

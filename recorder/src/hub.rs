@@ -1,4 +1,4 @@
-//! The channels offered to viewers and the viewers' slots: each client's subscriptions, the last values for a client that
+//! Manages the channels offered to viewers and the viewers' slots: each client's subscriptions, the last values for a client that
 //! joins, and a bound on their number.
 
 use std::collections::BTreeMap;
@@ -187,7 +187,7 @@ impl Slot {
         Ok(())
     }
 
-    /// The client gets no more of a subscription.
+    /// The client receives no more messages of a subscription.
     pub(crate) fn unsubscribe(&self, id: u32) {
         if let Some(client) = self.hub.lock().clients.get_mut(&self.client) {
             client.outbox.unsubscribe(id);

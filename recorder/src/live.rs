@@ -1,4 +1,4 @@
-//! Offers messages, and frames with a picture, to viewers who follow a flight over WebSocket; listens at the configured
+//! Offers messages, and frames with a picture, to viewers that follow a flight over WebSocket; listens at the configured
 //! address, and does nothing while no viewer follows.
 
 use std::collections::BTreeMap;

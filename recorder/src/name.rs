@@ -1,4 +1,4 @@
-//! The names of recordings.
+//! Makes the names of recordings.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};

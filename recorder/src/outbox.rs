@@ -70,7 +70,7 @@ pub(crate) struct Outbox {
 #[derive(Debug)]
 struct Subscribed {
     id: u32,
-    /// With their numbers, in the order in which they came.
+    /// With their numbers, in the order of reception.
     waiting: VecDeque<(u64, Message)>,
 }
 

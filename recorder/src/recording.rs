@@ -1,4 +1,4 @@
-//! One recording under way: the MCAP writer with its chunks, the buffer in front of the disk's thread, and
+//! Writes one recording: the MCAP writer with its chunks, the buffer in front of the disk's thread, and
 //! which messages have reached the disk.
 
 use std::collections::{BTreeMap, VecDeque};

@@ -1,4 +1,4 @@
-//! A viewer's WebSocket (Foxglove, Lichtblick or another client of their protocol): origin checked,
+//! Serves a viewer's WebSocket (Foxglove, Lichtblick or another client of their protocol): origin checked,
 //! subscriptions taken, messages sent within its window, pings.
 
 use std::convert::Infallible;

@@ -23,7 +23,7 @@ use crate::unseen::Unseen;
 
 /// Longest wait for a message, after which the file is looked after.
 const MAX_WAIT: Duration = Duration::from_millis(50);
-/// Period in which the file is looked after while messages come.
+/// Period in which the file is maintained while messages are received.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// Pause after a file that could not be opened or written, before another one is tried.
 const RETRY_PAUSE: Duration = Duration::from_secs(2);
@@ -111,7 +111,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
 /// Whether a status is published, after the last one: at once when something but the numbers of messages and bytes has changed.
 fn is_due(last: Option<&RecorderStatus>, now: &RecorderStatus, now_ns: i64) -> bool {
     let Some(last) = last else { return true };
-    // A tick comes a little early or late.
+    // A tick is a little early or late.
     let max_ns = (MAX_STATUS_PERIOD - MIN_STATUS_PERIOD / 2).as_nanos();
     u128::from(now_ns.abs_diff(last.stamp_ns)) >= max_ns
         || last.problem != now.problem
@@ -182,7 +182,7 @@ struct Recorder {
     retry: Option<Instant>,
     /// Messages that were kept.
     kept: Counts,
-    /// Frames that never came.
+    /// Frames that were never received.
     unseen: Unseen,
     /// Messages that were lost.
     lost: Counts,
@@ -403,7 +403,7 @@ impl Recorder {
                 self.end_problem = Some(format!("the end of a recording is missing: {problem}"));
             }
         }
-        // At last, so that a full file is followed by the next before another message comes.
+        // At last, so that a full file is followed by the next before another message is received.
         let is_due = self.retry.is_none_or(|retry| Instant::now() >= retry);
         if self.recording.is_none() && is_due {
             match self.begin() {
@@ -547,7 +547,7 @@ impl Recorder {
     }
 }
 
-/// Writes a message: frames as configured, everything else as it came.
+/// Writes a message: frames as configured, everything else as it was received.
 fn keep(recording: &mut Recording, message: &Tapped, frame: Option<&Frame>) -> anyhow::Result<()> {
     match frame {
         Some(Frame { header, picture, .. }) => {

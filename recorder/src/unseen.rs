@@ -25,7 +25,7 @@ struct Numbers {
     last: u64,
     /// Numbers that were left out before it.
     missing: u64,
-    /// Frames that came and were dropped before they were looked at; their numbers are missing as well.
+    /// Frames that were received and dropped before they were looked at; their numbers are missing as well.
     dropped: u64,
     /// Frames that have been returned as unseen.
     counted: u64,
@@ -63,8 +63,8 @@ impl Unseen {
         }
     }
 
-    /// The frames that never came and were not returned before, by key and reason. One that was dropped is missing only once
-    /// the next has come, so that some are returned later.
+    /// The frames that were never received and were not returned before, by key and reason. One that was dropped is missing only once
+    /// the next was received; some are returned later.
     pub(crate) fn more(&mut self) -> Vec<(String, u64)> {
         let more = self.cameras.iter_mut().filter_map(|(key, numbers)| {
             let unseen = numbers.missing.saturating_sub(numbers.dropped);
@@ -84,7 +84,7 @@ mod tests {
     const UNSEEN: &str = "camera/down/frame (never came)";
 
     #[test]
-    fn numbers_that_are_left_out_are_frames_that_never_came() {
+    fn missing_numbers_are_frames_that_were_never_received() {
         let mut unseen = Unseen::default();
         for sequence in [7, 8, 12, 13] {
             unseen.take(KEY, sequence);

@@ -1,4 +1,4 @@
-//! The records of a recording: messages as they came, and as JSON.
+//! Makes the records of a recording: messages as they were received, and as JSON.
 
 use messages::{
     CameraControl, CameraInfo, CameraResponse, Configuration, ControllerStatus, DecodeError,
@@ -8,10 +8,10 @@ use messages::{
 
 use crate::protobuf::{MessageType, descriptor_set};
 
-/// Message encoding of a message as it came: the length of its attachment (four bytes, little-endian), the attachment,
+/// Message encoding of a message as it was received: the length of its attachment (four bytes, little-endian), the attachment,
 /// the payload.
 pub const RAW: &str = "alight";
-/// Prefix of the channels with messages as they came.
+/// Prefix of the channels with messages as they were received.
 pub const RAW_PREFIX: &str = "raw/";
 /// A JSON schema that allows any object: the messages' own types are more exact, and are in the documents.
 const ANY_OBJECT: &[u8] = br#"{"type":"object"}"#;
@@ -82,13 +82,13 @@ pub struct Record {
     pub channel: String,
     /// How its bytes are read.
     pub schema: Schema,
-    /// When it was taken, in nanoseconds of its publisher's clock; when it came, without a stamp of its own.
+    /// When it was taken, in nanoseconds of its publisher's clock; when it was received, without a stamp of its own.
     pub stamp_ns: i64,
     /// The bytes.
     pub data: Vec<u8>,
 }
 
-/// A message as it came.
+/// A message as it was received.
 #[derive(Copy, Clone, Debug)]
 pub struct Received<'a> {
     /// Its key, without the vehicle.
@@ -97,7 +97,7 @@ pub struct Received<'a> {
     pub payload: &'a [u8],
     /// Its attachment; empty without.
     pub attachment: &'a [u8],
-    /// When it came, in nanoseconds of the recorder's clock.
+    /// When it was received, in nanoseconds of the recorder's clock.
     pub received_ns: i64,
 }
 
@@ -154,7 +154,7 @@ pub fn is_state(key: &str) -> bool {
     states.any(|row| matches(row.key, key))
 }
 
-/// A message as it came.
+/// A message as it was received.
 pub(crate) fn raw(message: Received<'_>) -> Record {
     let Received { key, payload, attachment, received_ns } = message;
     let mut data = Vec::with_capacity(4 + attachment.len() + payload.len());

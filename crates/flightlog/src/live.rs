@@ -1,7 +1,7 @@
 //! Serves a flight under way to programs that follow it: messages and requests of the Foxglove WebSocket protocol,
 //! version 1, without the network.
 //!
-//! The channels are those of a recording with the same types, but for messages as they came
+//! The channels are those of a recording with the same types, but for messages as they were received
 //! ([`RAW_PREFIX`](crate::channel::RAW_PREFIX)), which no viewer can show.
 //!
 //! Reference: `docs/spec.md` of <https://github.com/foxglove/ws-protocol>, version 1, and the handshake of

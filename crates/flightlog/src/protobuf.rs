@@ -1,4 +1,4 @@
-//! Protocol buffers, as far as recordings need them: message types as tables, which describe a type in a file
+//! Encodes protocol buffers, as far as recordings need them: tables of message types, which describe a type in a file
 //! (`FileDescriptorSet`) and encode their fields.
 //!
 //! Reference: the wire format and `descriptor.proto` of Protocol Buffers, version 3.

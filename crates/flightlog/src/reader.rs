@@ -20,7 +20,7 @@ use crate::writer::{DROPPED_CHANNEL, Error, METADATA, TIME_SET};
 pub enum Entry<'a> {
     /// Facts about the recording, by name; before everything else.
     About(BTreeMap<String, String>),
-    /// A message as it came. Of a frame only the attachment, which is its header.
+    /// A message as it was received. Of a frame only the attachment, which is its header.
     Message(Received<'a>),
     /// The recorded picture of a frame, after the frame's own message.
     Picture {
@@ -42,7 +42,7 @@ pub enum Entry<'a> {
 pub struct Reading {
     /// Whether it has its end: without, its recorder was killed, or the rest is missing.
     pub is_ended: bool,
-    /// Messages that were read as they came.
+    /// Messages that were read as they were received.
     pub messages: u64,
     /// The parts that could not be read, as sentences.
     pub damage: Vec<String>,
@@ -158,7 +158,7 @@ struct Found<F> {
     /// The channels that the index describes.
     in_index: HashMap<u16, Arc<Channel<'static>>>,
     utc_offset_ns: i64,
-    /// The last frame: its camera by its key, when it came by the file's time, and its header.
+    /// The last frame: its camera by its key, when it was received by the file's time, and its header.
     frame: Option<(String, u64, FrameHeader)>,
     reading: Reading,
     /// Messages of channels that nothing describes.

@@ -1,4 +1,4 @@
-//! The records of a file, one after the other.
+//! Iterates over the records of a file, one after the other.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 

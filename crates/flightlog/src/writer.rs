@@ -1,4 +1,4 @@
-//! Writes a recording's MCAP file, append-only: schemas, channels, messages as they came, as JSON and as Foxglove shows them,
+//! Writes a recording's MCAP file, append-only: schemas, channels, messages as received, as JSON and as Foxglove shows them,
 //! frames, and counts of lost messages.
 //!
 //! Chunks are gathered in memory and written in one piece, so a killed writer loses the messages after the last
@@ -69,7 +69,7 @@ struct Open {
     sequence: u32,
 }
 
-/// How many messages of each key could not be kept so far, or never came.
+/// How many messages of each key could not be recorded so far, or were never received.
 pub fn dropped(now_ns: i64, so_far: &BTreeMap<String, u64>) -> Record {
     Record {
         channel: DROPPED_CHANNEL.to_owned(),
@@ -105,7 +105,7 @@ impl<W: Write> Writer<W> {
         })
     }
 
-    /// Adds a message: as it came, as JSON, and as Foxglove shows it. One that cannot be decoded is kept as it came.
+    /// Adds a message: as received, as JSON, and as Foxglove shows it. One that cannot be decoded is recorded only as received.
     ///
     /// # Errors
     /// When the output does not take it; the recording is then at its end.
@@ -127,7 +127,7 @@ impl<W: Write> Writer<W> {
         Ok(())
     }
 
-    /// Adds a frame: its header as it came and as JSON, and the picture.
+    /// Adds a frame: its header as received and as JSON, and the picture.
     ///
     /// # Errors
     /// As [`Writer::receive`].
@@ -185,7 +185,7 @@ impl<W: Write> Writer<W> {
         Ok(())
     }
 
-    /// Adds a record that came at `received_ns`.
+    /// Adds a record that was received at `received_ns`.
     fn write(&mut self, received_ns: i64, record: &Record) -> Result<(), Error> {
         let (log_time, publish_time) = (self.utc(received_ns), self.utc(record.stamp_ns));
         let channel = self.channel(record)?;
@@ -205,7 +205,7 @@ impl<W: Write> Writer<W> {
 
     fn channel(&mut self, record: &Record) -> Result<&mut Open, Error> {
         let name = record.schema.name();
-        // A camera that starts again may send pictures of another kind: they get a channel of the same name.
+        // A camera that starts again may send pictures of another kind: they have a channel of the same name.
         if self.open.get(&record.channel).is_none_or(|open| open.schema != name) {
             let encoding = record.schema.message_encoding();
             let schema = match record.schema.description() {

@@ -1,4 +1,4 @@
-//! A recording is written, cut, damaged, repaired and read again.
+//! Recordings are written, cut, damaged, repaired and read again.
 
 #![expect(clippy::unwrap_used, reason = "a test fails by a panic")]
 

@@ -1,4 +1,4 @@
-//! The lander's configuration: estimator, phases, envelope, checks, guidance, and the actions after an abort or an alarm,
+//! Declares the lander's configuration: estimator, phases, envelope, checks, guidance, and the actions after an abort or an alarm,
 //! each number with default, unit and range.
 
 use serde::{Deserialize, Serialize};
@@ -138,7 +138,7 @@ settings! {
         /// Outliers in agreement that start a new estimate, when the marker is found in a larger fraction of the
         /// frames that show their position than of those that show the estimate's position.
         restart_after: u32 = 8, 2.0..=f64::from(MAX_COUNTED_DETECTIONS);
-        /// Minimum time over which such outliers must come, in s.
+        /// Minimum time over which such outliers must occur, in s.
         restart_s: f64 = 1.5, 0.0..=10.0;
         /// Time without a detection after which the estimate is discarded, in s.
         forget_after_s: f64 = 10.0, 0.5..=600.0;
@@ -148,7 +148,7 @@ settings! {
 }
 
 settings! {
-    /// Limits of every setpoint, whatever the guidance asks for.
+    /// Limits of every setpoint, whatever the guidance requests.
     EnvelopeConfig in "envelope" {
         /// Maximum horizontal speed, in m/s.
         horizontal_m_s: f64 = 2.0, 0.05..=10.0;

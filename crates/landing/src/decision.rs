@@ -216,13 +216,13 @@ named! {
         OperatorLost = "operator-lost", "operator link lost";
         /// The link to the autopilot is lost.
         AutopilotLost = "autopilot-lost", "autopilot link lost, holding until it is back";
-        /// The autopilot's reports have not come for a moment.
+        /// The autopilot's reports have not been received for a moment.
         VehicleAging = "vehicle-aging", "no vehicle state just now, descent stopped";
         /// The autopilot's reports stopped.
         VehicleStale = "vehicle-stale", "no recent vehicle state, holding";
         /// The autopilot's heartbeat, and with it the mode, is missing.
         ModeUnknown = "mode-unknown", "no heartbeat of the autopilot for seconds, so its mode is not known, holding";
-        /// Over the link to the autopilot setpoints come too late to steer by.
+        /// Over the link to the autopilot setpoints arrive too late to steer by.
         LinkSlow = "link-slow", "the link to the autopilot takes more than 0.7 s both ways, too slow to steer, holding";
         /// No detector is alive.
         NoDetector = "no-detector", "no detector is alive, nothing descends";

@@ -1,4 +1,4 @@
-//! The estimator of the landing point's position and motion: fuses each detection at its own stamp, also late
+//! Estimates the landing point's position and motion: fuses each detection at its own stamp, also late
 //! ones, and refuses outliers by their innovation.
 //!
 //! It runs the `filter` in the odometry frame, the autopilot's local frame without its jumps
@@ -26,7 +26,7 @@ use crate::hypotheses::{Hypotheses, Supported};
 use crate::measurement::{MarkerPose, Measurement};
 use crate::time::Timestamp;
 
-/// Number of detections kept, so that late ones can be inserted.
+/// Number of stored detections, among which late ones are inserted.
 pub const MEMORY: usize = 32;
 
 /// Time constant with which the heave of a pad out of view is forgotten, in seconds.

@@ -21,7 +21,7 @@ pub enum Event {
     /// The autopilot reported mode, motors or contact with the ground, which are known also while position or
     /// attitude is missing.
     Status(VehicleStatus),
-    /// The last detector has gone (false), or one has come.
+    /// The last detector has disappeared (false), or one has appeared.
     DetectorsAlive(bool),
     /// A detector has searched an image.
     Frame(FrameObservation),

@@ -1,5 +1,5 @@
-//! The vehicle's last states in the order of their stamps, and its motion (pose, velocity, turn rate, position in the odometry frame)
-//! interpolated at any time.
+//! Stores the vehicle's last states in the order of their stamps, and computes its motion (pose, velocity, turn rate, position in the
+//! odometry frame) interpolated at any time.
 
 use std::collections::VecDeque;
 

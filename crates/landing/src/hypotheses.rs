@@ -1,4 +1,4 @@
-//! Two hypotheses of where the pad is: the estimate, and a competing position at which outliers agree.
+//! Compares two hypotheses of the pad's position: the estimate, and a competing position at which outliers agree.
 //!
 //! Detections of one position alone do not decide between the two, because the other may just be out of view:
 //! low over the ground, or while the vehicle tilts into the wind. So support is the fraction of the frames

@@ -45,7 +45,7 @@ const HAND_OVER_S: f64 = 1.0;
 /// metres.
 const DISPUTE_MARGIN_M: f64 = 0.5;
 
-/// Height over the one that it stands with, in metres, up to which LAND is asked for although detectors do not agree: a climb may
+/// Height over the one that it stands with, in metres, up to which LAND is requested although detectors do not agree: a climb may
 /// be one from the ground.
 const MAX_DISPUTED_LAND_M: f64 = 0.3;
 
@@ -62,7 +62,7 @@ const MAX_LINK_DELAY_S: f64 = 0.7;
 const MAX_QUICK_DELAY_S: f64 = 0.5;
 
 /// Maximum age of the vehicle's state at which it descends, in seconds, in addition to the link's delay: a state that is late now
-/// comes over a link that has become slow, and setpoints will take as long.
+/// was sent over a link that has become slow, and setpoints will take as long.
 const MAX_DESCEND_AGE_S: f64 = 0.2;
 
 /// Vertical speed of a vehicle that hovers, in m/s.
@@ -458,7 +458,7 @@ impl Lander {
         self.link_delay_s = if seconds >= 0.0 { libm::fmin(seconds, 10.0) } else { 0.0 };
         let limit_s = if self.is_link_slow { MAX_QUICK_DELAY_S } else { MAX_LINK_DELAY_S };
         self.is_link_slow = self.link_delay_s > limit_s;
-        // A frame may come long before the vehicle's state of its time.
+        // A frame may be received long before the vehicle's state of its time.
         let one_way_s = 0.5 * libm::fmin(self.link_delay_s, MAX_LINK_DELAY_S);
         let usual_s = self.config.target.max_extrapolation_s;
         self.history.set_max_extrapolation(usual_s + one_way_s);

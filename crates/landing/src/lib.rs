@@ -1,4 +1,4 @@
-//! The landing decision, a pure function of time and events.
+//! Decides the landing, as a pure function of time and events.
 //!
 //! [`Lander::step`] takes the time and an event (the vehicle's state, a searched image, an operator's
 //! command, an alarm, or a tick) and returns a phase, an action for the autopilot, and the reasons. It keeps

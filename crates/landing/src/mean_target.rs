@@ -1,4 +1,4 @@
-//! The target of the thesis' guidance: a mean of detections, each joined with the vehicle's motion at its
+//! Computes the target of the thesis' guidance: a mean of detections, each joined with the vehicle's motion at its
 //! exposure.
 //!
 //! The mean forgets: high up, where a degree of tilt is 20 cm on the ground, it averages over more detections

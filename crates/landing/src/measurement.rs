@@ -1,4 +1,4 @@
-//! From a detection to a measurement: the marker's pose joined with the vehicle's motion at the exposure.
+//! Converts a detection to a measurement: the marker's pose joined with the vehicle's motion at the exposure.
 
 use geometry::{Body, Marker, Ned, Point, Rotation, Transform, Vector, squared};
 use libm::{acos, fmax};

@@ -2,7 +2,7 @@
 //!
 //! A pad that does not move has one position. Under a mount that is off by `θ` it moves by `θ` times the height as
 //! the height changes; under a focal length that is off it moves as the vehicle tilts, under a marker of another
-//! size as the vehicle moves sideways. A Kalman filter of parameters that hardly change (Bar-Shalom, Li,
+//! size as the vehicle moves sideways. A Kalman filter of nearly constant parameters (Bar-Shalom, Li,
 //! Kirubarajan: Estimation with Applications to Tracking and Navigation, section 7) explains the apparent
 //! horizontal motion by them and by its other causes:
 //!

@@ -43,7 +43,7 @@ const MIN_TURNED_RAD: f64 = 0.02;
 #[derive(Clone, Debug, Default)]
 pub(crate) struct RepeatedPicture {
     newest: Option<Sight>,
-    /// The first of those that are alike, and how many came after it.
+    /// The first of those that are alike, and how many followed it.
     first: Option<First>,
     alike: u32,
     /// The first of those in which the marker stays as it does in pictures that were coded again.

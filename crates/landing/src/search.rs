@@ -1,8 +1,8 @@
-//! The search for the marker: an expanding square about the position where the search started, flown along its
+//! Flies the search for the marker: an expanding square about the position where the search started, flown along its
 //! lines over the ground in wind as well.
 //!
 //! A camera that is fixed to the vehicle looks downwind, because the vehicle tilts into the wind: a marker
-//! right below may be out of view, upwind of the image. So the first leg goes upwind.
+//! right below may be out of view, upwind of the image. So the first leg is flown upwind.
 
 use geometry::{Body, Ned, Odometry, Point, Rotation, Vector};
 use libm::{atan2, fmax, fmin, sin, sincos};
@@ -250,7 +250,7 @@ mod tests {
     #[test]
     fn a_vehicle_that_cannot_follow_still_sees_the_other_sides() {
         let config = Config::default();
-        // The first leg goes north and the third south.
+        // The first leg is flown north and the third south.
         let goes_south_after_s = |is_fenced: bool| {
             let begin = Timestamp::from_seconds(0.0);
             let mut square =

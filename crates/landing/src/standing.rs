@@ -1,9 +1,9 @@
-//! The height of the body's origin over the pad when the vehicle stands on it, measured at the end of a landing.
+//! Measures the height of the body's origin over the pad at the end of a landing, when the vehicle stands on it.
 //!
 //! The autopilot's position is that of its inertial sensors, which a real vehicle carries 10 to 30 cm above the ground. The
 //! estimate of the target is relative to the same point, so that its height on the ground is `standing_height_m`. The camera
 //! no longer sees the marker then, and the autopilot's height drifts near the ground: the error is 0.15 m at most in the
-//! tests. So it is only reported, and changes no landing: one that is too large would ask for LAND too high.
+//! tests. So it is only reported, and changes no landing: one that is too large would request LAND too high.
 //!
 //! And whether a vehicle may stand on the pad already, although its autopilot does not report it. A lander that takes over the
 //! landing of another one has not seen the pad: it receives the position from that one, or, where no position is known, a vehicle that is
@@ -42,7 +42,7 @@ const MAX_STILL_M_S: f64 = 0.1;
 const MIN_STILL_S: f64 = 1.0;
 const MAX_STILL_HEIGHT_M: f64 = 0.5;
 /// Maximum distance from the local origin, in metres, at which the autopilot's report that such a vehicle flies counts for nothing: it
-/// comes seconds late.
+/// is seconds late.
 const MAX_ORIGIN_M: f64 = 3.0;
 /// Maximum time after taking over within which that is assumed, in seconds: an autopilot reports by then that it stands.
 const MAX_UNREPORTED_S: f64 = 10.0;

@@ -33,7 +33,7 @@
 //! |---|---|
 //! | the operator's abort | Aborted; in LAND only above `no_return_height_m`, back to GUIDED |
 //! | `landing_timeout_s` over | Aborted; not in Final |
-//! | the operator's hold | Hold; ignored in LAND and while it is asked for |
+//! | the operator's hold | Hold; ignored in LAND and while it is requested |
 //! | the axes of camera and autopilot, or the marker's size, are not as configured | Hold |
 //! | the vehicle's state is stale, or its mode not known | Hold; Final waits |
 //! | the link to the autopilot is slow | Hold |
@@ -67,19 +67,19 @@ const MIN_RETRY_S: f64 = 2.0;
 /// the marker before.
 const MIN_LOOK_S: f64 = 1.0;
 
-/// Time after LAND has shown in which our own mode may show again, in seconds: on a link with jitter an older heartbeat comes
+/// Time after LAND has shown in which our own mode may show again, in seconds: on a link with jitter an older heartbeat is
 /// late, and the next one follows in a second. Nothing is sent meanwhile, so a pilot who takes over does not wait.
 const MAX_OVERTAKEN_S: f64 = 1.2;
 
-/// Time in which a mode that was asked for until then may still show, in seconds: LAND after an abort, our own mode after a recall from
-/// LAND. Heartbeats come each second, and one may be lost.
+/// Time in which a mode that was requested until then may still show, in seconds: LAND after an abort, our own mode after a recall from
+/// LAND. Heartbeats are sent each second, and one may be lost.
 const MAX_LATE_MODE_S: f64 = 2.5;
 
 /// Longest time by which LAND may exceed the duration by its speed and the known height while the vehicle still sinks, in seconds:
 /// the ground may lie far below the position where the vehicle took off.
 const MAX_SINKING_S: f64 = 600.0;
 
-/// Wait for the report of the ground after the motors have stopped, in seconds: it may come later.
+/// Wait for the report of the ground after the motors have stopped, in seconds: it may be later.
 const MAX_CONTACT_WAIT_S: f64 = 0.5;
 
 /// The inputs of one step.
@@ -154,7 +154,7 @@ pub struct StateMachine {
     is_recalling: bool,
     /// When that ended for a vehicle that had become too low, until it shows another mode than LAND.
     became_low: Option<Timestamp>,
-    /// LAND was asked for before the abort and the vehicle may still show it: then it is recalled.
+    /// LAND was requested before the abort and the vehicle may still show it: then it is recalled.
     expects_land: bool,
     /// Retries of this landing so far.
     retries: u32,
@@ -418,7 +418,7 @@ impl StateMachine {
         } else if self.is_recalling && is_low {
             self.became_low = Some(inputs.now);
         }
-        // While the mode is not known nothing is asked for, and it may be LAND still.
+        // While the mode is not known no mode is requested, and it may be LAND still.
         let may_land = matches!(vehicle.mode, Mode::Land | Mode::Unknown);
         self.is_recalling &= may_land && in_time && !is_low;
         let may_follow =
@@ -438,7 +438,7 @@ impl StateMachine {
                 Mode::Guided => !self.landing || self.elapsed_s(inputs.now) < MAX_OVERTAKEN_S,
                 Mode::Land => self.phase == Phase::Final,
                 Mode::Other => false,
-                // Undecided: nothing is asked for, and the vehicle hovers.
+                // Undecided: no mode is requested, and the vehicle hovers.
                 Mode::Unknown => true,
             };
             if !is_ours {
@@ -473,7 +473,7 @@ impl StateMachine {
                 AlarmAction::Land => return Some((Phase::Final, reason)),
             }
         }
-        // While LAND is asked for a hold would let the vehicle enter it unwatched; an abort calls it back.
+        // While LAND is requested a hold would let the vehicle enter it unwatched; an abort calls it back.
         let asks_for_land = self.phase == Phase::Final && self.reason != Reason::LandingBySetpoints;
         if inputs.operator == Some(OperatorCommand::Hold) && !asks_for_land {
             return Some((Phase::Hold, Reason::OperatorHold));
@@ -699,7 +699,7 @@ impl StateMachine {
                     | Reason::MayStand
             );
             if is_unknown && !low {
-                // LAND cannot be asked for; a vehicle that hovers waits for the heartbeat.
+                // LAND cannot be requested; a vehicle that hovers waits for the heartbeat.
                 self.entered = inputs.now;
                 return None;
             }

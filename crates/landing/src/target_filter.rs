@@ -1,4 +1,4 @@
-//! The target of a landing by the filter of its guidance (the estimator, or the mean of the thesis'), and the stamps of
+//! Tracks the target of a landing by the filter of its guidance (the estimator, or the mean of the thesis'), and the stamps of
 //! the markers that were used or refused.
 
 use geometry::{Ned, Point};

@@ -1,4 +1,4 @@
-//! Moments of one clock, which the caller owns.
+//! Time stamps of one clock, which the caller owns.
 
 /// A moment in nanoseconds of the caller's clock; its origin does not matter, as long as all stamps share it.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]

@@ -1,4 +1,4 @@
-//! Whether a marker at a position on the ground is in the field of view of a frame's camera, by the vehicle's
+//! Decides whether a marker at a position on the ground is in the field of view of a frame's camera, by the vehicle's
 //! pose.
 
 use geometry::{Body, Camera, Odometry, Point, Rotation, Vector};

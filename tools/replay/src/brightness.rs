@@ -28,7 +28,7 @@ pub struct Meter {
 }
 
 impl Meter {
-    /// How bright a picture is; `None` when it cannot be read. Of one that came in parts the largest part of the frame counts.
+    /// How bright a picture is; `None` when it cannot be read. Of one that is sent in parts the largest part of the frame counts.
     pub fn measure(&mut self, header: &FrameHeader, bytes: &[u8]) -> Option<Brightness> {
         let FrameHeader { width, height, format, .. } = *header;
         if format == PixelFormat::Jpeg {

@@ -25,7 +25,7 @@ pub struct Begun {
 /// The result of a replay, and how it differs from the recorded one.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Change {
-    /// How far it came.
+    /// How far the replay came.
     pub end: End,
     /// The phases of the replay with their reasons.
     pub phases: Vec<Begun>,
@@ -106,7 +106,7 @@ pub fn change_with(
     Ok(change)
 }
 
-/// Whether it is the controller's state, which goes nowhere.
+/// Whether it is the controller's state, which is not published.
 fn is_state(record: &TapeRecord<'_>) -> bool {
     matches!(record.event, TapeEvent::State(_))
 }

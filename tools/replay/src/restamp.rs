@@ -1,4 +1,4 @@
-//! Gives the messages of a recording the stamps of now, so that services which run take them for those of a flight.
+//! Gives the messages of a recording present stamps, as those of a flight under way have.
 
 use airlink::Unpacker;
 use flightlog::{Received, VehicleClock};

@@ -1,4 +1,4 @@
-//! Where a marker truly was in a frame, of a simulation.
+//! Computes the true position of a marker in a simulated frame.
 
 use geometry::{Body, Camera, CameraModel, Ned, Point, Rotation, Transform};
 use messages::{CameraInfo, Truth};

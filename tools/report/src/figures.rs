@@ -1,4 +1,4 @@
-//! The page's charts as files of their own, for papers and slides: SVG with title and legend, in the colours for light.
+//! Writes the page's charts as separate files, for papers and slides: SVG with title and legend, in the colours for light.
 
 use std::fmt::Write as _;
 

@@ -31,7 +31,7 @@ const LIGHT_PERIOD_NS: u64 = 1_000_000_000;
 /// Detections as they were received.
 #[derive(Clone, Debug)]
 pub struct Found {
-    /// The detector on whose key they came.
+    /// The detector on whose key they were received.
     pub detector: String,
     /// When the recorder received them, in nanoseconds of the recorder's clock.
     pub received_ns: i64,
@@ -71,7 +71,7 @@ pub struct Unreadable {
 /// The first and the last health of a process.
 #[derive(Clone, Debug)]
 pub struct Process {
-    /// When the recorder got the first, in nanoseconds of the recorder's clock: a process may stamp by the clock of another machine.
+    /// When the recorder received the first, in nanoseconds of the recorder's clock: a process may stamp by the clock of another machine.
     pub first_ns: i64,
     /// The first.
     pub first: Health,
@@ -82,7 +82,7 @@ pub struct Process {
 /// The last status of a bridge to the ground stations.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Bridge {
-    /// When the recorder got it, in nanoseconds of the recorder's clock.
+    /// When the recorder received it, in nanoseconds of the recorder's clock.
     pub received_ns: i64,
     /// The status.
     pub status: GcsStatus,
@@ -93,7 +93,7 @@ pub struct Bridge {
 pub struct Change {
     /// Service and instance.
     pub service: String,
-    /// When the recorder got it, in nanoseconds of the recorder's clock.
+    /// When the recorder received it, in nanoseconds of the recorder's clock.
     pub received_ns: i64,
     /// The key, and its value before and after.
     pub setting: Difference,
@@ -159,7 +159,7 @@ pub struct Flight {
     pub truth: Vec<Truth>,
     /// The wind, of a simulation.
     pub wind: Vec<Wind>,
-    /// Detections of all detectors, as they came.
+    /// Detections of all detectors, as they were received.
     pub found: Vec<Found>,
     /// Frames by camera.
     pub frames: BTreeMap<String, Vec<Frame>>,
@@ -210,7 +210,7 @@ pub struct Flight {
 pub struct FlightReader {
     flight: Flight,
     tapes: TapeReader,
-    /// Starts of the vehicle's computer that there had been when a part of a tape came last, by the tape's begin.
+    /// Number of starts of the vehicle's computer before the last part of a tape, by the tape's begin.
     boot_of_tape: BTreeMap<i64, usize>,
     meter: Meter,
     begin: Begin,

@@ -11,7 +11,7 @@ use crate::flight::{Flight, Found};
 
 /// How far stamps of the same frame may be apart that were computed from ages, in nanoseconds.
 const SAME_FRAME_NS: i64 = 2_000;
-/// How much later the recorder may get detections than the controller's estimate from them, in nanoseconds.
+/// How much later the recorder may receive detections than the controller's estimate from them, in nanoseconds.
 const MAX_LATER_NS: i64 = 30_000_000;
 /// Longest time from detections to the setpoint that uses them, in nanoseconds: the next one later has other reasons.
 const MAX_TO_SETPOINT_NS: i64 = 2_000_000_000;
@@ -118,7 +118,7 @@ pub struct Handled {
 pub struct Frames {
     /// Whether they are from the controller's tape, which has each with the time at which it was handled.
     pub is_from_tape: bool,
-    /// The frames, in the order in which their detections came.
+    /// The frames, in the order in which their detections were received.
     pub all: Vec<Handled>,
 }
 
@@ -174,7 +174,7 @@ fn stands(flight: &Flight, at_ns: i64) -> bool {
 }
 
 /// Whether the autopilot reports at a time that the vehicle stands, or the vehicle neither sinks nor climbs any more until it does: an
-/// autopilot takes a second or two to be sure, and nothing comes from the air to the ground without sinking. Where states are missing
+/// autopilot takes a second or two to be sure, and no vehicle reaches the ground without sinking. Where states are missing
 /// it may have sunk meanwhile, and another height shows that it has.
 fn rests(vehicle: &[VehicleState], at_ns: i64) -> bool {
     let later = vehicle.partition_point(|it| it.stamp_ns <= at_ns);

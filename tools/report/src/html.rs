@@ -1,4 +1,4 @@
-//! Pieces of a page: escaped texts, and blocks such as tables, which a document shows as well.
+//! Makes pieces of a page: escaped texts, and blocks such as tables, which a document shows as well.
 
 use std::fmt::Write as _;
 

@@ -1,4 +1,4 @@
-//! The log of the report, in order of time: phases with reasons, commands, detector changes, the autopilot's texts,
+//! Makes the log of the report, in order of time: phases with reasons, commands, detector changes, the autopilot's texts,
 //! warnings, failures and changed settings.
 
 use messages::TapeEvent;
@@ -90,7 +90,7 @@ fn controller(flight: &Flight) -> Vec<Line> {
     lines
 }
 
-/// Commands and detectors that came or went, which only a tape has.
+/// Commands and detectors that appeared or disappeared, which only a tape has.
 fn commands(flight: &Flight) -> Vec<Line> {
     let mut lines = Vec::new();
     for tape in &flight.tapes {
@@ -106,10 +106,10 @@ fn commands(flight: &Flight) -> Vec<Line> {
                     ("operator", !accepted, format!("{command:?}: {answer}, {reason}"))
                 }
                 TapeEvent::Presence { detector, alive: true } => {
-                    ("controller", false, format!("detector {detector} came"))
+                    ("controller", false, format!("detector {detector} appeared"))
                 }
                 TapeEvent::Presence { detector, alive: false } => {
-                    ("controller", true, format!("detector {detector} went"))
+                    ("controller", true, format!("detector {detector} disappeared"))
                 }
                 // It is recorded again until all that it takes is sent.
                 TapeEvent::Shutdown if !std::mem::replace(&mut has_ended, true) => {

@@ -1,4 +1,4 @@
-//! The latency budget: from a frame's exposure to its detections and to the setpoint that uses it.
+//! Computes the latency budget: from a frame's exposure to its detections and to the setpoint that uses it.
 
 use node::stats::quantile;
 use serde::Serialize;

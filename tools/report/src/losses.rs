@@ -36,7 +36,7 @@ struct Numbers {
 }
 
 impl Numbers {
-    /// Of numbers in the order in which they came.
+    /// Of numbers in the order of reception.
     fn of(sequences: impl Iterator<Item = u64>) -> Option<Self> {
         sequences.fold(None, |so_far: Option<Self>, sequence| {
             let alone = Self { first: sequence, last: sequence, count: 1, before: 0 };
@@ -182,7 +182,7 @@ mod tests {
     #[test]
     fn missing_numbers_are_counted_across_a_start_of_their_publisher() {
         assert_eq!(counted(5..10), (0, 5));
-        assert_eq!(counted([5, 6, 9, 8]), (1, 5), "the 8 came late");
+        assert_eq!(counted([5, 6, 9, 8]), (1, 5), "the 8 was late");
         // 300 and ten of them missing, then a start, and three missing of 50.
         let before = (0..300).filter(|number| !(100..110).contains(number));
         let after = (0..50).filter(|number| !(20..23).contains(number));

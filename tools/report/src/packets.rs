@@ -6,7 +6,7 @@ use autopilot::dialect::{MavAutopilot, MavMessage, MavParamType};
 use autopilot::{Battery, Packet, Parser};
 use flightlog::OwnAutopilot;
 
-/// That a packet came.
+/// The arrival of a packet.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Arrival {
     /// When, in nanoseconds of the recorder's clock.
@@ -18,7 +18,7 @@ pub struct Arrival {
 /// The battery at a time.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Power {
-    /// When it came, in nanoseconds of the recorder's clock.
+    /// When it was received, in nanoseconds of the recorder's clock.
     pub received_ns: i64,
     /// Voltage, in volts.
     pub voltage_v: Option<f64>,
@@ -31,7 +31,7 @@ pub struct Power {
 /// A text of the autopilot.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Text {
-    /// When it came, in nanoseconds of the recorder's clock.
+    /// When it was received, in nanoseconds of the recorder's clock.
     pub received_ns: i64,
     /// Whether it is a warning or worse.
     pub is_warning: bool,
@@ -46,7 +46,7 @@ pub struct Text {
 pub struct Packets {
     /// Each of them.
     pub received: Vec<Arrival>,
-    /// The last value of each parameter that was asked for.
+    /// The last value of each requested parameter.
     pub parameters: BTreeMap<String, f64>,
     /// The battery.
     pub power: Vec<Power>,
@@ -58,7 +58,7 @@ pub struct Packets {
 }
 
 impl Packets {
-    /// Adds a packet that came at `received_ns`, if the vehicle's autopilot has sent it.
+    /// Adds a packet that was received at `received_ns`, if the vehicle's autopilot has sent it.
     pub fn take(&mut self, received_ns: i64, bytes: &[u8]) {
         let parsed =
             Packet::from_raw(bytes).or_else(|| Parser::new().push(bytes).into_iter().next());

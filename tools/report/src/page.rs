@@ -1,4 +1,4 @@
-//! The report as one file of HTML that needs nothing else: title and outcome, numbers, sections; of one
+//! Writes the report as one self-contained file of HTML: title and outcome, numbers, sections; of one
 //! flight, or of two side by side with their differences.
 
 use std::fmt::Write as _;
@@ -122,7 +122,7 @@ const fn figure(
     Figure { name, of, digits, unit }
 }
 
-/// The numbers that matter most come first.
+/// The most important numbers are first.
 static FIGURES: [Figure; 18] = [
     figure("time to disarm", |s| s.time_to_disarm_s, 1, "s"),
     figure("time to touchdown", |s| s.time_to_touchdown_s, 1, "s"),

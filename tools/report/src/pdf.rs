@@ -1,4 +1,4 @@
-//! Pages of a PDF file: texts, rules and charts on A4, in the standard fonts that every viewer has.
+//! Writes the pages of a PDF file: texts, rules and charts on A4, in the standard fonts that every viewer has.
 
 use std::convert::Infallible;
 

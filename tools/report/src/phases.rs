@@ -1,4 +1,4 @@
-//! The phases of a flight with their reasons.
+//! Finds the phases of a flight with their reasons.
 
 use serde::Serialize;
 

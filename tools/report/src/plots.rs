@@ -1,4 +1,4 @@
-//! The charts of the report, over time or from above: path over the pad, height, velocity against setpoints, frames by
+//! Makes the charts of the report, over time or from above: path over the pad, height, velocity against setpoints, frames by
 //! fate, light, latency, wind, battery, and the thesis' figures. Those of two flights are the same, one by one, so that
 //! their axes can be shared.
 
@@ -48,7 +48,7 @@ fn over_time(view: &View<'_>, title: &str, unit: &str, layers: Vec<Layer>) -> Ch
 
 /// The landing in one picture: from above, and from the side.
 pub fn landing(view: &View<'_>) -> Vec<Chart> {
-    // From the begin of the landing on: where the vehicle came from does not matter.
+    // From the begin of the landing on: the flight before it is not shown.
     let landing = |positions: &[TrackPoint]| -> Vec<TrackPoint> {
         let shown = positions.iter().filter(|it| it.time_s >= 0.0 && view.is_shown(it.time_s));
         shown.copied().collect()
@@ -327,7 +327,7 @@ pub fn latency(view: &View<'_>) -> Vec<Chart> {
     vec![chart]
 }
 
-/// True and estimated wind, as one speaks of it: by where it comes from.
+/// True and estimated wind, named by the direction from which it blows.
 pub fn wind(view: &View<'_>) -> Vec<Chart> {
     let flight = view.flight;
     let axis = |axis: usize, from: &str, against: &str| {

@@ -1,4 +1,4 @@
-//! The sections of the report, from landing, phases and height to log, configuration and recording: the charts and tables
+//! Makes the sections of the report, from landing, phases and height to log, configuration and recording: the charts and tables
 //! of each for one flight, and the messages that were not recorded.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -11,7 +11,7 @@ use crate::summary::counted;
 use crate::view::View;
 use crate::{journal, light, losses, plots};
 
-/// Age of a bridge's last status at the end beyond which it does not hold for the end, in nanoseconds; one comes every 2 s.
+/// Age of a bridge's last status at the end beyond which it does not hold for the end, in nanoseconds; one is published every 2 s.
 const MAX_STATUS_AGE_NS: i64 = 5_000_000_000;
 
 /// A part of the page, for one flight.
@@ -458,7 +458,7 @@ fn log(view: &View<'_>) -> Section {
     let mut section = section("log", "Log", "");
     let (lines, left_out) = journal::of(view.flight);
     if lines.is_empty() {
-        section.before.push(missing("status, packets and health, of which the log is made"));
+        section.before.push(missing("status, packets and health, from which the log is made"));
         return section;
     }
     let rows: Vec<Vec<Cell>> = lines
@@ -519,7 +519,7 @@ fn configuration(view: &View<'_>) -> Section {
             .iter()
             .map(|(name, value)| vec![text(name), Cell::Number(value.to_string())])
             .collect();
-        let title = format!("{} parameters of the autopilot, as far as asked for", rows.len());
+        let title = format!("{} parameters of the autopilot, as far as requested", rows.len());
         section.after.push(details(&title, table(&["parameter", "value"], rows)));
     }
     for (camera, info) in &flight.cameras {

@@ -1,4 +1,4 @@
-//! Where the vehicle was relative to the pad: as it was estimated, and in truth.
+//! Computes the vehicle's track relative to the pad: the estimated and the true one.
 
 use crate::flight::{Flight, true_offset};
 

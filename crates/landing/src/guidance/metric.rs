@@ -1,4 +1,4 @@
-//! The metric guidance: from the target's position in metres to a velocity setpoint, by closing speed to the side, a funnel downwards,
+//! The metric guidance computes a velocity setpoint from the target's position in metres, by closing speed to the side, a funnel downwards,
 //! waiting low over the pad, and the touchdown.
 //!
 //! Laterally, the commanded closing speed is proportional to the error that will be left when a setpoint
@@ -36,7 +36,7 @@
 //!
 //! Below `blind_height_m` the vehicle continues down on the estimate when the marker leaves the view. LAND
 //! follows no target and drifts by a decimetre in a second of gusts, so it takes over only at
-//! `land_height_m`, and only from a vehicle that hardly moves sideways.
+//! `land_height_m`, and only from a vehicle that moves slowly sideways.
 
 use geometry::{Ned, Point, Vector, squared};
 use libm::{cos, exp, fmax, fmin, tan};
@@ -337,7 +337,7 @@ impl Metric {
     }
 
     /// True while the vehicle follows its path. In a gust it does not, and LAND, which starts a new path,
-    /// would let the vehicle drift: then the touchdown comes before LAND.
+    /// would let the vehicle drift: then the touchdown precedes LAND.
     fn is_steady(&self, situation: &Situation<'_>) -> bool {
         self.observer.is_none_or(|observer| {
             let difference = observer.path.velocity() - situation.vehicle.velocity;

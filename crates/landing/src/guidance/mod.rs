@@ -1,4 +1,4 @@
-//! From the target to a velocity: either [`thesis`] or [`metric`].
+//! Computes a velocity from the target: either by [`thesis`] or by [`metric`].
 
 pub mod metric;
 mod observer;

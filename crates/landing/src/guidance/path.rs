@@ -1,4 +1,4 @@
-//! The path that an autopilot makes of velocity setpoints, horizontally.
+//! Models the horizontal path that an autopilot flies from velocity setpoints.
 //!
 //! ArduPilot Copter does not hand a setpoint to its loops: it bends a path towards it within limits of
 //! acceleration and jerk (`shape_vel_accel` of `AP_Math/control.cpp`), and the loops of position and velocity

@@ -15,7 +15,7 @@
 //! | `K_p` = 1e-6 | 1e-3 (`kp`) | see below |
 //! | errors of x and y inside the tolerance | used as they are, as Algorithm 18 lists them: the tolerance only gates the descent | set to zero, as the text can be read, the vehicle drifts through the circle: it is over the pad after 31 s instead of 8 s, LAND comes after 55.5 s instead of 50.4 s, and the error is 0.11 m instead of 0.065 m |
 //! | how fast the loop runs, and the sum's time step | once per frame; the sum counts frames, not seconds (Equation 3.14) | "upon receiving a message" |
-//! | anti-windup | none: the sum grows while the output is limited | none is described; with these gains x and y hardly reach their limit |
+//! | anti-windup | none: the sum grows while the output is limited | none is described; with these gains x and y seldom reach their limit |
 //! | altitude over the marker | the target's height where the detector gives a pose, else the altitude over the autopilot's origin | the text says "relative to the marker", the algorithm `drone.altitude()`; on the thesis' field they are equal |
 //! | coordinates | image right and image up are the vehicle's right and forward, turned into the world by its heading | the thesis flew with one heading, where image up was its ENU's y |
 //! | end of the run | LAND at the first frame inside the tolerance below 80 cm | as listed |

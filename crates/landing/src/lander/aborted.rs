@@ -1,4 +1,4 @@
-//! Flies after an abort: the vehicle hovers, lands or climbs, and then leaves the vehicle to its autopilot.
+//! Commands the vehicle after an abort: it hovers, lands or climbs, and is then left to its autopilot.
 
 use geometry::Vector;
 

@@ -1,5 +1,5 @@
-//! Flies while the marker is out of view or lost: the height to which a retry climbs, and the pad's position to remember over a
-//! silence of the autopilot.
+//! Commands the vehicle while the marker is out of view or lost: the height to which a retry climbs, and the pad's position to remember
+//! over a silence of the autopilot.
 
 use geometry::Vector;
 

@@ -1,4 +1,4 @@
-//! How the lander takes the marker in a frame: its measurement fused into the target, or the reason for which it is rejected.
+//! Takes the marker in a frame: fuses its measurement into the target, or returns the reason for which it is rejected.
 
 use super::Lander;
 use crate::decision::Rejection;

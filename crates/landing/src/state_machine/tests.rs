@@ -185,7 +185,7 @@ fn a_landing_that_lasts_long_is_not_broken_off_on_its_last_metre() {
     check(&refused, Phase::Final, Reason::LandingBySetpoints);
     let late = [&refused[..], &[at(long_s + 1.0)]].concat();
     check(&late, Phase::Final, Reason::LandingBySetpoints);
-    // Without a heartbeat LAND cannot be asked for, and Final waits.
+    // Without a heartbeat LAND cannot be requested, and Final waits.
     let unknown = |seconds| flown(seconds, |v| v.mode = Mode::Unknown);
     let waits = [start(), hold, land, unknown(long_s - 0.5)];
     check(&waits, Phase::Final, Reason::OperatorLand);
@@ -216,7 +216,7 @@ fn an_abort_ends_land_only_while_the_vehicle_is_high() {
     assert_eq!(after(&[land(15.0, 3.0)]), (false, true), "it did not return");
     let low = land(10.0, 0.9);
     assert_eq!(after(&[low]), (false, false), "it may have carried out the request");
-    assert_eq!(after(&[low, land(10.2, 1.1)]), (false, false), "it is asked no more");
+    assert_eq!(after(&[low, land(10.2, 1.1)]), (false, false), "it is requested no more");
     assert_eq!(
         after(&[low, land(10.2, 0.8), at(10.4), at(14.0)]),
         (false, false),
@@ -525,7 +525,7 @@ fn a_vehicle_that_may_stand_is_landed_and_not_lifted_when_its_link_becomes_slow(
     check(&[a, b, c, slow(3.0, false)], Phase::Hold, Reason::LinkSlow);
     // It touches down after the link has become slow.
     check(&[a, b, c, slow(3.0, false), slow(3.5, true)], Phase::Final, Reason::MayStand);
-    // Without a heartbeat LAND cannot be asked for.
+    // Without a heartbeat LAND cannot be requested.
     let unknown =
         Inputs { vehicle: flown(3.5, |v| v.mode = Mode::Unknown).vehicle, ..slow(3.5, true) };
     check(&[a, b, c, slow(3.0, false), unknown], Phase::Hold, Reason::LinkSlow);

@@ -48,7 +48,7 @@ fn jumps_pauses_and_old_states_make_no_bias() {
         assert!(silent < 1e-6, "no state for {pause_s} s: {silent}");
     }
     let late = largest_bias(every().map(|s| (s, s + 0.3)), |_| 0.0);
-    assert!(late < 1e-6, "states that come late: {late}");
+    assert!(late < 1e-6, "late states: {late}");
 }
 
 #[test]
@@ -167,7 +167,7 @@ fn a_retry_has_the_time_of_the_first_try_at_the_height_of_waiting_as_well() {
 #[test]
 fn a_vehicle_that_stands_is_pushed_down_and_not_steered_whatever_it_says_of_its_velocity() {
     let mut metric = Metric::new(MetricConfig::default());
-    let (mut asked_m_s, mut stands) = (0.0f64, None);
+    let (mut commanded_m_s, mut stands) = (0.0f64, None);
     for i in 0..80u32 {
         // It sinks until it stands, at 0.08 m, while its reported velocity errs by 0.15 m/s.
         let s = f64::from(i) / 40.0;
@@ -181,15 +181,15 @@ fn a_vehicle_that_stands_is_pushed_down_and_not_steered_whatever_it_says_of_its_
         let (setpoint, _) = metric.velocity(&situation);
         if s > 1.0 + TOUCHING_S + 0.05 {
             // Beyond the velocity that it reports.
-            asked_m_s = asked_m_s.max((setpoint - drift).horizontal_norm());
+            commanded_m_s = commanded_m_s.max((setpoint - drift).horizontal_norm());
             assert!(setpoint.z() >= PUSHING_M_S, "{s}: {setpoint:?}");
         }
     }
-    assert!(asked_m_s < 0.03, "{asked_m_s} m/s sideways");
+    assert!(commanded_m_s < 0.03, "{commanded_m_s} m/s sideways");
     assert!(stands.is_some_and(|s| s < 0.5), "{stands:?} s");
 }
 
-/// The minimum speed down, in m/s, that is asked from 0.2 m down to the ground and for a second there, of a vehicle that sinks at
+/// The minimum speed down, in m/s, that is commanded from 0.2 m down to the ground and for a second there, of a vehicle that sinks at
 /// 0.5 m/s while the estimate of its pad changes by the time in seconds; and whether it is known to stand at the end.
 fn touched(noise_m_s: f64, change: impl Fn(f64, &mut TargetEstimate)) -> (f64, bool) {
     let mut metric = Metric::new(MetricConfig::default());

@@ -1,4 +1,4 @@
-//! Everything the state machine can do: every event of an alphabet in every reachable state, where two
+//! Explores the state machine completely: every event of an alphabet in every reachable state, where two
 //! states are the same when phase, reason, flags, retries and the expired timeouts agree.
 
 use super::*;
