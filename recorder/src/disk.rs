@@ -85,7 +85,7 @@ impl Disk {
         self.shared.changed.notify_all();
     }
 
-    /// Nothing more will be handed over.
+    /// No more bytes will be handed over.
     pub(crate) fn complete(&self) {
         self.shared.lock().is_complete = true;
         self.shared.changed.notify_all();

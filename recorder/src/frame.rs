@@ -20,7 +20,7 @@ pub(crate) struct Frame {
     pub(crate) header: FrameHeader,
     /// Its picture, as configured.
     pub(crate) picture: Picture,
-    /// Whether that is all that is configured: pixels that are no complete image make no picture.
+    /// Whether that is all that is configured: an incomplete image makes no picture.
     pub(crate) is_complete: bool,
 }
 

@@ -86,7 +86,7 @@ async fn connect(
         );
     };
     upgrade.on_upgrade(async move |mut socket| {
-        // A client that disconnects is no failure.
+        // A client that disconnects is not a failure.
         if let Err(error) = follow(&server, &slot, &mut socket).await {
             tracing::debug!(problem = %error, "A client has gone");
         }

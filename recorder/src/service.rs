@@ -413,7 +413,7 @@ impl Recorder {
         }
     }
 
-    /// Messages that were kept and are not on the disk are lost.
+    /// Messages that were recorded and are not on the disk are lost.
     fn count_unsynced(&mut self, unsynced: BTreeMap<String, u64>) {
         for (key, count) in unsynced {
             self.kept.take_back(&key, count);

@@ -59,7 +59,7 @@ impl Window {
         }
     }
 
-    /// Whether a client takes nothing any more.
+    /// Whether a client takes no more messages.
     pub(crate) fn is_stuck(&self, now: Instant) -> bool {
         self.pings.front().is_some_and(|ping| now.duration_since(ping.at) > PONG_TIMEOUT)
     }

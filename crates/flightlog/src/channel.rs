@@ -103,7 +103,7 @@ pub struct Received<'a> {
 
 type ToJson = fn(&[u8]) -> Result<Vec<u8>, DecodeError>;
 
-/// A kind of message that is also kept as JSON.
+/// A kind of message that is also recorded as JSON.
 struct JsonTopic {
     key: fn(&[&str]) -> String,
     name: &'static str,

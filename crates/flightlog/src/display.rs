@@ -383,7 +383,7 @@ impl Display {
         records
     }
 
-    /// Lines for what has changed: the phase and its reason, and warnings.
+    /// Lines for changes of the phase, its reason and the warnings.
     fn log(&mut self, stamp_ns: i64, status: &ControllerStatus) -> Vec<Record> {
         let mut lines = Vec::new();
         let now = (status.phase, status.why.clone());

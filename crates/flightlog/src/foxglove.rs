@@ -96,7 +96,7 @@ pub enum Image<'a> {
 
 /// The contents of a message of [`COMPRESSED_IMAGE`] or [`RAW_IMAGE`]; `None` for another.
 pub fn image(message: &[u8]) -> Option<Image<'_>> {
-    // The second field of pixels is their width, which is no bytes.
+    // The second field of pixels is their width, which is a number, not bytes.
     let file = bytes_of(message, 2).map(Image::File);
     file.or_else(|| bytes_of(message, 6).map(Image::Pixels))
 }

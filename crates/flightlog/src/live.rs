@@ -91,7 +91,7 @@ pub struct Subscription {
 /// The request in a client's text.
 ///
 /// # Errors
-/// Why it is no request.
+/// When it is not a request, with the reason.
 pub fn request(text: &str) -> Result<Request, String> {
     serde_json::from_str(text).map_err(|cause| cause.to_string())
 }

@@ -222,7 +222,7 @@ fn collect(message: &'static MessageType, found: &mut Vec<&'static MessageType>)
     }
 }
 
-/// The `FileDescriptorProto` of one message type: a file of its own.
+/// The `FileDescriptorProto` of one message type: a separate file.
 fn file(message: &MessageType) -> Encoder {
     let (package, name) = message.name.rsplit_once('.').unwrap_or(("", message.name));
     let mut imports: Vec<&str> = Vec::new();
@@ -290,7 +290,7 @@ mod tests {
             .finish();
         assert_eq!(bytes_of(&message, 4), Some(&b"no"[..]));
         assert_eq!(bytes_of(&message, 5), Some(&[9; 200][..]));
-        // Numbers are no bytes.
+        // Numbers are not bytes.
         assert_eq!(
             (bytes_of(&message, 1), bytes_of(&message, 3), bytes_of(&message, 6)),
             (None, None, None)

@@ -51,7 +51,7 @@ pub struct Reading {
 /// Reads a recording; `each` receives its entries, in order.
 ///
 /// # Errors
-/// When it is no MCAP file at all.
+/// When it is not an MCAP file.
 pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Error> {
     check_begin(recording)?;
     let summary = contained(|| Summary::read(recording)).ok().flatten();
@@ -116,7 +116,7 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Er
     Ok(found.reading)
 }
 
-/// The time of a file's first message that is no state from before: it gives the order of a recording's files.
+/// The time of a file's first message other than an earlier state: it gives the order of a recording's files.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Begin {
     /// In nanoseconds of the recorder's clock; `None` before such a message.
@@ -135,7 +135,7 @@ impl Begin {
 /// The files of a recording in the order in which they were written.
 ///
 /// # Errors
-/// When one is no MCAP file at all.
+/// When one is not an MCAP file.
 pub fn in_order(files: &[Vec<u8>]) -> Result<Vec<&[u8]>, Error> {
     let mut parts = Vec::new();
     for file in files {
@@ -161,7 +161,7 @@ struct Found<F> {
     /// The last frame: its camera by its key, when it was received by the file's time, and its header.
     frame: Option<(String, u64, FrameHeader)>,
     reading: Reading,
-    /// Messages of channels that nothing describes.
+    /// Messages of channels without a description.
     lost: u64,
     each: F,
 }
@@ -402,7 +402,7 @@ mod tests {
             let repaired = crate::repair(&flipped, std::io::sink()).unwrap();
             assert!(!repaired.damage.is_empty(), "bit {bit}: {repaired:?}");
         }
-        // A record of an index that a bit makes an end of the data ends nothing.
+        // An index record that a flipped bit turns into the end of the data does not end the file.
         let mut at = mcap::MAGIC.len();
         let mut tried = 0;
         while at < end {

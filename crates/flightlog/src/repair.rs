@@ -11,7 +11,7 @@ use mcap::{Attachment, Channel, McapError, Summary};
 use crate::records::{Records, check_begin, contained, records_of};
 use crate::writer::Error;
 
-/// The damage of a file of which nothing else is known to be damaged.
+/// The damage of a file without any other known damage.
 pub(crate) const DIFFERS: &str =
     "the data before its end are damaged, by their checksum; the damaged record could not be found";
 
@@ -32,7 +32,7 @@ pub struct Repaired {
 /// was ended. Where both are damaged or missing, the messages of the channel are lost, and counted.
 ///
 /// # Errors
-/// When `recording` is no MCAP file at all, or the output does not take it.
+/// When `recording` is not an MCAP file, or the output cannot be written.
 pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Error> {
     check_begin(recording)?;
     let index = contained(|| Summary::read(recording)).ok().flatten();

@@ -30,7 +30,7 @@ impl TapeReader {
     /// Adds the parts in a recording.
     ///
     /// # Errors
-    /// When it is no MCAP file at all.
+    /// When it is not an MCAP file.
     pub fn read(&mut self, recording: &[u8]) -> Result<(), Error> {
         let key = topic::TAPE.key(&[]);
         let reading = read(recording, |entry| match entry {

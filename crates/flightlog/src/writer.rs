@@ -2,7 +2,7 @@
 //! frames, and counts of lost messages.
 //!
 //! Chunks are gathered in memory and written in one piece, so a killed writer loses the messages after the last
-//! [`Writer::flush`] and nothing before it.
+//! [`Writer::flush`] and no earlier ones.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -28,7 +28,7 @@ pub const TIME_SET: &str = "alight-time-set";
 /// Why a recording cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The file could not be written, or is no MCAP file.
+    /// The file could not be written, or is not an MCAP file.
     #[error("{0}")]
     Mcap(#[from] mcap::McapError),
     /// The file is empty.
@@ -144,7 +144,7 @@ impl<W: Write> Writer<W> {
         Ok(())
     }
 
-    /// Writes how many messages of each key could not be kept so far, on [`DROPPED_CHANNEL`].
+    /// Writes how many messages of each key could not be recorded so far, on [`DROPPED_CHANNEL`].
     ///
     /// # Errors
     /// As [`Writer::receive`].

@@ -81,14 +81,14 @@ fn pictures_of_another_kind_get_a_channel_of_their_own() {
 fn flushed_messages_survive_a_kill_and_are_ended_by_a_repair() {
     let killed = recording(true);
     assert!(mcap::Summary::read(&killed).map_or(true, |summary| summary.is_none()));
-    let mut mended = Vec::new();
-    let found = repair(&killed, &mut mended).unwrap();
-    assert_eq!(numbers(&mended), (0..MESSAGES).collect::<Vec<_>>());
+    let mut repaired = Vec::new();
+    let found = repair(&killed, &mut repaired).unwrap();
+    assert_eq!(numbers(&repaired), (0..MESSAGES).collect::<Vec<_>>());
     assert_eq!(found.messages, 2 * MESSAGES as u64);
     assert!(found.damage[0].contains("not ended"), "{found:?}");
-    // A second time there is nothing to mend.
+    // A second repair finds no damage.
     let mut again = Vec::new();
-    assert_eq!(repair(&mended, &mut again).unwrap().damage, Vec::<String>::new());
+    assert_eq!(repair(&repaired, &mut again).unwrap().damage, Vec::<String>::new());
     assert_eq!(numbers(&again).len(), MESSAGES);
 }
 
@@ -98,14 +98,14 @@ fn whatever_is_cut_the_whole_chunks_before_it_are_recovered() {
     let chunks = chunks(&complete);
     assert_eq!(chunks.len(), MESSAGES / 10);
     for length in mcap::MAGIC.len()..complete.len() {
-        let mut mended = Vec::new();
-        let found = repair(&complete[..length], &mut mended).unwrap();
+        let mut repaired = Vec::new();
+        let found = repair(&complete[..length], &mut repaired).unwrap();
         let before = chunks.iter().filter(|chunk| chunk.end <= length).count();
         assert!(
             found.chunks as usize >= before,
             "{length}: {found:?}, {before} chunks are complete"
         );
-        assert_eq!(numbers(&mended).len(), 10 * found.chunks as usize, "{length}");
+        assert_eq!(numbers(&repaired).len(), 10 * found.chunks as usize, "{length}");
         assert!(!found.damage.is_empty(), "cut at {length} of {}", complete.len());
     }
     assert!(repair(&complete[..4], &mut Vec::new()).is_err());
@@ -124,14 +124,14 @@ fn flipped_bits_are_named_and_lose_no_other_chunk() {
         let bit = (random >> 16) as usize % (8 * complete.len());
         let mut damaged = complete.clone();
         damaged[bit / 8] ^= 1 << (bit % 8);
-        let mut mended = Vec::new();
-        let Ok(found) = repair(&damaged, &mut mended) else { continue };
+        let mut repaired = Vec::new();
+        let Ok(found) = repair(&damaged, &mut repaired) else { continue };
         named += usize::from(!found.damage.is_empty());
         let before = chunks.iter().filter(|chunk| chunk.end <= bit / 8).count();
         // The length of a record is not repeated: all data after a damaged one are lost.
         let is_in_chunk = chunks.iter().any(|chunk| chunk.contains(&(bit / 8)));
         let min = if is_in_chunk { MESSAGES - 10 } else { 10 * before };
-        assert!(numbers(&mended).len() >= min, "bit {bit}: {found:?}");
+        assert!(numbers(&repaired).len() >= min, "bit {bit}: {found:?}");
     }
     assert!(named > 5000, "{named}");
 }

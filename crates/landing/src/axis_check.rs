@@ -5,8 +5,8 @@
 //! are as configured. If the camera is turned about the vertical, its image is mirrored, or roll or pitch has
 //! the wrong sign, the pad appears to move with every motion of the vehicle, unless the error is undone. So
 //! the position of the pad is computed under each of a few dozen alternatives, and the one with the smallest
-//! scatter is compared with the configured one: a likelihood ratio that needs no motion of its own, only
-//! enough of any.
+//! scatter is compared with the configured one: a likelihood ratio that needs no special motion, only
+//! enough of any kind.
 
 use geometry::{Body, Odometry, Point, Rotation, Vector};
 use libm::{exp, fmin, sincos};

@@ -23,7 +23,7 @@ pub struct Decision {
 /// A command for the autopilot.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub enum Action {
-    /// Nothing: stop streaming setpoints.
+    /// No action: stop streaming setpoints.
     None,
     /// Stream this velocity setpoint until the next decision.
     Velocity {

@@ -7,7 +7,7 @@
 //! the reported position moved against the truth by 0.010 m over 2 s, the sum of the reported velocity by
 //! 0.032 m.
 //!
-//! The last [`MEMORY`] detections are kept with the state after each; a late one is inserted between them,
+//! The last [`MEMORY`] detections are stored with the state after each; a late one is inserted between them,
 //! and those after it are fused again. A detection whose normalised innovation squared (NIS) exceeds the
 //! gate is an outlier, and may start a competing hypothesis (`hypotheses.rs`). An estimate without a
 //! detection for `forget_after_s` is discarded.
@@ -46,12 +46,12 @@ pub struct Estimator {
     heading: Option<[f64; 2]>,
     hypotheses: Hypotheses,
     nis: Option<f64>,
-    kept: Option<Kept>,
+    stored: Option<Stored>,
 }
 
 /// The estimate of an earlier time.
 #[derive(Clone, Debug)]
-struct Kept {
+struct Stored {
     newest: FusedMeasurement,
     detections: u32,
     heading: Option<[f64; 2]>,
@@ -75,7 +75,7 @@ impl Estimator {
             heading: None,
             hypotheses: Hypotheses::default(),
             nis: None,
-            kept: None,
+            stored: None,
         }
     }
 
@@ -107,7 +107,7 @@ impl Estimator {
 
     /// Stores the estimate, for the case that the next detections are to be forgotten.
     pub fn keep(&mut self) {
-        self.kept = self.past.back().map(|newest| Kept {
+        self.stored = self.past.back().map(|newest| Stored {
             newest: newest.clone(),
             detections: self.detections,
             heading: self.heading,
@@ -115,13 +115,13 @@ impl Estimator {
         });
     }
 
-    /// Goes back to the estimate that was kept, if any; late frames of before are not inserted any more.
+    /// Restores the stored estimate, if any; earlier late frames are not inserted any more.
     pub fn go_back(&mut self) {
         self.past.clear();
-        let Some(kept) = self.kept.clone() else { return };
-        self.past.push_back(kept.newest);
+        let Some(stored) = self.stored.clone() else { return };
+        self.past.push_back(stored.newest);
         (self.detections, self.heading, self.hypotheses) =
-            (kept.detections, kept.heading, kept.hypotheses);
+            (stored.detections, stored.heading, stored.hypotheses);
     }
 
     /// The estimate relative to a vehicle at `vehicle`, at `now`, with the odometry frame's present position.

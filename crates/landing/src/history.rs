@@ -8,7 +8,7 @@ use geometry::{Body, Ned, Odometry, Point, Rotation, Transform, Vector};
 use crate::event::VehicleState;
 use crate::time::Timestamp;
 
-/// Number of states kept: five seconds at 50 Hz.
+/// Number of stored states: five seconds at 50 Hz.
 const CAPACITY: usize = 256;
 
 /// Longest interval between two states over which motion is interpolated, in seconds.

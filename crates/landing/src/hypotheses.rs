@@ -2,7 +2,7 @@
 //!
 //! Detections of one position alone do not decide between the two, because the other may just be out of view:
 //! low over the ground, or while the vehicle tilts into the wind. So support is the fraction of the frames
-//! showing a position in which the marker was there, and a position out of view keeps its support for a while. The
+//! showing a position in which the marker was there, and a position out of view retains its support for a while. The
 //! competing position becomes the estimate, and the estimate the competing position, once its fraction is clearly
 //! larger over a long enough time. A pad that is moved is found again within seconds where its old position is
 //! in view, and a second marker is not accepted just because the first is out of view. An estimate with few

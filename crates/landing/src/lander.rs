@@ -621,7 +621,7 @@ impl Lander {
             .then_some((AlarmAction::Hold, Reason::Disputed))
     }
 
-    /// True when a dispute of two detectors keeps the vehicle from descending.
+    /// True when a dispute of two detectors prevents the descent.
     fn waits_for_agreement(&self, situation: &Situation<'_>) -> bool {
         self.disputed.is_some()
             && matches!(self.state_machine.phase(), Phase::Approach | Phase::Descend)
@@ -681,7 +681,7 @@ impl Lander {
         let phases = &self.config.phases;
         let look_s = if self.resumed.is_some() { MIN_RESUMED_LOOK_S } else { 0.0 };
         let delay_s = libm::fmax(phases.search_delay_s, look_s);
-        // A search without a detector finds nothing.
+        // A search without a detector finds no marker.
         if self.state_machine.elapsed_s(now) < delay_s || !self.detectors_alive {
             return Action::hover();
         }

@@ -364,7 +364,7 @@ impl MountCheck {
         fmax(self.covariance[(index, index)], 0.0).sqrt()
     }
 
-    /// Begins with another position of the pad, and keeps the estimates of the camera.
+    /// Begins with another position of the pad, and retains the estimates of the camera.
     fn reset_position(&mut self, measurement: &Measurement) {
         for (i, unknown) in UNKNOWN.iter().enumerate().take(TILT) {
             self.covariance.row_mut(i).fill(0.0);

@@ -331,7 +331,7 @@ mod tests {
         };
         let old = recoded(975, &hovers, &back);
         assert!(goes_on_from(&old, 931), "{old:?}");
-        // A slow drift of the autopilot's height over a vehicle that stays is no repetition.
+        // A slow drift of the autopilot's height over a vehicle that stays is not a repetition.
         let drifts = |number: u32| 5.0 + 0.1 * f64::from(number) / 15.0;
         assert_eq!(recoded(3000, &drifts, &alternates), Vec::<u32>::new());
     }

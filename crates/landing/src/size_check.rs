@@ -106,7 +106,7 @@ impl SizeCheck {
         }
     }
 
-    /// Forgets the detections and keeps what they showed: the vehicle stands, or its height restarts.
+    /// Forgets the detections and retains their result: the vehicle stands, or its height restarts.
     pub(crate) fn interrupt(&mut self) {
         self.fit = Fit::default();
     }

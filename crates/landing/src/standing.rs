@@ -41,13 +41,13 @@ const MAX_REMEMBERED_S: f64 = 60.0;
 const MAX_STILL_M_S: f64 = 0.1;
 const MIN_STILL_S: f64 = 1.0;
 const MAX_STILL_HEIGHT_M: f64 = 0.5;
-/// Maximum distance from the local origin, in metres, at which the autopilot's report that such a vehicle flies counts for nothing: it
+/// Maximum distance from the local origin, in metres, at which the autopilot's report that such a vehicle flies is ignored: it
 /// is seconds late.
 const MAX_ORIGIN_M: f64 = 3.0;
 /// Maximum time after taking over within which that is assumed, in seconds: an autopilot reports by then that it stands.
 const MAX_UNREPORTED_S: f64 = 10.0;
 /// Maximum distance from the pad of such a vehicle that stands next to it, in metres.
-const MAX_BESIDE_M: f64 = 2.0;
+const MAX_NEXT_TO_PAD_M: f64 = 2.0;
 
 /// Heights that a vehicle may have and that are above the error of the measurement, in metres.
 const PLAUSIBLE_M: RangeInclusive<f64> = 0.15..=1.0;
@@ -153,10 +153,10 @@ impl Resumed {
             age_s: situation.now.seconds_since(pad.stamp),
             velocity: Vector::zero(),
         };
-        let is_beside = below.lateral_m <= MAX_BESIDE_M
+        let is_next_to_pad = below.lateral_m <= MAX_NEXT_TO_PAD_M
             && below.height_m >= -MAX_STILL_HEIGHT_M
             && is_low(config, &below, MAX_STANDING_M);
-        is_right_over(situation, config, &below, MAX_STANDING_M) || is_still && is_beside
+        is_right_over(situation, config, &below, MAX_STANDING_M) || is_still && is_next_to_pad
     }
 }
 

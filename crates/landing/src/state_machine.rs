@@ -68,7 +68,7 @@ const MIN_RETRY_S: f64 = 2.0;
 const MIN_LOOK_S: f64 = 1.0;
 
 /// Time after LAND has shown in which our own mode may show again, in seconds: on a link with jitter an older heartbeat is
-/// late, and the next one follows in a second. Nothing is sent meanwhile, so a pilot who takes over does not wait.
+/// late, and the next one follows in a second. No setpoint is sent meanwhile, so a pilot that takes over does not wait.
 const MAX_OVERTAKEN_S: f64 = 1.2;
 
 /// Time in which a mode that was requested until then may still show, in seconds: LAND after an abort, our own mode after a recall from
@@ -373,7 +373,7 @@ impl StateMachine {
         self.retries = 0;
     }
 
-    /// Ends the landing; nothing is done until another one is started.
+    /// Ends the landing; no action follows until another one is started.
     pub fn stand_down(&mut self, now: Timestamp) {
         self.enter(Phase::Idle, Reason::WaitingForStart, now);
         (self.expects_land, self.released) = (false, false);
@@ -478,7 +478,7 @@ impl StateMachine {
         if inputs.operator == Some(OperatorCommand::Hold) && !asks_for_land {
             return Some((Phase::Hold, Reason::OperatorHold));
         }
-        // Final has timeouts of its own, but for the wait until the mode is known.
+        // Final has separate timeouts, except for the wait until the mode is known.
         let is_bounded = self.phase == Phase::Final
             && inputs.vehicle.is_some_and(|vehicle| vehicle.mode != Mode::Unknown);
         let lasted_s = inputs.now.seconds_since(self.started);

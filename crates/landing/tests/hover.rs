@@ -9,7 +9,7 @@ use landing::{
 
 const DT_S: f64 = 0.02;
 
-/// A vehicle over nothing that is seen, which takes half a second to fly as commanded, and drifts in addition.
+/// A vehicle that sees no marker, takes half a second to fly as commanded, and drifts in addition.
 struct Drifter {
     lander: Lander,
     steps: u32,

@@ -50,7 +50,7 @@ fn silence_at_any_height_ends_in_a_soft_touchdown_or_in_none() {
     check(&[0.0, 5.0], &[f64::INFINITY, 0.5, 2.0, 5.0], |_| {});
 }
 
-/// A vehicle that brakes in a long silence has moved by less than by its velocities before and after. That is no jump of the
+/// A vehicle that brakes in a long silence has moved by less than by its velocities before and after. That is not a jump of the
 /// autopilot's position, after which the pad would seem to be right below.
 #[test]
 fn after_a_long_silence_no_landing_is_asked_for_high_up() {

@@ -66,7 +66,7 @@ fn brightness(view: GrayView<'_>) -> Option<Brightness> {
     Some(Brightness { mean: sum / all / 255.0, brightest: level / 255.0, noise: noise(view)? })
 }
 
-/// Standard deviation of the noise, from 0 to 1: the difference of two second differences across each other has nothing of edges and
+/// Standard deviation of the noise, from 0 to 1: the difference of two second differences across each other contains no edges and
 /// slopes (J. Immerkaer, "Fast Noise Variance Estimation", 1996), and the median of its size little of a fine texture. Every second
 /// pixel counts: a camera's colour mosaic, its denoising and JPEG make the noise of neighbours alike.
 fn noise(view: GrayView<'_>) -> Option<f64> {

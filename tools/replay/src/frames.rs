@@ -172,7 +172,7 @@ impl Facts {
 ///
 /// # Errors
 /// When the recording lacks necessary messages, a setting is refused (a [`node::ConfigError`]), the detector cannot be meant (a
-/// [`WrongDetector`]), or a file is no recording.
+/// [`WrongDetector`]), or a file is not a recording.
 pub fn search(
     files: &[Vec<u8>],
     tapes: &[RecordedTape],

@@ -3,8 +3,8 @@
 //! The controller's tape has each event in the order in which it was handled. Here they are given to a flight that
 //! starts again, without network and clock. Its decisions are compared with the recorded ones.
 //!
-//! Modules in reading order: [`mod@run`] gives a tape to a flight, [`difference`] names what two results differ in,
-//! [`mod@verify`] finds the first difference, and [`mod@change`] sums up what another configuration would have done; [`frames`]
+//! Modules in reading order: [`mod@run`] gives a tape to a flight, [`difference`] names the difference of two results,
+//! [`mod@verify`] finds the first difference, and [`mod@change`] summarises the decisions of another configuration; [`frames`]
 //! searches the recorded pictures again and compares the new detections with the recorded ones, by [`truth`] where there is one,
 //! [`brightness`] measures how bright they are, and [`mod@restamp`] gives messages the time at which they are published again.
 

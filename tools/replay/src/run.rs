@@ -239,7 +239,7 @@ pub fn of_unused_guidance(tape: &RecordedTape, set: &[String]) -> Option<String>
     })
 }
 
-/// A recorded configuration with settings of now over it, which may mend it: it may name files of another machine.
+/// A recorded configuration with settings of the replay over it, which may correct it: it may name files of another machine.
 ///
 /// # Errors
 /// When it cannot be read: a [`node::ConfigError`] where that is for a setting of now alone.
@@ -253,7 +253,7 @@ pub(crate) fn configured<T: Settings>(name: &str, toml: &str, set: &[String]) ->
 /// Whether a recorded configuration can be read as it is.
 ///
 /// # Errors
-/// When it cannot, in words only: the user who replays it has not configured it wrongly.
+/// When it cannot, as text only: the settings of the replay are not wrong.
 fn check_recorded<T: Settings>(name: &str, toml: &str) -> anyhow::Result<()> {
     from_toml::<T>(name, toml, &[]).map(drop).map_err(|error| anyhow!("{error}"))
 }

@@ -228,7 +228,7 @@ impl FlightReader {
     /// Adds a file of the recording, after those that were written before it ([`FlightReader::begin`]).
     ///
     /// # Errors
-    /// When it is no MCAP file at all.
+    /// When it is not an MCAP file.
     pub fn add(&mut self, recording: &[u8]) -> Result<(), flightlog::Error> {
         let Self { flight, tapes, boot_of_tape, meter, begin, lost_by_run } = self;
         let tape_key = topic::TAPE.key(&[]);
@@ -266,7 +266,7 @@ impl FlightReader {
         Ok(())
     }
 
-    /// True when nothing of a flight was added.
+    /// True when no message of a flight was added.
     pub fn is_empty(&self) -> bool {
         self.flight.messages == 0 && self.tapes.is_empty()
     }
@@ -323,7 +323,7 @@ fn configuration_of(tape: &RecordedTape) -> Option<String> {
 }
 
 impl Flight {
-    /// A mark by which its page is known as its own: made of its recording's name, run and begin, and of its landing.
+    /// A mark that identifies its page: made of its recording's name, run and begin, and of its landing.
     pub fn mark(&self) -> String {
         let run = self.facts.get("run").map_or("", String::as_str);
         let landing = self.landing.as_ref().map_or(0, |it| it.number);

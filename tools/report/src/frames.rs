@@ -21,7 +21,7 @@ const MAX_RESTING_M_S: f64 = 0.1;
 const GAP_NS: i64 = 1_000_000_000;
 /// How far the height of a vehicle that stands may be from that with which its autopilot says so, in metres.
 const MAX_RISE_M: f64 = 0.2;
-/// Phases in which nothing is landing.
+/// Phases in which no vehicle is landing.
 const OUTSIDE: [&str; 5] = ["idle", "takeoff", "landed", "aborted", "pilot-in-command"];
 
 /// The outcome of a frame.

@@ -1,4 +1,4 @@
-//! Reports on a recorded flight: a page, a summary and figures that show what happened and why.
+//! Reports on a recorded flight: a page, a summary and figures that show the events and their reasons.
 //!
 //! Recordings in, a page out: HTML that needs no network and no other file, with charts as SVG. This crate uses no
 //! files, no clock and no network, and decides nothing: all that it reports of a flight is in the recording.
@@ -6,10 +6,10 @@
 //! Modules in reading order: [`flight`] has the messages of a recording, with the autopilot's [`packets`], and [`landings`] keeps
 //! one landing of it; [`frames`] shows
 //! the outcome of each frame, [`latency`] how long it took, [`light`] how bright the pictures were, [`track`] where the vehicle was,
-//! [`phases`] and [`journal`] what happened and why, [`losses`] the lost messages, [`tape`] whether the tape gives the same again, and
-//! [`mod@summary`] all of it in numbers. [`difference`], over [`settings`], compares configurations. [`view`] joins these for the page:
+//! [`phases`] and [`journal`] the events and their reasons, [`losses`] the lost messages, [`tape`] whether the tape gives the same again,
+//! and [`mod@summary`] all of it in numbers. [`difference`], over [`settings`], compares configurations. [`view`] joins these for the page:
 //! [`plots`] are its charts, drawn by [`chart`], [`sections`] its parts, in pieces of [`html`], and [`mod@page`] the whole,
-//! [`mod@document`] the same on the pages of a [`pdf`] file. [`mod@figures`] are the charts as files of their own.
+//! [`mod@document`] the same on the pages of a [`pdf`] file. [`mod@figures`] are the charts as separate files.
 
 pub mod chart;
 pub mod difference;

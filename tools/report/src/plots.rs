@@ -123,7 +123,7 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
     let from_the_side = Chart {
         title: "From the side, along the way from the start to the pad".to_owned(),
         axes: Axes {
-            x_name: "past the pad, m (the two axes have scales of their own)".to_owned(),
+            x_name: "past the pad, m (the two axes have different scales)".to_owned(),
             y_name: "height over the pad, m".to_owned(),
             x,
             y: span(positions().map(|it| it.height_m), 0.0..1.0),
@@ -500,7 +500,7 @@ pub fn share_axes(one: &mut Chart, other: &mut Chart) {
         |a: &std::ops::Range<f64>, b: &std::ops::Range<f64>| a.start.min(b.start)..a.end.max(b.end);
     one.axes.x = joined(&one.axes.x, &other.axes.x);
     other.axes.x = one.axes.x.clone();
-    // Rows have names of their own.
+    // Rows have separate names.
     if one.rows.is_empty() {
         one.axes.y = joined(&one.axes.y, &other.axes.y);
         other.axes.y = one.axes.y.clone();

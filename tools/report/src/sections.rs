@@ -21,7 +21,7 @@ pub struct Section {
     pub id: &'static str,
     /// Its title.
     pub title: &'static str,
-    /// Its contents, for a reader who has not seen one before; may be empty.
+    /// Its explanation, for a first reader; may be empty.
     pub lead: &'static str,
     /// Its charts.
     pub charts: Vec<Chart>,
@@ -190,7 +190,7 @@ fn detections(view: &View<'_>) -> Section {
         })
         .collect();
     if rows.is_empty() {
-        section.before.push(missing("pictures, so nothing is known of the light"));
+        section.before.push(missing("pictures, so the light is not known"));
     } else {
         let head = [
             "camera",

@@ -46,7 +46,7 @@ pub(crate) fn differences(
         .collect()
 }
 
-/// Hands over each value below another one that is no table, with its path.
+/// Hands over each value below another one that is not a table, with its path.
 pub(crate) fn flatten(path: &str, value: &Value, take: &mut impl FnMut(String, String)) {
     match value {
         Value::Table(table) => {

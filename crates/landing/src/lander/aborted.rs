@@ -34,7 +34,7 @@ pub(super) enum AbortClimb {
         /// It may stand, and climbs once it moves.
         may_climb: bool,
     },
-    /// Nothing is sent any more.
+    /// No more setpoints are sent.
     Released,
 }
 

@@ -44,7 +44,7 @@ impl Lander {
         self.first_seen = None;
     }
 
-    /// A moving pad shows nothing of the mount, and the thesis' guidance has no such check.
+    /// A moving pad gives no information about the mount, and the thesis' guidance has no such check.
     fn checks_axes(&self) -> bool {
         let is_metric = matches!(self.config.guidance, GuidanceConfig::Metric(_));
         is_metric

@@ -26,7 +26,7 @@ impl Lander {
                 self.sightings.forget_since(since);
                 return Err(Rejection::RepeatedPicture);
             }
-            // One that is carried by hand, as before the first flight, shows nothing: its height is not that of a flight.
+            // One that is carried by hand, as before the first flight, gives no information: its height is not that of a flight.
             if stands || !self.status.is_some_and(|status| status.armed) {
                 self.size_check.interrupt();
             } else {
