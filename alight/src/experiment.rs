@@ -269,7 +269,7 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
     let mut folder = Folder::claim(&args.output, args.replace)?;
     faults::tell_only_size_counts(
         vision,
-        &plan::told_settings(request.plan.marker.as_ref(), &request.plan.set),
+        &plan::settings_text(request.plan.marker.as_ref(), &request.plan.set),
     );
     let interruption = Interruption::on_signals(FLIGHTS_END)?;
     let steps = Steps::of_flights();

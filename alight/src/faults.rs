@@ -13,7 +13,7 @@ use experiments::faults::report;
 use experiments::faults::{self, Findings};
 use experiments::landing::Watch;
 use experiments::landing::plan::{
-    ONLY_SIZE_COUNTS, Values, Vision, only_size_counts, refuse_swept, told_settings,
+    ONLY_SIZE_COUNTS, Values, Vision, only_size_counts, refuse_swept, settings_text,
 };
 use experiments::results::{self, Folder};
 use markers::Marker;
@@ -213,7 +213,7 @@ pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
     request.tapes_in.as_deref().map_or(Ok(()), results::claim_for_recordings)?;
     if !real_time {
         let plan = &request.plan;
-        let settings = told_settings(plan.marker.as_ref(), &plan.set);
+        let settings = settings_text(plan.marker.as_ref(), &plan.set);
         tell_only_size_counts(Vision::Modelled, &settings);
     }
     let interruption = Interruption::on_signals(match real_time {

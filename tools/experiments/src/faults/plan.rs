@@ -9,7 +9,7 @@ use node::ConfigError;
 use super::kind::{Kind, LIAR};
 use crate::landing::configuration;
 use crate::landing::fault::{START_ANGLE, drawn, drawn_angle};
-use crate::landing::plan::{Swept, Values, refuse_other_marker, set_option, told_settings};
+use crate::landing::plan::{Swept, Values, refuse_other_marker, set_option, settings_text};
 
 /// Durations that are drawn, in seconds; infinity is for ever.
 pub const DURATIONS_S: [f64; 4] = [0.5, 2.0, 5.0, f64::INFINITY];
@@ -285,7 +285,7 @@ impl Planned {
 
     /// Its guidance, the marker where one was asked for, and the further settings, in a word for each.
     pub fn settings(&self) -> String {
-        told_settings(self.marker.as_ref(), &self.set)
+        settings_text(self.marker.as_ref(), &self.set)
     }
 
     /// Names of its faults.

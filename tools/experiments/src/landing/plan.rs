@@ -255,7 +255,7 @@ impl Plan {
 
     /// Its flights, cell after cell.
     pub fn flights(&self) -> Vec<Planned> {
-        let settings = told_settings(self.marker.as_ref(), &self.set);
+        let settings = settings_text(self.marker.as_ref(), &self.set);
         let mut flights = Vec::new();
         let mut row = 0;
         for fault in without_repeats(&self.faults) {
@@ -435,7 +435,7 @@ fn without_repeats<T: PartialEq>(values: &[T]) -> impl Iterator<Item = &T> {
 
 /// The guidance, the marker where one was asked for, and the further settings, one word for each: by them the flights of two campaigns
 /// are told apart.
-pub fn told_settings(marker: Option<&Marker>, set: &[String]) -> String {
+pub fn settings_text(marker: Option<&Marker>, set: &[String]) -> String {
     const GUIDANCE: &str = "controller.guidance";
     let key_of = |setting: &String| setting.split('=').next().unwrap_or_default().trim().to_owned();
     let of_controller: Vec<String> =
