@@ -6,7 +6,7 @@
 COMMAND is the path of `alight`, FAMILY one that OpenCV or AprilTag 3 knows as well, such as apriltag-36h11 or aruco-4x4-50. Markers that every
 detector finds are compared; corners of the references are sub-pixel ones.
 
-No photograph tells where a corner truly is, and references that move an edge in the same sense agree with each other. But what a camera's
+No photograph shows the true position of a corner, and references that move an edge in the same sense agree with each other. But what a camera's
 tone curve makes of a blurred edge, and what ink does on paper, moves edges from black to white and from white to black in opposite senses, by
 the same amount. So the places of the edges between a marker's cells are fitted with one projection and one such movement along each axis; the
 projection then gives the corners without it. The outline itself, on which all detectors rest, takes no part. Prints whose cells are not as
@@ -81,7 +81,7 @@ def edges_between_cells(grey, to_image, cells):
 
 
 def corners_by_cells(grey, corners, cells):
-    """The corners that the edges between the cells give, beginning from others; `None` where the cells do not tell."""
+    """The corners that the edges between the cells give, beginning from others; `None` where the cells do not suffice."""
     square = np.array([[0, 0], [cells, 0], [cells, cells], [0, cells]], np.float32)
     to_image = cv2.getPerspectiveTransform(square, np.asarray(corners, np.float32))
     half = cells / 2.0
@@ -164,7 +164,7 @@ def main():
         sys.exit(f"none of {len(images)} images has a {family} of at least {MIN_CELL_PX:.0f} px a cell that all of {names} find")
     markers = np.concatenate([np.array(of) for of in distances.values()])
     by_image = np.array([np.median(of, 0) for of in distances.values()])
-    print(f"{len(markers)} markers in {len(by_image)} images; {without} more, whose cells do not tell, are left out")
+    print(f"{len(markers)} markers in {len(by_image)} images; {without} more, whose cells do not suffice, are left out")
     print("distance of the corners from where the cells put them, and how far outside of it they are; px")
     for i, name in enumerate(names):
         print(

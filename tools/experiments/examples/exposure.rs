@@ -26,7 +26,7 @@ const RATE_HZ: f64 = 15.0;
 /// When the light changes, and when it is over, in frames.
 const CHANGE: u64 = 15;
 const END: u64 = 60;
-/// Frames from an exposure to the detections that the camera hears of.
+/// Frames from an exposure to the detections that the camera receives.
 const LATENCY: usize = 1;
 /// The light for which the camera is set, of full sun: six stops less is the light of a dull evening.
 const LIGHT: f64 = 0.5;

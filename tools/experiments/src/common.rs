@@ -192,10 +192,11 @@ mod tests {
             run(ALL_AT_ONCE, "rings", &[None; 4]),
         ];
         let rows = rows(&runs);
-        let told = |row: &Row| (row.detector.clone(), row.found, row.common, row.centre_worst_px);
-        let told: Vec<_> = rows.iter().map(told).collect();
+        let main_values =
+            |row: &Row| (row.detector.clone(), row.found, row.common, row.centre_worst_px);
+        let stated: Vec<_> = rows.iter().map(main_values).collect();
         assert_eq!(
-            told,
+            stated,
             [
                 (OURS.to_owned(), 3, 2, Some(0.02)),
                 (OURS.to_owned(), 3, 2, Some(0.1)),

@@ -146,7 +146,7 @@ fn earlier(results: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(earlier)
 }
 
-/// Runs the experiment; `begins` is told of each step, and may break it off before that one. The report is of what was done.
+/// Runs the experiment; `begins` is called before each step, and may end the run there. The report is of what was done.
 ///
 /// # Errors
 /// When a file cannot be read or written, or there are results of an earlier run that are not to be replaced.
@@ -486,11 +486,11 @@ mod tests {
         let ours = ["alight/far/rings.jsonl", "alight-all/textured/rings.jsonl", "report.md"];
         for name in ours.into_iter().chain(["table-a1.csv", "scores.csv", "figure-4-7.svg"]) {
             write(&results, name);
-            let told = check_unused(&request).unwrap_err().to_string();
-            assert!(told.contains(name) && told.contains("`--replace`"), "{told}");
+            let error = check_unused(&request).unwrap_err().to_string();
+            assert!(error.contains(name) && error.contains("`--replace`"), "{error}");
             // Nothing is begun, nor is anything of the earlier run touched.
             let begun = run(&request, &mut |_| panic!("a set is begun")).unwrap_err().to_string();
-            assert_eq!(begun, told);
+            assert_eq!(begun, error);
             request.replaces = true;
             check_unused(&request).unwrap();
             let findings = run(&request, &mut |_| ControlFlow::Break(())).unwrap();
@@ -528,26 +528,26 @@ mod tests {
         // Faults of other detectors: a line that is none, a frame that is missing, a photograph that is missing.
         let mine = results.join("mine/far/aruco-4x4-50.jsonl");
         let refused = |request: &Request| {
-            let told =
+            let error =
                 format!("{:#}", run(request, &mut |_| panic!("a set is begun")).unwrap_err());
-            assert!(results.join(old).exists(), "{told}");
-            told
+            assert!(results.join(old).exists(), "{error}");
+            error
         };
         std::fs::create_dir_all(mine.parent().unwrap()).unwrap();
         for (text, wanted) in [("no line", "line 1 of "), ("", "no line for the frame")] {
             std::fs::write(&mine, text).unwrap();
-            let told = refused(&request);
-            assert!(told.contains(wanted) && told.contains("mine"), "{told}");
+            let error = refused(&request);
+            assert!(error.contains(wanted) && error.contains("mine"), "{error}");
         }
         std::fs::remove_file(&mine).unwrap();
         let line = "{\"image\":\"a.png\",\"markers\":[{\"family\":\"apriltag-36h11\",\"id\":3,\"corners\":[[0,0],[9,0],[9,9],[0,9]]}]}";
         std::fs::write(folder.path().join("labels.jsonl"), line).unwrap();
         request.photographs = Some(folder.path().to_owned());
         write(&results, "mine/photographs/apriltag-36h11.jsonl");
-        let told = refused(&request);
+        let error = refused(&request);
         let place = Path::new("mine").join(PHOTOGRAPHS).join("apriltag-36h11.jsonl");
-        assert!(told.contains("no result for a.png"), "{told}");
-        assert!(told.contains(&place.display().to_string()), "{told}");
+        assert!(error.contains("no result for a.png"), "{error}");
+        assert!(error.contains(&place.display().to_string()), "{error}");
         request.photographs = None;
         assert!(!run(&request, &mut go).unwrap().is_interrupted);
         assert!(!results.join(old).exists());
@@ -558,7 +558,7 @@ mod tests {
     }
 
     #[test]
-    fn a_report_tells_what_of_it_was_there_already() {
+    fn a_report_names_results_that_were_there_before() {
         let folder = tempfile::tempdir().unwrap();
         let run = |detector: &str, set| Run {
             set,
@@ -572,9 +572,9 @@ mod tests {
             std::fs::create_dir_all(&folder).unwrap();
             std::fs::write(folder.join(store::RENDERED_BY), version).unwrap();
         }
-        let told = of_others(&runs, folder.path());
-        assert!(told.contains("results of mine are of files"), "{told}");
-        assert!(told.contains("Frames of cut were") && told.contains("alight 0.0.9"), "{told}");
+        let text = of_others(&runs, folder.path());
+        assert!(text.contains("results of mine are of files"), "{text}");
+        assert!(text.contains("Frames of cut were") && text.contains("alight 0.0.9"), "{text}");
         assert_eq!(of_others(&runs[..1], folder.path()), "");
     }
 }

@@ -330,12 +330,15 @@ mod tests {
             let recall = recall(folder.path(), "apriltag-36h11", &records).unwrap();
             assert_eq!((recall.markers, recall.found, recall.unlabelled), (1, 1, 1), "{family}");
             let of_ours = BTreeMap::from([(record::OURS.to_owned(), recall)]);
-            let told = text(&BTreeMap::from([("apriltag-36h11".to_owned(), of_ours)]));
-            assert!(told.contains("without a label by us, apriltag-36h11:\n- a.jpg: 1"), "{told}");
+            let report = text(&BTreeMap::from([("apriltag-36h11".to_owned(), of_ours)]));
+            assert!(
+                report.contains("without a label by us, apriltag-36h11:\n- a.jpg: 1"),
+                "{report}"
+            );
         }
         let wrong = label("tag36h11").replace("corners", "corner");
         std::fs::write(&path, format!("{}\n{wrong}\n", label("tag36h11"))).unwrap();
-        let told = format!("{:#}", check(folder.path()).unwrap_err());
-        assert!(told.contains("line 2 of") && told.contains("docs/experiments.md"), "{told}");
+        let error = format!("{:#}", check(folder.path()).unwrap_err());
+        assert!(error.contains("line 2 of") && error.contains("docs/experiments.md"), "{error}");
     }
 }

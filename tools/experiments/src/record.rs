@@ -157,7 +157,7 @@ pub fn answer(
 pub enum Ids {
     /// All of the family.
     Any,
-    /// The one that a frame shows, as a landing on that marker does: less evidence is enough to tell one id from no marker.
+    /// The one that a frame shows, as a landing on that marker does: distinguishing one id from no marker needs less evidence.
     Shown,
 }
 
@@ -299,9 +299,9 @@ mod tests {
         let records = parse(path, &good).unwrap();
         assert_eq!(records[0].found[0].centre_covariance_px2, Some([1.0, 0.0, 1.0]));
         let text = format!("{good}\n{}\n", line("covariance_px2"));
-        let told = format!("{:#}", parse(path, &text).unwrap_err());
-        assert!(told.contains("line 2 of mine.jsonl"), "{told}");
-        assert!(told.contains("unknown field `covariance_px2`"), "{told}");
+        let error = format!("{:#}", parse(path, &text).unwrap_err());
+        assert!(error.contains("line 2 of mine.jsonl"), "{error}");
+        assert!(error.contains("unknown field `covariance_px2`"), "{error}");
         assert!(parse(path, "{\"image\":\"a.png\",\"ms\":1,\"found\":[],\"time_ms\":1}").is_err());
     }
 
@@ -313,11 +313,11 @@ mod tests {
             )
         };
         let text = [line("aruco-4x4-50"), line("aruco_4x4_50")].join("\n");
-        let told = parse(Path::new("mine.jsonl"), &text).unwrap_err().to_string();
+        let error = parse(Path::new("mine.jsonl"), &text).unwrap_err().to_string();
         assert!(
-            told.starts_with("line 2 of mine.jsonl: ") && told.contains("`aruco_4x4_50`"),
-            "{told}"
+            error.starts_with("line 2 of mine.jsonl: ") && error.contains("`aruco_4x4_50`"),
+            "{error}"
         );
-        assert!(told.contains("aruco-4x4-50, "), "{told}");
+        assert!(error.contains("aruco-4x4-50, "), "{error}");
     }
 }

@@ -488,8 +488,11 @@ mod tests {
         assert_eq!(complete_to(9..=13, of(5)), "-");
         let rows = [run(Set::Negatives)];
         let row = of_processing(&Variant::default(), &rows[0]);
-        let told = by_processing(&[row]);
-        assert!(told.contains("| linear | 0 | negatives | experiment | 0/1 | 0.0 | - |"), "{told}");
+        let table = by_processing(&[row]);
+        assert!(
+            table.contains("| linear | 0 | negatives | experiment | 0/1 | 0.0 | - |"),
+            "{table}"
+        );
     }
 
     #[test]
@@ -500,9 +503,12 @@ mod tests {
 
     #[test]
     fn a_report_has_no_heading_without_a_content_and_no_marker_is_found_where_none_is() {
-        let told = text(&[run(Set::Negatives)]);
-        assert!(told.contains("| negatives | experiment | alight | none in 1 | 0 | 0 |"), "{told}");
-        let headings: Vec<&str> = told.lines().filter(|line| line.starts_with('#')).collect();
+        let report = text(&[run(Set::Negatives)]);
+        assert!(
+            report.contains("| negatives | experiment | alight | none in 1 | 0 | 0 |"),
+            "{report}"
+        );
+        let headings: Vec<&str> = report.lines().filter(|line| line.starts_with('#')).collect();
         assert_eq!(headings, ["## All sets"]);
     }
 }

@@ -16,7 +16,7 @@ pub const FLIGHTS_AS_JSON: &str = "flights.jsonl";
 pub const FLIGHTS_AS_CSV: &str = "flights.csv";
 /// The report.
 pub const REPORT: &str = "report.md";
-/// The report's first lines, by which it is told from one of another origin.
+/// The report's first lines, which distinguish it from a report of another origin.
 pub const LANDINGS_HEADING: &str = "# Landings\n";
 /// See [`LANDINGS_HEADING`].
 pub const FAULTS_HEADING: &str = "# Faults\n";
@@ -526,7 +526,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_told_and_only_that() {
+    fn only_missing_flights_are_reported() {
         assert_eq!(interrupted(3, 3), "");
         assert!(interrupted(2, 3).contains("after 2 of 3 flights"));
         assert!(interrupted(0, 3).contains("before any of 3 flights"));

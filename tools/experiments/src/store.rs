@@ -202,8 +202,8 @@ pub fn make(
 
 /// The version that rendered the frames of a folder.
 pub fn rendered_by(folder: &Path) -> String {
-    let told = std::fs::read_to_string(folder.join(RENDERED_BY));
-    told.map_or_else(|_| "of an unknown version".to_owned(), |it| it.trim().to_owned())
+    let version = std::fs::read_to_string(folder.join(RENDERED_BY));
+    version.map_or_else(|_| "of an unknown version".to_owned(), |it| it.trim().to_owned())
 }
 
 fn write_png(path: &Path, pixels: &[u8], camera: &CameraLine) -> anyhow::Result<()> {

@@ -27,18 +27,18 @@ fn reference_detectors_take_the_sets_that_are_there() {
             .unwrap()
     };
     let output = run(&[]);
-    let told = String::from_utf8_lossy(&output.stdout);
+    let output_text = String::from_utf8_lossy(&output.stdout);
     let problem = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{told}{problem}");
-    if told.contains("skipped: the reference detectors need") {
-        testing::skip("python", told.trim());
+    assert!(output.status.success(), "{output_text}{problem}");
+    if output_text.contains("skipped: the reference detectors need") {
+        testing::skip("python", output_text.trim());
         return;
     }
-    assert!(told.contains(&format!("of {frames} frames")), "{told}");
-    assert!(results.join("opencv/far/aruco-4x4-50.jsonl").is_file(), "{told}");
+    assert!(output_text.contains(&format!("of {frames} frames")), "{output_text}");
+    assert!(results.join("opencv/far/aruco-4x4-50.jsonl").is_file(), "{output_text}");
     let output = run(&["set=circles"]);
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert!(!output.status.success() && told.contains("--set circles"), "{told}");
+    let error_text = String::from_utf8_lossy(&output.stderr);
+    assert!(!output.status.success() && error_text.contains("--set circles"), "{error_text}");
     // Labels have our names or OpenCV's. A family of which there is no photograph has no file.
     let far = store::folder(&sets, Set::Far, marker);
     let frame = store::frames(&far).unwrap().remove(0);
@@ -51,7 +51,7 @@ fn reference_detectors_take_the_sets_that_are_there() {
         );
         std::fs::write(far.join("labels.jsonl"), label).unwrap();
         let output = run(&["detector=opencv", &format!("photographs={}", far.display())]);
-        let told = String::from_utf8_lossy(&output.stdout);
+        let output_text = String::from_utf8_lossy(&output.stdout);
         let folder = results.join("opencv/photographs");
         let file = folder.join("aruco-4x4-1000.jsonl");
         let text = std::fs::read_to_string(&file).unwrap();
@@ -60,7 +60,7 @@ fn reference_detectors_take_the_sets_that_are_there() {
         // Where it is in the picture as it is stored, not as it is turned.
         let is_there = |[u, v]: [f64; 2]| (u - x).hypot(v - y) < 1.0;
         assert!(found.clone().any(|it| is_there(it.centre_px)), "{family}: {x}, {y}, {text}");
-        assert!(!folder.join("apriltag-36h11.jsonl").exists(), "{told}");
+        assert!(!folder.join("apriltag-36h11.jsonl").exists(), "{output_text}");
         std::fs::remove_dir_all(folder).unwrap();
     }
 }

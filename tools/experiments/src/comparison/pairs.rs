@@ -14,7 +14,7 @@ use crate::landing::plan::{ONLY_SIZE_COUNTS, only_size_counts};
 use crate::landing::table::{median_coverage, median_interval, percentile, sign_test};
 use crate::results::FLIGHTS_AS_JSON;
 
-/// A flight, as its row tells it.
+/// A flight, as its row states it.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Flight {
     /// The name of its circumstances.
@@ -449,12 +449,13 @@ impl Comparison {
             runs: summaries(&members),
             pairs: Pairs::new(&members),
         });
-        let is_told = |run: &Run| {
+        let needs_warning = |run: &Run| {
             run.flights.iter().any(|flight| only_size_counts(&flight.vision, &flight.settings))
         };
-        let told = [first, second].into_iter().any(is_told).then(|| ONLY_SIZE_COUNTS.to_owned());
+        let warning =
+            [first, second].into_iter().any(needs_warning).then(|| ONLY_SIZE_COUNTS.to_owned());
         Ok(Self {
-            warnings: told.into_iter().collect(),
+            warnings: warning.into_iter().collect(),
             runs: [side(first, pairs.len()), side(second, pairs.len())],
             cells: cells.collect(),
             paired: summaries(&pairs),
@@ -590,18 +591,18 @@ mod tests {
     #[test]
     fn runs_without_a_pair_are_refused_with_what_they_have() {
         let [one, other] = [1, 2].map(|seed| run(vec![flight("calm", seed, None)]));
-        let told = Comparison::new(&one, &other).unwrap_err().to_string();
-        assert!(told.contains("seed 1 of calm") && told.contains("seed 2 of calm"), "{told}");
+        let error = Comparison::new(&one, &other).unwrap_err().to_string();
+        assert!(error.contains("seed 1 of calm") && error.contains("seed 2 of calm"), "{error}");
     }
 
     #[test]
     fn what_is_no_run_of_landings_is_refused_by_its_line() {
         let folder = tempfile::tempdir().unwrap();
-        let told = |folder: &Path| format!("{:#}", Run::read(folder).unwrap_err());
-        assert!(told(folder.path()).contains("alight experiment landing"));
+        let error_of = |folder: &Path| format!("{:#}", Run::read(folder).unwrap_err());
+        assert!(error_of(folder.path()).contains("alight experiment landing"));
         std::fs::write(folder.path().join(FLIGHTS_AS_JSON), "{\"seed\":1}\n").unwrap();
-        assert!(told(folder.path()).contains("line 1 of"));
+        assert!(error_of(folder.path()).contains("line 1 of"));
         std::fs::write(folder.path().join(FLIGHTS_AS_JSON), "").unwrap();
-        assert!(told(folder.path()).contains("no flight"));
+        assert!(error_of(folder.path()).contains("no flight"));
     }
 }

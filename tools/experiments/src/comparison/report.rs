@@ -1,4 +1,4 @@
-//! Tells a comparison: as tables in Markdown, as JSON, and as a plot with a point for each pair.
+//! Writes a comparison: as tables in Markdown, as JSON, and as a plot with a point for each pair.
 
 use std::fmt::Write as _;
 
@@ -61,16 +61,16 @@ fn head(letter: char, side: &Side) -> String {
 
 /// What else than the settings differs, or that nothing does.
 fn differing([first, second]: &[Side; 2]) -> String {
-    let mut told = Vec::new();
+    let mut sentences = Vec::new();
     if first.visions != second.visions {
-        told.push("The vision differs between them.");
+        sentences.push("The vision differs between them.");
     }
     if first.programs != second.programs {
-        told.push("The program differs between them.");
+        sentences.push("The program differs between them.");
     } else if first.settings == second.settings && first.visions == second.visions {
-        told.push("Settings, vision and program are the same.");
+        sentences.push("Settings, vision and program are the same.");
     }
-    told.iter().map(|sentence| format!("\n{sentence}\n")).collect()
+    sentences.iter().map(|sentence| format!("\n{sentence}\n")).collect()
 }
 
 fn summaries(comparison: &Comparison) -> String {
@@ -86,7 +86,7 @@ fn summaries(comparison: &Comparison) -> String {
     let mut text = format!(
         "\nPairs have the same circumstances and seed: {}, of which {} landed in both, {} in A alone, {} in B alone (sign test p = {}) and {} in neither. \
          All numbers are of pairs, those of flights of all, and errors, times and speeds, and their differences (B - A: below 0 B is better), \
-         of those that landed in both; 95 % is told of 20 or more.{once} \
+         of those that landed in both; 95 % is given for 20 or more.{once} \
          The interval is that of the median at 95 % or, as it ends at one of the differences, a little more, which stands beside it, by order statistics (from six \
          seeds on); p is of a two-sided sign test, for numbers of flights of the seeds in which B has fewer or more. {} values are tested: if A and B did not differ, \
          one of them would have p < 0.05 in up to {} % of comparisons, so take one that you did not choose beforehand for p < {:.3} alone. \
@@ -317,24 +317,24 @@ mod tests {
     fn the_table_has_both_runs_of_the_same_pairs_and_counts_a_seed_once() {
         let first = run(&[("calm", [0.01, 0.03]), ("windy", [0.01, 0.03])]);
         let second = run(&[("calm", [0.02, 0.04]), ("windy", [0.02, 0.04]), ("late", [0.9, 0.9])]);
-        let told = text(&Comparison::new(&first, &second).unwrap(), "compare");
+        let report = text(&Comparison::new(&first, &second).unwrap(), "compare");
         let row =
             "| touchdown error, m: median | 0.020 | 0.030 | +0.0100 | - | 0, 2 of 2 | 0.500 |";
-        assert!(told.contains(row), "{told}");
-        assert!(told.contains("| touchdown error, m: worst | 0.030 | 0.040 |"), "{told}");
-        assert!(told.contains("here it counts once"), "{told}");
+        assert!(report.contains(row), "{report}");
+        assert!(report.contains("| touchdown error, m: worst | 0.030 | 0.040 |"), "{report}");
+        assert!(report.contains("here it counts once"), "{report}");
         // Those of a wind that the other run did not have count nowhere.
         assert!(
-            told.contains("| flights | 4 | 4 |") && told.contains("2 of its 6 flights"),
-            "{told}"
+            report.contains("| flights | 4 | 4 |") && report.contains("2 of its 6 flights"),
+            "{report}"
         );
-        assert!(told.contains("| within 0.1 m | 4 | 4 |"), "{told}");
-        // Of four landings no percentile is told.
-        assert!(told.contains("| touchdown error, m: 95 % | - | - |"), "{told}");
+        assert!(report.contains("| within 0.1 m | 4 | 4 |"), "{report}");
+        // Of four landings no percentile is given.
+        assert!(report.contains("| touchdown error, m: 95 % | - | - |"), "{report}");
         let [first, second] =
             [&[("calm", [0.01, 0.03])], &[("calm", [0.02, 0.04])]].map(|it| run(it));
-        let told = text(&Comparison::new(&first, &second).unwrap(), "compare");
-        assert!(!told.contains("counts once"), "{told}");
+        let report = text(&Comparison::new(&first, &second).unwrap(), "compare");
+        assert!(!report.contains("counts once"), "{report}");
     }
 
     #[test]
@@ -345,22 +345,25 @@ mod tests {
             (1..).zip(&mut run.flights).for_each(|(seed, flight)| flight.seed = seed);
             run
         };
-        let told = text(&Comparison::new(&of(0.02), &of(0.4)).unwrap(), "compare");
+        let report = text(&Comparison::new(&of(0.02), &of(0.4)).unwrap(), "compare");
         for row in [
             "| landed | 8 | 8 | | | 0, 0 of 8 | 1.000 |",
             "| within 0.1 m | 8 | 0 | | | 8, 0 of 8 | 0.008 |",
             "| unsafe | 0 | 8 | | | 0, 8 of 8 | 0.008 |",
             "| +0.3800 | +0.3800 to +0.3800 (99.2 %) | 0, 8 of 8 | 0.008 |",
         ] {
-            assert!(told.contains(row), "{row} is not in {told}");
+            assert!(report.contains(row), "{row} is not in {report}");
         }
         // The sum of seven, which holds however they depend on each other.
-        assert!(told.contains("in up to 35 % of comparisons"), "{told}");
-        assert!(told.contains("7 values are tested") && told.contains("p < 0.007 alone"), "{told}");
+        assert!(report.contains("in up to 35 % of comparisons"), "{report}");
+        assert!(
+            report.contains("7 values are tested") && report.contains("p < 0.007 alone"),
+            "{report}"
+        );
     }
 
     #[test]
-    fn two_markers_that_count_for_nothing_are_told_in_bold() {
+    fn a_warning_that_markers_do_not_count_is_in_bold() {
         let of = |marker: &str| {
             let mut run = run(&[("calm", [0.01, 0.03])]);
             run.flights
@@ -369,12 +372,15 @@ mod tests {
             run
         };
         let [rings, square] = ["rings:0.15", "apriltag-36h11:3:0.15"].map(of);
-        let told = Comparison::new(&rings, &square).unwrap();
-        assert!(text(&told, "compare").contains("\n\n**Vision is modelled"), "{told:?}");
-        let json = serde_json::to_value(&told).unwrap();
+        let comparison = Comparison::new(&rings, &square).unwrap();
+        assert!(
+            text(&comparison, "compare").contains("\n\n**Vision is modelled"),
+            "{comparison:?}"
+        );
+        let json = serde_json::to_value(&comparison).unwrap();
         assert!(json["warnings"][0].as_str().is_some_and(|it| it.contains("--vision rendered")));
-        let told = Comparison::new(&rings, &rings).unwrap();
-        assert!(!text(&told, "compare").contains("**"), "{told:?}");
+        let comparison = Comparison::new(&rings, &rings).unwrap();
+        assert!(!text(&comparison, "compare").contains("**"), "{comparison:?}");
     }
 
     #[test]

@@ -120,8 +120,8 @@ impl Controller {
         self.life == Life::Runs
     }
 
-    /// Lets it run, stand still or be dead. One that comes back to life resumes the landing, and must be told
-    /// the news again: then this is true.
+    /// Lets it run, stops it or ends it. A controller that is started again resumes the landing and needs the
+    /// news again: then this is true.
     ///
     /// # Errors
     /// When its settings are invalid.

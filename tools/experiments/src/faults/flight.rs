@@ -38,7 +38,7 @@ const HOVERS_S: f64 = 10.0;
 /// Time after the begin of the last fault before which a hover counts for nothing, in seconds: an autopilot
 /// waits for setpoints at first.
 const AFTER_FAULT_S: f64 = 15.0;
-/// A closed socket tells the end of a process after this time, in seconds.
+/// A closed socket shows the end of a process after this time, in seconds.
 const NOTICED_S: f64 = 0.05;
 /// A process that stands still is missed after this time, in seconds (`lease` of `local.json5`).
 const LEASE_S: f64 = 2.0;
@@ -100,7 +100,7 @@ struct FaultyFlight<'a> {
     /// What was found in the picture that the camera repeats.
     picture: Option<Vec<Detection>>,
     detector_alive: bool,
-    told_crowd: bool,
+    crowd_is_announced: bool,
     info_due_s: f64,
     strange_due_s: f64,
     has_liar: bool,
@@ -138,7 +138,7 @@ impl<'a> FaultyFlight<'a> {
             held: None,
             picture: None,
             detector_alive: true,
-            told_crowd: false,
+            crowd_is_announced: false,
             info_due_s: 0.0,
             strange_due_s: 0.0,
             has_liar: planned.faults.iter().any(|fault| fault.kind.is_preferred_liar()),
@@ -149,7 +149,7 @@ impl<'a> FaultyFlight<'a> {
             touched_z: None,
             outcome: Outcome::new(planned),
         };
-        flight.tell_all();
+        flight.announce_all();
         Ok(flight)
     }
 
@@ -232,7 +232,7 @@ impl<'a> FaultyFlight<'a> {
             Life::Runs
         };
         if self.controller.set_life(stamp_ns(now_s), life)? {
-            self.tell_all();
+            self.announce_all();
         }
         let is_missed = self.is_any(|begun, now_s| match begun.fault.kind {
             Kind::DetectorKilled => begun.is_on_later(now_s, NOTICED_S, STARTUP_S),
@@ -251,26 +251,26 @@ impl<'a> FaultyFlight<'a> {
             self.strange_due_s = now_s + 0.5 * INFO_S;
             self.controller.news(News::Camera(strange_camera(self.vision.info())));
         }
-        if self.is_on(Kind::Crowd) && !self.told_crowd {
-            self.told_crowd = true;
-            self.tell_crowd();
+        if self.is_on(Kind::Crowd) && !self.crowd_is_announced {
+            self.crowd_is_announced = true;
+            self.announce_crowd();
         }
         Ok(())
     }
 
-    /// What a controller that has just started learns of the others.
-    fn tell_all(&mut self) {
+    /// Reports the other processes to a controller that has just started.
+    fn announce_all(&mut self) {
         self.controller.news(News::Presence(DETECTOR.to_owned(), self.detector_alive));
         if self.has_liar {
             self.controller.news(News::Presence(LIAR.to_owned(), true));
         }
-        if self.told_crowd {
-            self.tell_crowd();
+        if self.crowd_is_announced {
+            self.announce_crowd();
         }
         self.controller.news(News::Camera(self.vision.info().clone()));
     }
 
-    fn tell_crowd(&mut self) {
+    fn announce_crowd(&mut self) {
         for name in &self.crowd {
             self.controller.news(News::Presence(name.clone(), true));
         }
@@ -455,7 +455,7 @@ impl<'a> FaultyFlight<'a> {
                     self.start_s = Some(now_s);
                     self.world.begin();
                 }
-                // A controller that was started anew and hears no heartbeat, or that the vehicle stands, can do no more.
+                // A controller that was started again cannot act without heartbeats, or when the vehicle is reported as landed.
                 let is_deceived = [
                     Kind::SilenceFrom,
                     Kind::SilenceBoth,

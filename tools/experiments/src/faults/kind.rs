@@ -6,8 +6,8 @@ use std::str::FromStr;
 /// The name of the preferred detector that lies.
 pub const LIAR: &str = "liar";
 
-/// A kind of fault. The order tells what it happens to: a process, the autopilot's link, detections and cameras, what the
-/// autopilot says, and last what only real processes show.
+/// A kind of fault. The order shows the affected part: a process, the autopilot's link, detections and cameras, values of the
+/// autopilot, and last faults that only real processes show.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
     /// The controller's process ends; after the duration another one resumes the landing.

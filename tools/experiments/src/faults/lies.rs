@@ -1,5 +1,5 @@
-//! Falsifies a simulated autopilot's packets: position, attitude, mode, contact with the ground, or time,
-//! changed or kept back while a fault of that kind lasts.
+//! Falsifies a simulated autopilot's packets: position, attitude, mode, contact with the ground, or time
+//! is changed or withheld while a fault of that kind is active.
 
 use autopilot::Packet;
 use autopilot::dialect::{LOCAL_POSITION_NED_DATA, MavLandedState, MavMessage, MavModeFlag};
@@ -7,32 +7,34 @@ use autopilot::packet::encode;
 
 use super::kind::Kind;
 
-/// The number of the mode that is claimed: LOITER, in which a pilot flies.
+/// The number of the mode that is falsely reported: LOITER, in which a pilot flies.
 const LOITER: u32 = 5;
 /// How old the one old boot time is, in milliseconds.
 const OLD_MS: u32 = 60_000;
 
-/// The memory of a lying autopilot.
+/// The state of an autopilot with false values.
 #[derive(Clone, Debug, Default)]
 pub struct Lies {
     frozen: Option<LOCAL_POSITION_NED_DATA>,
-    told_old_time: bool,
+    old_time_is_sent: bool,
 }
 
 impl Lies {
-    /// The bytes in place of a packet; `None` when it is kept back. `tells` says which lies are told now.
-    pub fn apply(&mut self, packet: &Packet, tells: impl Fn(Kind) -> bool) -> Option<Vec<u8>> {
-        if !tells(Kind::PositionFrozen) {
+    /// The bytes in place of a packet; `None` when it is withheld. `is_active` gives the faults of this time.
+    pub fn apply(&mut self, packet: &Packet, is_active: impl Fn(Kind) -> bool) -> Option<Vec<u8>> {
+        if !is_active(Kind::PositionFrozen) {
             self.frozen = None;
         }
-        if !tells(Kind::OldBootTime) {
-            self.told_old_time = false;
+        if !is_active(Kind::OldBootTime) {
+            self.old_time_is_sent = false;
         }
         let message = match &packet.message {
-            Some(MavMessage::HEARTBEAT(_)) if tells(Kind::HeartbeatMissing) => return None,
-            Some(MavMessage::LOCAL_POSITION_NED(_)) if tells(Kind::PositionMissing) => return None,
-            Some(MavMessage::ATTITUDE(_)) if tells(Kind::AttitudeMissing) => return None,
-            Some(message) => self.change(message.clone(), tells),
+            Some(MavMessage::HEARTBEAT(_)) if is_active(Kind::HeartbeatMissing) => return None,
+            Some(MavMessage::LOCAL_POSITION_NED(_)) if is_active(Kind::PositionMissing) => {
+                return None;
+            }
+            Some(MavMessage::ATTITUDE(_)) if is_active(Kind::AttitudeMissing) => return None,
+            Some(message) => self.change(message.clone(), is_active),
             None => return Some(packet.raw.clone()),
         };
         Some(match message {
@@ -42,14 +44,18 @@ impl Lies {
     }
 
     /// The changed message; `None` when it stays as it is.
-    fn change(&mut self, message: MavMessage, tells: impl Fn(Kind) -> bool) -> Option<MavMessage> {
+    fn change(
+        &mut self,
+        message: MavMessage,
+        is_active: impl Fn(Kind) -> bool,
+    ) -> Option<MavMessage> {
         match message {
             MavMessage::EXTENDED_SYS_STATE(mut state) => {
-                state.landed_state = if tells(Kind::LandedUndefined) {
+                state.landed_state = if is_active(Kind::LandedUndefined) {
                     MavLandedState::MAV_LANDED_STATE_UNDEFINED
-                } else if tells(Kind::LandedTakingOff) {
+                } else if is_active(Kind::LandedTakingOff) {
                     MavLandedState::MAV_LANDED_STATE_TAKEOFF
-                } else if tells(Kind::LandedOnGround) {
+                } else if is_active(Kind::LandedOnGround) {
                     MavLandedState::MAV_LANDED_STATE_ON_GROUND
                 } else {
                     return None;
@@ -57,9 +63,9 @@ impl Lies {
                 Some(MavMessage::EXTENDED_SYS_STATE(state))
             }
             MavMessage::HEARTBEAT(mut heartbeat) => {
-                if tells(Kind::ModeLie) {
+                if is_active(Kind::ModeLie) {
                     heartbeat.custom_mode = LOITER;
-                } else if tells(Kind::DisarmedLie) {
+                } else if is_active(Kind::DisarmedLie) {
                     heartbeat.base_mode.remove(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
                 } else {
                     return None;
@@ -67,7 +73,7 @@ impl Lies {
                 Some(MavMessage::HEARTBEAT(heartbeat))
             }
             MavMessage::LOCAL_POSITION_NED(position) => {
-                self.change_position(position, tells).map(MavMessage::LOCAL_POSITION_NED)
+                self.change_position(position, is_active).map(MavMessage::LOCAL_POSITION_NED)
             }
             _ => None,
         }
@@ -76,16 +82,16 @@ impl Lies {
     fn change_position(
         &mut self,
         mut position: LOCAL_POSITION_NED_DATA,
-        tells: impl Fn(Kind) -> bool,
+        is_active: impl Fn(Kind) -> bool,
     ) -> Option<LOCAL_POSITION_NED_DATA> {
-        if tells(Kind::PositionNan) {
+        if is_active(Kind::PositionNan) {
             (position.x, position.y, position.z) = (f32::NAN, f32::NAN, f32::NAN);
-        } else if tells(Kind::PositionFrozen) {
+        } else if is_active(Kind::PositionFrozen) {
             let time_boot_ms = position.time_boot_ms;
             let frozen = self.frozen.get_or_insert(position);
             position = LOCAL_POSITION_NED_DATA { time_boot_ms, ..frozen.clone() };
-        } else if tells(Kind::OldBootTime) && !self.told_old_time {
-            self.told_old_time = true;
+        } else if is_active(Kind::OldBootTime) && !self.old_time_is_sent {
+            self.old_time_is_sent = true;
             position.time_boot_ms = position.time_boot_ms.saturating_sub(OLD_MS);
         } else {
             return None;
@@ -102,7 +108,7 @@ mod tests {
 
     const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
 
-    fn told(lies: &mut Lies, kind: Kind, message: &MavMessage) -> Option<MavMessage> {
+    fn falsified(lies: &mut Lies, kind: Kind, message: &MavMessage) -> Option<MavMessage> {
         let packet = Parser::new().push(&encode(AUTOPILOT, 7, message)).remove(0);
         let raw = lies.apply(&packet, |asked| asked == kind)?;
         let packet = Parser::new().push(&raw).remove(0);
@@ -111,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn each_lie_changes_its_message_only() {
+    fn each_fault_changes_its_message_only() {
         let mut lies = Lies::default();
         let position = |time_boot_ms, x| {
             MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
@@ -122,23 +128,23 @@ mod tests {
         };
         let state = MavMessage::EXTENDED_SYS_STATE(EXTENDED_SYS_STATE_DATA::default());
         let heartbeat = MavMessage::HEARTBEAT(HEARTBEAT_DATA::default());
-        assert_eq!(told(&mut lies, Kind::HeartbeatMissing, &heartbeat), None);
-        assert_eq!(told(&mut lies, Kind::HeartbeatMissing, &state), Some(state.clone()));
-        assert_ne!(told(&mut lies, Kind::LandedOnGround, &state), Some(state));
+        assert_eq!(falsified(&mut lies, Kind::HeartbeatMissing, &heartbeat), None);
+        assert_eq!(falsified(&mut lies, Kind::HeartbeatMissing, &state), Some(state.clone()));
+        assert_ne!(falsified(&mut lies, Kind::LandedOnGround, &state), Some(state));
         assert_eq!(
-            told(&mut lies, Kind::PositionFrozen, &position(90_000, 1.0)),
+            falsified(&mut lies, Kind::PositionFrozen, &position(90_000, 1.0)),
             Some(position(90_000, 1.0))
         );
         assert_eq!(
-            told(&mut lies, Kind::PositionFrozen, &position(90_020, 2.0)),
+            falsified(&mut lies, Kind::PositionFrozen, &position(90_020, 2.0)),
             Some(position(90_020, 1.0))
         );
         assert_eq!(
-            told(&mut lies, Kind::OldBootTime, &position(90_040, 3.0)),
+            falsified(&mut lies, Kind::OldBootTime, &position(90_040, 3.0)),
             Some(position(30_040, 3.0))
         );
         assert_eq!(
-            told(&mut lies, Kind::OldBootTime, &position(90_060, 3.0)),
+            falsified(&mut lies, Kind::OldBootTime, &position(90_060, 3.0)),
             Some(position(90_060, 3.0))
         );
     }

@@ -72,11 +72,12 @@ pub fn run(request: &Request, folder: &mut Folder, watch: Watch<'_>) -> anyhow::
     Ok(Findings { report, outcomes, planned })
 }
 
-/// What must be said before any number, in bold.
+/// A warning in bold that stands before all numbers, or nothing.
 fn note(flights: &[plan::Planned]) -> String {
     let modelled = Vision::Modelled.name();
-    let is_told = flights.iter().any(|planned| only_size_counts(modelled, &planned.settings()));
-    if is_told { format!("**{ONLY_SIZE_COUNTS}**\n\n") } else { String::new() }
+    let needs_warning =
+        flights.iter().any(|planned| only_size_counts(modelled, &planned.settings()));
+    if needs_warning { format!("**{ONLY_SIZE_COUNTS}**\n\n") } else { String::new() }
 }
 
 #[cfg(test)]
@@ -84,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn that_a_marker_counts_for_nothing_is_told() {
+    fn a_marker_that_does_not_count_gives_a_warning() {
         let of = |marker: &str| {
             let marker = marker.parse().ok();
             note(&plan::Plan { marker, flights: 1, ..plan::Plan::default() }.flights())

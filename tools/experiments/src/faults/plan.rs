@@ -283,7 +283,7 @@ impl Planned {
         Ok(vec![format!("markers=[\"{}\"]", simulated.pad.marker)])
     }
 
-    /// Its guidance, the marker where one was asked for, and the further settings, in a word for each.
+    /// Its guidance, the marker where one was requested, and the further settings, in a word for each.
     pub fn settings(&self) -> String {
         settings_text(self.marker.as_ref(), &self.set)
     }
@@ -370,18 +370,18 @@ mod tests {
 
     #[test]
     fn a_pad_whose_marker_the_controller_does_not_look_for_is_refused() {
-        let told = |set: &[&str]| {
+        let checked = |set: &[&str]| {
             let set = set.iter().map(|&it| it.to_owned()).collect();
             Plan { set, ..Plan::default() }.check_marker()
         };
-        assert_eq!(told(&[]), Ok(()));
+        assert_eq!(checked(&[]), Ok(()));
         let pad = "simulator.pad.marker=apriltag-36h11:7:0.15";
-        let alone = told(&[pad]).unwrap_err();
+        let alone = checked(&[pad]).unwrap_err();
         assert!(alone.contains("looks for rings") && alone.contains("--marker"), "{alone}");
-        let other = told(&["controller.marker=apriltag-36h11"]).unwrap_err();
+        let other = checked(&["controller.marker=apriltag-36h11"]).unwrap_err();
         assert!(other.contains("looks for apriltag-36h11"), "{other}");
-        assert_eq!(told(&[pad, "controller.marker=apriltag-36h11:7"]), Ok(()));
-        assert!(told(&["simulator.pad.markers=a4"]).unwrap_err().contains("one marker"));
+        assert_eq!(checked(&[pad, "controller.marker=apriltag-36h11:7"]), Ok(()));
+        assert!(checked(&["simulator.pad.markers=a4"]).unwrap_err().contains("one marker"));
     }
 
     #[test]
@@ -424,14 +424,14 @@ mod tests {
             set: set.iter().map(|&setting| setting.to_owned()).collect(),
             ..Plan::default()
         };
-        let told = |plan: Plan| plan.check().unwrap_err().to_string();
+        let error_of = |plan: Plan| plan.check().unwrap_err().to_string();
         assert!(plan(&[0.3, 10.0], &[]).check().is_ok());
         assert!(plan(&[30.0], &["simulator.start.height_m=30"]).check().is_ok());
-        let high = told(plan(&[3.0, 30.0], &[]));
+        let high = error_of(plan(&[3.0, 30.0], &[]));
         assert!(high.contains("--height 3,30") && high.contains("at 30 m"), "{high}");
-        let unknown = told(plan(&[3.0], &["simulator.nonsense=3"]));
+        let unknown = error_of(plan(&[3.0], &["simulator.nonsense=3"]));
         assert!(unknown.contains("no key `simulator.nonsense`"), "{unknown}");
-        let refused = told(plan(&[3.0], &["controller.start=never"]));
+        let refused = error_of(plan(&[3.0], &["controller.start=never"]));
         assert!(refused.contains("controller.start"), "{refused}");
     }
 }

@@ -374,8 +374,8 @@ impl Planned {
     }
 }
 
-/// Refuses a flight with these settings if its controller looks for another marker than the pad has. What a service refuses anyway is not
-/// told again.
+/// Refuses a flight with these settings if its controller looks for another marker than the pad has. Settings that a service refuses
+/// anyway are not reported again.
 pub(crate) fn refuse_other_marker(
     simulator: &[String],
     controller: &[String],
@@ -433,8 +433,8 @@ fn without_repeats<T: PartialEq>(values: &[T]) -> impl Iterator<Item = &T> {
         .map(|(_, value)| value)
 }
 
-/// The guidance, the marker where one was asked for, and the further settings, one word for each: by them the flights of two campaigns
-/// are told apart.
+/// The guidance, the marker where one was requested, and the further settings, one word for each: they distinguish the flights of
+/// two campaigns.
 pub fn settings_text(marker: Option<&Marker>, set: &[String]) -> String {
     const GUIDANCE: &str = "controller.guidance";
     let key_of = |setting: &String| setting.split('=').next().unwrap_or_default().trim().to_owned();
@@ -520,31 +520,31 @@ mod tests {
     }
 
     #[test]
-    fn flights_are_told_apart_by_guidance_marker_and_settings() {
-        let told = |plan: Plan| plan.flights()[0].settings.clone();
-        assert_eq!(told(Plan::default()), "controller.guidance=metric");
+    fn guidance_marker_and_settings_distinguish_flights() {
+        let settings_of = |plan: Plan| plan.flights()[0].settings.clone();
+        assert_eq!(settings_of(Plan::default()), "controller.guidance=metric");
         let set = ["controller.guidance=\"thesis\"", "simulator.camera.rate_hz=20"];
         let set = set.map(str::to_owned).to_vec();
         let marker = "apriltag-36h11:7:0.15".parse().ok();
         assert_eq!(
-            told(Plan { set, marker, ..Plan::default() }),
+            settings_of(Plan { set, marker, ..Plan::default() }),
             "controller.guidance=thesis marker=apriltag-36h11:7:0.15 simulator.camera.rate_hz=20"
         );
     }
 
     #[test]
-    fn modelled_vision_is_told_from_that_of_another_marker_than_rings() {
-        let is_told = |vision: Vision, marker: &str, set: &[&str]| {
+    fn modelled_vision_of_a_marker_other_than_rings_needs_a_warning() {
+        let needs_warning = |vision: Vision, marker: &str, set: &[&str]| {
             let set = set.iter().map(|&it| it.to_owned()).collect();
             let plan = Plan { vision, marker: marker.parse().ok(), set, ..Plan::default() };
             only_size_counts(plan.vision.name(), &plan.flights()[0].settings)
         };
-        assert!(is_told(Vision::Modelled, "aruco-4x4-50:3:0.15", &[]));
+        assert!(needs_warning(Vision::Modelled, "aruco-4x4-50:3:0.15", &[]));
         let of_pad = ["simulator.pad.marker=\"stag-hd23:7:0.15\"", "controller.marker=stag-hd23"];
-        assert!(is_told(Vision::Modelled, "", &of_pad));
-        assert!(!is_told(Vision::Rendered, "aruco-4x4-50:3:0.15", &[]));
-        assert!(!is_told(Vision::Modelled, "rings:0.3", &["simulator.camera.rate_hz=20"]));
-        assert!(!is_told(Vision::Modelled, "", &[]));
+        assert!(needs_warning(Vision::Modelled, "", &of_pad));
+        assert!(!needs_warning(Vision::Rendered, "aruco-4x4-50:3:0.15", &[]));
+        assert!(!needs_warning(Vision::Modelled, "rings:0.3", &["simulator.camera.rate_hz=20"]));
+        assert!(!needs_warning(Vision::Modelled, "", &[]));
     }
 
     #[test]
@@ -562,21 +562,21 @@ mod tests {
 
     #[test]
     fn a_pad_whose_marker_the_controller_does_not_look_for_is_refused() {
-        let told = |set: &[&str]| {
+        let checked = |set: &[&str]| {
             let set = set.iter().map(|&it| it.to_owned()).collect();
             Plan { set, ..Plan::default() }.check_marker()
         };
-        let alone = told(&["simulator.pad.marker=apriltag-36h11:7:0.15"]).unwrap_err();
+        let alone = checked(&["simulator.pad.marker=apriltag-36h11:7:0.15"]).unwrap_err();
         assert!(alone.contains("looks for rings") && alone.contains("--marker"), "{alone}");
         let both =
             ["simulator.pad.marker=apriltag-36h11:7:0.15", "controller.marker=apriltag-36h11"];
-        assert_eq!(told(&both), Ok(()));
-        assert_eq!(told(&["simulator.pad.marker=rings:0.3"]), Ok(()));
-        assert!(told(&["simulator.pad.markers=a4"]).unwrap_err().contains("one marker"));
+        assert_eq!(checked(&both), Ok(()));
+        assert_eq!(checked(&["simulator.pad.marker=rings:0.3"]), Ok(()));
+        assert!(checked(&["simulator.pad.markers=a4"]).unwrap_err().contains("one marker"));
     }
 
     #[test]
-    fn what_is_given_twice_is_flown_once() {
+    fn a_value_that_is_given_twice_is_flown_once() {
         let winds = |wind: &str| {
             let faults = vec![Fault::NONE, Fault::NONE];
             let plan = Plan { wind: wind.parse().unwrap(), faults, flights: 2, ..Plan::default() };
@@ -591,8 +591,8 @@ mod tests {
         let windy = |wind: &str| Plan { wind: wind.parse().unwrap(), ..Plan::default() }.check();
         assert!(windy("0,20").is_ok());
         for wind in ["0,25", "0..200"] {
-            let told = windy(wind).unwrap_err().to_string();
-            assert!(told.contains("wind.mean_m_s") && told.contains("20"), "{told}");
+            let error = windy(wind).unwrap_err().to_string();
+            assert!(error.contains("wind.mean_m_s") && error.contains("20"), "{error}");
         }
     }
 }

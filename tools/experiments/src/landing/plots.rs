@@ -94,7 +94,7 @@ fn panels(outcomes: &[Outcome]) -> [usize; 2] {
 
 /// Height of the heading over panels, in pixels.
 const HEADING_PX: u32 = 96;
-/// Number of landings from which their 99th percentile is told.
+/// Number of landings from which their 99th percentile is given.
 const ENOUGH_FOR_99: usize = 100;
 
 fn against_wind_size(outcomes: &[Outcome]) -> [u32; 2] {
@@ -379,7 +379,7 @@ fn success(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     Ok(())
 }
 
-/// The complementary cumulative distribution of the error, for each cell where they can be told apart.
+/// The complementary cumulative distribution of the error, for each cell where they can be distinguished.
 fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     let mut cells = cells(outcomes);
     if cells.len() > COLOURS.len() {
@@ -474,8 +474,8 @@ mod tests {
             .collect();
         let plots = all(&outcomes).unwrap();
         for (name, svg) in plots.iter().take(2) {
-            for told in ["no fault, 80 of 80 landed", "gust, 80 of", "silence-2s, ", "lie, "] {
-                assert!(svg.contains(told), "{told} is not in {name}");
+            for text in ["no fault, 80 of 80 landed", "gust, 80 of", "silence-2s, ", "lie, "] {
+                assert!(svg.contains(text), "{text} is not in {name}");
             }
             assert_eq!(svg.matches("mean wind, m/s").count(), 4, "{name}");
             assert!(svg.contains("95 % interval of the median") && !svg.contains("cm\n"), "{name}");
@@ -496,8 +496,8 @@ mod tests {
         };
         let outcomes: Vec<Outcome> = plan.flights().iter().map(flown).collect();
         let plots = all(&outcomes).unwrap();
-        for told in ["8/8", "1/8", "of fewer than 100 landings the worst"] {
-            assert!(plots[0].1.contains(told), "{told} is not in the plot");
+        for text in ["8/8", "1/8", "of fewer than 100 landings the worst"] {
+            assert!(plots[0].1.contains(text), "{text} is not in the plot");
         }
         let members: Vec<&Outcome> = outcomes.iter().collect();
         let bins = bins(&members, |o| o.error_m);

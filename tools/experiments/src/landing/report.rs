@@ -103,10 +103,10 @@ fn share(outcomes: &[Outcome]) -> String {
     }
 }
 
-/// What must be said before any number, in bold.
+/// A warning in bold that stands before all numbers, or nothing.
 fn note(outcomes: &[Outcome]) -> String {
-    let is_told = outcomes.iter().any(|it| only_size_counts(it.vision, &it.settings));
-    if is_told { format!("**{ONLY_SIZE_COUNTS}**\n\n") } else { String::new() }
+    let needs_warning = outcomes.iter().any(|it| only_size_counts(it.vision, &it.settings));
+    if needs_warning { format!("**{ONLY_SIZE_COUNTS}**\n\n") } else { String::new() }
 }
 
 fn failures(flights: &[Planned], outcomes: &[Outcome]) -> String {
@@ -225,7 +225,7 @@ mod tests {
     use crate::landing::plan::Plan;
 
     /// The report's head for flights of a plan that all landed.
-    fn told(plan: Plan) -> String {
+    fn head_of(plan: Plan) -> String {
         let request = Request { plan, ..Request::default() };
         let landed = |planned: &Planned| Outcome {
             ending: Ending::Landed,
@@ -243,13 +243,13 @@ mod tests {
             flights: 8,
             ..Plan::default()
         };
-        let told_of = told(plan(&[0.0]));
+        let text = head_of(plan(&[0.0]));
         let alone = "8 landed within 0.1 m (100.00 %, 95 % interval of Wilson 67.56 to 100.00 %)";
-        assert!(told_of.contains(alone), "{told_of}");
+        assert!(text.contains(alone), "{text}");
         // Not that of sixteen flights, 80.64 %.
-        let told_of = told(plan(&[0.0, 5.0]));
+        let text = head_of(plan(&[0.0, 5.0]));
         let both = "16 landed within 0.1 m (100.00 %; of the 8 seeds 8 (100.00 %, 95 % interval of Wilson 67.56 to 100.00 %) have every flight there)";
-        assert!(told_of.contains(both), "{told_of}");
+        assert!(text.contains(both), "{text}");
     }
 
     #[test]
@@ -262,21 +262,21 @@ mod tests {
             ..Outcome::new(planned)
         };
         let outcomes: Vec<Outcome> = plan.flights().iter().enumerate().map(landed).collect();
-        let told = share(&outcomes);
-        assert!(told.starts_with("93.75 %; of the 8 seeds 7 (87.50 %, "), "{told}");
+        let text = share(&outcomes);
+        assert!(text.starts_with("93.75 %; of the 8 seeds 7 (87.50 %, "), "{text}");
         // Interrupted after four seeds in the second wind, or before it.
-        let told = share(&outcomes[..12]);
-        assert!(told.starts_with("91.67 %; of the 4 seeds 3 (75.00 %, "), "{told}");
-        let told = share(&outcomes[..8]);
-        assert!(told.starts_with("87.50 %, 95 % interval of Wilson"), "{told}");
+        let text = share(&outcomes[..12]);
+        assert!(text.starts_with("91.67 %; of the 4 seeds 3 (75.00 %, "), "{text}");
+        let text = share(&outcomes[..8]);
+        assert!(text.starts_with("87.50 %, 95 % interval of Wilson"), "{text}");
     }
 
     #[test]
-    fn that_a_marker_counts_for_nothing_is_told_before_any_number() {
+    fn a_warning_that_a_marker_does_not_count_stands_before_any_number() {
         let marker = "aruco-4x4-50:3:0.15".parse().ok();
-        let told_of = told(Plan { marker, ..Plan::default() });
-        let [note, number] = ["**Vision is modelled", "80 flights"].map(|it| told_of.find(it));
-        assert!(note.is_some() && note < number, "{told_of}");
-        assert!(!told(Plan::default()).contains("**"));
+        let text = head_of(Plan { marker, ..Plan::default() });
+        let [note, number] = ["**Vision is modelled", "80 flights"].map(|it| text.find(it));
+        assert!(note.is_some() && note < number, "{text}");
+        assert!(!head_of(Plan::default()).contains("**"));
     }
 }

@@ -88,7 +88,7 @@ impl SimVision {
         self.camera.settings().exposure_s
     }
 
-    /// Tells the camera what a detector found, for its exposure.
+    /// Passes a detector's detections to the camera, for its exposure.
     pub fn detected(&mut self, message: &Detections) {
         self.camera.detected(message);
     }

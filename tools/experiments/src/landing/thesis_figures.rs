@@ -122,7 +122,7 @@ fn view<'a, 'b>(
     builder
 }
 
-/// Pixels between the axes of a view, which only a drawn one tells.
+/// Pixels between the axes of a view, which is known only of a drawn one.
 fn plot_size() -> anyhow::Result<[f64; 2]> {
     let mut size = [1.0; 2];
     picture(VIEW, |area| {
