@@ -32,7 +32,7 @@ pub fn block_on<F: Future>(runtime: &Handle, future: F) -> F::Output {
     }
 }
 
-/// Tells a thread that its future can go on.
+/// Wakes a thread when its future can continue.
 struct Flag {
     thread: Thread,
     is_woken: AtomicBool,

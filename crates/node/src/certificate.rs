@@ -55,7 +55,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_certificate_tells_from_when_until_when_it_is_valid() {
+    fn the_validity_period_of_a_certificate_is_read() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x.pem");
         let key = rcgen::KeyPair::generate().unwrap();

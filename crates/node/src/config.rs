@@ -472,7 +472,7 @@ pub fn without_credentials(address: &str) -> String {
     format!("{scheme}{shown}")
 }
 
-/// A setting, its value or what is wrong with it as it is told: any line may have addresses with passwords in it.
+/// A setting, its value or an error text as it is reported, without the passwords that an address in any line may contain.
 fn shown(text: &str) -> String {
     let line = |line: &str| {
         let mut parts = line.split("://");
@@ -604,7 +604,7 @@ mod tests {
     }
 
     #[test]
-    fn a_password_in_an_address_is_not_told_with_what_is_refused() {
+    fn a_refused_value_is_reported_without_the_passwords_in_its_addresses() {
         let address = "rtsp://me:s3cret@host:554/main";
         let set = |key: &str| load(None, &[&format!("{key}={address}")]).unwrap_err();
         let file = load(Some(&format!("name = \"{address}\"")), &[]).unwrap_err();
@@ -623,15 +623,15 @@ mod tests {
         }
         let two = format!("rate_hz=[\"{address}\", \"rtsp://you:0ther@host\"]");
         for problem in [load(Some(&two), &[]).unwrap_err(), load(None, &[&two]).unwrap_err()] {
-            let is_told = ["s3cret", "0ther"].iter().any(|password| problem.contains(password));
-            assert!(!is_told && problem.contains("\"rtsp://host\""), "{problem}");
+            let is_shown = ["s3cret", "0ther"].iter().any(|password| problem.contains(password));
+            assert!(!is_shown && problem.contains("\"rtsp://host\""), "{problem}");
         }
         let form = load(None, &[address]).unwrap_err();
         assert!(form.contains("`rtsp://host:554/main`") && !form.contains("s3cret"), "{form}");
     }
 
     #[test]
-    fn a_file_that_is_not_utf_8_is_told_with_its_line() {
+    fn a_file_that_is_not_utf_8_is_reported_with_its_line() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("settings.toml");
         for (bytes, parts) in [
@@ -696,7 +696,7 @@ mod tests {
     }
 
     #[test]
-    fn a_word_that_is_no_variant_is_told_with_its_own_source_and_the_allowed_words() {
+    fn an_unknown_variant_is_reported_with_its_source_and_the_allowed_words() {
         let words = ["`lens.kind` = \"wide\" is invalid", "`pinhole`", "`fisheye`"];
         for (file, set, source) in [
             (None, &["lens.kind=wide", "rate_hz=30"][..], "--set lens.kind=wide: "),

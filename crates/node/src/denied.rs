@@ -130,8 +130,8 @@ fn denied_message(message: &str) -> Option<String> {
     Some(format!("denied: {} on {key}", action.to_lowercase()))
 }
 
-/// Whether a connection has a valid certificate, but of a holder that is not in the relay's list: the relay then tells
-/// it of nobody, and of what it says nothing arrives that could be counted.
+/// Whether a connection has a valid certificate, but of a holder that is not in the relay's list: the relay then
+/// announces no other process to it, and none of its messages arrive that could be counted.
 fn is_without_rights(message: &str) -> bool {
     message.contains(" did not match any configured ACL subject")
 }

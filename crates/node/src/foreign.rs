@@ -17,7 +17,7 @@ use crate::endpoint::{self, Endpoint};
 
 /// Maximum time for which the start of a tool waits for answers: a process on this machine gives one within milliseconds.
 const AT_START: Duration = Duration::from_millis(300);
-/// Time after which an address at which somebody accepts connections, and says nothing, is told: less than a tool listens.
+/// Time after which an address is reported at which a program accepts connections and sends nothing: shorter than a tool waits.
 const PATIENCE: Duration = Duration::from_secs(2);
 /// Pause before an address is tried again at which a connection was closed without an answer, as a process does that ends.
 const PAUSE: Duration = Duration::from_millis(200);
@@ -116,7 +116,7 @@ fn log(problems: &[String]) {
     }
 }
 
-/// Asks in a task of its own. The receiver hears the problem; when nobody waits any more it is logged.
+/// Asks in a task of its own. The receiver gets the error; without a receiver it is logged.
 fn ask(contact: Contact) -> oneshot::Receiver<Option<String>> {
     let (sender, receiver) = oneshot::channel();
     tokio::spawn(async move {
@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn an_answer_tells_zenoh_from_other_programs() {
+    async fn an_answer_distinguishes_zenoh_from_other_programs() {
         let foreign = |said: &str| Answer::Foreign(said.to_owned());
         let answers: [(&'static [u8], Answer); 8] = [
             (b"\x09\x00\x21\x09\x31abcd\x00\x00", Answer::Fine),
@@ -381,23 +381,23 @@ mod tests {
 
     #[test]
     fn a_problem_names_the_port_and_what_to_do() {
-        let told = |endpoint: &str, answer| Contact::of(endpoint).unwrap().problem(&answer);
-        let here = told("tcp/127.0.0.1:7447", Answer::Foreign("`HTTP`".to_owned())).unwrap();
+        let problem_of = |endpoint: &str, answer| Contact::of(endpoint).unwrap().problem(&answer);
+        let here = problem_of("tcp/127.0.0.1:7447", Answer::Foreign("`HTTP`".to_owned())).unwrap();
         for part in ["port 7447 of this machine", "answers `HTTP`", "ss -ltnp", "--meet PORT"] {
             assert!(here.contains(part), "`{part}` is not in: {here}");
         }
         // A tunnel has its end here as well.
         for endpoint in ["tcp/10.0.0.1:7448", "tcp/127.0.0.1:7448?prio=5-6"] {
-            let there = told(endpoint, Answer::Silence).unwrap();
+            let there = problem_of(endpoint, Answer::Silence).unwrap();
             for part in ["0.0.1:7448, where", "2 s", "on that machine", "--connect"] {
                 assert!(there.contains(part), "`{part}` is not in: {there}");
             }
-            let keys = told(endpoint, Answer::Encrypted).unwrap();
+            let keys = problem_of(endpoint, Answer::Encrypted).unwrap();
             assert!(keys.contains("wants keys") && keys.contains("`--keys DIRECTORY`"), "{keys}");
             assert!(!keys.contains("end it"), "a relay is to be ended: {keys}");
         }
-        let speaks_tls = told("tcp/127.0.0.1:7447", Answer::Encrypted).unwrap();
+        let speaks_tls = problem_of("tcp/127.0.0.1:7447", Answer::Encrypted).unwrap();
         assert!(speaks_tls.contains("TLS") && !speaks_tls.contains("end it"), "{speaks_tls}");
-        assert_eq!(told("tcp/127.0.0.1:7447", Answer::Fine), None);
+        assert_eq!(problem_of("tcp/127.0.0.1:7447", Answer::Fine), None);
     }
 }

@@ -30,7 +30,7 @@ pub struct Unreadable {
     pub count: u64,
     /// Why the newest of them could not be read, and of how many bytes it was.
     pub why: String,
-    /// How many the log has told of, and when it did the last time, in nanoseconds.
+    /// How many were logged, and the time of the last log entry, in nanoseconds.
     logged: u64,
     logged_ns: i64,
 }
@@ -98,7 +98,7 @@ impl HealthCounters {
         }
     }
 
-    /// Counts a payload that could not be read, by its key. Returns how many the log has not told of, when it is to tell again.
+    /// Counts a payload that could not be read, by its key. Returns how many are not logged yet, if they are to be logged now.
     pub fn unreadable_payload(&self, now_ns: i64, key: &str, why: String) -> Option<u64> {
         let mut counters = self.lock();
         let all = &mut counters.unreadable;
@@ -230,17 +230,18 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_read_is_counted_by_key_and_logged_now_and_then() {
+    fn unreadable_payloads_are_counted_by_key_and_logged_now_and_then() {
         let counters = HealthCounters::default();
         let mut logged = Vec::new();
         for tenth in 0..250 {
             let now_ns = tenth * 100_000_000;
-            let told = counters.unreadable_payload(now_ns, "detector/a/detections", "why".into());
-            logged.extend(told.map(|count| (tenth, count)));
+            let unlogged =
+                counters.unreadable_payload(now_ns, "detector/a/detections", "why".into());
+            logged.extend(unlogged.map(|count| (tenth, count)));
         }
         assert_eq!(logged, [(0, 1), (100, 100), (200, 100)]);
-        let told = counters.unreadable_payload(1, "detector/b/detections", "cut".into());
-        assert_eq!(told, Some(1), "another key is told at once");
+        let unlogged = counters.unreadable_payload(1, "detector/b/detections", "cut".into());
+        assert_eq!(unlogged, Some(1), "another key is logged at once");
         for i in 0..1000 {
             counters.unreadable_payload(1, &format!("{i}"), String::new());
         }

@@ -99,21 +99,21 @@ mod tests {
             (["other.pem", "own.pem", "garbage"], "garbage\" is no private key"),
             (["other.pem", "own.pem", "other.key"], "other.key\" does not belong to"),
         ] {
-            let told = problem(names).unwrap_err();
-            assert!(told.contains(named), "{told}");
+            let problem = problem(names).unwrap_err();
+            assert!(problem.contains(named), "{problem}");
         }
     }
 
     #[test]
     fn a_file_that_this_user_may_not_read_is_not_called_a_wrong_one() {
         let path = Path::new("keys/operator.key");
-        let told = |kind: io::ErrorKind| {
+        let problem_of = |kind: io::ErrorKind| {
             format!("{:#}", unusable(path, "private key", pem::Error::Io(kind.into())))
         };
-        let denied = told(io::ErrorKind::PermissionDenied);
+        let denied = problem_of(io::ErrorKind::PermissionDenied);
         assert!(denied.starts_with("this user may not read \"keys/operator.key\""), "{denied}");
         assert!(denied.contains("`sudo -u alight alight ...`"), "{denied}");
-        let absent = told(io::ErrorKind::NotFound);
+        let absent = problem_of(io::ErrorKind::NotFound);
         assert!(absent.starts_with("\"keys/operator.key\" is no private key"), "{absent}");
     }
 }

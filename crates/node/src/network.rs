@@ -565,8 +565,8 @@ mod tests {
             "alight keys issue --role detector --authority DIR -o no/keys`",
         );
         for role in ["drone", "relay"] {
-            let told = issue_arguments(role);
-            assert_eq!(told, format!("--role {role} --address HOST"));
+            let arguments = issue_arguments(role);
+            assert_eq!(arguments, format!("--role {role} --address HOST"));
         }
     }
 
@@ -586,7 +586,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_listens_beyond_this_machine_without_keys_unless_told() {
+    fn no_process_listens_beyond_this_machine_without_keys_unless_configured() {
         let open = |network: &Network| configured(network).err();
         for name in ["drone", "relay"] {
             let network = Network { connect: Some("10.0.0.1".into()), ..built_in(name) };
@@ -659,13 +659,13 @@ mod tests {
 
     #[test]
     fn keys_that_this_user_may_not_read_are_not_called_missing() {
-        let told = |kind: io::ErrorKind| {
+        let problem_of = |kind: io::ErrorKind| {
             let result = check_is_there(Path::new("keys/x.pem"), Err(kind.into()), "operator");
             result.unwrap_err().to_string()
         };
-        let denied = told(io::ErrorKind::PermissionDenied);
+        let denied = problem_of(io::ErrorKind::PermissionDenied);
         assert!(denied.contains("may not read \"keys/x.pem\"") && denied.contains("sudo -u"));
-        let absent = told(io::ErrorKind::NotFound);
+        let absent = problem_of(io::ErrorKind::NotFound);
         assert!(absent.contains("missing key file") && absent.contains("-o keys`"), "{absent}");
     }
 

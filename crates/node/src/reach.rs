@@ -254,7 +254,7 @@ fn shake(
             stream.set_write_timeout(Some(left(end)?))?;
             connection.write_tls(stream)?;
         } else {
-            hear(connection, stream, end)?;
+            read_once(connection, stream, end)?;
         }
     }
     while connection.wants_write() {
@@ -264,14 +264,14 @@ fn shake(
     Ok(())
 }
 
-/// Waits whether the certificate is refused: then the other end says so, or closes the connection.
+/// Waits for a refusal of the certificate: then the other end sends an alert or closes the connection.
 fn is_taken(
     connection: &mut ClientConnection,
     stream: &mut TcpStream,
     end: Instant,
 ) -> io::Result<()> {
     loop {
-        match hear(connection, stream, end) {
+        match read_once(connection, stream, end) {
             Ok(()) => {}
             Err(cause) if is_timeout(&cause) => return Ok(()),
             Err(cause) => return Err(cause),
@@ -279,8 +279,12 @@ fn is_taken(
     }
 }
 
-/// Reads once, until then.
-fn hear(connection: &mut ClientConnection, stream: &mut TcpStream, end: Instant) -> io::Result<()> {
+/// Reads once, until `end`.
+fn read_once(
+    connection: &mut ClientConnection,
+    stream: &mut TcpStream,
+    end: Instant,
+) -> io::Result<()> {
     stream.set_read_timeout(Some(left(end)?))?;
     match connection.read_tls(stream) {
         Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
@@ -292,7 +296,7 @@ fn hear(connection: &mut ClientConnection, stream: &mut TcpStream, end: Instant)
         Ok(state) if state.peer_has_closed() => Err(io::ErrorKind::UnexpectedEof.into()),
         Ok(_) => Ok(()),
         Err(cause) => {
-            // The other end is told why, if it still listens.
+            // The alert reports the cause to the other end, if that still reads.
             drop(connection.write_tls(stream));
             Err(io::Error::other(cause))
         }
@@ -356,20 +360,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_clock_that_is_wrong_is_told_where_a_certificate_is_not_valid_at_this_time() {
+    fn a_certificate_that_is_not_valid_at_this_time_is_reported_with_the_clock_as_a_cause() {
         let place = Place { host: "10.0.0.1".to_owned(), port: 7448, is_encrypted: true };
-        let told = |problem: rustls::Error| {
+        let reason_of = |problem: rustls::Error| {
             Reach::default().reason(&place, &Finding::Refused(io::Error::other(problem)))
         };
         // A relay says so of a certificate that is not valid yet as well.
         let expired = AlertDescription::CertificateExpired;
-        let refused = told(rustls::Error::AlertReceived(expired));
+        let refused = reason_of(rustls::Error::AlertReceived(expired));
         for part in ["has expired", "alight keys issue", "clock of that machine", "timedatectl"] {
             assert!(refused.contains(part), "`{part}` is not in: {refused}");
         }
-        let other = told(rustls::Error::AlertReceived(AlertDescription::UnknownCA));
+        let other = reason_of(rustls::Error::AlertReceived(AlertDescription::UnknownCA));
         assert!(other.contains("another authority") && !other.contains("clock"), "{other}");
-        let early = told(rustls::Error::InvalidCertificate(CertificateError::NotValidYet));
+        let early = reason_of(rustls::Error::InvalidCertificate(CertificateError::NotValidYet));
         for part in ["not valid yet", "this machine's clock", "timedatectl"] {
             assert!(early.contains(part), "`{part}` is not in: {early}");
         }

@@ -132,9 +132,9 @@ where
         // The process can be stopped also while it cannot join the network.
         () = shutdown.requested() => return Ok(()),
     };
-    // In a task of its own: it goes on however busy the service is.
-    let told = node.clone();
-    let mut health = tokio::spawn(async move { told.publish_health().await });
+    // In a separate task: it continues however busy the service is.
+    let reporter = node.clone();
+    let mut health = tokio::spawn(async move { reporter.publish_health().await });
     let result = tokio::select! {
         result = service(node.clone(), shutdown.clone()) => result,
         result = &mut health => result.context("reporting the health").flatten(),
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn an_ignored_signal_is_told_from_the_status_of_the_process() {
+    fn an_ignored_signal_is_found_in_the_status_of_the_process() {
         let status =
             "SigBlk:\t0000000000000000\nSigIgn:\t0000000000001001\nSigCgt:\t0000000000004002\n";
         assert!(is_ignored(status, 1));

@@ -4,8 +4,8 @@
 //! Every mailbox is a ring: a slow reader loses the oldest messages, and never blocks a publisher.
 //!
 //! A command is not carried out once its requester has given up. Clocks of two hosts differ, so the requester asks the
-//! recipient for its time first, and tells with the command when that was by the recipient's own clock. A recipient that is
-//! frozen does not answer, and what waited on a link is refused.
+//! recipient for its time first, and sends this time with the command, by the recipient's clock. A recipient that is
+//! frozen does not answer, and a command that waited on a link is refused.
 
 use std::marker::PhantomData;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -285,17 +285,17 @@ impl Node {
     ) -> BoxFuture<'_, anyhow::Result<messages::CommandReply>> {
         Box::pin(async move {
             let until_ns = now_ns() + REPLY_TIMEOUT.as_nanos() as i64;
-            let mut told = None;
-            while told.is_none() && now_ns() < until_ns {
+            let mut reply = None;
+            while reply.is_none() && now_ns() < until_ns {
                 let left_ns = until_ns.saturating_sub(now_ns());
-                told = self.query(&key, &[], ASKS_TIME, nanoseconds(left_ns)).await?;
-                if told.is_none() {
+                reply = self.query(&key, &[], ASKS_TIME, nanoseconds(left_ns)).await?;
+                if reply.is_none() {
                     tokio::time::sleep(RETRY_PAUSE).await;
                 }
             }
-            let sent = match told {
+            let sent = match reply {
                 Some(Reply::Time(time_ns)) => time_ns.to_le_bytes().to_vec(),
-                // A recipient that tells no time.
+                // A recipient that gives no time.
                 Some(Reply::Command(_)) => Vec::new(),
                 None => return Err(self.unanswered(&key).await),
             };
@@ -393,7 +393,7 @@ impl<M: Message> Commands<M> {
             let query = next_query(&self.queryable).await?;
             let attachment = query.attachment();
             if attachment.is_some_and(|asks| asks.to_bytes().as_ref() == ASKS_TIME) {
-                tell_time(query).await;
+                reply_with_time(query).await;
                 continue;
             }
             let sent_ns = attachment.and_then(time);
@@ -434,7 +434,7 @@ impl<M: Message> Commands<M> {
 fn refusal(sent_ns: Option<i64>, now_ns: i64) -> Option<String> {
     let age_ns = now_ns.saturating_sub(sent_ns?);
     let max_ns = REPLY_TIMEOUT.as_nanos() as i64;
-    // A time to come was told by another process, before this host was started again.
+    // A time in the future is from another process, before this host was started again.
     (!(0..=max_ns).contains(&age_ns)).then(|| {
         format!(
             "the command is {:.1} s old and its sender has given up after {REPLY_TIMEOUT:?}: it waited, as a process or a link stood still; give it again if it is still wanted",
@@ -452,8 +452,8 @@ fn next_sample(mailbox: &SampleMailbox) -> BoxFuture<'_, Option<Sample>> {
     Box::pin(async move { mailbox.recv_async().await.ok() })
 }
 
-/// Answers a question for the time.
-fn tell_time(query: Query) -> BoxFuture<'static, ()> {
+/// Answers a request for the time.
+fn reply_with_time(query: Query) -> BoxFuture<'static, ()> {
     Box::pin(async move {
         let key = query.key_expr().clone();
         let reply = query.reply(key, Vec::<u8>::new()).attachment(now_ns().to_le_bytes().to_vec());

@@ -78,6 +78,6 @@ async fn real_denials_are_counted() -> anyhow::Result<()> {
         .await?;
 
     // The session opens without a connection, and retries it.
-    let _stranger = open("detector", "detector.main", foreign_keys.path(), ground).await?;
+    let _denied = open("detector", "detector.main", foreign_keys.path(), ground).await?;
     until_denied("connection", CONNECTION_TARGET, async || {}).await
 }

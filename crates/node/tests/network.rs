@@ -305,14 +305,14 @@ async fn a_command_that_waited_until_its_sender_gave_up_is_refused() -> anyhow::
         }
     });
     let start = encode(&ControllerCommand::Start);
-    let told = foreign.ask("drone/controller/command", &[], b"time?").await?;
-    let time_ns = i64::from_le_bytes(told.1.context("no time")?.as_slice().try_into()?);
+    let reply = foreign.ask("drone/controller/command", &[], b"time?").await?;
+    let time_ns = i64::from_le_bytes(reply.1.context("no time")?.as_slice().try_into()?);
     assert!((now_ns() - time_ns).abs() < 5_000_000_000, "the recipient's own clock");
     for (sent_ns, accepted) in [
         (time_ns, true),
         (now_ns() - 2_500_000_000, false),
         (now_ns() - 3_600_000_000_000, false),
-        // Told before the recipient's host was started again.
+        // From before the recipient's host was started again.
         (now_ns() + 3_600_000_000_000, false),
     ] {
         let reply =
@@ -359,17 +359,17 @@ async fn a_command_that_was_taken_and_not_answered_may_have_been_carried_out() -
     // One session for both, which needs not wait until it is connected.
     let node = open("controller", "main", free_port()?).await?;
     let commands = node.commands(topic::COMMAND, &[]).await?;
-    let told = async || {
+    let unanswered = async || {
         let reply = node.command(topic::COMMAND, &[], &ControllerCommand::Start).await;
         reply.err().context("it is answered").map(|problem| problem.to_string())
     };
     // It takes the command and ends.
-    let (problem, taken) = tokio::join!(told(), async { commands.next().await.map(drop) });
+    let (problem, taken) = tokio::join!(unanswered(), async { commands.next().await.map(drop) });
     let (problem, ()) = (problem?, taken.context("no command came")?);
     let part = "sent to the controller, and the connection to it ended before an answer came: it may have been carried out";
     assert!(problem.contains(part), "{problem}");
     // It takes the command and stands still.
-    let (problem, taken) = tokio::join!(told(), commands.next());
+    let (problem, taken) = tokio::join!(unanswered(), commands.next());
     let (problem, _taken) = (problem?, taken.context("no command came")?);
     let part = "no answer came within 2 s: it may have been carried out";
     assert!(problem.contains(part), "{problem}");

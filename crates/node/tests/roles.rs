@@ -151,8 +151,8 @@ async fn a_base_station_relays_between_drone_and_ground() -> anyhow::Result<()> 
     is_received(&detector, &camera).await
 }
 
-/// What an operator is told who commands with this network.
-async fn told(network: &Network) -> anyhow::Result<String> {
+/// The error text for an operator whose command goes through this network.
+async fn error_text(network: &Network) -> anyhow::Result<String> {
     let identity = Identity { service: "alight", instance: "command".into() };
     let operator = Node::open_tool(identity, &network.source("operator")?).await?;
     let unanswered = operator.command(topic::COMMAND, &[], &ControllerCommand::Hold).await;
@@ -160,15 +160,15 @@ async fn told(network: &Network) -> anyhow::Result<String> {
     Ok(unanswered.err().context("it is answered")?.to_string())
 }
 
-fn contains(told: &str, parts: &[&str]) -> anyhow::Result<()> {
+fn contains(text: &str, parts: &[&str]) -> anyhow::Result<()> {
     for part in parts {
-        ensure!(told.contains(part), "`{part}` is not in: {told}");
+        ensure!(text.contains(part), "`{part}` is not in: {text}");
     }
     Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_an_answer_the_operator_is_told_why() -> anyhow::Result<()> {
+async fn the_cause_of_a_missing_answer_is_reported_to_the_operator() -> anyhow::Result<()> {
     let site = Site::new()?;
     let ground = site.network("ground");
     let at = |network: &Network, host: &str| Network {
@@ -179,21 +179,22 @@ async fn without_an_answer_the_operator_is_told_why() -> anyhow::Result<()> {
     let name = format!("{}.invalid", "nowhere".repeat(10));
     let nowhere = at(&ground, &name);
     let here = Network { meet: Some(site.meet), ..Network::default() };
-    let (nobody, unknown, alone) = tokio::join!(told(&ground), told(&nowhere), told(&here));
-    contains(&nobody?, &["no controller", "nobody listens at 127.0.0.1", "--connect"])?;
+    let (no_relay, unknown, alone) =
+        tokio::join!(error_text(&ground), error_text(&nowhere), error_text(&here));
+    contains(&no_relay?, &["no controller", "nobody listens at 127.0.0.1", "--connect"])?;
     contains(&unknown?, &[&format!("address of `{name}` is not known")])?;
     contains(&alone?, &["no process of the vehicle `drone`", "--meet"])?;
 
     let relay = site.open("drone", "relay", "drone").await?;
     relay.announce().await?;
     let other = Network { vehicle: Some("kestrel".into()), ..ground.clone() };
-    let (known, other) = tokio::join!(told(&ground), told(&other));
+    let (known, other) = tokio::join!(error_text(&ground), error_text(&other));
     contains(&known?, &["there is only relay `drone`"])?;
     contains(&other?, &["no process of the vehicle `kestrel`", "--vehicle"])
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn whom_a_relay_shuts_out_is_told_why() -> anyhow::Result<()> {
+async fn a_client_that_a_relay_rejects_gets_the_reason() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let keys_of = |name: &str| -> anyhow::Result<PathBuf> {
         let path = folder.path().join(name);
@@ -233,19 +234,26 @@ async fn whom_a_relay_shuts_out_is_told_why() -> anyhow::Result<()> {
     let to_anna = ground(&keys_of_anna);
     let (to_bob, to_eve) = (ground(&keys_of_bob), ground(&keys_of_eve));
     let named = Network { connect: elsewhere, ..to_anna.clone() };
-    let (anna, bob, eve, named) =
-        tokio::join!(told(&to_anna), told(&to_bob), told(&to_eve), told(&named));
+    let (anna, bob, eve, named) = tokio::join!(
+        error_text(&to_anna),
+        error_text(&to_bob),
+        error_text(&to_eve),
+        error_text(&named)
+    );
     contains(&anna?, &["there is only relay `drone`"])?;
     contains(&bob?, &["bob/operator.pem, and shows it nothing", "revoked"])?;
     contains(&eve?, &["of another authority"])?;
     contains(&named?, &["not valid for the address `localhost`", "--address"])?;
     controller.announce().await?;
-    contains(&told(&ground(&mallory)).await?, &["the controller is there", "role of this key"])?;
+    contains(
+        &error_text(&ground(&mallory)).await?,
+        &["the controller is there", "role of this key"],
+    )?;
     relay.close().await;
 
     // A relay that has no keys yet.
     let open = Site::new()?;
     let _relay = open.open("drone", "relay", "drone").await?;
     let plain = with(open.network("ground"), &keys_of_anna);
-    contains(&told(&plain).await?, &["has not answered with a certificate", "without keys"])
+    contains(&error_text(&plain).await?, &["has not answered with a certificate", "without keys"])
 }

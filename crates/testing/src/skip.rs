@@ -17,7 +17,7 @@ pub fn skip(need: &str, why: impl Display) {
     if forbidden == "1" || forbidden.split(',').any(|listed| listed.trim() == need) {
         panic!("{line}ALIGHT_NO_SKIPS={forbidden} forbids it");
     }
-    // The print macros would be captured by the harness; without a standard error there is nobody to tell.
+    // The print macros would be captured by the harness; without a standard error nothing can be reported.
     let _ = std::io::stderr().lock().write_all(line.as_bytes());
     if let Some(path) = std::env::var_os("ALIGHT_SKIPS") {
         let file = OpenOptions::new().create(true).append(true).open(&path);

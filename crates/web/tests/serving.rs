@@ -108,8 +108,8 @@ async fn connections_that_say_nothing_or_little_are_closed() -> anyhow::Result<(
         ensure!(!answer.contains("200"), "{said:?}: {answer}");
         ensure!(began.elapsed() >= LIMITS.head, "{said:?}: {:?}", began.elapsed());
     }
-    let told = format!("{:?}", served.health);
-    ensure!(told.contains("a request took too long"), "{told}");
+    let health = format!("{:?}", served.health);
+    ensure!(health.contains("a request took too long"), "{health}");
     Ok(())
 }
 
@@ -118,8 +118,8 @@ async fn a_connection_that_was_answered_and_waits_for_no_more_is_no_fault() -> a
     let served = served().await?;
     let answer = ask(served.address, "GET /who HTTP/1.1\r\nHost: x\r\n\r\n").await?;
     ensure!(answer.starts_with("HTTP/1.1 200"), "{answer}");
-    let told = format!("{:?}", served.health);
-    ensure!(!told.contains("took too long"), "{told}");
+    let health = format!("{:?}", served.health);
+    ensure!(!health.contains("took too long"), "{health}");
     Ok(())
 }
 
@@ -141,8 +141,8 @@ async fn an_answer_that_never_comes_ends_with_its_connection() -> anyhow::Result
     let served = served().await?;
     let answer = ask(served.address, "GET /slowly HTTP/1.1\r\nHost: x\r\n\r\n").await?;
     ensure!(answer.is_empty(), "{answer}");
-    let told = format!("{:?}", served.health);
-    ensure!(told.contains("a connection took too long"), "{told}");
+    let health = format!("{:?}", served.health);
+    ensure!(health.contains("a connection took too long"), "{health}");
     Ok(())
 }
 

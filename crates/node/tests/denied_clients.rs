@@ -1,8 +1,8 @@
-//! Strangers at the drone's relay: what they say on every topic is refused. Connections and messages that reach the relay
-//! are counted as denied.
+//! Clients without rights at the drone's relay: all that they publish and query is refused on every topic. The relay counts
+//! their connections and messages that reach it as denied.
 //!
 //! Prints the table of `docs/results.md`:
-//! `cargo test -p node --test strangers -- --nocapture`.
+//! `cargo test -p node --test denied_clients -- --nocapture`.
 
 mod common;
 
@@ -32,30 +32,30 @@ const PAUSE: Duration = Duration::from_millis(100);
 
 /// A peer's session opens without a connection.
 const PEER: &str = "peer";
-/// A client sends to the relay whatever it knows of subscribers; of those on the drone the relay says nothing to who
-/// has no rights.
+/// A client sends to the relay whatever it knows of subscribers; the relay announces the subscribers on the drone to no
+/// client without rights.
 const CLIENT: &str = "client";
 
-/// What was heard on the drone: by whom, on which key.
-type Heard = Arc<Mutex<BTreeSet<(String, String)>>>;
+/// The messages that were received: their sender and key.
+type Received = Arc<Mutex<BTreeSet<(String, String)>>>;
 
-fn note(heard: &Heard, payload: &[u8], key: &str) {
-    let who = String::from_utf8_lossy(payload).into_owned();
-    let mut heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
-    heard.insert((who, key.to_owned()));
+fn note(received: &Received, payload: &[u8], key: &str) {
+    let sender = String::from_utf8_lossy(payload).into_owned();
+    let mut received = received.lock().unwrap_or_else(PoisonError::into_inner);
+    received.insert((sender, key.to_owned()));
 }
 
-fn has_heard(heard: &Heard, who: &str, key: &str) -> bool {
-    let heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
-    heard.contains(&(who.to_owned(), key.to_owned()))
+fn is_received(received: &Received, sender: &str, key: &str) -> bool {
+    let received = received.lock().unwrap_or_else(PoisonError::into_inner);
+    received.contains(&(sender.to_owned(), key.to_owned()))
 }
 
-/// The drone: its relay, and a process on it that hears everything.
+/// The drone: its relay, and a process on it that receives everything.
 struct Drone {
     _relay: Node,
     inside: Session,
-    published: Heard,
-    queried: Heard,
+    published: Received,
+    queried: Received,
     air: String,
 }
 
@@ -84,7 +84,7 @@ impl Drone {
         let relay = Node::open(identity, &network.source("drone")?).await?;
         let local = Network { meet: Some(meet), ..Network::default() };
         let inside = open(&local, "controller").await?;
-        let (published, queried) = (Heard::default(), Heard::default());
+        let (published, queried) = (Received::default(), Received::default());
         let notes = Arc::clone(&published);
         inside
             .declare_subscriber("**")
@@ -107,13 +107,13 @@ impl Drone {
         Ok(Self { _relay: relay, inside, published, queried, air })
     }
 
-    /// Somebody on the ground.
-    async fn stranger(
+    /// A client on the ground.
+    async fn client(
         &self,
         keys: Option<&Path>,
         key_name: &str,
         mode: &str,
-    ) -> anyhow::Result<Stranger> {
+    ) -> anyhow::Result<Client> {
         let network = Network {
             config: Some("ground".into()),
             connect: Some(self.air.clone()),
@@ -126,8 +126,8 @@ impl Drone {
             config["listen"]["endpoints"] = serde_json::json!([]);
         }
         let session = opened(config).await?;
-        let received = Heard::default();
-        // Each key by itself: who may not subscribe to all of them may to some.
+        let received = Received::default();
+        // Each key on its own: a client that may not subscribe to all of them may subscribe to some.
         for key in all_keys().keys() {
             let notes = Arc::clone(&received);
             session
@@ -139,19 +139,19 @@ impl Drone {
                 .await
                 .map_err(|cause| anyhow!("{cause}"))?;
         }
-        Ok(Stranger { session, received })
+        Ok(Client { session, received })
     }
 }
 
 #[derive(Clone)]
-struct Stranger {
+struct Client {
     session: Session,
-    received: Heard,
+    received: Received,
 }
 
-impl Stranger {
+impl Client {
     /// Publishes and queries on a key, with its name.
-    async fn says(&self, name: &str, key: &str) {
+    async fn publish_and_query(&self, name: &str, key: &str) {
         drop(self.session.put(key, name).await);
         let get = self.session.get(key).payload(name).timeout(Duration::from_millis(200));
         drop(get.await);
@@ -196,9 +196,9 @@ const ROLES: [&str; 10] = [
     "simulator",
 ];
 
-/// Publishes on the ground what a gcs-bridge may subscribe to and what it may not, until a changed one has heard the former;
-/// returns whether it heard the latter as well.
-async fn is_sent_what_it_may_not(
+/// Publishes on the ground a topic to which a gcs-bridge may subscribe and one to which it may not, until a changed bridge
+/// has received the former; returns whether it received the latter as well.
+async fn is_sent_a_forbidden_topic(
     drone: &Drone,
     home: &Path,
     ground: &Path,
@@ -210,7 +210,7 @@ async fn is_sent_what_it_may_not(
         ..Network::default()
     };
     let detector = open(&network, "detector.ground").await?;
-    let changed = drone.stranger(Some(home), "gcs-bridge", PEER).await?;
+    let changed = drone.client(Some(home), "gcs-bridge", PEER).await?;
     let (may, may_not) = ("detector/ground/detections", "detector/ground/ack");
     timeout(PATIENCE, async {
         let mut rounds = 0;
@@ -218,13 +218,13 @@ async fn is_sent_what_it_may_not(
         while rounds < 20 {
             drop(detector.put(may, "ground").await);
             drop(detector.put(may_not, "ground").await);
-            rounds += i32::from(has_heard(&changed.received, "ground", may));
+            rounds += i32::from(is_received(&changed.received, "ground", may));
             sleep(PAUSE).await;
         }
     })
     .await
-    .context("the changed gcs-bridge does not hear what it may")?;
-    let is_sent = has_heard(&changed.received, "ground", may_not);
+    .context("the changed gcs-bridge does not receive an allowed topic")?;
+    let is_sent = is_received(&changed.received, "ground", may_not);
     for session in [detector, changed.session] {
         session.close().await.map_err(|cause| anyhow!("{cause}"))?;
     }
@@ -232,7 +232,7 @@ async fn is_sent_what_it_may_not(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_the_ground_publishes_is_sent_to_who_may_subscribe_to_it_where_it_has_the_list()
+async fn a_ground_process_with_the_list_sends_only_to_subscribers_with_the_right()
 -> anyhow::Result<()> {
     let (home, plain) = (tempfile::tempdir()?, tempfile::tempdir()?);
     let authority = Authority::new()?;
@@ -243,15 +243,17 @@ async fn what_the_ground_publishes_is_sent_to_who_may_subscribe_to_it_where_it_h
         common::list(home.path(), &format!("{role}@drone"))?;
     }
     let drone = Drone::start(home.path()).await?;
-    let without = is_sent_what_it_may_not(&drone, home.path(), plain.path()).await?;
-    let with = is_sent_what_it_may_not(&drone, home.path(), home.path()).await?;
-    println!("sent what it may not subscribe to: without a list {without}, with it {with}");
+    let without = is_sent_a_forbidden_topic(&drone, home.path(), plain.path()).await?;
+    let with = is_sent_a_forbidden_topic(&drone, home.path(), home.path()).await?;
+    println!(
+        "sent a topic to which it may not subscribe: without a list {without}, with it {with}"
+    );
     ensure!(!with, "sent although the ground has the list");
     Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
+async fn clients_without_rights_are_refused_on_every_topic() -> anyhow::Result<()> {
     node::start_logging("off");
     let folders: Vec<_> = (0..5).map(|_| tempfile::tempdir()).collect::<Result<_, _>>()?;
     let [home, foreign, kestrel, revoked, spare] =
@@ -274,35 +276,35 @@ async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
     let drone = Drone::start(home).await?;
     denied::take();
 
-    // Those whose connection is refused.
+    // Clients whose connection is refused.
     let mut counted = BTreeMap::new();
-    let no_key = drone.stranger(None, "operator", PEER).await?;
-    let wrong_key = drone.stranger(Some(foreign), "operator", PEER).await?;
+    let no_key = drone.client(None, "operator", PEER).await?;
+    let wrong_key = drone.client(Some(foreign), "operator", PEER).await?;
     let connection = "denied: a connection without a valid certificate";
     until(&mut counted, "two refused connections", async |counted| {
         counted.get(connection).is_some_and(|times| *times >= 2)
     })
     .await?;
 
-    // Those who come in, and have no rights, or others.
-    // The first two have no rights, so the relay tells them of nobody to talk to: what they say stays with them, and
-    // their connections are counted.
+    // Clients that are connected, with no rights or with other rights.
+    // The first two have no rights, so the relay announces no subscribers to them: they send nothing, and their
+    // connections are counted.
     let without_rights = "denied: a connection without rights, of another vehicle or revoked";
     let mut connected = Vec::new();
     for keys in [kestrel, revoked] {
         let mut counted = BTreeMap::new();
         denied::take();
-        connected.push(drone.stranger(Some(keys), "operator", CLIENT).await?);
+        connected.push(drone.client(Some(keys), "operator", CLIENT).await?);
         until(&mut counted, "a connection without rights", async |counted| {
             counted.contains_key(without_rights)
         })
         .await?;
     }
-    let [other_vehicle, revoked] = <[Stranger; 2]>::try_from(connected)
-        .map_err(|_| anyhow!("two strangers were connected"))?;
-    let observer = drone.stranger(Some(home), "observer", CLIENT).await?;
-    let other_name = drone.stranger(Some(spare), "detector.spare", CLIENT).await?;
-    let strangers = [
+    let [other_vehicle, revoked] =
+        <[Client; 2]>::try_from(connected).map_err(|_| anyhow!("two clients were connected"))?;
+    let observer = drone.client(Some(home), "observer", CLIENT).await?;
+    let other_name = drone.client(Some(spare), "detector.spare", CLIENT).await?;
+    let clients = [
         ("no key", &no_key),
         ("wrong key", &wrong_key),
         ("another vehicle's", &other_vehicle),
@@ -310,11 +312,11 @@ async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
         ("another role's", &observer),
         ("another detector's", &other_name),
     ];
-    // Those who may subscribe, each to what its role needs.
+    // Clients that may subscribe, each to the topics of its role.
     let mut subscribers = Vec::new();
     for service in ["camera-pub", "controller", "gcs-bridge", "simulator", "recorder"] {
         let file = file_of(role_of(service));
-        subscribers.push((service, drone.stranger(Some(home), &file, CLIENT).await?));
+        subscribers.push((service, drone.client(Some(home), &file, CLIENT).await?));
     }
     let mut subscriptions = BTreeMap::new();
     until(&mut subscriptions, "refused subscriptions are counted", async |counted| {
@@ -327,58 +329,58 @@ async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
     let mut refused = 0;
     for (key, row) in &all_keys() {
         let is_query = row.delivery == Delivery::Query;
-        // Who may is heard, so that the silence of the others says something.
+        // Messages of a client with the right arrive; otherwise the absence of the others' messages would prove nothing.
         let role = role_of(row.publishers.first().context("a publisher")?);
-        let rightful = drone.stranger(Some(home), &file_of(role), CLIENT).await?;
-        let heard = if is_query { &drone.queried } else { &drone.published };
-        until(&mut counted, &format!("{role} is heard on {key}"), async |_| {
-            rightful.says("rightful", key).await;
-            has_heard(heard, "rightful", key)
+        let rightful = drone.client(Some(home), &file_of(role), CLIENT).await?;
+        let received = if is_query { &drone.queried } else { &drone.published };
+        until(&mut counted, &format!("{role} is received on {key}"), async |_| {
+            rightful.publish_and_query("rightful", key).await;
+            is_received(received, "rightful", key)
         })
         .await?;
         let action = if is_query { "query" } else { "put" };
         let reason = format!("denied: {action} on drone/{key}");
         denied::take();
         let mut refusals = BTreeMap::new();
-        for (name, stranger) in strangers {
+        for (name, client) in clients {
             let has_rights = ["another role's", "another detector's"].contains(&name);
             until(&mut refusals, &format!("{name} is refused on {key}"), async |refusals| {
-                stranger.says(name, key).await;
-                // Only who has some rights is told of somebody to talk to.
+                client.publish_and_query(name, key).await;
+                // The relay announces subscribers only to clients with some rights.
                 !has_rights || refusals.remove(&reason).is_some()
             })
             .await?;
         }
-        // They are not heard later either, and each listens to what its role may.
-        let may_listen =
+        // Their messages do not arrive later either, and each client receives the topics of its role.
+        let may_subscribe =
             |service: &str| MONITORS.contains(&service) || row.subscribers.contains(&service);
-        until(&mut counted, &format!("who may hears {key}"), async |_| {
+        until(&mut counted, &format!("each client with the right receives {key}"), async |_| {
             drop(drone.inside.put(key.as_str(), "inside").await);
-            let mut those = subscribers.iter().filter(|(service, _)| may_listen(service));
-            those.all(|(_, it)| has_heard(&it.received, "inside", key))
+            let mut allowed = subscribers.iter().filter(|(service, _)| may_subscribe(service));
+            allowed.all(|(_, it)| is_received(&it.received, "inside", key))
         })
         .await?;
-        let listening: Vec<&str> = subscribers
+        let subscribed: Vec<&str> = subscribers
             .iter()
-            .filter(|(_, it)| has_heard(&it.received, "inside", key))
+            .filter(|(_, it)| is_received(&it.received, "inside", key))
             .map(|(service, _)| *service)
             .collect();
         for (service, _) in &subscribers {
-            let listens = listening.contains(service);
-            ensure!(listens == may_listen(service), "{service} on {key}: listens: {listens}");
-            refused += usize::from(!listens);
+            let receives = subscribed.contains(service);
+            ensure!(receives == may_subscribe(service), "{service} on {key}: receives: {receives}");
+            refused += usize::from(!receives);
         }
         let mut cells = Vec::new();
-        for (name, stranger) in strangers {
-            let is_heard = has_heard(heard, name, key);
-            ensure!(!is_heard, "{name}: {action} on {key} was heard");
-            let listens = has_heard(&stranger.received, "inside", key);
+        for (name, client) in clients {
+            let has_arrived = is_received(received, name, key);
+            ensure!(!has_arrived, "{name}: {action} on {key} has arrived");
+            let receives = is_received(&client.received, "inside", key);
             let has_rights = ["another role's", "another detector's"].contains(&name);
-            ensure!(!listens || has_rights, "{name} on {key}: listens");
-            cells.push(if listens { "refused; hears" } else { "refused; hears nothing" });
+            ensure!(!receives || has_rights, "{name} on {key}: receives");
+            cells.push(if receives { "refused; receives" } else { "refused; receives nothing" });
         }
-        let listening = listening.join(", ");
-        rows.push(format!("| `{key}` | {action} | {} | {listening} |", cells.join(" | ")));
+        let subscribed = subscribed.join(", ");
+        rows.push(format!("| `{key}` | {action} | {} | {subscribed} |", cells.join(" | ")));
     }
     ensure!(refused > 50, "only {refused} subscriptions were refused");
     let denied_subscriptions = subscriptions
@@ -386,8 +388,8 @@ async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
         .filter(|(reason, _)| reason.starts_with("denied: declare subscriber on drone/"));
     let denied_subscriptions = denied_subscriptions.count();
     ensure!(denied_subscriptions > 10, "counted subscriptions: {subscriptions:?}");
-    let names: Vec<&str> = strangers.iter().map(|(name, _)| *name).collect();
-    println!("| key | what | {} | who subscribes |", names.join(" | "));
+    let names: Vec<&str> = clients.iter().map(|(name, _)| *name).collect();
+    println!("| key | what | {} | subscribers |", names.join(" | "));
     println!("|---|---|{}---|", "---|".repeat(names.len()));
     rows.iter().for_each(|row| println!("{row}"));
     Ok(())
@@ -404,32 +406,32 @@ async fn an_encrypted_link_takes_the_cipher_that_needs_no_change_of_keys() -> an
     roots.add(CertificateDer::from_pem_file(file(AUTHORITY))?)?;
     let own = vec![CertificateDer::from_pem_file(file("drone.pem"))?];
     let private = PrivateKeyDer::from_pem_file(file("drone.key"))?;
-    // Somebody who would take any.
+    // A client that would take any.
     let config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
         .with_safe_default_protocol_versions()?
         .with_root_certificates(roots)
         .with_client_auth_cert(own, private)?;
-    let mut stranger = ClientConnection::new(Arc::new(config), ServerName::try_from("127.0.0.1")?)?;
+    let mut client = ClientConnection::new(Arc::new(config), ServerName::try_from("127.0.0.1")?)?;
     let mut stream = TcpStream::connect(&drone.air)?;
     stream.set_read_timeout(Some(PATIENCE))?;
     tokio::task::block_in_place(|| {
-        while stranger.is_handshaking() {
-            stranger.complete_io(&mut stream)?;
+        while client.is_handshaking() {
+            client.complete_io(&mut stream)?;
         }
         anyhow::Ok(())
     })?;
     let is_without_limit = |suite: &SupportedCipherSuite| {
         suite.tls13().is_some_and(|it| it.common.confidentiality_limit == u64::MAX)
     };
-    let taken = stranger.negotiated_cipher_suite().context("a cipher")?;
+    let taken = client.negotiated_cipher_suite().context("a cipher")?;
     ensure!(is_without_limit(&taken), "{taken:?}");
-    // What our own connections offer.
+    // The ciphers that our own connections offer.
     let offered = &CryptoProvider::get_default().context("a default")?.cipher_suites;
     ensure!(!offered.is_empty() && offered.iter().all(is_without_limit), "{offered:?}");
     Ok(())
 }
 
-/// Repeats an attempt until it succeeds; what is denied meanwhile is counted.
+/// Repeats an attempt until it succeeds, and counts the denials meanwhile.
 async fn until(
     counted: &mut BTreeMap<String, u64>,
     what: &str,
