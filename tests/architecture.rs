@@ -18,7 +18,7 @@ use messages::{Delivery, MONITORS, TOPICS};
 use crate::circles::{Graph, circles, modules};
 use crate::source::{lines_of_code, tokens, without_tests};
 
-/// The algorithm crates, and what each may know of this workspace. `autopilot` is told apart for its link.
+/// The algorithm crates, and the crates of this workspace on which each may depend. `autopilot` is an exception for its link.
 const ALGORITHMS: [(&str, &[&str]); 10] = [
     ("geometry", &[]),
     ("imaging", &[]),

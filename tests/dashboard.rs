@@ -16,9 +16,9 @@ use tokio::time::{sleep, timeout};
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::{WebSocketStream, client_async};
 
-use crate::crowd::{Crowd, memory_mb};
 use crate::film;
 use crate::flight::{ALIGHT, Landing, PATIENCE, alone, beside_another, output_of, time_for};
+use crate::many_clients::{Browsers, memory_mb};
 
 /// Exit status of a script that lacks a browser or a package.
 const LACKS: i32 = 77;
@@ -28,7 +28,7 @@ const MAX_GREY_S: f64 = 1.0;
 const MAX_BACK_S: f64 = 2.0;
 const MAX_ANSWER_S: f64 = 1.5;
 /// Twice two pictures and their texts for each of twenty browsers, with room for what the system keeps.
-const MAX_CROWD_MB: f64 = 60.0;
+const MAX_BROWSERS_MB: f64 = 60.0;
 /// A descent of twenty seconds.
 const SLOWLY: [&str; 2] = ["--set", "controller.metric.max_descend_m_s=0.5"];
 
@@ -82,9 +82,9 @@ async fn a_landing_is_shown_and_goes_on_when_the_page_is_killed() -> anyhow::Res
                     let bytes = message?.into_data();
                     let length = u32::from_le_bytes(bytes.get(..4).context("a length")?.try_into()?) as usize;
                     let header: Value = serde_json::from_slice(bytes.get(4..4 + length).context("a header")?)?;
-                    let is_told = !header["found_sequence"].is_null();
-                    ensure!(!is_told || header["found_sequence"] == header["sequence"], "{header}");
-                    with_detections += usize::from(is_told);
+                    let has_detections = !header["found_sequence"].is_null();
+                    ensure!(!has_detections || header["found_sequence"] == header["sequence"], "{header}");
+                    with_detections += usize::from(has_detections);
                     pictures += 1;
                     video.send(Message::text(header["number"].to_string())).await?;
                 }
@@ -172,7 +172,7 @@ async fn twenty_browsers_and_a_page_that_is_stopped_and_killed_change_no_decisio
         drop(socket(&page, "/ws").await?);
         let dashboard = landing.service("dashboard")?.pid;
         let alone_mb = memory_mb(dashboard)?;
-        let crowd = Crowd::new(&page);
+        let browsers = Browsers::new(&page);
         landing.descends_below(8.0).await?;
         sleep(Duration::from_secs(3)).await;
         let with_mb = memory_mb(dashboard)?;
@@ -184,10 +184,10 @@ async fn twenty_browsers_and_a_page_that_is_stopped_and_killed_change_no_decisio
         println!(
             "{alone_mb:.0} MB alone, {with_mb:.0} with 20 browsers, {after_mb:.0} after a stop"
         );
-        ensure!(with_mb.max(after_mb) < alone_mb + MAX_CROWD_MB, "{after_mb} MB");
+        ensure!(with_mb.max(after_mb) < alone_mb + MAX_BROWSERS_MB, "{after_mb} MB");
         landing.kill("dashboard")?;
         landing.lands().await?;
-        drop(crowd);
+        drop(browsers);
         let replay =
             output_of(std::process::Command::new(ALIGHT).args(["replay", name, "--verify"]))?;
         let said = String::from_utf8_lossy(&replay.stdout).into_owned();

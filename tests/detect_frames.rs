@@ -353,8 +353,8 @@ fn an_image_that_is_read_ends_with_status_0_and_wrong_use_with_2() {
         let output = detect(wrong);
         assert_eq!(output.status.code(), Some(2), "{wrong:?}: {output:?}");
         assert!(output.stdout.is_empty(), "{wrong:?}");
-        let told = String::from_utf8_lossy(&output.stderr);
-        assert!(told.contains(part), "{wrong:?}: {told}");
+        let error_text = String::from_utf8_lossy(&output.stderr);
+        assert!(error_text.contains(part), "{wrong:?}: {error_text}");
     }
 }
 

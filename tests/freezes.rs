@@ -54,7 +54,7 @@ pub(crate) async fn of_a_landing(name: &str, freezes_s: &[f64]) -> anyhow::Resul
         let since = freeze(pid, *seconds).await?;
         let since_ns = now_ns();
         if name == "gcs-bridge" {
-            tokio::task::block_in_place(|| hears_the_vehicle(&station, since))?;
+            tokio::task::block_in_place(|| receives_from_the_vehicle(&station, since))?;
         } else {
             frames_are_used(&landing, since_ns).await?;
         }
@@ -132,7 +132,7 @@ async fn command(landing: &Landing, command: ControllerCommand) -> anyhow::Resul
 }
 
 /// Waits for the autopilot's packets at the ground station: many, as a few may have waited.
-fn hears_the_vehicle(station: &UdpSocket, since: Instant) -> anyhow::Result<()> {
+fn receives_from_the_vehicle(station: &UdpSocket, since: Instant) -> anyhow::Result<()> {
     station.set_nonblocking(true)?;
     let mut bytes = [0; 2048];
     while station.recv(&mut bytes).is_ok() {}

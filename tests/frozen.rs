@@ -1,5 +1,5 @@
-//! A process that is frozen for a while (SIGSTOP) and goes on takes its full part again within 2 s. `measure.rs` freezes
-//! each for longer.
+//! A process that is frozen for a while (SIGSTOP) works again within 2 s after it continues. `measure.rs` freezes each for
+//! longer.
 
 use testing::with_second_try;
 
@@ -14,7 +14,7 @@ async fn a_frozen_detector_detects_again_and_it_lands() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_frozen_bridge_is_heard_again_and_it_lands() -> anyhow::Result<()> {
+async fn packets_of_a_frozen_bridge_arrive_again_and_it_lands() -> anyhow::Result<()> {
     with_second_try(|| freezes::of_a_landing("gcs-bridge", &FREEZES_S[1..])).await
 }
 

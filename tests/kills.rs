@@ -64,11 +64,11 @@ impl Victim {
     }
 }
 
-/// What is heard on the drone.
+/// The messages that are received on the drone.
 #[derive(Clone, Default)]
 struct Picture {
     alive: BTreeSet<(String, String)>,
-    /// How often each was missed: who is back at once may never be seen to be away.
+    /// How often each was missed: a process that is back at once may never be seen to be away.
     missed: BTreeMap<(String, String), u32>,
     status: ControllerStatus,
     /// The truth: it has touched down.
@@ -83,20 +83,20 @@ impl Picture {
         if status.stamp_ns <= since_ns {
             return false;
         }
-        let heard = |name: &str| {
+        let is_received = |name: &str| {
             let known = status.candidates.iter().find(|candidate| candidate.detector == name);
             known.is_some_and(|it| {
                 it.alive && matches!(it.state, DetectorState::Active | DetectorState::Shadow)
             })
         };
         let steers = status.started_ns.is_some() && status.setpoint.is_some();
-        let both = heard("onboard") && heard("ground");
+        let both = is_received("onboard") && is_received("ground");
         // One that is started after the touchdown has nothing to steer any more.
         there && (self.landed || status.finished || status.phase == Phase::Final || steers && both)
     }
 }
 
-/// A flight: the world, both sides under their supervisors, and what is heard.
+/// A flight: the world, both sides under their supervisors, and the received messages.
 struct Flight {
     folder: PathBuf,
     world: Child,
@@ -336,7 +336,7 @@ pub(crate) async fn kill_while_held() -> anyhow::Result<()> {
     flight.command(&ControllerCommand::Hold).await?;
     let is_held = |picture: &Picture| picture.status.waits_for_operator;
     flight.until("it is held", now_ns(), is_held).await?;
-    // The supervisor hears it as late as this.
+    // The supervisor receives the state this late.
     sleep(Duration::from_millis(300)).await;
     kill_process(flight.process(DRONE, "controller")?, Signal::KILL)?;
     let killed_ns = now_ns();

@@ -6,18 +6,16 @@
 //! cargo bench -p tests -- swaps [TIMES]       swap detectors so often in one flight (100)
 //! cargo bench -p tests -- freezes             freeze each process (SIGSTOP) for 0.5, 2, 5 and 30 s
 //! cargo bench -p tests -- recorder [TIMES]    kill the recorder so often in one flight at 30 frames a second (50)
-//! cargo bench -p tests -- recording [KEY=VALUE...] what the recorder costs at 15 and 30 frames a second
+//! cargo bench -p tests -- recording [KEY=VALUE...] the cost of the recorder at 15 and 30 frames a second
 //! cargo bench -p tests -- link [NAME...]      the trials on a bad radio link, or some of them
 //! cargo bench -p tests -- overlay [FRAMES]    read back so many drawn pictures of the page with their overlay (1000)
 //! cargo bench -p tests -- video [SECONDS] [link]  the page's pictures, from sent to drawn: at most a minute on this machine at 15
 //!                                             and at 30 Hz, and for so long (600) over a link of 6 Mbit/s, or that alone
-//! cargo bench -p tests -- crowd [TIMES]       what 1 and 20 browsers cost a flight, and other work of that size, in so many rounds (6)
+//! cargo bench -p tests -- crowd [TIMES]       the cost of 1 and 20 browsers for a flight, and of other work of that size, in so many rounds (6)
 //! ```
 
-#![expect(clippy::print_stdout, reason = "what was measured is for people to read")]
+#![expect(clippy::print_stdout, reason = "results are for people to read")]
 
-#[path = "dashboard/crowd.rs"]
-mod crowd;
 #[path = "dashboard/film.rs"]
 mod film;
 mod flight;
@@ -25,6 +23,8 @@ mod freezes;
 mod kills;
 #[path = "link/mod.rs"]
 mod link;
+#[path = "dashboard/many_clients.rs"]
+mod many_clients;
 #[path = "link/onehost.rs"]
 mod onehost;
 #[path = "recording/recorders.rs"]
@@ -47,10 +47,7 @@ fn main() -> ExitCode {
         match args.first().map(String::as_str) {
             Some("kills") => kills::kill_each(times(20)?).await,
             Some("swaps") => {
-                ensure!(
-                    swaps::swaps(times(100)?).await?,
-                    "frames were late whoever found the marker in them"
-                );
+                ensure!(swaps::swaps(times(100)?).await?, "frames were late for every detector");
                 Ok(())
             }
             Some("freezes") => freeze_each(&[0.5, 2.0, 5.0, 30.0]).await,
@@ -72,7 +69,7 @@ fn main() -> ExitCode {
                 let is_link_only = args.get(2).is_some_and(|it| it == "link");
                 video(times(600)? as f64, is_link_only).await
             }
-            Some("crowd") => crowd::cost(times(6)?).await,
+            Some("crowd") => many_clients::cost(times(6)?).await,
             Some("reader") => {
                 println!("{}", onehost::reader(args.get(1).context("reader PORT")?).await?);
                 Ok(())

@@ -92,7 +92,7 @@ async fn a_program_of_mavsdk_finds_the_vehicle_its_parameters_and_its_camera() -
     .await
 }
 
-/// The result of a landing has all that it should tell.
+/// The result of a landing has all values that it should contain.
 fn says_how_well(result: &serde_json::Value) -> anyhow::Result<()> {
     for key in [
         "time_to_disarm_s",
@@ -212,7 +212,7 @@ async fn a_landing_is_killed(height_m: f64) -> anyhow::Result<()> {
     let left: Vec<_> = left.iter().map(|it| &it.name).collect();
     ensure!(left.is_empty(), "{left:?} outlive their landing by {MAX_ORPHANED:?}");
     motion.extend(vehicle.motion(Duration::from_secs(8)).await);
-    let last = motion.last().context("nothing is told of the vehicle")?;
+    let last = motion.last().context("no truth of the vehicle was received")?;
     println!(
         "killed below {height_m} m: its processes ended after {ended_s:.1} s, the vehicle is at {:.2} m; {:?}",
         last.pad_ned_m[2] - last.position_ned_m[2],
@@ -370,7 +370,7 @@ async fn comes_down_after_an_abort(on_abort: &str) -> anyhow::Result<()> {
     let landing = Landing::start(&["--seed", "6", "--set", &on]).await?;
     landing.descends_below(9.0).await?;
     command(&landing, ControllerCommand::Abort).await?;
-    let told = match on_abort {
+    let expected = match on_abort {
         "hover" => {
             command(&landing, ControllerCommand::LandHere).await?;
             "the operator's command to land here; it touched down "
@@ -381,7 +381,10 @@ async fn comes_down_after_an_abort(on_abort: &str) -> anyhow::Result<()> {
     ensure!(status == Some(1), "{status:?}: {result}");
     ensure!(result["landed"] == false && result["down"] == true, "{result}");
     let outcome = result["outcome"].as_str().context("outcome")?;
-    ensure!(outcome.starts_with(told) && outcome.contains("from the pad's centre"), "{outcome}");
+    ensure!(
+        outcome.starts_with(expected) && outcome.contains("from the pad's centre"),
+        "{outcome}"
+    );
     Ok(())
 }
 

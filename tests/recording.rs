@@ -89,7 +89,7 @@ async fn others_read_a_landing() -> anyhow::Result<()> {
     let overlays =
         [&read["overlays"], &read["overlays_with_picture"]].map(serde_json::Value::as_u64);
     let [Some(overlays), Some(with_picture)] = overlays else { anyhow::bail!("{read}") };
-    // The detector may tell of a frame that the recorder lost to the one after it.
+    // Detections may belong to a frame that the recorder has replaced by the next one.
     ensure!(overlays > 50 && with_picture * 100 >= overlays * 95, "{with_picture} of {overlays}");
     let log = read["log"].to_string();
     ensure!(log.contains("descend") && log.contains("touchdown"), "{log}");
@@ -169,14 +169,14 @@ async fn what_an_overloaded_recorder_loses_is_in_its_file_to_the_frame() -> anyh
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_disk_that_is_full_read_only_or_removed_is_told_and_the_landing_goes_on()
+async fn a_disk_that_is_full_read_only_or_removed_is_reported_and_the_landing_continues()
 -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     with_second_try(disks::fail).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_waits_for_a_disk_that_stands_still_is_bounded_and_what_fails_is_told_soon()
+async fn data_that_waits_for_a_stopped_disk_is_bounded_and_each_failure_is_reported_soon()
 -> anyhow::Result<()> {
     let _flight = time_for(2).await?;
     with_second_try(disks::beside_a_flight).await

@@ -124,12 +124,12 @@ async fn health(
     timeout(PATIENCE, found).await.map_err(|_| anyhow!("waiting until {what}"))?
 }
 
-/// Publishes acknowledgements until one is heard.
-async fn is_heard(detector: &Node, controller: &Node) -> anyhow::Result<()> {
+/// Publishes acknowledgements until one is received.
+async fn is_received(detector: &Node, controller: &Node) -> anyhow::Result<()> {
     let subscriber = controller.subscriber(topic::FRAME_ACK, &["ground"]).await?;
     let publisher = detector.publisher(topic::FRAME_ACK, &["ground"]).await?;
     let ack = FrameAck::sample();
-    let heard = async {
+    let received = async {
         loop {
             publisher.publish(&ack).await;
             if timeout(Duration::from_millis(50), subscriber.next()).await.is_ok() {
@@ -137,11 +137,11 @@ async fn is_heard(detector: &Node, controller: &Node) -> anyhow::Result<()> {
             }
         }
     };
-    timeout(PATIENCE, heard).await.context("the detector is not heard")
+    timeout(PATIENCE, received).await.context("no message of the detector is received")
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn each_says_what_its_role_may_and_strangers_nothing() -> anyhow::Result<()> {
+async fn each_role_publishes_its_topics_and_unknown_clients_nothing() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     let mut drone = Drone::start().await?;
     let commands = drone.controller.commands(topic::COMMAND, &[]).await?;
@@ -157,10 +157,10 @@ async fn each_says_what_its_role_may_and_strangers_nothing() -> anyhow::Result<(
         health.errors.iter().any(|e| e.reason.contains(part) && e.count > 0)
     };
 
-    // A detector is heard as such, and as nothing else.
+    // A detector may publish as a detector, and as nothing else.
     let detector = drone.on_the_ground("detector", "detector.ground").await?;
     detector.announce().await?;
-    is_heard(&detector, &drone.controller).await?;
+    is_received(&detector, &drone.controller).await?;
     ensure!(drone.controller.alive("detector", "*").await? == ["ground"]);
     let command = detector.command(topic::COMMAND, &[], &ControllerCommand::Abort).await;
     ensure!(command.is_err(), "a detector commanded: {command:?}");
@@ -190,11 +190,11 @@ async fn each_says_what_its_role_may_and_strangers_nothing() -> anyhow::Result<(
     health(&healths, "the connections' refusal is counted", |h| refused(h, "connection")).await?;
     ensure!(commanded.try_recv().is_err(), "a command came through");
 
-    // The operator commands, the detector is heard as before.
+    // The operator commands, the detector's messages arrive as before.
     let output = drone.command(Some(drone.folder.path()))?;
     ensure!(output.status.success(), "{output:?}");
     ensure!(commanded.recv().await == Some(ControllerCommand::Hold));
-    is_heard(&detector, &drone.controller).await?;
+    is_received(&detector, &drone.controller).await?;
     answering.abort();
     Ok(())
 }
@@ -224,13 +224,13 @@ async fn a_program_in_another_language_joins_by_the_session_that_is_printed() ->
     ensure!(printed.status.success(), "{printed:?}");
     let file = drone.folder.path().join("session.json");
     std::fs::write(&file, printed.stdout)?;
-    // The relay reads the list of those who may connect anew within seconds.
+    // The relay reads the list of those who may connect again within seconds.
     let infos = drone.controller.subscriber(topic::DETECTOR_INFO, &["python"]).await?;
     let marker = ["--id", "python", "--place", "ground", "--marker", "aruco-4x4-50:7:0.3"];
     let python = python(script, &[&marker[..], &["--zenoh", text(&file)?]].concat());
     let mut python = python.context("it started a moment ago")?;
     let joined = async {
-        let info = timeout(PATIENCE, infos.next()).await.context("it is not heard")?;
+        let info = timeout(PATIENCE, infos.next()).await.context("its message is not received")?;
         ensure!(info.is_some_and(|info| info.place == Place::Ground), "the ground's detector");
         let stop = DetectorCommand::Stop;
         let stopped = drone.controller.command(topic::DETECTOR_COMMAND, &["python"], &stop);
@@ -244,7 +244,7 @@ async fn a_program_in_another_language_joins_by_the_session_that_is_printed() ->
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_running_relay_shuts_out_who_is_revoked_and_goes_on() -> anyhow::Result<()> {
+async fn a_running_relay_rejects_a_revoked_holder_and_continues() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     let drone = Drone::start().await?;
     let commands = drone.controller.commands(topic::COMMAND, &[]).await?;
@@ -255,21 +255,21 @@ async fn a_running_relay_shuts_out_who_is_revoked_and_goes_on() -> anyhow::Resul
     });
     let detector = drone.on_the_ground("detector", "detector.ground").await?;
     detector.announce().await?;
-    is_heard(&detector, &drone.controller).await?;
+    is_received(&detector, &drone.controller).await?;
     let subscriber = drone.controller.subscriber(topic::FRAME_ACK, &["ground"]).await?;
     let publisher = detector.publisher(topic::FRAME_ACK, &["ground"]).await?;
     keys(&["revoke", "detector.ground@drone", "--authority", text(drone.folder.path())?])?;
     let revoked = Instant::now();
-    let mut heard = revoked;
+    let mut last_received = revoked;
     while revoked.elapsed() < Duration::from_secs(8) {
         publisher.publish(&FrameAck::sample()).await;
         if timeout(Duration::from_millis(50), subscriber.next()).await.is_ok() {
-            heard = Instant::now();
+            last_received = Instant::now();
         }
     }
-    let took = heard - revoked;
-    println!("heard for {took:?} after it was revoked");
-    ensure!(took < Duration::from_secs(3), "heard for {took:?} after it was revoked");
+    let took = last_received - revoked;
+    println!("received for {took:?} after it was revoked");
+    ensure!(took < Duration::from_secs(3), "received for {took:?} after it was revoked");
     // The relay is there for the others.
     let output = drone.command(Some(drone.folder.path()))?;
     ensure!(output.status.success(), "{output:?}");
@@ -286,7 +286,8 @@ fn relay(arguments: &[&str]) -> anyhow::Result<String> {
 }
 
 #[test]
-fn a_relay_without_keys_does_not_start_unless_told_and_keys_are_private() -> anyhow::Result<()> {
+fn a_relay_without_keys_does_not_start_unless_configured_and_keys_are_private() -> anyhow::Result<()>
+{
     let ([meet], air, _) = ports::free()?;
     let (meet, air) = (meet.to_string(), format!("0.0.0.0:{air}"));
     let said = relay(&["--listen", &air, "--meet", &meet])?;
@@ -304,7 +305,7 @@ fn a_relay_without_keys_does_not_start_unless_told_and_keys_are_private() -> any
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_insecure_says_so() -> anyhow::Result<()> {
+async fn insecure_processes_report_it() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     let ([meet], air, _) = ports::free()?;
     let (port, air) = (meet.to_string(), format!("0.0.0.0:{air}"));
@@ -317,14 +318,14 @@ async fn what_is_insecure_says_so() -> anyhow::Result<()> {
     let identity = Identity { service: "controller", instance: "main".into() };
     let inside = Node::open(identity, &local.source("controller")?).await?;
     let healths = inside.subscriber(topic::HEALTH, &["relay", "drone"]).await?;
-    let told = health(&healths, "its health says so", |h| {
+    let reported = health(&healths, "its health says so", |h| {
         h.errors.iter().any(|error| error.reason == node::INSECURE)
     })
     .await;
     let output = output_of(&["doctor", "--meet", &port, "--seconds", "2"]);
     relay.kill()?;
     let said = relay.wait_with_output()?;
-    told?;
+    reported?;
     let said = String::from_utf8_lossy(&said.stderr).into_owned();
     ensure!(said.contains("INSECURE"), "{said}");
     let output = output?;

@@ -85,15 +85,15 @@ async fn python_lands_it() -> anyhow::Result<()> {
     let flown = flown.await;
     // Closing its session takes Zenoh a while.
     let mut ended = python.try_wait()?;
-    let told = std::time::Instant::now();
-    while flown.is_ok() && ended.is_none() && told.elapsed() < PATIENCE / 4 {
+    let stopped = std::time::Instant::now();
+    while flown.is_ok() && ended.is_none() && stopped.elapsed() < PATIENCE / 4 {
         sleep(Duration::from_millis(50)).await;
         ended = python.try_wait()?;
     }
     let _ = python.kill();
     let _ = python.wait();
     flown?;
-    ensure!(ended.is_some_and(|status| status.success()), "{ended:?} after it was told to stop");
+    ensure!(ended.is_some_and(|status| status.success()), "{ended:?} after its command to stop");
     Ok(())
 }
 

@@ -126,35 +126,35 @@ impl std::fmt::Display for Ticks {
     }
 }
 
-/// What was heard of any detector: when, and of which frame.
+/// A received message of any detector: when it came, and of which frame.
 #[derive(Clone, Copy)]
-struct Heard {
+struct Received {
     at_ns: i64,
     stamp_ns: i64,
     sequence: u64,
 }
 
 /// Notes all detections from now on.
-async fn listen(node: &Node) -> anyhow::Result<Arc<Mutex<Vec<Heard>>>> {
+async fn listen(node: &Node) -> anyhow::Result<Arc<Mutex<Vec<Received>>>> {
     let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
-    let heard = Arc::new(Mutex::new(Vec::new()));
-    let noted = Arc::clone(&heard);
+    let received = Arc::new(Mutex::new(Vec::new()));
+    let noted = Arc::clone(&received);
     tokio::spawn(async move {
         while let Some(message) = detections.next().await {
             let Detections { header, .. } = message;
-            let heard =
-                Heard { at_ns: now_ns(), stamp_ns: header.stamp_ns, sequence: header.sequence };
-            noted.lock().unwrap_or_else(PoisonError::into_inner).push(heard);
+            let message =
+                Received { at_ns: now_ns(), stamp_ns: header.stamp_ns, sequence: header.sequence };
+            noted.lock().unwrap_or_else(PoisonError::into_inner).push(message);
         }
     });
-    Ok(heard)
+    Ok(received)
 }
 
-/// The times in which no detector had told of a fresh frame, each with its length in ms and its cause.
-fn droughts(heard: &[Heard]) -> Vec<(i64, f64, String)> {
+/// The times without detections of a fresh frame, each with its length in ms and its cause.
+fn droughts(received: &[Received]) -> Vec<(i64, f64, String)> {
     let mut droughts = Vec::new();
-    let Some(mut newest) = heard.first().copied() else { return droughts };
-    for next in heard {
+    let Some(mut newest) = received.first().copied() else { return droughts };
+    for next in received {
         if next.stamp_ns <= newest.stamp_ns {
             continue;
         }
@@ -162,7 +162,7 @@ fn droughts(heard: &[Heard]) -> Vec<(i64, f64, String)> {
         if over_ns > 0 {
             let ms = |ns: i64| ns as f64 * 1e-6;
             let cause = format!(
-                "{:.0} ms and {} frames after the last one, heard {:.0} ms later",
+                "{:.0} ms and {} frames after the last one, received {:.0} ms later",
                 ms(next.stamp_ns - newest.stamp_ns),
                 next.sequence - newest.sequence,
                 ms(next.at_ns - next.stamp_ns),
@@ -193,7 +193,7 @@ pub(crate) async fn swaps(number: usize) -> anyhow::Result<bool> {
     ];
     let landing = Landing::start(&[&LONG[..], &args].concat()).await?;
     let healths = landing.node.subscriber(topic::HEALTH, &["controller", "main"]).await?;
-    let heard = listen(&landing.node).await?;
+    let received = listen(&landing.node).await?;
     landing.descends_below(8.0).await?;
     command(&landing, ControllerCommand::Hold).await?;
     landing.status("it holds", |s| s.phase == Phase::Hold).await?;
@@ -241,8 +241,8 @@ pub(crate) async fn swaps(number: usize) -> anyhow::Result<bool> {
         "{number} swaps, in use after {:.1} s each; with them {with}; beside them {without}",
         took_s.get(took_s.len() / 2).copied().unwrap_or_default(),
     );
-    let heard = heard.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    for (at_ns, over_ms, cause) in droughts(&heard) {
+    let received = received.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    for (at_ns, over_ms, cause) in droughts(&received) {
         let swap = marks.iter().find(|(began_ns, _, ended_s)| {
             (0.0..*ended_s + 0.2).contains(&seconds(at_ns - began_ns))
         });

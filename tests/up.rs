@@ -64,7 +64,7 @@ fn alight(folder: &Path, arguments: &[&str]) -> anyhow::Result<Output> {
 struct Up {
     child: Child,
     said: mpsc::UnboundedReceiver<String>,
-    heard: Vec<String>,
+    printed: Vec<String>,
 }
 
 impl Up {
@@ -86,14 +86,14 @@ impl Up {
         std::thread::Builder::new()
             .name("said".into())
             .spawn(move || lines.map_while(Result::ok).all(|line| sender.send(line).is_ok()))?;
-        Ok(Self { child, said, heard: Vec::new() })
+        Ok(Self { child, said, printed: Vec::new() })
     }
 
     /// Waits for a line from now on that begins and goes on so.
     async fn says(&mut self, begin: &str, part: &str) -> anyhow::Result<String> {
         let line = async {
             while let Some(line) = self.said.recv().await {
-                self.heard.push(line.clone());
+                self.printed.push(line.clone());
                 if line.starts_with(begin) && line.contains(part) {
                     return Some(line);
                 }
@@ -101,7 +101,7 @@ impl Up {
             None
         };
         let line = timeout(PATIENCE, line).await.ok().flatten();
-        line.ok_or_else(|| anyhow!("`{begin} ... {part}` was not said: {:#?}", self.heard))
+        line.ok_or_else(|| anyhow!("`{begin} ... {part}` was not said: {:#?}", self.printed))
     }
 
     /// The process of a service, once it is started.
@@ -137,9 +137,9 @@ impl Drop for Up {
         let _ = self.child.kill();
         let _ = self.child.wait();
         while let Ok(line) = self.said.try_recv() {
-            self.heard.push(line);
+            self.printed.push(line);
         }
-        for line in &self.heard {
+        for line in &self.printed {
             println!("{line}");
         }
     }
@@ -261,8 +261,9 @@ async fn two_roles_meet() -> anyhow::Result<()> {
     let wrong: Vec<_> = findings.iter().filter(|f| f["verdict"] == "wrong").collect();
     ensure!(wrong.is_empty() && output.status.success(), "{wrong:#?}");
     for part in ["controller `main`", "detector `ground`", "relay `drone`"] {
-        let told = |f: &serde_json::Value| f["finding"].as_str().is_some_and(|f| f.contains(part));
-        ensure!(findings.iter().any(told), "`{part}` is not in {text}");
+        let names_it =
+            |f: &serde_json::Value| f["finding"].as_str().is_some_and(|f| f.contains(part));
+        ensure!(findings.iter().any(names_it), "`{part}` is not in {text}");
     }
 
     // The last one first, and none is left.
@@ -326,7 +327,7 @@ command = ["./own.sh"]
     let again = up.process("detector:").await?;
     ensure!(again != detector && test_kill_process(again).is_ok(), "{again:?}");
     let code = up.stop()?;
-    ensure!(code == Some(0), "{code:?}: {:#?}", up.heard);
+    ensure!(code == Some(0), "{code:?}: {:#?}", up.printed);
     Ok(())
 }
 
@@ -388,8 +389,8 @@ set = ["autopilot.address=udpin:127.0.0.1:{autopilot}", "start=takeoff"]
             up.says("the `alight up` before this one was killed", "starts no motors").await?;
         }
         let started = up.says("controller:", "started as process").await?;
-        let told = started.split_once("start = ").map(|(_, mode)| mode.trim_matches('"'));
-        ensure!(told == mode, "{started}");
+        let started_mode = started.split_once("start = ").map(|(_, mode)| mode.trim_matches('"'));
+        ensure!(started_mode == mode, "{started}");
         let code = up.stop_by(signal)?;
         ensure!(code == (signal != Signal::KILL).then_some(0), "{code:?}");
     }
@@ -513,7 +514,7 @@ impl Drop for WebServer {
 }
 
 #[test]
-fn another_program_where_tools_connect_is_told_at_the_start() -> anyhow::Result<()> {
+fn another_program_where_tools_connect_is_reported_at_the_start() -> anyhow::Result<()> {
     let server = WebServer::start()?;
     let port = server.port.to_string();
     let address = format!("127.0.0.1:{port}");
@@ -583,7 +584,7 @@ async fn services_outlast_it() -> anyhow::Result<()> {
                 drop(sender.send(line));
             }
         })?;
-        let tells = async {
+        let reports = async {
             while let Some(line) = said.recv().await {
                 if line.contains("ERROR") && line.contains("answers `HTTP/1.0 400") {
                     return Ok(());
@@ -591,7 +592,7 @@ async fn services_outlast_it() -> anyhow::Result<()> {
             }
             anyhow::bail!("{arguments:?} ended")
         };
-        timeout(PATIENCE, tells).await??;
+        timeout(PATIENCE, reports).await??;
         services.push(service);
     }
     tokio::time::sleep(Duration::from_secs(1)).await;

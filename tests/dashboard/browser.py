@@ -31,8 +31,8 @@ SPREAD = """(selector) => {
 
 # How the lines of elements go: `line-through` where they are struck through.
 LINES = "(selector) => [...document.querySelectorAll(selector)].map((it) => getComputedStyle(it).textDecorationLine)"
-# What tells of the landing, each in its own way, and has something to tell throughout.
-TELLING = ["#height", "#why", "#mode", "#detector-why", "#detectors td", "#services td", "#recorders", "#checks span", "#strips span:last-child", "#video-text"]
+# Elements that show the state of the landing, each in its own way, and are never empty.
+STATE_ELEMENTS = ["#height", "#why", "#mode", "#detector-why", "#detectors td", "#services td", "#recorders", "#checks span", "#strips span:last-child", "#video-text"]
 CONNECTED = "document.getElementById('connection').textContent === 'connected'"
 # A button that is pressed shortly and then held, before the server has answered the first press.
 TWICE = """(button) => {
@@ -58,7 +58,7 @@ def accessibility(page, names):
     if AXE is None:
         return None
     page.evaluate(AXE.read_text())
-    # While it looks, the page cannot: what was told meanwhile may be old by the end. Only what is found each time is wrong.
+    # The page is blocked during the check, so values on it may be old by the end. Only violations of every attempt count.
     wrong = None
     for _ in range(ATTEMPTS):
         found = page.evaluate(VIOLATIONS)
@@ -120,7 +120,7 @@ def give(page, command, down, up):
 
 def lose_link_while_held(page):
     """Holds a button while the link stalls: nothing may be sent once buttons cannot be used."""
-    # Without the focus, which some browsers give to no button: one that loses it hears of that.
+    # Without the focus, which some browsers give to no button: a button that loses it gets an event.
     page.evaluate("document.activeElement.blur()")
     page.locator("button[data-command=hold]").dispatch_event("keydown", {"key": " "})
     # The link stalls as the second begins: before that is over the page counts as cut off.
@@ -145,8 +145,8 @@ def lose_answer(page):
         wait(page, replied("Sent, waiting"), 2)
         page.keyboard.up("Space")
         wait(page, "!" + replied("Sent, waiting"), 10)
-    told = text(page, "#reply")
-    assert told.startswith("hold: ") and "may have been carried out" in told, told
+    reply = text(page, "#reply")
+    assert reply.startswith("hold: ") and "may have been carried out" in reply, reply
     wait(page, CONNECTED, 10)
 
 
@@ -163,7 +163,7 @@ def refuse_a_third(browser):
 
 
 def meet_another_vehicle(browser):
-    """A page whose server is replaced by that of another vehicle begins anew, and tells of the command that the one before did not answer."""
+    """A page whose server is replaced by that of another vehicle reloads, and reports the command that the previous server did not answer."""
     page, connections = browser.new_page(), []
 
     def connect(socket):
@@ -172,7 +172,7 @@ def meet_another_vehicle(browser):
         # A command gets no answer.
         socket.on_message(lambda said: None if json.loads(said)["kind"] == "command" else server.send(said))
         if len(connections) > 1:
-            server.on_message(lambda told: socket.send(re.sub('"vehicle":"[^"]+"', '"vehicle":"kestrel"', told)))
+            server.on_message(lambda message: socket.send(re.sub('"vehicle":"[^"]+"', '"vehicle":"kestrel"', message)))
 
     page.route_web_socket("**/ws", connect)
     page.goto(URL)
@@ -185,8 +185,8 @@ def meet_another_vehicle(browser):
     with page.expect_navigation():
         connections[0].close()
     wait(page, "document.getElementById('vehicle-name').textContent === 'kestrel'", 10)
-    told = text(page, "#reply")
-    assert told.startswith(f"{name}: hold: ") and "may have been carried out" in told, told
+    reply = text(page, "#reply")
+    assert reply.startswith(f"{name}: hold: ") and "may have been carried out" in reply, reply
     begun = page.evaluate("performance.getEntriesByType('navigation')[0].type")
     assert begun == "reload", f"the page of another vehicle goes on ({begun})"
     page.screenshot(path=FOLDER / "another-vehicle.png")
@@ -296,7 +296,7 @@ def main():
             holds = "===" if command == "hold" else "!=="
             wait(page, f"document.getElementById('phase').textContent {holds} 'Holding the position'")
         page.screenshot(path=FOLDER / "holding.png", full_page=True)
-        for selector in TELLING:
+        for selector in STATE_ELEMENTS:
             wait(page, f"/^none(,none)*$/.test(({LINES})({json.dumps(selector)}))", 10)
 
         page.locator("button[data-command=hold]").evaluate(TWICE)
@@ -338,7 +338,7 @@ def main():
         accessibility(page, ["button-name"])
         assert page.locator("button[data-command=abort]").is_disabled(), "a button can be used without a connection"
         assert "was:" in text(page, "#phase"), text(page, "#phase")
-        for selector in TELLING:
+        for selector in STATE_ELEMENTS:
             lines = page.evaluate(LINES, selector)
             assert lines and set(lines) == {"line-through"}, f"{selector} is not struck through: {lines}"
         time.sleep(1.5)

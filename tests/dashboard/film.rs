@@ -30,10 +30,10 @@ const PATIENCE: Duration = Duration::from_secs(30);
 /// the detector that is not in use is wrong.
 const SQUARE: usize = 80;
 const SPARE_SHIFT: f64 = 40.0;
-/// Of so many frames in a row the first are told by both detectors, the next by none, the last by the one that is not in use.
+/// Of so many frames in a row the first have detections of both detectors, the next of none, the last of the one that is not in use.
 const CYCLE: u64 = 40;
 const BOTH: u64 = 24;
-const NOBODY: u64 = 32;
+const NONE: u64 = 32;
 
 /// What is filmed.
 #[derive(Clone, Copy, Debug)]
@@ -84,8 +84,8 @@ fn ground([width, height]: [usize; 2]) -> Vec<u8> {
     (0..width * height).map(|index| at(index) + noise()).collect()
 }
 
-/// What a detector tells of a frame: the square, as far aside as it is wrong.
-fn told(detector: &str, header: &FrameHeader, shift_px: f64) -> Detections {
+/// A detector's message on a frame: the square, shifted by the detector's error.
+fn detections_of(detector: &str, header: &FrameHeader, shift_px: f64) -> Detections {
     let [left, top] = place(header.sequence).map(|it| it as f64 - 0.5);
     let (left, edge) = (left + shift_px, SQUARE as f64);
     let corners = [[0.0, 0.0], [edge, 0.0], [edge, edge], [0.0, edge]];
@@ -138,7 +138,7 @@ async fn play(node: Node, film: Film) -> anyhow::Result<()> {
         write_square(&mut loan, width, sequence);
         frames.publish(&header, loan).await;
         if !film.is_difficult {
-            main.publish(&told("main", &header, 0.0)).await;
+            main.publish(&detections_of("main", &header, 0.0)).await;
             continue;
         }
         let (main, spare) = (Arc::clone(&main), Arc::clone(&spare));
@@ -146,12 +146,12 @@ async fn play(node: Node, film: Film) -> anyhow::Result<()> {
         let delay = Duration::from_millis(sequence * 37 % 71);
         tokio::spawn(async move {
             let at = sequence % CYCLE;
-            if !(BOTH..NOBODY).contains(&at) {
-                spare.publish(&told("spare", &header, SPARE_SHIFT)).await;
+            if !(BOTH..NONE).contains(&at) {
+                spare.publish(&detections_of("spare", &header, SPARE_SHIFT)).await;
             }
             sleep(delay).await;
             if at < BOTH {
-                main.publish(&told("main", &header, 0.0)).await;
+                main.publish(&detections_of("main", &header, 0.0)).await;
             }
         });
     }
@@ -253,7 +253,7 @@ pub(crate) async fn overlay(frames: u64) -> anyhow::Result<Option<Value>> {
     ensure!(count("frames")? >= frames, "{read}");
     ensure!(count("coloured_elsewhere")? == 0 && count("of_another_frame")? == 0, "{read}");
     ensure!(read["corner_max_px"].as_f64().is_some_and(|px| px < 1.0), "{read}");
-    // All three kinds of frames were drawn; those that both tell of, three of five, are shown with it.
+    // All three kinds of frames were drawn; those with detections of both, three of five, are shown with them.
     ensure!(count("with_overlay")? * 10 >= frames * 3, "{read}");
     ensure!(count("bare")? > 0 && count("of_another_detector")? > 0, "{read}");
     Ok(Some(read))

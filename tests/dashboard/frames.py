@@ -17,9 +17,9 @@ URL, SECONDS, FRAMES = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
 TOKEN = sys.argv[4] if len(sys.argv) > 4 else None
 PATIENCE_S = 60
 
-# Notes what the page hears of each drawn picture: its number, when it was made and taken (ms of the server's clock), and when this was heard.
+# Notes the page's message on each drawn picture: its number, when it was made and taken (ms of the server's clock), and when this message came.
 LISTEN = """
-window.toldOf = new Map();
+window.drawn = new Map();
 const Plain = window.Worker;
 window.Worker = class extends Plain {
   constructor(...args) {
@@ -28,7 +28,7 @@ window.Worker = class extends Plain {
       if (data.kind !== 'drawn') return;
       const { sequence, shown_ms, taken_ms, found_sequence, width, height } = data.header;
       window.size = [width, height];
-      window.toldOf.set(sequence & 0xffff, { shown: shown_ms, taken: taken_ms, at: performance.now(), sequence, found_sequence });
+      window.drawn.set(sequence & 0xffff, { shown: shown_ms, taken: taken_ms, at: performance.now(), sequence, found_sequence });
     });
   }
 };
@@ -157,7 +157,7 @@ def main():
             page.locator("#token").fill(TOKEN)
             page.locator("#login button").click()
         until = time.monotonic() + PATIENCE_S
-        while not page.evaluate("window.toldOf.size > 5"):
+        while not page.evaluate("window.drawn.size > 5"):
             assert time.monotonic() < until, "no picture is drawn"
             time.sleep(0.1)
         offset, error = offset_ms(page)
@@ -168,9 +168,9 @@ def main():
             time.sleep(0.5)
         took_s = time.monotonic() - began
         drift = offset_ms(page)[0] - offset
-        seen, told, unreadable = page.evaluate("[window.seen, [...window.toldOf], window.unreadable ?? 0]")
+        seen, drawn, unreadable = page.evaluate("[window.seen, [...window.drawn], window.unreadable ?? 0]")
         browser.close()
-    told = dict(told)
+    drawn = dict(drawn)
     measured = {"frames": len(seen), "seconds": round(took_s, 1), "unreadable": unreadable}
     if SECONDS <= 0:
         assert all(it["isInPlace"] for it in seen), "a picture is not where its pixels must be"
@@ -180,16 +180,16 @@ def main():
             "bare": sum(it["used"] is None and it["spare"] is None for it in seen),
             "coloured_elsewhere": sum(it["elsewhere"] > 0 for it in seen),
             "corner_max_px": round(max((it["used"] if it["used"] is not None else it["spare"] or 0.0) for it in seen), 2),
-            "of_another_frame": sum(it["found_sequence"] not in (None, it["sequence"]) for it in told.values()),
+            "of_another_frame": sum(it["found_sequence"] not in (None, it["sequence"]) for it in drawn.values()),
         }
     else:
-        known = [(it["at"], told[it["number"]]) for it in seen if it["number"] in told]
+        known = [(it["at"], drawn[it["number"]]) for it in seen if it["number"] in drawn]
         readable = [at + offset - it["shown"] for at, it in known]
         measured |= {
             "rate_hz": round(len(seen) / took_s, 1),
             "clock_known_to_ms": round(error, 2),
             "clock_drift_ms": round(drift, 2),
-            "sent_to_heard_ms": quantiles([it["at"] + offset - it["shown"] for it in told.values()]),
+            "sent_to_reported_ms": quantiles([it["at"] + offset - it["shown"] for it in drawn.values()]),
             "sent_to_readable_ms": quantiles(readable),
             "light_to_readable_ms": quantiles([at + offset - it["taken"] for at, it in known]),
             "growth_ms_per_min": slope_per_min([at for at, _ in known], readable),

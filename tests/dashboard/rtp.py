@@ -52,7 +52,7 @@ with tempfile.TemporaryDirectory() as folder:
     said = log.read()
 assert opened, f"OpenCV does not open it: {said}"
 steps = [after - before for before, after in zip(numbers, numbers[1:])]
-told = {
+result = {
     "pictures": len(numbers),
     "size": [width, height],
     "first_s": round(first_s, 2),
@@ -60,5 +60,5 @@ told = {
     "smallest_step": min(steps),
     "said": said,
 }
-print(json.dumps(told))
+print(json.dumps(result))
 sys.exit(0 if len(numbers) == pictures and min(steps) > 0 and not said else 1)

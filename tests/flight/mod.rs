@@ -17,10 +17,10 @@ use tokio::time::timeout;
 
 /// Longest wait for anything; a landing takes a fifth of it.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
-/// Longest time that a landing which is told to end may take.
+/// Longest time that a landing may take to end after a command.
 const MAX_END: Duration = Duration::from_secs(15);
 /// Furthest from the pad's centre that a landing may end, whatever happened on the way; 0.05 m is the worst
-/// that `docs/results.md` tells of landings without a fault.
+/// of the landings without a fault in `docs/results.md`.
 const MAX_ERROR_M: f64 = 0.1;
 /// The simulated camera with a quarter of its pixels and without a camera's processing: what is tested is how processes fit
 /// together, on machines that may have no time for the rest.
@@ -286,7 +286,7 @@ impl Landing {
         Ok(result)
     }
 
-    /// Waits for the result and the exit status, which tells of a recording that lacks something, and checks that it landed on
+    /// Waits for the result and the exit status, which reports an incomplete recording, and checks that it landed on
     /// the pad.
     pub(crate) async fn lands_with_losses(
         self,

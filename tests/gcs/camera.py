@@ -72,8 +72,8 @@ def find_camera(link, began):
     if heartbeat is None:
         return {"problem": "no heartbeat of a camera"}
     link.vehicle = heartbeat.get_srcSystem()
-    heard = time.monotonic()
-    found = {"heartbeat_s": round(heard - began, 2)}
+    connected = time.monotonic()
+    found = {"heartbeat_s": round(connected - began, 2)}
     information = None
     for attempt in range(ATTEMPTS):
         if attempt % 2 == 0:
@@ -104,7 +104,7 @@ def find_camera(link, began):
             return {**found, "problem": f"no {kind}"}
         if kind == "VIDEO_STREAM_INFORMATION":
             found["stream"] = {"type": message.type, "uri": message.uri}
-    found["found_s"] = round(time.monotonic() - heard, 2)
+    found["found_s"] = round(time.monotonic() - connected, 2)
     if link.loss == 0 and found["found_s"] > MAX_FOUND_S:
         found["problem"] = f"it took more than {MAX_FOUND_S} s"
     return found

@@ -134,7 +134,7 @@ def main():
         elapsed = time.monotonic() - began
         if elapsed > options.timeout or (not station.missing() and elapsed >= options.duration):
             break
-        # Nobody can be asked before somebody was heard.
+        # Requests need a system that has sent a packet.
         if station.packets and time.monotonic() - asked >= 1.0:
             asked = time.monotonic()
             station.ask()

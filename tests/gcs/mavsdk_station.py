@@ -26,7 +26,7 @@ except (ImportError, OSError) as problem:
 
 
 def first(subscribe, seconds, fits=lambda it: True):
-    """The first of what is told that fits; none after these seconds."""
+    """The first published value that fits; none after these seconds."""
     came, found = threading.Event(), []
 
     def take(it, _):
@@ -40,11 +40,11 @@ def first(subscribe, seconds, fits=lambda it: True):
 
 
 def stream(camera, component, seconds):
-    """The address of the camera's video, as soon as MAVSDK has heard of it; none after these seconds."""
+    """The address of the camera's video, as soon as MAVSDK has received it; none after these seconds."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         try:
-            # Before it has heard of one it tells of an empty one.
+            # Before it has received an address it returns an empty one.
             if uri := camera.get_video_stream_info(component).settings.uri:
                 return uri
         except CameraError:
@@ -72,7 +72,7 @@ def main():
     found["connected_s"] = round(connected - began, 3)
 
     telemetry = Telemetry(system)
-    # ArduPilot tells it to who asks.
+    # ArduPilot sends the position only on request.
     telemetry.set_rate_position(5.0)
     position = first(telemetry.subscribe_position, options.timeout)
     found["position_s"] = round(time.monotonic() - connected, 3)

@@ -61,7 +61,7 @@ def load(link):
     """The values by place, as QGroundControl gets them."""
     mav = link.connection.mav
     values, reads, asked, lists = {}, {}, set(), 0
-    began = heard = time.monotonic()
+    began = received = time.monotonic()
     while time.monotonic() - began < PATIENCE_S:
         count = next((it.param_count for it in values.values()), None)
         if count is not None and len(values) == count:
@@ -71,19 +71,19 @@ def load(link):
                 raise AssertionError(f"no parameter after {LISTS} requests for the list")
             lists += 1
             link.send(mav.param_request_list_send, link.vehicle, 0)
-        elif time.monotonic() - heard >= VALUE_S or asked:
-            if time.monotonic() - heard >= VALUE_S:
+        elif time.monotonic() - received >= VALUE_S or asked:
+            if time.monotonic() - received >= VALUE_S:
                 asked.clear()
-                heard = time.monotonic()
+                received = time.monotonic()
             missing = [place for place in range(count) if place not in values and place not in asked]
             for place in missing[: BATCH - len(asked)]:
                 reads[place] = reads.get(place, 0) + 1
                 assert reads[place] <= READS, f"parameter {place} did not come after {READS} requests"
                 asked.add(place)
                 link.send(mav.param_request_read_send, link.vehicle, COMPANION, b"", place)
-        value = link.next("PARAM_VALUE", LIST_S if count is None else max(0.01, heard + VALUE_S - time.monotonic()))
+        value = link.next("PARAM_VALUE", LIST_S if count is None else max(0.01, received + VALUE_S - time.monotonic()))
         if value is not None:
-            heard = time.monotonic()
+            received = time.monotonic()
             asked.discard(value.param_index)
             assert value.param_type == mavlink.MAV_PARAM_TYPE_REAL32, value
             values[value.param_index] = value
@@ -131,18 +131,18 @@ def main():
     values = load(link)
     loaded_s = round(time.monotonic() - began, 2)
     named = {value.param_id: value for value in values.values()}
-    told = {"loss": options.loss, "seed": options.seed, "parameters": len(values), "names": len(named), "loaded_s": loaded_s}
+    result = {"loss": options.loss, "seed": options.seed, "parameters": len(values), "names": len(named), "loaded_s": loaded_s}
     before = named[options.name]
-    told["value"] = before.param_value
-    told["set"] = [set_one(link, before, wanted) for wanted in (before.param_value + 1, float("nan"))]
+    result["value"] = before.param_value
+    result["set"] = [set_one(link, before, wanted) for wanted in (before.param_value + 1, float("nan"))]
     # Of a text of several packets a lossy link may lose one or all.
-    is_kept = all(it["after"] == before.param_value for it in told["set"])
+    is_kept = all(it["after"] == before.param_value for it in result["set"])
     if options.loss == 0:
-        is_kept = is_kept and all(options.name in it["said"] for it in told["set"])
+        is_kept = is_kept and all(options.name in it["said"] for it in result["set"])
     is_quick = loaded_s <= (MAX_LOADED_S if options.loss == 0 else MAX_LOADED_LOSSY_S)
-    told["ok"] = is_kept and is_quick and len(named) == len(values)
-    print(json.dumps(told))
-    return 0 if told["ok"] else 1
+    result["ok"] = is_kept and is_quick and len(named) == len(values)
+    print(json.dumps(result))
+    return 0 if result["ok"] else 1
 
 
 if __name__ == "__main__":

@@ -142,7 +142,7 @@ def main():
     quiet = pauses(station.beats)
     sent, flooded = flood(station, options.flood_rate, options.flood_s)
     answered["after the flood"] = station.is_answered(station.packet())
-    told = {
+    result = {
         "answered": answered,
         "received_unsigned": station.unsigned,
         "forged": sent,
@@ -153,9 +153,9 @@ def main():
         },
     }
     expected = {name: name in ("signed", "after the flood") for name in answered}
-    told["ok"] = answered == expected and station.unsigned == 0 and len(flooded) > 0
-    print(json.dumps(told))
-    return 0 if told["ok"] else 1
+    result["ok"] = answered == expected and station.unsigned == 0 and len(flooded) > 0
+    print(json.dumps(result))
+    return 0 if result["ok"] else 1
 
 
 if __name__ == "__main__":

@@ -167,8 +167,8 @@ pub(crate) async fn cut(radio: Radio, seed: u64, seconds: f64) -> anyhow::Result
     let during = local.take();
     site.air.cut(false)?;
     let joined = Instant::now();
-    let heard = site.node.subscriber(topic::DETECTIONS, &["ground"]).await?;
-    let again = timeout(Duration::from_secs(15), heard.next()).await.is_ok();
+    let detections = site.node.subscriber(topic::DETECTIONS, &["ground"]).await?;
+    let again = timeout(Duration::from_secs(15), detections.next()).await.is_ok();
     let back_s = again.then(|| joined.elapsed().as_secs_f64());
     let is_used = |s: &ControllerStatus| s.active_detector.as_deref() == Some("ground");
     let used = until(&statuses, "the one on the ground is used again", is_used);
@@ -288,7 +288,7 @@ impl Watch {
             tokio::select! {
                 () = tokio::time::sleep_until(end) => break,
                 Some(truth) = self.truths.next() => touchdown = truth.touchdown,
-                Some(health) = self.healths.next() => flight.hear(&health),
+                Some(health) = self.healths.next() => flight.take_health(&health),
                 Some(status) = self.statuses.next() => {
                     flight.why = format!("{}: {}", status.phase, status.why);
                     if status.finished && done.is_none() {
@@ -303,7 +303,7 @@ impl Watch {
         }
         site.all_run()?;
         ensure!(done.is_some(), "no end of the flight: {flight}");
-        // The truth may be heard after the status.
+        // The truth may be received after the status.
         flight.landed = disarmed && touchdown.is_some();
         flight.error_m = touchdown.map_or(f64::NAN, |touchdown| touchdown.error_m);
         Ok(flight)
@@ -311,7 +311,7 @@ impl Watch {
 }
 
 impl Flight {
-    fn hear(&mut self, health: &Health) {
+    fn take_health(&mut self, health: &Health) {
         let latency = |name: &str| {
             let found = health.latencies.iter().find(|latency| latency.name == name);
             found.map(|latency| [latency.p50_ms, latency.p99_ms])

@@ -77,10 +77,10 @@ fn stamped(sequence: u64) -> FrameAck {
     FrameAck { sequence, stamp_ns: now_ns(), ..FrameAck::sample() }
 }
 
-/// The drone's end: sends as the state of the vehicle goes, and hears what comes as detections do.
+/// The drone's end: sends in the way of the vehicle's state, and receives in the way of detections.
 pub(crate) async fn beacon(node: &Node) -> anyhow::Result<Shared> {
     let sender = node.publisher(topic::FRAME_ACK, &[DRONE]).await?;
-    let heard = node.subscriber(topic::FRAME_ACK, &[GROUND]).await?;
+    let subscriber = node.subscriber(topic::FRAME_ACK, &[GROUND]).await?;
     let back = Shared::default();
     tokio::spawn(async move {
         let mut ticks = interval(PERIOD);
@@ -91,7 +91,7 @@ pub(crate) async fn beacon(node: &Node) -> anyhow::Result<Shared> {
     });
     let times = Arc::clone(&back);
     tokio::spawn(async move {
-        while let Some(message) = heard.next().await {
+        while let Some(message) = subscriber.next().await {
             note(&times, message.sequence, message.stamp_ns);
         }
     });

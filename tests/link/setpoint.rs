@@ -1,8 +1,7 @@
 //! One host: from a frame to the setpoint, without the time the detector needs, while the simulator flies.
 //!
-//! This process receives the frames as the detector does, which is when the clock starts: what came before is the
-//! simulator's drawing, in the place of a camera's exposure. The detector tells with its detections how long its stages
-//! took, and the controller publishes its target right after it has sent the setpoint. How long a frame is under way in
+//! This process receives the frames as the detector does, which is when the clock starts: the time before is the
+//! simulator's drawing, in the place of a camera's exposure. The detector states the durations of its stages with its detections, and the controller publishes its target right after it has sent the setpoint. How long a frame is under way in
 //! shared memory is the trial `onehost`.
 
 use std::collections::BTreeMap;
@@ -18,7 +17,7 @@ use crate::link::site::{Radio, Site};
 
 /// Longest flight.
 const PATIENCE: Duration = Duration::from_secs(90);
-/// The age of a detection is told in milliseconds: a frame's stamp is found again within this time.
+/// The age of a detection is published in milliseconds: a frame's stamp is found again within this time.
 const ROUNDING_NS: i64 = 2_000;
 
 /// What was measured.
@@ -49,7 +48,7 @@ struct Journal {
     arrived: BTreeMap<i64, i64>,
     searched: BTreeMap<i64, i64>,
     sent: BTreeMap<i64, i64>,
-    /// Setpoints that tell of a frame again.
+    /// Setpoints for a frame that has one already.
     without_marker: usize,
 }
 
@@ -62,7 +61,7 @@ impl Journal {
     fn target(&mut self, target: &TargetEstimate) {
         if let Some(age_ms) = target.age_ms.filter(|_| target.velocity_ned_m_s.is_some()) {
             let stamp_ns = target.stamp_ns - (age_ms * 1e6) as i64;
-            // A frame without a marker has a setpoint as well, and its target still tells of the last frame with one.
+            // A frame without a marker has a setpoint as well, and its target still belongs to the last frame with one.
             if self.sent.range(around(stamp_ns)).next().is_none() {
                 self.sent.insert(stamp_ns, target.stamp_ns);
             } else {

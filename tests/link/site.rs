@@ -101,17 +101,17 @@ impl Air {
         Ok(Some(air))
     }
 
-    /// Changes how the link is.
+    /// Changes the properties of the link.
     pub(crate) fn set(&mut self, radio: Radio) -> anyhow::Result<()> {
         let Radio { rate_mbit, delay_ms, jitter_ms, loss, marks, .. } = radio;
-        self.tell(&serde_json::json!({
+        self.change(&serde_json::json!({
             "rate_mbit": rate_mbit, "delay_ms": delay_ms, "jitter_ms": jitter_ms, "loss": loss, "marks": marks,
         }))
     }
 
     /// Cuts the link, or joins it again.
     pub(crate) fn cut(&mut self, is_cut: bool) -> anyhow::Result<()> {
-        self.tell(&serde_json::json!({ "cut": is_cut }))
+        self.change(&serde_json::json!({ "cut": is_cut }))
     }
 
     /// A command that runs on the ground.
@@ -122,7 +122,7 @@ impl Air {
         command
     }
 
-    fn tell(&mut self, settings: &serde_json::Value) -> anyhow::Result<()> {
+    fn change(&mut self, settings: &serde_json::Value) -> anyhow::Result<()> {
         writeln!(self.settings.as_mut().context("the emulator's input")?, "{settings}")?;
         let mut line = String::new();
         ensure!(self.answers.read_line(&mut line)? > 0, "the link's emulator ended");

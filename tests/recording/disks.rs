@@ -1,4 +1,4 @@
-//! Disks that are full, read-only, removed or stand still, and the flight beside them.
+//! Records a flight to disks that are full, read-only, removed or do not respond.
 
 use std::fs::File;
 use std::path::Path;
@@ -15,12 +15,12 @@ use tokio::time::{Instant, sleep, timeout};
 use crate::flight::{ALIGHT, LONG, Landing, PATIENCE, output_of};
 use crate::recorders::{Contents, command};
 
-/// Longest time until a disk that fails is told.
-const MAX_UNTOLD: Duration = Duration::from_secs(2);
-/// How long a disk stands still.
+/// Longest time until a failure of the disk is reported.
+const MAX_UNREPORTED: Duration = Duration::from_secs(2);
+/// How long a disk does not respond.
 const STALL: Duration = Duration::from_secs(5);
-/// Maximum growth of a recorder that waits for its disk, in MB; of `max_waiting_mb` = 16 half may wait, beside what is being
-/// written.
+/// Maximum growth of a recorder that waits for its disk, in MB; of `max_waiting_mb` = 16 half may wait, in addition to the data
+/// that are being written.
 const MAX_HELD_MB: f64 = 32.0;
 
 /// A small disk of its own, until it is dropped.
@@ -123,15 +123,16 @@ pub(crate) async fn fail() -> anyhow::Result<()> {
     let landing = Landing::start(&["--seed", "6", "--set", slowly, "--record", name]).await?;
     let statuses = landing.node.subscriber(topic::RECORDER_STATUS, &[]).await?;
     let healths = landing.node.subscriber(topic::HEALTH, &["recorder", "main"]).await?;
-    told(&statuses, "the disk is read-only", |s| has_problem(s, "Read-only")).await?;
+    reported(&statuses, "the disk is read-only", |s| has_problem(s, "Read-only")).await?;
     disk.change("rw")?;
-    told(&statuses, "it records", |s| s.problem.is_none() && s.bytes > 0).await?;
-    told(&statuses, "the disk is full", |s| has_problem(s, "No space left")).await?;
+    reported(&statuses, "it records", |s| s.problem.is_none() && s.bytes > 0).await?;
+    reported(&statuses, "the disk is full", |s| has_problem(s, "No space left")).await?;
     disk.change("rw,size=400m")?;
-    let again = told(&statuses, "it records again", |s| s.problem.is_none() && s.bytes > 0).await?;
+    let again =
+        reported(&statuses, "it records again", |s| s.problem.is_none() && s.bytes > 0).await?;
     std::fs::remove_dir_all(path.join("flights"))?;
-    told(&statuses, "the file is removed", |s| has_problem(s, "removed")).await?;
-    told(&statuses, "it records again", |s| s.problem.is_none() && s.bytes > 0).await?;
+    reported(&statuses, "the file is removed", |s| has_problem(s, "removed")).await?;
+    reported(&statuses, "it records again", |s| s.problem.is_none() && s.bytes > 0).await?;
     let lost = again.lost();
     ensure!(lost > 100, "{again:?}");
     let in_health = timeout(PATIENCE, async {
@@ -156,7 +157,7 @@ fn has_problem(status: &RecorderStatus, part: &str) -> bool {
     status.problem.as_ref().is_some_and(|problem| problem.contains(part))
 }
 
-async fn told(
+async fn reported(
     statuses: &Subscriber<RecorderStatus>,
     what: &str,
     holds: impl Fn(&RecorderStatus) -> bool,
@@ -175,7 +176,7 @@ async fn told(
     found.with_context(|| format!("waiting until {what}; last: {last:?}"))
 }
 
-/// A landing is recorded twice: as usual, and with every pixel at 30 frames a second to a disk that is read-only, stands still, is
+/// A landing is recorded twice: as usual, and with every pixel at 30 frames a second to a disk that is read-only, does not respond, is
 /// full, from which the file is removed, and that is taken away. Flown again without any recorder, the same decisions are
 /// made on the same events, to the bit.
 pub(crate) async fn beside_a_flight() -> anyhow::Result<()> {
@@ -195,15 +196,15 @@ pub(crate) async fn beside_a_flight() -> anyhow::Result<()> {
     landing.descends_below(9.0).await?;
     command(&landing, ControllerCommand::Hold).await?;
     landing.status("it holds", |s| s.phase == Phase::Hold).await?;
-    told(&statuses, "the disk is read-only", |s| has_problem(s, "Read-only")).await?;
+    reported(&statuses, "the disk is read-only", |s| has_problem(s, "Read-only")).await?;
     disk.change("rw")?;
     let is_well = |s: &RecorderStatus| s.problem.is_none() && s.bytes > 0;
-    told(&statuses, "it records", is_well).await?;
+    reported(&statuses, "it records", is_well).await?;
 
     let before_mb = resident_mb(pid)?;
     let frozen = disk.frozen()?;
     let began = Instant::now();
-    told(&statuses, "it stands still", |s| has_problem(s, "taken nothing")).await?;
+    reported(&statuses, "it does not respond", |s| has_problem(s, "taken nothing")).await?;
     let still = began.elapsed();
     let mut max_mb = before_mb;
     while began.elapsed() < STALL {
@@ -211,39 +212,39 @@ pub(crate) async fn beside_a_flight() -> anyhow::Result<()> {
         sleep(Duration::from_millis(50)).await;
     }
     drop(frozen);
-    let after = told(&statuses, "it records again", is_well).await?;
+    let after = reported(&statuses, "it records again", is_well).await?;
 
     fill(&path.join("filler"))?;
     let began = Instant::now();
-    told(&statuses, "the disk is full", |s| has_problem(s, "No space left")).await?;
+    reported(&statuses, "the disk is full", |s| has_problem(s, "No space left")).await?;
     let full = began.elapsed();
     std::fs::remove_file(path.join("filler"))?;
     std::fs::remove_dir_all(path.join("flights"))?;
-    told(&statuses, "it records again", is_well).await?;
+    reported(&statuses, "it records again", is_well).await?;
 
     let began = Instant::now();
     std::fs::remove_dir_all(path.join("flights"))?;
-    told(&statuses, "the file is removed", |s| has_problem(s, "removed")).await?;
+    reported(&statuses, "the file is removed", |s| has_problem(s, "removed")).await?;
     let removed = began.elapsed();
-    told(&statuses, "it records again", is_well).await?;
+    reported(&statuses, "it records again", is_well).await?;
 
     let began = Instant::now();
     disk.unmount()?;
-    told(&statuses, "the disk is taken away", |s| has_problem(s, "removed")).await?;
+    reported(&statuses, "the disk is taken away", |s| has_problem(s, "removed")).await?;
     let taken_away = began.elapsed();
-    told(&statuses, "it records again", is_well).await?;
+    reported(&statuses, "it records again", is_well).await?;
 
     let controller = latest(&healths).await?;
     command(&landing, ControllerCommand::Resume).await?;
     landing.lands().await?;
     let lost = after.lost();
     println!(
-        "told after {still:.1?} (stands still), {full:.1?} (full), {removed:.1?} (removed), {taken_away:.1?} (unmounted); held {:.0} MB more than {before_mb:.0} MB; {lost} messages lost in {STALL:?}; drops of the controller: {:?}",
+        "reported after {still:.1?} (does not respond), {full:.1?} (full), {removed:.1?} (removed), {taken_away:.1?} (unmounted); held {:.0} MB more than {before_mb:.0} MB; {lost} messages lost in {STALL:?}; drops of the controller: {:?}",
         max_mb - before_mb,
         controller.drops,
     );
-    for told in [still, full, removed, taken_away] {
-        ensure!(told < MAX_UNTOLD, "it was told after {told:?}");
+    for reported_after in [still, full, removed, taken_away] {
+        ensure!(reported_after < MAX_UNREPORTED, "it was reported after {reported_after:?}");
     }
     ensure!(lost > 0, "nothing was lost, so that the bound was not reached");
     ensure!(max_mb - before_mb < MAX_HELD_MB, "{max_mb} MB after {before_mb} MB");

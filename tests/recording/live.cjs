@@ -1,6 +1,6 @@
 #!/usr/bin/env node
-// Follows a flight with a client that is none of ours: Foxglove's `@foxglove/ws-protocol`, which its own viewer used, with
-// `protobufjs` for the types that the recorder tells of.
+// Follows a flight with an independent client: Foxglove's `@foxglove/ws-protocol`, which its own viewer used, with
+// `protobufjs` for the types that the recorder describes.
 //
 // It looks for a picture with the stamp of each of some overlays, and prints what it found as one JSON object.
 //
@@ -85,9 +85,9 @@ function connect() {
   client.on("close", () => server && fail("the recorder closed the connection"));
   client.on("serverInfo", (info) => (server = info));
   client.on("status", (status) => (warning = status.message));
-  client.on("advertise", (told) => {
-    for (const channel of told) {
-      if (channels.has(channel.topic)) fail(`${channel.topic} is told twice`);
+  client.on("advertise", (advertised) => {
+    for (const channel of advertised) {
+      if (channels.has(channel.topic)) fail(`${channel.topic} is advertised twice`);
       channels.set(channel.topic, channel);
       subscribed.set(client.subscribe(channel.id), { channel, decode: decoder(channel) });
     }

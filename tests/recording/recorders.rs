@@ -22,8 +22,8 @@ use crate::flight::{LONG, Landing, PATIENCE};
 /// Maximum that a killed recorder may lose, in seconds.
 const MAX_LOSS_S: f64 = 1.0;
 
-/// Maximum number of frames by which those that an overloaded recorder kept and told as lost may differ from those that were published.
-const MAX_UNTOLD_FRAMES: u64 = 5;
+/// Maximum difference between the frames that an overloaded recorder stored or reported as lost and those that were published.
+const MAX_UNREPORTED_FRAMES: u64 = 5;
 
 /// Why the simulator's camera leaves out numbers of frames.
 const LEFT_OUT: &str = "frames that took too long to render";
@@ -194,8 +194,8 @@ pub(crate) async fn cost(rate_hz: u32, more: &[&str]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A recorder has no room for what it is to keep, and for a while no processor: what it loses stands in its file, as far as frames
-/// under way can be told.
+/// A recorder has no room for its data, and for a while no processor: its losses stand in its file, but for the uncertainty of
+/// frames under way.
 pub(crate) async fn overload() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("flight.mcap");
@@ -235,14 +235,20 @@ pub(crate) async fn overload() -> anyhow::Result<()> {
     let between = numbered(ended) - numbered(began);
     let is_between = |stamp_ns: &&i64| (began.stamp_ns..ended.stamp_ns).contains(*stamp_ns);
     let kept = stamps_ns.iter().filter(is_between).count() as u64;
-    let told = |key: &str| contents.dropped.get(key).copied().unwrap_or(0);
-    let lost = told("camera/down/frame") + told(&format!("camera/down/frame {NEVER_CAME}"));
-    println!("of {between} frames {kept} are kept, {lost} told: {:?}", contents.dropped);
+    let dropped = |key: &str| contents.dropped.get(key).copied().unwrap_or(0);
+    let lost = dropped("camera/down/frame") + dropped(&format!("camera/down/frame {NEVER_CAME}"));
+    println!(
+        "of {between} frames {kept} are kept, {lost} reported as lost: {:?}",
+        contents.dropped
+    );
     ensure!(lost > 0, "nothing was lost, so nothing was tried: {contents:?}");
-    // What is lost while the recorder is stopped it knows by the missing numbers only. The rest are frames under way at the two
+    // Losses while the recorder is stopped show only as missing numbers. The rest are frames under way at the two
     // reports, and before and after them.
-    let untold = between.abs_diff(kept + lost);
-    ensure!(untold <= MAX_UNTOLD_FRAMES, "of {between} frames {kept} are kept, {lost} told");
+    let unreported = between.abs_diff(kept + lost);
+    ensure!(
+        unreported <= MAX_UNREPORTED_FRAMES,
+        "of {between} frames {kept} are kept, {lost} reported as lost"
+    );
     Ok(())
 }
 

@@ -1,4 +1,4 @@
-//! Many browsers at one page, slow and silent ones among them, and what they cost a flight.
+//! Connects many browsers to one page, some of them slow or silent, and measures their cost for a flight.
 
 #![allow(dead_code, reason = "each program uses its part")]
 
@@ -24,33 +24,33 @@ const QUICK: usize = 14;
 const SLOW: usize = 3;
 const SILENT: usize = 3;
 const ALL: usize = QUICK + SLOW + SILENT;
-/// A silent one is cut off by the server, and comes again.
+/// The server closes the connection of a silent browser, which then connects again.
 const SILENT_FOR: Duration = Duration::from_secs(8);
-/// How long processors are measured, each time.
+/// Duration of each measurement of processor time.
 const WINDOW: Duration = Duration::from_secs(10);
-/// In which Linux counts processor time for programs, on every kind of processor that is flown.
+/// The unit in which Linux counts processor time for programs, on every kind of processor that is flown.
 const TICKS_PER_S: f64 = 100.0;
 /// The services that fly.
 const FLIGHT: [&str; 4] = ["detector", "controller", "gcs-bridge", "simulator"];
 
-/// Twenty browsers; gone with this.
-pub(crate) struct Crowd {
+/// Twenty browsers, until this is dropped.
+pub(crate) struct Browsers {
     _browsers: JoinSet<()>,
 }
 
-impl Crowd {
+impl Browsers {
     pub(crate) fn new(page: &str) -> Self {
         Self::of(page, ALL)
     }
 
-    /// The first so many of them, the quick ones before the others.
+    /// This number of browsers, the quick ones first.
     fn of(page: &str, count: usize) -> Self {
         let mut browsers: JoinSet<()> = JoinSet::new();
         for number in 0..count {
             let page = page.to_owned();
             browsers.spawn(async move {
                 loop {
-                    // The page may be stopped or gone: another try.
+                    // The page may be stopped or gone: try again.
                     drop(browse(&page, number).await);
                     sleep(Duration::from_millis(500)).await;
                 }
@@ -70,7 +70,7 @@ async fn browse(page: &str, number: usize) -> anyhow::Result<()> {
     let pause = Duration::from_secs(u64::from(number >= QUICK));
     loop {
         tokio::select! {
-            told = data.next() => drop(told.context("closed")??),
+            message = data.next() => drop(message.context("closed")??),
             shown = video.next() => {
                 let bytes = shown.context("closed")??.into_data();
                 let Some(length) = bytes.first_chunk().map(|it| u32::from_le_bytes(*it) as usize) else { continue };
@@ -102,47 +102,46 @@ pub(crate) fn memory_mb(pid: Pid) -> anyhow::Result<f64> {
 /// Processor time of a process so far, in seconds.
 fn processor_s(pid: Pid) -> anyhow::Result<f64> {
     let stat = std::fs::read_to_string(format!("/proc/{}/stat", pid.as_raw_nonzero()))?;
-    // What follows the name in parentheses; user and system time are the 14th and 15th of all.
+    // The text after the name in parentheses; user and system time are the 14th and 15th of all.
     let (_, rest) = stat.rsplit_once(") ").context("a name")?;
     let times: Vec<f64> =
         rest.split(' ').skip(11).take(2).map(str::parse).collect::<Result<_, _>>()?;
     Ok(times.iter().sum::<f64>() / TICKS_PER_S)
 }
 
-/// Who uses the machine beside the services that fly.
+/// The other load of the machine, next to the services that fly.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-enum Beside {
-    /// So many browsers, whose page and they themselves need processors.
+enum Load {
+    /// This number of browsers, which need processors together with their page.
     Browsers(usize),
-    /// Threads that have nothing to do with the flight, and need as much as the last browsers and their page did.
-    Strangers,
+    /// Threads without any part in the flight, with the processor time of the last browsers and their page.
+    Threads,
 }
 
-/// The flight alone, beside one browser, beside all, and the control: what other work on the same processors costs by itself.
-const BESIDE: [Beside; 4] =
-    [Beside::Browsers(0), Beside::Browsers(1), Beside::Browsers(ALL), Beside::Strangers];
-/// How often each stranger works, as a browser takes pictures.
-const STRANGER_HZ: f64 = 15.0;
-/// What a stranger copies at a time, as a picture is.
-const STRANGER_BYTES: usize = 40_000;
+/// The flight alone, with one browser, with all, and the control: the cost of other work alone on the same processors.
+const LOADS: [Load; 4] = [Load::Browsers(0), Load::Browsers(1), Load::Browsers(ALL), Load::Threads];
+/// How often each thread works, as a browser takes pictures.
+const THREAD_HZ: f64 = 15.0;
+/// Bytes that a thread copies at a time, the size of a picture.
+const THREAD_BYTES: usize = 40_000;
 
-/// Threads that use processors by themselves; they end with this.
-struct Strangers {
+/// Threads that use processors, until this is dropped.
+struct LoadThreads {
     are_over: Arc<AtomicBool>,
 }
 
-impl Strangers {
-    /// As many as the crowd, which together need this share of a core.
-    fn new(share: f64) -> Self {
+impl LoadThreads {
+    /// As many as there are browsers, which together need this fraction of a core.
+    fn new(fraction: f64) -> Self {
         let are_over = Arc::new(AtomicBool::new(false));
         let count = ALL;
-        let period = Duration::from_secs_f64(1.0 / STRANGER_HZ);
-        let work = period.mul_f64(share / count as f64);
+        let period = Duration::from_secs_f64(1.0 / THREAD_HZ);
+        let work = period.mul_f64(fraction / count as f64);
         for number in 0..count {
             let over = Arc::clone(&are_over);
             std::thread::spawn(move || {
                 std::thread::sleep(period.mul_f64(number as f64 / count as f64));
-                let (from, mut to) = (vec![7_u8; STRANGER_BYTES], vec![0; STRANGER_BYTES]);
+                let (from, mut to) = (vec![7_u8; THREAD_BYTES], vec![0; THREAD_BYTES]);
                 while !over.load(Ordering::Relaxed) {
                     let began = Instant::now();
                     while began.elapsed() < work {
@@ -157,20 +156,20 @@ impl Strangers {
     }
 }
 
-impl Drop for Strangers {
+impl Drop for LoadThreads {
     fn drop(&mut self) {
         self.are_over.store(true, Ordering::Relaxed);
     }
 }
 
-/// The mean of measurements, and the standard deviation of that mean; a single one tells none.
+/// The mean of measurements, and the standard deviation of that mean; a single one has none.
 fn mean_and_deviation(values: &[f64]) -> [f64; 2] {
     let deviation = standard_deviation(values).unwrap_or(f64::NAN);
     [mean(values).unwrap_or(f64::NAN), deviation / (values.len() as f64).sqrt()]
 }
 
-/// Processor time of each service in a hover alone, beside one browser and twenty, and beside other work of the same size, in turn,
-/// so many times; and the page's memory.
+/// Processor time of each service in a hover alone, with one browser and twenty, and with other work of the same size, in turn,
+/// this number of times; and the page's memory.
 pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
     let ([port], _, _) = testing::ports::free()?;
     let page = format!("127.0.0.1:{port}");
@@ -187,16 +186,16 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
     let used = |pids: &[Pid]| {
         pids.iter().map(|pid| processor_s(*pid)).collect::<anyhow::Result<Vec<f64>>>()
     };
-    let mut windows = BESIDE.map(|_| Vec::new());
-    let [mut memories_mb, mut shares, mut strangers] = [const { Vec::new() }; 3];
-    let mut share = 0.0;
+    let mut windows = LOADS.map(|_| Vec::new());
+    let [mut memories_mb, mut percents, mut threads] = [const { Vec::new() }; 3];
+    let mut fraction = 0.0;
     for round in 0..times {
-        // Each round begins with another one, so that what changes within a minute favours none.
-        for at in (0..BESIDE.len()).map(|at| (at + round) % BESIDE.len()) {
-            let (beside, windows) = (&BESIDE[at], &mut windows[at]);
-            let _beside: (Option<Crowd>, Option<Strangers>) = match beside {
-                Beside::Browsers(count) => (Some(Crowd::of(&page, *count)), None),
-                Beside::Strangers => (None, Some(Strangers::new(share))),
+        // Each round begins with another load, so that changes within a minute favour none.
+        for at in (0..LOADS.len()).map(|at| (at + round) % LOADS.len()) {
+            let (load, windows) = (&LOADS[at], &mut windows[at]);
+            let _load: (Option<Browsers>, Option<LoadThreads>) = match load {
+                Load::Browsers(count) => (Some(Browsers::of(&page, *count)), None),
+                Load::Threads => (None, Some(LoadThreads::new(fraction))),
             };
             // Until they are connected, or pictures are no longer made.
             sleep(WINDOW / 2).await;
@@ -209,14 +208,14 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
             });
             windows.push(flown);
             let used = others.iter().sum::<f64>() / WINDOW.as_secs_f64();
-            match beside {
-                Beside::Browsers(ALL) => {
-                    share = used;
+            match load {
+                Load::Browsers(ALL) => {
+                    fraction = used;
                     memories_mb.push(memory_mb(dashboard)?);
-                    shares.push(100.0 * used);
+                    percents.push(100.0 * used);
                 }
-                Beside::Strangers => strangers.push(100.0 * used),
-                Beside::Browsers(_) => {}
+                Load::Threads => threads.push(100.0 * used),
+                Load::Browsers(_) => {}
             }
         }
     }
@@ -224,9 +223,9 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
         let used = windows.each_ref().map(|windows| {
             windows.iter().map(|window| 100.0 * of(window) / WINDOW.as_secs_f64()).collect()
         });
-        let [alone, one, all, strangers]: [Vec<f64>; 4] = used;
+        let [alone, one, all, threads]: [Vec<f64>; 4] = used;
         let usual = mean_and_deviation(&alone)[0];
-        // Each beside the window of its own round without anything: a machine changes within minutes.
+        // Each is compared with the window of its round without load: a machine changes within minutes.
         let more = |with: &[f64]| {
             let more: Vec<f64> =
                 with.iter().zip(&alone).map(|(with, alone)| with - alone).collect();
@@ -234,10 +233,10 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
             format!("{mean:+.1} ± {deviation:.1} %")
         };
         println!(
-            "{name}: {usual:.1} % of a core alone, {} with one browser, {} with 20, {} beside other work",
+            "{name}: {usual:.1} % of a core alone, {} with one browser, {} with 20, {} with other work",
             more(&one),
             more(&all),
-            more(&strangers)
+            more(&threads)
         );
     };
     for (at, name) in FLIGHT.iter().enumerate() {
@@ -245,7 +244,7 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
     }
     compare("detector, controller and gcs-bridge", &|window| window[..3].iter().sum());
     compare("all four", &|window| window.iter().sum());
-    println!("page and 20 browsers, % of a core: {shares:.0?}; other work: {strangers:.0?}");
+    println!("page and 20 browsers, % of a core: {percents:.0?}; other work: {threads:.0?}");
     println!("memory of the dashboard with them, MB: {memories_mb:.0?}");
     landing.node.command(topic::COMMAND, &[], &ControllerCommand::Resume).await?;
     landing.lands().await.map(drop)

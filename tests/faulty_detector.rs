@@ -1,4 +1,4 @@
-//! A detector that lies: told at once, and never followed to the ground.
+//! A detector with wrong poses: the controller reports it at once, and never follows it to the ground.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,17 +12,17 @@ use tokio::time::timeout;
 
 use crate::flight::{Landing, beside_another};
 
-/// Publishes what `main` finds under its own name, and 1 m to the side once it lies.
-async fn tell(liar: Node, lies: Arc<AtomicBool>) -> anyhow::Result<()> {
-    let seen = liar.subscriber(topic::DETECTIONS, &["main"]).await?;
-    let told = liar.publisher(topic::DETECTIONS, &["liar"]).await?;
-    liar.announce().await?;
+/// Publishes the detections of `main` under its own name, and 1 m to the side once it is wrong.
+async fn publish(faulty: Node, is_wrong: Arc<AtomicBool>) -> anyhow::Result<()> {
+    let seen = faulty.subscriber(topic::DETECTIONS, &["main"]).await?;
+    let publisher = faulty.publisher(topic::DETECTIONS, &["faulty"]).await?;
+    faulty.announce().await?;
     while let Some(mut message) = seen.next().await {
-        message.detector = "liar".into();
-        if lies.load(Ordering::Relaxed) {
+        message.detector = "faulty".into();
+        if is_wrong.load(Ordering::Relaxed) {
             shift(&mut message);
         }
-        told.publish(&message).await;
+        publisher.publish(&message).await;
     }
     Ok(())
 }
@@ -35,45 +35,47 @@ fn shift(message: &mut Detections) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_preferred_liar_beside_an_honest_detector_is_told_and_not_followed_down()
+async fn a_preferred_detector_with_wrong_poses_is_reported_and_not_followed_down()
 -> anyhow::Result<()> {
-    with_second_try(a_liar_is_preferred).await
+    with_second_try(a_faulty_detector_is_preferred).await
 }
 
-async fn a_liar_is_preferred() -> anyhow::Result<()> {
+async fn a_faulty_detector_is_preferred() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     let landing = Landing::start(&["--seed", "5"]).await?;
     landing.status("it begins", |s| s.active_detector.as_deref() == Some("main")).await?;
-    let identity = Identity { service: "detector", instance: "liar".into() };
-    let liar = Node::open(identity, &ZenohSource::File(landing.zenoh.clone())).await?;
-    let lies = Arc::new(AtomicBool::new(false));
-    let telling = tokio::spawn(tell(liar.clone(), Arc::clone(&lies)));
+    let identity = Identity { service: "detector", instance: "faulty".into() };
+    let faulty = Node::open(identity, &ZenohSource::File(landing.zenoh.clone())).await?;
+    let is_wrong = Arc::new(AtomicBool::new(false));
+    let publishing = tokio::spawn(publish(faulty.clone(), Arc::clone(&is_wrong)));
     // On a busy machine either of the two may be the active one, with which the other is compared.
     let known = |s: &messages::ControllerStatus| s.candidates.iter().any(|c| c.agreed > 8);
-    landing.status("the liar is believed", known).await?;
-    let command = ControllerCommand::UseDetector("liar".into());
+    landing.status("the faulty detector is believed", known).await?;
+    let command = ControllerCommand::UseDetector("faulty".into());
     let reply = landing.node.command(topic::COMMAND, &[], &command).await?;
     ensure!(reply.accepted, "{reply:?}");
     landing.descends_below(6.0).await?;
-    lies.store(true, Ordering::Relaxed);
+    is_wrong.store(true, Ordering::Relaxed);
     let began = Instant::now();
-    let told = landing.status("it is told", |s| !s.warnings.is_empty()).await?;
+    let status = landing.status("a warning is reported", |s| !s.warnings.is_empty()).await?;
     let took = began.elapsed();
-    println!("told after {took:?}: {:?}", told.warnings);
+    println!("reported after {took:?}: {:?}", status.warnings);
     ensure!(took < Duration::from_secs(1), "{took:?}");
-    ensure!(told.warnings.iter().any(|text| text.contains("`liar`")), "{:?}", told.warnings);
+    ensure!(status.warnings.iter().any(|text| text.contains("`faulty`")), "{:?}", status.warnings);
     let lowest_m = landing
         .motion(Duration::from_secs(8))
         .await
         .iter()
         .map(|truth| -truth.position_ned_m[2])
         .fold(f64::INFINITY, f64::min);
-    println!("lowest height in 8 s of lies: {lowest_m:.2} m");
+    println!("lowest height in 8 s of wrong poses: {lowest_m:.2} m");
     ensure!(lowest_m > 2.0, "{lowest_m} m");
     let waits = landing.status("it waits", |_| true).await?;
     println!("{}: {}", waits.phase, waits.why);
     // The operator ends it.
-    telling.abort();
-    timeout(Duration::from_secs(5), liar.close()).await.context("closing the liar's session")?;
+    publishing.abort();
+    timeout(Duration::from_secs(5), faulty.close())
+        .await
+        .context("closing the faulty detector's session")?;
     landing.lands().await.map(drop)
 }
