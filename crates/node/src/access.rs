@@ -1,8 +1,8 @@
-//! The holders of certificates, a relay's list of them with who is revoked, and Zenoh's access control made of that
+//! Reads and writes a relay's list of certificate holders, valid and revoked, and makes Zenoh's access control of that
 //! list and of the rules of the roles: on which keys each may publish, subscribe and query.
 //!
-//! The common name of a certificate is `ROLE@VEHICLE` or `ROLE.NAME@VEHICLE`. A relay lets in whom its list of
-//! holders names, of its own vehicle and not revoked; a detector may publish as itself only. Zenoh compares
+//! The common name of a certificate is `ROLE@VEHICLE` or `ROLE.NAME@VEHICLE`. A relay accepts only the holders
+//! in its list, of its own vehicle and not revoked; a detector may publish under its own name only. Zenoh compares
 //! common names as they are, so each holder becomes a subject of its access control.
 
 use std::collections::BTreeSet;
@@ -21,10 +21,10 @@ pub const HOLDERS: &str = "holders.txt";
 const DETECTOR: &str = "detector";
 /// The beginning of all keys in the rules: any vehicle.
 const ANY_VEHICLE: &str = "*/";
-/// What a line of a revoked holder begins with.
+/// The beginning of the line of a revoked holder.
 const REVOKED: &str = "revoked ";
 const HEADING: &str = "\
-# Who may connect to a relay: the common names of the certificates, one a line; `revoked` before a name shuts it out.
+# The holders that may connect to a relay: the common names of the certificates, one a line; `revoked` before a name excludes it.
 # `alight keys` keeps this list in the directory of the authority; every relay needs a copy of it among its keys.
 ";
 
@@ -88,12 +88,12 @@ impl FromStr for Holder {
     type Err = anyhow::Error;
 
     fn from_str(text: &str) -> anyhow::Result<Self> {
-        let (who, vehicle) = text
+        let (subject, vehicle) = text
             .split_once('@')
             .with_context(|| format!("`{text}` is not ROLE@VEHICLE or ROLE.NAME@VEHICLE"))?;
-        match who.split_once('.') {
+        match subject.split_once('.') {
             Some((role, name)) => Self::new(role, Some(name), vehicle),
-            None => Self::new(who, None, vehicle),
+            None => Self::new(subject, None, vehicle),
         }
     }
 }
@@ -113,36 +113,36 @@ impl Holders {
     pub fn admit(&mut self, holder: &Holder) -> anyhow::Result<()> {
         ensure!(
             !self.revoked.contains(holder),
-            "`{holder}` was revoked, and a new key of this name would let the old one in again; give another `--name`"
+            "`{holder}` was revoked, and a new key of this name would make the old one valid again; give another `--name`"
         );
         self.admitted.insert(holder.clone());
         Ok(())
     }
 
-    /// Shuts a holder out for good.
+    /// Excludes a holder permanently.
     ///
     /// # Errors
     /// When it is not in the list.
     pub fn revoke(&mut self, holder: &Holder) -> anyhow::Result<()> {
         ensure!(
             self.admitted.remove(holder) || self.revoked.contains(holder),
-            "no key was issued to `{holder}`; {HOLDERS} beside the authority's key lists all"
+            "no key was issued to `{holder}`; {HOLDERS} next to the authority's key lists all"
         );
         self.revoked.insert(holder.clone());
         Ok(())
     }
 
-    /// True when it is among them, and not revoked.
+    /// True when it is in the list, and not revoked.
     pub fn admits(&self, holder: &Holder) -> bool {
         self.admitted.contains(holder)
     }
 
-    /// Those who may connect, sorted.
+    /// The holders that may connect, sorted.
     pub fn admitted(&self) -> impl Iterator<Item = &Holder> {
         self.admitted.iter()
     }
 
-    /// Those who are shut out, sorted.
+    /// The revoked holders, sorted.
     pub fn revoked(&self) -> impl Iterator<Item = &Holder> {
         self.revoked.iter()
     }
@@ -211,7 +211,7 @@ pub fn access_control(rules: &Value, holders: &Holders, vehicle: &str) -> anyhow
             }
         } else {
             let names: Vec<String> = of_roles.map(ToString::to_string).collect();
-            // Without a name the subject would be everybody.
+            // Without a name the subject would be every client.
             if !names.is_empty() {
                 named["cert_common_names"] = json!(names);
                 subjects.push(named);
@@ -264,8 +264,8 @@ pub fn access_control(rules: &Value, holders: &Holders, vehicle: &str) -> anyhow
     Ok(access)
 }
 
-/// For a rule that allows to subscribe, that by which the messages are sent to who subscribed. A session of a certain kind
-/// would be sent messages that it never subscribed to.
+/// For a rule that allows to subscribe, the rule that allows to send the messages to the subscriber. Without it a session of a
+/// certain kind would receive messages to which it never subscribed.
 fn received(rule: &Value) -> Option<Value> {
     let messages = rule["messages"].as_array()?;
     messages.iter().any(|message| message == "declare_subscriber").then_some(())?;
@@ -278,7 +278,7 @@ fn received(rule: &Value) -> Option<Value> {
     Some(sent)
 }
 
-/// The id of the rule by which what was subscribed to is sent.
+/// The id of the rule that allows to send to a subscriber.
 fn received_id(rule: &Value) -> String {
     format!("received by {}", rule.as_str().unwrap_or_default())
 }
@@ -342,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn the_revoked_stay_out() {
+    fn revoked_holders_stay_excluded() {
         let mut list = holders("operator@drone\nrevoked operator@drone\n");
         assert_eq!(list.of("operator", "drone").count(), 0);
         let operator: Holder = "operator@drone".parse().unwrap();

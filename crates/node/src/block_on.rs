@@ -11,11 +11,11 @@ use tokio::runtime::Handle;
 
 /// Runs a future to its end on this thread, with `runtime` for its timers, sockets and tasks.
 ///
-/// Use this instead of the runtime's own `block_on` for whatever uses Zenoh. Some of Zenoh's calls block their thread with a
+/// Use this instead of the runtime's own `block_on` for all code that uses Zenoh. Some of Zenoh's calls block their thread with a
 /// `block_on` of their own, and in Tokio both wait for the same flag of the thread: the inner one takes a wake-up that was meant for
-/// the outer, and a future that is joined or selected there stands still. Here each has its own.
+/// the outer, and a future that is joined or selected there blocks. Here each has its own.
 pub fn block_on<F: Future>(runtime: &Handle, future: F) -> F::Output {
-    // Entered first, so that what the future holds is dropped inside the runtime.
+    // Entered first, so that the future is dropped inside the runtime.
     let _entered = runtime.enter();
     let mut future = pin!(future);
     let flag = Arc::new(Flag { thread: std::thread::current(), is_woken: AtomicBool::new(false) });

@@ -1,4 +1,4 @@
-//! What a certificate says: whose it is, from when until when, and by whom it is signed.
+//! Reads a certificate: its holder, validity period and authority.
 
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};

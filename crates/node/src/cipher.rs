@@ -1,9 +1,9 @@
-//! The cipher of encrypted links.
+//! Chooses the cipher of encrypted links.
 
 use rustls::crypto::CryptoProvider;
 use rustls::crypto::ring::{cipher_suite, default_provider};
 
-/// Has every connection whose cipher is chosen nowhere else, as Zenoh's are, take ChaCha20-Poly1305; the first call in a process counts.
+/// Makes ChaCha20-Poly1305 the default cipher, which Zenoh's connections take; only the first call in a process counts.
 ///
 /// AES-GCM asks for other keys after 2^24 records (RFC 8446, section 5.5), ChaCha20-Poly1305 never, and while the keys of a connection change Zenoh
 /// reads and writes it in two threads (`zenoh-config/README.md`).

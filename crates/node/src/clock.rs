@@ -1,4 +1,4 @@
-//! The host's clock: monotonic, the same for all processes of a host since its boot.
+//! Reads the host's clock: monotonic, the same for all processes of a host since its boot.
 
 use std::sync::OnceLock;
 
@@ -13,7 +13,7 @@ pub fn boot_ahead_ns() -> i64 {
     let boot = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
     let boot_ns = boot.tv_sec.saturating_mul(1_000_000_000).saturating_add(boot.tv_nsec);
     let ahead_ns = boot_ns.saturating_sub(now_ns());
-    // A host that has not slept has one clock; what lies between the two calls is no difference.
+    // A host that has not slept has one clock; the time between the two calls is no difference.
     if ahead_ns.abs() < 1_000_000 { 0 } else { ahead_ns }
 }
 

@@ -21,7 +21,7 @@ pub trait Settings: Sized {
     const DEFAULTS: &'static str;
 
     /// The values of a table with every key: `table.try_into()`. Each service says so itself, so that reading its configuration is
-    /// compiled in its crate, and not anew in every one that loads it.
+    /// compiled in its crate, and not again in every crate that loads it.
     ///
     /// # Errors
     /// When the table is of other settings.
@@ -58,7 +58,7 @@ pub enum ConfigError {
         path: PathBuf,
         /// The line with the first wrong byte, from 1.
         line: usize,
-        /// What else it is, or nothing.
+        /// The encoding that it seems to have, or nothing.
         hint: &'static str,
     },
     /// Text that is not TOML.
@@ -108,7 +108,7 @@ pub enum ConfigError {
         key: String,
         /// The value.
         value: String,
-        /// What it must be.
+        /// The allowed values.
         limit: String,
     },
 }
@@ -150,7 +150,7 @@ impl ConfigError {
 }
 
 impl ConfigError {
-    /// The same with what may be meant by an unknown key to which none beside it is similar: a key of such a name in another table of
+    /// The same with a suggestion for an unknown key without a similar key in its table: a key of such a name in another table of
     /// `all`.
     fn with_place(self, all: &Table, layer: &Table) -> Self {
         match self {
@@ -257,8 +257,8 @@ fn effective<T: Settings>(mut table: Table, layers: &[Layer]) -> Result<Effectiv
     }
 }
 
-/// Which value of which layer the settings cannot be read with, after [`lay_over`] found all keys and types right: such as a
-/// word that an enumeration lacks. The reader of a table does not say where it stood, so that each value is tried alone.
+/// The value, and its layer, with which the settings cannot be read although [`lay_over`] found all keys and types right: such
+/// as a word that an enumeration lacks. The reader of a table does not report its position, so each value is tried alone.
 fn refusal<T: Settings>(mut table: Table, layers: &[Layer], cause: &TableError) -> ConfigError {
     for layer in layers {
         for (path, value) in single_values(&layer.table) {
@@ -355,7 +355,7 @@ fn setting_layer(text: &str, defaults: &Table) -> Result<Layer, ConfigError> {
         Err(_) if default_is_text || default.is_none() => quoted()?,
         Err(problem) => {
             return Err(match default {
-                // Of a list or a table the parser knows better what is wrong.
+                // For a list or a table the parser's error is more precise.
                 None | Some(Value::Array(_) | Value::Table(_)) => problem,
                 Some(default) => ConfigError::WrongType {
                     source_name: name,
@@ -453,8 +453,8 @@ pub fn named<T: DeserializeOwned>(text: &str) -> Result<T, String> {
     T::deserialize(text).map_err(|cause| cause.to_string())
 }
 
-/// An address without a name and a password: without what stands between its scheme and the last `@` before the path, or, where
-/// a password has a slash in it, before the end.
+/// An address without a name and a password: without the text between its scheme and the last `@` before the path, or, where
+/// a password contains a slash, before the end.
 pub fn without_credentials(address: &str) -> String {
     let (scheme, rest) = match address.split_once("://") {
         Some((scheme, rest)) => (format!("{scheme}://"), rest),
@@ -707,7 +707,7 @@ mod tests {
             assert!(problem.contains(source) && !problem.contains("TOML"), "{problem}");
             assert!(words.iter().all(|word| problem.contains(word)), "{problem}");
         }
-        // A later layer mends an earlier one.
+        // A later layer corrects an earlier one.
         assert!(load(Some("lens.kind = \"wide\""), &["lens.kind=fisheye"]).is_ok());
     }
 

@@ -1,4 +1,4 @@
-//! Counts what Zenoh denies: connections without a valid certificate or without any rights, and messages that access
+//! Counts the denials of Zenoh: connections without a valid certificate or without any rights, and messages that access
 //! control rejects.
 //!
 //! Zenoh 1.10 has no counter for these. It only logs them, below the level that is shown; this module reads
@@ -25,7 +25,7 @@ const OTHER: &str = "denied: others";
 
 static COUNTS: Mutex<BTreeMap<String, u64>> = Mutex::new(BTreeMap::new());
 
-/// What was denied since the last call: the number of times for each reason.
+/// The denials since the last call: the number of times for each reason.
 pub fn take() -> BTreeMap<String, u64> {
     let mut counts = COUNTS.lock().unwrap_or_else(PoisonError::into_inner);
     // The reasons are kept, so that their number stays below the limit.
@@ -125,8 +125,8 @@ fn is_precomputed(message: &str) -> bool {
 /// Parses `ZID on SUBJECT is unauthorized to Query (ingress) on KEY`, or `ZID is unauthorized ...` from the
 /// cache. Outgoing messages are not counted: their sender is this process.
 fn denied_message(message: &str) -> Option<String> {
-    let (_who, what) = message.split_once(" is unauthorized to ")?;
-    let (action, key) = what.split_once(" (ingress) on ")?;
+    let (_subject, denial) = message.split_once(" is unauthorized to ")?;
+    let (action, key) = denial.split_once(" (ingress) on ")?;
     Some(format!("denied: {} on {key}", action.to_lowercase()))
 }
 
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn a_connection_of_somebody_who_is_not_in_the_list_is_denied() {
+    fn a_connection_of_an_unlisted_holder_is_denied() {
         let message = "d480 did not match any configured ACL subject. Default permission `Deny` will be applied on all messages";
         assert!(is_without_rights(message));
         assert!(!is_without_rights("Access control is enabled"));

@@ -1,4 +1,4 @@
-//! Zenoh's endpoints: where a session listens and connects.
+//! Parses Zenoh's endpoints: the addresses at which a session listens and to which it connects.
 
 use std::net::IpAddr;
 
@@ -9,7 +9,7 @@ pub(crate) struct Endpoint {
     pub(crate) protocol: String,
     pub(crate) host: String,
     pub(crate) port: u16,
-    /// What follows the port.
+    /// The text after the port.
     pub(crate) rest: String,
 }
 
@@ -30,7 +30,7 @@ impl Endpoint {
         format!("{}/{}:{}{}", self.protocol, self.host, self.port, self.rest)
     }
 
-    /// Whether the processes of this machine meet there; else it is the other side of a link, of which each connection has settings.
+    /// Whether it is the rendezvous of this machine; else it is the other side of a link, and each connection has settings.
     pub(crate) fn is_rendezvous(&self) -> bool {
         self.protocol == "tcp" && self.rest.is_empty() && self.is_local()
     }

@@ -1,5 +1,5 @@
 //! Probes, with Zenoh's greeting, the unencrypted addresses to which a session connects: a tool is refused where only other programs
-//! answer, a service logs it and goes on. Zenoh tries such an address again for ever, without a word; the service meets the others
+//! answer; a service logs it and continues. Zenoh retries such an address for ever without a log message; the service connects
 //! once the right program is there.
 
 use std::io;
@@ -18,7 +18,7 @@ use crate::endpoint::{self, Endpoint};
 /// Maximum time for which the start of a tool waits for answers: a process on this machine gives one within milliseconds.
 const AT_START: Duration = Duration::from_millis(300);
 /// Time after which an address is reported at which a program accepts connections and sends nothing: shorter than a tool waits.
-const PATIENCE: Duration = Duration::from_secs(2);
+const TIMEOUT: Duration = Duration::from_secs(2);
 /// Pause before an address is tried again at which a connection was closed without an answer, as a process does that ends.
 const PAUSE: Duration = Duration::from_millis(200);
 /// Bytes of an answer that are read.
@@ -27,59 +27,59 @@ const ANSWER_BYTES: usize = 64;
 /// The first message of a Zenoh client that wants to connect (INIT), with its length before it. Its name, which may be any
 /// bytes, is two ends of a line: servers of lines of text, such as web servers, then answer at once.
 const GREETING: [u8; 9] = [7, 0, 0x01, 0x09, 0x32, b'\r', b'\n', b'\r', b'\n'];
-/// The answer that accepts: INIT with the flag A. The upper two bits say what follows in it.
+/// The answer that accepts: INIT with the flag A. The upper two bits show the optional parts.
 const INIT_ACK: u8 = 0x21;
 /// It is shorter than this: two letters, taken for its length, are more.
 const MAX_INIT_ACK: u16 = 4096;
-/// The answer that refuses: CLOSE, which is shorter than what TLS says to who does not speak it.
+/// The answer that refuses: CLOSE, which is shorter than the alert of TLS to a client without TLS.
 const CLOSE: u8 = 0x03;
 const MAX_CLOSE: u16 = 16;
-/// The answer of a relay with keys to who does not speak TLS: the beginning of an alert.
+/// The answer of a relay with keys to a client without TLS: the beginning of an alert.
 const TLS_ALERT: [u8; 2] = [0x15, 0x03];
 
-/// What answers at an address.
+/// The program at an address, by its answer.
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Answer {
-    /// Nobody, or a process that speaks Zenoh.
+    /// No program, or a process that speaks Zenoh.
     Fine,
-    /// Somebody who speaks TLS, as a relay with keys does.
+    /// A program that speaks TLS, as a relay with keys does.
     Encrypted,
-    /// Another program, with the beginning of what it says.
+    /// Another program, with the beginning of its answer.
     Foreign(String),
-    /// Somebody accepts connections and says nothing: another program, or one of ours that stands still.
+    /// A program accepts connections and sends nothing: another program, or a stopped process of Alight.
     Silence,
 }
 
-/// Where a session connects.
+/// An address to which a session connects.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Contact {
     /// `127.0.0.1:7447`.
     address: SocketAddr,
-    /// Whether the processes of this machine meet there; else it is the other side of a link.
+    /// Whether it is the rendezvous of this machine; else it is the other side of a link.
     is_rendezvous: bool,
 }
 
-/// All places where a session connects.
+/// All addresses to which a session connects.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 struct Contacts {
-    /// Those that are asked. Names are not: the system looks them up for long, and holds up the end of the process meanwhile. Nor are
-    /// encrypted ones: who greets them without a certificate is counted there as an intruder.
+    /// The addresses that are probed. Names are not: the system may take long to resolve them, and delays the end of the process.
+    /// Encrypted addresses are not: a greeting without a certificate is counted there as a denied connection.
     asked: Vec<Contact>,
     /// Whether there are others.
     has_others: bool,
 }
 
-/// Refuses the session of a tool that would meet nobody: wherever it connects is another program. What is found out later, or is
-/// wrong with some of several places, is logged.
+/// Refuses the session of a tool when other programs answer at all addresses to which it connects. Later answers, and errors
+/// at some of several addresses, are logged.
 ///
 /// # Errors
-/// Names the port, what answers there, and what to do.
+/// Names the port, the program that answers there, and a remedy.
 pub(crate) fn refuse(config: &zenoh::Config) -> BoxFuture<'static, anyhow::Result<()>> {
     let Contacts { asked, has_others } = Contacts::of(config);
     Box::pin(async move {
         let start = Instant::now() + AT_START;
         let count = asked.len();
-        // All are asked before the first answer is awaited.
+        // All are probed before the first answer is awaited.
         let answers: Vec<_> = asked.into_iter().map(ask).collect();
         let mut problems = Vec::new();
         for mut answer in answers {
@@ -97,7 +97,7 @@ pub(crate) fn refuse(config: &zenoh::Config) -> BoxFuture<'static, anyhow::Resul
     })
 }
 
-/// Logs what is wrong where a service connects, beside its start.
+/// Logs errors at the addresses to which a service connects, in parallel with its start.
 pub(crate) fn watch(config: &zenoh::Config) {
     let answers: Vec<_> = Contacts::of(config).asked.into_iter().map(ask).collect();
     tokio::spawn(async move {
@@ -109,14 +109,14 @@ pub(crate) fn watch(config: &zenoh::Config) {
     });
 }
 
-/// Logs the first problem alone: the ports of a relay have all the same one.
+/// Logs only the first error: the ports of a relay all have the same one.
 fn log(problems: &[String]) {
     if let Some(first) = problems.first() {
         tracing::error!("Zenoh cannot connect: {first}");
     }
 }
 
-/// Asks in a task of its own. The receiver gets the error; without a receiver it is logged.
+/// Probes in a separate task. The receiver gets the error; without a receiver it is logged.
 fn ask(contact: Contact) -> oneshot::Receiver<Option<String>> {
     let (sender, receiver) = oneshot::channel();
     tokio::spawn(async move {
@@ -128,9 +128,9 @@ fn ask(contact: Contact) -> oneshot::Receiver<Option<String>> {
     receiver
 }
 
-/// Greets until there is an answer, or patience ends.
+/// Greets until there is an answer, or until the timeout.
 async fn answer(address: SocketAddr) -> Answer {
-    let end = Instant::now() + PATIENCE;
+    let end = Instant::now() + TIMEOUT;
     loop {
         match timeout_at(end, greet(address)).await {
             Ok(Ok(answer)) => return answer,
@@ -145,8 +145,8 @@ async fn answer(address: SocketAddr) -> Answer {
 /// # Errors
 /// When the connection is closed without an answer.
 async fn greet(address: SocketAddr) -> io::Result<Answer> {
-    // An address out of reach takes longer than the patience, and is nobody either.
-    let Ok(Ok(mut stream)) = timeout(PATIENCE - PAUSE, TcpStream::connect(address)).await else {
+    // An unreachable address takes longer than the timeout, and has no program either.
+    let Ok(Ok(mut stream)) = timeout(TIMEOUT - PAUSE, TcpStream::connect(address)).await else {
         return Ok(Answer::Fine);
     };
     answer_on(&mut stream).await
@@ -157,7 +157,7 @@ async fn greet(address: SocketAddr) -> io::Result<Answer> {
 /// # Errors
 /// When it is closed without an answer.
 async fn answer_on(stream: &mut TcpStream) -> io::Result<Answer> {
-    // A port of those that the system gives away can be its own: then nobody listens there.
+    // The system may choose the destination port as the local port: then no program listens there.
     if stream.local_addr()? == stream.peer_addr()? {
         return Ok(Answer::Fine);
     }
@@ -187,7 +187,7 @@ async fn answer_on(stream: &mut TcpStream) -> io::Result<Answer> {
     })
 }
 
-/// The beginning of an answer for people.
+/// The beginning of an answer, as text.
 fn beginning(said: &[u8]) -> String {
     let is_text = |byte: &&u8| byte.is_ascii_graphic() || **byte == b' ';
     let text: Vec<u8> = said.iter().take_while(is_text).copied().collect();
@@ -203,12 +203,12 @@ impl Contacts {
         Self::parse(&part("mode"), &part("connect/endpoints"))
     }
 
-    /// Of a mode and endpoints as JSON: a list, or one for each mode.
+    /// The addresses of a mode and endpoints as JSON: a list, or one for each mode.
     fn parse(mode: &str, endpoints: &str) -> Self {
         let mut contacts = Self::default();
         for endpoint in endpoint::connected(mode, endpoints) {
             match Contact::of(&endpoint) {
-                // Several connections may lead to one place.
+                // Several connections may have one address.
                 Some(contact) if contacts.asked.contains(&contact) => {}
                 Some(contact) => contacts.asked.push(contact),
                 None => contacts.has_others = true,
@@ -226,13 +226,13 @@ impl Contact {
         Some(Self { is_rendezvous: endpoint.is_rendezvous(), address })
     }
 
-    /// What is wrong with an answer, and what to do.
+    /// The error of an answer, with a remedy.
     fn problem(&self, answer: &Answer) -> Option<String> {
         let Self { address, is_rendezvous } = self;
         let port = address.port();
         let place = match is_rendezvous {
             true => format!("port {port} of this machine, where its processes meet ({address})"),
-            false => format!("{address}, where this process is to connect"),
+            false => format!("{address}, to which this process is to connect"),
         };
         let elsewhere = "have all processes of this machine meet at another port: by the endpoints of the file where `--zenoh` names \
                          one, else by `--meet PORT`, `meet` of the site, or ALIGHT_MEET";
@@ -248,19 +248,19 @@ impl Contact {
         match answer {
             Answer::Fine => None,
             Answer::Encrypted if *is_rendezvous => Some(format!(
-                "who listens at {place} speaks TLS, as a relay with keys does, and the processes of a machine meet without: {elsewhere}"
+                "the program that listens at {place} speaks TLS, as a relay with keys does, but the processes of a machine meet without TLS: {elsewhere}"
             )),
             Answer::Encrypted => Some(format!(
-                "who listens at {place}, wants keys, and this process has none: give it those of the vehicle with `--keys DIRECTORY`, \
+                "the program that listens at {place}, wants keys, and this process has none: give it those of the vehicle with `--keys DIRECTORY`, \
                  `keys` of the site, or ALIGHT_KEYS; where it is no relay of yours, {correct}"
             )),
             Answer::Foreign(said) => Some(format!(
                 "another program listens at {place}: it does not speak Zenoh, but answers {said}. {remedy}"
             )),
             Answer::Silence => Some(format!(
-                "somebody listens at {place}, and has not answered for {} s: another program, or one of Alight that stands still; \
-                 this process meets nobody there. {remedy}",
-                PATIENCE.as_secs()
+                "a program listens at {place}, and has not answered for {} s: another program, or a stopped process of Alight; \
+                 this process cannot connect there. {remedy}",
+                TIMEOUT.as_secs()
             )),
         }
     }
@@ -271,7 +271,7 @@ mod tests {
     use super::*;
     use tokio::net::TcpListener;
 
-    /// Says this to everybody who connects, once they have said something, and closes the connection; or keeps it and says
+    /// Sends this to each client after its first bytes, and closes the connection; or keeps it open and sends
     /// nothing.
     async fn listener(says: Option<&'static [u8]>) -> SocketAddr {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -322,18 +322,18 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn who_closes_or_says_nothing_is_silent_and_nobody_is_fine() {
+    async fn a_program_that_closes_or_sends_nothing_is_silent_and_no_program_is_fine() {
         let begun = Instant::now();
         let [closes, keeps] = [listener(Some(b"")).await, listener(None).await];
         let (closes, keeps) = tokio::join!(answer(closes), answer(keeps));
         assert_eq!([closes, keeps], [Answer::Silence, Answer::Silence]);
-        assert!(begun.elapsed() < PATIENCE + Duration::from_secs(2), "{:?}", begun.elapsed());
-        let nobody = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
-        assert_eq!(answer(nobody).await, Answer::Fine);
+        assert!(begun.elapsed() < TIMEOUT + Duration::from_secs(2), "{:?}", begun.elapsed());
+        let unused = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
+        assert_eq!(answer(unused).await, Answer::Fine);
     }
 
     #[tokio::test]
-    async fn who_connects_to_itself_has_met_nobody() {
+    async fn a_connection_to_itself_has_no_answer() {
         // With its own port as the one that it wants, the system connects a socket to itself.
         let socket = tokio::net::TcpSocket::new_v4().unwrap();
         socket.bind(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
@@ -343,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn only_addresses_without_encryption_are_asked_of_the_sessions_mode() {
+    fn only_addresses_without_encryption_of_the_sessions_mode_are_probed() {
         let found = |mode, text| {
             let Contacts { asked, has_others } = Contacts::parse(mode, text);
             (asked.iter().map(|it| it.address.to_string()).collect::<Vec<_>>(), has_others)
@@ -362,13 +362,13 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_tool_is_refused_only_where_all_that_it_connects_to_is_foreign() {
+    async fn a_tool_is_refused_only_where_all_its_addresses_are_foreign() {
         let foreign = listener(Some(b"HTTP/1.0 400 Bad Request\r\n\r\n")).await;
-        let nobody = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
+        let unused = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
         for (endpoints, is_refused) in [
             (vec![format!("tcp/{foreign}")], true),
             (vec![format!("tcp/{foreign}"), format!("tcp/{foreign}?prio=5-6")], true),
-            (vec![format!("tcp/{foreign}"), format!("tcp/{nobody}")], false),
+            (vec![format!("tcp/{foreign}"), format!("tcp/{unused}")], false),
             (vec![format!("tcp/{foreign}"), "tcp/drone.local:7448".to_owned()], false),
             (vec![], false),
         ] {
@@ -380,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn a_problem_names_the_port_and_what_to_do() {
+    fn an_error_names_the_port_and_a_remedy() {
         let problem_of = |endpoint: &str, answer| Contact::of(endpoint).unwrap().problem(&answer);
         let here = problem_of("tcp/127.0.0.1:7447", Answer::Foreign("`HTTP`".to_owned())).unwrap();
         for part in ["port 7447 of this machine", "answers `HTTP`", "ss -ltnp", "--meet PORT"] {

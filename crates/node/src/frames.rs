@@ -34,13 +34,13 @@ const FRAMES_IN_POOL: usize = 4;
 /// A pool that is exhausted for this time is replaced: a reader that was killed never returns its frames.
 /// Longer than any reader keeps a frame.
 const POOL_EXHAUSTED_TIMEOUT: Duration = Duration::from_secs(1);
-/// Minimum failed allocations, besides, before a pool is replaced: at a low frame rate the time alone says
+/// Minimum failed allocations, in addition, before a pool is replaced: at a low frame rate the time alone proves
 /// little.
 const MIN_FAILED_ALLOCATIONS: u32 = 4;
 /// Maximum number of replacement pools of a publisher, as readers keep the old ones mapped.
 const MAX_NEW_POOLS: u32 = 3;
 
-/// On the air link each priority has a connection of its own (`zenoh-config/README.md`); frames use these
+/// On the air link each priority has a separate connection (`zenoh-config/README.md`); frames use these
 /// two.
 const FIRST_PRIORITY: Priority = Priority::DataLow;
 const SECOND_PRIORITY: Priority = Priority::Background;
@@ -50,7 +50,7 @@ const FRAME_CONNECTIONS: usize = 2;
 pub struct FramePublisher {
     publisher: zenoh::pubsub::Publisher<'static>,
     pool: Option<Mutex<Pool>>,
-    /// What its frames are counted as, but for JPEG.
+    /// The name under which its frames are counted, except JPEG.
     counted: &'static str,
     health: Arc<HealthCounters>,
 }
@@ -122,7 +122,7 @@ impl Node {
         self.session
             .declare_publisher(key.clone())
             .priority(priority)
-            // `Drop` would lose almost all large frames on a lossy link; this drops whole frames.
+            // `Drop` would lose almost all large frames on a lossy link; this drops complete frames.
             .congestion_control(CongestionControl::BlockFirst)
             .await
             .map_err(|cause| anyhow!("declaring a publisher on {key}: {cause}"))
@@ -191,7 +191,7 @@ impl Pool {
         self.provider.alloc(len).with_policy::<GarbageCollect>().wait().ok()
     }
 
-    /// Whether readers may lock one more pool beside those they keep, and as much again for other locked
+    /// Whether readers may lock one more pool in addition to those they keep, and as much again for other locked
     /// memory: a reader beyond its limit would get no frames, while without a new pool they are copied.
     /// Readers are assumed to have the limit of this process.
     fn is_replaceable(&self) -> bool {

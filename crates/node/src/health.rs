@@ -1,4 +1,4 @@
-//! A service's counters, published once a second as its health.
+//! Counts events, latencies, drops and errors of a service, which publishes them once a second as its health.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -14,11 +14,11 @@ use crate::version::version;
 /// Number of recent latencies over which percentiles are taken.
 pub const LATENCIES_KEPT: usize = 512;
 
-/// Maximum number of keys whose unreadable payloads are counted each; those of further ones are counted together.
+/// Maximum number of keys whose unreadable payloads are counted each; those of further keys are counted together.
 const MAX_KEYS: usize = 64;
 /// The name of all further keys.
 const OTHER_KEYS: &str = "other keys";
-/// Minimum time between two lines of the log on what cannot be read of one key, in nanoseconds.
+/// Minimum time between two lines of the log on unreadable payloads of one key, in nanoseconds.
 const LOG_PERIOD_NS: i64 = 10_000_000_000;
 
 /// Payloads of one key that could not be read.
@@ -207,7 +207,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_report_has_what_was_counted() {
+    fn a_report_contains_all_counts() {
         let counters = HealthCounters::default();
         for ms in 1..=100 {
             counters.count("frames");

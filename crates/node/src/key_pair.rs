@@ -1,6 +1,6 @@
-//! Whether the files of a key belong together.
+//! Checks that the files of a key belong together.
 //!
-//! A process whose files do not would start, listen nowhere, and say nothing of it.
+//! Otherwise a process would start and listen nowhere, without an error.
 
 use std::io;
 use std::path::Path;
@@ -28,7 +28,7 @@ pub(crate) fn check(authority: &Path, certificate: &Path, key: &Path) -> anyhow:
     Ok(())
 }
 
-/// The authority in whose certificates a process trusts.
+/// The authority that a process trusts.
 pub(crate) fn trusted(authority: &Path) -> anyhow::Result<RootCertStore> {
     let mut roots = RootCertStore::empty();
     roots
@@ -47,25 +47,25 @@ pub(crate) fn certificate_of(path: &Path) -> anyhow::Result<CertificateDer<'stat
     CertificateDer::from_pem_file(path).map_err(|cause| unusable(path, "certificate", cause))
 }
 
-/// Why a file cannot be used for what it is to be.
-fn unusable(path: &Path, what: &str, cause: pem::Error) -> anyhow::Error {
+/// The error of a file that cannot be used as this kind of file.
+fn unusable(path: &Path, kind: &str, cause: pem::Error) -> anyhow::Error {
     if let pem::Error::Io(cause) = &cause
         && let Err(denied) = check_permission(path, cause)
     {
         return denied;
     }
-    anyhow!(cause).context(format!("{path:?} is no {what}; copy it again from where it was made"))
+    anyhow!(cause).context(format!("{path:?} is no {kind}; copy it again from its origin"))
 }
 
-/// Checks that it is not for the rights of this user alone that a file of a key was not found or read: nothing is wrong with it then.
+/// Checks that missing rights of this user are not the reason why a file of a key was not found or read: then the file is not faulty.
 ///
 /// # Errors
-/// Says as whom to read it.
+/// Names the user that may read it.
 pub(crate) fn check_permission(path: &Path, cause: &io::Error) -> anyhow::Result<()> {
     ensure!(
         cause.kind() != io::ErrorKind::PermissionDenied,
-        "this user may not read {path:?}: run this as the user of the services (`sudo -u alight alight ...`), to whom the keys are to \
-         belong (`sudo chown alight: FILE`), or with a key of your own (`--keys DIRECTORY`)"
+        "this user may not read {path:?}: run this as the user of the services (`sudo -u alight alight ...`), which should own the \
+         keys (`sudo chown alight: FILE`), or with a key of your own (`--keys DIRECTORY`)"
     );
     Ok(())
 }
@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_key_of_another_certificate_and_files_that_are_none_are_named() {
+    fn a_key_of_another_certificate_and_invalid_files_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
         for name in ["own", "other"] {

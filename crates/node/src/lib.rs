@@ -1,15 +1,15 @@
-//! What every service needs: configuration, a session, presence, typed topics, health, and an orderly
+//! The base of every service: configuration, a session, presence, typed topics, health, and an orderly
 //! shutdown.
 //!
-//! This is the only crate that uses Zenoh. It knows nothing of images, markers or autopilots.
+//! This is the only crate that uses Zenoh. It does not depend on images, markers or autopilots.
 //!
 //! Modules in reading order: [`config`] merges a user's settings into the defaults; [`service`] runs a
 //! service from start to shutdown; [`network`] configures the network, its `endpoint`s and, from [`access`], the rights of others by their [`certificate`]s and the `cipher` of links,
-//! and [`session`] joins it under an [`identity`], a tool's unless `foreign` programs answer there (`reach` says why nobody does), with shared memory where `memory`
-//! says that it can; [`topics`] has typed messages and commands, with their `sender`, [`frames`] pixels,
-//! and [`tap`] everything as it came; [`health`] counts, with [`stats`]; [`denied`] counts what access control
-//! denies; [`clock`] is the host's clock, [`standstill`] says that a process was frozen, [`state`] where a service keeps
-//! what survives a reboot, and [`version`](mod@version) which program it is.
+//! and [`session`] joins it under an [`identity`], for a tool unless `foreign` programs answer there (`reach` finds why no process does), with shared memory where `memory`
+//! allows it; [`topics`] has typed messages and commands, with their `sender`, [`frames`] pixels,
+//! and [`tap`] all messages as bytes; [`health`] counts, with [`stats`]; [`denied`] counts denials of access
+//! control; [`clock`] is the host's clock, [`standstill`] detects that a process was frozen, [`state`] is the folder of
+//! data that survive a reboot, and [`version`](mod@version) the version of the program.
 
 pub mod access;
 mod block_on;

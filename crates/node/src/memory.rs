@@ -1,18 +1,18 @@
-//! Whether a session can have shared memory.
+//! Checks whether a session can have shared memory.
 
 use rustix::fs::statvfs;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
-/// What a session with shared memory must be able to lock as it opens, in bytes. Zenoh 1.10.2 locks 1.3 MB, and panics when it
+/// The memory that a session with shared memory must be able to lock as it opens, in bytes. Zenoh 1.10.2 locks 1.3 MB, and panics when it
 /// cannot.
 const MIN_BYTES: u64 = 2 << 20;
-/// Where the system has its shared memory.
+/// The system's folder of shared memory.
 const FOLDER: &str = "/dev/shm";
 
 /// Why this process cannot share memory, if it cannot. Its memlock limit is raised as far as it may.
 pub(crate) fn lack_of_shared_memory() -> Option<String> {
     let Rlimit { maximum, .. } = getrlimit(Resource::Memlock);
-    // Where this is refused, the limit stays what it was.
+    // If this is refused, the limit does not change.
     let _ = setrlimit(Resource::Memlock, Rlimit { current: maximum, maximum });
     let limit = getrlimit(Resource::Memlock).current;
     if let Some(limit) = limit.filter(|limit| *limit < MIN_BYTES) {
@@ -30,7 +30,7 @@ pub(crate) fn lack_of_shared_memory() -> Option<String> {
     // A file system without a bound has no blocks.
     (about.f_blocks > 0 && free < MIN_BYTES).then(|| {
         format!(
-            "{FOLDER} has {} kB free, less than {} kB: remove what is in it, or give a container more (`--shm-size`)",
+            "{FOLDER} has {} kB free, less than {} kB: remove files in it, or give a container more (`--shm-size`)",
             free >> 10,
             MIN_BYTES >> 10
         )

@@ -1,7 +1,7 @@
-//! The Zenoh configuration of a process: its role's JSON5, built in or of a file, with the site's vehicle name, addresses and
-//! keys filled in; access rules, key files and ports checked.
+//! Makes the Zenoh configuration of a process: its role's JSON5, built in or of a file, with the site's vehicle name, addresses and
+//! keys filled in. Checks access rules, key files and ports.
 //!
-//! How the processes of a role connect is the same at every site; what differs is filled in here, so that no site needs files
+//! The processes of a role connect in the same way at every site. The differences are filled in here, so that no site needs files
 //! of its own.
 
 use std::ffi::OsString;
@@ -30,17 +30,17 @@ pub const SECURED_CONFIG: &str = include_str!("../../../zenoh-config/secured.jso
 /// The port of the air link for control; the next two are for frames.
 pub const AIR_PORT: u16 = 7448;
 
-/// The reason for which a process that everybody in reach may command counts an error in its health.
+/// The error that a process counts in its health when every client in range may command it.
 pub const INSECURE: &str = "insecure: without keys anyone in reach can command the vehicle";
 
-/// The reason for which a bridge that any ground station in reach may command by counts an error in its health.
+/// The error that a bridge counts in its health when every ground station in range may command by it.
 pub const OPEN: &str =
     "open: any ground station in reach can command the vehicle; see `ground_stations`";
 
 /// The file name of the authority's certificate in a directory of keys.
 pub const AUTHORITY: &str = "authority.pem";
 
-/// Why an IPv6 address is refused where there are keys, and what to do.
+/// The error of an IPv6 address with keys, and a remedy.
 pub const NO_KEYS_OVER_IPV6: &str = "with keys, nothing can be reached at an IPv6 address: give the IPv4 address of that machine, which its key has to name as well \
      (`alight keys issue --address`)";
 
@@ -187,7 +187,7 @@ impl Network {
         Ok(vehicle.with_context(|| format!("{name} has no `namespace`"))?.to_owned())
     }
 
-    /// The first endpoint at which this process is to listen whose port another one has. Zenoh would wait for it without a word.
+    /// The first endpoint at which this process is to listen and whose port is in use. Zenoh would wait for it without a log message.
     ///
     /// # Errors
     /// As [`Network::source`].
@@ -263,7 +263,7 @@ fn parse(name: &str, text: &str) -> anyhow::Result<Value> {
 
 /// Adds TLS to a configuration, and access control where others connect.
 fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()> {
-    // The services on the drone use its loopback interface, where everybody with a login is trusted.
+    // The services on the drone use its loopback interface, where every user with a login is trusted.
     let connects_locally = endpoints(config, "connect").any(|e| e.contains(LOOPBACK));
     let listens_locally = endpoints(config, "listen").all(|e| e.contains(LOOPBACK));
     if connects_locally && listens_locally {
@@ -292,11 +292,11 @@ fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()>
     }
     let path = keys.join(HOLDERS);
     if listens_locally && !path.is_file() {
-        // Only this machine connects here; what is said across the air link is judged by the relay.
+        // Only this machine connects here; the relay checks messages over the air link.
         layer.as_object_mut().and_then(|layer| layer.remove("access_control"));
     } else {
         let text = std::fs::read_to_string(&path).with_context(|| {
-            format!("reading {path:?}, the list of those who may connect; copy it from the authority's directory")
+            format!("reading {path:?}, the list of holders that may connect; copy it from the authority's directory")
         })?;
         let holders = text.parse().with_context(|| format!("{path:?}"))?;
         let vehicle =
@@ -307,7 +307,7 @@ fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()>
     Ok(())
 }
 
-/// Checks that a file of a key is there, by what the system says of it.
+/// Checks that a file of a key is there, by the result of the system call.
 fn check_is_there(path: &Path, is_file: io::Result<bool>, key_name: &str) -> anyhow::Result<()> {
     if let Err(cause) = &is_file {
         key_pair::check_permission(path, cause)?;
@@ -336,13 +336,13 @@ pub fn issue_arguments(key_name: &str) -> String {
 /// Refuses a private key that other users can read.
 ///
 /// # Errors
-/// Says how to mend it.
+/// Names a remedy.
 pub fn check_private(path: &Path) -> anyhow::Result<()> {
     let file = std::fs::metadata(path).with_context(|| format!("reading {path:?}"))?;
     let mode = file.permissions().mode() & 0o777;
     ensure!(
         mode & 0o077 == 0,
-        "the private key {path:?} is open to other users (mode {mode:o}): `chmod 600 {}`; if somebody may have read \
+        "the private key {path:?} is open to other users (mode {mode:o}): `chmod 600 {}`; if another user may have read \
          it, revoke it (`alight keys revoke`) and make another",
         path.display()
     );
@@ -358,7 +358,7 @@ pub fn check_pair(keys: &Path, key_name: &str) -> anyhow::Result<()> {
     key_pair::check(&keys.join(AUTHORITY), &certificate, &key)
 }
 
-/// An endpoint at which everybody in reach may connect to this configuration; `None` if only this machine or
+/// An endpoint at which every client in range may connect to this configuration; `None` if only this machine or
 /// holders of a certificate may.
 fn open_endpoint(config: &Value) -> Option<String> {
     let asks_for_certificates = config["transport"]["link"]["tls"]["enable_mtls"] == true;
@@ -601,7 +601,7 @@ mod tests {
             let local = Network { listen: Some("127.0.0.1:9000".into()), ..network };
             assert!(open(&local).is_none());
             let local = Network { insecure: true, ..local };
-            assert!(!local.is_open().unwrap(), "nobody outside reaches it");
+            assert!(!local.is_open().unwrap(), "it cannot be reached from outside");
         }
         for (text, is_open) in [
             ("{}", true),

@@ -1,6 +1,6 @@
 //! Explains to a tool why it sees no process of the vehicle, by TCP and TLS connections of its own: a name or address unknown,
-//! nobody listening, its key refused. Zenoh tries an address again for ever without a word, and a relay says nothing to whom it
-//! shuts out.
+//! no program listening, its key refused. Zenoh retries an address for ever without a log message, and a relay sends nothing to a
+//! client that it rejects.
 
 use std::io;
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
@@ -21,15 +21,15 @@ use crate::key_pair;
 const PATIENCE: Duration = Duration::from_secs(1);
 /// Maximum time for an address altogether: the system may look a name up for longer.
 const MAX_TIME: Duration = Duration::from_secs(4);
-/// Who refuses a certificate says so one round trip later; a relay that accepts it waits for the first message.
+/// A refusal of a certificate arrives one round trip later; a relay that accepts it waits for the first message.
 const MIN_REFUSAL: Duration = Duration::from_millis(300);
 /// Addresses that are tried; a session has one, or the few of its site.
 const MAX_PLACES: usize = 4;
-/// What to do about an address.
+/// The remedy for a wrong address.
 const CORRECT: &str =
     "correct the address: `--connect`, `address` or `relay_address` of the site, or ALIGHT_CONNECT";
 
-/// Where a session connects, with what.
+/// The addresses to which a session connects, and its keys.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Reach {
     /// The vehicle's name.
@@ -56,18 +56,18 @@ struct Keys {
     private: PathBuf,
 }
 
-/// What a connection to a place showed.
+/// The result of a connection to an address.
 #[derive(Debug)]
 enum Finding {
     /// The name is not known.
     Unknown(io::Error),
-    /// Nobody listens, or nothing comes back.
+    /// No program listens, or no answer arrives.
     Unreachable(io::Error),
     /// The exchange of certificates failed.
     Refused(io::Error),
-    /// Nothing of all that was known in time.
+    /// No result in time.
     Slow,
-    /// The files of the own key cannot be used.
+    /// The files of this process's key cannot be used.
     Keys(anyhow::Error),
     Accepted,
 }
@@ -110,7 +110,7 @@ impl Reach {
         self.keys.as_ref().map(|keys| keys.certificate.as_path())
     }
 
-    /// Why no process of the vehicle is to be seen, and what to do.
+    /// The reason why no process of the vehicle is seen, and a remedy.
     pub(crate) async fn explain(&self) -> String {
         let mut reasons = Vec::new();
         for place in &self.places {
@@ -130,13 +130,15 @@ impl Reach {
         }
     }
 
-    /// Asks in a thread, which nobody waits for: neither the runtime's workers nor the end of the process.
+    /// Connects in a separate thread, for which neither the runtime's workers nor the end of the process waits.
     async fn finding(&self, place: &Place) -> Finding {
         let (place, keys) = (place.clone(), self.keys.clone());
         let (sender, receiver) = oneshot::channel();
         let asks = move || drop(sender.send(place.finding(keys.as_ref())));
         if let Err(cause) = std::thread::Builder::new().name("reach".into()).spawn(asks) {
-            return Finding::Keys(anyhow!("starting a thread that looks who is there: {cause}"));
+            return Finding::Keys(anyhow!(
+                "starting a thread that connects to the addresses: {cause}"
+            ));
         }
         match timeout(MAX_TIME, receiver).await {
             Ok(Ok(finding)) => finding,
@@ -155,7 +157,7 @@ impl Reach {
             }
             Finding::Unreachable(cause) if cause.kind() == io::ErrorKind::ConnectionRefused => {
                 format!(
-                    "nobody listens at {at}: start the relay there (`alight up drone`), or {CORRECT}"
+                    "no program listens at {at}: start the relay there (`alight up drone`), or {CORRECT}"
                 )
             }
             Finding::Unreachable(cause) => format!(
@@ -167,7 +169,7 @@ impl Reach {
             ),
             Finding::Keys(cause) => format!("{cause:#}"),
             Finding::Refused(cause) => match rustls_error(cause) {
-                // Also said of one that is not valid yet.
+                // Also reported for a certificate that is not valid yet.
                 Some(rustls::Error::AlertReceived(AlertDescription::CertificateExpired)) => {
                     format!(
                         "the relay at {at} refuses the certificate {own}, as not valid at this time: it has expired (`alight keys issue` makes \
@@ -183,7 +185,7 @@ impl Reach {
                     format!("the relay at {at} has a certificate {problem}")
                 }
                 _ => format!(
-                    "who listens at {at} has not answered with a certificate ({cause}): another program, or a relay without keys \
+                    "the program that listens at {at} has not answered with a certificate ({cause}): another program, or a relay without keys \
                      (`--keys`); else {CORRECT}"
                 ),
             },
@@ -191,8 +193,8 @@ impl Reach {
                 format!("the relay at {at} wants a key, and this process has none (`--keys`)")
             }
             Finding::Accepted if place.is_encrypted => format!(
-                "the relay at {at} accepts the certificate {own}, and shows it nothing: its holder was revoked, is of another vehicle than \
-                 `{}`, or is not in the relay's holders.txt, which `alight keys issue` and `revoke` write beside the authority's key, and \
+                "the relay at {at} accepts the certificate {own}, but announces no process to it: its holder was revoked, is of another vehicle than \
+                 `{}`, or is not in the relay's holders.txt, which `alight keys issue` and `revoke` write next to the authority's key, and \
                  which is to be copied to each relay",
                 self.vehicle
             ),
@@ -205,7 +207,7 @@ impl Reach {
 }
 
 impl Place {
-    /// Connects, and exchanges certificates where that is asked for.
+    /// Connects, and exchanges certificates on an encrypted address.
     fn finding(&self, keys: Option<&Keys>) -> Finding {
         let host = self.host.trim_matches(['[', ']']);
         let addresses: Vec<SocketAddr> = match (host, self.port).to_socket_addrs() {
@@ -303,7 +305,7 @@ fn read_once(
     }
 }
 
-/// The time until then.
+/// The time until `end`.
 fn left(end: Instant) -> io::Result<Duration> {
     let left = end.saturating_duration_since(Instant::now());
     if left.is_zero() { Err(io::ErrorKind::TimedOut.into()) } else { Ok(left) }
@@ -332,7 +334,7 @@ fn rustls_error(cause: &io::Error) -> Option<&rustls::Error> {
     cause.get_ref()?.downcast_ref()
 }
 
-/// What is wrong with the certificate of a relay, and what to do.
+/// The error of a relay's certificate, and a remedy.
 fn certificate_problem(problem: &CertificateError, host: &str) -> String {
     match problem {
         CertificateError::NotValidForName | CertificateError::NotValidForNameContext { .. } => {
@@ -365,7 +367,7 @@ mod tests {
         let reason_of = |problem: rustls::Error| {
             Reach::default().reason(&place, &Finding::Refused(io::Error::other(problem)))
         };
-        // A relay says so of a certificate that is not valid yet as well.
+        // A relay reports a certificate that is not valid yet in the same way.
         let expired = AlertDescription::CertificateExpired;
         let refused = reason_of(rustls::Error::AlertReceived(expired));
         for part in ["has expired", "alight keys issue", "clock of that machine", "timedatectl"] {

@@ -1,6 +1,6 @@
-//! Who sends a command, as its recipient logs it.
+//! Names the sender of a command, as its recipient logs it.
 //!
-//! With keys it is the holder of the certificate, else the user. Nothing proves it: whoever may command can send any name.
+//! With keys it is the holder of the certificate, else the user. It is not authenticated: each client that may command can send any name.
 
 use std::path::Path;
 
@@ -18,15 +18,15 @@ pub(crate) fn name(identity: &Identity, own: Option<&Path>) -> String {
     let holder = own.and_then(|path| certificate::certificate(path).ok());
     let holder = holder.map(|it| it.common_name).filter(|it| !it.is_empty());
     let user = || USER.iter().find_map(|name| std::env::var(name).ok()).filter(|it| !it.is_empty());
-    let who = holder.or_else(user).unwrap_or_else(|| "somebody".to_owned());
+    let user = holder.or_else(user).unwrap_or_else(|| "somebody".to_owned());
     let Identity { service, instance } = identity;
-    let name = format!("{who}, {service} {instance} on {}", host_name());
-    // It is a parameter of a selector, whose own signs it must not have.
+    let name = format!("{user}, {service} {instance} on {}", host_name());
+    // It is a parameter of a selector, and must not contain a selector's separators.
     let is_plain = |it: char| it.is_alphanumeric() || " .,@_-".contains(it);
     shown(&name.replace(|it| !is_plain(it), "_"))
 }
 
-/// A name as it came from the network, short and without what a terminal or a log would take for its own.
+/// A name from the network, shortened and without control characters.
 pub(crate) fn shown(name: &str) -> String {
     let letters = name.chars().filter(|character| !character.is_control());
     let shown: String = letters.take(MAX_LETTERS).collect();

@@ -40,10 +40,10 @@ pub struct Shutdown {
     requested: watch::Receiver<Option<Cause>>,
 }
 
-/// What requests a shutdown.
+/// The cause of a shutdown request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Cause {
-    /// Whoever runs the process, by SIGINT or SIGTERM.
+    /// The user or supervisor, by SIGINT or SIGTERM.
     Operator,
     /// SIGHUP.
     Hangup,
@@ -57,7 +57,7 @@ impl Shutdown {
     pub fn on_signals() -> anyhow::Result<Self> {
         let mut interrupt = signal(SignalKind::interrupt()).context("listening to SIGINT")?;
         let mut terminate = signal(SignalKind::terminate()).context("listening to SIGTERM")?;
-        // Whoever listens would undo that it is ignored.
+        // A handler would undo that it is ignored.
         let mut hangup = match ignores_hangups() {
             true => None,
             false => Some(signal(SignalKind::hangup()).context("listening to SIGHUP")?),
@@ -81,7 +81,7 @@ impl Shutdown {
                      terminal that is closed, and one that is started with `nohup` ignores it"
                 );
             }
-            // There is no receiver left when the service has ended by itself.
+            // There is no receiver left when the service has ended on its own.
             sender.send_replace(Some(cause));
             // Keeps the sender: without it receivers would see a closed channel.
             std::future::pending::<()>().await;
@@ -96,7 +96,7 @@ impl Shutdown {
         drop(requested.wait_for(Option::is_some).await);
     }
 
-    /// Whether it was requested by SIGHUP, so perhaps by nobody.
+    /// Whether it was requested by SIGHUP, so perhaps unintentionally.
     pub fn is_by_hangup(&self) -> bool {
         *self.requested.borrow() == Some(Cause::Hangup)
     }
@@ -145,7 +145,7 @@ where
     result
 }
 
-/// What is logged of Zenoh. It warns about every failed attempt to listen at or connect to the rendezvous, which are expected here, and
+/// The log levels of Zenoh. It warns about every failed attempt to listen at or connect to the rendezvous, which are expected here, and
 /// about messages in flight when their sender's session closes ("Route data with unknown scope", "Route query with unknown scope";
 /// eclipse-zenoh/zenoh issues 980 and 1050, pull request 2524). Such a query gets an empty reply, and a command without a recipient is
 /// sent again.
@@ -174,14 +174,14 @@ pub fn start_logging(default_level: &str) {
         tracing::warn!(
             ALIGHT_LOG = level,
             %problem,
-            "Logging at {default_level:?}: what is set is no level (error, warn, info, debug, trace, off), nor levels by module (info,controller=debug)"
+            "Logging at {default_level:?}: the value of ALIGHT_LOG is no level (error, warn, info, debug, trace, off), nor levels by module (info,controller=debug)"
         );
     }
 }
 
 /// These levels over those of Zenoh.
 fn levels(ours: &str) -> anyhow::Result<Targets> {
-    // A word that is no level would be taken for a module of which all is logged, and nothing of the others.
+    // A word other than a level would be taken for a module: all of it would be logged, and nothing of the others.
     for level in ours.split(',').filter(|entry| !entry.contains('=')) {
         level.parse::<LevelFilter>().with_context(|| format!("{level:?}"))?;
     }
@@ -210,7 +210,7 @@ pub fn relaunch(environment: &[(&str, &str)]) -> std::io::Error {
         .exec()
 }
 
-/// The file of this program, to start it once more: also where it was replaced or removed since it started.
+/// The file of this program, to start it again: also where it was replaced or removed since it started.
 pub fn own_program() -> PathBuf {
     let file = std::env::current_exe().ok().filter(|file| file.is_file());
     file.unwrap_or_else(|| "/proc/self/exe".into())

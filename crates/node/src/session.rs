@@ -1,4 +1,4 @@
-//! A process on Zenoh's network: opens the session, claims a unique name, declares its presence, or that of services whose recording
+//! Puts a process on Zenoh's network: opens the session, claims a unique name, declares its presence, or that of services whose recording
 //! is played, and follows that of others.
 
 use std::path::{Path, PathBuf};
@@ -92,7 +92,7 @@ pub struct Presence {
 }
 
 impl Node {
-    /// Opens the session of a service, which goes on where another program answers: it meets the others once the right one is there.
+    /// Opens the session of a service, which continues where another program answers: it connects once the right one is there.
     /// The service is not announced before [`Node::announce`].
     ///
     /// # Errors
@@ -142,7 +142,7 @@ impl Node {
         })
     }
 
-    /// Who this process is to those that it commands.
+    /// The name of this process as a sender of commands.
     pub(crate) fn sender(&self) -> String {
         sender::name(&self.identity, self.reach.certificate())
     }
@@ -152,7 +152,7 @@ impl Node {
         &self.identity
     }
 
-    /// The name of the vehicle whose processes it meets.
+    /// The name of the vehicle to whose processes it connects.
     pub fn vehicle(&self) -> &str {
         self.reach.vehicle()
     }
@@ -250,7 +250,7 @@ impl Node {
         })
     }
 
-    /// Why a service does not answer, the one with this name if one is wanted, and what to do: for a tool that gives up.
+    /// The reason why a service, or its instance of this name, does not answer, and a remedy: for a tool that gives up.
     pub fn explain_silence<'a>(
         &'a self,
         service: &'a str,
@@ -269,9 +269,9 @@ impl Node {
                     Some(_) => ", or the role of this key may not command",
                     None => "",
                 };
-                return format!("the {service} is there: it stands still, or is too busy{role}");
+                return format!("the {service} is there: it is stopped, or too busy{role}");
             }
-            // Anybody who may be present chooses its name.
+            // Each process that may be present chooses its name.
             let names = ready.iter().map(|(name, id)| format!("{name} `{id}`"));
             let names: Vec<_> = names.map(|name| sender::shown(&name)).collect();
             let vehicle = self.reach.vehicle();
@@ -305,18 +305,18 @@ impl Node {
         self.announce_as("Ready")
     }
 
-    /// Announces that the service is there, and logs what it is or waits for: one that says more later logs that itself.
+    /// Announces that the service is there, and logs its state or what it waits for; a service logs later changes itself.
     ///
     /// # Errors
     /// When the session is closed.
-    pub fn announce_as<'a>(&'a self, what: &'a str) -> BoxFuture<'a, anyhow::Result<()>> {
+    pub fn announce_as<'a>(&'a self, state: &'a str) -> BoxFuture<'a, anyhow::Result<()>> {
         Box::pin(async move {
             let key = topic::alive_key(self.identity.service, &self.identity.instance);
             let token = self.declare(&key).await?;
             *self.token.lock().unwrap_or_else(PoisonError::into_inner) = Some(token);
             // The announcement replaces the claim.
             drop(self.claim.lock().unwrap_or_else(PoisonError::into_inner).take());
-            tracing::info!(service = self.identity.service, instance = %self.identity.instance, "{what}");
+            tracing::info!(service = self.identity.service, instance = %self.identity.instance, "{state}");
             Ok(())
         })
     }
@@ -380,8 +380,8 @@ impl Node {
         self.changed.send_replace(Some(toml));
     }
 
-    /// Publishes the service's configuration once it is announced, when it changes, and every few seconds for those that
-    /// come late, until it fails. One that is refused its name publishes none.
+    /// Publishes the service's configuration once it is announced, when it changes, and every few seconds for late
+    /// subscribers, until it fails. One that is refused its name publishes none.
     ///
     /// # Errors
     /// When the session is closed.

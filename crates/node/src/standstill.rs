@@ -1,10 +1,10 @@
-//! Whether this process stood still a moment ago: frozen, or its host asleep or overloaded.
+//! Detects that this process was stopped a moment ago: frozen, or its host asleep or overloaded.
 
 use std::time::Duration;
 
 /// Shortest pause between two steps of a loop with a quick tick that is a standstill, in nanoseconds.
 const MIN_PAUSE_NS: i64 = 1_000_000_000;
-/// Time after it within which what arrives may have waited, in nanoseconds: it lies in sockets and mailboxes.
+/// Time after it in which arriving messages may have waited in sockets and mailboxes, in nanoseconds.
 const AFTERMATH_NS: i64 = 1_000_000_000;
 
 /// The steps of a loop that takes several each second.
@@ -16,7 +16,7 @@ pub struct Standstill {
 }
 
 impl Standstill {
-    /// The loop goes on; returns how long it stood still when that was just now, so that what arrives may be old.
+    /// The loop continues; returns the length of a standstill that ended just now, so that arriving messages may be old.
     pub fn step(&mut self, now_ns: i64) -> Option<Duration> {
         let before_ns = self.stepped_ns.replace(now_ns).unwrap_or(now_ns);
         let pause_ns = now_ns.saturating_sub(before_ns);
@@ -35,7 +35,7 @@ mod tests {
     const MS: i64 = 1_000_000;
 
     #[test]
-    fn what_arrives_just_after_a_standstill_may_be_old() {
+    fn messages_just_after_a_standstill_may_be_old() {
         let mut loop_ = Standstill::default();
         assert_eq!(loop_.step(9_000_000 * MS), None, "the first step");
         for ms in (0..2000).step_by(200) {

@@ -1,4 +1,4 @@
-//! Where a service keeps what survives a reboot.
+//! Finds the folder for data of a service that survive a reboot.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! Statistics of samples: for health reports, tools and experiments.
+//! Computes statistics of samples: for health reports, tools and experiments.
 
 /// The mean; `None` for an empty sample.
 pub fn mean(values: &[f64]) -> Option<f64> {

@@ -1,5 +1,5 @@
 //! Receives every message of many topics as bytes, for a recorder, in one queue of bounded size, and counts by key
-//! what did not fit.
+//! the messages that did not fit.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -22,7 +22,7 @@ const MAX_KEYS: usize = 1024;
 /// The name under which the losses of further keys are counted.
 const OTHER_KEYS: &str = "other keys";
 
-/// A message as it came.
+/// A message as it was received.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Tapped {
     /// Its key, without the vehicle.
@@ -180,7 +180,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_has_no_room_is_counted_by_key() {
+    fn messages_without_room_are_counted_by_key() {
         let shared = Shared::new(100, Arc::default());
         assert!(shared.reserve("wind", 60));
         assert!(!shared.reserve("wind", 41) && !shared.reserve("truth", 41));

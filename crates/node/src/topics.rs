@@ -37,9 +37,9 @@ const SENDER: &str = "from";
 /// The attachment of a query that asks for the recipient's time.
 const ASKS_TIME: &[u8] = b"time?";
 
-/// A mailbox of what is published on the keys that match.
+/// A mailbox of messages that are published on the keys that match.
 pub(crate) type SampleMailbox = zenoh::pubsub::Subscriber<RingChannelHandler<Sample>>;
-/// A mailbox of what is asked on a key.
+/// A mailbox of queries on a key.
 type QueryMailbox = Queryable<RingChannelHandler<Query>>;
 
 /// Publishes messages of one type on one key.
@@ -77,12 +77,12 @@ pub struct Request<M> {
     pub message: M,
     /// When it was sent, in nanoseconds of this recipient's clock; `None` from a requester that has not asked for it.
     pub sent_ns: Option<i64>,
-    /// Who says to have sent it, for a log.
+    /// The sender's name as it stated it, for a log.
     pub sender: String,
     query: Query,
 }
 
-/// What was replied to a query.
+/// The reply to a query.
 enum Reply {
     Command(messages::CommandReply),
     /// The recipient's time, in nanoseconds of its clock.
@@ -107,7 +107,7 @@ fn qos(delivery: Delivery) -> Qos {
         Delivery::LatestPriority => (Priority::RealTime, CongestionControl::Drop, 64),
         Delivery::LastValue => (Priority::InteractiveHigh, CongestionControl::Drop, 64),
         Delivery::Reliable => (Priority::InteractiveLow, CongestionControl::Drop, 512),
-        // On the air link with the frames, and not with control: what waited for a late recorder is much.
+        // On the air link with the frames, and not with control: data that waited for a late recorder are large.
         Delivery::Record => (Priority::Data, CongestionControl::Drop, 512),
         Delivery::Query => (Priority::InteractiveHigh, CongestionControl::Drop, 16),
     };
@@ -308,15 +308,15 @@ impl Node {
         })
     }
 
-    /// Why nobody answered who was asked for the time; no command was sent.
+    /// The error when no recipient answered the request for the time; no command was sent.
     async fn unanswered(&self, key: &str) -> anyhow::Error {
-        let who = recipient(key);
-        let (service, wanted) = match who.split_once('/') {
+        let recipient = recipient(key);
+        let (service, wanted) = match recipient.split_once('/') {
             Some((service, instance)) => (service, Some(instance)),
-            None => (who, None),
+            None => (recipient, None),
         };
         let why = self.explain_silence(service, wanted).await;
-        anyhow!("no {who} answered within {} s: {why}", REPLY_TIMEOUT.as_secs())
+        anyhow!("no {recipient} answered within {} s: {why}", REPLY_TIMEOUT.as_secs())
     }
 
     async fn query(
@@ -345,10 +345,10 @@ impl Node {
 
 /// The service, and its instance if one is meant, to which a command's key belongs.
 fn recipient(key: &str) -> &str {
-    key.rsplit_once('/').map_or(key, |(who, _command)| who)
+    key.rsplit_once('/').map_or(key, |(recipient, _command)| recipient)
 }
 
-/// What is known of a command that was sent so long ago and has no reply.
+/// The error of a command that was sent this long ago and has no reply.
 fn unconfirmed(key: &str, waited: Duration) -> anyhow::Error {
     let lack = match waited < REPLY_TIMEOUT {
         true => "the connection to it ended before an answer came".to_owned(),
@@ -437,7 +437,7 @@ fn refusal(sent_ns: Option<i64>, now_ns: i64) -> Option<String> {
     // A time in the future is from another process, before this host was started again.
     (!(0..=max_ns).contains(&age_ns)).then(|| {
         format!(
-            "the command is {:.1} s old and its sender has given up after {REPLY_TIMEOUT:?}: it waited, as a process or a link stood still; give it again if it is still wanted",
+            "the command is {:.1} s old and its sender has given up after {REPLY_TIMEOUT:?}: it waited, as a process or a link was stopped; give it again if it is still needed",
             age_ns as f64 * 1e-9
         )
     })
@@ -464,7 +464,7 @@ fn reply_with_time(query: Query) -> BoxFuture<'static, ()> {
 }
 
 impl<M: Message> Request<M> {
-    /// Answers the command, and logs whose it was.
+    /// Answers the command, and logs its sender.
     pub async fn answer(self, reply: &messages::CommandReply) {
         let command = serde_json::to_string(&self.message).unwrap_or_default();
         let command: String = command.chars().take(MAX_LOGGED).collect();

@@ -21,7 +21,7 @@ const ROLES: [(&str, &str); 9] = [
     ("observer", "observer"),
 ];
 
-/// The incoming messages by which a role subscribes, publishes, queries, replies and sees who is there.
+/// The incoming messages by which a role subscribes, publishes, queries, replies and sees the processes that are present.
 const MESSAGES: [&str; 8] = [
     "declare_subscriber",
     "put",
@@ -100,7 +100,7 @@ fn is_reply(row: &Row) -> bool {
 }
 
 #[test]
-fn the_access_rules_allow_what_the_topic_table_says_and_nothing_else() -> anyhow::Result<()> {
+fn the_access_rules_allow_exactly_the_rights_of_the_topic_table() -> anyhow::Result<()> {
     let access = access()?;
     for (role, service) in ROLES {
         let rights = rights(&access, role);
@@ -116,7 +116,7 @@ fn the_access_rules_allow_what_the_topic_table_says_and_nothing_else() -> anyhow
                 | Delivery::Reliable
                 | Delivery::Record => &["put"],
             };
-            // The last value is asked for by who subscribes.
+            // A subscriber queries the last value.
             let receiving: &[&str] = match row.delivery {
                 Delivery::LastValue => &["declare_subscriber", "query"],
                 _ => &["declare_subscriber"],
@@ -189,7 +189,7 @@ fn no_role_has_rights_to_wildcards() -> anyhow::Result<()> {
 }
 
 #[test]
-fn every_role_sees_who_is_there() -> anyhow::Result<()> {
+fn every_role_sees_the_processes_that_are_present() -> anyhow::Result<()> {
     let access = access()?;
     for (role, _) in ROLES {
         for message in ["liveliness_query", "declare_liveliness_subscriber"] {

@@ -52,7 +52,7 @@ fn header(sequence: u64) -> FrameHeader {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn frames_arrive_as_they_were_written_and_misfits_are_skipped() -> anyhow::Result<()> {
+async fn frames_arrive_as_they_were_written_and_invalid_ones_are_skipped() -> anyhow::Result<()> {
     let (_nodes, publisher, subscriber) = frames().await?;
     let too_short = publisher.loan(5);
     publisher.publish(&header(1), too_short).await;
@@ -157,7 +157,7 @@ async fn of_two_that_start_at_once_one_has_priority() -> anyhow::Result<()> {
     for [first, second] in [["main", "main"], ["a", "b"], ["b", "a"], ["main", "main"]] {
         let port = free_port()?;
         let host = open("simulator", "main", port).await?;
-        // Each in a task of its own, as in its own process: a call of Zenoh that blocks the thread of one `block_on` takes what wakes
+        // Each in a task of its own, as in its own process: a call of Zenoh that blocks the thread of one `block_on` takes the wake-up of
         // another future there.
         let start = |instance: &'static str| {
             tokio::spawn(async move {
@@ -240,7 +240,7 @@ async fn foreign_payloads_are_counted_and_skipped() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_published_after_the_session_was_closed_is_no_failure() -> anyhow::Result<()> {
+async fn a_message_after_the_session_was_closed_is_no_failure() -> anyhow::Result<()> {
     let node = open("alight", "main", free_port()?).await?;
     let winds = node.publisher(topic::WIND, &[]).await?;
     let frames = node.frame_publisher(topic::FRAME, &["down"], 64 * 48).await?;
@@ -259,12 +259,12 @@ async fn what_is_published_after_the_session_was_closed_is_no_failure() -> anyho
 async fn a_command_is_answered_and_without_a_controller_the_error_says_so() -> anyhow::Result<()> {
     let port = free_port()?;
     let operator = open("alight", "main", port).await?;
-    let nobody = operator
+    let unanswered = operator
         .command(topic::COMMAND, &[], &ControllerCommand::Hold)
         .await
         .err()
-        .context("nobody")?;
-    assert!(nobody.to_string().contains("no controller answered"), "{nobody}");
+        .context("it is answered")?;
+    assert!(unanswered.to_string().contains("no controller answered"), "{unanswered}");
     let controller = open("controller", "main", port).await?;
     let commands = controller.commands(topic::COMMAND, &[]).await?;
     let answering = tokio::spawn(async move {
@@ -345,7 +345,7 @@ async fn a_recipient_that_does_not_answer_is_sent_no_command() -> anyhow::Result
     let controller = open("controller", "main", port).await?;
     let commands = controller.commands(topic::COMMAND, &[]).await?;
     let operator = open("alight", "main", port).await?;
-    // It stands still until the sender has given up.
+    // It is stopped until the sender has given up.
     let given_up = operator.command(topic::COMMAND, &[], &ControllerCommand::Start).await;
     assert!(given_up.is_err(), "{given_up:?}");
     let late = timeout(Duration::from_secs(1), commands.next()).await;
@@ -368,7 +368,7 @@ async fn a_command_that_was_taken_and_not_answered_may_have_been_carried_out() -
     let (problem, ()) = (problem?, taken.context("no command came")?);
     let part = "sent to the controller, and the connection to it ended before an answer came: it may have been carried out";
     assert!(problem.contains(part), "{problem}");
-    // It takes the command and stands still.
+    // It takes the command and does not continue.
     let (problem, taken) = tokio::join!(unanswered(), commands.next());
     let (problem, _taken) = (problem?, taken.context("no command came")?);
     let part = "no answer came within 2 s: it may have been carried out";

@@ -1,5 +1,5 @@
-//! Zenoh sessions of drone and ground through one relay or two, with the configuration of each role: who
-//! receives from whom, and what an operator who cannot connect reads.
+//! Zenoh sessions of drone and ground through one relay or two, with the configuration of each role: which
+//! process receives from which, and the error texts for an operator without a connection.
 
 mod common;
 
@@ -175,13 +175,13 @@ async fn the_cause_of_a_missing_answer_is_reported_to_the_operator() -> anyhow::
         connect: Some(site.air.replace("127.0.0.1", host)),
         ..network.clone()
     };
-    // A label is too long for any server of names to be asked for it.
+    // The label is too long for a query to a name server.
     let name = format!("{}.invalid", "nowhere".repeat(10));
     let nowhere = at(&ground, &name);
     let here = Network { meet: Some(site.meet), ..Network::default() };
     let (no_relay, unknown, alone) =
         tokio::join!(error_text(&ground), error_text(&nowhere), error_text(&here));
-    contains(&no_relay?, &["no controller", "nobody listens at 127.0.0.1", "--connect"])?;
+    contains(&no_relay?, &["no controller", "no program listens at 127.0.0.1", "--connect"])?;
     contains(&unknown?, &[&format!("address of `{name}` is not known")])?;
     contains(&alone?, &["no process of the vehicle `drone`", "--meet"])?;
 
@@ -241,7 +241,7 @@ async fn a_client_that_a_relay_rejects_gets_the_reason() -> anyhow::Result<()> {
         error_text(&named)
     );
     contains(&anna?, &["there is only relay `drone`"])?;
-    contains(&bob?, &["bob/operator.pem, and shows it nothing", "revoked"])?;
+    contains(&bob?, &["bob/operator.pem, but announces no process to it", "revoked"])?;
     contains(&eve?, &["of another authority"])?;
     contains(&named?, &["not valid for the address `localhost`", "--address"])?;
     controller.announce().await?;

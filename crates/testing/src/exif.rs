@@ -1,4 +1,4 @@
-//! Pictures that viewers turn.
+//! Makes pictures that viewers turn, by their Exif data.
 
 /// The bytes of a JPEG file with Exif data of this orientation, from 1 (upright) to 8.
 pub fn with_exif_orientation(jpeg: &[u8], orientation: u8) -> Vec<u8> {

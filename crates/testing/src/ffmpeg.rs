@@ -1,4 +1,4 @@
-//! Whether ffmpeg can encode what a test streams.
+//! Checks whether ffmpeg can encode the video of a test.
 
 use std::process::Command;
 

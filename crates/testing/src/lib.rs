@@ -1,7 +1,7 @@
-//! What the tests of several crates share: skips that are seen, recordings, peers in Python and JavaScript, ffmpeg, pictures that Exif turns,
+//! Helpers for the tests of several crates: visible skips, recordings, peers in Python and JavaScript, ffmpeg, pictures that Exif turns,
 //! free ports, second tries and waiting.
 //!
-//! It is a dev-dependency only, and knows no other crate of this workspace.
+//! It is a dev-dependency only, and depends on no other crate of this workspace.
 
 mod exif;
 mod ffmpeg;

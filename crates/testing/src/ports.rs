@@ -1,11 +1,11 @@
-//! Ports that are free, for the tests that name them in a file before anybody listens there.
+//! Finds free ports, for tests that name them in a file before a process listens there.
 
 use std::net::{TcpListener, UdpSocket};
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use anyhow::Context;
 
-/// Ports that Linux gives to nobody who asks for just any, nor `alight land` to its processes, so that what is free there stays so.
+/// Ports that neither Linux gives to a process that requests any port, nor `alight land` to its processes, so free ones stay free.
 const FIRST: u32 = 20_000;
 const COUNT: u32 = 6_000;
 /// The most neighbouring ports that are asked for.

@@ -1,9 +1,6 @@
-//! Peers written in Python and JavaScript, run for a test.
+//! Runs peers in Python and JavaScript for a test.
 
-#![expect(
-    clippy::print_stdout,
-    reason = "the output of a script is for whoever looks at a failed test"
-)]
+#![expect(clippy::print_stdout, reason = "the output of a script is for readers of a failed test")]
 
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};

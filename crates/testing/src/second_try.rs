@@ -1,6 +1,6 @@
-//! A second try for tests that take real time.
+//! Gives a second try to tests that take real time.
 
-/// Runs a test, and once more if it fails: a machine that is busy with something else may disturb what takes its time.
+/// Runs a test, and once more if it fails: other work on a busy machine may delay the tested processes.
 ///
 /// # Errors
 /// Those of the second try.
@@ -9,7 +9,7 @@ pub async fn with_second_try(test: impl AsyncFn() -> anyhow::Result<()>) -> anyh
     match test().await {
         Ok(()) => Ok(()),
         Err(problem) => {
-            println!("once more: {problem:#}");
+            println!("second try: {problem:#}");
             test().await
         }
     }

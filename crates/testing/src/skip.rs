@@ -1,4 +1,4 @@
-//! Tests that are skipped, visibly.
+//! Skips tests visibly.
 
 use std::fmt::Display;
 use std::fs::OpenOptions;
@@ -6,7 +6,7 @@ use std::io::Write;
 
 /// Reports that a test is skipped because this machine lacks `need`, and why; then the test returns.
 ///
-/// The report goes past the test harness, which shows nothing of a test that passes. It is also a line in the file named
+/// The report goes past the test harness, which shows no output of a test that passes. It is also a line in the file named
 /// by `ALIGHT_SKIPS`. `ALIGHT_NO_SKIPS` makes it a failure: for every need when it is `1`, else for the needs that it
 /// lists (`python,ffmpeg`).
 #[expect(clippy::panic, reason = "a test fails by a panic")]

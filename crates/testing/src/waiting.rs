@@ -1,19 +1,19 @@
-//! Waiting for what another process or task does in its own time.
+//! Waits for a condition that another process or task brings about.
 
 use std::time::Duration;
 
 use anyhow::Context;
 use tokio::time::{sleep, timeout};
 
-/// How often it is asked.
+/// How often the condition is checked.
 const PERIOD: Duration = Duration::from_millis(20);
 
-/// Waits until something holds, by asking every 20 ms.
+/// Waits until a condition holds, by checking every 20 ms.
 ///
 /// # Errors
-/// It does not hold within the patience; the error says `what` was waited for.
+/// It does not hold within the timeout; the error names the `condition`.
 pub async fn until(
-    what: &str,
+    condition: &str,
     patience: Duration,
     mut holds: impl AsyncFnMut() -> bool,
 ) -> anyhow::Result<()> {
@@ -22,7 +22,7 @@ pub async fn until(
             sleep(PERIOD).await;
         }
     };
-    timeout(patience, asked).await.with_context(|| format!("waited {patience:?} until {what}"))
+    timeout(patience, asked).await.with_context(|| format!("waited {patience:?} until {condition}"))
 }
 
 #[cfg(test)]
@@ -30,7 +30,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn it_asks_until_something_holds_and_says_what_does_not() {
+    async fn it_waits_until_a_condition_holds_and_names_one_that_does_not() {
         let mut asked = 0;
         let third = async || {
             asked += 1;

@@ -1,8 +1,8 @@
 //! Answers to browsers and viewers over HTTP, whose connections are bounded in number and time.
 //!
-//! Whoever reaches the address can open connections and say nothing. Each takes a place until its request is there, or its
-//! time is over; a WebSocket gives it back, as those are counted by who answers them. An answer without end, as a video, says
-//! that its connection lasts, and ends it.
+//! Each client that reaches the address can open connections and send nothing. Each connection takes a place until its request is
+//! there, or its time is over. A WebSocket releases its place, as the handler counts WebSockets. An answer without end, as a video,
+//! marks its connection as lasting, and ends it.
 
 mod tls;
 
@@ -45,7 +45,7 @@ pub struct Limits {
     pub connection: Duration,
 }
 
-/// Encryption, and what is answered without it.
+/// Encryption, and the answer to a connection without it.
 #[derive(Clone)]
 pub struct Encryption {
     /// The certificate.
@@ -66,7 +66,7 @@ struct Shared {
     over: Notify,
 }
 
-/// As long as this is there, its connection lasts beyond [`Limits::connection`]; with it the connection ends, whatever is still
+/// As long as this is there, its connection lasts beyond [`Limits::connection`]; with it the connection ends, even if data are still
 /// to be sent.
 pub struct Lasting(Connection);
 
@@ -94,7 +94,7 @@ impl Connection {
 
 impl Drop for Lasting {
     fn drop(&mut self) {
-        // One permit is kept, also when nobody waits yet.
+        // One permit is stored, also when no task waits yet.
         self.0.0.over.notify_one();
     }
 }
@@ -106,7 +106,7 @@ impl Default for Limits {
     }
 }
 
-/// Answers whoever connects, with encryption where there is one, and counts in the health what took too long. Each request has
+/// Answers each connection, encrypted if so configured, and counts timeouts in the health. Each request has
 /// its peer's address as `ConnectInfo<SocketAddr>`.
 pub fn serve(
     listener: TcpListener,

@@ -1,4 +1,4 @@
-//! Encryption: what a server shows to browsers, and its private key.
+//! Encrypts connections with a server's certificate and private key.
 
 use std::io;
 use std::path::Path;
@@ -24,7 +24,7 @@ pub struct Tls(TlsAcceptor);
 pub(crate) enum Begun {
     /// Encrypted.
     Encrypted(Box<TlsStream<TcpStream>>),
-    /// With something else than TLS, or with nothing.
+    /// With bytes other than TLS, or with none.
     Plain(TcpStream),
 }
 
@@ -48,7 +48,7 @@ impl Tls {
         Ok(Self(TlsAcceptor::from(Arc::new(config))))
     }
 
-    /// Begins a connection by what its other side sends first.
+    /// Begins a connection by the first byte of its other side.
     pub(crate) async fn begin(&self, stream: TcpStream) -> io::Result<Begun> {
         let mut first = [0];
         stream.peek(&mut first).await?;

@@ -1,4 +1,4 @@
-//! Which certificates are served.
+//! Tests which certificates are served.
 
 use std::fs::{Permissions, copy, set_permissions, write};
 use std::os::unix::fs::PermissionsExt;
@@ -18,7 +18,7 @@ fn make(folder: &Path, name: &str) -> anyhow::Result<[PathBuf; 2]> {
 }
 
 #[test]
-fn what_cannot_be_served_is_named() -> anyhow::Result<()> {
+fn a_certificate_that_cannot_be_served_is_named() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let [certificate, key] = make(folder.path(), "page")?;
     let [_, other] = make(folder.path(), "other")?;

@@ -1,4 +1,4 @@
-//! Connections that say nothing, little, or go on.
+//! Tests connections that send nothing, little, or continue.
 
 use std::convert::Infallible;
 use std::net::SocketAddr;
@@ -33,7 +33,7 @@ async fn slowly() -> &'static str {
     "late"
 }
 
-async fn who(ConnectInfo(peer): ConnectInfo<SocketAddr>) -> String {
+async fn peer_address(ConnectInfo(peer): ConnectInfo<SocketAddr>) -> String {
     peer.ip().to_string()
 }
 
@@ -49,7 +49,7 @@ async fn socket(upgrade: WebSocketUpgrade) -> Response {
     })
 }
 
-/// The connection of an answer without end, which ends when nobody has taken anything for 300 ms; it takes a second to begin.
+/// The connection of an answer without end, which ends when the client has taken nothing for 300 ms; it takes a second to begin.
 async fn video(Extension(connection): Extension<Connection>) -> Body {
     let (parts, waiting) = mpsc::channel::<Bytes>(1);
     let lasting = connection.last();
@@ -78,7 +78,7 @@ async fn served() -> anyhow::Result<Served> {
     let address = listener.local_addr()?;
     let health = Arc::new(HealthCounters::default());
     let router = Router::new()
-        .route("/who", get(who))
+        .route("/who", get(peer_address))
         .route("/slowly", get(slowly))
         .route("/video", get(video))
         .route("/socket", get(socket));
@@ -86,7 +86,7 @@ async fn served() -> anyhow::Result<Served> {
     Ok(Served { address, health })
 }
 
-/// What is answered, until the connection is closed.
+/// The answer, until the connection is closed.
 async fn ask(address: SocketAddr, text: &str) -> anyhow::Result<String> {
     let mut stream = TcpStream::connect(address).await?;
     stream.write_all(text.as_bytes()).await?;
@@ -100,7 +100,7 @@ async fn rest(stream: &mut TcpStream) -> anyhow::Result<String> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn connections_that_say_nothing_or_little_are_closed() -> anyhow::Result<()> {
+async fn connections_that_send_nothing_or_little_are_closed() -> anyhow::Result<()> {
     let served = served().await?;
     for said in ["", "GET /who HT", "GET /who HTTP/1.1\r\nHost: x\r\n"] {
         let began = Instant::now();
@@ -124,7 +124,7 @@ async fn a_connection_that_was_answered_and_waits_for_no_more_is_no_fault() -> a
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn those_that_say_nothing_keep_nobody_out() -> anyhow::Result<()> {
+async fn silent_connections_do_not_block_other_clients() -> anyhow::Result<()> {
     let served = served().await?;
     let mut silent = Vec::new();
     for _ in 0..3 * LIMITS.connections {
@@ -165,18 +165,18 @@ async fn a_websocket_lasts_and_takes_no_place() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_answer_that_lasts_goes_on_until_who_gives_it_ends_it() -> anyhow::Result<()> {
+async fn a_lasting_answer_continues_until_its_handler_ends_it() -> anyhow::Result<()> {
     let served = served().await?;
     let request = b"GET /video HTTP/1.1\r\nHost: x\r\n\r\n";
     let mut stream = TcpStream::connect(served.address).await?;
     let began = Instant::now();
     stream.write_all(request).await?;
     let answer = rest(&mut stream).await?;
-    // What was not sent at its end is lost.
+    // Data that were not sent at its end are lost.
     ensure!(answer.len() > 250 * 100_000, "{} bytes", answer.len());
     ensure!(began.elapsed() > LIMITS.connection, "{:?}", began.elapsed());
 
-    // Who takes nothing has what fits into the buffers of the system, and then a closed connection.
+    // A client that takes nothing receives the system's buffered data, and then a closed connection.
     let mut stuck = TcpStream::connect(served.address).await?;
     stuck.write_all(request).await?;
     sleep(LIMITS.connection + Duration::from_secs(2)).await;
