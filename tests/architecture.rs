@@ -1,5 +1,5 @@
-//! Checks the documents against the tree (paths, names, topics, list of files), and the tree against rules: which
-//! crate may need which, what algorithms do without, how long files are.
+//! Checks the documents against the tree (paths, names, topics, list of files), and the tree against rules:
+//! dependencies between crates, forbidden names in algorithms, lengths of files.
 
 #[path = "architecture/circles.rs"]
 mod circles;
@@ -33,17 +33,17 @@ const ALGORITHMS: [(&str, &[&str]); 10] = [
 ];
 const AUTOPILOT: (&str, &[&str]) = ("autopilot", &["geometry"]);
 const NODE: (&str, &[&str]) = ("node", &["messages"]);
-/// What cameras and detectors share.
+/// The crates that cameras and detectors share.
 const AIRLINK: (&str, &[&str]) = ("airlink", &["imaging", "messages", "node"]);
-/// Files that people bring: images, videos, calibrations.
+/// Files of users: images, videos, calibrations.
 const MEDIA: (&str, &[&str]) = ("media", &["geometry", "imaging"]);
 const SERVICES: [&str; 6] =
     ["camera-pub", "controller", "dashboard", "detector", "gcs-bridge", "recorder"];
-/// What a recording is.
+/// The format of recordings.
 const FLIGHTLOG: (&str, &[&str]) = ("flightlog", &["autopilot", "messages"]);
 /// Answers over HTTP.
 const WEB: (&str, &[&str]) = ("web", &["node"]);
-/// What a service or a tool may know.
+/// The crates on which a service or a tool may depend.
 const ROOMS: [&str; 14] = [
     "airlink",
     "autopilot",
@@ -60,22 +60,22 @@ const ROOMS: [&str; 14] = [
     "node",
     "web",
 ];
-/// What a tool may know beside: pictures and worlds with truth, which also the tests of any room may use.
+/// Further crates on which a tool may depend: pictures and worlds with truth, which also the tests of any room may use.
 const TRUTH: [&str; 2] = ["rendering", "world"];
-/// What only tests may know.
+/// The crates on which only tests may depend.
 const TESTING: &str = "testing";
 /// The tests of the whole system.
 const TESTS: &str = "tests";
-/// The fuzz targets: they call whatever reads from outside.
+/// The fuzz targets: they call all parsers of external data.
 const FUZZ: &str = "fuzz";
-/// The tools that stand above others: they call their pure parts in lock-step, or with what was recorded; the tests of
+/// The tools that stand above others: they call their pure parts in lock-step, or with recorded data; the tests of
 /// replay and report take flights of the experiments.
 const ABOVE: [(&str, &[&str]); 3] = [
     ("experiments", &["controller", "detector", "simulator"]),
     ("replay", &["controller", "detector", "experiments"]),
     ("report", &["controller", "experiments", "replay"]),
 ];
-/// What the program may know beside services and tools: markers to find in files and to print, and the network.
+/// Further crates on which the program may depend, besides services and tools: markers to find in files and to print, and the network.
 const ALIGHT: [&str; 9] = [
     "calibration",
     "fiducial",
@@ -92,7 +92,7 @@ const ALIGHT: [&str; 9] = [
 const WITH_THREADS: [(&str, &[&str]); 2] =
     [("autopilot", &["connect", "link", "newest", "peers", "key_file"]), ("airlink", &["sender"])];
 
-/// What an algorithm does without.
+/// Names that an algorithm must not use.
 const OUTSIDE: [&str; 17] = [
     "std::env",
     "std::fs",
@@ -113,7 +113,7 @@ const OUTSIDE: [&str; 17] = [
     "rustix",
 ];
 
-/// The crates whose results a replay compares to the bit, and the lint that forbids them what differs between machines.
+/// The crates whose results a replay compares to the bit, and the lint that forbids them functions whose results differ between machines.
 const SAME_EVERYWHERE: [&str; 5] = ["geometry", "messages", "autopilot", "landing", "controller"];
 const SAME_LINT: &str = "#![cfg_attr(not(test), deny(clippy::disallowed_methods))]";
 
@@ -123,10 +123,10 @@ const MAX_LINES: usize = 700;
 /// Maximum number of functions of which a parameter is a tuple: two or three of a type are clearer with names.
 const MAX_TUPLES: usize = 4;
 
-/// What publishes a recording again.
+/// The file that publishes a recording again.
 const PLAYER: &str = "alight/src/replay/live.rs";
 
-/// What documents name that a command makes.
+/// Paths in documents that a command makes.
 const EXAMPLES: [&str; 1] = ["seen/"];
 
 /// Keys that share the comment of the key above them.
@@ -139,9 +139,9 @@ struct Package {
     folder: PathBuf,
     /// Names of the libraries and, where there is none, of the programs it builds.
     targets: Vec<String>,
-    /// What it depends on, for tests included, but for the pictures that tests look at.
+    /// Its dependencies, those of tests included, except the pictures of tests.
     dependencies: BTreeSet<String>,
-    /// What it depends on for anything: itself, its tests, benches and examples.
+    /// All its dependencies: of itself, its tests, benches and examples.
     all_dependencies: BTreeSet<String>,
 }
 
@@ -280,7 +280,7 @@ fn dependencies_point_downwards_only() -> anyhow::Result<()> {
             }
             None => {
                 let is_known = package.is_tool() || SERVICES.contains(&package.name.as_str());
-                ensure!(is_known, "{}: name what it may depend on in this test", package.name);
+                ensure!(is_known, "{}: name its allowed dependencies in this test", package.name);
                 let truth = TRUTH.into_iter().filter(|_| package.is_tool());
                 let below = ABOVE.into_iter().filter(|(above, _)| package.name == *above);
                 let below = below.flat_map(|(_, below)| below.iter().copied());
@@ -341,7 +341,7 @@ fn bounds_are_named_min_and_max() -> anyhow::Result<()> {
         for name in tokens(&code) {
             let upper = name.split('_').any(|part| part == "MOST" || part == "LEAST");
             let lower = name.starts_with("most_") || name.starts_with("least_");
-            // Comments, which say "at most", are no code.
+            // Comments, which contain "at most", are not checked.
             let bare = is_code && (name == "most" || name == "least");
             let is_private = upper || bare || lower && !name.starts_with("least_squares");
             found.extend(is_private.then(|| format!("{path}: {name}")));
@@ -370,7 +370,7 @@ fn with_tuples(code: &str) -> Vec<String> {
     let mut found = Vec::new();
     for (at, _) in tokens.iter().enumerate().filter(|(_, token)| **token == "fn") {
         let rest = &tokens[at + 1..];
-        // After the name and what is generic about it.
+        // After the name and its generic parameters.
         let Some(open) = rest.iter().position(|token| *token == "(") else { continue };
         let mut depth = 0;
         let mut before = "";
@@ -410,7 +410,7 @@ fn has_comma(tokens: &[&str]) -> bool {
 }
 
 #[test]
-fn only_node_knows_zenoh_and_only_autopilot_knows_mavlink() -> anyhow::Result<()> {
+fn only_node_uses_zenoh_and_only_autopilot_uses_mavlink() -> anyhow::Result<()> {
     for (protocol, room) in [("zenoh", "node"), ("mavlink", "autopilot")] {
         for package in workspace()? {
             let knows = package.dependencies.iter().any(|name| name.starts_with(protocol));
@@ -421,7 +421,7 @@ fn only_node_knows_zenoh_and_only_autopilot_knows_mavlink() -> anyhow::Result<()
 }
 
 #[test]
-fn algorithms_know_no_clock_file_network_thread_or_log() -> anyhow::Result<()> {
+fn algorithms_use_no_clock_file_network_thread_or_log() -> anyhow::Result<()> {
     let workspace = workspace()?;
     let mut files = Vec::new();
     for (name, _) in ALGORITHMS {
@@ -454,7 +454,7 @@ fn algorithms_know_no_clock_file_network_thread_or_log() -> anyhow::Result<()> {
 }
 
 #[test]
-fn no_service_knows_of_a_simulation() -> anyhow::Result<()> {
+fn no_service_depends_on_a_simulation() -> anyhow::Result<()> {
     let workspace = workspace()?;
     for service in SERVICES {
         for path in package(&workspace, service)?.sources()? {
@@ -507,16 +507,16 @@ fn topic_constants(workspace: &[Package]) -> anyhow::Result<Vec<(String, String)
 }
 
 #[test]
-fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
+fn a_topic_is_published_by_the_services_that_its_row_names() -> anyhow::Result<()> {
     let workspace = workspace()?;
     let constants = topic_constants(&workspace)?;
     let mut publishers: BTreeMap<(String, &str), BTreeSet<&str>> = BTreeMap::new();
     for package in workspace.iter().filter(|p| p.name != "node" && p.name != TESTS) {
-        // A recording that is published again is in the place of those who published it.
+        // A recording that is published again replaces its publishers.
         for path in package.sources()?.into_iter().filter(|path| !path.ends_with(PLAYER)) {
             let code: String = code(&path)?.split_whitespace().collect();
             for (name, key) in &constants {
-                // A query's row names who asks, its reply's row who answers.
+                // A query's row names the requester, its reply's row the recipient.
                 for (call, end) in [("publisher", ""), (".command", ""), (".commands", "_REPLY")] {
                     if code.contains(&format!("{call}(topic::{name},")) {
                         let row = (format!("{name}{end}"), key.as_str());
@@ -541,12 +541,12 @@ fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
         let stated: BTreeSet<_> = row.publishers.iter().copied().collect();
         ensure!(stated == *found, "{key} is published by {found:?}, its row says {stated:?}");
     }
-    ensure!(publishers.len() == TOPICS.len(), "rows that nobody publishes: only {publishers:#?}");
+    ensure!(publishers.len() == TOPICS.len(), "rows without a publisher: only {publishers:#?}");
     Ok(())
 }
 
 #[test]
-fn a_topic_is_subscribed_to_by_those_its_row_names() -> anyhow::Result<()> {
+fn a_topic_is_subscribed_to_by_the_services_that_its_row_names() -> anyhow::Result<()> {
     let workspace = workspace()?;
     let constants = topic_constants(&workspace)?;
     let mut rows = 0;
@@ -561,7 +561,7 @@ fn a_topic_is_subscribed_to_by_those_its_row_names() -> anyhow::Result<()> {
                     continue;
                 }
                 match package.name.as_str() {
-                    // The sender of the air link is a part of who publishes frames.
+                    // The sender of the air link is a part of the publisher of frames.
                     "airlink" => found.extend(["camera-pub", "simulator"]),
                     // `alight up` watches with the key of the service that it supervises.
                     "alight" if path.ends_with("peers.rs") => {
@@ -613,11 +613,11 @@ fn every_key_of_a_default_configuration_is_explained() -> anyhow::Result<()> {
         }
     }
     ensure!(services > SERVICES.len(), "only {services} packages have a configuration");
-    ensure!(shared.len() == SHARED_COMMENTS.len(), "exceptions that are none: only {shared:?} are");
+    ensure!(shared.len() == SHARED_COMMENTS.len(), "unused exceptions: only {shared:?} are");
     Ok(())
 }
 
-/// What stands in backticks in a Markdown text, outside of its code blocks.
+/// The texts in backticks of a Markdown text, outside of its code blocks.
 fn quoted(markdown: &str) -> Vec<&str> {
     let prose = markdown.split("```").step_by(2);
     prose.flat_map(|part| part.split('`').skip(1).step_by(2)).collect()
@@ -637,7 +637,7 @@ fn defines(code: &str, name: &str) -> bool {
 }
 
 #[test]
-fn documents_name_only_what_exists() -> anyhow::Result<()> {
+fn documents_name_only_existing_items() -> anyhow::Result<()> {
     let mut wrong = Vec::new();
     let extensions = [".rs", ".toml", ".md", ".json5", ".py"];
     let mut names = 0;
@@ -681,7 +681,7 @@ fn documents_name_only_what_exists() -> anyhow::Result<()> {
 }
 
 #[test]
-fn what_decides_computes_the_same_on_every_machine() -> anyhow::Result<()> {
+fn decisions_are_the_same_on_every_machine() -> anyhow::Result<()> {
     let workspace = workspace()?;
     for name in SAME_EVERYWHERE {
         let library = package(&workspace, name)?.folder.join("src/lib.rs");
@@ -732,7 +732,7 @@ fn the_architecture_has_the_topic_table() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// `UPDATE_EXPECT=1 cargo test -p tests --test architecture` writes the list anew.
+/// `UPDATE_EXPECT=1 cargo test -p tests --test architecture` writes the list again.
 #[test]
 fn the_architecture_lists_every_source_file() -> anyhow::Result<()> {
     let path = root().join("ARCHITECTURE.md");
@@ -766,7 +766,7 @@ fn the_architecture_lists_every_source_file() -> anyhow::Result<()> {
 }
 
 #[test]
-fn nothing_names_a_folder_of_somebodys_machine() -> anyhow::Result<()> {
+fn no_file_names_a_folder_of_a_developers_machine() -> anyhow::Result<()> {
     let folders = ["home", "root", "tmp", "Users", "work"].map(|name| format!("/{name}/"));
     for file in tracked("")? {
         let bytes = std::fs::read(root().join(&file))?;

@@ -1,4 +1,4 @@
-//! The page of `alight land`'s landings: a real browser that commands, Motion JPEG, overlays found in the very picture,
+//! Tests the page of `alight land`'s landings: a real browser that commands, Motion JPEG, overlays on the right picture,
 //! the page killed or its port taken, twenty browsers at once.
 
 use std::io::{BufRead, BufReader, Write};
@@ -22,12 +22,12 @@ use crate::many_clients::{Browsers, memory_mb};
 
 /// Exit status of a script that lacks a browser or a package.
 const LACKS: i32 = 77;
-/// Longest time in which a page that is cut off strikes through what it shows, and in which it is connected again once its
+/// Longest time in which a page that is cut off strikes through its values, and in which it is connected again once its
 /// server is there; beyond the time in which the browser answers a question, up to a limit.
 const MAX_GREY_S: f64 = 1.0;
 const MAX_BACK_S: f64 = 2.0;
 const MAX_ANSWER_S: f64 = 1.5;
-/// Twice two pictures and their texts for each of twenty browsers, with room for what the system keeps.
+/// Twice two pictures and their texts for each of twenty browsers, with room for the system's buffers.
 const MAX_BROWSERS_MB: f64 = 60.0;
 /// A descent of twenty seconds.
 const SLOWLY: [&str; 2] = ["--set", "controller.metric.max_descend_m_s=0.5"];
@@ -66,7 +66,7 @@ fn a_landing_does_not_begin_when_another_program_has_the_port_of_its_page() -> a
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_landing_is_shown_and_goes_on_when_the_page_is_killed() -> anyhow::Result<()> {
+async fn a_landing_is_shown_and_continues_when_the_page_is_killed() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     with_second_try(async || {
         let page = free_page()?;
@@ -113,7 +113,7 @@ async fn a_browser_shows_a_landing_and_commands_it() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_program_that_knows_only_motion_jpeg_sees_the_landing() -> anyhow::Result<()> {
+async fn a_program_with_only_motion_jpeg_sees_the_landing() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     with_second_try(async || {
         let page = free_page()?;
@@ -147,7 +147,7 @@ async fn a_program_that_knows_only_motion_jpeg_sees_the_landing() -> anyhow::Res
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_drawn_over_a_picture_was_found_in_that_very_picture() -> anyhow::Result<()> {
+async fn each_overlay_is_drawn_over_the_picture_in_which_it_was_found() -> anyhow::Result<()> {
     let _alone = alone().await?;
     with_second_try(async || {
         if let Some(read) = film::overlay(200).await? {

@@ -1,7 +1,7 @@
-//! `alight detect` on rendered frames whose truth is known, on files that are no images, and on photographs without the
+//! Tests `alight detect` on rendered frames with their truth, on files that are no images, and on photographs without the
 //! marker. `cargo test --release -p tests --test detect_frames -- --nocapture` prints the tables.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
-#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+#![allow(clippy::print_stdout, reason = "the figures are for people to read")]
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -13,7 +13,7 @@ use serde_json::Value;
 
 const FAMILIES: [&str; 2] = ["rings", "rings-thesis"];
 
-/// A detection this far from the marker is another thing.
+/// A detection this far from the marker is of another object.
 const ELSEWHERE_PX: f64 = 5.0;
 
 fn detect(arguments: &[&str]) -> Output {
@@ -35,7 +35,7 @@ fn list(value: &Value) -> &[Value] {
 
 // ---- Frames with truth
 
-/// What came of the frames from one height.
+/// The results for the frames from one height.
 #[derive(Default)]
 struct Row {
     frames: usize,
@@ -186,7 +186,7 @@ fn number(value: f64, digits: usize) -> String {
     if value.is_nan() { "-".to_owned() } else { format!("{value:.digits$}") }
 }
 
-/// What must hold of `rings` up to a height.
+/// The bounds for `rings` up to a height.
 struct Bound {
     to_m: usize,
     centre_median_px: f64,

@@ -1,4 +1,4 @@
-//! A detector with wrong poses: the controller reports it at once, and never follows it to the ground.
+//! Tests a detector with wrong poses: the controller reports it at once, and never follows it to the ground.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

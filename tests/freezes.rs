@@ -1,5 +1,5 @@
-//! Processes that are frozen for a while (SIGSTOP) and go on; nothing stands beside them that could take their place: no
-//! second detector, no supervisor.
+//! Freezes processes for a while (SIGSTOP) and continues them, without any replacement: no second detector, no
+//! supervisor.
 
 use std::net::UdpSocket;
 use std::process::{Child, Command, Stdio};
@@ -14,12 +14,12 @@ use tokio::time::{sleep, timeout};
 
 use crate::flight::{ALIGHT, Landing, beside_another};
 
-/// Longest time until a process that goes on takes its part again.
+/// Longest time until a process that continues works again.
 const BACK: Duration = Duration::from_secs(2);
 /// Time within which a command that waited would be carried out.
 const LATE: Duration = Duration::from_secs(3);
 
-/// Freezes a process, and lets it go on.
+/// Freezes a process, and continues it.
 async fn freeze(pid: Pid, seconds: f64) -> anyhow::Result<Instant> {
     kill_process(pid, Signal::STOP)?;
     sleep(Duration::from_secs_f64(seconds)).await;
@@ -29,12 +29,12 @@ async fn freeze(pid: Pid, seconds: f64) -> anyhow::Result<Instant> {
 
 /// Waits until the controller uses frames that were taken after this time.
 async fn frames_are_used(landing: &Landing, since_ns: i64) -> anyhow::Result<()> {
-    let what = "new frames are used";
+    let condition = "new frames are used";
     let is_used = |s: &messages::ControllerStatus| {
         s.stamp_ns > since_ns
             && s.detection_age_ms.is_some_and(|ms| s.stamp_ns - (ms * 1e6) as i64 > since_ns)
     };
-    landing.status(what, is_used).await.map(drop)
+    landing.status(condition, is_used).await.map(drop)
 }
 
 /// Freezes a process of a landing for each of these times, and lands.
@@ -60,7 +60,7 @@ pub(crate) async fn of_a_landing(name: &str, freezes_s: &[f64]) -> anyhow::Resul
         }
         is_back(name, *seconds, since)?;
         command(&landing, ControllerCommand::Resume).await?;
-        landing.status("it goes on", |s| s.phase != Phase::Hold).await?;
+        landing.status("it continues", |s| s.phase != Phase::Hold).await?;
     }
     landing.lands().await.map(drop)
 }
@@ -100,7 +100,7 @@ pub(crate) async fn of_a_camera(freezes_s: &[f64]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Commands a controller that is frozen until its operator has given up, lets it go on, and lands.
+/// Commands a controller that is frozen until its operator has given up, continues it, and lands.
 pub(crate) async fn of_a_commanded_controller() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     let landing = Landing::start(&["--seed", "4", "--timeout-s", "300"]).await?;
@@ -114,7 +114,7 @@ pub(crate) async fn of_a_commanded_controller() -> anyhow::Result<()> {
     let since_ns = now_ns();
     let later_ns = since_ns + LATE.as_nanos() as i64;
     let is_later = |s: &messages::ControllerStatus| s.stamp_ns > later_ns;
-    let status = landing.status("it goes on", is_later).await?;
+    let status = landing.status("it continues", is_later).await?;
     ensure!(status.phase == Phase::Hold, "the command was carried out late: {status:?}");
     command(&landing, ControllerCommand::Resume).await?;
     landing.lands().await.map(drop)
@@ -165,7 +165,7 @@ impl Drop for Running {
     }
 }
 
-/// Waits until what one publishes reaches the other.
+/// Waits until a message of one process reaches the other.
 async fn reaches(from: &Node, by: &Node) -> anyhow::Result<()> {
     let publisher = from.publisher(topic::WIND, &[]).await?;
     let subscriber = by.subscriber(topic::WIND, &[]).await?;

@@ -1,4 +1,4 @@
-//! A process that is frozen for a while (SIGSTOP) works again within 2 s after it continues. `measure.rs` freezes each for
+//! Tests that a process that is frozen for a while (SIGSTOP) works again within 2 s after it continues. `measure.rs` freezes each for
 //! longer.
 
 use testing::with_second_try;
@@ -19,12 +19,12 @@ async fn packets_of_a_frozen_bridge_arrive_again_and_it_lands() -> anyhow::Resul
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_frozen_simulation_goes_on_and_lands() -> anyhow::Result<()> {
+async fn a_frozen_simulation_continues_and_lands() -> anyhow::Result<()> {
     with_second_try(|| freezes::of_a_landing("simulator", &FREEZES_S[1..])).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_frozen_controller_goes_on_and_lands() -> anyhow::Result<()> {
+async fn a_frozen_controller_continues_and_lands() -> anyhow::Result<()> {
     with_second_try(|| freezes::of_a_landing("controller", &FREEZES_S[1..2])).await
 }
 

@@ -1,5 +1,5 @@
 //! Kills processes of a drone and a ground station, each under `alight up`, at random moments of landings, and checks
-//! the touchdown and that all come back. The world is apart from both; the relay and the supervisors are killed
+//! the touchdown and that all start again. The world is apart from both; the relay and the supervisors are killed
 //! (`kill -9`) as well.
 
 #![allow(dead_code, reason = "each program uses its part")]
@@ -26,12 +26,12 @@ const PATIENCE: Duration = Duration::from_secs(90);
 /// The pause after which systemd starts a supervisor again: `RestartSec` of the units.
 const RESTART: Duration = Duration::from_secs(1);
 
-/// What is killed.
+/// A process to kill.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Victim {
     /// A process of a side (`drone`, `ground`), by its name there; and its service and instance in the network.
     Process { side: usize, name: &'static str, alive: (&'static str, &'static str) },
-    /// The supervisor of a side; one of its processes in the network, and what stands in the table.
+    /// The supervisor of a side; one of its processes in the network, and its name in the table.
     Supervisor { side: usize, name: &'static str, alive: (&'static str, &'static str) },
 }
 
@@ -76,7 +76,7 @@ struct Picture {
 }
 
 impl Picture {
-    /// All that belongs there is there and at work, by a status from after a moment; or the landing is over.
+    /// All processes are present and at work, by a status from after a moment; or the landing is over.
     fn is_well(&self, since_ns: i64) -> bool {
         let there = VICTIMS.iter().all(|victim| self.alive.contains(&victim.alive()));
         let status = &self.status;
@@ -106,7 +106,7 @@ struct Flight {
     nodes: [Node; 2],
 }
 
-/// The site: the drone's camera follows what the world's autopilot reports, as beside a real autopilot.
+/// The site: the drone's camera follows what the world's autopilot reports, as next to a real autopilot.
 fn site(seed: u64, [meet, air, autopilot]: [u16; 3]) -> String {
     let small = small_camera();
     format!(
@@ -146,7 +146,7 @@ impl Flight {
             .args(["simulator", "--meet", &apart.to_string(), "--vehicle", "world"])
             .args(["--set", &format!("autopilot.address=udpout:127.0.0.1:{autopilot}")])
             .args(["--set", &format!("seed={seed}")])
-            // The drone's camera sees what the autopilot believes, and its own is of no use.
+            // The drone's camera follows the autopilot's estimate; the world's camera is not used.
             .args(["--set", "autopilot.errors=0", "--set", "camera.rate_hz=0.1"])
             .stdin(Stdio::null())
             .stdout(Stdio::null())
@@ -286,13 +286,13 @@ async fn watch_picture(node: &Node, picture: &watch::Sender<Picture>) -> anyhow:
         let (presence, picture) = (node.presence(service).await?, picture.clone());
         tokio::spawn(async move {
             while let Some((instance, alive)) = presence.next().await {
-                let who = (service.to_owned(), instance);
+                let process = (service.to_owned(), instance);
                 picture.send_modify(|picture| {
                     match alive {
-                        true => picture.alive.insert(who),
+                        true => picture.alive.insert(process),
                         false => {
-                            *picture.missed.entry(who.clone()).or_default() += 1;
-                            picture.alive.remove(&who)
+                            *picture.missed.entry(process.clone()).or_default() += 1;
+                            picture.alive.remove(&process)
                         }
                     };
                 });
@@ -351,7 +351,7 @@ pub(crate) async fn kill_while_held() -> anyhow::Result<()> {
     let log = std::fs::read_to_string(folder.path().join(LOGS[DRONE]))?;
     ensure!(status.started_ns.is_none() && sunk_m < 0.3, "{sunk_m} m lower: {status:?}\n{log}");
     ensure!(log.contains("start = \"command\""), "{log}");
-    // The operator goes on.
+    // The operator continues.
     flight.command(&ControllerCommand::Start).await?;
     flight.lands().await.map(drop)
 }
@@ -368,7 +368,7 @@ impl Dice {
     }
 }
 
-/// What was noticed how long after a kill, and when all was well again, in seconds.
+/// The times from a kill until it was noticed and until all was well again, in seconds.
 type Times = Vec<(Victim, f64, f64)>;
 
 /// Flies until as many as possible of these were killed, from the last one on; the killed ones are taken out.
@@ -385,7 +385,7 @@ async fn fly(
             let there = VICTIMS.iter().all(|victim| picture.alive.contains(&victim.alive()));
             there && picture.status.phase == Phase::Descend || picture.landed
         };
-        flight.until("everybody is there and it descends", now_ns(), began).await?;
+        flight.until("all processes are there and it descends", now_ns(), began).await?;
         while let Some(victim) = victims.last().copied() {
             sleep(Duration::from_millis(dice.roll(1500))).await;
             if flight.is_over() {

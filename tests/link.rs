@@ -1,8 +1,8 @@
-//! Two hosts joined by a bad radio link: what must hold with the detector on the ground.
+//! Tests two hosts joined by a bad radio link, with the detector on the ground.
 //!
 //! It is skipped where namespaces and TUN devices may not be made. `measure.rs` has the long trials.
 
-#![expect(clippy::print_stdout, reason = "what a test measured is for people to read")]
+#![expect(clippy::print_stdout, reason = "results of a test are for people to read")]
 
 #[path = "link/mod.rs"]
 mod link;
@@ -16,7 +16,7 @@ use crate::link::{GOOD, LOSSY, flight, saturation};
 
 fn main() -> ExitCode {
     link::run(async |args| match args.first().map(String::as_str) {
-        // What a test runner asks of its harness: which tests there are.
+        // A test runner requests the list of tests.
         Some("--list") if args.iter().any(|arg| arg == "--ignored") => Ok(()),
         Some("--list") => {
             println!("a_bad_link_is_survived: test");
@@ -47,7 +47,7 @@ async fn a_saturated_link() -> anyhow::Result<()> {
     for name in saturation::CLASSES {
         ensure!(trial.lost(name) == 0, "{name}: messages are lost");
         let (idle, busy) = (trial.p99_ms(name, 0), trial.p99_ms(name, 1));
-        // Without a link of its own it would wait behind frames, hundreds of milliseconds.
+        // Without a separate link it would wait behind frames, hundreds of milliseconds.
         ensure!(busy < idle + 150.0, "{name}: {busy:.0} ms, and {idle:.0} ms on the idle link");
     }
     Ok(())

@@ -1,4 +1,4 @@
-//! Measurements of the whole system that take too long for a test; each prints what it measured and fails as the test of
+//! Runs measurements of the complete system that take too long for a test; each prints its results and fails as the test of
 //! the same name does.
 //!
 //! ```text

@@ -1,4 +1,4 @@
-//! `alight land` as processes: landings beside other programs, controllers, detectors and the landing itself killed in
+//! Tests `alight land` as processes: landings next to other programs, controllers, detectors and the landing itself killed in
 //! flight, aborts, two landings at once, ports that are taken, wrong settings.
 //!
 //! A test that flies waits until the machine has time for it, flies `alight land` in real time, and joins its network
@@ -17,7 +17,7 @@ use crate::flight::{
     ALIGHT, Landing, Vehicle, beside_another, descent_m_s, output_of, seconds, speed_m_s, time_for,
 };
 
-/// Longest time that the processes of a landing which was killed may go on.
+/// Longest time that the processes of a landing which was killed may run on.
 const MAX_ORPHANED: Duration = Duration::from_secs(6);
 /// Exit status of a script that lacks a package.
 const LACKS_MAVSDK: i32 = 77;
@@ -36,7 +36,7 @@ async fn others_watch_and_the_ground_dies() -> anyhow::Result<()> {
     let station = python("tests/gcs/ground_station.py", &connect);
     let landing = Landing::start(&["--seed", "2", "--set", &address]).await?;
     landing.descends_below(9.0).await?;
-    // It waits up there for the other programs, which take their time.
+    // It waits at this height for the other programs, which start slowly.
     command(&landing, ControllerCommand::Hold).await?;
     let port = std::fs::read_to_string(&landing.zenoh)?
         .split("connect: {")
@@ -80,7 +80,7 @@ async fn a_program_of_mavsdk_finds_the_vehicle_its_parameters_and_its_camera() -
             return Ok(());
         }
         let found: serde_json::Value =
-            serde_json::from_str(said.lines().last().context("nothing was said")?)?;
+            serde_json::from_str(said.lines().last().context("nothing was printed")?)?;
         ensure!(found["ok"] == true && output.status.success(), "{found}");
         ensure!(found["camera"]["model"] == "down", "{found}");
         ensure!(found["camera"]["size"] == serde_json::json!([648, 486]), "{found}");
@@ -182,7 +182,7 @@ async fn the_controller_is_killed_again_and_again() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Of its own simulated vehicle nothing would be seen after the kill, as its simulator ends with it: it leads another one.
+/// The landing leads another simulated vehicle: its own simulator would end with the kill.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_landing_killed_in_the_descent_takes_its_processes_with_it_and_lets_nothing_hit_the_ground()
 -> anyhow::Result<()> {
@@ -218,12 +218,12 @@ async fn a_landing_is_killed(height_m: f64) -> anyhow::Result<()> {
         last.pad_ned_m[2] - last.position_ned_m[2],
         last.touchdown
     );
-    ensure!(last.on_ground || speed_m_s(last) < 0.1, "it goes on: {last:?}");
+    ensure!(last.on_ground || speed_m_s(last) < 0.1, "it still moves: {last:?}");
     ensure!(last.touchdown.as_ref().is_none_or(is_soft), "it hit the ground: {last:?}");
     Ok(())
 }
 
-/// Whether a process that is not a child of ours runs; one that has ended stays as a zombie where nobody waits for orphans.
+/// Whether a process that is not a child of ours runs; one that has ended stays as a zombie if no process waits for orphans.
 fn runs(pid: Pid) -> bool {
     let stat = std::fs::read_to_string(format!("/proc/{}/stat", pid.as_raw_nonzero()));
     let state = stat.ok().and_then(|stat| stat.rsplit_once(')')?.1.trim_start().chars().next());
@@ -254,7 +254,7 @@ async fn without_a_detector_it_stops_descending(landing: &Landing) -> anyhow::Re
     let killed_ns = landing.kill("detector")?;
     let mut descended_s: f64 = 0.0;
     let stopped = landing
-        .status("no descent is asked for", |s| {
+        .status("no descent is requested", |s| {
             let is_later = s.stamp_ns > killed_ns;
             let descends = s.setpoint.is_some_and(|s| s.velocity_ned_m_s[2] > 0.0);
             if is_later && descends {
@@ -264,14 +264,14 @@ async fn without_a_detector_it_stops_descending(landing: &Landing) -> anyhow::Re
         })
         .await?;
     let after_s = seconds(stopped.stamp_ns - killed_ns);
-    println!("descent last asked for after {descended_s:.2} s, no longer after {after_s:.2} s");
-    ensure!(descended_s <= 0.5, "descent still asked for {descended_s:.2} s after the kill");
+    println!("descent last requested after {descended_s:.2} s, no longer after {after_s:.2} s");
+    ensure!(descended_s <= 0.5, "descent still requested {descended_s:.2} s after the kill");
     let still = landing
-        .truth("it stands still", |t| t.stamp_ns > killed_ns && descent_m_s(t).abs() < 0.1)
+        .truth("it is stationary", |t| t.stamp_ns > killed_ns && descent_m_s(t).abs() < 0.1)
         .await?;
     println!("descent ended after {:.2} s", seconds(still.stamp_ns - killed_ns));
     landing.status("it holds", |s| s.phase == Phase::Hold).await?;
-    // Drained first: what follows is the motion from now on.
+    // Drained first: the next messages are the motion from now on.
     landing.motion(Duration::from_millis(100)).await;
     let motion = landing.motion(Duration::from_secs(2)).await;
     let fastest = motion.iter().map(speed_m_s).fold(0.0, f64::max);
@@ -295,7 +295,7 @@ async fn two_detectors_take_turns() -> anyhow::Result<()> {
         .await?;
     ensure!(both.active_detector.as_deref() == Some("main"), "{both:?}");
     the_operators_choice_is_followed(&landing).await?;
-    // The landing goes on without the one that it was begun with, be it before the take-off.
+    // The landing continues without the detector of its start, also before the take-off.
     let stopped =
         landing.node.command(topic::DETECTOR_COMMAND, &["main"], &DetectorCommand::Stop).await?;
     ensure!(stopped.accepted, "{stopped:?}");
@@ -341,8 +341,8 @@ async fn two_detectors_take_turns() -> anyhow::Result<()> {
 }
 
 async fn the_operators_choice_is_followed(landing: &Landing) -> anyhow::Result<()> {
-    let nobody = ControllerCommand::UseDetector("nobody".into());
-    let refused = landing.node.command(topic::COMMAND, &[], &nobody).await?;
+    let absent = ControllerCommand::UseDetector("nobody".into());
+    let refused = landing.node.command(topic::COMMAND, &[], &absent).await?;
     ensure!(!refused.accepted && refused.reason.contains("main"), "{refused:?}");
     let output = output_of(
         Command::new(ALIGHT)
@@ -357,7 +357,7 @@ async fn the_operators_choice_is_followed(landing: &Landing) -> anyhow::Result<(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_came_down_after_an_abort_is_not_said_to_have_landed() -> anyhow::Result<()> {
+async fn a_touchdown_after_an_abort_is_not_reported_as_a_landing() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     for on_abort in ["hover", "land"] {
         with_second_try(async || comes_down_after_an_abort(on_abort).await).await?;
@@ -486,7 +486,7 @@ fn wrong_settings_stop_the_start_with_file_key_value_and_limit() -> anyhow::Resu
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         ensure!(output.status.code() == Some(2), "{args:?} ended with {}: {said}", output.status);
         for part in parts {
-            ensure!(said.contains(part), "`{part}` is not in what {args:?} said: {said}");
+            ensure!(said.contains(part), "`{part}` is not in the output of {args:?}: {said}");
         }
         anyhow::Ok(())
     };

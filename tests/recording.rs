@@ -1,4 +1,4 @@
-//! Recordings of real landings: programs that are not ours find every channel and picture in them; recorders are killed, and
+//! Tests recordings of complete landings: independent programs find every channel and picture in them; recorders are killed, and
 //! disks fail.
 
 mod disks;
@@ -56,7 +56,7 @@ async fn others_read_a_landing() -> anyhow::Result<()> {
     ] {
         ensure!(contents.files.iter().any(|name| name == file), "no {file} in {contents:?}");
     }
-    // Of each topic with pictures, overlays and states there is also every message as it came.
+    // Of each topic with pictures, overlays and states there is also every message as it was received.
     for topic in ["camera/down/frame", "detector/main/detections", "vehicle/state"] {
         let as_it_came = contents.channels.get(&format!("raw/{topic}"));
         ensure!(as_it_came == contents.channels.get(topic), "{topic} in {contents:?}");
@@ -122,13 +122,13 @@ async fn a_landing_is_followed_by_a_client_of_foxglove() -> anyhow::Result<()> {
         }
         landing.lands().await?;
         let contents = Contents::read(&file)?;
-        ensure!(contents.is_whole(), "lost while it was followed: {:?}", contents.dropped);
+        ensure!(contents.is_complete(), "lost while it was followed: {:?}", contents.dropped);
         Ok(())
     })
     .await
 }
 
-/// Whether a client saw what a viewer shows.
+/// Whether a client received the data of a viewer.
 fn follows(seen: &serde_json::Value) -> anyhow::Result<()> {
     for (topic, schema) in [
         ("camera/down/picture", "foxglove.CompressedImage"),
@@ -157,13 +157,13 @@ fn follows(seen: &serde_json::Value) -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_recorder_that_is_killed_leaves_a_file_and_the_landing_goes_on() -> anyhow::Result<()> {
+async fn a_recorder_that_is_killed_leaves_a_file_and_the_landing_continues() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     with_second_try(|| kills(3, &[])).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_an_overloaded_recorder_loses_is_in_its_file_to_the_frame() -> anyhow::Result<()> {
+async fn losses_of_an_overloaded_recorder_are_in_its_file_to_the_frame() -> anyhow::Result<()> {
     let _alone = alone().await?;
     with_second_try(recorders::overload).await
 }

@@ -1,5 +1,5 @@
-//! Keys in the whole system: processes without or with foreign keys at a relay, the rights of each role, holders
-//! that are revoked, relays without keys, and what an insecure start logs.
+//! Tests keys in the complete system: processes without or with foreign keys at a relay, the rights of each role, holders
+//! that are revoked, relays without keys, and the log of an insecure start.
 
 use std::io::{BufRead, BufReader};
 use std::os::unix::fs::PermissionsExt;
@@ -30,7 +30,7 @@ fn keys(arguments: &[&str]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A drone with a relay that asks for keys, and a controller that takes every command.
+/// A drone with a relay that requires keys, and a controller that accepts every command.
 struct Drone {
     relay: Child,
     said: mpsc::UnboundedReceiver<String>,
@@ -67,7 +67,7 @@ impl Drone {
         let controller = Node::open(identity, &local.source("controller")?).await?;
         controller.announce().await?;
         let drone = Self { relay, said, controller, air, folder };
-        // The relay is there when its health is.
+        // The relay is ready when its health is received.
         let healths = drone.controller.subscriber(topic::HEALTH, &["relay", "drone"]).await?;
         health(&healths, "the relay is ready", |_| true).await?;
         Ok(drone)
@@ -177,9 +177,9 @@ async fn each_role_publishes_its_topics_and_unknown_clients_nothing() -> anyhow:
     };
     timeout(PATIENCE, line).await.context("the refusal is not logged")?;
     let counted = health(&healths, "its next health", |_| true).await?;
-    ensure!(!refused(&counted, "detector/ground"), "what it may do was refused: {counted:?}");
+    ensure!(!refused(&counted, "detector/ground"), "an allowed message was refused: {counted:?}");
 
-    // Who has no key, or one of another authority, does not come in.
+    // A client without a key, or with one of another authority, is refused.
     let output = drone.command(None)?;
     ensure!(!output.status.success(), "without a key: {output:?}");
     let foreign = tempfile::tempdir()?;
@@ -215,16 +215,16 @@ async fn a_program_in_another_language_joins_by_the_session_that_is_printed() ->
     let lacking = session("detector.python")?;
     let said = String::from_utf8_lossy(&lacking.stderr).into_owned();
     ensure!(said.contains("issue --role detector --name python"), "{said}");
-    let nobody = session("detector")?;
-    let said = String::from_utf8_lossy(&nobody.stderr).into_owned();
-    ensure!(nobody.status.code() == Some(2) && said.contains("`detector.NAME`"), "{said}");
+    let unnamed = session("detector")?;
+    let said = String::from_utf8_lossy(&unnamed.stderr).into_owned();
+    ensure!(unnamed.status.code() == Some(2) && said.contains("`detector.NAME`"), "{said}");
 
     keys(&["issue", "--role", "detector", "--name", "python", "-o", home])?;
     let printed = session("detector.python")?;
     ensure!(printed.status.success(), "{printed:?}");
     let file = drone.folder.path().join("session.json");
     std::fs::write(&file, printed.stdout)?;
-    // The relay reads the list of those who may connect again within seconds.
+    // The relay reads the list of holders that may connect again within seconds.
     let infos = drone.controller.subscriber(topic::DETECTOR_INFO, &["python"]).await?;
     let marker = ["--id", "python", "--place", "ground", "--marker", "aruco-4x4-50:7:0.3"];
     let python = python(script, &[&marker[..], &["--zenoh", text(&file)?]].concat());
@@ -270,14 +270,14 @@ async fn a_running_relay_rejects_a_revoked_holder_and_continues() -> anyhow::Res
     let took = last_received - revoked;
     println!("received for {took:?} after it was revoked");
     ensure!(took < Duration::from_secs(3), "received for {took:?} after it was revoked");
-    // The relay is there for the others.
+    // The relay still serves the others.
     let output = drone.command(Some(drone.folder.path()))?;
     ensure!(output.status.success(), "{output:?}");
     answering.abort();
     Ok(())
 }
 
-/// Runs `alight relay` until it ends by itself.
+/// Runs `alight relay` until it ends on its own.
 fn relay(arguments: &[&str]) -> anyhow::Result<String> {
     let output = output_of(&[&["relay", "--zenoh", "drone"], arguments].concat())?;
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -318,7 +318,7 @@ async fn insecure_processes_report_it() -> anyhow::Result<()> {
     let identity = Identity { service: "controller", instance: "main".into() };
     let inside = Node::open(identity, &local.source("controller")?).await?;
     let healths = inside.subscriber(topic::HEALTH, &["relay", "drone"]).await?;
-    let reported = health(&healths, "its health says so", |h| {
+    let reported = health(&healths, "its health reports it", |h| {
         h.errors.iter().any(|error| error.reason == node::INSECURE)
     })
     .await;

@@ -1,4 +1,4 @@
-//! Detectors in flight: `alight swap`, failed swaps, twenty more detectors beside ten dashboards, and a
+//! Tests detectors in flight: `alight swap`, failed swaps, twenty more detectors with ten dashboards, and a
 //! detector written in Python that leads a landing. `measure.rs` swaps them more often.
 
 use std::process::Command;
@@ -25,9 +25,9 @@ fn detectors(landing: &Landing, args: &[&str]) -> anyhow::Result<String> {
 #[tokio::test(flavor = "multi_thread")]
 async fn detectors_are_swapped_in_flight_without_a_gap() -> anyhow::Result<()> {
     with_second_try(async || {
-        // A machine without time for it may say so, a failure may not be passed over.
+        // A machine without time for it may skip this; a failure may not be ignored.
         if !swaps::swaps(3).await? && !swaps::swaps(3).await? {
-            testing::skip("time", "frames were late whoever found the marker in them");
+            testing::skip("time", "frames were late for every detector");
         }
         Ok(())
     })
@@ -112,7 +112,7 @@ async fn ages(targets: &Subscriber<TargetEstimate>, over: Duration) -> anyhow::R
     Ok([at(0.5).context("no frame was used")?, at(0.99).context("no frame was used")?])
 }
 
-/// Publishes what a detector publishes once more, in the names of ten others.
+/// Publishes the messages of a detector again, in the names of ten others.
 async fn ten_more(node: Node, tens: usize) -> anyhow::Result<()> {
     let mut others = Vec::new();
     for i in 0..10 {
@@ -131,22 +131,26 @@ async fn ten_more(node: Node, tens: usize) -> anyhow::Result<()> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn failed_swaps_and_twenty_more_detectors_change_nothing() -> anyhow::Result<()> {
-    with_second_try(swaps_fail_and_many_speak).await
+    with_second_try(swaps_fail_and_many_publish).await
 }
 
-async fn swaps_fail_and_many_speak() -> anyhow::Result<()> {
+async fn swaps_fail_and_many_publish() -> anyhow::Result<()> {
     let _flight = time_for(3).await?;
     let landing = Landing::start(&["--seed", "22"]).await?;
     landing.descends_below(9.0).await?;
     command(&landing, ControllerCommand::Hold).await?;
-    tokio::task::block_in_place(|| a_swap_that_fails_keeps_the_old_one_and_says_why(&landing))?;
+    tokio::task::block_in_place(|| {
+        a_swap_that_fails_keeps_the_old_one_and_reports_the_reason(&landing)
+    })?;
     twenty_detectors_and_ten_dashboards_leave_the_latency_as_it_was(&landing).await?;
     command(&landing, ControllerCommand::Resume).await?;
     landing.lands().await?;
     Ok(())
 }
 
-fn a_swap_that_fails_keeps_the_old_one_and_says_why(landing: &Landing) -> anyhow::Result<()> {
+fn a_swap_that_fails_keeps_the_old_one_and_reports_the_reason(
+    landing: &Landing,
+) -> anyhow::Result<()> {
     let zenoh = landing.zenoh.display();
     let blind = format!(
         "'{ALIGHT}' detector --set id=blind --set 'markers=[\"apriltag-36h11:5:0.2\"]' --zenoh '{zenoh}'"
@@ -179,7 +183,7 @@ fn a_swap_that_fails_keeps_the_old_one_and_says_why(landing: &Landing) -> anyhow
         )?;
         let said = String::from_utf8_lossy(&[output.stdout.as_slice(), &output.stderr].concat())
             .into_owned();
-        // Only what is no command at all is a wrong use.
+        // Only an invalid command line is a wrong use.
         let status = if to.contains('\'') && !to.contains(ALIGHT) { 2 } else { 1 };
         ensure!(output.status.code() == Some(status), "{to} ended with {}: {said}", output.status);
         for part in parts {
@@ -222,7 +226,7 @@ async fn twenty_detectors_and_ten_dashboards_leave_the_latency_as_it_was(
     // Frames may be late while so many begin at once; then it is used again.
     command(landing, ControllerCommand::UseDetector("main".into())).await?;
     let mut ratio = f64::INFINITY;
-    // What else the machine does comes and goes.
+    // Other load of the machine varies.
     for _ in 0..3 {
         let [alone_ms, alone_99_ms] = ages(&targets, Duration::from_secs(8)).await?;
         let mut tasks = Vec::new();

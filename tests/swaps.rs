@@ -1,4 +1,4 @@
-//! Detectors of two families are swapped again and again in one flight, and no frame is missed.
+//! Swaps detectors of two families repeatedly in one flight, and checks that no frame is missed.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -13,14 +13,14 @@ use tokio::time::{sleep, timeout};
 
 use crate::flight::{ALIGHT, LONG, Landing, PATIENCE, alone, output_of, seconds};
 
-/// Ends processes that outlive those who started them.
+/// Ends processes that outlive their parents.
 #[derive(Default)]
 struct Outliving(Vec<Pid>);
 
 impl Drop for Outliving {
     fn drop(&mut self) {
         for pid in &self.0 {
-            // Those that were swapped away have ended.
+            // Replaced detectors have ended.
             let _ = kill_process(*pid, Signal::KILL);
         }
     }
@@ -57,11 +57,11 @@ pub(crate) async fn command(landing: &Landing, command: ControllerCommand) -> an
     Ok(())
 }
 
-/// A pad of two families: rings in its middle, an AprilTag beside them.
+/// A pad of two families: rings in its centre, an AprilTag next to them.
 const RINGS: &str = "[[markers]]\nmarker = \"rings:0.15341\"\n";
 const TAG: &str = "[[markers]]\nmarker = \"apriltag-36h11:3:0.12\"\nx_m = 0.17\n";
 
-/// The pad as it lies there, and four detectors of it as files: two families, each in two versions.
+/// The pad, and four detectors of it as files: two families, each in two versions.
 fn pad_and_detectors(directory: &Path) -> anyhow::Result<(PathBuf, Vec<PathBuf>)> {
     let write = |name: &str, text: String| -> anyhow::Result<PathBuf> {
         let file = directory.join(name);
@@ -175,8 +175,8 @@ fn droughts(received: &[Received]) -> Vec<(i64, f64, String)> {
 }
 
 /// Holds over the pad, swaps detectors of two families again and again, and lands. Between the swaps, for a third as long,
-/// the same hold without them. False when the machine had no time for it: then frames were late whoever found the
-/// marker in them, and what a hand-over missed is not known.
+/// the same hold without them. False when the machine had no time for it: then frames were late for every
+/// detector, and the frames that a hand-over missed are not known.
 pub(crate) async fn swaps(number: usize) -> anyhow::Result<bool> {
     let _alone = alone().await?;
     let directory = tempfile::tempdir()?;
@@ -233,12 +233,12 @@ pub(crate) async fn swaps(number: usize) -> anyhow::Result<bool> {
             without.add_since(after, Ticks::now(&healths).await?);
         }
         if i % 25 == 24 {
-            println!("{} swaps; with them {with}; beside them {without}", i + 1);
+            println!("{} swaps; with them {with}; between them {without}", i + 1);
         }
     }
     took_s.sort_by(f64::total_cmp);
     println!(
-        "{number} swaps, in use after {:.1} s each; with them {with}; beside them {without}",
+        "{number} swaps, in use after {:.1} s each; with them {with}; between them {without}",
         took_s.get(took_s.len() / 2).copied().unwrap_or_default(),
     );
     let received = received.lock().unwrap_or_else(PoisonError::into_inner).clone();
@@ -246,7 +246,7 @@ pub(crate) async fn swaps(number: usize) -> anyhow::Result<bool> {
         let swap = marks.iter().find(|(began_ns, _, ended_s)| {
             (0.0..*ended_s + 0.2).contains(&seconds(at_ns - began_ns))
         });
-        let when = swap.map_or("beside the swaps".to_owned(), |(began_ns, at_s, _)| {
+        let when = swap.map_or("between the swaps".to_owned(), |(began_ns, at_s, _)| {
             format!("{:.2} s into a swap {at_s:.2?}", seconds(at_ns - began_ns))
         });
         println!("no fresh frame for {over_ms:.0} ms {when}: the next was taken {cause}");

@@ -1,5 +1,5 @@
-//! `alight up` for the drone and the ground on one machine: processes meet, are restarted when killed and given
-//! up when refused, the supervisor crashes; dry runs, systemd units.
+//! Tests `alight up` for the drone and the ground on one machine: processes connect, are restarted when killed and given
+//! up when refused; a crash of the supervisor; dry runs, systemd units.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -89,7 +89,7 @@ impl Up {
         Ok(Self { child, said, printed: Vec::new() })
     }
 
-    /// Waits for a line from now on that begins and goes on so.
+    /// Waits for a new line with this beginning and this part.
     async fn says(&mut self, begin: &str, part: &str) -> anyhow::Result<String> {
         let line = async {
             while let Some(line) = self.said.recv().await {
@@ -101,7 +101,7 @@ impl Up {
             None
         };
         let line = timeout(PATIENCE, line).await.ok().flatten();
-        line.ok_or_else(|| anyhow!("`{begin} ... {part}` was not said: {:#?}", self.printed))
+        line.ok_or_else(|| anyhow!("`{begin} ... {part}` was not printed: {:#?}", self.printed))
     }
 
     /// The process of a service, once it is started.
@@ -160,7 +160,8 @@ async fn longest_gap(states: &Subscriber<VehicleState>) -> Duration {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn two_roles_meet_what_dies_comes_back_and_the_end_is_orderly() -> anyhow::Result<()> {
+async fn two_roles_connect_killed_processes_start_again_and_the_end_is_orderly()
+-> anyhow::Result<()> {
     with_second_try(two_roles_meet).await
 }
 
@@ -199,7 +200,7 @@ async fn two_roles_meet() -> anyhow::Result<()> {
         let during = longest_gap(&states).await;
         kill_process(on_the_ground, Signal::CONT)?;
         println!("longest gap in the vehicle's state: {before:?}, while the link hangs {during:?}");
-        // Missed after the lease, and back when it goes on.
+        // Missed after the lease, and back when it continues.
         change("ground", false).await?;
         change("ground", true).await?;
         calm = during < before * 3;
@@ -209,7 +210,7 @@ async fn two_roles_meet() -> anyhow::Result<()> {
     }
     ensure!(calm, "local messages were held up");
 
-    // A detector that is killed comes back, and so does the relay, with the ground behind it.
+    // A killed detector starts again, and so does the relay, with the ground behind it.
     kill_process(on_the_ground, Signal::KILL)?;
     change("ground", false).await?;
     change("ground", true).await?;
@@ -243,13 +244,13 @@ async fn two_roles_meet() -> anyhow::Result<()> {
     processes.push(drone.process("detector").await?);
     change("onboard", true).await?;
 
-    // A controller comes back waiting for a command: there was no landing to be taken up.
+    // A new controller waits for a command: there was no landing to be resumed.
     let controller = processes[3];
     kill_process(controller, Signal::KILL)?;
     let again = drone.says("controller", "started as process").await?;
     ensure!(again.contains("start = \"command\""), "{again}");
 
-    // All is well, as the doctor sees it from the ground.
+    // The doctor on the ground finds no error.
     timeout(PATIENCE, async {
         while node.alive("controller", "*").await.is_ok_and(|alive| alive.is_empty()) {}
     })
@@ -303,7 +304,7 @@ command = ["./own.sh"]
     );
     std::fs::write(folder.path().join("site.toml"), site)?;
     let mut alight = Command::new(&program);
-    // What the user's shell has for commands is not the site's.
+    // The environment of the user's shell is not the site's.
     alight.env("ALIGHT_MEET", "1").env("ALIGHT_VEHICLE", "other");
     let mut up = Up::run(alight, folder.path(), "local")?;
     let detector = up.process("detector:").await?;
@@ -321,7 +322,7 @@ command = ["./own.sh"]
     std::fs::remove_file(&script)?;
     kill_process(own, Signal::KILL)?;
     up.says("own:", "restarting").await?;
-    // It cannot be started: that is one more of its ends, and no end of the others.
+    // It cannot be started: that counts as its end, and does not end the others.
     up.says("own:", "./own.sh").await?;
     kill_process(detector, Signal::KILL)?;
     let again = up.process("detector:").await?;
@@ -332,11 +333,12 @@ command = ["./own.sh"]
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_program_that_cannot_be_started_is_tried_again_beside_the_others() -> anyhow::Result<()> {
+async fn a_program_that_cannot_be_started_is_tried_again_while_the_others_run() -> anyhow::Result<()>
+{
     let _flight = beside_another().await?;
     let folder = tempfile::tempdir()?;
     let script = folder.path().join("own.sh");
-    // It may be run, but what is to read it is not there.
+    // It is executable, but its interpreter is missing.
     std::fs::write(&script, "#!/no/such/shell\n")?;
     std::fs::set_permissions(&script, std::fs::Permissions::from_mode(0o755))?;
     let ([meet], ..) = ports::free()?;
@@ -402,7 +404,7 @@ set = ["autopilot.address=udpin:127.0.0.1:{autopilot}", "start=takeoff"]
 }
 
 #[test]
-fn a_dry_run_says_what_would_be_run_and_a_mistake_is_named() -> anyhow::Result<()> {
+fn a_dry_run_prints_the_commands_and_an_error_is_named() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     write_site(folder.path())?;
     let output = alight(folder.path(), &["up", "drone", "--dry-run"])?;
@@ -476,7 +478,7 @@ fn a_camera_is_ready_once_its_first_frame_is_there() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A web server, which answers once it was sent something, for as long as this lives.
+/// A web server, which answers after the first bytes of a client, until this is dropped.
 struct WebServer {
     port: u16,
     ends: Arc<AtomicBool>,
@@ -494,7 +496,7 @@ impl WebServer {
                 if asked.load(Ordering::Relaxed) {
                     return;
                 }
-                // Who connects may leave at any time, or say nothing.
+                // A client may disconnect at any time, or send nothing.
                 let _ = stream.set_read_timeout(Some(Duration::from_millis(300)));
                 let _ = stream.read(&mut [0; 256]);
                 let _ = stream.write_all(b"HTTP/1.0 400 Bad request\r\n\r\n");
@@ -599,7 +601,7 @@ async fn services_outlast_it() -> anyhow::Result<()> {
     for (service, arguments) in services.iter_mut().zip(all) {
         ensure!(service.0.try_wait()?.is_none(), "{arguments:?} ended");
     }
-    // The program goes, and they meet.
+    // The program ends, and they connect.
     drop(server);
     let network = Network { meet: Some(port), ..Network::default() };
     let identity = Identity { service: "alight", instance: "test".into() };
@@ -613,12 +615,12 @@ async fn services_outlast_it() -> anyhow::Result<()> {
             }
         }
     };
-    timeout(PATIENCE, meet).await.context("they never meet")??;
+    timeout(PATIENCE, meet).await.context("they never connect")??;
     Ok(())
 }
 
 #[test]
-fn the_units_are_as_systemd_wants_them() -> anyhow::Result<()> {
+fn systemd_accepts_the_units() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let deploy = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy");
     let mut command = Command::new("systemd-analyze");
@@ -629,10 +631,10 @@ fn the_units_are_as_systemd_wants_them() -> anyhow::Result<()> {
         ensure!(unit.contains(&format!("/usr/local/bin/alight up {role} ")), "{unit}");
         // The end of one process is no end of the others.
         ensure!(unit.lines().any(|line| line == "OOMPolicy=continue"), "{unit}");
-        // What was noted for the case of a crash is kept where systemd starts the unit no more.
+        // The notes for the case of a crash are kept if systemd does not start the unit again.
         let notes = unit.lines().find(|line| line.starts_with("RuntimeDirectoryPreserve="));
         ensure!(notes.is_none_or(|line| line.ends_with("=yes")), "{unit}");
-        // It also looks whether the program is there.
+        // It also checks whether the program exists.
         std::fs::write(folder.path().join(&name), unit.replace("/usr/local/bin/alight", ALIGHT))?;
         command.arg(folder.path().join(&name));
     }
@@ -647,7 +649,7 @@ fn the_units_are_as_systemd_wants_them() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_refused_its_configuration_is_given_up_at_once() -> anyhow::Result<()> {
+async fn a_process_with_a_refused_configuration_is_given_up_at_once() -> anyhow::Result<()> {
     with_second_try(a_process_refuses_its_configuration).await
 }
 

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""A Zenoh program that is none of ours: who is there, and what do the frames' headers say?
+"""An independent Zenoh program: which services are there, and what do the frames' headers contain?
 
 It lists the live services by their liveliness tokens and reads the headers of some frames from their attachments
-(codec: `A`, type 1, version 3, then postcard), and prints what it saw as one JSON object on the last line.
+(codec: `A`, type 1, version 3, then postcard), and prints the result as one JSON object on the last line.
 
     python3 tests/zenoh_client.py tcp/127.0.0.1:7447
 

@@ -1,11 +1,11 @@
-//! Circles in a graph, and the graph of the modules of a crate.
+//! Finds cycles in a graph, and makes the graph of the modules of a crate.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use crate::source::{tokens, without_tests};
 
-/// Who needs whom.
+/// The nodes that each node needs.
 pub(crate) type Graph = BTreeMap<String, BTreeSet<String>>;
 
 /// The sets of nodes that need each other, directly or by way of others.
@@ -34,7 +34,7 @@ fn reached_from<'a>(graph: &'a Graph, node: &String) -> BTreeSet<&'a String> {
     reached
 }
 
-/// A module: its file, the modules that it declares, and what it passes on under names of its own.
+/// A module: its file, the modules that it declares, and the items that it re-exports.
 #[derive(Default)]
 struct Module {
     code: String,
@@ -42,10 +42,10 @@ struct Module {
     passed_on: BTreeMap<String, Vec<String>>,
 }
 
-/// The modules of a crate by their paths (`a::b`; the crate's root is `crate`), and which uses which.
+/// The modules of a crate by their paths (`a::b`; the crate's root is `crate`), and the modules that each of them uses.
 ///
-/// A module uses another one when it names something of it. Not counted: a module's declaration, what a module's children
-/// use of it (they are parts of it), and names that the crate's root passes on.
+/// A module uses another one when it names an item of it. Not counted: a module's declaration, uses by a module's children
+/// (they are parts of it), and names that the crate's root re-exports.
 pub(crate) fn modules(src: &Path, files: &[PathBuf]) -> std::io::Result<Graph> {
     let mut modules = BTreeMap::new();
     for file in files {
@@ -201,7 +201,7 @@ fn tree_at(
                 names.push(name.to_owned());
                 at += 1;
             }
-            // `*`, or what follows a turbofish.
+            // `*`, or the text after a turbofish.
             _ => break,
         }
         if tokens.get(at) != Some(&"::") {

@@ -1,4 +1,4 @@
-//! The list of source files in ARCHITECTURE.md: each with the first sentence of its own documentation and what it defines.
+//! Makes the list of source files in ARCHITECTURE.md: each with the first sentence of its documentation and its definitions.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -45,7 +45,7 @@ fn place(file: &str) -> Option<(&str, usize, &str)> {
     })
 }
 
-/// What a file defines, but for its tests: types, functions, methods that are no trait's, then constants; the first of them.
+/// The definitions in a file, without its tests: types, functions, methods that are no trait's, then constants; the first of them.
 fn names(text: &str) -> String {
     let before_tests = text.split("\nmod tests {").next().unwrap_or_default();
     let (mut is_test, mut of_trait) = (false, false);
@@ -73,7 +73,7 @@ fn names(text: &str) -> String {
     if names.is_empty() { String::new() } else { format!(" ({})", names.join(", ")) }
 }
 
-/// What a line defines with one of these keywords, public or not.
+/// The name that a line defines with one of these keywords, public or not.
 fn defined<'a>(line: &'a str, keywords: &[&str]) -> Option<&'a str> {
     let line = ["pub(crate) ", "pub(super) ", "pub "]
         .iter()
@@ -112,7 +112,7 @@ fn ends_sentence(paragraph: &str, at: usize) -> bool {
     paragraph[at + 2..].starts_with(|first: char| first.is_uppercase() || first == '`')
 }
 
-/// ` (<https://...>)` says nothing about a file.
+/// ` (<https://...>)` does not describe a file.
 fn without_addresses(sentence: &str) -> String {
     match (sentence.find(" (<"), sentence.find(">)")) {
         (Some(begin), Some(end)) if begin < end => {

@@ -1,6 +1,6 @@
-//! What stands in a Rust source file: its code without comments, literals and tests, as tokens.
+//! Reads the code of a Rust source file without comments, literals and tests, as tokens.
 
-/// The code of a file: comments and what literals contain are blanks, and items under `#[cfg(test)]` are left out.
+/// The code of a file: comments and contents of literals are blanks, and items under `#[cfg(test)]` are left out.
 pub(crate) fn without_tests(source: &str) -> String {
     let mut code = without_text(source);
     while let Some(begin) = code.find("#[cfg(test)]") {
@@ -31,7 +31,7 @@ fn item_len(code: &str) -> usize {
     code.len()
 }
 
-/// The source with blanks instead of comments and of what literals contain; lines stay where they are.
+/// The source with blanks instead of comments and contents of literals; line numbers do not change.
 fn without_text(source: &str) -> String {
     let bytes = source.as_bytes();
     let mut code = String::with_capacity(source.len());

@@ -1,7 +1,7 @@
 """Looks at a landing in a real browser, and commands it: browser.py URL FOLDER
 
-Says `STOP` and `CONT` when the page's server is to be stopped and to go on, `KILL` and `START` when it is to be killed and started
-again, and waits for a line after each. Prints what was measured as JSON on its last line. Exit status 77: no browser, or no package to drive one.
+Says `STOP` and `CONT` when the page's server is to be stopped and to continue, `KILL` and `START` when it is to be killed and started
+again, and waits for a line after each. Prints the measurements as JSON on its last line. Exit status 77: no browser, or no package to drive one.
 """
 
 import json
@@ -43,10 +43,10 @@ TWICE = """(button) => {
 
 # Deque's axe-core, the rules of accessibility that browsers' own tools check.
 AXE = next((found for folder in os.environ.get("NODE_PATH", "").split(os.pathsep) if (found := Path(folder) / "axe-core/axe.min.js").is_file()), None)
-# In sunlight 7:1 is asked for, which axe-core does by itself for 4.5:1.
+# In sunlight 7:1 is required; by default axe-core requires 4.5:1.
 VIOLATIONS = """async () => {
   const enhanced = document.documentElement.dataset.theme === 'sun';
-  // What is old is grey, so that nobody reads it as new.
+  // Old values are grey, so that they are not mistaken for new ones.
   const found = await axe.run({ exclude: ['.stale', '.old'] }, { rules: { 'color-contrast-enhanced': { enabled: enhanced } } });
   const checked = found.passes.map((rule) => rule.id);
   return { checked, violations: found.violations.map((it) => `${it.impact} ${it.id}: ${it.nodes.map((node) => node.html.slice(0, 80)).join(' | ')}`) };
@@ -73,7 +73,7 @@ def accessibility(page, names):
 
 
 def tab_to(page, command):
-    """Goes on with the tabulator until a command's button has the focus, which it has not while it cannot be used."""
+    """Presses the tab key until a command's button has the focus, which it has not while it cannot be used."""
     began = time.monotonic()
     while time.monotonic() - began < PATIENCE_S:
         if page.evaluate("document.activeElement?.dataset?.command ?? ''") == command:
@@ -104,10 +104,10 @@ def point_at(page, command):
 
 
 def give(page, command, down, up):
-    """Holds a button as long as the page asks for it; once more where that did nothing, as it moved or could not be used just then."""
+    """Holds a button as long as the page asks for it; again where that had no effect, as it moved or could not be used just then."""
     for attempt in range(ATTEMPTS):
         if attempt:
-            print(f"{command}: once more, as it says: {text(page, '#reply')}", file=sys.stderr)
+            print(f"{command}: again, as the reply is: {text(page, '#reply')}", file=sys.stderr)
         wait(page, f"!document.querySelector('button[data-command={command}]').disabled")
         down()
         if holds_within(page, replied("Keep holding"), 2):
@@ -188,7 +188,7 @@ def meet_another_vehicle(browser):
     reply = text(page, "#reply")
     assert reply.startswith(f"{name}: hold: ") and "may have been carried out" in reply, reply
     begun = page.evaluate("performance.getEntriesByType('navigation')[0].type")
-    assert begun == "reload", f"the page of another vehicle goes on ({begun})"
+    assert begun == "reload", f"the page of another vehicle continues ({begun})"
     page.screenshot(path=FOLDER / "another-vehicle.png")
     page.close()
 
@@ -198,8 +198,8 @@ def replied(begin):
     return f"document.getElementById('reply').textContent.startsWith('{begin}')"
 
 
-def asked(what):
-    print(what, flush=True)
+def asked(action):
+    print(action, flush=True)
     sys.stdin.readline()
 
 
@@ -265,7 +265,7 @@ def main():
         assert 10_000 < measured["page_bytes"] <= 300_000, sizes
         page.screenshot(path=FOLDER / "descending.png", full_page=True)
 
-        # What the detector refused in that very frame, for as long as it is asked.
+        # The detector's rejected candidates in this frame, for as long as they are requested.
         assert text(page, "#refused-text") == ""
         page.locator("#refused").click()
         some = "/^main refused \\d+ candidates? in it.*: \\d+ \\w/.test(document.getElementById('refused-text').textContent)"
@@ -316,7 +316,7 @@ def main():
         assert width <= 360, f"a telephone would have to scroll sideways: {width} px"
         boxes = [panel.bounding_box() for panel in page.locator(".panel").all()]
         assert len(boxes) > 10 and all(box["x"] >= 0 and box["x"] + box["width"] <= 360 and box["height"] > 40 for box in boxes), boxes
-        # Nothing of a table is cut off, and what is to be looked at before the flight comes before what is for later.
+        # Nothing of a table is cut off, and panels for the time before the flight come before those for later.
         page.set_viewport_size({"width": 390, "height": 844})
         time.sleep(0.5)
         for table in page.locator(".scroll").all():
@@ -356,7 +356,7 @@ def main():
         browser.close()
     foreign = [url for url in requests if not url.startswith(URL)]
     assert not foreign, f"asked of others: {foreign}"
-    # What fails while the server is away is no problem of the page.
+    # Failures while the server is away are no error of the page.
     problems = [it for it in problems if "ERR_CONNECTION" not in it and "WebSocket connection" not in it]
     assert not problems, problems
     print(json.dumps(measured))

@@ -1,4 +1,4 @@
-//! A page whose camera and detectors are played: each frame has its number in its pixels, and a browser reads back what it draws.
+//! Plays camera and detectors for a page: each frame has its number in its pixels, and a browser reads back the drawn pictures.
 
 #![allow(dead_code, reason = "each program uses its part")]
 
@@ -20,13 +20,13 @@ use crate::site::{Air, Radio};
 
 /// Exit status of the script where a browser or a package is missing.
 const LACKS: i32 = 77;
-/// Blocks of the number in the pixels: their edge in pixels, and their grey values.
+/// Blocks of the number in the pixels: their edge in pixels, and their intensities.
 const BLOCK: usize = 24;
 const BLACK: u8 = 20;
 const WHITE: u8 = 230;
 /// Longest wait for the page.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// The square whose place follows from the number, as `tests/dashboard/frames.py` computes it: its edge in pixels, and by how much
+/// The square whose position follows from the number, as `tests/dashboard/frames.py` computes it: its edge in pixels, and by how much
 /// the detector that is not in use is wrong.
 const SQUARE: usize = 80;
 const SPARE_SHIFT: f64 = 40.0;
@@ -35,7 +35,7 @@ const CYCLE: u64 = 40;
 const BOTH: u64 = 24;
 const NONE: u64 = 32;
 
-/// What is filmed.
+/// The frames of a film.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Film {
     pub(crate) size: [u32; 2],
@@ -158,7 +158,7 @@ async fn play(node: Node, film: Film) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A page with what is filmed for it; gone with this.
+/// A page with its film, until this is dropped.
 pub(crate) struct Shown {
     dashboard: Child,
     player: JoinHandle<anyhow::Result<()>>,
@@ -198,8 +198,8 @@ impl Shown {
         Ok(Self { dashboard, player, port, token, _folder: folder })
     }
 
-    /// What a browser read back, on this machine or at the other end of a link: of so many frames with what is drawn over them, or for
-    /// so long. `None` where there is none, after saying so.
+    /// The result of a browser, on this machine or at the other end of a link: of this number of frames with their overlays, or for
+    /// this time. `None` without a browser, after a message.
     pub(crate) async fn read(
         &mut self,
         air: Option<&Air>,
@@ -238,13 +238,13 @@ impl Shown {
 impl Drop for Shown {
     fn drop(&mut self) {
         self.player.abort();
-        // One that has ended by itself needs no end.
+        // A process that has ended needs no kill.
         drop(self.dashboard.kill());
         drop(self.dashboard.wait());
     }
 }
 
-/// Reads back so many frames with what is drawn over them; an error when one has the overlay of another.
+/// Reads back this number of frames with their overlays; an error when one has the overlay of another.
 pub(crate) async fn overlay(frames: u64) -> anyhow::Result<Option<Value>> {
     let film = Film { size: [648, 486], rate_hz: 30.0, is_difficult: true };
     let mut shown = Shown::start(film).await?;
@@ -259,7 +259,7 @@ pub(crate) async fn overlay(frames: u64) -> anyhow::Result<Option<Value>> {
     Ok(Some(read))
 }
 
-/// From sent to drawn, in milliseconds, for so long; over a link where there is one.
+/// From sent to drawn, in milliseconds, for this time; over a link if there is one.
 pub(crate) async fn latency(
     rate_hz: f64,
     seconds: f64,

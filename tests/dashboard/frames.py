@@ -1,9 +1,9 @@
-"""Reads back what a page draws: frames.py URL SECONDS FRAMES [TOKEN]
+"""Reads back the pictures that a page draws: frames.py URL SECONDS FRAMES [TOKEN]
 
-Each frame has its number in its pixels, and a square whose place follows from it (`tests/dashboard/film.rs`). The page's canvas is
+Each frame has its number in its pixels, and a square whose position follows from it (`tests/dashboard/film.rs`). The page's canvas is
 read until so many different frames were drawn or the time is over: the number, and which overlay is drawn where. The times at which the server
 sent each picture and at which its pixels can be read on the page are compared by the clock that all processes of a machine share.
-Prints what was measured as JSON on its last line. Exit status 77: no browser, or no package to drive one.
+Prints the measurements as JSON on its last line. Exit status 77: no browser, or no package to drive one.
 """
 
 import json
@@ -110,7 +110,7 @@ READ = """([frames, withOverlay]) => {
       [whole.canvas.width, whole.canvas.height] = [width, height];
       whole.drawImage(video, 0, 0, width, height);
       const image = whole.getImageData(0, 0, width, height);
-      // What was drawn meanwhile is another frame.
+      // Another frame was drawn meanwhile.
       const again = numberIn(whole.getImageData(0, 0, strip.width, strip.height).data);
       if (again !== number) { numbers.delete(number); return; }
       Object.assign(entry, overlay(image, number));

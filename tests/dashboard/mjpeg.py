@@ -1,6 +1,6 @@
-"""Reads the video of a landing's page as a program that knows only Motion JPEG: mjpeg.py URL
+"""Reads the video of a landing's page as a program with only Motion JPEG: mjpeg.py URL
 
-Prints what was seen as JSON on its last line. Exit status 77: no OpenCV with a reader of videos.
+Prints the result as JSON on its last line. Exit status 77: no OpenCV with a reader of videos.
 """
 
 import json

@@ -1,7 +1,7 @@
-"""Reads H.264 over RTP as a program that knows nothing of Alight: rtp.py PORT PICTURES
+"""Reads H.264 over RTP as a program without any part of Alight: rtp.py PORT PICTURES
 
 Each picture has its number in its pixels: sixteen squares in its upper left corner, the lowest bit first, white for 1. Prints
-what was seen as JSON on its last line. Exit status: 0 all was as it must be, 1 it was not, 77 no OpenCV with a reader of videos.
+the result as JSON on its last line. Exit status: 0 all was as it must be, 1 it was not, 77 no OpenCV with a reader of videos.
 """
 
 import json
@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 
-# What ffmpeg says of damaged pictures goes to the error output, and is counted there.
+# ffmpeg's messages on damaged pictures go to the error output, and are counted there.
 os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = "protocol_whitelist;file,rtp,udp|fflags;nobuffer|flags;low_delay"
 os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "16"
 

@@ -19,11 +19,11 @@ use tokio::time::timeout;
 pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
 /// Longest time that a landing may take to end after a command.
 const MAX_END: Duration = Duration::from_secs(15);
-/// Furthest from the pad's centre that a landing may end, whatever happened on the way; 0.05 m is the worst
+/// Furthest from the pad's centre that a landing may end, after any event on the way; 0.05 m is the worst
 /// of the landings without a fault in `docs/results.md`.
 const MAX_ERROR_M: f64 = 0.1;
-/// The simulated camera with a quarter of its pixels and without a camera's processing: what is tested is how processes fit
-/// together, on machines that may have no time for the rest.
+/// The simulated camera with a quarter of its pixels and without a camera's processing: the tests are of the interaction of processes,
+/// on machines that may have no time for the rest.
 const SMALL_CAMERA: [&str; 4] = [
     "camera.width=648",
     "camera.height=486",
@@ -45,17 +45,17 @@ pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 const MAX_AT_ONCE: u32 = 7;
 static FLIGHTS: Semaphore = Semaphore::const_new(MAX_AT_ONCE as usize);
 
-/// Waits until there is time for one more landing, until what this returns is dropped.
+/// Waits until there is time for one more landing, until the result is dropped.
 pub(crate) async fn beside_another() -> anyhow::Result<SemaphorePermit<'static>> {
     time_for(1).await
 }
 
-/// Waits until there is time for so many more landings, or what loads the machine as they do.
+/// Waits until there is time for this number of landings, or other work of this load.
 pub(crate) async fn time_for(landings: u32) -> anyhow::Result<SemaphorePermit<'static>> {
     Ok(FLIGHTS.acquire_many(landings).await?)
 }
 
-/// Waits until no landing is under way that waited for its time, and lets none begin: for what loads the machine by itself, or measures milliseconds.
+/// Waits until no landing is under way that waited for its time, and lets none begin: for tests that load the machine on their own, or measure milliseconds.
 pub(crate) async fn alone() -> anyhow::Result<SemaphorePermit<'static>> {
     time_for(MAX_AT_ONCE).await
 }
@@ -65,7 +65,7 @@ pub(crate) fn small_camera() -> String {
     SMALL_CAMERA.map(|key| format!("{key:?}")).join(", ")
 }
 
-/// What a command that should end by itself says; one that goes on is ended.
+/// The output of a command that should end on its own; a command that continues is killed.
 pub(crate) fn output_of(command: &mut Command) -> anyhow::Result<Output> {
     let mut child =
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
@@ -107,7 +107,7 @@ impl Vehicle {
         let simulator = Command::new(ALIGHT)
             .args(["simulator", "--meet", &meet.to_string()])
             .args(["--set", &format!("autopilot.address=udpout:127.0.0.1:{port}")])
-            // Nobody looks at its pictures: the landing's camera follows its pose.
+            // Its pictures are not used: the landing's camera follows its pose.
             .args(["--set", "camera.rate_hz=1"])
             .args(SMALL_CAMERA.iter().flat_map(|key| ["--set", key]))
             .env("ALIGHT_LOG", "warn")
@@ -157,7 +157,7 @@ pub(crate) struct Service {
     pub(crate) name: String,
     pub(crate) pid: Pid,
     pub(crate) by_hand: Vec<String>,
-    /// Where it keeps its notes, if not at the usual place.
+    /// The folder of its notes, if it is not the usual one.
     state: Option<String>,
 }
 
@@ -181,7 +181,7 @@ impl Landing {
         let mut zenoh = None;
         let number = 4 + ["--record", "--dashboard"].iter().filter(|it| args.contains(it)).count();
         while services.len() < number {
-            let line = lines.next().context("alight land said nothing")??;
+            let line = lines.next().context("alight land printed nothing")??;
             if let Some(rest) = line.split("--zenoh ").nth(1).filter(|_| zenoh.is_none()) {
                 zenoh = rest.split_whitespace().next().map(PathBuf::from);
             }
@@ -327,7 +327,7 @@ impl Drop for Landing {
             let _ = child.kill();
             let _ = child.wait();
         }
-        // What was said helps when a test fails, and is not shown otherwise.
+        // The output helps when a test fails, and is not shown otherwise.
         while let Ok(line) = self.said.try_recv() {
             println!("{line}");
         }
@@ -335,7 +335,7 @@ impl Drop for Landing {
 }
 
 /// The service in a line such as `detector is process 12; by hand: alight detector --zenoh FILE --set 'a=b'`; that of a controller
-/// may begin with where it keeps its notes.
+/// may begin with the folder of its notes.
 pub(crate) fn service_in(line: &str) -> Option<Service> {
     let (start, by_hand) = line.split_once("; by hand: ")?;
     let (before, by_hand) = by_hand.split_once("alight ")?;

@@ -4,7 +4,7 @@
 After the camera's heartbeat it asks for CAMERA_INFORMATION, at most ten times, now with MAV_CMD_REQUEST_MESSAGE and now
 with MAV_CMD_REQUEST_CAMERA_INFORMATION, and waits 2^(n/2) seconds each time; then for settings, video stream, capture
 status and storage. Then it has the marker tracked. With --commands it sends every MAV_CMD of the dialect to both
-components and counts those without an acknowledgement. It prints what it saw as one JSON object on the last line.
+components and counts those without an acknowledgement. It prints the result as one JSON object on the last line.
 
 Exit status: 0 all was found, 1 something was not, 77 pymavlink is missing (pip install pymavlink).
 """
@@ -28,7 +28,7 @@ mavlink = mavutil.mavlink
 
 CAMERA = 100
 COMPANION = 191
-# What is asked for after CAMERA_INFORMATION: its number, and the command that asks for it in older ground stations.
+# The messages that are requested after CAMERA_INFORMATION: the number, and the command that requests it in older ground stations.
 FURTHER = {
     "CAMERA_SETTINGS": (260, mavlink.MAV_CMD_REQUEST_CAMERA_SETTINGS),
     "VIDEO_STREAM_INFORMATION": (269, mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION),
@@ -37,12 +37,12 @@ FURTHER = {
 }
 ATTEMPTS = 10
 # Longest time from the camera's heartbeat until all is found where no packet is lost, in seconds. With losses chance decides which of
-# the attempts, ever farther apart, comes through; that one of them does is what counts.
+# the attempts, ever farther apart, comes through; one of them must.
 MAX_FOUND_S = 3.0
 
 
 class Link:
-    """A connection that loses a share of the packets in each direction."""
+    """A connection that loses a fraction of the packets in each direction."""
 
     def __init__(self, connection, loss, seed):
         self.connection = connection
@@ -67,7 +67,7 @@ class Link:
 
 
 def find_camera(link, began):
-    """What was found, as QGroundControl asks for it, and when."""
+    """The found messages, requested as QGroundControl does, and their times."""
     heartbeat = link.wait("HEARTBEAT", 30.0, fits=lambda it: it.type == mavlink.MAV_TYPE_CAMERA)
     if heartbeat is None:
         return {"problem": "no heartbeat of a camera"}
@@ -136,7 +136,7 @@ def unanswered(link):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--connect", default="udpin:127.0.0.1:14550", help="where to listen, as pymavlink writes it")
-    parser.add_argument("--loss", type=float, default=0.0, help="share of packets lost in each direction")
+    parser.add_argument("--loss", type=float, default=0.0, help="fraction of packets lost in each direction")
     parser.add_argument("--seed", type=int, default=1, help="which packets are lost")
     parser.add_argument("--area", type=float, nargs=4, default=[0, 0, 1, 1], help="rectangle to point at, 0 to 1")
     parser.add_argument("--commands", action="store_true", help="send every command to both components")

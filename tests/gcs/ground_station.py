@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""A ground station that checks what it is shown: is this vehicle fit for QGroundControl?
+"""A ground station that checks the received messages: is this vehicle fit for QGroundControl?
 
 It listens where QGroundControl would, and waits for the vehicle's heartbeat, the companion's (component 191), texts
 about the landing (STATUSTEXT), and the landing point (LANDING_TARGET); it asks the vehicle for a parameter, and the
-companion for something it cannot do. It prints what it saw as one JSON object on the last line.
+companion for something it cannot do. It prints the result as one JSON object on the last line.
 
     python3 tests/gcs/ground_station.py --connect udpin:127.0.0.1:14550
 
@@ -25,7 +25,7 @@ except ImportError:
 
 mavlink = mavutil.mavlink
 
-# What must be seen, in the order in which it is reported.
+# The messages that must be received, in the order of the report.
 CHECKS = (
     "vehicle_heartbeat",
     "companion_heartbeat",
@@ -37,7 +37,7 @@ CHECKS = (
 
 
 class GroundStation:
-    """What was seen so far."""
+    """The messages that were received so far."""
 
     def __init__(self, connection, component, parameter, echo):
         self.connection = connection
@@ -55,7 +55,7 @@ class GroundStation:
         return [name for name in CHECKS if self.seen[name] is None]
 
     def take(self, message):
-        """Files one message under what it shows."""
+        """Stores one message under the check that it passes."""
         self.packets += 1
         kind = message.get_type()
         system, component = message.get_srcSystem(), message.get_srcComponent()
@@ -88,14 +88,14 @@ class GroundStation:
             print(f"[{message.severity}] {text}", file=sys.stderr)
 
     def take_target(self, message):
-        """Counts a landing point if it is a place in local NED."""
+        """Counts a landing point if it is a position in local NED."""
         self.targets.append(time.monotonic())
         if message.frame == mavlink.MAV_FRAME_LOCAL_NED and message.position_valid == 1:
             place = [round(value, 3) for value in (message.x, message.y, message.z)]
             self.seen["landing_target"] = {"position_ned_m": place, "distance_m": round(message.distance, 3)}
 
     def ask(self):
-        """Says that a ground station is here, and asks for what is still missing."""
+        """Sends a ground station's heartbeat, and requests the missing messages."""
         send = self.connection.mav
         send.heartbeat_send(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE)
         if self.vehicle is None:
@@ -117,7 +117,7 @@ def target_rate_hz(times):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--connect", default="udpin:127.0.0.1:14550", help="where to listen, as pymavlink writes it")
-    parser.add_argument("--timeout", type=float, default=90.0, help="seconds until what is missing is missed")
+    parser.add_argument("--timeout", type=float, default=90.0, help="seconds to wait for missing messages")
     parser.add_argument("--duration", type=float, default=0.0, help="seconds to watch at least, even when all was seen")
     parser.add_argument("--component", type=int, default=191, help="component number of the companion")
     parser.add_argument("--parameter", default="LAND_SPEED", help="parameter to ask the vehicle for")

@@ -1,6 +1,6 @@
-"""Which packets a link loses.
+"""Chooses the packets that a link loses.
 
-What a packet says and how often it went before decide, never the time at which it goes: a busy machine loses the same ones.
+The contents of a packet and the number of earlier ones like it decide, never its time: a busy machine loses the same packets.
 """
 
 import collections
@@ -8,7 +8,7 @@ import random
 
 
 class Losses:
-    """A share of the packets of every kind, chosen by a seed."""
+    """A fraction of the packets of every kind, chosen by a seed."""
 
     def __init__(self, share, seed):
         self.share = share
@@ -16,7 +16,7 @@ class Losses:
         self.sent = collections.Counter()
 
     def takes(self, *packet):
-        """Whether the next packet that says this is lost."""
+        """Whether the next packet with these contents is lost."""
         said = repr(packet)
         self.sent[said] += 1
         return random.Random(f"{self.seed} {said} {self.sent[said]}").random() < self.share

@@ -2,7 +2,7 @@
 """A program of MAVSDK at the vehicle's link: does it find the vehicle, its position, its parameters and its camera?
 
 It waits for the autopilot, its position and all of its parameters, and with --camera for the camera's information and video
-stream. Times count from the first packet's arrival on. It prints what it found as one JSON object on the last line.
+stream. Times count from the first packet's arrival on. It prints the result as one JSON object on the last line.
 
     python3 tests/gcs/mavsdk_station.py --connect udpin://127.0.0.1:14550 --camera
 

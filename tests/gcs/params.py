@@ -2,8 +2,8 @@
 """A ground station that loads the companion's parameters as QGroundControl does, over a link that loses packets.
 
 It asks all components for their lists, again after 5 s without any value (at most four times). After 3 s without a value it
-asks for those that are missing by their places, ten at a time, each at most five times. Then it sets one, to a number and to
-none. It prints what it saw as one JSON object on the last line.
+asks for the missing ones by their indices, ten at a time, each at most five times. Then it sets one, to a number and to
+none. It prints the result as one JSON object on the last line.
 
 Exit status: 0 all was there, 1 something was not, 77 pymavlink is missing (pip install pymavlink).
 """
@@ -34,7 +34,7 @@ MAX_LOADED_S, MAX_LOADED_LOSSY_S = 3.0, 15.0
 
 
 class Link:
-    """A connection that loses a share of the packets in each direction."""
+    """A connection that loses a fraction of the packets in each direction."""
 
     def __init__(self, connection, loss, seed):
         self.connection = connection
@@ -58,7 +58,7 @@ class Link:
 
 
 def load(link):
-    """The values by place, as QGroundControl gets them."""
+    """The values by index, as QGroundControl gets them."""
     mav = link.connection.mav
     values, reads, asked, lists = {}, {}, set(), 0
     began = received = time.monotonic()
@@ -75,12 +75,12 @@ def load(link):
             if time.monotonic() - received >= VALUE_S:
                 asked.clear()
                 received = time.monotonic()
-            missing = [place for place in range(count) if place not in values and place not in asked]
-            for place in missing[: BATCH - len(asked)]:
-                reads[place] = reads.get(place, 0) + 1
-                assert reads[place] <= READS, f"parameter {place} did not come after {READS} requests"
-                asked.add(place)
-                link.send(mav.param_request_read_send, link.vehicle, COMPANION, b"", place)
+            missing = [index for index in range(count) if index not in values and index not in asked]
+            for index in missing[: BATCH - len(asked)]:
+                reads[index] = reads.get(index, 0) + 1
+                assert reads[index] <= READS, f"parameter {index} did not come after {READS} requests"
+                asked.add(index)
+                link.send(mav.param_request_read_send, link.vehicle, COMPANION, b"", index)
         value = link.next("PARAM_VALUE", LIST_S if count is None else max(0.01, received + VALUE_S - time.monotonic()))
         if value is not None:
             received = time.monotonic()
@@ -91,7 +91,7 @@ def load(link):
 
 
 def set_one(link, before, wanted):
-    """The value after an attempt to change it, and what was said."""
+    """The value after an attempt to change it, and the status texts."""
     mav = link.connection.mav
     texts, after = [], None
     for _ in range(5):
@@ -115,7 +115,7 @@ def set_one(link, before, wanted):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--connect", default="udpin:127.0.0.1:14550", help="where to listen, as pymavlink writes it")
-    parser.add_argument("--loss", type=float, default=0.0, help="share of packets lost in each direction")
+    parser.add_argument("--loss", type=float, default=0.0, help="fraction of packets lost in each direction")
     parser.add_argument("--seed", type=int, default=1, help="which packets are lost")
     parser.add_argument("--name", default="AL_DESC_SPEED", help="the parameter that is set")
     options = parser.parse_args()

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""A ground station with a key for signed packets, and what somebody without it can do.
+"""A ground station with a key for signed packets, and the effect of packets without it.
 
 It asks the companion for a message, in each of these ways: signed; not signed; signed with another key; the signed packet
-once more; as a sender that is not known yet with a stamp of two minutes ago. Then it sends forged packets for a while, and
-asks once more. Only the first and the last may be answered. It prints what it saw as one JSON object on the last line.
+again; as a sender that is not known yet with a stamp of two minutes ago. Then it sends forged packets for a while, and
+asks again. Only the first and the last may be answered. It prints the result as one JSON object on the last line.
 
 Exit status: 0 all was as it must be, 1 something was not, 77 pymavlink is missing (pip install pymavlink).
 """
@@ -46,7 +46,7 @@ class Station:
         self.beats = []
 
     def next(self, kind, seconds):
-        """The companion's next message of a kind; counts what was not signed, and keeps the times of heartbeats."""
+        """The companion's next message of a kind; counts unsigned ones, and stores the times of heartbeats."""
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
             message = self.connection.recv_match(blocking=True, timeout=left)

@@ -45,7 +45,7 @@ class Direction:
     def __init__(self, settings, source, target):
         self.settings, self.source, self.target = settings, source, target
         self.urgent, self.usual = deque(), deque()
-        self.free_at = 0.0  # when the sender has sent what it is sending
+        self.free_at = 0.0  # when the sender has sent its current packet
         self.flying = deque()  # (arrival, packet)
         self.counts = {"sent": 0, "lost": 0, "refused": 0}
 
@@ -64,7 +64,7 @@ class Direction:
                 (self.urgent if marked else self.usual).append((now, packet))
 
     def advance(self, now):
-        """Sends and delivers what is due; returns when to come again, or None."""
+        """Sends and delivers the packets that are due; returns the time of the next call, or None."""
         s = self.settings
         if s["cut"]:
             self.counts["lost"] += len(self.urgent) + len(self.usual) + len(self.flying)
@@ -118,8 +118,8 @@ def main(names):
             if not data:
                 return
             lines += data
-            *whole, lines = lines.split(b"\n")
-            for line in whole:
+            *complete, lines = lines.split(b"\n")
+            for line in complete:
                 settings.update(json.loads(line))
                 print(json.dumps([direction.counts for direction in directions]), flush=True)
         now = time.monotonic()

@@ -1,5 +1,5 @@
-//! Landings with the detector onboard, on the ground behind an emulated radio link, or with both while the link is
-//! cut: errors, ages of the frames used, and what the cut does.
+//! Flies landings with the detector onboard, on the ground behind an emulated radio link, or with both while the link is
+//! cut: errors, ages of the frames used, and effects of the cut.
 
 use std::time::Duration;
 
@@ -15,10 +15,10 @@ use super::site::{Radio, Site};
 
 /// Longest flight.
 const PATIENCE: Duration = Duration::from_secs(110);
-/// A probe on the ground runs so long beside a landing.
+/// A probe on the ground runs this long next to a landing.
 const PROBE_S: f64 = 14.0;
 
-/// What became of a landing.
+/// The outcome of a landing.
 #[derive(Default)]
 pub(crate) struct Flight {
     pub(crate) landed: bool,
@@ -34,7 +34,7 @@ pub(crate) struct Flight {
     cut: Option<Cut>,
 }
 
-/// What a cut of the link did.
+/// The effects of a cut of the link.
 #[derive(Default)]
 struct Cut {
     /// From the cut to the onboard detector's being used.
@@ -174,7 +174,7 @@ pub(crate) async fn cut(radio: Radio, seed: u64, seconds: f64) -> anyhow::Result
     let used = until(&statuses, "the one on the ground is used again", is_used);
     let used = timeout(Duration::from_secs(10), used).await.ok().and_then(Result::ok);
     let preferred_s = used.as_ref().map(|(_, at)| (*at - joined).as_secs_f64());
-    // Long enough to see it change its mind.
+    // Long enough to see a further change of the detector.
     let end = Instant::now() + Duration::from_secs(3);
     let mut last = used.map(|(status, _)| status);
     while let Ok(Some(status)) = timeout_at(end, statuses.next()).await {
@@ -214,7 +214,7 @@ async fn until(
     found.await.ok().flatten().with_context(|| format!("waiting until {what}; last: {last:?}"))
 }
 
-/// What arrives on the drone from the drone.
+/// The messages on the drone that come from the drone.
 struct Local {
     detections: Subscriber<Detections>,
     states: Subscriber<messages::VehicleState>,

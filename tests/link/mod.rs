@@ -1,4 +1,4 @@
-//! Two hosts joined by a bad radio link, and what is measured on it.
+//! Joins two hosts by a bad radio link, and measures on it.
 
 #![allow(dead_code, reason = "each program uses its part")]
 

@@ -1,8 +1,8 @@
-//! One host: a frame from its camera to a reader in another process, beside a bare ring of buffers in shared memory.
+//! Measures on one host a frame from its camera to a reader in another process, next to a bare ring of buffers in shared memory.
 //!
 //! The ring is the limit: two threads that share the buffers, in memory of the same kind, woken by a condition variable,
 //! which is a futex. (Two processes with a futex between them take the same time within 5 %, but need `unsafe`.) Between both
-//! stands Zenoh alone, the example `bare_zenoh` of `node`, when it is built: what it takes is not ours to save.
+//! stands Zenoh alone, the example `bare_zenoh` of `node`, when it is built: its time is the limit of this implementation.
 
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
@@ -29,7 +29,7 @@ const ROUNDS: usize = 3;
 const WARM_UP: u64 = 10;
 const BUFFERS: usize = 4;
 
-/// What was measured, in milliseconds.
+/// The measured times, in milliseconds.
 pub(crate) struct OneHost {
     ring: Times,
     frames: Times,
@@ -38,7 +38,7 @@ pub(crate) struct OneHost {
     bare: Option<Bare>,
 }
 
-/// Zenoh without anything of ours.
+/// Zenoh without any other code of Alight.
 #[derive(Default)]
 struct Bare {
     frames: Times,
@@ -144,12 +144,12 @@ fn start_reader(meet: u16) -> anyhow::Result<Child> {
     command.spawn().context("starting the reader")
 }
 
-/// What a camera writes.
+/// The camera's work: it writes every pixel.
 fn write(pixels: &mut [u8], sequence: u64) {
     pixels.fill(sequence as u8);
 }
 
-/// What a reader makes of it: it has looked at every pixel.
+/// The reader's work: it reads every pixel.
 fn read(pixels: &[u8]) -> u64 {
     pixels.iter().map(|pixel| u64::from(*pixel)).sum()
 }

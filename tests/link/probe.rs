@@ -1,4 +1,4 @@
-//! Small messages both ways across the link, with the time they were sent at: both hosts share a clock here.
+//! Sends small messages both ways across the link, with their send times: both hosts share a clock here.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -118,7 +118,7 @@ pub(crate) async fn controller(node: &Node) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The ground's end, a process of its own; prints what it measured.
+/// The ground's end, a process of its own; prints its measurements.
 pub(crate) async fn run(address: &str, seconds: f64, commands: bool) -> anyhow::Result<Value> {
     let identity = Identity { service: "alight", instance: "probe".into() };
     let node = Node::open(identity, &ground_network(address).source("alight")?).await?;
@@ -161,7 +161,7 @@ pub(crate) async fn run(address: &str, seconds: f64, commands: bool) -> anyhow::
     }))
 }
 
-/// Asks again and again; how long the answers took, and how many did not come.
+/// Sends queries repeatedly; the times of the answers, and the number of missing ones.
 async fn ask(node: Node, until: Instant) -> (Times, u64) {
     let (mut times, mut unanswered) = (Times::default(), 0);
     let mut ticks = interval(COMMAND_PERIOD);

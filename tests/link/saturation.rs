@@ -1,4 +1,4 @@
-//! Small messages while frames are offered at twice what the link carries, by a camera that does not adapt.
+//! Measures small messages while a camera that does not adapt offers frames at twice the link's rate.
 
 use std::time::Duration;
 
@@ -16,7 +16,7 @@ pub(crate) const CLASSES: [&str; 4] = ["state", "mavlink", "commands", "detectio
 /// Bytes of a frame.
 const FRAME_BYTES: usize = 125_000;
 
-/// What the probes measured: on the idle link, and on the saturated one.
+/// The measurements of the probes: on the idle link, and on the saturated one.
 pub(crate) struct Saturation {
     phases: [Value; 2],
     offered_hz: f64,
@@ -73,7 +73,7 @@ async fn phase(site: &mut Site, back: &probe::Shared, seconds: f64) -> anyhow::R
     Ok(report)
 }
 
-/// Publishes frames that are nothing but noise, whatever becomes of them.
+/// Publishes frames of noise only, without waiting for their delivery.
 async fn offer(frames: FramePublisher, rate_hz: f64) {
     let mut ticks = interval(Duration::from_secs_f64(1.0 / rate_hz));
     let mut noise = vec![0_u8; FRAME_BYTES];

@@ -1,8 +1,9 @@
-//! One host: from a frame to the setpoint, without the time the detector needs, while the simulator flies.
+//! Measures on one host the time from a frame to the setpoint, without the time of the detector, while the simulator flies.
 //!
-//! This process receives the frames as the detector does, which is when the clock starts: the time before is the
-//! simulator's drawing, in the place of a camera's exposure. The detector states the durations of its stages with its detections, and the controller publishes its target right after it has sent the setpoint. How long a frame is under way in
-//! shared memory is the trial `onehost`.
+//! This process receives the frames as the detector does, and the clock starts there: the time before is the simulator's
+//! drawing, in the place of a camera's exposure. The detector states the durations of its stages with its detections, and
+//! the controller publishes its target right after it has sent the setpoint. The trial `onehost` measures how long a frame
+//! is under way in shared memory.
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -20,7 +21,7 @@ const PATIENCE: Duration = Duration::from_secs(90);
 /// The age of a detection is published in milliseconds: a frame's stamp is found again within this time.
 const ROUNDING_NS: i64 = 2_000;
 
-/// What was measured.
+/// The measurements.
 pub(crate) struct Setpoint {
     times: Times,
     frames: usize,
@@ -42,7 +43,7 @@ impl std::fmt::Display for Setpoint {
     }
 }
 
-/// When things happened to the frame of a stamp, in nanoseconds.
+/// The times of events of the frame with a stamp, in nanoseconds.
 #[derive(Default)]
 struct Journal {
     arrived: BTreeMap<i64, i64>,

@@ -1,4 +1,4 @@
-//! Two hosts on one machine: the drone, and the ground in a network namespace, joined by an emulated radio link.
+//! Makes two hosts on one machine: the drone, and the ground in a network namespace, joined by an emulated radio link.
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::PathBuf;
@@ -14,7 +14,7 @@ const EMULATOR: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/link/emulator.py");
 /// Runs a program on the ground, where there is no shared memory of the drone's.
 const WITHOUT_SHARED_MEMORY: &str = "mount -t tmpfs tmpfs /dev/shm && exec \"$@\"";
 
-/// How the link is.
+/// The properties of the link.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Radio {
     pub(crate) rate_mbit: f64,
@@ -24,11 +24,11 @@ pub(crate) struct Radio {
     pub(crate) loss: f64,
     /// Packets marked for expedited forwarding go first.
     pub(crate) marks: bool,
-    /// Both hosts send again what was lost after 30 ms at the soonest, instead of 200.
+    /// Both hosts send lost packets again after 30 ms at the soonest, instead of 200.
     pub(crate) resends_soon: bool,
 }
 
-/// The emulated link and the ground's namespace; gone with this.
+/// The emulated link and the ground's namespace, until this is dropped.
 pub(crate) struct Air {
     emulator: Child,
     settings: Option<ChildStdin>,
@@ -201,7 +201,7 @@ impl Site {
         self.spawn(service, command)
     }
 
-    /// Starts this program's probe on the ground; it prints what it measured as it ends. Where there is no controller
+    /// Starts this program's probe on the ground; it prints its measurements as it ends. Where there is no controller
     /// but the drone's end of the probe, it also sends commands.
     pub(crate) fn probe(&mut self, seconds: f64, commands: bool) -> anyhow::Result<Child> {
         let this = std::env::current_exe()?;
@@ -235,7 +235,7 @@ impl Site {
 impl Drop for Site {
     fn drop(&mut self) {
         for (_, child) in &mut self.children {
-            // One that has ended by itself needs no end.
+            // A process that has ended needs no kill.
             drop(child.kill());
             drop(child.wait());
         }

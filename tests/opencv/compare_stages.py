@@ -3,9 +3,9 @@
 
     python3 tests/opencv/compare_stages.py [IMAGE ...]
 
-Without images it renders three and takes some of the photographs beside the repository, if they are there. The
+Without images it renders three and takes some of the photographs next to the repository, if they are there. The
 stages come from the example `stages` of the crate `fiducial`, which is built first. Exit status: 0 when the stages
-agree within the limits below, 1 when not, 77 with a message when Python lacks what this needs.
+agree within the limits below, 1 when not, 77 with a message when Python lacks a package.
 """
 
 import json
@@ -46,10 +46,10 @@ def rendered(name):
     scale = 8
     side = int(size * 1.4)
     patch = np.full((side * scale, side * scale), 225, np.uint8)
-    middle = side * scale // 2
+    centre = side * scale // 2
     for radius, grey in [(50, 30), (40, 225), (25, 30), (15, 225), (3, 30), (1, 225)]:
         axis = radius / 100 * size * scale
-        cv2.ellipse(patch, (middle, middle), (round(axis), round(axis * tilt)), 25, 0, 360, grey, -1)
+        cv2.ellipse(patch, (centre, centre), (round(axis), round(axis * tilt)), 25, 0, 360, grey, -1)
     patch = cv2.resize(patch, (side, side), interpolation=cv2.INTER_AREA)
     top, left = 300, 500
     ground[top : top + side, left : left + side] = patch
@@ -112,7 +112,7 @@ def compare(image, program, folder):
             continue
         row["ellipses"] += 1
         if not contour["valid"]:
-            # What is no ellipse is fitted by none in particular; only the valid ones go on.
+            # The fit to another shape is arbitrary; only valid ellipses are compared.
             continue
         row["ellipses_valid"] += 1
         (x, y), (minor, major), angle = cv2.fitEllipse(points)
@@ -137,7 +137,7 @@ def images(arguments, folder):
         cv2.imwrite(str(path), rendered(name))
         chosen.append(path)
     if not PHOTOS.is_dir():
-        print("the photographs beside the repository are missing: renderings only")
+        print("the photographs next to the repository are missing: renderings only")
         return chosen
     for pattern in ["negative_aerial/*/*", "negative_street/*/gtsdb*", "ring_*/*/*", "calibration/*/left0*", "stag/*/*"]:
         chosen += sorted(PHOTOS.glob(pattern))[:3]
@@ -145,7 +145,7 @@ def images(arguments, folder):
 
 
 def main():
-    # With the features that the whole workspace asks of its dependencies, as `cargo test --workspace` has built it.
+    # With the features that the complete workspace requires of its dependencies, as `cargo test --workspace` has built it.
     build = ["cargo", "build", "-q", "--workspace", "--example", "stages", "--message-format=json"]
     built = subprocess.run(build, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     program = next(m["executable"] for m in map(json.loads, built.splitlines()) if m.get("executable"))

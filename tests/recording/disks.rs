@@ -23,7 +23,7 @@ const STALL: Duration = Duration::from_secs(5);
 /// that are being written.
 const MAX_HELD_MB: f64 = 32.0;
 
-/// A small disk of its own, until it is dropped.
+/// A small separate disk, until this is dropped.
 struct Disk<'a>(&'a Path);
 
 impl<'a> Disk<'a> {
@@ -50,7 +50,7 @@ fn change(path: &Path, options: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A file as a disk, which can be made to stand still.
+/// A file as a disk, which can be stopped.
 struct Freezing<'a>(&'a Path);
 
 impl<'a> Freezing<'a> {
@@ -75,7 +75,7 @@ impl<'a> Freezing<'a> {
         change(self.0, options)
     }
 
-    /// Takes it away, though files on it are open.
+    /// Removes it, though files on it are open.
     fn unmount(self) -> anyhow::Result<()> {
         let status = Command::new("umount").arg("-l").arg(self.0).status()?;
         ensure!(status.success(), "umount -l: {status}");
@@ -83,7 +83,7 @@ impl<'a> Freezing<'a> {
         Ok(())
     }
 
-    /// Lets it stand still for as long as the result lives. Who writes to it cannot be ended meanwhile.
+    /// Stops it for as long as the result lives. A process that writes to it cannot be ended meanwhile.
     fn frozen(&self) -> anyhow::Result<Frozen<'_>> {
         let status = Command::new("fsfreeze").arg("-f").arg(self.0).status()?;
         ensure!(status.success(), "fsfreeze -f: {status}");
@@ -91,7 +91,7 @@ impl<'a> Freezing<'a> {
     }
 }
 
-/// A disk that stands still.
+/// A disk that is stopped.
 struct Frozen<'a>(&'a Path);
 
 impl Drop for Frozen<'_> {
@@ -159,7 +159,7 @@ fn has_problem(status: &RecorderStatus, part: &str) -> bool {
 
 async fn reported(
     statuses: &Subscriber<RecorderStatus>,
-    what: &str,
+    condition: &str,
     holds: impl Fn(&RecorderStatus) -> bool,
 ) -> anyhow::Result<RecorderStatus> {
     let mut last = None;
@@ -173,7 +173,7 @@ async fn reported(
         None
     });
     let found = found.await.ok().flatten();
-    found.with_context(|| format!("waiting until {what}; last: {last:?}"))
+    found.with_context(|| format!("waiting until {condition}; last: {last:?}"))
 }
 
 /// A landing is recorded twice: as usual, and with every pixel at 30 frames a second to a disk that is read-only, does not respond, is
@@ -256,7 +256,7 @@ pub(crate) async fn beside_a_flight() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The resident memory of a process, in MB, without what it shares with others: a camera's pool is mapped whole.
+/// The resident memory of a process, in MB, without memory that it shares with others: a camera's pool is mapped completely.
 fn resident_mb(pid: Pid) -> anyhow::Result<f64> {
     let status = std::fs::read_to_string(format!("/proc/{}/status", pid.as_raw_nonzero()))?;
     let line = status.lines().find_map(|line| line.strip_prefix("RssAnon:"));

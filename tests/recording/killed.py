@@ -28,7 +28,7 @@ def read(path):
                 messages += 1
                 last_ns = max(last_ns, message.log_time)
         except EndOfFile:
-            # Killed, it has no end.
+            # After a kill the file has no end.
             pass
     return {"messages": messages, "last_ns": last_ns}
 

@@ -2,7 +2,7 @@
 // Follows a flight with an independent client: Foxglove's `@foxglove/ws-protocol`, which its own viewer used, with
 // `protobufjs` for the types that the recorder describes.
 //
-// It looks for a picture with the stamp of each of some overlays, and prints what it found as one JSON object.
+// It looks for a picture with the stamp of each of some overlays, and prints the result as one JSON object.
 //
 //     npm install @foxglove/ws-protocol protobufjs ws        (NODE_PATH is where)
 //     node tests/recording/live.cjs ws://127.0.0.1:8765 foxglove.websocket.v1

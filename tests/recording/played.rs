@@ -1,4 +1,4 @@
-//! A recording that is published again, to services that run.
+//! Publishes a recording again, to services that run.
 
 use std::net::UdpSocket;
 use std::path::Path;
@@ -16,7 +16,7 @@ const ATTITUDE: [u8; 3] = [30, 0, 0];
 /// Oldest that a status may seem, in seconds.
 const MAX_AGE_S: f64 = 2.0;
 
-/// A process that ends with this.
+/// A process, until this is dropped.
 struct Running(Child);
 
 impl Running {
@@ -34,7 +34,7 @@ impl Drop for Running {
     }
 }
 
-/// A landing is recorded, and published again to a detector, a ground station and whoever watches.
+/// A landing is recorded, and published again to a detector, a ground station and other subscribers.
 pub(crate) async fn to_services() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("flight.mcap");

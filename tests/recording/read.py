@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Reads a recording with programs that are none of ours: the Python packages `mcap` and `mcap-protobuf-support`.
+"""Reads a recording with independent programs: the Python packages `mcap` and `mcap-protobuf-support`.
 
 It decodes every message, compares the types with those of Foxglove's own package, looks for a picture with the stamp of
-each overlay, counts the drawings of a report, and prints what it found as one JSON object on the last line.
+each overlay, counts the drawings of a report, and prints the result as one JSON object on the last line.
 
     python3 tests/recording/read.py FILE.mcap [FOLDER OF FIGURES]
 
@@ -58,7 +58,7 @@ def nanoseconds(stamp):
 
 
 def is_drawing(path):
-    """Whether a file is whole SVG with something drawn in it."""
+    """Whether a file is a complete SVG with at least one shape."""
     root = xml.etree.ElementTree.parse(path).getroot()
     svg = "{http://www.w3.org/2000/svg}"
     return root.tag == f"{svg}svg" and any(root.iter(f"{svg}{kind}") for kind in ("polyline", "polygon", "circle"))

@@ -1,5 +1,5 @@
-//! Reads what a recorder has written beside a flight: its messages and gaps when it is killed or overloaded, compared with Python's
-//! reader; and what it costs.
+//! Reads the files of a recorder: messages and gaps when it is killed or overloaded, compared with Python's reader. Measures
+//! its cost.
 
 #![allow(dead_code, reason = "the test and the measurement use their parts")]
 
@@ -25,10 +25,10 @@ const MAX_LOSS_S: f64 = 1.0;
 /// Maximum difference between the frames that an overloaded recorder stored or reported as lost and those that were published.
 const MAX_UNREPORTED_FRAMES: u64 = 5;
 
-/// Why the simulator's camera leaves out numbers of frames.
+/// The reason why the simulator's camera leaves out numbers of frames.
 const LEFT_OUT: &str = "frames that took too long to render";
 
-/// What is in a recording.
+/// The contents of a recording.
 #[derive(Debug, Default)]
 pub(crate) struct Contents {
     pub(crate) messages: u64,
@@ -36,7 +36,7 @@ pub(crate) struct Contents {
     pub(crate) channels: BTreeMap<String, u64>,
     /// Names of the files within it.
     pub(crate) files: Vec<String>,
-    /// What was lost, by key.
+    /// Lost messages, by key.
     pub(crate) dropped: BTreeMap<String, u64>,
     /// When the last message came, in nanoseconds since 1970.
     pub(crate) last_ns: u64,
@@ -63,8 +63,8 @@ impl Contents {
         Ok(contents)
     }
 
-    /// Whether the recorder lost nothing of what came to it.
-    pub(crate) fn is_whole(&self) -> bool {
+    /// Whether the recorder lost no message that it received.
+    pub(crate) fn is_complete(&self) -> bool {
         self.dropped.keys().all(|key| has_never_come(key))
     }
 
@@ -107,7 +107,7 @@ pub(crate) async fn kills(times: usize, more: &[&str]) -> anyhow::Result<()> {
     let mut random = 1_u64;
     for number in 1..=times {
         has_grown(&file(number)).await?;
-        // Numerical Recipes' generator: any will do.
+        // Numerical Recipes' generator: any other is as good.
         random =
             random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         sleep(Duration::from_millis(300 + (random >> 33) % 1500)).await;
@@ -158,7 +158,7 @@ fn read_by_python(files: &[(PathBuf, Contents)]) -> anyhow::Result<usize> {
     Ok(files.len())
 }
 
-/// What a recorder costs in a landing at a rate of frames, as its own health says.
+/// The cost of a recorder in a landing at a rate of frames, by its health.
 pub(crate) async fn cost(rate_hz: u32, more: &[&str]) -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("flight.mcap");
@@ -190,7 +190,7 @@ pub(crate) async fn cost(rate_hz: u32, more: &[&str]) -> anyhow::Result<()> {
         last.uptime_s - first.uptime_s,
         contents.dropped
     );
-    ensure!(contents.is_whole(), "{:?}", contents.dropped);
+    ensure!(contents.is_complete(), "{:?}", contents.dropped);
     Ok(())
 }
 
