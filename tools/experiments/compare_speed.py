@@ -16,7 +16,7 @@ import sys
 
 import references
 
-# Ours by theirs, and what it may be at most.
+# The maximum ratio of our time to theirs.
 BARS = [
     ("rings", "thesis-rings", 1 / 3),
     ("apriltag-16h5", "opencv", 1 / 2.5),
@@ -31,7 +31,7 @@ MAX_MS = {"alight-all": 8.0, "alight-following": 0.15}
 
 
 def times(results, detector, name, family):
-    """Processor time of each frame in milliseconds; none when the detector is not there."""
+    """Processor time of each frame in milliseconds; none without the detector."""
     path = results / detector / name / f"{family}.jsonl"
     if not path.is_file():
         return None

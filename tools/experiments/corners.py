@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Measures in photographs how far the corners of square markers are from where the marker's own cells put them.
+"""Measures in photographs how far the corners of square markers are from their positions by the marker's own cells.
 
     python3 tools/experiments/corners.py COMMAND FAMILY IMAGE...
 
 COMMAND is the path of `alight`, FAMILY one that OpenCV or AprilTag 3 knows as well, such as apriltag-36h11 or aruco-4x4-50. Markers that every
 detector finds are compared; corners of the references are sub-pixel ones.
 
-No photograph shows the true position of a corner, and references that move an edge in the same sense agree with each other. But what a camera's
-tone curve makes of a blurred edge, and what ink does on paper, moves edges from black to white and from white to black in opposite senses, by
-the same amount. So the places of the edges between a marker's cells are fitted with one projection and one such movement along each axis; the
+No photograph shows the true position of a corner, and references that move an edge in the same sense agree with each other. But the effect of a
+camera's tone curve on a blurred edge, and of ink on paper, moves edges from black to white and from white to black in opposite senses, by
+the same amount. So the positions of the edges between a marker's cells are fitted with one projection and one such movement along each axis; the
 projection then gives the corners without it. The outline itself, on which all detectors rest, takes no part. Prints whose cells are not as
 wide as the design has them (MAX_RESIDUAL_CELLS) are left out, and markers of cells that are too small to see an edge alone (MIN_CELL_PX).
 """
@@ -25,11 +25,11 @@ from references import cv2, np
 
 # Half an edge's profile and its step, and where profiles lie along the edge; in cells.
 REACH, STEP, ALONG = 0.5, 0.05, (0.35, 0.5, 0.65)
-# Of grey values, between the two sides of an edge.
+# Of intensities, between the two sides of an edge.
 MIN_CONTRAST = 25.0
 MIN_EDGES = 40
 MIN_CELL_PX = 8.0
-# Standard deviation of the edges' places about the fit.
+# Standard deviation of the edges' positions about the fit.
 MAX_RESIDUAL_CELLS = 0.03
 
 
@@ -47,7 +47,7 @@ def same_order(corners, quad):
 
 
 def crossing(profile, places):
-    """Where a profile passes the middle between its two ends; `None` when it does so more than once."""
+    """The position at which a profile passes the mean of its two ends; `None` when it does so more than once."""
     first, last = profile[:3].mean(), profile[-3:].mean()
     if abs(last - first) < MIN_CONTRAST:
         return None
@@ -60,7 +60,7 @@ def crossing(profile, places):
 
 
 def edges_between_cells(grey, to_image, cells):
-    """Axis, place across and along in cells, how far it is from there, and whether it becomes brighter, of each edge."""
+    """Axis, position across and along in cells, offset from there, and sense of brightness, of each edge."""
 
     def sample(points):
         points = np.c_[points, np.ones(len(points))] @ to_image.T
@@ -153,7 +153,7 @@ def main():
             if not all(near) or side < MIN_CELL_PX * cells:
                 continue
             quads = [same_order(quad, np.array(one[0]["corners_px"])) for one in near]
-            # It begins from the middle of all, so that no detector is nearer to it for that.
+            # It begins from the mean of all, so that it favours no detector.
             true = corners_by_cells(grey, np.mean(quads, 0), cells)
             if true is None:
                 without += 1
@@ -165,7 +165,7 @@ def main():
     markers = np.concatenate([np.array(of) for of in distances.values()])
     by_image = np.array([np.median(of, 0) for of in distances.values()])
     print(f"{len(markers)} markers in {len(by_image)} images; {without} more, whose cells do not suffice, are left out")
-    print("distance of the corners from where the cells put them, and how far outside of it they are; px")
+    print("distance of the corners from their positions by the cells, and how far outside of them they are; px")
     for i, name in enumerate(names):
         print(
             f"{name:20} median of markers {np.median(markers[:, i]):.2f}, of images {np.median(by_image[:, i]):.2f};"

@@ -3,8 +3,8 @@
 
     python3 tools/experiments/references.py SETS RESULTS [set=NAME ...] [family=NAME ...] [detector=NAME ...] [photographs=FOLDER]
 
-SETS is what `alight experiment markers` has rendered, RESULTS where it keeps its answers; the references' answers are
-put beside them in the same form, and the same command with `--replace` scores them with its own. Sets that are not
+SETS are the frames that `alight experiment markers` has rendered, RESULTS is the folder of its answers; the references' answers are
+put next to them in the same form, and the same command with `--replace` scores them with its own. Sets that are not
 rendered are left out. Everything runs on one thread,
 and times are processor time. Detectors that are not installed are skipped with a message: OpenCV
 (opencv-contrib-python or opencv-python), AprilTag 3 (pyapriltags or pupil-apriltags), STag (stag-python). The thesis'
@@ -57,7 +57,7 @@ LABELS = {
 }
 # As Alight reads them: where a file says by Exif that it is to be turned, as it is stored.
 AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-# Sets in which time matters, and how often their frames are looked at.
+# Sets whose times are compared, and how often their frames are searched.
 TIMED, TIMED_RUNS = ("textured", "tracking"), 5
 
 
@@ -73,7 +73,7 @@ def found(family, number, centre, corners=None, confidence=0.0, place=None):
 
 
 def crossing(corners):
-    """Where the diagonals meet: the projection of the centre."""
+    """The intersection of the diagonals: the projection of the centre."""
     a, b, c, d = (np.append(corner, 1.0) for corner in np.asarray(corners, float))
     meeting = np.cross(np.cross(a, c), np.cross(b, d))
     return meeting[:2] / meeting[2]
@@ -133,7 +133,7 @@ class AprilTag:
 
 
 class AprilTagFiltered(AprilTag):
-    """The same without what is uncertain."""
+    """The same without uncertain detections."""
 
     name, is_filtered = "apriltag-filtered", True
 
@@ -262,7 +262,7 @@ DETECTORS = [OpenCV, AprilTag, AprilTagFiltered, AprilTagHalf, Stag, Rings, Ring
 
 
 def place(seen, frame):
-    """Where it is in the camera frame, by OpenCV from the corners, or from the size alone."""
+    """Its position in the camera frame, by OpenCV from the corners, or from the size alone."""
     marker, camera = frame["marker"], frame["camera"]
     if marker is None:
         return None

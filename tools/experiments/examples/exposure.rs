@@ -1,4 +1,4 @@
-//! Exposure for the marker, beside a camera's own metering and a fixed exposure.
+//! Compares exposure for the marker with a camera's own metering and with a fixed exposure.
 //!
 //! `cargo run --release -p experiments --example exposure -- frames [SEED [CHANGE]]` changes the light on a pad in rendered frames, and
 //! prints the level that its white reaches, after how many frames, and in how many the marker was found.
@@ -141,7 +141,7 @@ impl Run {
         swaying(&self.still, &self.pad, time_s)
     }
 
-    /// The pad in the image, as it is.
+    /// The true pad in the image.
     fn pad_at(&self, time_s: f64) -> Option<Pad> {
         let seen = self.camera.camera_from_marker(&self.truth_at(time_s), &self.pad);
         let model = self.camera.settings().model;
@@ -229,7 +229,7 @@ impl Run {
     }
 }
 
-/// Prints the rows of the ways and lights whose names contain what is wanted.
+/// Prints the rows of the ways and lights whose names contain the requested texts.
 fn flights(seed: u64, number: u64, wanted: [&str; 2]) -> anyhow::Result<()> {
     let ways = || WAYS.into_iter().filter(|way| way.contains(wanted[0]));
     let is_wanted = |light: &str| light.contains(wanted[1]);
@@ -269,7 +269,7 @@ fn flights(seed: u64, number: u64, wanted: [&str; 2]) -> anyhow::Result<()> {
     for (name, set) in [
         ("low sun: +2 stops, and a reflection of 0.3 of white", weak.as_slice()),
         ("low sun: +2 stops, and a reflection as bright as white", &strong),
-        ("in shade of 3 stops, its edge 0.5 m beside the pad", &shade),
+        ("in shade of 3 stops, its edge 0.5 m next to the pad", &shade),
         ("a shadow's edge across the pad, 3 stops", &shadow),
     ] {
         for way in ways().filter(|_| is_wanted(name)) {

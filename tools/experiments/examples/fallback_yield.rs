@@ -24,7 +24,7 @@ use imaging::GrayView;
 use markers::Marker;
 use rendering::Preset;
 
-/// What one pass adds.
+/// The yield of one pass.
 #[derive(Clone, Copy, Default)]
 struct Yield {
     /// Markers that are found with all passes, and not without this one.
@@ -45,7 +45,7 @@ struct Sums {
     /// Images in which nothing is found without a pass.
     searched: usize,
     passes: [Yield; FallbackPass::ALL.len()],
-    /// What only one pass finds: its number, the set and the group.
+    /// Markers that only one pass finds: its number, the set and the group.
     groups: Vec<(usize, &'static str, String)>,
 }
 
@@ -89,7 +89,7 @@ fn arguments() -> anyhow::Result<Arguments> {
 
 fn main() -> anyhow::Result<()> {
     let Arguments { every, seed, presets, sets, photographs, markers } = arguments()?;
-    println!("| marker | pass | only this pass | share of found | this pass alone | ms |");
+    println!("| marker | pass | only this pass | fraction of found | this pass alone | ms |");
     println!("|---|---|---|---|---|---|");
     if let Some(folder) = photographs {
         for family in photographs::labelled_families() {
@@ -170,7 +170,7 @@ impl Sums {
         let (without_any, base_s) = detect(PassSchedule::NONE);
         self.found += with_all;
         self.without_any += without_any;
-        // On boards a pass may add to what was found.
+        // On boards a pass may add to earlier detections.
         if without_any > 0 && with_all <= without_any {
             return;
         }

@@ -1,10 +1,10 @@
-//! Where the time of a single image without a marker goes: frames of each ground from four heights, searched for the four
+//! Measures the time of each stage for a single image without a marker: frames of each ground from four heights, searched for the four
 //! families of the thesis, with the shortest of a few times of each stage.
 //!
 //! ```text
 //! cargo run --release -p experiments --example no_marker -- [SEED]
 //! ```
-#![allow(clippy::print_stdout, reason = "a table for people is what this example is for")]
+#![allow(clippy::print_stdout, reason = "this example prints a table for people")]
 
 use anyhow::Context;
 use detector::StageClock;

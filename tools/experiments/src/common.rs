@@ -1,4 +1,4 @@
-//! Errors in common frames. A marker that is found in near frames alone has smaller errors than one that is found far off as well, so that
+//! Compares errors in common frames. A marker that is found in near frames alone has smaller errors than one that is found far off as well, so that
 //! markers, and detectors, are compared in the frames in which each of them was found.
 
 use std::collections::BTreeSet;
@@ -13,12 +13,12 @@ use crate::score::{Score, Summary};
 /// The file with the rows.
 pub const FILE: &str = "common.csv";
 
-/// The errors of a detector on one family, in the frames that it has in common with those beside it.
+/// The errors of a detector on one family, in the frames that it has in common with the others.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Row {
     /// The set.
     pub set: &'static str,
-    /// What was found in all of these frames: `markers` (each family, by this detector) or `detectors` (this family, by ours and another).
+    /// The objects that were found in all of these frames: `markers` (each family, by this detector) or `detectors` (this family, by ours and another).
     pub compared: &'static str,
     /// The other detector, where two are compared.
     pub with: Option<String>,
@@ -49,7 +49,7 @@ struct Group<'a> {
     members: Vec<&'a Run>,
 }
 
-/// The rows of all sets: first markers by detector, then our detector beside each other one by marker.
+/// The rows of all sets: first markers by detector, then our detector with each other one by marker.
 pub fn rows(runs: &[Run]) -> Vec<Row> {
     groups(runs).iter().flat_map(of_group).collect()
 }

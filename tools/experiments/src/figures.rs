@@ -1,4 +1,4 @@
-//! Figures 4.7 and 4.8 of the thesis: the mean estimated distance at each position for every marker.
+//! Draws Figures 4.7 and 4.8 of the thesis: the mean estimated distance at each position for every marker.
 
 use anyhow::anyhow;
 use node::stats::mean;
@@ -19,7 +19,7 @@ pub const FIGURES: [(&str, &str); 2] = [("figure-4-7", "2x2"), ("figure-4-8", "4
 /// One curve: a family, and the mean error at each position in metres.
 type Curve = (String, Vec<Option<f64>>);
 
-/// The colour of a family, whichever were run.
+/// The colour of a family, the same for any selection of families.
 fn colour_of(family: &str) -> RGBColor {
     let place = families().position(|name| name == family).unwrap_or(usize::MAX);
     COLOURS[place.min(COLOURS.len() - 1)]

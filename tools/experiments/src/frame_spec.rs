@@ -1,5 +1,5 @@
-//! One frame of the marker experiment: marker or clutter, camera and path of poses, surface, light, occluder, print and binning;
-//! rendered to pixels, with centre, corners and pose as truth.
+//! Specifies and renders one frame of the marker experiment: marker or clutter, camera and path of poses, surface, light, occluder, print and binning,
+//! with centre, corners and pose as truth.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -25,7 +25,7 @@ pub struct FrameSpec {
     pub group: String,
     /// The marker with its size; `None` in a negative.
     pub marker: Option<Marker>,
-    /// Other things on the ground.
+    /// Other objects on the ground.
     pub clutter: Vec<PadInScene>,
     /// Whether black and white are swapped.
     pub inverted: bool,
@@ -41,14 +41,14 @@ pub struct FrameSpec {
     pub painted_marks: u32,
     /// Light on the scene; 1 is full sun.
     pub light: f64,
-    /// What is between scene and camera.
+    /// Objects between scene and camera.
     pub occluder: Occluder,
     /// How the marker is printed.
     pub print: Print,
     /// Whether grey is interpolated from a Bayer mosaic.
     pub bayer: bool,
     /// The frame is binned by software: each of its pixels is the mean of so many of a sensor with a Bayer mosaic, across and down;
-    /// 1 for a camera that does what it does itself. Camera and truth are those of the binned frame.
+    /// 1 for a camera that bins on its own or not at all. Camera and truth are those of the binned frame.
     pub binned: u32,
     /// Seed of the random generators.
     pub seed: u64,
@@ -446,7 +446,7 @@ mod tests {
         let own = FrameSpec { painted_marks: 0, ..spec() };
         let size = own.settings.model.width as usize;
         let centre = |pixels: &[u8]| {
-            // The middle of what is dark around the marker's pixel.
+            // The centre of the dark pixels around the marker's pixel.
             let [mut sum, mut x, mut y] = [0.0; 3];
             for (v, u) in (260..340).flat_map(|v| (160..240).map(move |u| (v, u))) {
                 let dark = (200.0 - f64::from(pixels[v * size + u])).max(0.0);

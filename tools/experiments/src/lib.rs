@@ -1,4 +1,4 @@
-//! The thesis' experiments, extended: markers in rendered frames (section 4.3), and hundreds of landings
+//! Runs the thesis' experiments, extended: markers in rendered frames (section 4.3), and hundreds of landings
 //! (section 4.4).
 //!
 //! This crate is above the services: it calls their pure parts as functions, without a network or a clock.
@@ -7,7 +7,7 @@
 //! one frame, whose marker may be a poor [`mod@print`]; [`set`] names the sets and [`sets`] has their frames; [`store`] keeps them on disk; [`record`]
 //! has a detector's results, and [`score`] their errors; [`photographs`] has the results on real images;
 //! [`report`] is the report, with errors in [`common`] frames, the [`tables`] and [`figures`] of the [`thesis`]. [`landing`] is the
-//! experiment with landings, of which [`comparison`] puts two runs side by side, [`faults`] the campaign in which something dies, lies or falls silent; [`results`] is the folder of
+//! experiment with landings, of which [`comparison`] compares two runs, [`faults`] the campaign with killed processes, wrong values and lost messages; [`results`] is the folder of
 //! their results.
 
 pub mod common;

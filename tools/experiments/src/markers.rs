@@ -1,4 +1,4 @@
-//! The experiment with markers: renders missing sets, runs the detector, scores all results, writes the
+//! Runs the experiment with markers: renders missing sets, runs the detector, scores all results, writes the
 //! report.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -23,10 +23,10 @@ use crate::store;
 use crate::tables;
 use crate::thesis::TABLES;
 
-/// What to run.
+/// The experiment to run.
 #[derive(Clone, Debug)]
 pub struct Request {
-    /// The command that asked for it, for the report.
+    /// The command that requested it, for the report.
     pub command: String,
     /// Folder of the sets; missing ones are rendered.
     pub sets_in: PathBuf,
@@ -78,7 +78,7 @@ const TIMED_RUNS: usize = 5;
 #[derive(Clone, Debug)]
 pub struct Step<'a> {
     /// The set and the family.
-    pub what: &'a str,
+    pub name: &'a str,
     /// Its number, from 1 on, and that of all.
     pub number: usize,
     /// See `number`.
@@ -87,12 +87,12 @@ pub struct Step<'a> {
 
 impl fmt::Display for Step<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { what, number, of } = self;
-        write!(f, "{what} ({number} of {of})")
+        let Self { name, number, of } = self;
+        write!(f, "{name} ({number} of {of})")
     }
 }
 
-/// What an experiment with markers gave.
+/// The results of an experiment with markers.
 #[derive(Clone, Debug)]
 pub struct Findings {
     /// The report, in Markdown.
@@ -123,7 +123,7 @@ pub fn check_unused(request: &Request) -> anyhow::Result<()> {
     }
 }
 
-/// What an earlier run has written into its folder of results; not those of other detectors.
+/// The files that an earlier run has written into its folder of results; not those of other detectors.
 fn earlier(results: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut earlier: Vec<PathBuf> = Vec::new();
     let tables = TABLES.iter().map(|table| format!("{}.csv", tables::name(table)));
@@ -146,7 +146,7 @@ fn earlier(results: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(earlier)
 }
 
-/// Runs the experiment; `begins` is called before each step, and may end the run there. The report is of what was done.
+/// Runs the experiment; `begins` is called before each step, and may end the run there. The report is of the finished steps.
 ///
 /// # Errors
 /// When a file cannot be read or written, or there are results of an earlier run that are not to be replaced.
@@ -175,8 +175,8 @@ pub fn run(
     let mut done = 0;
     for (set, marker) in steps {
         let name = marker.family.name();
-        let what = format!("{} {name}", set.name());
-        if begins(Step { what: &what, number: done + 1, of }).is_break() {
+        let step = format!("{} {name}", set.name());
+        if begins(Step { name: &step, number: done + 1, of }).is_break() {
             break;
         }
         store::make(sets_in, set, marker, request.variant, &mut renderer)?;
@@ -186,7 +186,7 @@ pub fn run(
     }
     if let Some(folder) = &request.photographs
         && done + 1 == of
-        && begins(Step { what: "photographs", number: of, of }).is_continue()
+        && begins(Step { name: "photographs", number: of, of }).is_continue()
     {
         let written = search_photographs(folder, results_in, &request.families)?;
         remove(std::mem::take(&mut old), &written)?;
@@ -195,7 +195,7 @@ pub fn run(
     }
     let is_interrupted = done < of;
     if done == 0 {
-        // What an earlier run has left stays as it was.
+        // Files of an earlier run are not changed.
         let report = format!("Interrupted before the first of {of} sets and families.\n");
         return Ok(Findings { report, is_interrupted });
     }
@@ -231,7 +231,7 @@ pub fn run(
     Ok(Findings { report: text, is_interrupted })
 }
 
-/// Removes what an earlier run has left and this one has not written anew.
+/// Removes files of an earlier run that this one has not replaced.
 fn remove(mut old: Vec<PathBuf>, written: &[PathBuf]) -> anyhow::Result<()> {
     old.retain(|path| !written.contains(path));
     for path in old {
@@ -241,7 +241,7 @@ fn remove(mut old: Vec<PathBuf>, written: &[PathBuf]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What the command and the version at the report's head do not hold for: other detectors, and frames of another version.
+/// The results to which the command and the version at the report's head do not apply: other detectors, and frames of another version.
 fn of_others(runs: &[Run], sets_in: &Path) -> String {
     let others: BTreeSet<&str> = runs.iter().map(|run| run.detector.as_str()).collect();
     let others: Vec<&str> = others.into_iter().filter(|name| !ALL_OURS.contains(name)).collect();
@@ -262,7 +262,7 @@ fn of_others(runs: &[Run], sets_in: &Path) -> String {
     for (version, sets) in versions {
         let sets: Vec<&str> = sets.into_iter().collect();
         text += &format!(
-            "**Frames of {} were there already, rendered by alight {version}; without the folder `sets` they are rendered anew.**\n\n",
+            "**Frames of {} were there already, rendered by alight {version}; without the folder `sets` they are rendered again.**\n\n",
             sets.join(", ")
         );
     }
@@ -304,7 +304,7 @@ pub fn compared(requests: &[Request]) -> anyhow::Result<Compared> {
     Ok(Compared { name, markdown: report::by_processing(&rows), csv: csv(&rows)? })
 }
 
-/// The name of the files with the table by processing of such a request: what all of its rows share.
+/// The name of the files with the table by processing of such a request: the common parts of all rows.
 pub fn compared_name(request: &Request) -> String {
     let Variant { seed, every, .. } = request.variant;
     let ids = if request.ids == Ids::Shown { "-known-id" } else { "" };
@@ -415,7 +415,7 @@ fn search_photographs(
     Ok(written)
 }
 
-/// What these detectors have found of the labelled photographs.
+/// The detections of these detectors in the labelled photographs.
 fn recalls(
     folder: &Path,
     results: &Path,
@@ -476,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn a_used_folder_is_refused_and_what_is_of_others_never_removed() {
+    fn a_used_folder_is_refused_and_other_files_are_never_removed() {
         let folder = tempfile::tempdir().unwrap();
         let mut request = Request::within(folder.path(), Variant::default(), Ids::Any);
         let results = request.results_in.clone();
@@ -525,7 +525,7 @@ mod tests {
         std::fs::write(&image, "no picture").unwrap();
         assert!(run(&request, &mut go).is_err() && results.join(old).exists());
         std::fs::write(&image, pixels).unwrap();
-        // Faults of other detectors: a line that is none, a frame that is missing, a photograph that is missing.
+        // Faults of other detectors: an invalid line, a frame that is missing, a photograph that is missing.
         let mine = results.join("mine/far/aruco-4x4-50.jsonl");
         let refused = |request: &Request| {
             let error =
@@ -552,7 +552,7 @@ mod tests {
         assert!(!run(&request, &mut go).unwrap().is_interrupted);
         assert!(!results.join(old).exists());
         assert!(results.join("alight/far/aruco-4x4-50.jsonl").exists());
-        // The same again removes nothing of what it writes.
+        // The same again removes none of its own files.
         run(&request, &mut go).unwrap();
         assert!(results.join("alight/far/aruco-4x4-50.jsonl").exists());
     }

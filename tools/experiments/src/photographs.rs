@@ -1,4 +1,4 @@
-//! Real photographs: recall on labelled ones, false detections on those without a marker.
+//! Scores real photographs: recall on labelled ones, false detections on those without a marker.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -26,7 +26,7 @@ pub const FAMILIES: [(&str, &str); 5] = [
 struct Photograph {
     image: String,
     markers: Vec<Label>,
-    /// What may be found or not.
+    /// A label that may be found or not.
     #[serde(default)]
     uncertain: Vec<Label>,
     #[serde(default)]
@@ -254,7 +254,7 @@ pub fn negatives(folder: &Path, families: &[Family]) -> anyhow::Result<Negatives
     Ok((images, wrong))
 }
 
-/// The whole image, its quarters and its ninths, with suffixes for its name.
+/// The complete image, its quarters and its ninths, with suffixes for its name.
 fn parts(whole: &GrayImage) -> Vec<(String, GrayImage)> {
     let mut parts = vec![(String::new(), whole.clone())];
     for count in [2, 3] {
@@ -293,11 +293,11 @@ pub fn text(recalls: &Recalls) -> String {
         );
     }
     for (family, _, r) in rows().filter(|(_, detector, _)| *detector == record::OURS) {
-        for (what, photographs) in
+        for (heading, photographs) in
             [("Missed", &r.missed), ("Of another id or without a label", &r.others)]
         {
             if !photographs.is_empty() {
-                let _ = writeln!(text, "\n{what} by us, {family}:");
+                let _ = writeln!(text, "\n{heading} by us, {family}:");
             }
             for (image, count) in photographs {
                 let _ = writeln!(text, "- {image}: {count}");
@@ -312,7 +312,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn labels_of_ones_own_need_no_more_than_is_known() {
+    fn labels_of_a_user_need_only_the_known_fields() {
         let folder = tempfile::tempdir().unwrap();
         let label = |family: &str| {
             format!(

@@ -1,4 +1,4 @@
-//! Prints that are not sharp or not flat: a marker's drawing made of dots, or cut into flat pieces of a bent, folded or wavy
+//! Models prints that are not sharp or not flat: a marker's drawing made of dots, or cut into flat pieces of a bent, folded or wavy
 //! sheet.
 
 use geometry::{Marker as MarkerFrame, Point, Rotation, Transform};
@@ -14,7 +14,7 @@ pub enum Print {
     /// In square dots.
     Dots {
         /// Number of dots along the marker's size, rounded: a printer's file has them, so that size and place of the print
-        /// are the marker's, and only what is inside is a little off.
+        /// are the marker's, and only the inside is a little off.
         per_size: f64,
     },
     /// On paper that is bent; its centre stays where it is.
@@ -26,7 +26,7 @@ pub enum Print {
 pub struct Bend {
     /// Direction in which its height changes, in radians from the marker's x axis towards its y axis.
     pub towards: f64,
-    /// Height of what is half a size from the centre.
+    /// Height at half a size from the centre.
     pub height: f64,
     /// The form.
     pub form: BendForm,
@@ -37,7 +37,7 @@ pub struct Bend {
 pub enum BendForm {
     /// Curled like a roll.
     Curl,
-    /// Folded in the middle.
+    /// Folded at its centre.
     Fold,
     /// In waves, as cloth lies.
     Waves,
@@ -51,7 +51,7 @@ const DOTS: usize = 128;
 const OVERLAP: f64 = 1.5;
 
 impl Bend {
-    /// The height at a place along its direction, and its slope.
+    /// The height at a position along its direction, and its slope.
     fn at(&self, along: f64) -> (f64, f64) {
         let part = 2.0 * along;
         match self.form {
@@ -120,7 +120,7 @@ fn piece(pad: &PadInScene, bend: &Bend, centre: [f64; 2], half_m: f64) -> PadInS
     }
 }
 
-/// A square of a drawing in `count` x `count` dots; each is of the ink in its middle.
+/// A square of a drawing in `count` x `count` dots; each is of the ink at its centre.
 fn dotted(drawing: &Drawing, centre: [f64; 2], half_m: f64, count: usize) -> Drawing {
     let dot_m = 2.0 * half_m / count as f64;
     let edge = |index: usize| -half_m + index as f64 * dot_m;
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn dots_have_the_ink_of_their_middle() {
+    fn dots_have_the_ink_of_their_centre() {
         let pad = pad();
         let sharp = pad.drawing.clone();
         let [dotted] = Print::Dots { per_size: 40.3 }.pieces(pad).try_into().unwrap();

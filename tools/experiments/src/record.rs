@@ -1,4 +1,4 @@
-//! The results of a detector, one line of JSON per frame; the same format for this detector and for others.
+//! Reads and writes the results of a detector, one line of JSON per frame; the same format for this detector and for others.
 
 use std::path::{Path, PathBuf};
 
@@ -67,7 +67,7 @@ pub struct Found {
 
 #[cfg(test)]
 impl Found {
-    /// A detection of a family at the first pixel, of which nothing else is known.
+    /// A detection of a family at the first pixel, without further values.
     pub fn sample(family: &str) -> Self {
         Self {
             family: family.to_owned(),
@@ -244,8 +244,8 @@ pub fn write<'a>(path: &Path, records: impl IntoIterator<Item = &'a Record>) -> 
     std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))
 }
 
-/// The results in a file's text. A field of another name and a family of which there is none are refused: what they say would be missing
-/// without a word, or count as a false detection.
+/// The results in a file's text. An unknown field and an unknown family are refused: their values would be ignored
+/// silently, or count as a false detection.
 ///
 /// # Errors
 /// When a line is no result, with the file and the line.
@@ -287,7 +287,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_field_of_another_name_is_refused_with_its_name_and_place() {
+    fn an_unknown_field_is_refused_with_its_name_and_line() {
         let line = |name: &str| {
             let found = format!(
                 "{{\"family\":\"rings\",\"id\":null,\"centre_px\":[1,2],\"{name}\":[1,0,1]}}"
@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn a_family_of_which_there_is_none_is_refused_with_its_line() {
+    fn an_unknown_family_is_refused_with_its_line() {
         let line = |family: &str| {
             format!(
                 "{{\"image\":\"a.png\",\"ms\":1,\"found\":[{{\"family\":\"{family}\",\"id\":3,\"centre_px\":[1,2]}}]}}"

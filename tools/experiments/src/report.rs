@@ -1,4 +1,4 @@
-//! The report of the marker experiment in Markdown: tables of recall, errors and times by set, family and detector, of
+//! Writes the report of the marker experiment in Markdown: tables of recall, errors and times by set, family and detector, of
 //! groups within a set, and the frames that were missed.
 
 use std::collections::BTreeMap;
@@ -130,7 +130,7 @@ fn place(set: Set) -> usize {
     Set::ALL.iter().position(|other| *other == set).unwrap_or(0)
 }
 
-/// The whole report, as Markdown.
+/// The complete report, as Markdown.
 pub fn text(runs: &[Run]) -> String {
     let mut text = String::new();
     append_summary(&mut text, runs);
@@ -232,7 +232,7 @@ pub fn by_processing(rows: &[OfProcessing<'_>]) -> String {
     text
 }
 
-/// How many of how many, with the interval of the share.
+/// How many of how many, with the interval of the proportion.
 fn share(found: usize, of: usize) -> String {
     let [low, high] = share_interval(found, of).map(|share| 100.0 * share);
     format!("{found}/{of} ({low:.0} to {high:.0} %)")
@@ -250,7 +250,7 @@ fn append_summary(text: &mut String, runs: &[Run]) {
         text,
         "## All sets\n\nchi2 are medians: 1.39 (centre) and 0.45 (range) for a consistent covariance. Times are processor time. In frames without a marker every detection is elsewhere. \
          Errors are of the frames in which the marker was found, which are others for each marker and detector: to compare them see the errors in common frames. \
-         After what was found is Wilson's 95 % interval of its share, as if each frame were drawn by itself.\n"
+         After each count of found markers is Wilson's 95 % interval of its proportion, as if the frames were independent.\n"
     );
     let _ = writeln!(
         text,
@@ -496,13 +496,13 @@ mod tests {
     }
 
     #[test]
-    fn what_was_found_has_its_interval() {
+    fn a_count_of_found_markers_has_its_interval() {
         assert_eq!(share(3, 8), "3/8 (14 to 69 %)");
         assert_eq!(share(370, 370), "370/370 (99 to 100 %)");
     }
 
     #[test]
-    fn a_report_has_no_heading_without_a_content_and_no_marker_is_found_where_none_is() {
+    fn a_report_has_no_empty_section_and_no_marker_is_found_in_negatives() {
         let report = text(&[run(Set::Negatives)]);
         assert!(
             report.contains("| negatives | experiment | alight | none in 1 | 0 | 0 |"),

@@ -1,6 +1,6 @@
-//! The output folder of an experiment with landings or faults, or of a comparison: its report, tables, recordings and logs, written whole in the place of
-//! an earlier run's. It is claimed before the first flight: hours of flying are neither lost to a folder that cannot be written, nor
-//! mixed with the results of another run. What it has of an earlier run is kept until the first of the new results is written: there
+//! Manages the output folder of an experiment with landings or faults, or of a comparison: its report, tables, recordings and logs replace those of
+//! an earlier run completely. It is claimed before the first flight: hours of flying are neither lost to a folder that cannot be written, nor
+//! mixed with the results of another run. Results of an earlier run are kept until the first of the new results is written: there
 //! may be none.
 
 use std::collections::BTreeSet;
@@ -26,7 +26,7 @@ pub const COMPARISON_HEADING: &str = "# Two runs of landings\n";
 pub const COMPARISON_AS_JSON: &str = "comparison.json";
 /// Its plot.
 pub const COMPARISON_PLOT: &str = "comparison.svg";
-/// The paragraph of a report that says by which command and version it was made; nothing for an experiment that no command asked for.
+/// The paragraph of a report that says by which command and version it was made; nothing for an experiment without a command.
 pub fn origin(command: &str) -> String {
     match command {
         "" => String::new(),
@@ -58,19 +58,19 @@ pub const RECORDINGS: &str = "recordings";
 const LOGS: &str = "logs-";
 /// The end of that name while it is flown, and after an interruption: no result, which neither counts nor is refused.
 const UNFINISHED: &str = "-unfinished";
-/// What the logs are called, without their ending.
+/// The names of the logs, without their ending.
 const PARTS: [&str; 5] = ["world", "camera", "detector", "controller", "bridge"];
 
 /// The claimed folder.
 #[derive(Debug)]
 pub struct Folder {
     path: PathBuf,
-    /// What it has of an earlier run.
+    /// The files of an earlier run.
     old: Vec<PathBuf>,
 }
 
 impl Folder {
-    /// Makes the folder. What an earlier run has written there is refused, or with `replaces` removed before the first new result.
+    /// Makes the folder. Files of an earlier run there are refused, or with `replaces` removed before the first new result.
     ///
     /// # Errors
     /// When there is such, or a report of another origin that would be overwritten, or the folder cannot be made or read.
@@ -104,15 +104,15 @@ impl Folder {
         Ok(Self { path: path.to_owned(), old })
     }
 
-    /// Where it is.
+    /// Its path.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Writes a file into it, whole or not at all: what is there is kept where a disk is full.
+    /// Writes a file into it, completely or not at all: the existing file is kept if a disk is full.
     ///
     /// # Errors
-    /// When it cannot be written, or what is old cannot be removed.
+    /// When it cannot be written, or old files cannot be removed.
     pub fn put(&mut self, name: &str, text: &str) -> anyhow::Result<()> {
         let (path, new) = (self.path.join(name), self.path.join(format!(".{name}.new")));
         let written = std::fs::write(&new, text)
@@ -137,8 +137,8 @@ impl Folder {
         Ok(logs)
     }
 
-    /// Gives the logs of a flight that counts their place, instead of those of an earlier run. What is not of a process stays
-    /// where it is.
+    /// Moves the logs of a flight that counts to their folder, instead of those of an earlier run. Files that are not of a process are
+    /// not moved.
     ///
     /// # Errors
     /// When those cannot be removed, or these not be moved: they are left where they were written, and the flight counts.
@@ -193,7 +193,7 @@ fn move_logs(from: &Path, to: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Whether something has this name, be it a link to nothing.
+/// Whether a file has this name, or a link without a target.
 fn is_there(path: &Path) -> bool {
     path.symlink_metadata().is_ok()
 }
@@ -266,7 +266,7 @@ fn is_of_logs(name: &str) -> bool {
     name.strip_prefix(LOGS).is_some_and(|seed| seed.parse::<u64>().is_ok())
 }
 
-/// Whether a process of a flight in real time writes it: its log, or what a controller notes of the vehicle.
+/// Whether a process of a flight in real time writes it: its log, or a controller's notes of the vehicle.
 fn is_of_a_process(name: &str) -> bool {
     let is_note = || name.starts_with("controller-") && name.ends_with(".json");
     name.strip_suffix(".log").is_some_and(|part| PARTS.contains(&part)) || is_note()
@@ -281,7 +281,7 @@ fn is_of_a_row(name: &str) -> bool {
     name.starts_with("row-") && name.contains("-seed-") && is_recording(name)
 }
 
-/// A sentence of what an interruption left, with an empty line after it; nothing when all is there.
+/// A sentence on the results of an interrupted experiment, with an empty line after it; nothing when all is there.
 pub fn interrupted(done: usize, of: usize) -> String {
     match done {
         _ if done == of => String::new(),
@@ -290,7 +290,7 @@ pub fn interrupted(done: usize, of: usize) -> String {
     }
 }
 
-/// A sentence of what there is while more is to come, with an empty line after it; nothing when all is there.
+/// A sentence on the results so far while more are to come, with an empty line after it; nothing when all is there.
 pub fn so_far(done: usize, of: usize) -> String {
     match done {
         _ if done == of => String::new(),
@@ -302,7 +302,7 @@ pub fn so_far(done: usize, of: usize) -> String {
 mod tests {
     use super::*;
 
-    /// What an experiment writes.
+    /// The files that an experiment writes.
     const OURS: [&str; 7] = [
         "flights.csv",
         "flights.jsonl",
@@ -357,7 +357,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_would_be_removed_is_refused_and_stays() {
+    fn each_file_that_would_be_removed_is_refused_and_stays() {
         for name in OURS {
             let folder = tempfile::tempdir().unwrap();
             let folder = folder.path();
@@ -388,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_written_is_found_at_the_start_and_removes_nothing_later() {
+    fn a_folder_that_cannot_be_written_is_found_at_the_start_and_nothing_is_removed_later() {
         let folder = tempfile::tempdir().unwrap();
         let folder = folder.path();
         write(folder, FLIGHTS_AS_CSV, "old");
@@ -444,7 +444,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_user_has_in_the_folders_of_logs_is_neither_moved_nor_overwritten() {
+    fn files_of_the_user_in_the_folders_of_logs_are_neither_moved_nor_overwritten() {
         let folder = tempfile::tempdir().unwrap();
         for name in ["logs-1-unfinished/notes", "logs-1/notes", "logs-2/world.log/notes"] {
             write(folder.path(), name, "of the user");

@@ -1,4 +1,4 @@
-//! Rows of flights for programs, as lines of JSON and as comma-separated values: columns in the order of the documentation, and numbers
+//! Writes rows of flights for programs, as lines of JSON and as comma-separated values: columns in the order of the documentation, and numbers
 //! without digits that mean nothing.
 
 use std::fmt;
@@ -48,7 +48,7 @@ impl Row {
     }
 }
 
-/// Rounds a number, or those of a list, as the end of its name says.
+/// Rounds a number, or those of a list, by the end of its name.
 fn round(name: &str, value: &mut Value) {
     let ends = DIGITS.iter().filter(|(end, _)| name.ends_with(end));
     let Some((_, digits)) = ends.max_by_key(|(end, _)| end.len()) else { return };

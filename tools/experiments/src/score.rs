@@ -1,4 +1,4 @@
-//! Scores of results: recall, wrong ids, false detections, errors of centre and range, consistency of the
+//! Scores results: recall, wrong ids, false detections, errors of centre and range, consistency of the
 //! covariances.
 
 use node::stats::{interpolated_quantile as quantile, mean};

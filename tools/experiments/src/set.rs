@@ -1,4 +1,4 @@
-//! The sets of frames by name, and the markers of the experiment.
+//! Names the sets of frames, and the markers of the experiment.
 
 pub use rendering::views::{MARKERS, SIZE_M};
 

@@ -1,4 +1,4 @@
-//! The frames of a set of the marker experiment, by its name, a marker and a variant (seed, processing, share
+//! Specifies the frames of a set of the marker experiment, by its name, a marker and a variant (seed, processing, fraction
 //! of the frames).
 //!
 //! A set has the same views, grounds and lights for every marker, so that results of different markers are
@@ -24,7 +24,7 @@ use scene::Draw;
 /// Pixels of the thesis' sensor across.
 const SENSOR_WIDTH: u32 = 2592;
 
-/// Which frames of a set are meant.
+/// A selection of frames of a set.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Variant {
     /// Seed of poses, ids, lights, grounds and noise. With 0 they are those on which the detector was

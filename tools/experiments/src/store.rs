@@ -1,4 +1,4 @@
-//! Sets on disk, `FOLDER/SET/FAMILY/`: a PNG file per frame, and a line of JSON per frame in `truth.jsonl`.
+//! Stores sets on disk, `FOLDER/SET/FAMILY/`: a PNG file per frame, and a line of JSON per frame in `truth.jsonl`.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -15,10 +15,10 @@ use crate::frame_spec::{FrameRenderer, FrameSpec};
 use crate::set::Set;
 use crate::sets::{self, Variant};
 
-/// The file with the ground truth of the frames beside it.
+/// The file with the ground truth of the frames next to it.
 pub const TRUTH: &str = "truth.jsonl";
 
-/// The file with the version that rendered the frames beside it.
+/// The file with the version that rendered the frames next to it.
 pub const RENDERED_BY: &str = "rendered-by.txt";
 
 /// A frame with its ground truth.

@@ -1,4 +1,4 @@
-//! Tables A.1 to A.8 of the thesis from rendered frames, beside the values of the thesis and of reference
+//! Writes Tables A.1 to A.8 of the thesis from rendered frames, next to the values of the thesis and of reference
 //! detectors.
 
 use std::fmt::Write as _;

@@ -1,4 +1,4 @@
-//! The measurements of the thesis (Tables A.1 to A.8): mean and standard deviation of the errors at each
+//! Contains the measurements of the thesis (Tables A.1 to A.8): mean and standard deviation of the errors at each
 //! position.
 
 #![allow(clippy::approx_constant, reason = "0.318 m is a measurement and not 1 / pi")]

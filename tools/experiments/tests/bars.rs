@@ -1,7 +1,7 @@
-//! What is promised of hard frames: markers that the frame cuts are where they are said to be, and circles that
-//! people make are none.
+//! Tests bounds for hard frames: errors of markers that the frame cuts are within their covariance, and circles that
+//! people make are not detected as markers.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
-#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+#![allow(clippy::print_stdout, reason = "the figures are for people to read")]
 
 use experiments::frame_spec::FrameRenderer;
 use experiments::set::{MARKERS, SIZE_M, Set};

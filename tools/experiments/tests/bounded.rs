@@ -1,7 +1,7 @@
-//! The detector's processor time on images of patterns and noise, relative to a normal frame of the same
+//! Tests the detector's processor time on images of patterns and noise, relative to a normal frame of the same
 //! size, and its search of images from 1 x 1 to 16384 pixels long.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
-#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+#![allow(clippy::print_stdout, reason = "the figures are for people to read")]
 
 use experiments::record::processor_ms;
 use fiducial::{Detector, Settings};

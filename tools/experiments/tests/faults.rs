@@ -1,6 +1,6 @@
-//! Flights of the campaign with faults, in lock-step: the same to the bit for a seed, a landing once
-//! a fault is over, and slow touchdowns or none when processes die, links fall silent or the
-//! autopilot lies.
+//! Tests flights of the campaign with faults, in lock-step: the same to the bit for a seed, a landing once
+//! a fault is over, and slow touchdowns or none when processes die, links fail or the
+//! autopilot reports wrong values.
 
 use experiments::faults::flight::fly;
 use experiments::faults::kind::Kind;
@@ -63,7 +63,7 @@ fn without_a_controller_the_vehicle_is_followed_to_its_rest() {
 }
 
 #[test]
-fn what_dies_lies_or_falls_silent_lets_the_vehicle_touch_slowly_or_not_at_all() {
+fn with_killed_processes_wrong_values_or_lost_messages_the_vehicle_touches_slowly_or_not_at_all() {
     let kinds = vec![
         Kind::ControllerKilled,
         Kind::ControllerStopped,

@@ -1,7 +1,7 @@
-//! Errors are consistent with the covariance, for every family at any blur, and for rings with saturated
+//! Tests that errors are consistent with the covariance, for every family at any blur, and for rings with saturated
 //! white.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
-#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+#![allow(clippy::print_stdout, reason = "the figures are for people to read")]
 
 use experiments::frame_spec::{FrameRenderer, FrameSpec};
 use experiments::set::{MARKERS, SIZE_M, Set};

@@ -1,4 +1,4 @@
-//! Flights of the landing experiment in lock-step: the same to the bit for a seed, with modelled vision as with
+//! Tests flights of the landing experiment in lock-step: the same to the bit for a seed, with modelled vision as with
 //! rendered frames, and no unsafe touchdown under any named fault.
 
 use std::fs::File;
@@ -22,7 +22,7 @@ fn fly_all(flights: &[Planned]) -> Vec<Outcome> {
     in_parallel(flights, 2, |planned| fly(planned, None)).unwrap_or_default()
 }
 
-/// Holds what a flight should be; one that is not is flown again for a recording, which the failure names.
+/// Checks a flight; one that fails is flown again for a recording, which the failure names.
 #[expect(clippy::panic, reason = "a test fails by a panic")]
 fn expect(planned: &Planned, outcome: &Outcome, holds: bool) {
     if holds {
@@ -258,7 +258,7 @@ fn an_interruption_leaves_the_results_of_the_flights_that_were_flown() {
 }
 
 #[test]
-fn old_results_outlast_a_run_that_gives_none() {
+fn old_results_outlast_a_run_without_results() {
     let folder = tempfile::tempdir().unwrap();
     let old = folder.path().join("flights.csv");
     std::fs::write(&old, "old").unwrap();

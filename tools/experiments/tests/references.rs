@@ -1,4 +1,4 @@
-//! `tools/experiments/references.py` on a folder in which not every set is rendered.
+//! Tests `tools/experiments/references.py` on a folder in which not every set is rendered.
 
 use std::path::Path;
 use std::process::Command;
@@ -39,7 +39,7 @@ fn reference_detectors_take_the_sets_that_are_there() {
     let output = run(&["set=circles"]);
     let error_text = String::from_utf8_lossy(&output.stderr);
     assert!(!output.status.success() && error_text.contains("--set circles"), "{error_text}");
-    // Labels have our names or OpenCV's. A family of which there is no photograph has no file.
+    // Labels have our names or OpenCV's. A family without a photograph has no file.
     let far = store::folder(&sets, Set::Far, marker);
     let frame = store::frames(&far).unwrap().remove(0);
     let pixels = record::read(&far.join(&frame.image)).unwrap();
@@ -57,7 +57,7 @@ fn reference_detectors_take_the_sets_that_are_there() {
         let text = std::fs::read_to_string(&file).unwrap();
         let records = record::parse(&file, &text).unwrap();
         let found = records.iter().flat_map(|record| &record.found);
-        // Where it is in the picture as it is stored, not as it is turned.
+        // At its position in the picture as it is stored, not as it is turned.
         let is_there = |[u, v]: [f64; 2]| (u - x).hypot(v - y) < 1.0;
         assert!(found.clone().any(|it| is_there(it.centre_px)), "{family}: {x}, {y}, {text}");
         assert!(!folder.join("apriltag-36h11.jsonl").exists(), "{output_text}");

@@ -1,4 +1,4 @@
-//! Reads the flights of two runs, pairs them by circumstances and seed, and compares what landings are judged by: a summary of each run,
+//! Reads the flights of two runs, pairs them by circumstances and seed, and compares the measures of landings: a summary of each run,
 //! the differences of the pairs, and a test of their sign. A seed draws the same wind, start and noise in all circumstances, so that its
 //! pairs are not independent: it counts as one.
 
@@ -48,12 +48,12 @@ pub struct Run {
     pub flights: Vec<Flight>,
 }
 
-/// What landings are judged by; the smaller, the better.
+/// A measure of landings; the smaller, the better.
 #[derive(Debug)]
 pub struct Measure {
     /// The name of its column.
     pub name: &'static str,
-    /// In words, with its unit.
+    /// Its description, with its unit.
     pub words: &'static str,
     /// Digits that mean something.
     pub digits: usize,
@@ -175,12 +175,12 @@ pub struct Side {
     pub visions: Vec<String>,
     /// Flights that have no partner in the other run.
     pub unpaired: usize,
-    /// What it gave.
+    /// Its results.
     #[serde(flatten)]
     pub summary: Summary,
 }
 
-/// What some flights of a run gave.
+/// The results of some flights of a run.
 #[derive(Clone, Debug, Serialize)]
 pub struct Summary {
     /// Number of flights.
@@ -233,7 +233,7 @@ pub struct Point {
     pub second: f64,
 }
 
-/// Pairs of which both landed, in one measure: what each run gave, and the differences, the second run's value minus the first's. Of a
+/// Pairs of which both landed, in one measure: the values of each run, and the differences, the second run's value minus the first's. Of a
 /// seed with several pairs it is the median of its differences.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Difference {
@@ -323,7 +323,7 @@ impl Tested {
     }
 }
 
-/// What flights are counted by: the name in the JSON, and what counts.
+/// The criteria by which flights are counted: the name in the JSON, and the condition.
 pub const COUNTS: [Counted; 3] = [
     ("landed", Flight::is_landed),
     ("within_100_mm", |it| it.is_within(0.1)),
@@ -336,7 +336,7 @@ type Counted = (&'static str, fn(&Flight) -> bool);
 pub struct Pairs {
     /// Number of pairs.
     pub pairs: usize,
-    /// The tests of what is counted, by its name.
+    /// The tests of the counts, by their names.
     pub counts: BTreeMap<&'static str, Tested>,
     /// Which of them landed.
     pub landed: Landed,
@@ -380,12 +380,12 @@ fn values(measure: &Measure, pairs: &[Pair<'_>]) -> Vec<Point> {
     pairs.iter().filter_map(both).collect()
 }
 
-/// The pairs of some circumstances, with what each run gave in them.
+/// The pairs of some circumstances, with the results of each run in them.
 #[derive(Clone, Debug, Serialize)]
 pub struct Cell {
     /// The name of the circumstances.
     pub cell: String,
-    /// What the paired flights of each run gave.
+    /// The results of the paired flights of each run.
     pub runs: [Summary; 2],
     /// The pairs.
     #[serde(flatten)]
@@ -395,11 +395,11 @@ pub struct Cell {
 /// Two runs, side by side.
 #[derive(Clone, Debug, Serialize)]
 pub struct Comparison {
-    /// What must be known before a number is believed.
+    /// Warnings on the validity of all numbers.
     pub warnings: Vec<String>,
     /// The first and the second run, with all of their flights.
     pub runs: [Side; 2],
-    /// What the paired flights of each run gave.
+    /// The results of the paired flights of each run.
     pub paired: [Summary; 2],
     /// All pairs.
     #[serde(flatten)]
@@ -465,7 +465,7 @@ impl Comparison {
     }
 }
 
-/// What the flights of each run gave in these pairs.
+/// The results of the flights of each run in these pairs.
 fn summaries(pairs: &[Pair<'_>]) -> [Summary; 2] {
     let (first, second): (Vec<&Flight>, Vec<&Flight>) =
         pairs.iter().map(|pair| (pair.first, pair.second)).unzip();
@@ -514,7 +514,7 @@ mod tests {
     fn flights_of_the_same_circumstances_and_seed_are_compared_and_no_others() {
         let errors_m = [0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07];
         let first = (1..).zip(errors_m).map(|(seed, error_m)| flight("calm", seed, Some(error_m)));
-        // The pairs differ by 0.02 m each, whatever the order of the rows, and one more has not landed.
+        // The pairs differ by 0.02 m each, in any order of the rows, and one more has not landed.
         let mut second: Vec<Flight> = (1..)
             .zip(errors_m)
             .map(|(seed, error_m)| flight("calm", seed, Some(error_m + 0.02)))
@@ -573,7 +573,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_compared_is_of_the_same_pairs_on_both_sides() {
+    fn both_sides_of_a_comparison_have_the_same_pairs() {
         // The second run's flights without a partner that landed have large errors.
         let first = [Some(0.01), Some(0.03), None];
         let second = [Some(0.02), Some(0.04), Some(0.9)];
@@ -589,14 +589,14 @@ mod tests {
     }
 
     #[test]
-    fn runs_without_a_pair_are_refused_with_what_they_have() {
+    fn runs_without_a_pair_are_refused_with_their_contents() {
         let [one, other] = [1, 2].map(|seed| run(vec![flight("calm", seed, None)]));
         let error = Comparison::new(&one, &other).unwrap_err().to_string();
         assert!(error.contains("seed 1 of calm") && error.contains("seed 2 of calm"), "{error}");
     }
 
     #[test]
-    fn what_is_no_run_of_landings_is_refused_by_its_line() {
+    fn a_file_that_is_no_run_of_landings_is_refused_by_its_line() {
         let folder = tempfile::tempdir().unwrap();
         let error_of = |folder: &Path| format!("{:#}", Run::read(folder).unwrap_err());
         assert!(error_of(folder.path()).contains("alight experiment landing"));

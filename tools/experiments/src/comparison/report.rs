@@ -59,7 +59,7 @@ fn head(letter: char, side: &Side) -> String {
     )
 }
 
-/// What else than the settings differs, or that nothing does.
+/// Further differences than the settings, or a sentence that there are none.
 fn differing([first, second]: &[Side; 2]) -> String {
     let mut sentences = Vec::new();
     if first.visions != second.visions {
@@ -87,7 +87,7 @@ fn summaries(comparison: &Comparison) -> String {
         "\nPairs have the same circumstances and seed: {}, of which {} landed in both, {} in A alone, {} in B alone (sign test p = {}) and {} in neither. \
          All numbers are of pairs, those of flights of all, and errors, times and speeds, and their differences (B - A: below 0 B is better), \
          of those that landed in both; 95 % is given for 20 or more.{once} \
-         The interval is that of the median at 95 % or, as it ends at one of the differences, a little more, which stands beside it, by order statistics (from six \
+         The interval is that of the median at 95 % or, as it ends at one of the differences, a little more, which stands next to it, by order statistics (from six \
          seeds on); p is of a two-sided sign test, for numbers of flights of the seeds in which B has fewer or more. {} values are tested: if A and B did not differ, \
          one of them would have p < 0.05 in up to {} % of comparisons, so take one that you did not choose beforehand for p < {:.3} alone. \
          Unsafe: faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways, or, without having given up, too far off.\n\n\
@@ -145,7 +145,7 @@ type Part = fn(&Spread) -> Option<f64>;
 /// Something with its name in the table.
 type Named<T> = (&'static str, T);
 
-/// What else a spread has than its median.
+/// A further value of a spread than its median.
 const PARTS: [Named<Part>; 2] = [("95 %", |it| it.p95), ("worst", |it| Some(it.worst))];
 
 fn part(spread: Option<Spread>, digits: usize, of: Part) -> String {
@@ -338,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_counted_is_tested_and_an_interval_has_its_probability() {
+    fn counts_are_tested_and_an_interval_has_its_probability() {
         // Two errors for each of four circumstances would be two seeds; here each pair is a seed of its own.
         let of = |error_m: f64| {
             let mut run = run(&[("calm", [error_m; 2]); 4]);

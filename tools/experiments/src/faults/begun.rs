@@ -1,4 +1,4 @@
-//! The faults that have begun.
+//! Keeps the faults of a flight that have begun.
 
 use super::kind::Kind;
 use super::plan::Fault;
@@ -13,7 +13,7 @@ pub struct Begun {
 }
 
 impl Begun {
-    /// True while it lasts.
+    /// True while it is active.
     pub fn is_on(&self, now_s: f64) -> bool {
         self.is_on_later(now_s, 0.0, 0.0)
     }
@@ -51,7 +51,7 @@ impl BegunFaults {
         self.on(kind, now_s).is_some()
     }
 
-    /// What a fault's size makes of a range, from its start to its end; 0 while it is off.
+    /// The value in a range, from start to end, by the size of a fault; 0 while it is off.
     pub fn value(&self, kind: Kind, now_s: f64, range: std::ops::RangeInclusive<f64>) -> f64 {
         let (start, end) = range.into_inner();
         self.on(kind, now_s).map_or(0.0, |begun| start + (end - start) * begun.fault.size)

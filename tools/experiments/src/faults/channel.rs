@@ -1,4 +1,4 @@
-//! A connection that delays, loses, doubles, reorders and damages what it carries.
+//! Simulates a connection that delays, loses, doubles, reorders and damages its payloads.
 
 use std::collections::VecDeque;
 
@@ -20,7 +20,7 @@ pub const SOME: f64 = 0.3;
 /// Maximum number of bits that are flipped in one payload.
 const MAX_FLIPPED: usize = 8;
 
-/// What a connection does to its payloads.
+/// The faults of a connection.
 #[derive(Copy, Clone, Debug, Default, PartialEq)]
 pub struct Trouble {
     /// Nothing arrives.
@@ -57,7 +57,7 @@ impl Channel {
 
     /// Sends a payload that would arrive at a time.
     pub fn put(&mut self, at_s: f64, mut payload: Vec<u8>, trouble: &Trouble) {
-        // The same number of draws for each, so that one trouble does not change the luck of another.
+        // The same number of draws for each, so that one trouble does not change the draws of another.
         let [lost, jitter, twice, again, late, later, damaged] =
             [(); 7].map(|()| self.random.random::<f64>());
         if trouble.silent || lost < trouble.loss {
@@ -110,7 +110,7 @@ impl Channel {
 mod tests {
     use super::*;
 
-    /// What arrives of payloads numbered 0 to 199 that are sent every 10 ms.
+    /// The payloads that arrive, of those numbered 0 to 199 that are sent every 10 ms.
     fn carried(trouble: Trouble) -> Vec<(f64, Vec<u8>)> {
         let mut channel = Channel::new(1, 1);
         let mut arrived = Vec::new();
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn each_trouble_does_what_it_says() {
+    fn each_trouble_has_its_effect() {
         assert!(carried(Trouble { silent: true, ..Trouble::default() }).is_empty());
         let lost = carried(Trouble { loss: 0.5, ..Trouble::default() }).len();
         assert!((90..170).contains(&lost), "{lost}");

@@ -1,4 +1,4 @@
-//! The controller's process in lock-step: it runs, is stopped or killed and started again, and the packets,
+//! Simulates the controller's process in lock-step: it runs, is stopped or killed and started again, and the packets,
 //! detections and ticks for it wait or are lost meanwhile.
 
 use std::collections::VecDeque;
@@ -17,7 +17,7 @@ const MAX_DETECTIONS: usize = 64;
 /// News of detectors and cameras that wait; they are few.
 const MAX_NEWS: usize = 1024;
 
-/// What others say once, or seldom.
+/// Messages of others that come once, or seldom.
 #[derive(Clone, Debug)]
 pub enum News {
     /// A detector came (true) or went.
@@ -31,13 +31,13 @@ pub enum News {
 pub enum Life {
     /// It runs.
     Runs,
-    /// It stands still.
+    /// It is stopped.
     Stopped,
     /// It is gone.
     Dead,
 }
 
-/// The order in which a process that goes on finds what it has to do: in the real one it is by chance.
+/// The order in which a process that continues finds its work: in the real process it is random.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Order {
     /// Its clock ticks before it reads anything.
@@ -55,7 +55,7 @@ pub struct Controller {
     pad_file: Option<PadNote>,
     life: Life,
     parser: Parser,
-    /// What the flights have handled, when it is wanted.
+    /// The events that the flights have handled, if they are kept.
     tapes: Option<Vec<Tape>>,
     packets: VecDeque<Vec<u8>>,
     detections: VecDeque<(String, Vec<u8>)>,
@@ -84,12 +84,12 @@ impl Controller {
         Ok(controller)
     }
 
-    /// Keeps what is handled from now on.
+    /// Keeps the handled events from now on.
     pub fn keep_tapes(&mut self) {
         self.tapes.get_or_insert_default();
     }
 
-    /// What was handled since [`Controller::keep_tapes`], of each life.
+    /// The events that were handled since [`Controller::keep_tapes`], of each life.
     pub fn into_tapes(mut self) -> Vec<Tape> {
         self.take_tape();
         self.tapes.unwrap_or_default()
@@ -170,7 +170,7 @@ impl Controller {
         }
     }
 
-    /// Reads what has arrived, if it runs.
+    /// Reads the messages that have arrived, if it runs.
     pub fn read(&mut self, now_ns: i64) {
         if self.life != Life::Runs {
             return;
@@ -198,7 +198,7 @@ impl Controller {
     fn read_packets(&mut self, now_ns: i64) {
         let Some(flight) = &mut self.flight else { return };
         for datagram in self.packets.drain(..) {
-            // A datagram holds whole packets: what is incomplete in it stays so, as in the real link.
+            // A datagram holds complete packets: an incomplete one in it stays so, as in the real link.
             let mut packets = self.parser.push(&datagram);
             packets.extend(self.parser.finish());
             for packet in packets {
@@ -210,7 +210,7 @@ impl Controller {
     fn read_detections(&mut self, now_ns: i64) {
         let Some(flight) = &mut self.flight else { return };
         for (publisher, payload) in self.detections.drain(..) {
-            // What cannot be decoded is counted and skipped by the network's code.
+            // Payloads that cannot be decoded are counted and skipped by the network's code.
             if let Ok(message) = messages::decode::<Detections>(&payload) {
                 flight.detections(now_ns, &publisher, &message);
             }
@@ -228,7 +228,7 @@ impl Controller {
         }
     }
 
-    /// What it says of itself, if it runs.
+    /// Its status, if it runs.
     pub fn status(&self, now_ns: i64) -> Option<ControllerStatus> {
         self.flight.as_ref().filter(|_| self.runs()).map(|flight| flight.flight().status(now_ns))
     }
@@ -239,7 +239,7 @@ impl Controller {
     }
 }
 
-/// True for a phase after which the controller does nothing more by itself.
+/// True for a phase after which the controller does nothing more on its own.
 pub fn is_terminal(phase: Phase) -> bool {
     matches!(phase, Phase::Landed | Phase::Aborted | Phase::PilotInCommand | Phase::Failed)
 }

@@ -1,5 +1,5 @@
-//! One flight with faults in lock-step: world, vision and controller as functions, with connections between
-//! them that fail. It goes on until the vehicle is at rest, also without a controller.
+//! Flies one flight with faults in lock-step: world, vision and controller as functions, with connections between
+//! them that fail. It continues until the vehicle is at rest, also without a controller.
 
 use anyhow::Context;
 use autopilot::Parser;
@@ -12,10 +12,10 @@ use world::world::STEP_S;
 use super::begun::{Begun, BegunFaults};
 use super::channel::{Channel, MAX_DELAY_S, MAX_LOSS, MIN_DELAY_S, MIN_LOSS, SOME, Trouble};
 use super::controller::{Controller, Life, News, Order, is_terminal};
-use super::kind::{Kind, LIAR};
+use super::kind::{FAULTY_DETECTOR, Kind};
 use super::link::FaultyLink;
 use super::outcome::{Ending, Outcome};
-use super::peers::{Lie, babble, liar, strange_camera, stranger};
+use super::peers::{Behaviour, babble, faulty_detector, other_camera, unknown_detector};
 use super::plan::Planned;
 use crate::landing::configuration;
 use crate::landing::plan::Vision;
@@ -40,18 +40,18 @@ const HOVERS_S: f64 = 10.0;
 const AFTER_FAULT_S: f64 = 15.0;
 /// A closed socket shows the end of a process after this time, in seconds.
 const NOTICED_S: f64 = 0.05;
-/// A process that stands still is missed after this time, in seconds (`lease` of `local.json5`).
+/// A stopped process is missed after this time, in seconds (`lease` of `local.json5`).
 const LEASE_S: f64 = 2.0;
 /// Time that a detector or a camera needs to start, and to be met again, in seconds.
 const STARTUP_S: f64 = 1.0;
 const MEETING_S: f64 = 0.2;
 /// Period of the camera's information, in seconds.
 const INFO_S: f64 = 1.0;
-/// The size of the crowd.
+/// Number of detectors in the fault `crowd`.
 const CROWD: usize = 70;
 /// The largest step of a camera's clock, in seconds.
 const MAX_CLOCK_STEP_S: f64 = 2.0;
-/// By how much the places of a marker in one picture differ, as a share of its distance: in the very same one, and in those of JPEG
+/// By how much the positions of a marker in one picture differ, as a fraction of its distance: in the same one, and in those of JPEG
 /// qualities from 50 to 95 (4x4-50 of 0.3 m at 1.5 to 10 m, focal length 1000 pixels: from one quality to the next 7e-5 to 7e-4).
 const REPEATED_SHARE: f64 = 5e-6;
 const RECODED_SHARE: f64 = 5e-4;
@@ -91,19 +91,19 @@ struct FaultyFlight<'a> {
     link: FaultyLink,
     to_world: Parser,
     detections: Channel,
-    liar_detections: Channel,
+    faulty_detections: Channel,
     crowd: Vec<String>,
     frame_period_s: f64,
     sequence: u64,
-    /// The newest frame of a detector that stands still.
+    /// The newest frame of a stopped detector.
     held: Option<Arrival>,
-    /// What was found in the picture that the camera repeats.
+    /// The detections in the picture that the camera repeats.
     picture: Option<Vec<Detection>>,
     detector_alive: bool,
     crowd_is_announced: bool,
     info_due_s: f64,
     strange_due_s: f64,
-    has_liar: bool,
+    has_faulty_detector: bool,
     height_reached_s: Option<f64>,
     faults: BegunFaults,
     start_s: Option<f64>,
@@ -132,7 +132,7 @@ impl<'a> FaultyFlight<'a> {
             link: FaultyLink::new(planned.seed),
             to_world: Parser::new(),
             detections: channel(3),
-            liar_detections: channel(4),
+            faulty_detections: channel(4),
             crowd: (0..CROWD).map(|number| format!("stranger-{number}")).collect(),
             frame_period_s,
             held: None,
@@ -141,7 +141,10 @@ impl<'a> FaultyFlight<'a> {
             crowd_is_announced: false,
             info_due_s: 0.0,
             strange_due_s: 0.0,
-            has_liar: planned.faults.iter().any(|fault| fault.kind.is_preferred_liar()),
+            has_faulty_detector: planned
+                .faults
+                .iter()
+                .any(|fault| fault.kind.prefers_a_faulty_detector()),
             height_reached_s: None,
             faults: BegunFaults::default(),
             start_s: None,
@@ -221,7 +224,7 @@ impl<'a> FaultyFlight<'a> {
         self.world.pad_at(self.now_s()).position.z() - self.world.truth().position.z()
     }
 
-    /// Processes end, stand still and come back.
+    /// Processes end, stop and start again.
     fn live_and_die(&mut self) -> anyhow::Result<()> {
         let now_s = self.now_s();
         let life = if self.is_on(Kind::ControllerKilled) {
@@ -249,7 +252,7 @@ impl<'a> FaultyFlight<'a> {
         }
         if self.is_on(Kind::StrangeCamera) && now_s >= self.strange_due_s {
             self.strange_due_s = now_s + 0.5 * INFO_S;
-            self.controller.news(News::Camera(strange_camera(self.vision.info())));
+            self.controller.news(News::Camera(other_camera(self.vision.info())));
         }
         if self.is_on(Kind::Crowd) && !self.crowd_is_announced {
             self.crowd_is_announced = true;
@@ -261,8 +264,8 @@ impl<'a> FaultyFlight<'a> {
     /// Reports the other processes to a controller that has just started.
     fn announce_all(&mut self) {
         self.controller.news(News::Presence(DETECTOR.to_owned(), self.detector_alive));
-        if self.has_liar {
-            self.controller.news(News::Presence(LIAR.to_owned(), true));
+        if self.has_faulty_detector {
+            self.controller.news(News::Presence(FAULTY_DETECTOR.to_owned(), true));
         }
         if self.crowd_is_announced {
             self.announce_crowd();
@@ -330,7 +333,7 @@ impl<'a> FaultyFlight<'a> {
         }
     }
 
-    /// Takes frames, finds the marker in them, and delivers what was found.
+    /// Takes frames, finds the marker in them, and delivers the detections.
     fn see(&mut self) -> anyhow::Result<()> {
         let now_s = self.now_s();
         let time_s = self.sequence as f64 * self.frame_period_s;
@@ -348,7 +351,7 @@ impl<'a> FaultyFlight<'a> {
             self.sequence += 1;
         }
         if self.held.is_some() && self.detector_runs() {
-            // What a detector that stood still found in its last frame, late.
+            // The detections of a stopped detector in its last frame, late.
             if let Some(held) = self.held.take() {
                 self.deliver(&Arrival { at_s: now_s, ..held });
             }
@@ -356,14 +359,14 @@ impl<'a> FaultyFlight<'a> {
         while let Some(payload) = self.detections.take(now_s) {
             self.controller.detections(DETECTOR, payload);
         }
-        while let Some(payload) = self.liar_detections.take(now_s) {
-            self.controller.detections(LIAR, payload);
+        while let Some(payload) = self.faulty_detections.take(now_s) {
+            self.controller.detections(FAULTY_DETECTOR, payload);
         }
         Ok(())
     }
 
-    /// What is found in the picture of a frame: where the camera repeats one, what was found in that. A detector finds it again to
-    /// within some millionths, as it remembers more of the camera each time; less well where the picture is coded anew.
+    /// The detections in the picture of a frame: where the camera repeats a picture, those of that. A detector finds the marker again to
+    /// within some millionths, as it has more frames of the camera each time; less well where the picture is coded again.
     fn repeated(&mut self, arrival: Arrival) -> Arrival {
         let share = if self.is_on(Kind::PictureRecoded) {
             RECODED_SHARE
@@ -390,22 +393,22 @@ impl<'a> FaultyFlight<'a> {
         } else if self.is_on(Kind::DetectorStopped) {
             self.held = Some(arrival.clone());
         }
-        if self.has_liar {
-            let lie = if self.is_on(Kind::LiarJumps) {
-                Lie::Jumps
+        if self.has_faulty_detector {
+            let behaviour = if self.is_on(Kind::LiarJumps) {
+                Behaviour::Jumps
             } else if let Some(begun) = self.faults.on(Kind::LiarDrifts, self.now_s()) {
-                Lie::Drifts(arrival.at_s - begun.at_s)
+                Behaviour::Drifts(arrival.at_s - begun.at_s)
             } else if self.is_on(Kind::PreferredIsBlind) {
-                Lie::Blind
+                Behaviour::Blind
             } else {
-                Lie::None
+                Behaviour::Correct
             };
-            let payload = messages::encode(&liar(&arrival.message, lie));
-            self.liar_detections.put(arrival.at_s, payload, &Trouble::default());
+            let payload = messages::encode(&faulty_detector(&arrival.message, behaviour));
+            self.faulty_detections.put(arrival.at_s, payload, &Trouble::default());
         }
         if self.is_on(Kind::Crowd) {
             for (number, name) in self.crowd.iter().enumerate() {
-                let message: Detections = stranger(&arrival.message, name, number);
+                let message: Detections = unknown_detector(&arrival.message, name, number);
                 self.controller.detections(name, messages::encode(&message));
             }
         }
@@ -482,7 +485,7 @@ impl<'a> FaultyFlight<'a> {
         let on_ground = self.world.truth().on_ground;
         let armed = self.world.autopilot().armed();
         let is_over = self.outcome.is_over;
-        // A fault that ends may bring somebody back.
+        // A fault that ends may bring a process back.
         let begun = self.faults.all();
         let pending = begun.iter().any(|begun| {
             begun.fault.for_s.is_finite() && now_s < begun.at_s + begun.fault.for_s + STARTUP_S

@@ -1,10 +1,10 @@
-//! The kinds of faults of a campaign, by name: processes killed or stopped, links that delay or damage, false
+//! Names the kinds of faults of a campaign: processes killed or stopped, links that delay or damage, false
 //! messages of autopilots, detectors and cameras, no memory or disk left.
 
 use std::str::FromStr;
 
-/// The name of the preferred detector that lies.
-pub const LIAR: &str = "liar";
+/// The name of the preferred detector with wrong detections.
+pub const FAULTY_DETECTOR: &str = "liar";
 
 /// A kind of fault. The order shows the affected part: a process, the autopilot's link, detections and cameras, values of the
 /// autopilot, and last faults that only real processes show.
@@ -12,15 +12,15 @@ pub const LIAR: &str = "liar";
 pub enum Kind {
     /// The controller's process ends; after the duration another one resumes the landing.
     ControllerKilled,
-    /// The controller's process is stopped (SIGSTOP), and goes on after the duration.
+    /// The controller's process is stopped (SIGSTOP), and continues after the duration.
     ControllerStopped,
     /// The detector's process ends; after the duration another one takes its place.
     DetectorKilled,
-    /// The detector's process is stopped, and goes on.
+    /// The detector's process is stopped, and continues.
     DetectorStopped,
     /// The camera's process ends, and another one takes its place.
     CameraKilled,
-    /// The camera's process is stopped, and goes on.
+    /// The camera's process is stopped, and continues.
     CameraStopped,
     /// Nothing arrives from the autopilot.
     SilenceFrom,
@@ -58,7 +58,7 @@ pub enum Kind {
     PictureRepeated,
     /// It does, and the link codes it anew for each frame.
     PictureRecoded,
-    /// A preferred detector says that the marker is 1 m beside its place.
+    /// A preferred detector reports the marker 1 m next to its position.
     LiarJumps,
     /// A preferred detector lets the marker drift by 5 cm/s.
     LiarDrifts,
@@ -66,21 +66,21 @@ pub enum Kind {
     PreferredIsBlind,
     /// The detector's poses are not numbers, infinite or absurd.
     DetectorBabbles,
-    /// Seventy strangers publish detections.
+    /// Seventy unknown detectors publish detections.
     Crowd,
-    /// A stranger publishes another camera's calibration and mount under the camera's name.
+    /// An unknown process publishes another camera's calibration and mount under the camera's name.
     StrangeCamera,
-    /// The autopilot's landed state says "undefined".
+    /// The autopilot's landed state is "undefined".
     LandedUndefined,
-    /// It says "taking off".
+    /// It is "taking off".
     LandedTakingOff,
-    /// It says "on the ground".
+    /// It is "on the ground".
     LandedOnGround,
     /// The autopilot's heartbeats alone are missing.
     HeartbeatMissing,
-    /// Its heartbeats claim that the pilot has taken another mode.
+    /// Its heartbeats falsely report another mode of the pilot.
     ModeLie,
-    /// Its heartbeats claim that the motors are off.
+    /// Its heartbeats falsely report that the motors are off.
     DisarmedLie,
     /// One packet has a boot time of long ago.
     OldBootTime,
@@ -94,7 +94,7 @@ pub enum Kind {
     AttitudeMissing,
     /// The ground station's bridge ends, and another one takes its place; in real time only.
     BridgeKilled,
-    /// The bridge is stopped, and goes on; in real time only.
+    /// The bridge is stopped, and continues; in real time only.
     BridgeStopped,
     /// The controller gets no more memory; in real time only.
     ControllerMemory,
@@ -174,7 +174,7 @@ impl Kind {
             .filter(|kind| kind.needs_processes() || kind.is_of_process() || kind.is_of_autopilot())
     }
 
-    /// True for what only real processes show.
+    /// True for faults that only real processes show.
     pub fn needs_processes(self) -> bool {
         self >= Self::BridgeKilled
     }
@@ -193,8 +193,8 @@ impl Kind {
         TABLE.iter().find(|row| row.0 == self).map_or("", |row| row.1)
     }
 
-    /// True when a second detector, which lies, is preferred.
-    pub fn is_preferred_liar(self) -> bool {
+    /// True when a second detector with wrong detections is preferred.
+    pub fn prefers_a_faulty_detector(self) -> bool {
         matches!(self, Self::LiarJumps | Self::LiarDrifts | Self::PreferredIsBlind)
     }
 }

@@ -1,11 +1,11 @@
-//! The autopilot's link with its faults, in lock-step and in real time.
+//! Carries the autopilot's link with its faults, in lock-step and in real time.
 
 use autopilot::Parser;
 
 use super::begun::BegunFaults;
 use super::channel::{Channel, MAX_DELAY_S, MAX_LOSS, MIN_DELAY_S, MIN_LOSS, SOME, Trouble};
+use super::falsify::Falsifier;
 use super::kind::Kind;
-use super::lies::Lies;
 use super::plan::Fault;
 
 /// Both directions of the link.
@@ -13,7 +13,7 @@ use super::plan::Fault;
 pub struct FaultyLink {
     faults: BegunFaults,
     parser: Parser,
-    lies: Lies,
+    falsifier: Falsifier,
     from_autopilot: Channel,
     to_autopilot: Channel,
 }
@@ -24,13 +24,13 @@ impl FaultyLink {
         Self {
             faults: BegunFaults::default(),
             parser: Parser::new(),
-            lies: Lies::default(),
+            falsifier: Falsifier::default(),
             from_autopilot: Channel::new(seed, 1),
             to_autopilot: Channel::new(seed, 2),
         }
     }
 
-    /// A fault begins, of whatever kind.
+    /// A fault begins, of any kind.
     pub fn begin(&mut self, now_s: f64, fault: Fault) {
         self.faults.begin(now_s, fault);
     }
@@ -40,7 +40,7 @@ impl FaultyLink {
         let trouble = self.trouble(Kind::SilenceFrom, now_s);
         let faults = &self.faults;
         for packet in self.parser.push(bytes) {
-            if let Some(raw) = self.lies.apply(&packet, |kind| faults.is_on(kind, now_s)) {
+            if let Some(raw) = self.falsifier.apply(&packet, |kind| faults.is_on(kind, now_s)) {
                 self.from_autopilot.put(now_s, raw, &trouble);
             }
         }

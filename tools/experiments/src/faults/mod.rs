@@ -1,17 +1,17 @@
-//! Flights in which something dies, lies or falls silent, by the hundred and in lock-step, so that a seed
+//! Flies hundreds of flights with killed processes, wrong values and lost messages in lock-step, so that a seed
 //! reproduces a flight to the bit.
 //!
 //! Modules in reading order: [`kind`] has the kinds of faults, [`plan`] draws those of a flight; [`flight`]
 //! flies it with the faults that have [`begun`], the process of [`controller`], the autopilot's [`link`] over
-//! the connections of [`channel`] with its [`lies`], and the [`peers`]; [`outcome`] is its result and the bar; [`report`] writes the table,
+//! the connections of [`channel`], whose packets [`falsify`] changes, and the [`peers`]; [`outcome`] is its result and the bar; [`report`] writes the table,
 //! [`tape_file`] a recording with the controller's tape.
 
 pub mod begun;
 pub mod channel;
 pub mod controller;
+pub mod falsify;
 pub mod flight;
 pub mod kind;
-pub mod lies;
 pub mod link;
 pub mod outcome;
 pub mod peers;
@@ -28,7 +28,7 @@ use flight::{fly, fly_with_tape};
 use outcome::Outcome;
 use plan::Request;
 
-/// What a campaign found.
+/// The results of a campaign.
 #[derive(Clone, Debug)]
 pub struct Findings {
     /// The report, in Markdown.

@@ -29,11 +29,11 @@ pub struct Outcome {
     pub kinds: String,
     /// Height over the pad at which they began, in metres.
     pub height_m: f64,
-    /// How long each lasted, in seconds; empty is for ever.
+    /// Duration of each, in seconds; empty is for ever.
     pub for_s: Vec<Option<f64>>,
     /// Mean wind, in m/s.
     pub wind_m_s: f64,
-    /// The guidance, the marker where one was asked for, and the further settings.
+    /// The guidance, the marker where one was requested, and the further settings.
     pub settings: String,
     /// The version of the program that flew it.
     pub program: String,
@@ -58,7 +58,7 @@ pub struct Outcome {
     /// Horizontal distance from the pad at the last touch, in metres.
     #[serde(rename = "touchdown_error_m")]
     pub error_m: Option<f64>,
-    /// Greatest height over the place of the first touch, after it, in metres.
+    /// Greatest height over the position of the first touch, after it, in metres.
     pub hop_m: Option<f64>,
     /// Greatest tilt in flight, in degrees.
     pub max_tilt_deg: f64,
@@ -104,7 +104,7 @@ impl Outcome {
         self.error_m = Some(error_m);
     }
 
-    /// Notes the height over the place of the first touch in metres.
+    /// Notes the height over the position of the first touch in metres.
     pub fn hop(&mut self, height_m: f64) {
         self.hop_m = greater(self.hop_m, Some(height_m));
     }

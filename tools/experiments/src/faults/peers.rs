@@ -1,24 +1,24 @@
-//! What lying, babbling and shouting detectors and cameras publish.
+//! Makes the messages of faulty detectors and cameras: wrong, absurd or too many.
 
 use geometry::{Body, Camera, Rotation, Transform, Vector};
 use messages::{CameraInfo, Detections};
 
-use super::kind::LIAR;
+use super::kind::FAULTY_DETECTOR;
 
-/// How far beside its place a liar puts the marker, in metres.
-const LIE_M: f64 = 1.0;
-/// How fast a drifting liar gets there, in m/s.
+/// Offset of a faulty detector's marker from its position, in metres.
+const OFFSET_M: f64 = 1.0;
+/// Speed at which a drifting detector reaches it, in m/s.
 const DRIFT_M_S: f64 = 0.05;
-/// Distance from the marker at which the crowd sees its own, in metres.
-const CROWD_M: f64 = 2.0;
+/// Distance between the marker and that of the unknown detectors, in metres.
+const UNKNOWN_M: f64 = 2.0;
 /// How far another camera's mount is turned, in radians.
 const STRANGE_ROLL_RAD: f64 = 0.3;
 
-/// What a preferred detector does.
+/// The behaviour of a preferred detector.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub enum Lie {
-    /// It says what it sees.
-    None,
+pub enum Behaviour {
+    /// Its detections are correct.
+    Correct,
     /// It is off, from one frame to the next.
     Jumps,
     /// It has drifted for this time, in seconds.
@@ -27,22 +27,22 @@ pub enum Lie {
     Blind,
 }
 
-/// The message of the preferred detector that lies, from what an honest one has found.
-pub fn liar(honest: &Detections, lie: Lie) -> Detections {
-    let mut message = Detections { detector: LIAR.to_owned(), ..honest.clone() };
-    match lie {
-        Lie::None => {}
-        Lie::Jumps => shift(&mut message, LIE_M),
-        Lie::Drifts(for_s) => shift(&mut message, (DRIFT_M_S * for_s).min(LIE_M)),
-        Lie::Blind => message.detections.clear(),
+/// The message of the faulty preferred detector, from a correct one.
+pub fn faulty_detector(correct: &Detections, behaviour: Behaviour) -> Detections {
+    let mut message = Detections { detector: FAULTY_DETECTOR.to_owned(), ..correct.clone() };
+    match behaviour {
+        Behaviour::Correct => {}
+        Behaviour::Jumps => shift(&mut message, OFFSET_M),
+        Behaviour::Drifts(for_s) => shift(&mut message, (DRIFT_M_S * for_s).min(OFFSET_M)),
+        Behaviour::Blind => message.detections.clear(),
     }
     message
 }
 
-/// The message of one of the crowd.
-pub fn stranger(honest: &Detections, name: &str, number: usize) -> Detections {
-    let mut message = Detections { detector: name.to_owned(), ..honest.clone() };
-    shift(&mut message, if number.is_multiple_of(2) { CROWD_M } else { -CROWD_M });
+/// The message of one of many unknown detectors.
+pub fn unknown_detector(correct: &Detections, name: &str, number: usize) -> Detections {
+    let mut message = Detections { detector: name.to_owned(), ..correct.clone() };
+    shift(&mut message, if number.is_multiple_of(2) { UNKNOWN_M } else { -UNKNOWN_M });
     message
 }
 
@@ -56,8 +56,8 @@ fn shift(message: &mut Detections, metres: f64) {
 }
 
 /// Detections whose poses no marker has; `number` chooses among them.
-pub fn babble(honest: &Detections, number: u64) -> Detections {
-    let mut message = honest.clone();
+pub fn babble(correct: &Detections, number: u64) -> Detections {
+    let mut message = correct.clone();
     for detection in &mut message.detections {
         let Some(pose) = &mut detection.pose else { continue };
         let translation = &mut pose.camera_from_marker.translation_m;
@@ -75,7 +75,7 @@ pub fn babble(honest: &Detections, number: u64) -> Detections {
 }
 
 /// Another camera's calibration and mount, under the same name.
-pub fn strange_camera(info: &CameraInfo) -> CameraInfo {
+pub fn other_camera(info: &CameraInfo) -> CameraInfo {
     let mut strange = info.clone();
     strange.focal_px = strange.focal_px.map(|focal| focal.map(|px| 1.5 * px));
     let turned =

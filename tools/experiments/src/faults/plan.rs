@@ -1,12 +1,12 @@
-//! Plans a campaign of flights with faults: each seed draws one fault or two, the height at which they begin, how
-//! long they last, and the wind.
+//! Plans a campaign of flights with faults: each seed draws one fault or two, the height at which they begin, their
+//! durations, and the wind.
 
 use std::path::PathBuf;
 
 use markers::Marker;
 use node::ConfigError;
 
-use super::kind::{Kind, LIAR};
+use super::kind::{FAULTY_DETECTOR, Kind};
 use crate::landing::configuration;
 use crate::landing::fault::{START_ANGLE, drawn, drawn_angle};
 use crate::landing::plan::{Swept, Values, refuse_other_marker, set_option, settings_text};
@@ -79,14 +79,14 @@ impl Default for Plan {
 pub const SWEPT: [Swept; 2] =
     [Swept::new("simulator.wind.mean_m_s", "--wind"), Swept::new("simulator.seed", "--seed")];
 
-/// What to run.
+/// The campaign to run.
 #[derive(Clone, Debug)]
 pub struct Request {
-    /// The command that asked for it, for the report.
+    /// The command that requested it, for the report.
     pub command: String,
     /// The flights.
     pub plan: Plan,
-    /// Folder of the recordings with the controllers' tapes, where they are wanted.
+    /// Folder of the recordings with the controllers' tapes, if they are requested.
     pub tapes_in: Option<PathBuf>,
     /// Number of flights in parallel.
     pub jobs: usize,
@@ -99,9 +99,9 @@ pub struct Fault {
     pub kind: Kind,
     /// From the moment the height is reached to its begin, in seconds.
     pub after_s: f64,
-    /// How long it lasts, in seconds; infinity is for ever.
+    /// Its duration, in seconds; infinity is for ever.
     pub for_s: f64,
-    /// How large it is, from 0 to 1; what that is depends on the kind.
+    /// Its size, from 0 to 1; the meaning depends on the kind.
     pub size: f64,
 }
 
@@ -120,11 +120,11 @@ pub struct Planned {
     pub simulator: Vec<String>,
     /// Settings of the controller.
     pub controller: Vec<String>,
-    /// The marker that was asked for.
+    /// The marker that was requested.
     marker: Option<Marker>,
     /// Further settings.
     set: Vec<String>,
-    /// What its command needs beside what is drawn.
+    /// Further options of its command, besides the drawn values.
     options: String,
 }
 
@@ -156,7 +156,7 @@ impl Plan {
     /// Refuses flights whose controller looks for another marker than the pad has, which is the same in all.
     ///
     /// # Errors
-    /// When they are such flights, with what to do about it.
+    /// When they are such flights, with a remedy.
     pub fn check_marker(&self) -> Result<(), String> {
         let Planned { simulator, controller, .. } = self.flight(self.seed);
         refuse_other_marker(&simulator, &controller)
@@ -253,14 +253,14 @@ impl Planned {
             "begin_height_m=1000".to_owned(),
         ];
         self.controller = vec!["start=airborne".to_owned()];
-        if self.faults.iter().any(|fault| fault.kind.is_preferred_liar()) {
-            self.controller.push(format!("detectors.preferred=\"{LIAR}\""));
+        if self.faults.iter().any(|fault| fault.kind.prefers_a_faulty_detector()) {
+            self.controller.push(format!("detectors.preferred=\"{FAULTY_DETECTOR}\""));
         }
         self.simulator.extend(self.given("simulator"));
         self.controller.extend(self.given("controller"));
     }
 
-    /// What was asked for of simulator or controller, which comes after what is drawn: the marker, then the further settings.
+    /// The requested settings of simulator or controller, which come after the drawn ones: the marker, then the further settings.
     pub fn given(&self, service: &str) -> Vec<String> {
         let marker = self.marker.as_ref().and_then(|marker| match service {
             "simulator" => Some(format!("pad.marker=\"{marker}\"")),

@@ -13,7 +13,7 @@ use crate::rows::{csv, json_lines};
 const BANDS_M: [f64; 7] = [0.5, 1.0, 2.0, 3.0, 4.5, 6.0, f64::INFINITY];
 /// Maximum number of unsafe flights in the report; the CSV has all.
 const MAX_LISTED: usize = 60;
-/// What two faults at once are called in the table.
+/// The name of two faults at once in the table.
 const TWO: &str = "two at once";
 
 /// Writes the files of the flights that were flown, of `planned` ones, and returns the report. `is_under_way` while more of them

@@ -1,4 +1,4 @@
-//! A recording with a controller's tape, as a recorder would write it.
+//! Writes a recording with a controller's tape, as a recorder would.
 
 use std::fs::File;
 use std::io::BufWriter;

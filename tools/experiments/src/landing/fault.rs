@@ -1,4 +1,4 @@
-//! The named circumstances of the landing experiment (lost frames, latency, stamps, GNSS, mount, gusts, occluders, moving
+//! Names the circumstances of the landing experiment (lost frames, latency, stamps, GNSS, mount, gusts, occluders, moving
 //! pads), as settings of simulator, controller and modelled detector.
 
 use std::f64::consts::TAU;
@@ -29,7 +29,7 @@ impl Vision {
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Fault(usize);
 
-/// What a fault changes: settings of the simulator and of the controller, and the modelled detector.
+/// The changes by a fault: settings of the simulator and of the controller, and the modelled detector.
 #[derive(Clone, Debug, Default)]
 pub struct Change {
     /// Settings of the simulator.
@@ -255,7 +255,7 @@ pub fn drawn(seed: u64, which: u32) -> f64 {
     (mixed >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// A number all of whose bits depend on all of these.
+/// A number; each of its bits depends on all of these.
 fn splitmix64(number: u64) -> u64 {
     let mixed = number.wrapping_add(0x9e37_79b9_7f4a_7c15);
     let mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);

@@ -1,4 +1,4 @@
-//! One flight in lock-step: the simulated autopilot and the controller exchange MAVLink packets, detections
+//! Flies one flight in lock-step: the simulated autopilot and the controller exchange MAVLink packets, detections
 //! arrive after their latency, and nothing waits for a clock.
 
 use std::collections::{BTreeMap, VecDeque};
@@ -160,7 +160,7 @@ impl<'a> LockstepFlight<'a> {
                     Some(recording) => {
                         recording.tick(now_ns, &mut self.controller, &self.world, &self.outcome)?;
                     }
-                    // Nobody reads it.
+                    // It is not read.
                     None => drop(self.controller.take_tape()),
                 }
                 if over_s.is_none() && self.is_over() {
@@ -242,7 +242,7 @@ impl<'a> LockstepFlight<'a> {
         let since_s = self.world.now_s() - start_s;
         let pad = self.world.pad_at(self.world.now_s());
         let away = now.position - pad.position;
-        // What is less than a hop is the contact of one touchdown.
+        // A height below a hop belongs to the contact of one touchdown.
         let hop_m = self.hop_m.map(|hop_m| hop_m.max(-away.z()));
         (self.hop_m, self.outcome.hop_m) = (hop_m, greater(self.outcome.hop_m, hop_m));
         let is_touch = now.on_ground && !before.on_ground;

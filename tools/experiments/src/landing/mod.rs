@@ -1,4 +1,4 @@
-//! Hundreds of landings: the simulator's world and the controller in lock-step in one process, without a
+//! Flies hundreds of landings: the simulator's world and the controller in lock-step in one process, without a
 //! network or a clock, so that a seed reproduces a flight to the bit.
 //!
 //! Modules in reading order: [`plan`] has the flights, with the faults of [`fault`]; [`flight`] flies one,
@@ -26,7 +26,7 @@ use plan::{Planned, Request};
 
 use crate::results::Folder;
 
-/// The configuration of a service by these settings over its defaults; a problem names the service.
+/// The configuration of a service by these settings over its defaults; an error names the service.
 pub(crate) fn configuration<T: Settings>(
     service: &str,
     set: &[String],
@@ -44,7 +44,7 @@ pub struct Watch<'a> {
     pub is_interrupted: &'a (dyn Fn() -> bool + Sync),
 }
 
-/// What many landings gave.
+/// The results of many landings.
 #[derive(Clone, Debug)]
 pub struct Landings {
     /// The report, in Markdown.

@@ -30,7 +30,7 @@ pub(crate) fn is_within(ending: Ending, error_m: Option<f64>, metres: f64) -> bo
 }
 
 /// Whether a flight touched the ground faster than is safe, by its greatest speeds in m/s, or, without an abort, far from the pad.
-/// Where an aborted flight comes down is the pilot's affair.
+/// The position of an aborted flight is the pilot's decision.
 pub(crate) fn is_unsafe(
     ending: Ending,
     error_m: Option<f64>,
@@ -45,7 +45,7 @@ fn beyond(value: Option<f64>, limit: f64) -> bool {
     value.is_some_and(|value| value > limit)
 }
 
-/// The greater one of those that are there.
+/// The greater of the values that exist.
 pub(crate) fn greater(before: Option<f64>, value: Option<f64>) -> Option<f64> {
     before.into_iter().chain(value).reduce(f64::max)
 }
@@ -84,7 +84,7 @@ pub struct Outcome {
     pub height_m: f64,
     /// Horizontal distance from the pad at the start, in metres.
     pub offset_m: f64,
-    /// The guidance, the marker where one was asked for, and the further settings.
+    /// The guidance, the marker where one was requested, and the further settings.
     pub settings: String,
     /// The version of the program that flew it.
     pub program: String,

@@ -167,7 +167,7 @@ pub const SWEPT: [Swept; 7] = [
     Swept::new("simulator.seed", "--seed"),
 ];
 
-/// Refuses a setting that would make a flight another one than its results say, with the option that chooses it.
+/// Refuses a setting by which a flight would differ from its stated circumstances, with the option that chooses it.
 ///
 /// # Errors
 /// When there is such a setting.
@@ -176,17 +176,17 @@ pub fn refuse_swept(settings: &[String], swept: &[Swept]) -> Result<(), String> 
         let key = setting.split('=').next().unwrap_or_default().trim();
         if let Some(Swept { option, .. }) = swept.iter().find(|swept| swept.setting == key) {
             return Err(format!(
-                "`--set {setting}`: results are sorted by it, so say it with `{option}`"
+                "`--set {setting}`: results are sorted by it, so give it with `{option}`"
             ));
         }
     }
     Ok(())
 }
 
-/// What to run.
+/// The experiment to run.
 #[derive(Clone, Debug, Default)]
 pub struct Request {
-    /// The command that asked for it, for the report.
+    /// The command that requested it, for the report.
     pub command: String,
     /// The flights.
     pub plan: Plan,
@@ -221,7 +221,7 @@ pub struct Planned {
     pub offset_m: f64,
     /// The fault.
     pub fault: Fault,
-    /// The guidance, the marker where one was asked for, and the further settings, in a word for each.
+    /// The guidance, the marker where one was requested, and the further settings, in a word for each.
     pub settings: String,
     /// All settings, and the faults of the modelled detector.
     pub change: Change,
@@ -240,10 +240,10 @@ impl Plan {
         })
     }
 
-    /// Refuses flights whose controller looks for another marker than the pad has: none would land, and none would say why.
+    /// Refuses flights whose controller looks for another marker than the pad has: none would land, and none would report the reason.
     ///
     /// # Errors
-    /// When there is such a flight, with what to do about it.
+    /// When there is such a flight, with a remedy.
     pub fn check_marker(&self) -> Result<(), String> {
         let mut flights = self.flights();
         flights.retain(|planned| planned.seed == self.seed);
@@ -400,12 +400,12 @@ pub(crate) fn refuse_other_marker(
     ))
 }
 
-/// What is said of flights for which [`only_size_counts`].
+/// The warning on flights for which [`only_size_counts`].
 pub const ONLY_SIZE_COUNTS: &str = "Vision is modelled with the errors of `rings`: of this marker nothing but the size counts, and another family gives \
      the same flights. Markers are compared with `--vision rendered` (faults with `--real-time`).";
 
-/// Whether flights with this vision and these settings have a marker that is not found as it would be: modelled vision has the errors of the
-/// rings, whatever the marker.
+/// Whether flights with this vision and these settings have a marker whose detections are not modelled: modelled vision has the errors of the
+/// rings for every marker.
 pub fn only_size_counts(vision: &str, settings: &str) -> bool {
     let words = shlex::split(settings).unwrap_or_default();
     let marker = words.iter().rev().find_map(|word| {

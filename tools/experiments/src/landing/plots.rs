@@ -1,5 +1,5 @@
-//! SVG plots of the landing experiment: error against wind with medians for each fault, touchdown points from above, success of each combination,
-//! the share with a larger error.
+//! Draws SVG plots of the landing experiment: error against wind with medians for each fault, touchdown points from above, success of each combination,
+//! the proportion with a larger error.
 
 use anyhow::anyhow;
 use messages::Touchdown;
@@ -25,7 +25,7 @@ pub const COLOURS: [RGBColor; 6] = [
 ];
 /// The font of a panel's caption.
 const FONT: (&str, u32) = ("sans-serif", 16);
-/// The colour of what is not a series.
+/// The colour of elements that are not a series.
 pub const GREY: RGBColor = RGBColor(150, 150, 150);
 
 /// Why a plot cannot be drawn.
@@ -105,8 +105,8 @@ fn against_wind_size(outcomes: &[Outcome]) -> [u32; 2] {
 }
 
 /// A panel for each fault, all with the same axes: every flight that landed as a dot; for each 1 m/s of wind the median with the interval
-/// in which it lies, the 99th percentile or of fewer landings the worst, and how many landed: what gave up has no dot, and the flights that are
-/// left may be the easy ones.
+/// in which it lies, the 99th percentile or of fewer landings the worst, and how many landed: flights that gave up have no dot, and the remaining
+/// ones may be the easy ones.
 fn against_wind(
     area: &Area<'_>,
     outcomes: &[Outcome],
@@ -191,7 +191,7 @@ fn one_fault(
     Ok(())
 }
 
-/// In how many lines, in turn, the numbers over the winds are, so that none covers its neighbour.
+/// The number of lines over which the numbers over the winds alternate, so that none covers its neighbour.
 fn number_lines(bins: &[Bin], px_per_m_s: f64) -> usize {
     // Of digits 12 pixels high, with a gap.
     const WIDTH_PX: f64 = 8.0;
@@ -503,7 +503,7 @@ mod tests {
         let bins = bins(&members, |o| o.error_m);
         let worst: Vec<_> = bins.iter().map(|bin| (bin.landed, bin.flown, bin.worst())).collect();
         assert_eq!(worst, [(8, 8, Some((0.08, false))), (1, 8, Some((0.01, false)))]);
-        // Three characters need 24 pixels beside each other.
+        // Three characters need 24 pixels next to each other.
         assert_eq!([23.0, 25.0].map(|px_per_m_s| number_lines(&bins, px_per_m_s)), [2, 1]);
     }
 

@@ -1,4 +1,4 @@
-//! A flight as a recording, as a recorder beside the services would write it: what they would publish, and the
+//! Writes a flight as a recording, as a recorder next to the services would: their messages, and the
 //! controller's tape.
 
 use std::collections::BTreeMap;
@@ -19,7 +19,7 @@ use super::sim_vision::DETECTOR;
 
 /// Period of the controller's status while its phase stays, in nanoseconds.
 const STATUS_PERIOD_NS: i64 = 200_000_000;
-/// Of so many ticks one writes the vehicle's state, truth and wind.
+/// Of this number of ticks one writes the vehicle's state, truth and wind.
 const TICKS_PER_STATE: u64 = 2;
 
 /// A recording under way.
@@ -48,7 +48,7 @@ impl<'a> Recording<'a> {
         })
     }
 
-    /// What services publish when they start.
+    /// The messages of services at their start.
     pub(crate) fn started(
         &mut self,
         now_ns: i64,
@@ -89,7 +89,7 @@ impl<'a> Recording<'a> {
         self.write(now_ns, topic::FROM_AUTOPILOT, &[], &bytes)
     }
 
-    /// What is published at each tick.
+    /// The messages of each tick.
     pub(crate) fn tick(
         &mut self,
         now_ns: i64,

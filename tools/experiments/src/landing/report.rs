@@ -19,7 +19,7 @@ use crate::rows::{csv, json_lines};
 
 /// Maximum number of failures in the report; the CSV has all.
 const MAX_LISTED: usize = 50;
-/// What the report of an interrupted experiment lacks.
+/// The sentence on missing parts in the report of an interrupted experiment.
 const NOT_AGAIN: &str =
     "\nThe worst flights were not flown again for figures and recordings, as it was interrupted.\n";
 
@@ -77,7 +77,7 @@ fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
     )
 }
 
-/// The share within 0.1 m, with its interval. A seed has the same draws in all circumstances, so that its flights are not independent: over
+/// The proportion within 0.1 m, with its interval. A seed has the same draws in all circumstances, so that its flights are not independent: over
 /// several of them the interval is of the seeds of which every flight landed there, among those flown in all of them.
 fn share(outcomes: &[Outcome]) -> String {
     let cells: BTreeSet<&str> = outcomes.iter().map(|o| o.cell.as_str()).collect();

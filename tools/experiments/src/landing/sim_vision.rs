@@ -1,4 +1,4 @@
-//! From the simulated world to a detector's message: rendered frames with the real detector, or a model of
+//! Makes a detector's message from the simulated world: rendered frames with the real detector, or a model of
 //! its errors.
 
 use anyhow::Context;

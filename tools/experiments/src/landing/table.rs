@@ -1,4 +1,4 @@
-//! Summaries of many flights, as tables.
+//! Summarises many flights as tables.
 
 use node::stats::interpolated_quantile;
 

@@ -1,4 +1,4 @@
-//! The thesis' Figures 4.10 to 4.16 for one flight: trajectory, position and command per axis, wind and
+//! Draws the thesis' Figures 4.10 to 4.16 for one flight: trajectory, position and command per axis, wind and
 //! command per axis.
 
 use std::ops::Range;
@@ -55,7 +55,7 @@ fn component(vector: [f64; 3], axis: usize) -> f64 {
 /// Height of the legend above the curves, relative to theirs.
 const LEGEND_RATIO: f64 = 0.32;
 
-/// What finite values span; of none from 0 to 1. Marks along an axis without an end are never all set.
+/// The range of finite values; from 0 to 1 without any. Marks along an axis without an end are never all set.
 fn span(values: impl Iterator<Item = f64>) -> Range<f64> {
     let widened = |so_far: Option<Range<f64>>, value: f64| {
         let Range { start, end } = so_far.unwrap_or(value..value);

@@ -138,7 +138,7 @@ fn nested(radii: &[f64], first: Ink) -> Vec<Layer> {
     radii.iter().zip(inks.into_iter().cycle()).map(|(radius, ink)| disc(*radius, ink)).collect()
 }
 
-/// Discs of one radius around a middle.
+/// Discs of one radius around a centre.
 fn around(count: u32, away: f64, radius_m: f64, ink: Ink) -> impl Iterator<Item = Layer> {
     (0..count).map(move |k| {
         let (sin, cos) = (f64::from(k) * TAU / f64::from(count)).sin_cos();
@@ -146,7 +146,7 @@ fn around(count: u32, away: f64, radius_m: f64, ink: Ink) -> impl Iterator<Item 
     })
 }
 
-/// Dirt on a thing: a few spots.
+/// Dirt on an object: a few spots.
 fn dirty(rng: &mut ChaCha8Rng, layers: &mut Vec<Layer>) {
     for _ in 0..rng.random_range(1..4) {
         let centre_m = [0, 1].map(|_| rng.random_range(-0.4..0.4));

@@ -18,7 +18,7 @@ use crate::set::Set;
 /// Frames of each kind.
 const FRAMES: usize = 40;
 
-/// A name, and what makes a plain view one of the kind.
+/// A name, and the function that changes a plain view into this kind.
 type Kind = (&'static str, fn(&mut FrameSpec, &mut ChaCha8Rng));
 
 const KINDS: [Kind; 14] = [
@@ -61,7 +61,7 @@ pub(super) fn frames(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
 fn grass(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     let size_px = spec.size_px();
     let blades = (0..rng.random_range(8..20)).map(|_| {
-        // From beside the marker towards its middle.
+        // From next to the marker towards its centre.
         let round: f64 = rng.random_range(0.0..TAU);
         let out = size_px * rng.random_range(0.55..0.75);
         let centre = centre(spec);
@@ -91,14 +91,14 @@ fn dirt(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     spec.occluder = Occluder::Several(vec![dust, clods]);
 }
 
-/// Snow that melts, on the marker and beside it.
+/// Snow that melts, on the marker and next to it.
 fn snow(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     let patches = discs(spec, rng, 4..12, 0.7, 0.04..0.13);
     let levels = rng.random_range(200.0..250.0);
     spec.occluder = Occluder::Patches { patches, edge_px: 3.0, transmission: 0.0, levels };
 }
 
-/// A rope or cable across, with the shadow beside it.
+/// A rope or cable across, with the shadow next to it.
 fn rope(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     const PARTS: usize = 8;
     let size_px = spec.size_px();
@@ -201,7 +201,7 @@ fn glass(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
             transmission: rng.random_range(0.6..0.85),
             levels: rng.random_range(15.0..60.0),
         },
-        // The edge of something that the pane reflects.
+        // The edge of an object that the pane reflects.
         Occluder::Shadow { edge, penumbra_px: 3.0, transmission: rng.random_range(0.6..0.9) },
         Occluder::Glare {
             centre: on_marker(spec, rng, 0.5),
@@ -243,7 +243,7 @@ fn low_sun(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     let shadows = (0..rng.random_range(1..4)).map(|_| {
         let at = on_marker(spec, rng, 0.5);
         let wide_px = size_px * rng.random_range(0.03..0.12);
-        // A shadow is a band: what is beyond its second edge is lit again.
+        // A shadow is a band: the ground beyond its second edge is lit again.
         let edge = |side: f64| Line {
             through: Pixel::new(
                 at.x + side * wide_px * along.cos(),
@@ -260,7 +260,7 @@ fn low_sun(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     spec.occluder = Occluder::Several(shadows.collect());
 }
 
-/// Night, and a landing light beside the camera.
+/// Night, and a landing light next to the camera.
 fn night(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     let light = rng.random_range(0.004..0.02);
     spec.settings = spec.settings.clone().exposed_for(light, rng.random_range(150.0..230.0), 0.008);

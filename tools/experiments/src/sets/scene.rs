@@ -1,4 +1,4 @@
-//! What the sets share: random generators, positions and views.
+//! Helpers for all sets: random generators, positions and views.
 
 use std::f64::consts::TAU;
 use std::ops::Range;

@@ -1,4 +1,4 @@
-//! Light and cover as they are outdoors: edges of hard shadows of any contrast, dappled shade, leaves.
+//! Frames with light and cover as they are outdoors: edges of hard shadows of any contrast, dappled shade, leaves.
 
 use std::f64::consts::TAU;
 use std::ops::Range;
@@ -57,7 +57,7 @@ pub(super) fn frames(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     frames
 }
 
-/// The edge of a shadow through the middle parts of the marker, with a penumbra of so many pixels.
+/// The edge of a shadow through the central parts of the marker, with a penumbra of so many pixels.
 fn edge(
     spec: &FrameSpec,
     rng: &mut ChaCha8Rng,

@@ -14,12 +14,12 @@ const OLD_MS: u32 = 60_000;
 
 /// The state of an autopilot with false values.
 #[derive(Clone, Debug, Default)]
-pub struct Lies {
+pub struct Falsifier {
     frozen: Option<LOCAL_POSITION_NED_DATA>,
     old_time_is_sent: bool,
 }
 
-impl Lies {
+impl Falsifier {
     /// The bytes in place of a packet; `None` when it is withheld. `is_active` gives the faults of this time.
     pub fn apply(&mut self, packet: &Packet, is_active: impl Fn(Kind) -> bool) -> Option<Vec<u8>> {
         if !is_active(Kind::PositionFrozen) {
@@ -108,9 +108,13 @@ mod tests {
 
     const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
 
-    fn falsified(lies: &mut Lies, kind: Kind, message: &MavMessage) -> Option<MavMessage> {
+    fn falsified(
+        falsifier: &mut Falsifier,
+        kind: Kind,
+        message: &MavMessage,
+    ) -> Option<MavMessage> {
         let packet = Parser::new().push(&encode(AUTOPILOT, 7, message)).remove(0);
-        let raw = lies.apply(&packet, |asked| asked == kind)?;
+        let raw = falsifier.apply(&packet, |asked| asked == kind)?;
         let packet = Parser::new().push(&raw).remove(0);
         assert_eq!((packet.sender, packet.sequence), (AUTOPILOT, 7));
         packet.message
@@ -118,7 +122,7 @@ mod tests {
 
     #[test]
     fn each_fault_changes_its_message_only() {
-        let mut lies = Lies::default();
+        let mut falsifier = Falsifier::default();
         let position = |time_boot_ms, x| {
             MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
                 time_boot_ms,
@@ -128,23 +132,23 @@ mod tests {
         };
         let state = MavMessage::EXTENDED_SYS_STATE(EXTENDED_SYS_STATE_DATA::default());
         let heartbeat = MavMessage::HEARTBEAT(HEARTBEAT_DATA::default());
-        assert_eq!(falsified(&mut lies, Kind::HeartbeatMissing, &heartbeat), None);
-        assert_eq!(falsified(&mut lies, Kind::HeartbeatMissing, &state), Some(state.clone()));
-        assert_ne!(falsified(&mut lies, Kind::LandedOnGround, &state), Some(state));
+        assert_eq!(falsified(&mut falsifier, Kind::HeartbeatMissing, &heartbeat), None);
+        assert_eq!(falsified(&mut falsifier, Kind::HeartbeatMissing, &state), Some(state.clone()));
+        assert_ne!(falsified(&mut falsifier, Kind::LandedOnGround, &state), Some(state));
         assert_eq!(
-            falsified(&mut lies, Kind::PositionFrozen, &position(90_000, 1.0)),
+            falsified(&mut falsifier, Kind::PositionFrozen, &position(90_000, 1.0)),
             Some(position(90_000, 1.0))
         );
         assert_eq!(
-            falsified(&mut lies, Kind::PositionFrozen, &position(90_020, 2.0)),
+            falsified(&mut falsifier, Kind::PositionFrozen, &position(90_020, 2.0)),
             Some(position(90_020, 1.0))
         );
         assert_eq!(
-            falsified(&mut lies, Kind::OldBootTime, &position(90_040, 3.0)),
+            falsified(&mut falsifier, Kind::OldBootTime, &position(90_040, 3.0)),
             Some(position(30_040, 3.0))
         );
         assert_eq!(
-            falsified(&mut lies, Kind::OldBootTime, &position(90_060, 3.0)),
+            falsified(&mut falsifier, Kind::OldBootTime, &position(90_060, 3.0)),
             Some(position(90_060, 3.0))
         );
     }
