@@ -325,10 +325,18 @@ fn touchdowns(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
             .label(format!("{radius} m"))
             .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour));
     }
-    chart.draw_series(places.iter().map(|(east, north, is_unsafe)| {
-        let colour = if *is_unsafe { COLOURS[1] } else { COLOURS[0] };
-        Circle::new((*east, *north), 4, colour.mix(0.5).filled())
-    }))?;
+    let dots = |is_unsafe: bool, colour: RGBColor| {
+        let shown = places.iter().filter(move |place| place.2 == is_unsafe);
+        shown.map(move |(east, north, _)| Circle::new((*east, *north), 4, colour.mix(0.5).filled()))
+    };
+    chart.draw_series(dots(false, COLOURS[0]))?;
+    // Without such flights the legend has no entry for them.
+    if places.iter().any(|place| place.2) {
+        chart
+            .draw_series(dots(true, COLOURS[1]))?
+            .label("unsafe")
+            .legend(|(x, y)| Circle::new((x + 8, y), 4, COLOURS[1].mix(0.5).filled()));
+    }
     legend(&mut chart, SeriesLabelPosition::UpperRight)
 }
 
