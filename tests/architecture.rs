@@ -64,7 +64,7 @@ const ROOMS: [&str; 14] = [
 const TRUTH: [&str; 2] = ["rendering", "world"];
 /// The crates on which only tests may depend.
 const TESTING: &str = "testing";
-/// The tests of the whole system.
+/// The tests of the complete system.
 const TESTS: &str = "tests";
 /// The fuzz targets: they call all parsers of external data.
 const FUZZ: &str = "fuzz";
@@ -244,8 +244,8 @@ fn package<'a>(workspace: &'a [Package], name: &str) -> anyhow::Result<&'a Packa
 
 /// The code in a file: without comments, and without the tests at its end.
 fn code(path: &Path) -> anyhow::Result<String> {
-    let whole = text(path)?;
-    let (code, tests) = whole.split_once("\n#[cfg(test)]\nmod ").unwrap_or((&whole, ""));
+    let source = text(path)?;
+    let (code, tests) = source.split_once("\n#[cfg(test)]\nmod ").unwrap_or((&source, ""));
     // The module's end is the first brace at the beginning of a line.
     let after = tests.split_once("\n}\n").map_or("", |(_, after)| after);
     ensure!(after.trim().is_empty(), "{path:?}: code after the tests, which come last");
@@ -539,7 +539,7 @@ fn a_topic_is_published_by_the_services_that_its_row_names() -> anyhow::Result<(
             |row: &&messages::Row| row.key == *key && (row.message == "CommandReply") == replies;
         let row = TOPICS.iter().find(of_row).with_context(|| format!("a row of {name}"))?;
         let stated: BTreeSet<_> = row.publishers.iter().copied().collect();
-        ensure!(stated == *found, "{key} is published by {found:?}, its row says {stated:?}");
+        ensure!(stated == *found, "{key} is published by {found:?}, its row states {stated:?}");
     }
     ensure!(publishers.len() == TOPICS.len(), "rows without a publisher: only {publishers:#?}");
     Ok(())
@@ -573,7 +573,7 @@ fn a_topic_is_subscribed_to_by_the_services_that_its_row_names() -> anyhow::Resu
         }
         found.retain(|service| !MONITORS.contains(service));
         let stated: BTreeSet<_> = row.subscribers.iter().copied().collect();
-        ensure!(stated == found, "{key} is subscribed to by {found:?}, its row says {stated:?}");
+        ensure!(stated == found, "{key} is subscribed to by {found:?}, its row states {stated:?}");
         rows += usize::from(!found.is_empty());
     }
     ensure!(rows > 10, "only {rows} topics have subscribers");
@@ -662,8 +662,8 @@ fn documents_name_only_existing_items() -> anyhow::Result<()> {
                 }
                 continue;
             }
-            let beside = root().join(&document).with_file_name(path);
-            let file = if beside.exists() { beside } else { root().join(path) };
+            let next_to_it = root().join(&document).with_file_name(path);
+            let file = if next_to_it.exists() { next_to_it } else { root().join(path) };
             if !file.exists() && !is_topic(path) && !EXAMPLES.contains(&path) {
                 wrong.push(format!("{document}: there is no `{path}`"));
             } else if let Some(name) = name {

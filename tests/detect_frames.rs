@@ -241,7 +241,7 @@ fn centre_and_range_are_right_at_four_by_four_binning() {
 
 // ---- Files that are no images
 
-/// A PNG file of one chunk of pixels, which need not be as many as the header says.
+/// A PNG file of one chunk of pixels, which need not be as many as in the header.
 fn png(width: u32, height: u32, pixels: &[u8]) -> Vec<u8> {
     let mut bytes = b"\x89PNG\r\n\x1a\n".to_vec();
     let mut chunk = |name: &[u8; 4], body: &[u8]| {
@@ -283,9 +283,9 @@ fn files_that_are_no_images_are_named_and_the_rest_is_looked_at() {
     let folder = folder.path();
     let write = |name: &str, bytes: &[u8]| std::fs::write(folder.join(name), bytes).unwrap();
     let jpeg = photo_of_the_marker(folder, "a.jpg");
-    let whole = photo_of_the_marker(folder, "z.png");
+    let complete = photo_of_the_marker(folder, "z.png");
     write("cut.jpg", &jpeg[..jpeg.len() / 2]);
-    write("cut.png", &whole[..whole.len() / 2]);
+    write("cut.png", &complete[..complete.len() / 2]);
     write("empty.png", b"");
     write("text.png", b"Dear detector,\nthere is no picture here.\n");
     write("claims-much.png", &png(65_535, 65_535, &[]));

@@ -227,7 +227,7 @@ impl Flight {
         Ok((noticed_s, well_s))
     }
 
-    /// The end: on the ground, at rest, on the pad.
+    /// The end: on the ground, stationary, on the pad.
     async fn lands(&mut self) -> anyhow::Result<Truth> {
         let landed = |truth: &Option<Truth>| {
             truth.as_ref().is_some_and(|truth| truth.touchdown.is_some() && truth.on_ground)

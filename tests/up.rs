@@ -509,7 +509,7 @@ impl WebServer {
 impl Drop for WebServer {
     fn drop(&mut self) {
         self.ends.store(true, Ordering::Relaxed);
-        // It looks at the next connection.
+        // It accepts the next connection.
         drop(TcpStream::connect(("127.0.0.1", self.port)));
         drop(self.thread.take().map(JoinHandle::join));
     }

@@ -151,7 +151,7 @@ def lose_answer(page):
 
 
 def refuse_a_third(browser):
-    """Opens more pages than `max_clients` allows: the last one says so."""
+    """Opens more pages than `max_clients` allows: the last one shows it."""
     second, third = browser.new_page(), browser.new_page()
     second.goto(URL)
     wait(second, CONNECTED)

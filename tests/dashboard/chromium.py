@@ -1,4 +1,4 @@
-"""Chromium, and Playwright to drive it. Where one of them is missing, a script that imports this says so and ends with status 77."""
+"""Finds Chromium, and Playwright to drive it. If one of them is missing, a script that imports this prints it and ends with status 77."""
 
 import shutil
 import sys

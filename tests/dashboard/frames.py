@@ -58,8 +58,8 @@ READ = """([frames, withOverlay]) => {
   };
   /** How far a pixel is from grey: towards green as the overlay of the detector in use is, or towards yellow as another one's. */
   const coloured = (data, at) => Math.max(data[at], data[at + 1]) - data[at + 2] > 40 ? data[at + 1] - data[at + 2] : 0;
-  /** The middle of the coloured pixels on a line through (x, y), from 7 pixels before to 7 behind; null where there are none. */
-  const middle = (image, x, y, [dx, dy]) => {
+  /** The centre of the coloured pixels on a line through (x, y), from 7 pixels before to 7 behind; null where there are none. */
+  const centre = (image, x, y, [dx, dy]) => {
     let [sum, weighted] = [0, 0];
     for (let step = -7; step <= 7; step += 1) {
       const weight = coloured(image.data, ((y + step * dy) * image.width + x + step * dx) * 4);
@@ -75,8 +75,8 @@ READ = """([frames, withOverlay]) => {
     const found = [0, 40].map((shift) => {
       const left = x + shift;
       const offsets = [
-        middle(image, left, y + 20, [1, 0]), middle(image, left + 20, y, [0, 1]),
-        middle(image, left + size, y + 20, [1, 0]), middle(image, left + 20, y + size, [0, 1]),
+        centre(image, left, y + 20, [1, 0]), centre(image, left + 20, y, [0, 1]),
+        centre(image, left + size, y + 20, [1, 0]), centre(image, left + 20, y + size, [0, 1]),
       ];
       // The line lies on the boundary of two pixels.
       return offsets.includes(null) ? null : Math.max(...offsets.map((it) => Math.abs(it + 0.5)));

@@ -92,7 +92,7 @@ pub(crate) struct Landing {
     pub(crate) by_hand: Vec<Child>,
 }
 
-/// A simulated vehicle of its own, in a network of its own, which flies on when the landing that leads it is killed.
+/// A separate simulated vehicle, in a separate network, which flies on when the landing that leads it is killed.
 pub(crate) struct Vehicle {
     _simulator: Simulator,
     truths: Subscriber<Truth>,
@@ -163,11 +163,11 @@ pub(crate) struct Service {
 
 impl Landing {
     pub(crate) async fn start(args: &[&str]) -> anyhow::Result<Self> {
-        let patience: &[&str] =
+        let options: &[&str] =
             if args.contains(&"--timeout-s") { &[] } else { &["--timeout-s", "110"] };
         let mut land = Command::new(ALIGHT)
             .args(["land", "--format", "json"])
-            .args(patience)
+            .args(options)
             // A ground station of the machine's own must not join the flight.
             .args(["--set", "gcs-bridge.ground=udpout:127.0.0.1:9"])
             .args(SMALL_CAMERA.iter().flat_map(|key| ["--set".into(), format!("simulator.{key}")]))

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""A ground station that looks for the vehicle's camera as QGroundControl does, over a link that loses packets.
+"""A ground station that searches for the vehicle's camera as QGroundControl does, over a link that loses packets.
 
 After the camera's heartbeat it asks for CAMERA_INFORMATION, at most ten times, now with MAV_CMD_REQUEST_MESSAGE and now
 with MAV_CMD_REQUEST_CAMERA_INFORMATION, and waits 2^(n/2) seconds each time; then for settings, video stream, capture

@@ -10,8 +10,8 @@ import random
 class Losses:
     """A fraction of the packets of every kind, chosen by a seed."""
 
-    def __init__(self, share, seed):
-        self.share = share
+    def __init__(self, fraction, seed):
+        self.fraction = fraction
         self.seed = seed
         self.sent = collections.Counter()
 
@@ -19,4 +19,4 @@ class Losses:
         """Whether the next packet with these contents is lost."""
         said = repr(packet)
         self.sent[said] += 1
-        return random.Random(f"{self.seed} {said} {self.sent[said]}").random() < self.share
+        return random.Random(f"{self.seed} {said} {self.sent[said]}").random() < self.fraction

@@ -53,7 +53,7 @@ class Station:
             if message is None:
                 return None
             if message.get_type().startswith("UNKNOWN"):
-                continue  # pymavlink looks at no signature of a message that its dialect does not have.
+                continue  # pymavlink checks no signature of a message that its dialect does not have.
             if message.get_type() == "BAD_DATA" or not message.get_signed():
                 self.unsigned += 1
                 continue

@@ -62,7 +62,7 @@ impl Times {
     }
 }
 
-/// Times that a task goes on to take.
+/// Times that a task continues to measure.
 pub(crate) type Shared = Arc<Mutex<Times>>;
 
 pub(crate) fn taken(times: &Shared) -> Times {

@@ -23,7 +23,7 @@ import sys
 import references
 from references import cv2, np
 
-# Half an edge's profile and its step, and where profiles lie along the edge; in cells.
+# Half an edge's profile and its step, and the positions of profiles along the edge; in cells.
 REACH, STEP, ALONG = 0.5, 0.05, (0.35, 0.5, 0.65)
 # Of intensities, between the two sides of an edge.
 MIN_CONTRAST = 25.0

@@ -55,7 +55,7 @@ LABELS = {
     "aruco_6x6_1000": "aruco-6x6-1000",
     "stag_hd21": "stag-hd21",
 }
-# As Alight reads them: where a file says by Exif that it is to be turned, as it is stored.
+# As Alight reads them: as they are stored, without the rotation in Exif data.
 AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 # Sets whose times are compared, and how often their frames are searched.
 TIMED, TIMED_RUNS = ("textured", "tracking"), 5

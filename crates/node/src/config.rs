@@ -20,7 +20,7 @@ pub trait Settings: Sized {
     /// The TOML file with the defaults of all keys.
     const DEFAULTS: &'static str;
 
-    /// The values of a table with every key: `table.try_into()`. Each service says so itself, so that reading its configuration is
+    /// The values of a table with every key: `table.try_into()`. Each service implements this, so that reading its configuration is
     /// compiled in its crate, and not again in every crate that loads it.
     ///
     /// # Errors
@@ -156,8 +156,10 @@ impl ConfigError {
         match self {
             Self::UnknownKey { source_name, key, hint } if hint.is_empty() => {
                 let is_meant = |path: &[&str]| {
-                    let whole = path.join(".");
-                    whole.strip_prefix(&key).is_some_and(|it| it.is_empty() || it.starts_with('.'))
+                    let full_key = path.join(".");
+                    full_key
+                        .strip_prefix(&key)
+                        .is_some_and(|it| it.is_empty() || it.starts_with('.'))
                 };
                 let set = single_values(layer).into_iter().map(|(path, _)| path);
                 let name = set.filter(|path| is_meant(path)).find_map(|path| path.last().copied());
@@ -499,7 +501,7 @@ pub struct Check<'a> {
 }
 
 impl Check<'_> {
-    /// The number `key` must lie within `range`.
+    /// The number `key` must be within `range`.
     pub fn range<N: PartialOrd + Display>(
         &mut self,
         key: &str,

@@ -334,7 +334,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_connection_to_itself_has_no_answer() {
-        // With its own port as the one that it wants, the system connects a socket to itself.
+        // If the local port is the destination port, the system connects a socket to itself.
         let socket = tokio::net::TcpSocket::new_v4().unwrap();
         socket.bind(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
         let address = socket.local_addr().unwrap();

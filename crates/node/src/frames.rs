@@ -28,7 +28,7 @@ use crate::session::Node;
 use crate::topics::{SampleMailbox, is_closed, report_refused};
 
 /// Capacity of the shared memory pool, in frames: one being written, one in flight, and one each for two slow
-/// readers. Small, because every subscriber keeps the whole pool mapped and locked.
+/// readers. Small, because every subscriber keeps the complete pool mapped and locked.
 const FRAMES_IN_POOL: usize = 4;
 
 /// A pool that is exhausted for this time is replaced: a reader that was killed never returns its frames.
@@ -280,7 +280,7 @@ impl DerefMut for Loan {
 }
 
 impl Frame {
-    /// The payload's bytes, where they lie.
+    /// The payload's bytes, without a copy.
     pub fn bytes(&self) -> Cow<'_, [u8]> {
         self.payload.to_bytes()
     }

@@ -9,7 +9,7 @@ const MIN_BYTES: u64 = 2 << 20;
 /// The system's folder of shared memory.
 const FOLDER: &str = "/dev/shm";
 
-/// Why this process cannot share memory, if it cannot. Its memlock limit is raised as far as it may.
+/// The reason why this process cannot share memory, if it cannot. Its memlock limit is raised as far as it may.
 pub(crate) fn lack_of_shared_memory() -> Option<String> {
     let Rlimit { maximum, .. } = getrlimit(Resource::Memlock);
     // If this is refused, the limit does not change.

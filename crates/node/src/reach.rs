@@ -1,4 +1,4 @@
-//! Explains to a tool why it sees no process of the vehicle, by TCP and TLS connections of its own: a name or address unknown,
+//! Explains to a tool why it sees no process of the vehicle, by separate TCP and TLS connections: a name or address unknown,
 //! no program listening, its key refused. Zenoh retries an address for ever without a log message, and a relay sends nothing to a
 //! client that it rejects.
 
@@ -119,7 +119,7 @@ impl Reach {
         }
         if let Some(port) = self.meet {
             reasons.push(format!(
-                "no process of the vehicle `{}` meets at port {port} of this machine: `alight land` says at which port its own do (`--meet`, \
+                "no process of the vehicle `{}` meets at port {port} of this machine: `alight land` prints the port of its processes (`--meet`, \
                  ALIGHT_MEET) and of which vehicle (`--vehicle`, ALIGHT_VEHICLE); for `alight up` the site says it",
                 self.vehicle
             ));
@@ -236,8 +236,8 @@ fn greet(mut stream: TcpStream, host: &str, keys: &Keys) -> Finding {
     };
     let begun = Instant::now();
     let outcome = shake(&mut connection, &mut stream, begun + PATIENCE).and_then(|()| {
-        let patience = (2 * begun.elapsed()).clamp(MIN_REFUSAL, PATIENCE);
-        is_taken(&mut connection, &mut stream, Instant::now() + patience)
+        let time_limit = (2 * begun.elapsed()).clamp(MIN_REFUSAL, PATIENCE);
+        is_taken(&mut connection, &mut stream, Instant::now() + time_limit)
     });
     match outcome {
         Ok(()) => Finding::Accepted,

@@ -47,7 +47,7 @@ const CLAIM_CHECK_DELAYS: [Duration; 3] =
 
 /// Period of a service's configuration.
 const CONFIGURATION_PERIOD: Duration = Duration::from_secs(3);
-/// Period in which a service that will publish it looks whether it is announced.
+/// Period in which a service that will publish it checks whether it is announced.
 const ANNOUNCED_PERIOD: Duration = Duration::from_millis(100);
 
 /// Timeout for closing the session.

@@ -159,10 +159,11 @@ impl Shared {
 }
 
 impl Tap {
-    /// The next message; `None` when there is none within `patience`.
-    pub fn next(&self, patience: Duration) -> Option<Tapped> {
+    /// The next message; `None` when there is none within `time_limit`.
+    pub fn next(&self, time_limit: Duration) -> Option<Tapped> {
         let is_empty = |queue: &mut Queue| queue.messages.is_empty();
-        let waited = self.shared.arrived.wait_timeout_while(self.shared.lock(), patience, is_empty);
+        let waited =
+            self.shared.arrived.wait_timeout_while(self.shared.lock(), time_limit, is_empty);
         let (mut queue, _timeout) = waited.unwrap_or_else(PoisonError::into_inner);
         let message = queue.messages.pop_front()?;
         queue.bytes = queue.bytes.saturating_sub(message.bytes());

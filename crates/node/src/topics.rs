@@ -75,7 +75,7 @@ pub struct Subscriber<M> {
 pub struct Request<M> {
     /// The command.
     pub message: M,
-    /// When it was sent, in nanoseconds of this recipient's clock; `None` from a requester that has not asked for it.
+    /// When it was sent, in nanoseconds of this recipient's clock; `None` from a requester that has not requested this time.
     pub sent_ns: Option<i64>,
     /// The sender's name as it stated it, for a log.
     pub sender: String,
@@ -264,11 +264,11 @@ impl Node {
     }
 
     /// Sends a command on a topic's key and waits for its reply. A new session may not be connected to the
-    /// recipient yet, so it is asked for its time until it answers; the command itself is sent once, and is refused
+    /// recipient yet, so its time is requested until it answers; the command itself is sent once, and is refused
     /// when it arrives after this requester has given up.
     ///
     /// # Errors
-    /// When there is no reply in time: says whether the command was sent.
+    /// When there is no reply in time: states whether the command was sent.
     pub async fn command<M: Message>(
         &self,
         topic: Topic<M>,
@@ -324,12 +324,12 @@ impl Node {
         key: &str,
         payload: &[u8],
         attachment: &[u8],
-        patience: Duration,
+        time_limit: Duration,
     ) -> anyhow::Result<Option<Reply>> {
         let replies = with_query_qos(self.session.get(key))
             .payload(payload)
             .attachment(attachment)
-            .timeout(patience)
+            .timeout(time_limit)
             .await
             .map_err(|cause| anyhow!("sending a command on {key}: {cause}"))?;
         while let Ok(reply) = replies.recv_async().await {

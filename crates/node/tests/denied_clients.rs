@@ -32,7 +32,7 @@ const PAUSE: Duration = Duration::from_millis(100);
 
 /// A peer's session opens without a connection.
 const PEER: &str = "peer";
-/// A client sends to the relay whatever it knows of subscribers; the relay announces the subscribers on the drone to no
+/// A client sends to the relay with or without known subscribers; the relay announces the subscribers on the drone to no
 /// client without rights.
 const CLIENT: &str = "client";
 

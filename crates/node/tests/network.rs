@@ -110,7 +110,7 @@ async fn the_others_still_meet_after_the_first_process_is_gone() -> anyhow::Resu
     let presence = second.presence("controller").await?;
     second.announce().await?;
     first.close().await;
-    // The third knows only the rendezvous, and must find the second.
+    // The third has only the address of the rendezvous, and must find the second.
     let third = open("controller", "main", port).await?;
     third.announce().await?;
     let arrived = timeout(PATIENCE, presence.next()).await?;
@@ -178,7 +178,7 @@ async fn of_two_that_start_at_once_one_has_priority() -> anyhow::Result<()> {
             .collect();
         assert_eq!(refusals.len(), 1, "{first} and {second}: {refusals:?}");
         let left = until(async || host.alive("controller", "*").await, |left| !left.is_empty());
-        let left = left.await.context("the one that goes on")?;
+        let left = left.await.context("the one that continues")?;
         assert_eq!(left.len(), 1, "{left:?}");
         both.0.0.close().await;
         both.1.0.close().await;

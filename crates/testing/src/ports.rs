@@ -8,7 +8,7 @@ use anyhow::Context;
 /// Ports that neither Linux gives to a process that requests any port, nor `alight land` to its processes, so free ones stay free.
 const FIRST: u32 = 20_000;
 const COUNT: u32 = 6_000;
-/// The most neighbouring ports that are asked for.
+/// The maximum number of neighbouring ports that are requested.
 const MAX_ROW: u32 = 3;
 /// No port is chosen twice by one process, and processes begin at different ones.
 static CHOSEN: AtomicU32 = AtomicU32::new(0);

@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 ///
 /// They are not part of the repository but lie next to it, in `../shared/data`; `None`, and a skip, where they do not.
 pub fn recording(path: &str) -> Option<PathBuf> {
-    let whole = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data").join(path);
-    if !whole.exists() {
+    let full = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data").join(path);
+    if !full.exists() {
         crate::skip("recordings", format_args!("there is no ../shared/data/{path}"));
         return None;
     }
-    Some(whole)
+    Some(full)
 }

@@ -14,7 +14,7 @@ const PERIOD: Duration = Duration::from_millis(20);
 /// It does not hold within the timeout; the error names the `condition`.
 pub async fn until(
     condition: &str,
-    patience: Duration,
+    time_limit: Duration,
     mut holds: impl AsyncFnMut() -> bool,
 ) -> anyhow::Result<()> {
     let asked = async {
@@ -22,7 +22,9 @@ pub async fn until(
             sleep(PERIOD).await;
         }
     };
-    timeout(patience, asked).await.with_context(|| format!("waited {patience:?} until {condition}"))
+    timeout(time_limit, asked)
+        .await
+        .with_context(|| format!("waited {time_limit:?} until {condition}"))
 }
 
 #[cfg(test)]

@@ -274,7 +274,7 @@ fn flights(seed: u64, number: u64, wanted: [&str; 2]) -> anyhow::Result<()> {
     ] {
         for way in ways().filter(|_| is_wanted(name)) {
             let mut set: Vec<String> = set.iter().map(|setting| (*setting).to_owned()).collect();
-            // The camera that is flown by default: one without a tone curve sees no pad half of which is three stops darker.
+            // The camera that is flown by default: one without a tone curve resolves no pad of which half is three stops darker.
             set.push("simulator.camera.processing=usb".to_owned());
             set.push("simulator.occluder.at_s=0".to_owned());
             set.push(format!("simulator.camera.exposure={way}"));

@@ -130,14 +130,14 @@ pub fn markdown(rows: &[Row]) -> String {
         |---|---|---|---|---|---|---|---|---|---|\n"
         .to_owned();
     for row in rows {
-        let beside = match &row.with {
+        let others = match &row.with {
             None => "the other markers".to_owned(),
             Some(other) => format!("{OURS} and {other}"),
         };
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
-            "| {} | {} | {} | {beside} | {}/{} | {} | {} | {} | {} | {} |",
+            "| {} | {} | {} | {others} | {}/{} | {} | {} | {} | {} | {} |",
             row.set,
             row.detector,
             row.family,

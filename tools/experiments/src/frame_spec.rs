@@ -204,9 +204,9 @@ fn between(
     let along = part.clamp(0.0, 1.0) * path.len().saturating_sub(1) as f64;
     let index = (along.floor() as usize).min(path.len().saturating_sub(2));
     let (from, to) = (path.get(index)?, path.get(index + 1).or(path.get(index))?);
-    let share = along - index as f64;
-    let origin = from.origin() + (to.origin() - from.origin()) * share;
-    Some(Transform::new(from.rotation().interpolate(&to.rotation(), share), origin))
+    let fraction = along - index as f64;
+    let origin = from.origin() + (to.origin() - from.origin()) * fraction;
+    Some(Transform::new(from.rotation().interpolate(&to.rotation(), fraction), origin))
 }
 
 /// Pictures of a video before the frame: a key frame, and one that is predicted from it, as the frame is from that.
@@ -301,15 +301,15 @@ impl FrameRenderer {
 fn sensor(frame: &CameraSettings, binned: u32) -> CameraSettings {
     let n = f64::from(binned);
     let CameraModel { width, height, fx, fy, cx, cy, distortion } = frame.model;
-    let middle = |at: f64| n * at + (n - 1.0) / 2.0;
+    let centre = |at: f64| n * at + (n - 1.0) / 2.0;
     CameraSettings {
         model: CameraModel {
             width: binned * width,
             height: binned * height,
             fx: n * fx,
             fy: n * fy,
-            cx: middle(cx),
-            cy: middle(cy),
+            cx: centre(cx),
+            cy: centre(cy),
             distortion,
         },
         electrons_per_s: frame.electrons_per_s / (n * n),

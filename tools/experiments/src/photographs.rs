@@ -232,7 +232,7 @@ pub fn families_for_negatives() -> [(&'static str, Vec<Family>); 2] {
 /// The number of images, and the false detections by image.
 pub type Negatives = (usize, Vec<(String, Vec<Found>)>);
 
-/// False detections in the photographs without a marker: the whole image, its quarters and its ninths, each
+/// False detections in the photographs without a marker: the complete image, its quarters and its ninths, each
 /// at full resolution.
 ///
 /// # Errors
@@ -242,8 +242,8 @@ pub fn negatives(folder: &Path, families: &[Family]) -> anyhow::Result<Negatives
     let mut detector = Detector::new(&markers, Settings::default())?;
     let (mut images, mut wrong) = (0, Vec::new());
     for photograph in photographs(folder)?.iter().filter(|photograph| photograph.negative) {
-        let whole = record::read(&folder.join(&photograph.image))?;
-        for (name, part) in parts(&whole) {
+        let complete = record::read(&folder.join(&photograph.image))?;
+        for (name, part) in parts(&complete) {
             let (_, found) = record::answer(&mut detector, &part, None, 1)?;
             images += 1;
             if !found.is_empty() {
@@ -255,12 +255,12 @@ pub fn negatives(folder: &Path, families: &[Family]) -> anyhow::Result<Negatives
 }
 
 /// The complete image, its quarters and its ninths, with suffixes for its name.
-fn parts(whole: &GrayImage) -> Vec<(String, GrayImage)> {
-    let mut parts = vec![(String::new(), whole.clone())];
+fn parts(complete: &GrayImage) -> Vec<(String, GrayImage)> {
+    let mut parts = vec![(String::new(), complete.clone())];
     for count in [2, 3] {
-        let (width, height) = (whole.width() / count, whole.height() / count);
+        let (width, height) = (complete.width() / count, complete.height() / count);
         for (x, y) in (0..count).flat_map(|x| (0..count).map(move |y| (x, y))) {
-            let part = image::imageops::crop_imm(whole, x * width, y * height, width, height);
+            let part = image::imageops::crop_imm(complete, x * width, y * height, width, height);
             parts
                 .push((format!(" {width}x{height}+{}+{}", x * width, y * height), part.to_image()));
         }

@@ -39,7 +39,7 @@ pub enum BendForm {
     Curl,
     /// Folded at its centre.
     Fold,
-    /// In waves, as cloth lies.
+    /// In waves, as cloth has.
     Waves,
 }
 
@@ -166,9 +166,9 @@ mod tests {
         // The marker's edge is a dot's.
         assert!((crate::set::SIZE_M / dot_m - 40.0).abs() < 1e-9 && half_m >= sharp.half_extent_m);
         assert!((0.5 * crate::set::SIZE_M / dot_m + 0.5 * count as f64).fract().abs() < 1e-9);
-        let middle = |index: usize| -half_m + (index as f64 + 0.5) * dot_m;
+        let centre = |index: usize| -half_m + (index as f64 + 0.5) * dot_m;
         for index in 0..count * count {
-            let (x, y) = (middle(index % count), middle(index / count));
+            let (x, y) = (centre(index % count), centre(index / count));
             assert_eq!(dotted.drawing.ink_at(x, y), sharp.ink_at(x, y), "{x} {y}");
         }
     }

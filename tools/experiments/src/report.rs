@@ -233,8 +233,8 @@ pub fn by_processing(rows: &[OfProcessing<'_>]) -> String {
 }
 
 /// How many of how many, with the interval of the proportion.
-fn share(found: usize, of: usize) -> String {
-    let [low, high] = share_interval(found, of).map(|share| 100.0 * share);
+fn with_interval(found: usize, of: usize) -> String {
+    let [low, high] = share_interval(found, of).map(|bound| 100.0 * bound);
     format!("{found}/{of} ({low:.0} to {high:.0} %)")
 }
 
@@ -259,7 +259,7 @@ fn append_summary(text: &mut String, runs: &[Run]) {
     for run in runs {
         let s = Score::new(&run.answers).summary();
         let found = if run.set.has_marker() {
-            share(s.found, s.frames)
+            with_interval(s.found, s.frames)
         } else {
             // There is none to find.
             format!("none in {}", s.frames)
@@ -497,8 +497,8 @@ mod tests {
 
     #[test]
     fn a_count_of_found_markers_has_its_interval() {
-        assert_eq!(share(3, 8), "3/8 (14 to 69 %)");
-        assert_eq!(share(370, 370), "370/370 (99 to 100 %)");
+        assert_eq!(with_interval(3, 8), "3/8 (14 to 69 %)");
+        assert_eq!(with_interval(370, 370), "370/370 (99 to 100 %)");
     }
 
     #[test]

@@ -26,7 +26,7 @@ pub const COMPARISON_HEADING: &str = "# Two runs of landings\n";
 pub const COMPARISON_AS_JSON: &str = "comparison.json";
 /// Its plot.
 pub const COMPARISON_PLOT: &str = "comparison.svg";
-/// The paragraph of a report that says by which command and version it was made; nothing for an experiment without a command.
+/// The paragraph of a report with the command and version that made it; nothing for an experiment without a command.
 pub fn origin(command: &str) -> String {
     match command {
         "" => String::new(),

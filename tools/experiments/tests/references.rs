@@ -65,7 +65,7 @@ fn reference_detectors_take_the_sets_that_are_there() {
     }
 }
 
-/// A JPEG whose Exif says that it is to be turned by a quarter.
+/// A JPEG whose Exif data request a quarter turn.
 fn turned(pixels: &image::GrayImage) -> image::ImageResult<Vec<u8>> {
     let mut file = Vec::new();
     image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 95).encode_image(pixels)?;

@@ -50,7 +50,7 @@ impl Authority {
     }
 }
 
-/// Adds a line to the list of holders beside the relay's key.
+/// Adds a line to the list of holders next to the relay's key.
 pub(crate) fn list(folder: &Path, line: &str) -> anyhow::Result<()> {
     let mut list = OpenOptions::new().create(true).append(true).open(folder.join(HOLDERS))?;
     writeln!(list, "{line}")?;

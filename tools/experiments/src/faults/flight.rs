@@ -1,5 +1,5 @@
 //! Flies one flight with faults in lock-step: world, vision and controller as functions, with connections between
-//! them that fail. It continues until the vehicle is at rest, also without a controller.
+//! them that fail. It continues until the vehicle is stationary, also without a controller.
 
 use anyhow::Context;
 use autopilot::Parser;
@@ -29,9 +29,9 @@ const START_NS: i64 = 100_000_000_000;
 const START_TIMEOUT_S: f64 = 30.0;
 /// Timeout for all, in seconds: longer than the controller's for a landing, with its holds.
 const TIMEOUT_S: f64 = 420.0;
-/// Speed below which the vehicle is at rest in the air, in m/s: in wind it is never quite still.
+/// Speed below which the vehicle is stationary in the air, in m/s: in wind it is never quite still.
 const REST_M_S: f64 = 0.6;
-/// Time at rest after which a flight is over, in seconds: on the ground disarmed or armed, and in the air.
+/// Time without motion after which a flight is over, in seconds: on the ground disarmed or armed, and in the air.
 const LANDED_S: f64 = 4.0;
 const GROUNDED_S: f64 = 150.0;
 const HOVERS_S: f64 = 10.0;
@@ -368,7 +368,7 @@ impl<'a> FaultyFlight<'a> {
     /// The detections in the picture of a frame: where the camera repeats a picture, those of that. A detector finds the marker again to
     /// within some millionths, as it has more frames of the camera each time; less well where the picture is coded again.
     fn repeated(&mut self, arrival: Arrival) -> Arrival {
-        let share = if self.is_on(Kind::PictureRecoded) {
+        let offset = if self.is_on(Kind::PictureRecoded) {
             RECODED_SHARE
         } else if self.is_on(Kind::PictureRepeated) {
             REPEATED_SHARE
@@ -378,10 +378,10 @@ impl<'a> FaultyFlight<'a> {
         };
         let mut detections =
             self.picture.get_or_insert_with(|| arrival.message.detections.clone()).clone();
-        let share = if self.sequence.is_multiple_of(2) { 0.0 } else { share };
+        let offset = if self.sequence.is_multiple_of(2) { 0.0 } else { offset };
         for pose in detections.iter_mut().filter_map(|it| it.pose.as_mut()) {
             for number in &mut pose.camera_from_marker.translation_m {
-                *number *= 1.0 + share;
+                *number *= 1.0 + offset;
             }
         }
         Arrival { message: Detections { detections, ..arrival.message }, ..arrival }
@@ -477,7 +477,7 @@ impl<'a> FaultyFlight<'a> {
         (self.outcome.phase, self.outcome.why, self.outcome.is_over) = (phase, why, is_over);
     }
 
-    /// Whether the vehicle is at rest and nothing more happens.
+    /// Whether the vehicle is stationary and nothing more happens.
     fn is_over(&mut self) -> bool {
         let (Some(_), Some(since_s)) = (self.start_s, self.rest_since_s) else { return false };
         let now_s = self.now_s();

@@ -56,7 +56,7 @@ pub enum Kind {
     ClockStep,
     /// The camera repeats its last picture, with new stamps.
     PictureRepeated,
-    /// It does, and the link codes it anew for each frame.
+    /// It does, and the link codes it again for each frame.
     PictureRecoded,
     /// A preferred detector reports the marker 1 m next to its position.
     LiarJumps,

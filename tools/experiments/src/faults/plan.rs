@@ -274,7 +274,7 @@ impl Planned {
         marker.into_iter().chain(self.set.iter().filter_map(of_service)).collect()
     }
 
-    /// Settings of the detector: it looks for the marker that is on the pad, whichever option has put it there.
+    /// Settings of the detector: it looks for the marker on the pad, for any option that has set it.
     ///
     /// # Errors
     /// When a setting of the simulator is invalid.

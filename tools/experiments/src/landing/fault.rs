@@ -205,7 +205,7 @@ impl Fault {
         only.is_none_or(|(_, only)| *only == vision)
     }
 
-    /// How many times larger than asked for the pad's marker is.
+    /// The factor by which the pad's marker is larger than requested.
     pub fn marker_scale(self) -> f64 {
         if self.name().starts_with("pad-") { MOVING_MARKER_SCALE } else { 1.0 }
     }

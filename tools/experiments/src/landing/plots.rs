@@ -358,7 +358,7 @@ fn success(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
         .build_cartesian_2d(0.0..200.0, 0.0..count)?;
     // The names of the cells are right of 100 %.
     let percent =
-        |share: &f64| if *share > 100.5 { String::new() } else { format!("{share:.0} %") };
+        |value: &f64| if *value > 100.5 { String::new() } else { format!("{value:.0} %") };
     chart
         .configure_mesh()
         .disable_mesh()
@@ -374,11 +374,11 @@ fn success(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     for (index, (name, members)) in cells.iter().enumerate() {
         let y = count - index as f64 - 0.5;
         let hits = members.iter().filter(|o| o.is_within(0.1)).count();
-        let [low, high] = share_interval(hits, members.len()).map(|share| 100.0 * share);
-        let share = 100.0 * hits as f64 / members.len().max(1) as f64;
+        let [low, high] = share_interval(hits, members.len()).map(|bound| 100.0 * bound);
+        let percent = 100.0 * hits as f64 / members.len().max(1) as f64;
         let line = PathElement::new([(low, y), (high, y)], COLOURS[0].stroke_width(3));
         chart.draw_series([line])?;
-        chart.draw_series([Circle::new((share, y), 4, COLOURS[0].filled())])?;
+        chart.draw_series([Circle::new((percent, y), 4, COLOURS[0].filled())])?;
         let short: String = name.chars().take(90).collect();
         let text = format!("{hits} of {}: {short}", members.len());
         let place = if low > 95.0 { 1.0 } else { 101.0 };
@@ -417,7 +417,7 @@ fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
         .configure_mesh()
         .x_desc("touchdown error, m")
         .y_desc("proportion")
-        .y_label_formatter(&|share| format!("{}", (share * 1e6).round() / 1e6))
+        .y_label_formatter(&|proportion| format!("{}", (proportion * 1e6).round() / 1e6))
         .draw()?;
     for ((name, errors), colour) in distributions.iter().zip(COLOURS) {
         let short: String = name.chars().take(80).collect();

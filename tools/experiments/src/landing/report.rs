@@ -72,14 +72,14 @@ fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
         outcomes.len(),
         plan.vision.name(),
         plan.seed,
-        share(outcomes),
+        proportion(outcomes),
         Touchdown::MAX_ERROR_M,
     )
 }
 
 /// The proportion within 0.1 m, with its interval. A seed has the same draws in all circumstances, so that its flights are not independent: over
 /// several of them the interval is of the seeds of which every flight landed there, among those flown in all of them.
-fn share(outcomes: &[Outcome]) -> String {
+fn proportion(outcomes: &[Outcome]) -> String {
     let cells: BTreeSet<&str> = outcomes.iter().map(|o| o.cell.as_str()).collect();
     let mut of_seeds: BTreeMap<u64, Vec<bool>> = BTreeMap::new();
     for outcome in outcomes {
@@ -92,12 +92,12 @@ fn share(outcomes: &[Outcome]) -> String {
     let [low, high] = share_interval(good, seeds).map(|part| 100.0 * part);
     let interval = format!("95 % interval of Wilson {low:.2} to {high:.2} %");
     let within = outcomes.iter().filter(|o| o.is_within(0.1)).count();
-    let share = percent(within, outcomes.len());
+    let proportion = percent(within, outcomes.len());
     match (cells.len(), seeds) {
-        (0 | 1, _) => format!("{share:.2} %, {interval}"),
-        (_, 0) => format!("{share:.2} %; no seed was flown in all circumstances"),
+        (0 | 1, _) => format!("{proportion:.2} %, {interval}"),
+        (_, 0) => format!("{proportion:.2} %; no seed was flown in all circumstances"),
         _ => format!(
-            "{share:.2} %; of the {seeds} seeds {good} ({:.2} %, {interval}) have every flight there",
+            "{proportion:.2} %; of the {seeds} seeds {good} ({:.2} %, {interval}) have every flight there",
             percent(good, seeds)
         ),
     }
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn a_share_has_the_interval_of_its_seeds() {
+    fn a_proportion_has_the_interval_of_its_seeds() {
         let plan = |wind: &[f64]| Plan {
             wind: crate::landing::plan::Values::List(wind.to_vec()),
             flights: 8,
@@ -262,12 +262,12 @@ mod tests {
             ..Outcome::new(planned)
         };
         let outcomes: Vec<Outcome> = plan.flights().iter().enumerate().map(landed).collect();
-        let text = share(&outcomes);
+        let text = proportion(&outcomes);
         assert!(text.starts_with("93.75 %; of the 8 seeds 7 (87.50 %, "), "{text}");
         // Interrupted after four seeds in the second wind, or before it.
-        let text = share(&outcomes[..12]);
+        let text = proportion(&outcomes[..12]);
         assert!(text.starts_with("91.67 %; of the 4 seeds 3 (75.00 %, "), "{text}");
-        let text = share(&outcomes[..8]);
+        let text = proportion(&outcomes[..8]);
         assert!(text.starts_with("87.50 %, 95 % interval of Wilson"), "{text}");
     }
 

@@ -65,10 +65,11 @@ pub fn sign_test(some: usize, others: usize) -> f64 {
 /// 95 % confidence interval of a proportion (Wilson, 1927).
 pub fn share_interval(hits: usize, of: usize) -> [f64; 2] {
     let (z, n) = (1.96_f64, (of as f64).max(1.0));
-    let share = hits as f64 / n;
-    let middle = (share + z * z / (2.0 * n)) / (1.0 + z * z / n);
-    let reach = z * (share * (1.0 - share) / n + z * z / (4.0 * n * n)).sqrt() / (1.0 + z * z / n);
-    [(middle - reach).max(0.0), (middle + reach).min(1.0)]
+    let proportion = hits as f64 / n;
+    let centre = (proportion + z * z / (2.0 * n)) / (1.0 + z * z / n);
+    let half_width = z * (proportion * (1.0 - proportion) / n + z * z / (4.0 * n * n)).sqrt()
+        / (1.0 + z * z / n);
+    [(centre - half_width).max(0.0), (centre + half_width).min(1.0)]
 }
 
 /// The cells with their flights, in order.

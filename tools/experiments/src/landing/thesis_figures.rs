@@ -134,7 +134,7 @@ fn plot_size() -> anyhow::Result<[f64; 2]> {
     Ok(size)
 }
 
-/// Ranges of two axes around these, with one scale for both on so many pixels: a landing looks as it was.
+/// Ranges of two axes around these, with one scale for both on this number of pixels, so that a landing is not distorted.
 fn to_scale(ranges: [Range<f64>; 2], size: [f64; 2]) -> [Range<f64>; 2] {
     let length = |range: &Range<f64>| range.end - range.start;
     let mut metres_a_pixel = 0.0;

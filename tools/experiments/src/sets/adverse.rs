@@ -29,7 +29,7 @@ pub(super) fn frames(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
 fn shadow(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
     let (spec, mut rng) = large(draw, marker, frame);
     let edge = Line {
-        through: beside(&spec, rng.random_range(-0.25..0.25), rng.random_range(-0.25..0.25)),
+        through: at_marker(&spec, rng.random_range(-0.25..0.25), rng.random_range(-0.25..0.25)),
         normal: rng.random_range(0.0..TAU),
     };
     let occluder = Occluder::Shadow {
@@ -44,7 +44,7 @@ fn shadow(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
 fn glare(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
     let (spec, mut rng) = large(draw, marker, frame);
     let size_px = spec.size_px();
-    let centre = beside(&spec, rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
+    let centre = at_marker(&spec, rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
     let occluder = Occluder::Glare {
         centre,
         radius_px: (size_px * rng.random_range(0.15..0.3)) as f32,
@@ -67,7 +67,7 @@ fn occlusion(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
     };
     let (sin, cos) = towards.sin_cos();
     let level = [20.0, 90.0, 230.0][frame % 3];
-    let (through, centre) = (beside(&spec, away * cos, away * sin), beside(&spec, 0.0, 0.0));
+    let (through, centre) = (at_marker(&spec, away * cos, away * sin), at_marker(&spec, 0.0, 0.0));
     let normal = (through.y - centre.y).atan2(through.x - centre.x);
     spec.with("occlusion", Occluder::Cover { edge: Line { through, normal }, level })
 }
@@ -157,7 +157,7 @@ fn large(draw: Draw, marker: Marker, frame: usize) -> (FrameSpec, rand_chacha::C
 }
 
 /// The pixel of a point on the marker, in marker sizes from its centre.
-fn beside(spec: &FrameSpec, x: f64, y: f64) -> Pixel {
+fn at_marker(spec: &FrameSpec, x: f64, y: f64) -> Pixel {
     let seen = spec.path.first().and_then(|camera_from_marker| {
         let place = *camera_from_marker * Point::new(x * SIZE_M, y * SIZE_M, 0.0);
         spec.settings.model.project(place)

@@ -80,7 +80,7 @@ fn spec(draw: Draw, frame: usize) -> FrameSpec {
         light,
         ..FrameSpec::negative(settings, pose(&model, at, distance_m, tilt, 0.0), seed)
     };
-    let middle = spec.place();
+    let centre = spec.place();
     for number in 0..rng.random_range(5..20) {
         let kind = if rng.random_bool(0.2) { rng.random_range(0..KINDS.len()) } else { frame };
         let ((_, drawn), [min_m, max_m]) = KINDS[kind % KINDS.len()];
@@ -95,10 +95,10 @@ fn spec(draw: Draw, frame: usize) -> FrameSpec {
             // Painted or cast in something dark.
             thing.layers.insert(0, rectangle([-half; 2], [half; 2], Ink::Black));
         }
-        let mut put = place(scaled(thing, size_m), &middle, &mut rng);
+        let mut put = place(scaled(thing, size_m), &centre, &mut rng);
         if number == 0 {
-            put.ned_from_marker.isometry.translation.vector.x = middle.x();
-            put.ned_from_marker.isometry.translation.vector.y = middle.y();
+            put.ned_from_marker.isometry.translation.vector.x = centre.x();
+            put.ned_from_marker.isometry.translation.vector.y = centre.y();
         }
         spec.clutter.push(put);
     }
@@ -252,9 +252,9 @@ fn helipad(rng: &mut ChaCha8Rng) -> Vec<Layer> {
 
 /// Two or three discs in each other.
 fn roundel(rng: &mut ChaCha8Rng) -> Vec<Layer> {
-    let middle = 0.5 * rng.random_range(0.4..0.85);
-    let inner = middle * rng.random_range(0.2..0.7);
-    let radii = [0.5, middle, inner];
+    let second = 0.5 * rng.random_range(0.4..0.85);
+    let inner = second * rng.random_range(0.2..0.7);
+    let radii = [0.5, second, inner];
     nested(&radii[..rng.random_range(2..4)], Ink::Black)
 }
 
@@ -334,10 +334,10 @@ fn whycon(rng: &mut ChaCha8Rng) -> Vec<Layer> {
 fn cctag(rng: &mut ChaCha8Rng) -> Vec<Layer> {
     let count = if rng.random_bool(0.5) { 6 } else { 8 };
     // Inner radii are at 0.3 of the outermost or more; neighbours at least 0.08 apart.
-    let mut shares: Vec<f64> = (0..count)
+    let mut fractions: Vec<f64> = (0..count)
         .map(|k| 0.95 - 0.65 * (f64::from(k) + rng.random_range(-0.3..0.3)) / f64::from(count))
         .collect();
-    shares.sort_by(|a, b| b.total_cmp(a));
-    let radii: Vec<f64> = shares.into_iter().map(|share| 0.5 * share).collect();
+    fractions.sort_by(|a, b| b.total_cmp(a));
+    let radii: Vec<f64> = fractions.into_iter().map(|fraction| 0.5 * fraction).collect();
     nested(&radii, Ink::Black)
 }

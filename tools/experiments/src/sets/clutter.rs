@@ -226,12 +226,12 @@ fn random_grid(rng: &mut ChaCha8Rng) -> Drawing {
     if count > 9 {
         let cell = 2.0 * inner / f64::from(count);
         for (x, y) in [(-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0)] {
-            let middle = [x, y].map(|side: f64| side * (inner - 3.5 * cell));
+            let centre = [x, y].map(|side: f64| side * (inner - 3.5 * cell));
             for (size, ink) in
                 [(4.0, Ink::White), (3.5, Ink::Black), (2.5, Ink::White), (1.5, Ink::Black)]
             {
                 let to = |sign: f64| {
-                    [0, 1].map(|i| (middle[i] + sign * size * cell).clamp(-inner, inner))
+                    [0, 1].map(|i| (centre[i] + sign * size * cell).clamp(-inner, inner))
                 };
                 layers.push(rectangle(to(-1.0), to(1.0), ink));
             }
@@ -283,8 +283,8 @@ fn dots(rng: &mut ChaCha8Rng) -> Drawing {
     let places = (0..count).flat_map(|x| (0..count).map(move |y| [x, y]));
     let layers = places
         .map(|place| {
-            let middle = place.map(|i| -half + (f64::from(i) + 0.5) * pitch);
-            rectangle(middle.map(|m| m - size), middle.map(|m| m + size), Ink::Black)
+            let centre = place.map(|i| -half + (f64::from(i) + 0.5) * pitch);
+            rectangle(centre.map(|m| m - size), centre.map(|m| m + size), Ink::Black)
         })
         .collect();
     drawing(half * 1.1, layers)

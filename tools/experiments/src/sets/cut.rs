@@ -43,7 +43,7 @@ fn spec(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
         let pose = pose(&model, at, distance_m, tilt, heading);
         FrameSpec::new(with_id(marker, frame), settings.clone(), pose, seed)
     };
-    let (side, mut at) = (frame % 4, beside(&model, frame % 4, along));
+    let (side, mut at) = (frame % 4, at_side(&model, frame % 4, along));
     // The outermost corner moves almost as the centre does.
     for _ in 0..4 {
         let Some(truth) = shown(at).ground_truth() else { break };
@@ -66,7 +66,7 @@ fn spec(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
 }
 
 /// A place on a side of the frame.
-fn beside(model: &CameraModel, side: usize, along: f64) -> Pixel {
+fn at_side(model: &CameraModel, side: usize, along: f64) -> Pixel {
     let [right, bottom] = [model.width, model.height].map(f64::from);
     match side {
         0 => Pixel::new(0.0, bottom * along),

@@ -102,7 +102,7 @@ fn snow(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
 fn rope(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     const PARTS: usize = 8;
     let size_px = spec.size_px();
-    let middle = on_marker(spec, rng, 0.35);
+    let centre = on_marker(spec, rng, 0.35);
     let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
     let (bow, radius_px) = (rng.random_range(-0.4..0.4), size_px * rng.random_range(0.015..0.04));
     let level = rng.random_range(30.0..200.0);
@@ -110,7 +110,7 @@ fn rope(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
         let along = 2.4 * (part as f64 / PARTS as f64 - 0.5);
         let aside = bow * along * along;
         let [x, y] = [along * cos - aside * sin, along * sin + aside * cos];
-        Pixel::new(middle.x + x * size_px, middle.y + y * size_px)
+        Pixel::new(centre.x + x * size_px, centre.y + y * size_px)
     };
     let strokes = |shift: f64, level: f32| -> Vec<Stroke> {
         let moved = |pixel: Pixel| Pixel::new(pixel.x + shift, pixel.y + shift);
@@ -173,7 +173,7 @@ fn faded(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     let spot_px = (size_px * rng.random_range(0.08..0.4)) as f32;
     let min = rng.random_range(0.2..0.5);
     spec.occluder = Occluder::Mottle {
-        area: whole(spec),
+        area: full_disc(spec),
         spot_px: [spot_px; 2],
         share: [min, min + rng.random_range(0.05..0.3)],
         level: paper_level(spec),
@@ -212,7 +212,7 @@ fn glass(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     spec.occluder = Occluder::Several(effects);
 }
 
-/// On cloth that lies in slight waves: its threads, and light and shade of the waves.
+/// On cloth with slight waves: its threads, and light and shade of the waves.
 fn cloth(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     let size_px = spec.size_px();
     let height = rng.random_range(0.003..0.01);
@@ -220,7 +220,7 @@ fn cloth(spec: &mut FrameSpec, rng: &mut ChaCha8Rng) {
     spec.print = Print::Bent(Bend { towards, height, form });
     let thread_px = (size_px * rng.random_range(0.01..0.02)) as f32;
     let mottle = |spot_px: [f32; 2], max: f32, level: f32| Occluder::Mottle {
-        area: whole(spec),
+        area: full_disc(spec),
         spot_px,
         share: [0.0, max],
         level,
@@ -301,7 +301,7 @@ fn towards(from: Pixel, to: Pixel, part: f64) -> Pixel {
 }
 
 /// The disc that holds the marker with its paper.
-fn whole(spec: &FrameSpec) -> Disc {
+fn full_disc(spec: &FrameSpec) -> Disc {
     Disc { centre: centre(spec), radius_px: (0.9 * spec.size_px()) as f32 }
 }
 

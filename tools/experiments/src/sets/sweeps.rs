@@ -51,13 +51,13 @@ pub(super) fn blur(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
             let settings = CameraSettings::thesis();
             let (mut spec, mut rng) =
                 view(draw.frame(Set::Blur, frames.len()), marker, settings, 50.0..150.0, 0.3);
-            let middle = spec.path[0];
+            let centre = spec.path[0];
             let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
-            let origin = middle.origin();
+            let origin = centre.origin();
             let per_px = origin.z() / spec.settings.model.fx * motion_px;
             let at = |part: f64| {
                 let offset = geometry::Vector::new(part * per_px * cos, part * per_px * sin, 0.0);
-                Transform::new(middle.rotation(), origin + offset)
+                Transform::new(centre.rotation(), origin + offset)
             };
             spec.path = vec![at(-0.5), at(0.0), at(0.5)];
             frames.push(spec.with(format!("motion{motion_px}"), Occluder::None));

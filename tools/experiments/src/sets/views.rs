@@ -1,4 +1,4 @@
-//! Frames of a marker as a landing sees it: the thesis' positions, far off, on the way down, on textured
+//! Frames of a marker as in a landing: the thesis' positions, far off, on the way down, on textured
 //! ground, and in sequences for tracking.
 
 use std::f64::consts::{PI, TAU};
