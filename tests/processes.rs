@@ -53,7 +53,7 @@ async fn others_watch_and_the_ground_dies() -> anyhow::Result<()> {
     command(&landing, ControllerCommand::Resume).await?;
     landing.descends_below(8.0).await?;
     landing.kill("gcs-bridge")?;
-    says_how_well(&landing.lands().await?)
+    check_result_values(&landing.lands().await?)
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -93,7 +93,7 @@ async fn a_program_of_mavsdk_finds_the_vehicle_its_parameters_and_its_camera() -
 }
 
 /// The result of a landing has all values that it should contain.
-fn says_how_well(result: &serde_json::Value) -> anyhow::Result<()> {
+fn check_result_values(result: &serde_json::Value) -> anyhow::Result<()> {
     for key in [
         "time_to_disarm_s",
         "time_to_touchdown_s",
@@ -455,7 +455,7 @@ async fn two_landings_that_begin_at_once_both_land() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_link_whose_port_is_taken_says_so() -> anyhow::Result<()> {
+async fn a_link_whose_port_is_taken_reports_it() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     let taken = std::net::UdpSocket::bind("127.0.0.1:0")?;
     let port = taken.local_addr()?.port();

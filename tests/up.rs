@@ -90,7 +90,7 @@ impl Up {
     }
 
     /// Waits for a new line with this beginning and this part.
-    async fn says(&mut self, begin: &str, part: &str) -> anyhow::Result<String> {
+    async fn wait_for_line(&mut self, begin: &str, part: &str) -> anyhow::Result<String> {
         let line = async {
             while let Some(line) = self.said.recv().await {
                 self.printed.push(line.clone());
@@ -106,7 +106,7 @@ impl Up {
 
     /// The process of a service, once it is started.
     async fn process(&mut self, name: &str) -> anyhow::Result<Pid> {
-        let line = self.says(name, "started as process").await?;
+        let line = self.wait_for_line(name, "started as process").await?;
         let number = line.split("process ").nth(1).and_then(|rest| rest.split(',').next());
         let number = number.context("a process number")?.parse()?;
         Pid::from_raw(number).context("a process number")
@@ -214,12 +214,12 @@ async fn two_roles_meet() -> anyhow::Result<()> {
     kill_process(on_the_ground, Signal::KILL)?;
     change("ground", false).await?;
     change("ground", true).await?;
-    ground.says("detector", "restarting in").await?;
+    ground.wait_for_line("detector", "restarting in").await?;
     processes.push(ground.process("detector").await?);
     kill_process(relay, Signal::KILL)?;
     change("ground", false).await?;
     change("ground", true).await?;
-    drone.says("relay", "restarting in").await?;
+    drone.wait_for_line("relay", "restarting in").await?;
     processes.push(drone.process("relay").await?);
 
     // A detector that was swapped stays stopped while its replacement runs, and no longer.
@@ -233,21 +233,21 @@ async fn two_roles_meet() -> anyhow::Result<()> {
         let stop = &DetectorCommand::Stop;
         let reply = node.command(topic::DETECTOR_COMMAND, &["onboard"], stop).await?;
         ensure!(reply.accepted, "{reply:?}");
-        drone.says("detector", "replaced by the detector `other`").await?;
+        drone.wait_for_line("detector", "replaced by the detector `other`").await?;
         change("onboard", false).await
     };
     let relieved = relieved.await;
     other.kill()?;
     other.wait()?;
     relieved?;
-    drone.says("detector", "its replacement is gone").await?;
+    drone.wait_for_line("detector", "its replacement is gone").await?;
     processes.push(drone.process("detector").await?);
     change("onboard", true).await?;
 
     // A new controller waits for a command: there was no landing to be resumed.
     let controller = processes[3];
     kill_process(controller, Signal::KILL)?;
-    let again = drone.says("controller", "started as process").await?;
+    let again = drone.wait_for_line("controller", "started as process").await?;
     ensure!(again.contains("start = \"command\""), "{again}");
 
     // The doctor on the ground finds no error.
@@ -270,8 +270,11 @@ async fn two_roles_meet() -> anyhow::Result<()> {
     // The last one first, and none is left.
     ensure!(drone.stop()? == Some(0));
     ensure!(ground.stop()? == Some(0));
-    let stopped = drone.says("controller: stopped", "").await;
-    ensure!(stopped.is_ok() && drone.says("relay: stopped", "").await.is_ok(), "{stopped:?}");
+    let stopped = drone.wait_for_line("controller: stopped", "").await;
+    ensure!(
+        stopped.is_ok() && drone.wait_for_line("relay: stopped", "").await.is_ok(),
+        "{stopped:?}"
+    );
     for process in processes {
         ensure!(test_kill_process(process).is_err(), "{process:?} is left");
     }
@@ -309,7 +312,7 @@ command = ["./own.sh"]
     let mut up = Up::run(alight, folder.path(), "local")?;
     let detector = up.process("detector:").await?;
     let own = up.process("own:").await?;
-    up.says("own:", &format!("meets at {meet}")).await?;
+    up.wait_for_line("own:", &format!("meets at {meet}")).await?;
     let network =
         Network { meet: Some(meet), vehicle: Some("tested".into()), ..Network::default() };
     let identity = Identity { service: "controller", instance: "main".into() };
@@ -321,9 +324,9 @@ command = ["./own.sh"]
     std::fs::remove_file(&program)?;
     std::fs::remove_file(&script)?;
     kill_process(own, Signal::KILL)?;
-    up.says("own:", "restarting").await?;
+    up.wait_for_line("own:", "restarting").await?;
     // It cannot be started: that counts as its end, and does not end the others.
-    up.says("own:", "./own.sh").await?;
+    up.wait_for_line("own:", "./own.sh").await?;
     kill_process(detector, Signal::KILL)?;
     let again = up.process("detector:").await?;
     ensure!(again != detector && test_kill_process(again).is_ok(), "{again:?}");
@@ -356,7 +359,7 @@ command = ["./own.sh"]
     std::fs::write(folder.path().join("site.toml"), site)?;
     let mut up = Up::start(folder.path(), "local")?;
     let other = up.process("other:").await?;
-    up.says("own: exited with an error at its start", "./own.sh").await?;
+    up.wait_for_line("own: exited with an error at its start", "./own.sh").await?;
     std::fs::write(&script, "#!/bin/sh\nexec sleep 600\n")?;
     up.process("own:").await?;
     ensure!(test_kill_process(other).is_ok(), "the other one has ended");
@@ -388,16 +391,17 @@ set = ["autopilot.address=udpin:127.0.0.1:{autopilot}", "start=takeoff"]
     ] {
         let mut up = Up::start(folder.path(), "local")?;
         if mode.is_some() {
-            up.says("the `alight up` before this one was killed", "starts no motors").await?;
+            up.wait_for_line("the `alight up` before this one was killed", "starts no motors")
+                .await?;
         }
-        let started = up.says("controller:", "started as process").await?;
+        let started = up.wait_for_line("controller:", "started as process").await?;
         let started_mode = started.split_once("start = ").map(|(_, mode)| mode.trim_matches('"'));
         ensure!(started_mode == mode, "{started}");
         let code = up.stop_by(signal)?;
         ensure!(code == (signal != Signal::KILL).then_some(0), "{code:?}");
     }
     let mut up = Up::start(folder.path(), "local")?;
-    let started = up.says("controller:", "started as process").await?;
+    let started = up.wait_for_line("controller:", "started as process").await?;
     ensure!(!started.contains("start ="), "{started}");
     ensure!(up.stop()? == Some(0));
     Ok(())
@@ -659,8 +663,8 @@ async fn a_process_refuses_its_configuration() -> anyhow::Result<()> {
         "[[local]]\ncommand = ['sh', '-c', 'echo out of order >&2; exit 2']\nname = 'broken'\n";
     std::fs::write(folder.path().join("site.toml"), site)?;
     let mut up = Up::start(folder.path(), "local")?;
-    up.says("broken: out of order", "").await?;
-    up.says("broken", "given up").await?;
+    up.wait_for_line("broken: out of order", "").await?;
+    up.wait_for_line("broken", "given up").await?;
     let status = tokio::task::spawn_blocking(move || up.child.wait()).await??;
     ensure!(status.code() == Some(1), "{status}");
     Ok(())

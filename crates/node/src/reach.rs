@@ -161,10 +161,10 @@ impl Reach {
                 )
             }
             Finding::Unreachable(cause) => format!(
-                "{at} is out of reach ({cause}): is it switched on, and is this machine in its network? Else {CORRECT}"
+                "{at} cannot be reached ({cause}): is it switched on, and is this machine in its network? Else {CORRECT}"
             ),
             Finding::Slow => format!(
-                "{at} was not reached, or has not answered, within {} s: its name is looked up for long, or it is out of reach; {CORRECT}",
+                "{at} was not reached, or has not answered, within {} s: its name is resolved slowly, or it cannot be reached; {CORRECT}",
                 MAX_TIME.as_secs()
             ),
             Finding::Keys(cause) => format!("{cause:#}"),

@@ -256,7 +256,7 @@ async fn a_message_after_the_session_was_closed_is_no_failure() -> anyhow::Resul
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_command_is_answered_and_without_a_controller_the_error_says_so() -> anyhow::Result<()> {
+async fn a_command_is_answered_and_a_missing_controller_is_reported() -> anyhow::Result<()> {
     let port = free_port()?;
     let operator = open("alight", "main", port).await?;
     let unanswered = operator

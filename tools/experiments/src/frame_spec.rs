@@ -33,7 +33,7 @@ pub struct FrameSpec {
     pub settings: CameraSettings,
     /// `camera_from_marker` from the opening to the closing of the shutter (with a rolling shutter from the
     /// opening in the first row to the closing in the last); one pose without motion. In a negative, of the
-    /// place of a marker.
+    /// position of a marker.
     pub path: Vec<Transform<Camera, MarkerFrame>>,
     /// The ground.
     pub surface: Surface,
@@ -77,7 +77,7 @@ impl FrameSpec {
         Self { marker: Some(marker), ..Self::negative(settings, camera_from_marker, seed) }
     }
 
-    /// The same without a marker, whose place is seen from `camera_from_place`.
+    /// The same without a marker, whose position is seen from `camera_from_place`.
     pub fn negative(
         settings: CameraSettings,
         camera_from_place: Transform<Camera, MarkerFrame>,
@@ -101,7 +101,7 @@ impl FrameSpec {
         }
     }
 
-    /// The position of the marker on the ground, in a negative of its place.
+    /// The position of the marker on the ground, in a negative its intended position.
     pub fn place(&self) -> Point<Ned> {
         pad(self).ned_from_marker.origin()
     }

@@ -13,7 +13,7 @@ pub enum Print {
     Sharp,
     /// In square dots.
     Dots {
-        /// Number of dots along the marker's size, rounded: a printer's file has them, so that size and place of the print
+        /// Number of dots along the marker's size, rounded: a printer's file has them, so that size and position of the print
         /// are the marker's, and only the inside is a little off.
         per_size: f64,
     },
@@ -100,7 +100,7 @@ fn dots(half_m: f64, per_size: f64) -> (f64, usize) {
     (0.5 * count * dot_m, count as usize)
 }
 
-/// The square piece about a place of a bent print.
+/// The square piece about a position on a bent print.
 fn piece(pad: &PadInScene, bend: &Bend, centre: [f64; 2], half_m: f64) -> PadInScene {
     let size_m = crate::set::SIZE_M;
     let (sin, cos) = bend.towards.sin_cos();
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn bent_paper_is_as_high_as_it_says_and_its_centre_stays() {
+    fn bent_paper_has_the_stated_height_and_its_centre_stays() {
         let flat = pad().ned_from_marker;
         for form in [BendForm::Curl, BendForm::Fold, BendForm::Waves] {
             let bend = Bend { towards: 0.7, height: 0.05, form };

@@ -32,7 +32,7 @@ fn time_ms(detector: &mut Detector, pixels: &[u8], width: usize, height: usize) 
     shortest
 }
 
-/// The grey level at a place.
+/// The grey level at a position.
 type Grey<'a> = &'a dyn Fn(usize, usize) -> u8;
 
 /// A bijection that scatters (splitmix64's finaliser).

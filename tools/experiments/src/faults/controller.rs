@@ -51,7 +51,7 @@ pub struct Controller {
     settings: Vec<String>,
     order: Order,
     flight: Option<TapedFlight>,
-    /// Its file with the pad's place.
+    /// Its file with the pad's position.
     pad_file: Option<PadNote>,
     life: Life,
     parser: Parser,

@@ -14,11 +14,11 @@ pub enum Kind {
     ControllerKilled,
     /// The controller's process is stopped (SIGSTOP), and continues after the duration.
     ControllerStopped,
-    /// The detector's process ends; after the duration another one takes its place.
+    /// The detector's process ends; after the duration another one replaces it.
     DetectorKilled,
     /// The detector's process is stopped, and continues.
     DetectorStopped,
-    /// The camera's process ends, and another one takes its place.
+    /// The camera's process ends, and another one replaces it.
     CameraKilled,
     /// The camera's process is stopped, and continues.
     CameraStopped,
@@ -92,7 +92,7 @@ pub enum Kind {
     PositionMissing,
     /// Its attitude is missing.
     AttitudeMissing,
-    /// The ground station's bridge ends, and another one takes its place; in real time only.
+    /// The ground station's bridge ends, and another one replaces it; in real time only.
     BridgeKilled,
     /// The bridge is stopped, and continues; in real time only.
     BridgeStopped,

@@ -65,7 +65,7 @@ fn spec(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
     spec.with(group, Occluder::None)
 }
 
-/// A place on a side of the frame.
+/// A position on a side of the frame.
 fn at_side(model: &CameraModel, side: usize, along: f64) -> Pixel {
     let [right, bottom] = [model.width, model.height].map(f64::from);
     match side {
