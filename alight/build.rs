@@ -1,11 +1,11 @@
-//! Says from which commit the program is built, as `ALIGHT_VERSION`: `0.1.0 (1a2b3c4d5, 2026-11-27)`, with `changed` where a file
-//! differs from it, and the version alone outside of a repository and without git.
+//! Sets `ALIGHT_VERSION` to the version and the commit from which the program is built: `0.1.0 (1a2b3c4d5, 2026-11-27)`. It contains
+//! `changed` if a source file differs from the commit. It is the version alone outside a repository or without git.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// What the program is made of, from the root of the repository. A change of it may be one since the commit, and builds this crate
-/// again in any case.
+/// The sources of the program, relative to the root of the repository. A change of one of them may be later than the commit, and builds
+/// this crate again in any case.
 const SOURCES: [&str; 13] = [
     "Cargo.lock",
     "Cargo.toml",
@@ -27,16 +27,16 @@ fn main() {
     let package = PathBuf::from(std::env::var_os("CARGO_MANIFEST_DIR").unwrap_or_default());
     println!("cargo::rerun-if-changed=build.rs");
     let root = package.parent().unwrap_or(Path::new("."));
-    // A source archive that lies in another repository is not of its commit.
+    // A source archive inside another repository does not belong to that repository's commit.
     let commit = root.join(".git").exists().then(|| commit(root)).flatten();
-    let told = commit.map_or_else(|| version.clone(), |commit| format!("{version} ({commit})"));
-    println!("cargo::rustc-env=ALIGHT_VERSION={told}");
+    let version = commit.map_or_else(|| version.clone(), |commit| format!("{version} ({commit})"));
+    println!("cargo::rustc-env=ALIGHT_VERSION={version}");
 }
 
-/// The commit, its date, and whether the sources differ from it; cargo asks again once that may have changed.
+/// The commit, its date, and whether the sources differ from it; cargo runs this script again once that may have changed.
 fn commit(root: &Path) -> Option<String> {
     let folder = git(root, &["rev-parse", "--absolute-git-dir"])?;
-    // Each commit, checkout and reset adds a line to the log, where there is one; else a branch changes.
+    // Each commit, checkout and reset adds a line to the log, if there is a log; otherwise a branch changes.
     let branches = git(root, &["rev-parse", "--git-path", "refs/heads"]).unwrap_or_default();
     let own = ["HEAD", "logs/HEAD"].map(|file| Path::new(&folder).join(file));
     for file in own.into_iter().chain([root.join(branches)]) {
@@ -56,10 +56,10 @@ fn commit(root: &Path) -> Option<String> {
     Some(commit)
 }
 
-/// What git says; `None` where there is none, or it refuses.
+/// The standard output of git; `None` if git is not installed or fails.
 fn git(root: &Path, arguments: &[&str]) -> Option<String> {
     let mut command = Command::new("git");
-    // A user may have git check signatures, and tell of it.
+    // A user's configuration may let git check signatures, and print the result.
     command.args(["-c", "log.showSignature=false", "-C"]).arg(root);
     let output = command.args(arguments).output().ok()?;
     let text = String::from_utf8(output.stdout).ok().filter(|_| output.status.success())?;

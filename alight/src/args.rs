@@ -15,11 +15,11 @@ use node::{Network, ZenohSource};
 /// The role whose key the tools at the command line use.
 pub(crate) const OPERATOR: &str = "operator";
 
-/// What a port at which the processes of a machine meet must be.
+/// The rule for the rendezvous port of the processes of a machine.
 pub(crate) const MEET_RULE: &str =
     "all processes of a machine meet at the same port: write a number from 1 to 65535";
 
-/// What a command line asks for that cannot be.
+/// The error of an invalid command line.
 #[derive(Debug)]
 pub(crate) struct WrongUse(pub(crate) String);
 
@@ -32,7 +32,7 @@ impl std::fmt::Display for WrongUse {
 impl std::error::Error for WrongUse {}
 
 impl WrongUse {
-    /// What is wrong with something that the user gave.
+    /// The error of an argument, or of a file that an argument names.
     pub(crate) fn of(problem: &anyhow::Error) -> Self {
         Self(format!("{problem:#}"))
     }
@@ -41,7 +41,7 @@ impl WrongUse {
 /// The session's configuration for a process with this key.
 ///
 /// # Errors
-/// Whatever is wrong with the network is so by the command line, or by files that it names: [`WrongUse`].
+/// [`WrongUse`]: every error of the network comes from the command line, or from files that it names.
 pub(crate) fn source_of(network: &Network, key_name: &str) -> Result<ZenohSource, WrongUse> {
     network.source(key_name).map_err(|problem| WrongUse::of(&problem))
 }
@@ -123,7 +123,7 @@ impl NetworkArgs {
     }
 }
 
-/// The port at which the processes of a machine meet; at port 0, any that is free, none would find another.
+/// Parses the rendezvous port of the processes of a machine. Port 0 (any free port) is refused: the processes would not find each other.
 pub(crate) fn meet_port(text: &str) -> Result<u16, String> {
     match text.parse() {
         Ok(port @ 1..) => Ok(port),
@@ -131,7 +131,7 @@ pub(crate) fn meet_port(text: &str) -> Result<u16, String> {
     }
 }
 
-/// A reader of whole numbers in a range that says which: that of the standard library says of `-1` that a digit is invalid.
+/// A parser of integers in a range, with the range in its error. The parser of the standard library reports an invalid digit for `-1`.
 pub(crate) fn whole_number<T: TryFrom<u64>>(
     range: RangeInclusive<u64>,
 ) -> impl Fn(&str) -> Result<T, String> + Clone {
@@ -200,8 +200,8 @@ mod tests {
     #[test]
     fn processes_that_would_meet_at_any_port_are_refused() {
         let given = |port: &str| Tool::try_parse_from(["tool", "--meet", port]);
-        let told = given("0").err().map(|problem| problem.to_string()).unwrap();
-        assert!(told.contains("--meet") && told.contains("1 to 65535"), "{told}");
+        let error = given("0").err().map(|problem| problem.to_string()).unwrap();
+        assert!(error.contains("--meet") && error.contains("1 to 65535"), "{error}");
         assert!(given("x").is_err() && given("65536").is_err());
         assert_eq!(given("9000").map(|tool| tool.network.meet).ok(), Some(Some(9000)));
     }

@@ -64,7 +64,7 @@ pub(crate) struct CamerasArgs {
     format: Format,
 }
 
-/// What there is.
+/// The cameras and the programs on this machine.
 #[derive(Serialize)]
 struct Listing {
     devices: Vec<Entry>,
@@ -137,7 +137,7 @@ fn listing(folder: &Path, only: Option<&Path>) -> Listing {
     }
 }
 
-/// That a device is none of those in a folder, which are named.
+/// The error that a device is not one of those in a folder, which it lists.
 fn not_there(device: &Path, folder: &Path) -> anyhow::Error {
     let others = listing(folder, None).devices;
     let names: Vec<String> =
@@ -238,7 +238,8 @@ fn announced_text(camera: &AnnouncedCamera) -> String {
         match source {
             Some(source) => text += &format!("\n{source}\n{RTSP_HINT}\n"),
             None => {
-                text += "  camera-pub does not read it by itself; ffmpeg may (`source.command`, docs/camera.md)\n";
+                text +=
+                    "  camera-pub cannot read it; ffmpeg may (`source.command`, docs/camera.md)\n";
             }
         }
     }
@@ -382,13 +383,13 @@ mod tests {
     }
 
     #[test]
-    fn a_device_that_is_not_there_is_told_with_those_that_are() {
+    fn a_missing_device_is_reported_with_those_that_are_there() {
         let folder = tempfile::tempdir().unwrap();
-        let told = |device: &str| not_there(Path::new(device), folder.path()).to_string();
-        assert!(told("/dev/video77").contains("no device of Video4Linux here"));
+        let message = |device: &str| not_there(Path::new(device), folder.path()).to_string();
+        assert!(message("/dev/video77").contains("no device of Video4Linux here"));
         std::fs::write(folder.path().join("video0"), "").unwrap();
-        let told = told("/dev/video77");
-        assert!(told.contains("/dev/video77") && told.contains("video0"), "{told}");
+        let message = message("/dev/video77");
+        assert!(message.contains("/dev/video77") && message.contains("video0"), "{message}");
     }
 
     #[test]

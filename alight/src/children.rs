@@ -259,24 +259,24 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
     }
 }
 
-/// Sends the output lines of a child, and its exit when it has ended. What it started and left behind is ended then, as it would
-/// have the child's name and devices beside the one that is started next.
+/// Sends the output lines of a child, and its exit when it has ended. Processes that it started and left behind are ended then. Otherwise
+/// they would keep the child's name and devices while the next one is started.
 async fn follow<K: Clone>(
     key: K,
     mut child: Child,
     pid: Option<Pid>,
     events: mpsc::Sender<ChildEvent<K>>,
 ) {
-    let (stderr, teller, to) = (child.stderr.take(), key.clone(), events.clone());
+    let (stderr, source, to) = (child.stderr.take(), key.clone(), events.clone());
     let lines = async move {
         if let Some(stderr) = stderr {
-            forward(teller, stderr, to).await;
+            forward(source, stderr, to).await;
         }
     };
     tokio::pin!(lines);
     let ended = tokio::select! {
         ended = child.wait() => {
-            // Whoever has its standard error open still is one that it started.
+            // A process that still has the child's standard error open was started by the child.
             let left = tokio::time::timeout(LAST_LINES, &mut lines).await.is_err();
             if let Some(pid) = pid.filter(|_| left) {
                 let _ = kill_process_group(pid, Signal::KILL);
@@ -324,7 +324,7 @@ mod tests {
 
     use super::*;
 
-    /// What is heard of a shell script until it has ended, and how long that took.
+    /// The lines and the exit of a shell script, and how long it took.
     async fn run(script: &str) -> (Vec<String>, Exit, Duration) {
         let mut children = Children::new();
         let mut command = Command::new("sh");
@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn the_end_of_a_child_is_noticed_while_what_it_started_goes_on_and_that_is_ended() {
+    async fn the_exit_of_a_child_is_noticed_while_its_own_child_runs_and_that_one_is_ended() {
         let (lines, exit, took) = run("sleep 600 & echo $! >&2; exit 3").await;
         assert_eq!(exit.status, Some(3));
         assert!(took < Duration::from_secs(20), "{took:?}");

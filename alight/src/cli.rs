@@ -103,8 +103,8 @@ struct ConfigArgs {
     /// One setting over the file. May be repeated.
     #[arg(long, value_name = "KEY=VALUE", requires = "service")]
     set: Vec<String>,
-    /// Print, as JSON, what a Zenoh program of your own opens its session with in the network of the options below: ROLE, of a detector
-    /// `detector.NAME`, is whose key it has there, if the network has keys.
+    /// Print, as JSON, the session configuration for a Zenoh program of your own in the network of the options below. ROLE (of a detector:
+    /// `detector.NAME`) is the role whose key the program uses, if the network has keys.
     #[arg(long, value_name = "ROLE", conflicts_with = "service", value_parser = keys::key_name_of)]
     session: Option<String>,
     #[command(flatten)]
@@ -151,7 +151,7 @@ fn perform(cli: Cli) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// A command whose options take one number with a minus for a value, and say what is wrong with it; otherwise it is told as an unknown
+/// A command whose options take a negative number as a value, and report what is wrong with it. Otherwise it is reported as an unknown
 /// option.
 fn with_negative_numbers(command: clap::Command) -> clap::Command {
     let takes_one =
@@ -199,19 +199,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_negative_number_is_told_by_its_option() {
+    fn a_negative_number_is_reported_with_its_option() {
         for (command, value) in [("landing", "-3"), ("landing", "-3,5"), ("faults", "-3,5")] {
             let arguments = ["alight", "experiment", command, "--wind", value];
             let problem = with_negative_numbers(Cli::command()).try_get_matches_from(arguments);
-            let told = problem.unwrap_err().to_string();
-            assert!(told.contains("invalid value '-3") && told.contains("for '--wind"), "{told}");
+            let error = problem.unwrap_err().to_string();
+            assert!(
+                error.contains("invalid value '-3") && error.contains("for '--wind"),
+                "{error}"
+            );
         }
     }
 
     #[test]
-    fn a_number_that_cannot_be_is_told_by_its_range() {
+    fn an_invalid_number_is_reported_with_its_range() {
         let seed = "write a whole number from 0 to 18446744073709551615";
-        for (words, told) in [
+        for (words, range) in [
             (&["land", "--seed", "-1"][..], seed),
             (&["experiment", "landing", "--seed", "1.5"], seed),
             (&["experiment", "markers", "--seed", "99999999999999999999"], seed),
@@ -228,7 +231,7 @@ mod tests {
             let arguments = ["alight"].iter().chain(words);
             let problem = with_negative_numbers(Cli::command()).try_get_matches_from(arguments);
             let problem = problem.unwrap_err().to_string();
-            assert!(problem.contains(told), "{words:?}: {problem}");
+            assert!(problem.contains(range), "{words:?}: {problem}");
         }
     }
 
@@ -252,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_asked_for_is_a_wrong_use() {
+    fn an_impossible_request_is_a_wrong_use() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name).display().to_string();
         for words in [
@@ -288,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn a_network_that_cannot_be_is_a_wrong_use_of_every_service() {
+    fn an_invalid_network_is_a_wrong_use_of_every_service() {
         for service in Service::value_variants() {
             for network in [["--zenoh", "nosuch.json5"], ["--vehicle", "a/b"]] {
                 let problem = performed(&[&[service.name()][..], &network].concat()).unwrap_err();
@@ -298,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn a_site_that_cannot_be_is_a_wrong_use() {
+    fn an_invalid_site_is_a_wrong_use() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("site.toml");
         let detector = "{ run = 'detector' }";
@@ -320,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_with_a_recording_is_no_wrong_use() {
+    fn an_error_of_a_recording_is_no_wrong_use() {
         for words in [&["replay", "nosuch.mcap", "--verify"][..], &["report", "nosuch.mcap"]] {
             let problem = performed(words).unwrap_err();
             assert!(!is_wrong_use(&problem), "{words:?}: {problem:#}");
@@ -328,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn the_help_says_the_rule_of_the_exit_status_and_a_landing_its_own() {
+    fn the_help_explains_the_exit_status_and_that_of_a_landing() {
         let mut command = Cli::command();
         let help = command.render_long_help().to_string();
         assert!(help.contains("Exit status: 0 done; 1 not done"), "{help}");
@@ -337,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn the_version_tells_the_commit_of_the_repository_in_which_it_is_built() {
+    fn the_version_contains_the_commit_of_the_repository_in_which_it_is_built() {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
         let arguments = ["show", "--no-patch", "--format=%h, %cs", "--abbrev=9", "HEAD"];
         let mut git = std::process::Command::new("git");
@@ -350,8 +353,8 @@ mod tests {
             return;
         };
         let commit = String::from_utf8(commit.stdout).unwrap();
-        let told = format!("{release} ({}", commit.trim());
-        let rest = VERSION.strip_prefix(told.as_str());
-        assert!(matches!(rest, Some(")" | ", changed)")), "{VERSION}, and not {told})");
+        let expected = format!("{release} ({}", commit.trim());
+        let rest = VERSION.strip_prefix(expected.as_str());
+        assert!(matches!(rest, Some(")" | ", changed)")), "{VERSION}, and not {expected})");
     }
 }

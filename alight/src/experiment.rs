@@ -43,13 +43,13 @@ enum Experiment {
     /// with several seeds each; write tables, plots, and the command that repeats each failure (section 4.4
     /// of the thesis, extended). Ctrl-C ends it with the results of the flights that were flown, exit status 130.
     Landing(LandingArgs),
-    /// Fly landings in which a process dies or stands still, a link fails, or somebody lies; write a table of
+    /// Fly landings in which a process dies or stops, a link fails, or a component reports false values; write a table of
     /// the worst touchdowns, and the command that repeats each. Exit status 1 when one was unsafe or did not end. Ctrl-C ends
-    /// it with the results of the flights that were flown, exit status 130 also when one of those was unsafe, which is said.
+    /// it with the results of the flights that were flown, exit status 130 also when one of those was unsafe, which is printed.
     Faults(FaultsArgs),
     /// Put two finished runs of `alight experiment landing` side by side, for example of two guidances or markers: landed, touchdown error,
-    /// time and speeds of each, and the differences of the pairs of flights with the same circumstances and seed, with the interval of their
-    /// median and a sign test.
+    /// time and speeds of each, and the differences of the pairs of flights with the same circumstances and seed, with the interval of
+    /// their median and a sign test.
     Compare(CompareArgs),
 }
 
@@ -198,7 +198,7 @@ fn faults_named(text: &str) -> Result<Faults, String> {
 /// The faults that are meant, for flights with this vision.
 ///
 /// # Errors
-/// When one was named that has no effect with it: its flights would be told as survived.
+/// When a named fault has no effect with it: its flights would be reported as survived.
 fn faults_meant(named: &[Faults], vision: Vision) -> Result<Vec<Fault>, String> {
     let mut meant = Vec::new();
     for faults in named {
@@ -217,8 +217,8 @@ fn faults_meant(named: &[Faults], vision: Vision) -> Result<Vec<Fault>, String> 
     Ok(meant)
 }
 
-/// Tells which faults `all` leaves out.
-fn tell_left_out(named: &[Faults], vision: Vision) {
+/// Prints the faults that `all` leaves out.
+fn print_left_out(named: &[Faults], vision: Vision) {
     let left_out = Fault::all().filter(|fault| !fault.works_in(vision)).map(Fault::name);
     if named.iter().any(|faults| matches!(faults, Faults::All)) {
         write_error(&format!(
@@ -245,7 +245,7 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
         VisionArg::Modelled => Vision::Modelled,
     };
     let faults = faults_meant(&args.faults, vision).map_err(WrongUse)?;
-    tell_left_out(&args.faults, vision);
+    print_left_out(&args.faults, vision);
     let request = plan::Request {
         command: this_command(),
         plan: Plan {
@@ -267,7 +267,7 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
     request.plan.check()?;
     request.plan.check_marker().map_err(WrongUse)?;
     let mut folder = Folder::claim(&args.output, args.replace)?;
-    faults::tell_only_size_counts(
+    faults::warn_if_only_size_counts(
         vision,
         &plan::settings_text(request.plan.marker.as_ref(), &request.plan.set),
     );
@@ -424,14 +424,14 @@ mod tests {
 
     #[test]
     fn a_setting_that_results_are_sorted_by_and_a_family_without_frames_are_refused() {
-        let told = |setting: &str| {
+        let refusal_text = |setting: &str| {
             let refusal = plan::refuse_swept(&[setting.to_owned()], &plan::SWEPT).err();
             refusal.unwrap_or_default()
         };
-        assert!(told("simulator.wind.mean_m_s=7").contains("`--wind`"));
-        assert!(told("simulator.camera.latency_ms=400").contains("`--latency`"));
-        assert_eq!(told("simulator.camera.rate_hz=20"), "");
-        assert_eq!(told(QUOTED), "");
+        assert!(refusal_text("simulator.wind.mean_m_s=7").contains("`--wind`"));
+        assert!(refusal_text("simulator.camera.latency_ms=400").contains("`--latency`"));
+        assert_eq!(refusal_text("simulator.camera.rate_hz=20"), "");
+        assert_eq!(refusal_text(QUOTED), "");
         assert_eq!(family_name("aruco-4x4-50").as_deref(), Ok("aruco-4x4-50"));
         for other in ["aruco", "apriltag-36h11:7", "bogus"] {
             assert!(family_name(other).unwrap_err().contains("stag-hd23"), "{other}");

@@ -176,7 +176,7 @@ fn run_in_real_time(
         }
         findings.outcomes.push(outcome);
         steps.flown(findings.outcomes.len(), planned);
-        // What there is, should the next one end this process.
+        // The results so far, in case the next flight ends this process.
         report::write(folder, &title, &findings.outcomes, planned, true)?;
     }
     steps.finish();
@@ -214,7 +214,7 @@ pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
     if !real_time {
         let plan = &request.plan;
         let settings = settings_text(plan.marker.as_ref(), &plan.set);
-        tell_only_size_counts(Vision::Modelled, &settings);
+        warn_if_only_size_counts(Vision::Modelled, &settings);
     }
     let interruption = Interruption::on_signals(match real_time {
         true => "the flight under way does not count, and those before it are kept",
@@ -230,31 +230,31 @@ pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
         write_error(&format!("flights and this report: {}", output.display()));
     }
     if interruption.is_requested() {
-        if let Some(bad) = told_of_bad(&findings.outcomes) {
-            write_error(&format!("{bad}, which the exit status of an interruption does not tell"));
+        if let Some(bad) = failure_text(&findings.outcomes) {
+            write_error(&format!("{bad}, which the exit status of an interruption does not show"));
         }
         return Ok(interruption.exit_code());
     }
-    let is_good = told_of_bad(&findings.outcomes).is_none();
+    let is_good = failure_text(&findings.outcomes).is_none();
     Ok(if is_good { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// Warns before the flights that another marker would give the same ones.
-pub(crate) fn tell_only_size_counts(vision: Vision, settings: &str) {
+/// Warns before the flights if another marker of the same size would give the same flights.
+pub(crate) fn warn_if_only_size_counts(vision: Vision, settings: &str) {
     if only_size_counts(vision.name(), settings) {
         write_error(&format!("warning: {ONLY_SIZE_COUNTS}"));
     }
 }
 
-/// What must not be, of the flights that were flown; `None` when nothing was unsafe and every flight ended.
-fn told_of_bad(outcomes: &[Outcome]) -> Option<String> {
+/// How many of the flights were unsafe or did not end; `None` if none was and every flight ended.
+fn failure_text(outcomes: &[Outcome]) -> Option<String> {
     let count = |of: fn(&Outcome) -> bool| outcomes.iter().filter(|outcome| of(outcome)).count();
     let [beyond, unended] = [count(Outcome::is_unsafe), count(Outcome::is_unended)];
     let flown = outcomes.len();
-    let told = || {
+    let text = || {
         format!("of {flown} flights that were flown {beyond} were unsafe and {unended} did not end")
     };
-    (beyond + unended > 0).then(told)
+    (beyond + unended > 0).then(text)
 }
 
 #[cfg(test)]
@@ -271,17 +271,17 @@ mod tests {
     }
 
     #[test]
-    fn what_must_not_be_is_told_of_the_flights_that_were_flown() {
+    fn unsafe_and_unended_flights_are_reported() {
         let planned = &plan(&["--flights", "1"]).flights()[0];
         let safe = Outcome { ending: Ending::Landed, is_over: true, ..Outcome::new(planned) };
-        assert_eq!(told_of_bad(&[]), None);
-        assert_eq!(told_of_bad(std::slice::from_ref(&safe)), None);
+        assert_eq!(failure_text(&[]), None);
+        assert_eq!(failure_text(std::slice::from_ref(&safe)), None);
         let beyond = Outcome { sink_m_s: Some(3.0), ..safe.clone() };
         let unended = Outcome { is_over: false, ..safe.clone() };
-        let told = told_of_bad(&[safe, beyond.clone(), unended, beyond]).unwrap();
+        let text = failure_text(&[safe, beyond.clone(), unended, beyond]).unwrap();
         assert!(
-            told.contains("4 flights") && told.contains("2 were unsafe and 1 did not"),
-            "{told}"
+            text.contains("4 flights") && text.contains("2 were unsafe and 1 did not"),
+            "{text}"
         );
     }
 

@@ -1,4 +1,5 @@
-//! Ctrl-C while there is something to keep: the first asks the work to end, the second ends the process.
+//! Handles Ctrl-C, SIGTERM and SIGHUP during long work: the first signal asks the work to end and keep its results, the second one ends the
+//! process.
 
 use std::process::ExitCode;
 
@@ -10,13 +11,13 @@ use tokio::sync::watch;
 
 use crate::terminal::write_error;
 
-/// What shells add to a signal's number for the exit status of a process that it ended.
+/// Shells add this to a signal's number for the exit status of a process that it ended.
 const BY_SIGNAL: u8 = 128;
 const HANGUP: u8 = 1;
 const INTERRUPT: u8 = 2;
 const TERMINATE: u8 = 15;
 
-/// What is kept of flights in lock-step.
+/// The message at the interruption of flights in lock-step.
 pub(crate) const FLIGHTS_END: &str =
     "the flights under way end, and those that were flown are kept";
 
@@ -28,26 +29,27 @@ pub(crate) struct Interruption {
 }
 
 impl Interruption {
-    /// By SIGINT (Ctrl-C), SIGTERM, or SIGHUP (the end of a terminal) unless that is ignored, as `nohup` does. `what_is_kept` is told at the first; a second one, but SIGHUP, ends the process at once.
+    /// By SIGINT (Ctrl-C), SIGTERM, or SIGHUP (the end of a terminal) unless that is ignored, as `nohup` does. The first signal prints
+    /// `what_is_kept`. A second one, except SIGHUP, ends the process at once.
     ///
     /// # Errors
-    /// When the signals cannot be listened to.
+    /// When the handlers of the signals cannot be installed.
     pub(crate) fn on_signals(what_is_kept: &'static str) -> anyhow::Result<Self> {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)
             .enable_all()
             .build()
-            .context("starting the runtime that listens to Ctrl-C")?;
+            .context("starting the runtime that waits for Ctrl-C")?;
         let (sender, receiver) = watch::channel(None);
         let mut signals = {
             let _in_it = runtime.enter();
-            Signals::listen().context("listening to Ctrl-C")?
+            Signals::listen().context("waiting for Ctrl-C")?
         };
         runtime.spawn(async move {
             let number = signals.next().await;
             write_error(&format!("interrupted: {what_is_kept}; Ctrl-C again ends it at once"));
             sender.send_replace(Some(number));
-            // The end of a terminal is told by the shell and by the kernel, one after the other.
+            // Both the shell and the kernel send a signal at the end of a terminal, one after the other.
             let number = loop {
                 let number = signals.next().await;
                 if number != HANGUP {
@@ -68,7 +70,7 @@ impl Interruption {
     pub(crate) async fn requested(&self) {
         let mut signal = self.signal.clone();
         if signal.wait_for(Option::is_some).await.is_err() {
-            // Nobody listens any more: nobody will ask.
+            // The sender is gone, so no request will come.
             std::future::pending::<()>().await;
         }
     }
@@ -88,7 +90,7 @@ struct Signals {
 
 impl Signals {
     fn listen() -> std::io::Result<Self> {
-        // Whoever listens would undo that it is ignored.
+        // A handler would undo that SIGHUP is ignored.
         let hangups = match ignores_hangups() {
             true => None,
             false => Some(signal(SignalKind::hangup())?),
@@ -124,9 +126,9 @@ mod tests {
 
     use super::*;
 
-    const PATIENCE: Duration = Duration::from_secs(20);
+    const TIMEOUT: Duration = Duration::from_secs(20);
 
-    /// One test sends them all: what listens in this process gets each.
+    /// One test sends all signals, as each handler in this process receives all of them.
     #[test]
     fn a_signal_asks_for_the_end_and_gives_the_exit_status() {
         let waiting = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
@@ -137,12 +139,11 @@ mod tests {
             let interruption = Interruption::on_signals("nothing is kept").unwrap();
             assert!(!interruption.is_requested());
             kill_process(getpid(), signal).unwrap();
-            let requested =
-                async { tokio::time::timeout(PATIENCE, interruption.requested()).await };
+            let requested = async { tokio::time::timeout(TIMEOUT, interruption.requested()).await };
             waiting.block_on(requested).unwrap();
             assert!(interruption.is_requested());
             if signal == Signal::HUP {
-                // Were a second one the end, this process would end.
+                // If a second one ended the process, this test would end here.
                 kill_process(getpid(), signal).unwrap();
                 std::thread::sleep(Duration::from_millis(200));
             }

@@ -624,7 +624,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_can_connect_to_is_no_address_of_a_certificate() {
+    fn an_address_without_connections_is_refused_in_a_certificate() {
         for address in ["10.0.0.1", "fe80::1", "kestrel.local", "drone_2"] {
             assert!(parameters("drone", &[address.to_owned()], 30).is_ok(), "{address}");
         }
@@ -676,8 +676,8 @@ mod tests {
         let mut early = list(&laptop).unwrap();
         assert!(!early.holders[0].is_not_valid_yet);
         early.holders[0].is_not_valid_yet = true;
-        let told = "operator.bob@drone  yes          operator.pem, not valid yet: is this machine's clock right?";
-        assert_eq!(early.table().lines().nth(1), Some(told));
+        let expected = "operator.bob@drone  yes          operator.pem, not valid yet: is this machine's clock right?";
+        assert_eq!(early.table().lines().nth(1), Some(expected));
         let of_home = list(here).unwrap().table();
         let lines: Vec<_> = of_home.lines().collect();
         assert!(lines[1].starts_with("observer@drone      yes          observer.pem, expires in "));

@@ -51,11 +51,11 @@ pub(crate) struct LandArgs {
     #[arg(long, value_name = "GUIDANCE")]
     guidance: Option<String>,
     /// Fly this autopilot instead of the simulated one: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT,
-    /// tcpin:HOST:PORT or serial:DEVICE[:BAUD]. The simulated camera then follows the pose it reports. Only a vehicle that says that
-    /// it is a simulation takes off.
+    /// tcpin:HOST:PORT or serial:DEVICE[:BAUD]. The simulated camera then follows the pose it reports. Only a vehicle that reports itself
+    /// as a simulation takes off.
     #[arg(long, value_name = "ADDRESS")]
     autopilot: Option<String>,
-    /// Allow the take-off of a vehicle that does not say that it is a simulation. THE MOTORS START, and the pad
+    /// Allow the take-off of a vehicle that does not report itself as a simulation. THE MOTORS START, and the pad
     /// is one that exists in the simulated camera only. Asks first.
     #[arg(long, requires = "autopilot")]
     real_vehicle: bool,
@@ -65,7 +65,7 @@ pub(crate) struct LandArgs {
     /// Zenoh configuration (JSON5) [default: the built-in `local.json5`].
     #[arg(long, value_name = "FILE")]
     zenoh: Option<PathBuf>,
-    /// Port at which the processes of this landing meet, if it is free; otherwise another one is chosen, and told [default: 7447].
+    /// Port at which the processes of this landing meet, if it is free; otherwise another one is chosen, and printed [default: 7447].
     #[arg(long, value_name = "PORT", env = variable::MEET, value_parser = meet_port)]
     meet: Option<u16>,
     /// The vehicle's name, the first part of all keys [default: drone, or that of `--zenoh`].
@@ -96,8 +96,8 @@ fn timeout_s(text: &str) -> Result<f64, String> {
 }
 
 const EXIT_STATUS: &str = "Exit status of a landing: 0 when it landed on the pad (led there by the marker, and at most 0.3 m from its centre), 1 when it did not, \
-                           also when it came down otherwise (after an abort, by `land-here`, for an alarm, by the pilot: the result says how far from the pad) or \
-                           when it landed and the recording of `--record` failed or lost messages (the result tells `landed`, the recording's `problem` and what it `dropped`), \
+                           also when it came down otherwise (after an abort, by `land-here`, for an alarm, by the pilot: the result states the distance from the pad) or \
+                           when it landed and the recording of `--record` failed or lost messages (the result contains `landed`, the recording's `problem` and the number `dropped`), \
                            and 2 for a wrong command line or setting.";
 
 /// The loopback interface.
@@ -109,8 +109,8 @@ const GROUND_PORT: u16 = 14_550;
 /// Maximum delay of Ctrl-C in this process after its services.
 const SIGNAL_GRACE: Duration = Duration::from_millis(200);
 
-/// Time for a detector to tell about itself, which it does every second.
-const INFO_PATIENCE: Duration = Duration::from_millis(1500);
+/// Time to wait for a detector's information, which it publishes every second.
+const INFO_TIMEOUT: Duration = Duration::from_millis(1500);
 
 /// Time after the landing for the last messages of the services.
 const AFTER_LANDING: Duration = Duration::from_millis(1200);
@@ -137,7 +137,7 @@ fn confirm_real_vehicle(args: &LandArgs, settings: &ServiceSettings) -> anyhow::
     }
     let warning = format!(
         "The vehicle at {} need not be a simulation: its motors start, it takes off, and it lands where the simulated \
-         camera shows a pad that is not there. Propellers off, or nobody near?",
+         camera shows a pad that is not there. Propellers off, or no person near?",
         args.autopilot.as_deref().unwrap_or("the autopilot's address")
     );
     if !std::io::stdin().is_terminal() {
@@ -264,7 +264,7 @@ impl ServiceSettings {
         Ok(Some(Layers { file: None, set }.load::<dashboard::Config>()?.settings))
     }
 
-    /// Whether the controller's vehicle is the simulated one of this landing, which nobody meets again.
+    /// Whether the controller's vehicle is the simulated one of this landing, which does not exist after it.
     fn is_simulated(&self) -> bool {
         let layers = Layers { file: None, set: self.of(Service::Controller).to_vec() };
         let config = layers.load::<controller::Config>();
@@ -296,7 +296,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     let shutdown = Shutdown::on_signals()?;
     let page = settings.page()?;
     if let Some(page) = &page {
-        // Before anything flies: later a landing goes on without its page.
+        // Before anything flies: later a landing continues without its page.
         TcpListener::bind(&page.listen).with_context(|| {
             format!(
                 "showing the page at {}; choose another address with `--dashboard IP:PORT`",
@@ -338,7 +338,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         let scheme = if page.certificate().is_some() { "https" } else { "http" };
         progress.say(&format!("The page is at {scheme}://{}/", page.listen));
     }
-    // What a controller notes of a simulated vehicle is of use to those that resume this landing, and to nobody after it.
+    // A controller's notes of a simulated vehicle are of use to controllers that resume this landing, and not after it.
     let notes_in = settings.is_simulated().then(|| rendezvous.directory.path());
     let mut children = Children::new();
     let mut resume = String::new();
@@ -443,7 +443,7 @@ async fn watch(
                         landing.interrupted("interrupted");
                         return Ok(landing);
                     }
-                    // What was told before it ended has arrived.
+                    // Messages that were published before it ended have arrived.
                     while let Some(truth) = truths.waiting() {
                         landing.truth(truth);
                     }
@@ -464,7 +464,7 @@ async fn watch(
                         controllers_exit = Some(exit.to_string());
                         if !landing.never_flew() {
                             progress.say(&format!("To resume the landing of an ArduPilot that is still in GUIDED: {resume}"));
-                            progress.say("A PX4 leaves OFFBOARD by itself when the setpoints stop: land it in Land or Return, or by hand");
+                            progress.say("A PX4 leaves OFFBOARD on its own when the setpoints stop: land it in Land or Return, or by hand");
                         }
                     }
                     // The landing needs no ground station, recording or page.
@@ -495,7 +495,7 @@ async fn watch(
                 return Ok(landing);
             }
             () = tokio::time::sleep_until(end) => {
-                // Where an abort lands it, or the pilot does, the result tells where it comes down.
+                // If an abort or the pilot lands it, the result contains where it touches down.
                 if over.is_some() && landing.comes_down() && Instant::now() < deadline {
                     over = Some(Instant::now() + AFTER_LANDING);
                     continue;
@@ -542,19 +542,19 @@ async fn end_of(node: &Node, landing: &LandingSummary, detector: &str) -> Option
     if let Some(left) = healths.iter().find(|it| it.host != here || is_running(it.pid)) {
         return Some(kill(&left.host, left.pid));
     }
-    // One of another program tells no health, and its process all the same.
+    // A detector of another program publishes no health, but its information contains its process number.
     let infos = node.subscriber(topic::DETECTOR_INFO, &[detector]).await;
-    let told = match &infos {
-        Ok(infos) => tokio::time::timeout(INFO_PATIENCE, infos.next()).await.ok().flatten(),
+    let info = match &infos {
+        Ok(infos) => tokio::time::timeout(INFO_TIMEOUT, infos.next()).await.ok().flatten(),
         Err(_) => None,
     };
-    match told {
+    match info {
         Some(info) => Some(kill(&info.host, info.pid)),
         None => healths.is_empty().then(|| "end it where it was started".to_owned()),
     }
 }
 
-/// Whether this host has a process of this number, whoever's it is.
+/// Whether this host has a process of this number, of any user.
 fn is_running(pid: u32) -> bool {
     let pid = i32::try_from(pid).ok().and_then(Pid::from_raw);
     pid.is_some_and(|pid| test_kill_process(pid) != Err(Errno::SRCH))
@@ -564,7 +564,7 @@ fn is_running(pid: u32) -> bool {
 fn consequence(service: Service) -> &'static str {
     match service {
         Service::Controller => {
-            "; ArduPilot stops a vehicle that flies, PX4 does what its COM_OBL_RC_ACT says"
+            "; ArduPilot stops a vehicle that flies, PX4 does what its COM_OBL_RC_ACT specifies"
         }
         Service::GcsBridge => "; the landing continues without the ground station",
         Service::Recorder => "; the landing continues, and is recorded no more",
@@ -613,7 +613,7 @@ impl Rendezvous {
 
 /// Locks a free port for a rendezvous. Its TCP port is bound a moment later, by the first of the processes; another landing that
 /// begins meanwhile would find it free, and the two would fly in one network. So the UDP port of the same number is held as a lock
-/// for as long as the landing lasts.
+/// until the end of the landing.
 fn claim(port: u16) -> std::io::Result<UdpSocket> {
     let lock = UdpSocket::bind((LOOPBACK, port))?;
     TcpListener::bind((LOOPBACK, port)).map(|_| lock)
@@ -665,7 +665,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pad_that_is_not_utf_8_is_told_with_its_line() {
+    fn a_pad_that_is_not_utf_8_is_reported_with_its_line() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("pad.toml");
         std::fs::write(&file, b"id = 1\nname = \"H\xf6he\"\n").unwrap();
@@ -677,14 +677,13 @@ mod tests {
     #[test]
     fn landings_that_begin_at_once_meet_at_different_ports() -> anyhow::Result<()> {
         let [first, second] = [Rendezvous::new(None, None)?, Rendezvous::new(None, None)?];
-        let [told, other] = [&first, &second].map(|it| std::fs::read_to_string(&it.file));
-        assert_ne!(told?, other?, "{} and {}", first.description, second.description);
+        let [one, other] = [&first, &second].map(|it| std::fs::read_to_string(&it.file));
+        assert_ne!(one?, other?, "{} and {}", first.description, second.description);
         Ok(())
     }
 
     #[test]
-    fn a_landing_meets_at_the_port_that_is_asked_for_and_tells_of_another_one() -> anyhow::Result<()>
-    {
+    fn a_landing_meets_at_the_requested_port_and_reports_another_one() -> anyhow::Result<()> {
         let (port, lock) = free_port()?;
         drop(lock);
         let args = Tool::parse_from(["land", "--meet", &port.to_string()]).land;
@@ -707,7 +706,7 @@ mod tests {
         assert_eq!(meet.get_env(), Some(std::ffi::OsStr::new("ALIGHT_MEET")));
     }
 
-    /// The result of a landing whose simulator exits, where these are told before it does.
+    /// The result of a landing whose simulator exits after these were published.
     async fn without_its_simulator(
         status: ControllerStatus,
         truth: Option<Truth>,
@@ -718,8 +717,8 @@ mod tests {
         let statuses = node.publisher(topic::STATUS, &[]).await?;
         let truths = node.publisher(topic::TRUTH, &[]).await?;
         let folder = tempfile::tempdir()?;
-        let told = folder.path().join("told");
-        let telling = async {
+        let published = folder.path().join("published");
+        let publishing = async {
             while !(statuses.has_subscribers().await && truths.has_subscribers().await) {
                 tokio::time::sleep(Duration::from_millis(5)).await;
             }
@@ -727,27 +726,29 @@ mod tests {
             if let Some(truth) = &truth {
                 truths.publish(truth).await;
             }
-            std::fs::write(&told, "")?;
+            std::fs::write(&published, "")?;
             std::future::pending::<anyhow::Result<()>>().await
         };
         let settings = ServiceSettings::new(&Tool::try_parse_from(["land"])?.land)?;
         let mut children = Children::new();
         let mut simulator = tokio::process::Command::new("sh");
-        simulator.args(["-c", "while [ ! -e \"$0\" ]; do sleep 0.02; done; exit 3"]).arg(&told);
+        simulator
+            .args(["-c", "while [ ! -e \"$0\" ]; do sleep 0.02; done; exit 3"])
+            .arg(&published);
         children.spawn(Service::Simulator, simulator, "sh", Reach::Leader)?;
         let mut progress = Progress::new(Format::Json);
         let deadline = Instant::now() + Duration::from_secs(60);
         let limits = Limits { shutdown: Shutdown::on_signals()?, deadline };
         let landing = tokio::select! {
             landing = watch(&node, &settings, &mut children, "", &mut progress, limits) => landing,
-            end = telling => bail!("telling: {end:?}"),
+            end = publishing => bail!("publishing: {end:?}"),
         };
         node.close().await;
         Ok(landing?.outcome())
     }
 
     #[tokio::test(flavor = "multi_thread")]
-    async fn what_is_known_of_a_landing_outlives_its_simulator() -> anyhow::Result<()> {
+    async fn the_result_of_a_landing_outlives_its_simulator() -> anyhow::Result<()> {
         let status = |phase, started_ns| ControllerStatus {
             phase,
             why: "because".to_owned(),
@@ -760,8 +761,8 @@ mod tests {
 
         let outcome = without_its_simulator(status(Phase::Descend, Some(1)), None).await?;
         let json = serde_json::to_string(&outcome)?;
-        let told = "the simulator exited: exit status: 3; it was in descend: because";
-        assert!(json.contains(told) && json.contains("\"landed\":false"), "{json}");
+        let outcome_text = "the simulator exited: exit status: 3; it was in descend: because";
+        assert!(json.contains(outcome_text) && json.contains("\"landed\":false"), "{json}");
         assert!(!outcome.is_done());
 
         let landed = ControllerStatus {
@@ -794,7 +795,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_said_of_a_detector_that_exited_is_so() {
+    fn the_text_on_an_exited_detector_follows_the_controllers_status() {
         let candidate = |name: &str, alive: bool| Candidate {
             detector: name.into(),
             alive,
@@ -841,7 +842,7 @@ mod tests {
         infos.publish(&DetectorInfo { host: "ground-station".into(), ..info }).await;
         let elsewhere = end("python").await;
         assert_eq!(elsewhere.as_deref(), Some("`kill 4711` on ground-station ends it"));
-        assert_eq!(end("nobody").await.as_deref(), Some("end it where it was started"));
+        assert_eq!(end("absent").await.as_deref(), Some("end it where it was started"));
         node.close().await;
         Ok(())
     }
@@ -874,7 +875,7 @@ mod tests {
     }
 
     #[test]
-    fn no_port_is_found_twice_although_nobody_binds_it() -> anyhow::Result<()> {
+    fn no_port_is_found_twice_although_none_is_bound() -> anyhow::Result<()> {
         let found: Vec<u16> =
             (0..20).map(|_| free_port().map(|(port, _)| port)).collect::<anyhow::Result<_>>()?;
         let different: std::collections::BTreeSet<u16> = found.iter().copied().collect();

@@ -1,4 +1,4 @@
-//! What a supervisor notes for the one that is started after it, should it be killed: that it runs, and a landing under way.
+//! Writes notes of a supervisor to files for its successor, in case it is killed: that it runs, and a landing under way.
 
 use std::io::{Error, ErrorKind};
 use std::os::unix::fs::MetadataExt;
@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 pub(crate) struct Notes {
     /// There from the start of its processes until an orderly stop.
     pub(crate) running: Note,
-    /// There while a landing is under way, and written anew again and again.
+    /// There while a landing is under way, and written again at intervals.
     pub(crate) landing: Note,
 }
 
@@ -92,7 +92,8 @@ impl Note {
         }
     }
 
-    /// Whether it is there, and the machine was not started anew since. What is there and cannot be read, as after a full disk, counts.
+    /// Whether it is there, and the machine was not started anew since. A note that is there and cannot be read, as after a full disk,
+    /// counts.
     pub(crate) fn is_there(&self) -> bool {
         match self.read() {
             Ok(content) => content.clock == clock_name(),
@@ -113,7 +114,8 @@ impl Note {
     }
 }
 
-/// Why notes cannot be kept in a directory: only this user (and root) may write there, as whoever can may have a landing resumed.
+/// Why notes cannot be kept in a directory: only this user (and root) may write there, because a user with write access can cause a landing
+/// to be resumed.
 fn unfit_because(directory: &Path) -> Option<String> {
     let found = match std::fs::metadata(directory) {
         Ok(found) => found,
@@ -142,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn a_note_tells_whether_it_was_written() {
+    fn writing_a_note_returns_whether_it_was_written() {
         let folder = tempfile::tempdir().unwrap();
         let note = Note { file: Some(folder.path().join("x.running")) };
         assert!(note.write() && note.is_there());

@@ -15,7 +15,7 @@ use crate::children::Exit;
 const THESIS_TIME_S: f64 = 55.0;
 const THESIS_ERROR_M: f64 = 0.0682;
 
-/// What is known of a landing under way.
+/// The state of a landing under way, from the messages received so far.
 #[derive(Default)]
 pub(crate) struct LandingSummary {
     pub(crate) last_status: Option<ControllerStatus>,
@@ -33,7 +33,7 @@ pub(crate) struct LandingSummary {
     recorder: Option<RecorderStatus>,
     /// How the recorder exited before it was to, or with an error.
     recorders_exit: Option<Exit>,
-    /// The error with which it exited at the end, as it says.
+    /// The error with which it exited at the end, from its standard error.
     recorders_word: Option<String>,
     /// The recorder that is to record it.
     recorded_by: Option<OurRecorder>,
@@ -67,7 +67,7 @@ pub(crate) struct Outcome {
     is_to_be_recorded: bool,
 }
 
-/// What was recorded of it.
+/// The recording of a landing.
 #[derive(Serialize)]
 struct Recording {
     /// The last file; none where it ended before one was begun.
@@ -104,8 +104,9 @@ pub(crate) struct OurRecorder {
 }
 
 impl OurRecorder {
-    /// Whether it tells this, and not one of the same name that others started. Without a file it tells why there is none.
-    fn tells(&self, status: &RecorderStatus) -> bool {
+    /// Whether this recorder published the status, not one of the same name that another process started. A status without a file contains
+    /// the reason.
+    fn published(&self, status: &RecorderStatus) -> bool {
         let wanted = self.file.to_string_lossy();
         let is_of_its_file = match status.file.as_str() {
             "" => status.problem.is_some() || wanted.is_empty(),
@@ -133,7 +134,7 @@ impl OurRecorder {
 }
 
 /// The problem of a recorder until it reports.
-const UNHEARD: &str = "the recorder has not reported";
+const NO_REPORT: &str = "the recorder has not reported";
 
 /// A vehicle that sinks faster comes down, in m/s.
 const MIN_SINK_M_S: f64 = 0.1;
@@ -147,9 +148,9 @@ const MAX_DISARMING_NS: i64 = 12_000_000_000;
 impl LandingSummary {
     /// Of a landing that this recorder is to record.
     pub(crate) fn recorded_by(recorder: OurRecorder) -> Self {
-        let unheard =
-            RecorderStatus { problem: Some(UNHEARD.to_owned()), ..RecorderStatus::default() };
-        Self { recorder: Some(unheard), recorded_by: Some(recorder), ..Self::default() }
+        let no_report =
+            RecorderStatus { problem: Some(NO_REPORT.to_owned()), ..RecorderStatus::default() };
+        Self { recorder: Some(no_report), recorded_by: Some(recorder), ..Self::default() }
     }
 
     /// Adds a status; true when the controller has finished.
@@ -180,11 +181,11 @@ impl LandingSummary {
     }
 
     pub(crate) fn recorder(&mut self, recorder: RecorderStatus) {
-        // Others may run beside it.
-        if self.recorded_by.as_ref().is_some_and(|ours| !ours.tells(&recorder)) {
+        // Other recorders may run in parallel.
+        if self.recorded_by.as_ref().is_some_and(|ours| !ours.published(&recorder)) {
             return;
         }
-        // One that fails goes on without a file; what it kept is in the last one.
+        // A recorder that fails continues without a file; its recorded messages are in the last one.
         let before = self.recorder.replace(recorder).map(|before| before.file);
         if let (Some(now), Some(before)) = (&mut self.recorder, before) {
             if now.file.is_empty() {
@@ -196,26 +197,26 @@ impl LandingSummary {
         }
     }
 
-    /// Notes that the recorder exited before it was to: what follows is not in its file, which lacks its end unless it was ended
+    /// Notes that the recorder exited before it was to: later messages are not in its file, which lacks its end unless the recorder ended
     /// in good order.
     pub(crate) fn recording_ended_early(&mut self, exit: &Exit) {
         self.recorder.get_or_insert_default();
         self.recorders_exit = Some(exit.clone());
     }
 
-    /// Notes that the recorder exited with an error when it was to, and what it said.
+    /// Notes that the recorder exited with an error when it was to, and the last line of its standard error.
     pub(crate) fn recording_failed(&mut self, exit: &Exit, said: Option<String>) {
         self.recording_ended_early(exit);
         self.recorders_word = said;
     }
 
-    /// Why the recording lacks something. What it told before it exited may be heard later, and does not undo that.
+    /// Why the recording is incomplete. Statuses that the recorder published before it exited may be received later, and do not undo that.
     fn recording_problem(&self, recorder: &RecorderStatus) -> Option<String> {
         let Some(exit) = &self.recorders_exit else { return recorder.problem.clone() };
         let is_begun = !recorder.file.is_empty();
         let ended_early = match (exit.status, is_begun) {
             (Some(0), true) => {
-                "the recorder ended before the landing; its file is whole".to_owned()
+                "the recorder ended before the landing; its file is complete".to_owned()
             }
             (Some(0), false) => "the recorder ended before the landing".to_owned(),
             (_, true) => {
@@ -223,7 +224,7 @@ impl LandingSummary {
             }
             (_, false) => format!("the recorder exited: {exit}"),
         };
-        let known = recorder.problem.clone().filter(|problem| problem != UNHEARD);
+        let known = recorder.problem.clone().filter(|problem| problem != NO_REPORT);
         Some(known.or(self.recorders_word.clone()).unwrap_or(ended_early))
     }
 
@@ -367,8 +368,8 @@ impl LandingSummary {
 }
 
 impl Outcome {
-    /// Whether all is done that was asked for: it landed on the pad, and what was to be recorded of it is. Frames that never came
-    /// to the recorder are no loss of its.
+    /// Whether everything requested is done: it landed on the pad, and it was recorded if that was requested. Frames that never reached the
+    /// recorder do not count as lost.
     pub(crate) fn is_done(&self) -> bool {
         let is_whole =
             |recording: &Recording| recording.problem.is_none() && recording.dropped == 0;
@@ -431,7 +432,7 @@ impl Outcome {
     }
 }
 
-/// What the latency and the frames are counted of: not of the same as in the report of a recording.
+/// The intervals that the latency and the frames are counted over: they differ from those in the report of a recording.
 fn counted() -> String {
     format!(
         "Frames and detections count from the camera's first frame, the take-off's too; the latency is of the last {LATENCIES_KEPT} setpoints. \
@@ -503,8 +504,8 @@ mod tests {
         assert_eq!(outcome.detections, 100);
         let table = outcome.table();
         assert!(table.contains("0.020 m        0.068 m"), "{table}");
-        for told in ["of the last 512 setpoints", "the take-off's too", "of the landing alone"] {
-            assert!(table.contains(told), "{told} is not in: {table}");
+        for part in ["of the last 512 setpoints", "the take-off's too", "of the landing alone"] {
+            assert!(table.contains(part), "{part} is not in: {table}");
         }
     }
 
@@ -524,10 +525,10 @@ mod tests {
     }
 
     #[test]
-    fn what_came_down_otherwise_has_not_landed_on_the_pad() {
+    fn a_vehicle_that_came_down_otherwise_has_not_landed_on_the_pad() {
         let landed = ended(Phase::Landed, "on the ground, disarmed", 0.02);
         assert_eq!((landed.landed, landed.down, landed.is_done()), (true, true, true));
-        for (phase, why, error_m, told) in [
+        for (phase, why, error_m, expected) in [
             (
                 Phase::Landed,
                 "on the ground, disarmed: the operator's command to land here",
@@ -554,13 +555,16 @@ mod tests {
             ),
         ] {
             let outcome = ended(phase, why, error_m);
-            assert_eq!(outcome.outcome, told);
+            assert_eq!(outcome.outcome, expected);
             assert_eq!((outcome.landed, outcome.down, outcome.is_done()), (false, true, false));
-            let how =
-                if told.contains("counts") { "beside the pad" } else { "but not led to the pad" };
+            let how = if expected.contains("counts") {
+                "beside the pad"
+            } else {
+                "but not led to the pad"
+            };
             let verdict = outcome.table().lines().next().unwrap_or_default().to_owned();
             assert!(verdict.starts_with("Down"), "{verdict}");
-            assert!(verdict.ends_with(&format!("{how}: {told}.")), "{verdict}");
+            assert!(verdict.ends_with(&format!("{how}: {expected}.")), "{verdict}");
         }
     }
 
@@ -613,7 +617,7 @@ mod tests {
         };
         assert!(!is_done(&LandingSummary::default()));
         assert!(is_done(&landed(LandingSummary::default())));
-        let told = |recorder: &str, file: &str, problem: Option<&str>| RecorderStatus {
+        let reported = |recorder: &str, file: &str, problem: Option<&str>| RecorderStatus {
             recorder: recorder.into(),
             file: file.into(),
             problem: problem.map(str::to_owned),
@@ -621,46 +625,46 @@ mod tests {
         };
         let ours = || OurRecorder { name: "main".into(), file: "flight.mcap".into() };
         let mut landing = landed(LandingSummary::recorded_by(ours()));
-        assert!(!is_done(&landing), "nobody knows of a recording");
-        landing.recorder(told("main", "", Some("No space left")));
+        assert!(!is_done(&landing), "no recorder has reported");
+        landing.recorder(reported("main", "", Some("No space left")));
         assert!(!is_done(&landing));
-        landing.recorder(told("main", "flight-2.mcap", None));
-        landing.recorder(told("another", "", Some("No space left")));
+        landing.recorder(reported("main", "flight-2.mcap", None));
+        landing.recorder(reported("another", "", Some("No space left")));
         assert!(is_done(&landing), "another file took its place");
         let exit = |words: &str, status| Exit { words: words.into(), status };
         landing.recording_ended_early(&exit("exit status: 1", Some(1)));
         assert!(!is_done(&landing));
         assert!(landing.outcome().table().contains("--repair"));
-        landing.recorder(told("main", "flight-2.mcap", None));
-        assert!(!is_done(&landing), "what it told before comes late");
+        landing.recorder(reported("main", "flight-2.mcap", None));
+        assert!(!is_done(&landing), "an earlier status is received late");
         assert!(landing.outcome().table().contains("--repair"));
-        landing.recorder(told("main", "", None));
-        landing.recorder(told("main", "elsewhere/flight.mcap", None));
+        landing.recorder(reported("main", "", None));
+        landing.recorder(reported("main", "elsewhere/flight.mcap", None));
         assert!(!is_done(&landing), "one of the same name says nothing of it");
         for (wanted, file) in [("flight-{time}.mcap", "flight-20261122T105011Z.mcap"), ("", "")] {
             let ours = OurRecorder { name: "main".into(), file: wanted.into() };
             let mut landing = landed(LandingSummary::recorded_by(ours));
-            landing.recorder(told("main", file, None));
+            landing.recorder(reported("main", file, None));
             assert!(is_done(&landing), "{wanted}");
         }
         let mut landing = landed(LandingSummary::recorded_by(ours()));
-        landing.recorder(told("main", "flight.mcap", None));
+        landing.recorder(reported("main", "flight.mcap", None));
         landing.recording_ended_early(&exit("exit status: 0", Some(0)));
         assert!(!is_done(&landing), "the landing is not in it");
         let table = landing.outcome().table();
-        assert!(table.contains("its file is whole") && !table.contains("--repair"), "{table}");
-        landing.recorder(told("main", "flight-2.mcap", None));
+        assert!(table.contains("its file is complete") && !table.contains("--repair"), "{table}");
+        landing.recorder(reported("main", "flight-2.mcap", None));
         assert!(is_done(&landing), "another recorder goes on");
         let losing = |key: &str| RecorderStatus {
             dropped: vec![RecorderCount { key: key.into(), count: 3 }],
-            ..told("main", "flight-2.mcap", None)
+            ..reported("main", "flight-2.mcap", None)
         };
         landing.recorder(losing("camera/down/frame (never came)"));
         assert!(is_done(&landing), "the recorder lost nothing");
         landing.recorder(losing("wind"));
         assert!(!is_done(&landing), "the recorder lost something");
         let mut landing = landed(LandingSummary::recorded_by(ours()));
-        landing.recorder(told("main", "flight.mcap", None));
+        landing.recorder(reported("main", "flight.mcap", None));
         let said = "running recorder: 3 messages came and are in no file".to_owned();
         landing.recording_failed(&exit("exit status: 1", Some(1)), Some(said));
         let table = landing.outcome().table();

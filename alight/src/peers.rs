@@ -1,5 +1,5 @@
-//! What a supervisor's restarts depend on, from statuses and detectors' information: whether a landing is under way, noted in a file, and which
-//! detector has replaced one that exited.
+//! Follows the controller's statuses and the detectors for a supervisor: whether a landing is under way, which it notes in a file, and
+//! which detector has replaced one that exited.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -15,7 +15,7 @@ use crate::runtime::tool_identity;
 
 /// Maximum number of detectors that are followed; a network has far fewer.
 const MAX_DETECTORS: usize = 64;
-/// Interval at which the note of a landing is written anew.
+/// Interval at which the note of a landing is written again.
 const REFRESH: Duration = Duration::from_secs(1);
 /// A note older than this is stale: its landing is not resumed.
 pub(crate) const STALE_AFTER: Duration = Duration::from_secs(15);
@@ -84,7 +84,7 @@ impl Peers {
                 tokio::select! {
                     Some(status) = statuses.next() => {
                         let under_way = monitor.update(&status, Instant::now());
-                        // Nobody waits for this: it is looked up when a controller is started.
+                        // No task waits for this value: it is looked up when a controller is started.
                         sender.send_if_modified(|table| {
                             table.under_way = under_way;
                             false
@@ -129,7 +129,7 @@ impl Peers {
         self.table.borrow().replacement(&node::host_name(), pid, own)
     }
 
-    /// Whoever runs in place of a supervised detector now: the one that did, or once that is gone one that came after it.
+    /// The detector that now runs in place of a supervised one: the known replacement, or, once that is gone, one that came after it.
     pub(crate) fn successor(&self, of: &Replacement, own: &[i32]) -> Option<Replacement> {
         self.table.borrow().successor(of, &node::host_name(), own)
     }
@@ -150,7 +150,7 @@ impl Slot {
 }
 
 impl PeerTable {
-    /// A controller that is dead tells nothing more, so without a status a landing is under way for a while only.
+    /// A dead controller publishes nothing, so a landing without a status counts as under way only for a while.
     fn landing(&self, now: Instant) -> bool {
         self.under_way.is_some_and(|last| now - last < STALE_AFTER)
     }
@@ -185,8 +185,8 @@ impl PeerTable {
         (!is_full(self)).then(|| self.detectors.entry(name.to_owned()).or_default())
     }
 
-    /// One that the operator has named, or that came after it. Others in its slot were beside it all along, and that the controller uses one of
-    /// them says only that this one has gone.
+    /// One that the operator has named, or that came after it. Other detectors in its slot ran in parallel with it all along. If the
+    /// controller uses one of them, that shows only that this one has gone.
     fn replacement(&self, host: &str, pid: i32, own: &[i32]) -> Option<Replacement> {
         let is_it =
             |it: &&KnownDetector| it.info.as_ref().is_some_and(|info| is_process(info, host, pid));
@@ -304,11 +304,11 @@ mod tests {
         assert_eq!(
             table.replacement("pi", 2, &own),
             None,
-            "neither one that was beside it, nor an own one, nor one of another place or camera"
+            "neither one that ran in parallel, nor a supervised one, nor one of another place or camera"
         );
         table.preference = "spare".into();
         assert_eq!(name(table.replacement("pi", 2, &own)).as_deref(), Some("spare"));
-        assert_eq!(table.replacement("pi", 77, &own), None, "it never told its slot");
+        assert_eq!(table.replacement("pi", 77, &own), None, "it never published its slot");
     }
 
     #[test]
@@ -371,24 +371,24 @@ mod tests {
         assert!(monitor.update(&landing, now).is_some() && notes.landing.is_there());
         assert!(monitor.update(&held, now).is_none() && !notes.landing.is_there());
         assert!(monitor.update(&restarted, now).is_none(), "nor while the next one waits");
-        // The operator goes on with it.
+        // The operator continues it.
         assert!(monitor.update(&landing, now).is_some() && notes.landing.is_there());
     }
 
     #[test]
-    fn a_landing_of_which_nothing_more_is_told_is_soon_over() {
+    fn a_landing_without_further_statuses_is_soon_over() {
         let (mut monitor, now) = (LandingMonitor::default(), Instant::now());
         let landing = ControllerStatus { started_ns: Some(1), ..ControllerStatus::default() };
         let waiting = ControllerStatus::default();
         let lands_after = |under_way, silence| {
             PeerTable { under_way, ..PeerTable::default() }.landing(now + silence)
         };
-        let told = monitor.update(&landing, now);
-        assert!(lands_after(told, STALE_AFTER / 2));
-        assert!(!lands_after(told, STALE_AFTER));
+        let under_way = monitor.update(&landing, now);
+        assert!(lands_after(under_way, STALE_AFTER / 2));
+        assert!(!lands_after(under_way, STALE_AFTER));
         // A controller that waits does not make the landing any younger.
-        let told = monitor.update(&waiting, now + STALE_AFTER / 2);
-        assert!(lands_after(told, STALE_AFTER / 2));
-        assert!(!lands_after(told, STALE_AFTER));
+        let under_way = monitor.update(&waiting, now + STALE_AFTER / 2);
+        assert!(lands_after(under_way, STALE_AFTER / 2));
+        assert!(!lands_after(under_way, STALE_AFTER));
     }
 }

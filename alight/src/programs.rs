@@ -1,4 +1,4 @@
-//! The programs that the processes of a site need beside `alight`, and whether this machine has them.
+//! Finds the programs, devices and files that the processes of a site need and this machine does not have.
 
 use std::ffi::OsStr;
 use std::os::unix::fs::PermissionsExt;
@@ -62,8 +62,9 @@ pub(crate) fn missing_devices(job: &Job, folder: &Path) -> Vec<String> {
         _ => {}
     }
     wanted.retain(|(path, _, _)| std::fs::metadata(folder.join(path)).is_err());
-    let told = |(path, what, advice)| format!("{}: there is no {what} {path}; {advice}", job.name);
-    wanted.into_iter().map(told).collect()
+    let message =
+        |(path, what, advice)| format!("{}: there is no {what} {path}; {advice}", job.name);
+    wanted.into_iter().map(message).collect()
 }
 
 fn absent(program: &str, folder: &Path, search: &OsStr) -> Option<String> {
@@ -109,36 +110,37 @@ mod tests {
     #[test]
     fn a_program_that_is_not_found_is_named() {
         let folder = folder();
-        let told = |program: &str| {
+        let error = |program: &str| {
             let job = job(Service::Detector, &[program], &[]);
             missing(&job, folder.path(), folder.path().as_os_str())
         };
         let file = folder.path().join("there");
         for program in ["alight", "there", "./there", file.to_str().unwrap()] {
-            assert_eq!(told(program), None, "{program}");
+            assert_eq!(error(program), None, "{program}");
         }
         for program in ["absent", "./absent", "/no/such"] {
-            let told = told(program).unwrap();
+            let error = error(program).unwrap();
             let named = format!("detector: there is no program `{program}`");
-            assert!(told.contains(&named), "{told}");
+            assert!(error.contains(&named), "{error}");
         }
         std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o644)).unwrap();
-        assert!(told("there").is_some(), "it may not be run");
+        assert!(error("there").is_some(), "it may not be run");
     }
 
     #[test]
     fn devices_and_files_that_are_not_there_are_named() {
         let folder = folder();
-        let told = |service, set: &[&str]| missing_devices(&job(service, &[], set), folder.path());
-        let line = told(Service::Controller, &["autopilot.address=serial:/dev/no-such:57600"]);
+        let missing =
+            |service, set: &[&str]| missing_devices(&job(service, &[], set), folder.path());
+        let line = missing(Service::Controller, &["autopilot.address=serial:/dev/no-such:57600"]);
         assert!(
             line[0].contains("controller: there is no device /dev/no-such; connect"),
             "{line:?}"
         );
-        let line = told(Service::Controller, &["autopilot.address=udpin:0.0.0.0:14550"]);
+        let line = missing(Service::Controller, &["autopilot.address=udpin:0.0.0.0:14550"]);
         assert_eq!(line, Vec::<String>::new());
         let size = "source.size_px=[64, 48]";
-        let camera = told(
+        let camera = missing(
             Service::CameraPub,
             &["source.device=/dev/video-no", size, "calibration.file=c.yaml"],
         );
@@ -146,22 +148,22 @@ mod tests {
             camera[0].contains("no device /dev/video-no") && camera[1].contains("no file c.yaml"),
             "{camera:?}"
         );
-        assert_eq!(told(Service::CameraPub, &["source.paths=['there']"]), Vec::<String>::new());
-        assert_eq!(told(Service::CameraPub, &["source.paths=['not-there']"]).len(), 1);
+        assert_eq!(missing(Service::CameraPub, &["source.paths=['there']"]), Vec::<String>::new());
+        assert_eq!(missing(Service::CameraPub, &["source.paths=['not-there']"]).len(), 1);
     }
 
     #[test]
     fn the_program_of_a_camera_is_looked_for_as_well() {
         let folder = folder();
-        let told = |command: &str| {
+        let error = |command: &str| {
             let command = format!("source.command={command}");
             let set = ["source.size_px=[64, 48]", "calibration.file=c.yaml", command.as_str()];
             let job = job(Service::CameraPub, &["alight", "camera-pub"], &set);
             missing_of_service(&job, folder.path(), folder.path().as_os_str())
         };
-        assert_eq!(told("['there', 'x']"), None);
-        assert_eq!(told("['./there']"), None);
-        let problem = told("['rpicam-none', 'x']").unwrap();
+        assert_eq!(error("['there', 'x']"), None);
+        assert_eq!(error("['./there']"), None);
+        let problem = error("['rpicam-none', 'x']").unwrap();
         assert_eq!(
             problem,
             "camera-pub: there is no program `rpicam-none` in the PATH; install it, or correct its `source.command`"

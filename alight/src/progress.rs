@@ -24,7 +24,7 @@ pub(crate) struct Progress {
     warnings: Warnings,
 }
 
-/// Time for which a warning that ends and begins again is not shown once more, nor what was shown in other words.
+/// Time for which a warning that ends and begins again is not shown again, also not in other words.
 const QUIET: Duration = Duration::from_secs(5);
 /// Maximum number of lines and of warnings that are remembered.
 const MAX_REMEMBERED: usize = 32;
@@ -43,23 +43,23 @@ struct Warnings {
 impl Warnings {
     /// Which of these, which hold now, are to be shown.
     fn take<'a>(&mut self, now: Instant, texts: &'a [String]) -> Vec<&'a String> {
-        let matters: Vec<String> = texts.iter().map(|text| matter(text)).collect();
+        let subjects: Vec<String> = texts.iter().map(|text| subject(text)).collect();
         let mut new = Vec::new();
-        for (text, matter) in texts.iter().zip(&matters) {
-            let is_told = self.shown.has(now, |shown| shown == matter)
-                || self.lines.has(now, |line| line.contains(matter));
-            if !self.present.contains(matter) && !is_told {
-                self.shown.add(now, matter.clone());
+        for (text, subject) in texts.iter().zip(&subjects) {
+            let was_shown = self.shown.has(now, |shown| shown == subject)
+                || self.lines.has(now, |line| line.contains(subject));
+            if !self.present.contains(subject) && !was_shown {
+                self.shown.add(now, subject.clone());
                 new.push(text);
             }
         }
-        self.present = matters;
+        self.present = subjects;
         new
     }
 
     /// Whether a line of the controller's standard error is to be shown: not one with a warning that was shown a moment ago.
     fn is_new_line(&mut self, now: Instant, line: &str) -> bool {
-        let line = matter(line);
+        let line = subject(line);
         let is_new = !self.shown.has(now, |shown| line.contains(shown));
         if is_new {
             self.lines.add(now, line);
@@ -132,7 +132,7 @@ impl Progress {
 
     /// Shows a change of phase or of detector.
     pub(crate) fn status(&mut self, status: &ControllerStatus) {
-        let why = matter(&status.why);
+        let why = subject(&status.why);
         // An autopilot may take a minute until it lets the vehicle take off, and says what it waits for.
         let is_other_reason = self.live.is_none()
             && matches!(status.phase, Phase::Idle | Phase::Takeoff)
@@ -174,7 +174,7 @@ impl Progress {
 }
 
 /// A text without its numbers, apart from names in backquotes: a change of numbers alone, as of a distance, is not shown.
-fn matter(text: &str) -> String {
+fn subject(text: &str) -> String {
     let numberless = |part: &str| part.replace(|c: char| c.is_ascii_digit(), "");
     let parts = text.split('`').enumerate();
     parts.map(|(i, part)| if i % 2 == 0 { numberless(part) } else { part.to_owned() }).collect()
@@ -268,7 +268,7 @@ impl Steps {
     }
 }
 
-/// When lines are due that nobody waits for: the longer the work has taken already, the rarer.
+/// Decides when progress lines are due: the longer the work has taken already, the rarer.
 struct Seldom {
     began: Instant,
     next: Mutex<Duration>,
@@ -302,7 +302,7 @@ mod tests {
     #[test]
     fn a_warning_with_other_numbers_is_the_same_and_with_another_name_is_not() {
         let silent =
-            |camera: &str, s: u32| matter(&format!("no frame from camera `{camera}` for {s} s"));
+            |camera: &str, s: u32| subject(&format!("no frame from camera `{camera}` for {s} s"));
         assert_eq!(silent("cam1", 2), silent("cam1", 13));
         assert_ne!(silent("cam1", 2), silent("cam2", 2));
     }
@@ -335,9 +335,9 @@ mod tests {
     fn lines_become_rarer_the_longer_it_takes() {
         let began = Instant::now();
         let lines = Seldom::new(began);
-        let told: Vec<u64> =
+        let due_s: Vec<u64> =
             (0..2000).filter(|s| lines.passed(began + Duration::from_secs(*s)).is_some()).collect();
-        assert_eq!(told, [10, 20, 40, 80, 160, 320, 620, 920, 1220, 1520, 1820]);
+        assert_eq!(due_s, [10, 20, 40, 80, 160, 320, 620, 920, 1220, 1520, 1820]);
     }
 
     #[test]

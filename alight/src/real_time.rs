@@ -1,5 +1,5 @@
-//! One flight with faults in real time: the services as processes that are killed and stopped for true, and
-//! their link to the simulated autopilot through a proxy that fails.
+//! Flies one landing with faults in real time: the services run as processes that are killed and stopped, and their link to the simulated
+//! autopilot goes through a proxy that fails.
 
 use std::fs::{File, OpenOptions};
 use std::path::{Path, PathBuf};
@@ -23,16 +23,16 @@ use crate::runtime::tool_identity;
 const TIMEOUT_S: f64 = 240.0;
 /// Timeout for the start of the landing, in seconds.
 const START_TIMEOUT_S: f64 = 60.0;
-/// Speed below which the vehicle is at rest in the air, in m/s.
+/// Speed below which the vehicle is stationary in the air, in m/s.
 const REST_M_S: f64 = 0.6;
-/// Time at rest after which a flight is over, in seconds: on the ground and in the air.
+/// Time without motion after which a flight is over, in seconds: on the ground and in the air.
 const LANDED_S: f64 = 6.0;
 const HOVERS_S: f64 = 10.0;
 /// Time after the begin of the last fault before which a hover counts for nothing, in seconds.
 const AFTER_FAULT_S: f64 = 15.0;
-/// What a process may use beyond what it has when its memory is limited, in bytes.
+/// Memory that a process may use in addition to its present size when its memory is limited, in bytes.
 const SPARE_BYTES: u64 = 1 << 20;
-/// Period of the campaign's own look at the flight.
+/// Period at which the campaign checks the flight.
 const LOOK: Duration = Duration::from_millis(5);
 /// The vehicle's name in the network of its services, and in that of its world.
 const VEHICLE: &str = "tried";
@@ -119,7 +119,7 @@ struct RealFlight<'a> {
 struct Ground {
     /// Where it first touched, downwards, in metres.
     touched_z: Option<f64>,
-    /// When it touched last: every truth tells the latest touch, until the vehicle is well in the air again.
+    /// When it touched last: every truth contains the latest touch, until the vehicle is well in the air again.
     touch_ns: Option<i64>,
 }
 
@@ -232,7 +232,7 @@ impl<'a> RealFlight<'a> {
         for setting in settings {
             command.args(["--set", setting]);
         }
-        // What a controller notes of this vehicle is of use in this flight only.
+        // A controller's notes of this vehicle are of use in this flight only.
         command.env(node::STATE_VARIABLE, self.folder);
         let log = if self.has(|kind| kind == Kind::FullDisk) && part != Part::World {
             command.env("ALIGHT_LOG", "debug");
@@ -280,9 +280,9 @@ impl<'a> RealFlight<'a> {
         Ok(())
     }
 
-    /// Checks that all processes live until the landing begins; where one ends later, the flight shows what comes of it.
+    /// Checks that all processes run until the landing begins. If one ends later, the flight shows the consequence.
     fn check_parts(&mut self) -> anyhow::Result<()> {
-        // These are there from the start, and a process that they end is what they do.
+        // Faults of the start are active from the beginning, and it is their effect that a process ends.
         let may_end = self.has(|kind| matches!(kind, Kind::FullDisk | Kind::FullSharedMemory));
         if self.started.is_some() || may_end {
             return Ok(());
@@ -389,7 +389,7 @@ impl<'a> RealFlight<'a> {
         }
     }
 
-    /// Lets a process have hardly more memory than it has.
+    /// Limits a process to hardly more memory than it has.
     fn limit_memory(&self, part: Part) -> anyhow::Result<()> {
         let Some(pid) = self.pid(part) else { return Ok(()) };
         let path = format!("/proc/{}/status", pid.as_raw_nonzero());
@@ -403,7 +403,7 @@ impl<'a> RealFlight<'a> {
         Ok(())
     }
 
-    /// Whether the controller is gone or stands still, for ever.
+    /// Whether the controller is gone or stopped permanently.
     fn is_without_controller(&self) -> bool {
         let gone = |begun: &Begun| {
             matches!(
@@ -462,7 +462,7 @@ impl<'a> RealFlight<'a> {
 impl Drop for RealFlight<'_> {
     fn drop(&mut self) {
         for (_, child) in &mut self.parts {
-            // One that stands still ends as well.
+            // A stopped process is ended as well.
             let _ = child.kill();
             let _ = child.wait();
         }
@@ -480,7 +480,7 @@ fn settings_of_world(planned: &Planned) -> Vec<String> {
     drawn.cloned().chain(given).collect()
 }
 
-/// The last thing that a log says.
+/// The last line of a log.
 fn last_line(log: &str) -> &str {
     log.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("its log is empty")
 }
@@ -499,12 +499,12 @@ mod tests {
     use node::Layers;
 
     #[test]
-    fn a_process_that_ends_before_the_landing_is_told_with_its_last_words() {
+    fn a_process_that_ends_before_the_landing_is_reported_with_its_last_line() {
         let folder = tempfile::tempdir().unwrap();
         let mut plan = Plan { flights: 1, ..Plan::default() };
         plan.kinds = vec![Kind::ControllerKilled];
         let planned = plan.flights().remove(0);
-        let told = crate::runtime::block_on(async {
+        let error = crate::runtime::block_on(async {
             let proxy = Proxy::start(1, 0, 9).await?;
             let mut flight = RealFlight::waiting(&planned, folder.path(), [0; 3], proxy);
             let log = Part::Controller.log(folder.path());
@@ -512,13 +512,13 @@ mod tests {
             let mut child = Command::new("false").spawn()?;
             child.wait()?;
             flight.parts.push((Part::Controller, child));
-            let told = flight.check_parts().unwrap_err().to_string();
+            let error = flight.check_parts().unwrap_err().to_string();
             flight.started = Some(Instant::now());
             flight.check_parts()?;
-            anyhow::Ok(told)
+            anyhow::Ok(error)
         });
-        let told = told.unwrap().unwrap();
-        assert!(told.contains("controller ended") && told.contains("`nonsense`"), "{told}");
+        let error = error.unwrap().unwrap();
+        assert!(error.contains("controller ended") && error.contains("`nonsense`"), "{error}");
     }
 
     #[test]
@@ -558,7 +558,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_that_leaves_the_ground_again_is_told() {
+    fn a_vehicle_that_leaves_the_ground_again_is_reported() {
         let mut outcome = Outcome::new(&Plan::default().flights()[0]);
         let mut ground = Ground::default();
         let touch = |stamp_ns, vertical_speed_m_s| {

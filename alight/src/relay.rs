@@ -1,7 +1,7 @@
 //! `alight relay`: relays messages between the processes on the drone and the ground.
 //!
 //! Zenoh forwards the messages; this process keeps the session open, and reports its health and what it
-//! denies. When the list of holders among its keys changes, it starts anew with the rights of the new one.
+//! denies. When the list of holders among its keys changes, it restarts with the rights of the new one.
 
 use std::io::ErrorKind;
 use std::path::PathBuf;
@@ -16,23 +16,23 @@ use tokio::time::MissedTickBehavior;
 
 use crate::args::{NetworkArgs, ParentArgs, source_of};
 use crate::runtime::block_on;
-use crate::services::{RELAY, tell_if_open};
+use crate::services::{RELAY, warn_if_open};
 
-/// Period at which the process notices that it goes on.
+/// Period at which the process checks that it is running.
 const BEAT: Duration = Duration::from_millis(100);
 /// Gap between two beats after which the process was frozen: a little less than the lease of
 /// `zenoh-config/drone.json5`.
 const FROZEN: Duration = Duration::from_millis(1200);
 /// Period at which the list of holders is read.
 const HOLDERS_PERIOD: Duration = Duration::from_millis(500);
-/// Time after which a port that another process has is not waited for any more.
-const PORTS_PATIENCE: Duration = Duration::from_secs(2);
-/// Pause before it starts anew after a panic, so that one at every start does not use all of a core.
+/// Time for which the relay waits for a port that another process has.
+const PORTS_TIMEOUT: Duration = Duration::from_secs(2);
+/// Pause before it restarts after a panic, so that one at every start does not use all of a core.
 const RELAUNCH_PAUSE: Duration = Duration::from_millis(200);
 
 /// What the health says of a list of holders that cannot be read.
 const NOT_TAKEN_UP: &str =
-    "the list of holders is not taken up, so who was revoked since is not shut out";
+    "the list of holders is not taken up, so holders that were revoked since are not shut out";
 
 /// The arguments of the relay.
 #[derive(Args, Clone)]
@@ -62,7 +62,7 @@ pub(crate) fn run(args: &RelayArgs) -> anyhow::Result<ExitCode> {
     let holders = HoldersFile::new(&network);
     relaunch_after_panics();
     let serve = async |node, shutdown| {
-        tell_if_open(&node, &network);
+        warn_if_open(&node, &network);
         relay(node, shutdown, holders).await
     };
     block_on(node::run(identity, &zenoh, serve))??;
@@ -74,8 +74,8 @@ fn wait_for_ports(network: &Network, role: &str) -> anyhow::Result<()> {
     let begun = Instant::now();
     while let Some(endpoint) = network.taken_endpoint(role)? {
         ensure!(
-            begun.elapsed() < PORTS_PATIENCE,
-            "another process listens at the relay's address {endpoint}, so nobody on the ground would reach this one. Stop it \
+            begun.elapsed() < PORTS_TIMEOUT,
+            "another process listens at the relay's address {endpoint}, so no process on the ground would reach this one. Stop it \
              (another relay?), or choose another port: `address` of the site, or `--listen`"
         );
         std::thread::sleep(BEAT);
@@ -83,8 +83,8 @@ fn wait_for_ports(network: &Network, role: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Starts anew when a thread panics: one of Zenoh's that did leaves its routing tables locked, and the process
-/// would live on without relaying.
+/// Restarts the process when a thread panics: a thread of Zenoh that panicked leaves its routing tables locked, and the process would
+/// continue without relaying.
 fn relaunch_after_panics() {
     let report = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
@@ -117,7 +117,7 @@ async fn relay(node: Node, shutdown: Shutdown, holders: HoldersFile) -> anyhow::
             }
             () = shutdown.requested() => return Ok(()),
         }
-        // The others have given some of the connections up, and nobody opens those again that gossip made. A
+        // The peers have given up some of the connections, and none of them reopens those that gossip made. A
         // session that is closed in order meanwhile takes new connections from the others, which are then lost.
         if last.elapsed() > FROZEN {
             tracing::warn!(gap = ?last.elapsed(), "This process was frozen; joining the network anew");
@@ -151,7 +151,7 @@ impl HoldersFile {
         text.parse().map(Some).with_context(|| format!("{path:?}"))
     }
 
-    /// True when it is another list now. One that cannot be read is told and changes nothing: with it the relay would not start.
+    /// True if the list differs now. A list that cannot be read is reported and has no effect: with it the relay would not start.
     fn has_changed(&self, health: &HealthCounters) -> bool {
         match self.read() {
             Ok(read) => read.is_some() && read != self.holders,
@@ -201,12 +201,15 @@ mod tests {
         write("drone@drone\nrevoked operator\n");
         for times in 1..3 {
             assert!(!holders.has_changed(&health));
-            let told = errors();
-            assert!(told[0].reason.contains("`operator` is not ROLE@VEHICLE"), "{told:?}");
-            assert!(told[0].reason.contains("who was revoked since is not shut out"), "{told:?}");
-            assert_eq!((told.len(), told[0].count), (1, times));
+            let reported = errors();
+            assert!(reported[0].reason.contains("`operator` is not ROLE@VEHICLE"), "{reported:?}");
+            assert!(
+                reported[0].reason.contains("holders that were revoked since are not shut out"),
+                "{reported:?}"
+            );
+            assert_eq!((reported.len(), reported[0].count), (1, times));
         }
-        // Whoever runs the tests may be allowed to read any file, but a directory is none.
+        // The user of the tests may be allowed to read any file (root), but a directory is not a file.
         std::fs::remove_file(&list).unwrap();
         std::fs::create_dir(&list).unwrap();
         assert!(!holders.has_changed(&health));

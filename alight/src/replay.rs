@@ -23,13 +23,13 @@ pub(crate) struct ReplayArgs {
     /// The recording, an MCAP file; of a recording in several files all, in whatever order.
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// Compare what comes out of each event with what came out then, to the bit. The first event that gives another
-    /// result is named, with the value. Exit status 0 when there is none, 1 otherwise.
+    /// Compare the result of each event with the recorded one, to the bit. The first event that gives another result is named, with the
+    /// value. Exit status 0 when there is none, 1 otherwise.
     #[arg(long)]
     verify: bool,
-    /// From where it is flown again: from the controller's events, whose phases are listed; from detections on, with estimator and
-    /// guidance, to see what `--set` changes (with `--set`, events are the same); or from frames on, which are searched again. The vehicle moves
-    /// as it was recorded. `--verify` is from events.
+    /// The data with which it is flown again: the controller's events, whose phases are listed; from detections on, with estimator and
+    /// guidance, to see the effect of `--set` (with `--set`, events are the same); or from frames on, which are searched again. The vehicle
+    /// moves as it was recorded. `--verify` is from events.
     #[arg(long, value_enum, default_value_t)]
     from: From,
     /// One setting of the controller over the recorded configuration, as KEY=VALUE or controller.KEY=VALUE; with `--from frames` also
@@ -63,7 +63,7 @@ enum From {
     Frames,
 }
 
-/// What the keys of a service's settings begin with.
+/// Prefixes of the settings of a service.
 const OF_CONTROLLER: &str = "controller.";
 const OF_DETECTOR: &str = "detector.";
 
@@ -76,15 +76,14 @@ impl ReplayArgs {
         {
             "`--set detector.KEY=VALUE` is for `--from frames`: nothing else searches"
         } else if self.verify && self.from != From::Events {
-            "`--verify` compares what comes out of the recorded events: without `--from`, or with `--from events`"
+            "`--verify` compares the results of the recorded events: without `--from`, or with `--from events`"
         } else {
             return Ok(());
         };
         Err(WrongUse(rule.to_owned()))
     }
 
-    /// What is searched again, and with which settings of whom: those of the controller with its name before them, as `alight land`
-    /// takes them, or without.
+    /// The detector and the settings for the search. Settings of the controller may have its name before them, as in `alight land`, or not.
     fn again(&self) -> Again {
         let mut again = Again { detector: self.detector.clone(), ..Again::default() };
         for setting in &self.set {
@@ -99,7 +98,7 @@ impl ReplayArgs {
     }
 }
 
-/// Replays, and prints what came out: a failure where something of the recording could not be, or is not the same.
+/// Replays, and prints the result: a failure if a part of the recording could not be replayed or gives another result.
 pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     args.check()?;
     let mut reader = TapeReader::default();
@@ -152,7 +151,7 @@ fn from_frames(
     let searched = search(recordings, tapes, again)?;
     print(compared(&searched).trim_end())?;
     for change in &searched.changes {
-        print(&told(change))?;
+        print(&change_text(change))?;
         if let Some(stop) = &change.end.stop {
             print(&stop.to_string())?;
         }
@@ -238,7 +237,7 @@ fn one(tape: &RecordedTape, args: &ReplayArgs, set: &[String]) -> anyhow::Result
             print(&format!("{:9.3} s  {:<16}  {}", begun.time_s, begun.phase, begun.why))?;
         }
         if args.from != From::Events || !set.is_empty() {
-            print(&told(&change))?;
+            print(&change_text(&change))?;
             if change.other_phase > 0 && ends_with_pilot(&change.phases) {
                 print(RECORDED_MODES)?;
             }
@@ -270,15 +269,14 @@ fn one(tape: &RecordedTape, args: &ReplayArgs, set: &[String]) -> anyhow::Result
     Ok(end.stop.is_none() && other_state.is_none())
 }
 
-/// Why a landing that is replayed with other settings may end with a pilot that nobody was.
-const RECORDED_MODES: &str = "pilot-in-command may be the recording's doing: its autopilot changes modes when the recorded landing \
-                              asked for them, and this landing did not ask then; fly it (`alight land --set ...`) to see its end";
+/// Why a landing that is replayed with other settings may end in the phase of a pilot although no pilot flew.
+const RECORDED_MODES: &str = "pilot-in-command may come from the recording: its autopilot changes modes when the recorded landing asked for them, and this landing did not ask then; fly it (`alight land --set ...`) to see its end";
 
 fn ends_with_pilot(phases: &[Begun]) -> bool {
     phases.last().is_some_and(|begun| begun.phase == Phase::PilotInCommand)
 }
 
-fn told(change: &Change) -> String {
+fn change_text(change: &Change) -> String {
     let Some(first_s) = change.first_s else {
         return match change.other_outputs {
             0 => "no decision is another one".to_owned(),
@@ -307,21 +305,21 @@ mod tests {
     use messages::{Message as _, Tape, TapeEvent, TapeOutput, TapeWriter, encode, topic};
 
     #[test]
-    fn a_marker_that_the_detector_does_not_look_for_is_told() {
+    fn a_marker_that_the_detector_does_not_look_for_is_reported() {
         let searched = |marker: &str| Searched {
             looked_for: vec!["rings:0.15341".to_owned(), "stag-hd23:4:0.2".to_owned()],
             now: replay::frames::Found { marker: marker.to_owned(), ..Default::default() },
             ..Searched::default()
         };
-        let told = compared(&searched("aruco-4x4-50:7"));
-        assert!(told.contains("looks for rings:0.15341, stag-hd23:4:0.2"), "{told}");
+        let text = compared(&searched("aruco-4x4-50:7"));
+        assert!(text.contains("looks for rings:0.15341, stag-hd23:4:0.2"), "{text}");
         for marker in ["rings", "stag-hd23:4"] {
             assert!(!compared(&searched(marker)).contains("looks for"), "{marker}");
         }
     }
 
     #[test]
-    fn errors_are_told_with_the_frames_that_they_are_of() {
+    fn errors_are_reported_with_their_number_of_frames() {
         let side = |errors_m: &[f64]| replay::frames::Found {
             errors_m: errors_m.to_vec(),
             ..Default::default()
@@ -333,9 +331,9 @@ mod tests {
             now: side(&[0.001, 0.0062, 0.009]),
             ..Searched::default()
         };
-        let told = compared(&searched);
-        assert!(told.contains("error in space, median") && told.contains("1.40 mm"), "{told}");
-        assert!(told.contains("6.20 mm") && told.contains("of the 3 frames in flight"), "{told}");
+        let text = compared(&searched);
+        assert!(text.contains("error in space, median") && text.contains("1.40 mm"), "{text}");
+        assert!(text.contains("6.20 mm") && text.contains("of the 3 frames in flight"), "{text}");
         let without_truth = compared(&Searched { showing_the_pad: None, ..searched });
         assert!(!without_truth.contains("error"), "{without_truth}");
         assert!(without_truth.contains("of the 3 frames in which both"), "{without_truth}");

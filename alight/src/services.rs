@@ -1,5 +1,5 @@
-//! The services by name, from camera-pub to the simulator: the effective configuration of each, and running one in
-//! this process until it is stopped.
+//! Lists the services by name, from camera-pub to the simulator, loads the effective configuration of each, and runs one in this process
+//! until it is stopped.
 
 use std::future::Future;
 use std::process::ExitCode;
@@ -93,8 +93,8 @@ pub(crate) fn run(service: Service, args: &ServiceArgs) -> anyhow::Result<ExitCo
     }
 }
 
-/// Says in the log and in the health report that anyone in reach can command the vehicle.
-pub(crate) fn tell_if_open(node: &Node, network: &Network) {
+/// Warns in the log and in the health report that anyone in reach can command the vehicle.
+pub(crate) fn warn_if_open(node: &Node, network: &Network) {
     if network.is_open().unwrap_or(false) && node.health().failed(INSECURE) {
         tracing::warn!(
             "INSECURE: this process listens beyond this machine without keys, so anyone in reach can command the vehicle; see `alight keys`"
@@ -119,11 +119,11 @@ where
     let network = args.network.network();
     let zenoh = source_of(&network, &key_name(service.name(), &identity.instance))?;
     block_on(node::run(identity, &zenoh, async |node, shutdown| {
-        tell_if_open(&node, &network);
-        let told = node.clone();
+        warn_if_open(&node, &network);
+        let publisher = node.clone();
         tokio::select! {
             result = run(node, config, shutdown) => result,
-            result = told.publish_configuration(table.to_string()) => result,
+            result = publisher.publish_configuration(table.to_string()) => result,
         }
     }))?
     .with_context(|| format!("running {}", service.name()))?;
@@ -135,7 +135,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_pad_that_is_not_utf_8_is_told_as_settings_are() {
+    fn a_pad_that_is_not_utf_8_is_reported_as_settings_are() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("pad.toml");
         std::fs::write(&file, b"id = 1\n# H\xf6he\n").unwrap();

@@ -1,5 +1,5 @@
-//! A site: one TOML file that lists the processes of every machine, read into jobs with program, settings, key and network, and
-//! checked, so that no two detectors have one id.
+//! Reads a site, the TOML file that lists the processes of every machine, into jobs with program, settings, key and network. Refuses two
+//! detectors with one id.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -65,7 +65,7 @@ pub(crate) struct Site {
     pub(crate) folder: PathBuf,
 }
 
-/// A process in the file, and where it stands there, in words.
+/// A process in the file, and its position there as a text.
 struct Placed<'a> {
     role: Role,
     place: String,
@@ -241,8 +241,8 @@ impl Site {
         Ok(())
     }
 
-    /// That no detector of the site looks for the marker of its controller; `None` where one may: by its configuration, or as another program
-    /// or a service whose files are not here. `role` is one of the machines of which that is asked.
+    /// The error that no detector of the site looks for the marker of its controller. `None` if one may: by its configuration, or because
+    /// it is another program or a service whose files are not here. `role` is one of the machines in question.
     pub(crate) fn marker_problem(&self, role: Role) -> Option<String> {
         let mut detectors = Vec::new();
         let mut controller = None;
@@ -267,13 +267,13 @@ impl Site {
         if detectors.is_empty() || !detectors.iter().all(|(_, markers)| is_other(markers)) {
             return None;
         }
-        let told = detectors
+        let searched = detectors
             .iter()
             .map(|(place, markers)| format!("{place} looks for {}", markers.join(" ")));
-        let told: Vec<String> = told.collect();
+        let searched: Vec<String> = searched.collect();
         Some(format!(
             "the controller, {at}, lands on {marker}, and no detector looks for that: {}; correct its `marker`, or their `markers`",
-            told.join(", ")
+            searched.join(", ")
         ))
     }
 
@@ -297,7 +297,7 @@ impl Site {
             Role::Relay => (Role::Relay, "relay_address", &self.relay_address),
             Role::Ground | Role::Local => return Ok(None),
         };
-        // It listens at the port to which others connect, and for IPv6 where that is what they use: by itself it does not.
+        // It listens at the port to which others connect, and for IPv6 if they use that: by default it does not.
         let address = reached_at.as_deref().map(Address::parse).transpose();
         let refused = |problem: &str| WrongUse(format!("`{key}` of the site: {problem}"));
         let address = address.map_err(|problem| refused(&format!("{problem:#}")))?;
@@ -479,11 +479,11 @@ mod tests {
                 assert_eq!(jobs[0].network.listen.as_deref(), listen, "{text}");
             }
         }
-        let told = problem("keys = 'keys'\naddress = 'fd00::1'", Role::Drone);
-        assert!(told.contains("`address` of the site: with keys, nothing"), "{told}");
+        let error = problem("keys = 'keys'\naddress = 'fd00::1'", Role::Drone);
+        assert!(error.contains("`address` of the site: with keys, nothing"), "{error}");
     }
 
-    /// The example beside the keys that `docs/deploy.md` has made for it.
+    /// The example, with the keys that `docs/deploy.md` makes for it.
     fn example_with_keys(change: impl Fn(String) -> String) -> (tempfile::TempDir, Site) {
         let home = tempfile::tempdir().unwrap();
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy");
@@ -516,22 +516,22 @@ mod tests {
                 jobs.iter().filter_map(|job| job.service).map(Service::name).collect();
             assert_eq!(names.join(" "), services, "{name}");
             for job in jobs {
-                // What an example names is known, and what it leaves out stays as it is.
+                // Every key of an example is known, and the keys that it leaves out have their defaults.
                 job.service.unwrap().effective_config(&job.layers).unwrap();
             }
         }
     }
 
     #[test]
-    fn without_keys_the_example_runs_only_when_it_says_that_it_is_insecure() {
+    fn without_keys_the_example_runs_only_with_insecure_set() {
         let (_home, without) = example_with_keys(|text| text.replace("\nkeys = ", "\n# keys = "));
         for role in [Role::Drone, Role::Relay] {
             let problem = format!("{:#}", without.jobs(role).unwrap_err());
             assert!(problem.contains("insecure = true"), "{problem}");
         }
-        let (_home, told) =
+        let (_home, insecure) =
             example_with_keys(|text| text.replace("\nkeys = \"keys\"", "\ninsecure = true"));
-        let jobs = told.jobs(Role::Drone).unwrap();
+        let jobs = insecure.jobs(Role::Drone).unwrap();
         let relay = jobs[0].network.environment();
         assert!(relay.contains(&("ALIGHT_INSECURE", "true".into())), "{relay:?}");
     }
@@ -547,20 +547,20 @@ mod tests {
     fn two_detectors_with_one_id_are_refused() {
         let detector = "{ run = 'detector', set = ['id=\"one\"'] }";
         let local = format!("local = [{detector}, {detector}]");
-        let told = problem(&local, Role::Local);
-        assert!(told.contains("[[local]] number 1 and [[local]] number 2"), "{told}");
-        assert!(told.contains("`one`"), "{told}");
+        let error = problem(&local, Role::Local);
+        assert!(error.contains("[[local]] number 1 and [[local]] number 2"), "{error}");
+        assert!(error.contains("`one`"), "{error}");
         let apart = format!(
             "address = '10.0.0.1'\ninsecure = true\ndrone = [{detector}]\nground = [{{ run = 'dashboard' }}, {detector}]"
         );
         for role in [Role::Drone, Role::Ground] {
-            let told = problem(&apart, role);
-            assert!(told.contains("[[drone]] number 1 and [[ground]] number 2"), "{told}");
+            let error = problem(&apart, role);
+            assert!(error.contains("[[drone]] number 1 and [[ground]] number 2"), "{error}");
         }
     }
 
     #[test]
-    fn a_controller_whose_marker_no_detector_of_the_site_looks_for_is_told() {
+    fn a_controller_whose_marker_no_detector_of_the_site_looks_for_is_reported() {
         let of = |drone: &str, ground: &str, role: Role| {
             let text = format!(
                 "address = '10.0.0.1'\ninsecure = true\ndrone = [{drone}]\nground = [{ground}]"
@@ -574,9 +574,9 @@ mod tests {
         let wrong = format!("{controller}, {rings}");
         let dashboard = "{ run = 'dashboard' }";
         for role in [Role::Drone, Role::Ground] {
-            let told = of(&wrong, dashboard, role).unwrap();
-            assert!(told.contains("[[drone]] number 1, lands on aruco-4x4-50:7"), "{told}");
-            assert!(told.contains("[[drone]] number 2 looks for rings:0.15"), "{told}");
+            let error = of(&wrong, dashboard, role).unwrap();
+            assert!(error.contains("[[drone]] number 1, lands on aruco-4x4-50:7"), "{error}");
+            assert!(error.contains("[[drone]] number 2 looks for rings:0.15"), "{error}");
             assert_eq!(of(&wrong, &tag, role), None, "one on the ground does");
         }
         assert_eq!(of(&wrong, dashboard, Role::Local), None, "it has no process here");
@@ -595,9 +595,9 @@ mod tests {
         let home = tempfile::tempdir().unwrap();
         let path = home.path().join("site.toml");
         std::fs::write(&path, b"vehicle = 'x'\n# H\xf6he\n").unwrap();
-        let told = Site::read(&path).unwrap_err().to_string();
-        assert!(told.contains("site.toml") && told.contains("line 2"), "{told}");
-        assert!(told.contains("save it as UTF-8"), "{told}");
+        let error = Site::read(&path).unwrap_err().to_string();
+        assert!(error.contains("site.toml") && error.contains("line 2"), "{error}");
+        assert!(error.contains("save it as UTF-8"), "{error}");
     }
 
     #[test]
@@ -605,8 +605,8 @@ mod tests {
         let home = tempfile::tempdir().unwrap();
         let path = home.path().join("site.toml");
         std::fs::write(&path, "meet = 0").unwrap();
-        let told = Site::read(&path).unwrap_err().to_string();
-        assert!(told.contains("`meet` = 0 is invalid") && told.contains("1 to 65535"), "{told}");
+        let error = Site::read(&path).unwrap_err().to_string();
+        assert!(error.contains("`meet` = 0 is invalid") && error.contains("1 to 65535"), "{error}");
         std::fs::write(&path, "meet = 9000").unwrap();
         assert_eq!(Site::read(&path).unwrap().meet, Some(9000));
     }

@@ -7,7 +7,7 @@ use std::io::{self, ErrorKind, Write};
 use std::os::fd::AsFd;
 use std::os::unix::fs::FileTypeExt;
 
-/// Prints a line to standard output. That nobody reads it any more is not an error.
+/// Prints a line to standard output. A closed pipe is not an error.
 pub(crate) fn print(line: &str) -> io::Result<()> {
     match writeln!(Output, "{line}") {
         Err(problem) if problem.kind() == ErrorKind::BrokenPipe => Ok(()),
@@ -15,23 +15,22 @@ pub(crate) fn print(line: &str) -> io::Result<()> {
     }
 }
 
-/// Standard output. Where nobody reads it any more, because a pipe was closed (`| head`) or a terminal hung up, its error is a
-/// broken pipe.
+/// Standard output. Its error is a broken pipe where a pipe was closed (`| head`) or a terminal hung up.
 pub(crate) struct Output;
 
 impl Write for Output {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        io::stdout().write(bytes).map_err(|problem| told(problem, &io::stdout()))
+        io::stdout().write(bytes).map_err(|problem| classified(problem, &io::stdout()))
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        io::stdout().flush().map_err(|problem| told(problem, &io::stdout()))
+        io::stdout().flush().map_err(|problem| classified(problem, &io::stdout()))
     }
 }
 
-/// The error of a file, as [`Output`] tells it. A terminal that hung up gives the same as a disk that fails, and no longer says that it
-/// is a terminal.
-fn told(problem: io::Error, file: &impl AsFd) -> io::Error {
+/// The error of a file, as [`Output`] returns it. A terminal that hung up gives the same error as a failing disk, and is no longer
+/// recognisable as a terminal.
+fn classified(problem: io::Error, file: &impl AsFd) -> io::Error {
     let is_device = || -> io::Result<bool> {
         let file = File::from(file.as_fd().try_clone_to_owned()?);
         Ok(file.metadata()?.file_type().is_char_device())
@@ -76,7 +75,7 @@ mod tests {
         let (disk, device) = (tempfile::tempfile().unwrap(), File::open("/dev/null").unwrap());
         let is_unread = |errno: Errno, file: &File| {
             let problem = io::Error::from_raw_os_error(errno.raw_os_error());
-            told(problem, file).kind() == ErrorKind::BrokenPipe
+            classified(problem, file).kind() == ErrorKind::BrokenPipe
         };
         assert!(is_unread(Errno::IO, &device) && is_unread(Errno::PIPE, &disk));
         assert!(!is_unread(Errno::IO, &disk) && !is_unread(Errno::NOSPC, &device));

@@ -34,7 +34,7 @@ pub(crate) struct UpArgs {
     /// The site: which processes run on which machine (TOML, `docs/deploy.md`).
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Print the processes without starting them. What is not there is named, with exit status 1: a program (also one that reads a
+    /// Print the processes without starting them. Missing items are named, with exit status 1: a program (also one that reads a
     /// camera), the autopilot's serial port, a camera's device, images, a calibration, a detector that looks for the controller's marker.
     #[arg(long)]
     dry_run: bool,
@@ -46,9 +46,9 @@ const MAX_PAUSE: Duration = Duration::from_secs(8);
 /// A process that exits this many times within [`PERIOD`] keeps failing, until it has run for that long.
 const MAX_EXITS: usize = 6;
 const PERIOD: Duration = Duration::from_secs(60);
-/// Pause before one is restarted that keeps failing: what it lacks, as a camera, may come back.
+/// Pause before the restart of a process that keeps failing: a missing device, as a camera, may return.
 const LONG_PAUSE: Duration = Duration::from_secs(30);
-/// Interval at which the note is written anew that this program runs.
+/// Interval at which the note is written again that this program runs.
 const RENEWAL: Duration = Duration::from_secs(60);
 /// The exit status for an invalid configuration, with which a restart is useless.
 const WRONG_USE: i32 = 2;
@@ -58,7 +58,7 @@ pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
     let site = Site::read(&args.config)?;
     let jobs = site.jobs(args.role)?;
     if args.dry_run {
-        // What a site names is relative to its folder.
+        // Paths in a site are relative to its folder.
         let is_here = std::env::current_dir().is_ok_and(|here| here == site.folder);
         let go_there = match is_here {
             true => String::new(),
@@ -71,13 +71,13 @@ pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
     let search = std::env::var_os("PATH").unwrap_or_default();
     let marker_problem = site.marker_problem(args.role);
     if args.dry_run {
-        return tell_missing(&jobs, &site.folder, &search, marker_problem);
+        return report_missing(&jobs, &site.folder, &search, marker_problem);
     }
     // Another detector may be started by hand, and a landing that finds none is refused.
     if let Some(problem) = marker_problem {
         say(&format!("warning: {problem}"));
     }
-    // In the air the others go on without a camera; its publisher tells what it lacks, and is started again.
+    // In the air the other processes continue without a camera; camera-pub reports what is missing, and is started again.
     if let Some(problem) = jobs.iter().find_map(|job| missing(job, &site.folder, &search)) {
         bail!(problem);
     }
@@ -86,8 +86,8 @@ pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
     block_on(supervise(&site, args.role, jobs))?
 }
 
-/// Tells all that the processes lack on this machine, and that their controller lacks a detector of its marker.
-fn tell_missing(
+/// Reports everything that the processes need and this machine lacks, and that no detector looks for the controller's marker.
+fn report_missing(
     jobs: &[Job],
     folder: &Path,
     search: &OsStr,
@@ -107,8 +107,8 @@ fn tell_missing(
     }
 }
 
-/// Takes the place of the only supervisor with this name, until what is returned is dropped: a second one would start every process
-/// again beside those of the first. It is a name in the kernel, of the same scope as the port at which processes meet (a network
+/// Takes the place of the only supervisor with this name, until the returned value is dropped: a second one would start every process again
+/// in parallel to those of the first. It is a name in the kernel, of the same scope as the port at which processes meet (a network
 /// namespace), and gone with the process that has it.
 fn only_supervisor(name: &str) -> anyhow::Result<UnixListener> {
     let address = SocketAddr::from_abstract_name(format!("alight-up-{name}"))?;
@@ -159,7 +159,7 @@ struct Supervised {
     exits: VecDeque<Instant>,
     /// How often in a row it exited with status 0.
     completions: usize,
-    /// Whether it has once run for [`PERIOD`], or led a landing under a supervisor that crashed: with what it is given it can run.
+    /// Whether it has once run for [`PERIOD`], or led a landing under a supervisor that crashed: its configuration is valid then.
     has_run: bool,
     keeps_failing: bool,
     state: State,
@@ -225,7 +225,7 @@ impl Supervised {
         let has_run_long = now.duration_since(self.started) >= PERIOD;
         self.has_run |= has_run_long;
         let name = &self.job.name;
-        // What has run may be refused for a moment, as while somebody copies its keys, and in flight it is to come back.
+        // A process that has run may be refused for a moment, as while its keys are copied, and in flight it has to return.
         if exit.status == Some(WRONG_USE) && !self.has_run {
             self.state = State::GivenUp;
             return format!(
@@ -268,7 +268,7 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
     let before = before.by_now(peers.landing());
     let mut children = Children::new();
     let is_noted = notes.running.write();
-    for line in jobs.iter().filter_map(|job| before.told_of(job, is_noted)) {
+    for line in jobs.iter().filter_map(|job| before.start_message(job, is_noted)) {
         say(line);
     }
     // Those of a landing that was under way have run.
@@ -291,11 +291,11 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
             say(&format!("{}: stopped", stopped.job.name));
         }
     }
-    // The peers are closed first, as they write the note of a landing too. A terminal that breaks off is no order to forget anything.
+    // The peers are closed first, as they write the note of a landing too. The loss of a terminal is no request to remove notes.
     peers.close().await;
     if !shutdown.is_by_hangup() {
         notes.landing.remove();
-        // What starts this program again by itself does so after a failure, and then nothing may take off.
+        // A supervisor such as systemd restarts this program after a failure, and then nothing may take off.
         if !all_are_out {
             notes.running.remove();
         }
@@ -303,7 +303,7 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
     Ok(ExitCode::from(u8::from(all_are_out)))
 }
 
-/// What was before this supervisor, by the notes of the one before it.
+/// How the supervisor before this one ended, by its notes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Before {
     /// Nothing, or an orderly stop.
@@ -324,7 +324,7 @@ impl Before {
         }
     }
 
-    /// What that is once it is known whether the landing can still be resumed.
+    /// The same once it is known whether the landing can still be resumed.
     fn by_now(self, landing: bool) -> Self {
         match self {
             Self::Landing { .. } if !landing => Self::Crash,
@@ -340,7 +340,7 @@ impl Before {
         }
     }
 
-    /// The mode of a process's first start; `None` for what the site says. A crash restarts the controller like any other of its ends.
+    /// The mode of a process's first start; `None` for the `start` of the site. A crash restarts the controller like any other of its ends.
     fn start_mode(self, job: &Job) -> Option<&'static str> {
         match self {
             Self::Nothing => None,
@@ -349,14 +349,14 @@ impl Before {
         }
     }
 
-    /// What is to be said of it before a process is started.
-    fn told_of(self, job: &Job, is_noted: bool) -> Option<&'static str> {
+    /// The message to show about it before a process is started.
+    fn start_message(self, job: &Job, is_noted: bool) -> Option<&'static str> {
         if job.service != Some(Service::Controller) {
             return None;
         }
         match self {
-            Self::Nothing if !is_noted && starts_by_itself(job) => Some(
-                "a crash of this `alight up` cannot be noted, and after one its controller would begin anew as its `start` says: set \
+            Self::Nothing if !is_noted && starts_without_command(job) => Some(
+                "a crash of this `alight up` cannot be noted, and after one its controller would begin again as its `start` specifies: set \
                  $RUNTIME_DIRECTORY to a directory that exists, has room, and to which only this user can write",
             ),
             Self::Nothing => None,
@@ -370,7 +370,7 @@ impl Before {
 }
 
 /// Whether a controller takes off or lands without a command.
-fn starts_by_itself(job: &Job) -> bool {
+fn starts_without_command(job: &Job) -> bool {
     let config = job.service.and_then(|service| service.effective_config(&job.layers).ok());
     let start = config.as_ref().and_then(|config| config.get("start")?.as_str());
     matches!(start, Some("takeoff" | "airborne"))
@@ -473,7 +473,7 @@ fn restart_unreplaced(supervised: &mut [Supervised], peers: &Peers) {
 }
 
 /// The start mode of a restarted controller. It never takes off a second time, and it resumes only a landing
-/// that was under way: a vehicle that somebody else flies in GUIDED is not landed.
+/// that was under way: a vehicle that another program flies in GUIDED is not landed.
 fn start_mode(job: &Job, landing: bool) -> Option<&'static str> {
     let is_controller = job.service == Some(Service::Controller);
     is_controller.then_some(if landing { "resume" } else { "command" })
@@ -492,7 +492,7 @@ fn show(supervised: &[Supervised], event: &ChildEvent<usize>) {
     }
 }
 
-/// Starts a process. A failure counts as one of its ends: the others go on, and so do the attempts.
+/// Starts a process. A failure counts as one of its ends: the others continue, and so do the attempts.
 fn start_or_retry(
     children: &mut Children<usize>,
     index: usize,
@@ -595,7 +595,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_before_is_told_by_its_notes() {
+    fn the_end_of_the_previous_supervisor_is_read_from_its_notes() {
         let folder = tempfile::tempdir().unwrap();
         let notes = Notes::kept_in(Some(folder.path()), "x");
         let before = || Before::noted_in(&notes);
@@ -632,11 +632,11 @@ mod tests {
     fn repeated_exits_delay_the_restart_up_to_half_a_minute() {
         let mut process = supervised();
         let mut now = Instant::now();
-        let (mut pauses, mut told) = (Vec::new(), Vec::new());
+        let (mut pauses, mut messages) = (Vec::new(), Vec::new());
         for _ in 0..9 {
             process.started = now;
             now += Duration::from_millis(100);
-            told.push(process.on_exit(&failure(1), now));
+            messages.push(process.on_exit(&failure(1), now));
             let State::Waiting(at) = process.state else { panic!("{:?}", process.state) };
             pauses.push(at - now);
             now = at;
@@ -644,8 +644,9 @@ mod tests {
         let half_seconds: Vec<_> = pauses.iter().map(|p| p.as_millis() / 500).collect();
         assert_eq!(half_seconds, [1, 2, 4, 8, 16, 60, 60, 60, 60]);
         assert!(process.is_out());
-        let news: Vec<_> = (0..).zip(&told).filter(|(_, it)| it.contains("from now on")).collect();
-        assert!(news.len() == 1 && news[0].0 == 5, "{told:#?}");
+        let news: Vec<_> =
+            (0..).zip(&messages).filter(|(_, it)| it.contains("from now on")).collect();
+        assert!(news.len() == 1 && news[0].0 == 5, "{messages:#?}");
         // It has run again for a while.
         process.started = now;
         now += PERIOD;
@@ -655,7 +656,7 @@ mod tests {
     }
 
     #[test]
-    fn it_goes_on_while_one_runs_and_ends_when_all_keep_failing() {
+    fn it_continues_while_one_runs_and_ends_when_all_keep_failing() {
         let mut all = [supervised(), supervised(), supervised()];
         let now = Instant::now();
         let fail = |process: &mut Supervised, status: i32| {
@@ -669,7 +670,7 @@ mod tests {
         fail(&mut all[2], 1);
         assert!(all_are_out(&all));
         all[0].state = State::Running;
-        assert!(!all_are_out(&all), "one has come back");
+        assert!(!all_are_out(&all), "one has returned");
     }
 
     #[test]
@@ -687,7 +688,7 @@ mod tests {
         assert!(!ended(&["./setup.sh"], None, 1).0);
         assert!(!ended(&["alight", "relay"], None, 0).0);
         assert!(!ended(&["alight", "detector"], Some(Service::Detector), 0).0);
-        // A failure between is another matter.
+        // A failure between them resets the count.
         let mut process = supervised();
         (process.job.service, process.job.command) = (None, vec!["./setup.sh".to_owned()]);
         for status in [0, 0, 0, 1, 0, 0, 0, 0, 0] {
@@ -719,7 +720,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_run_is_started_again_although_it_is_refused_now() {
+    fn a_process_that_has_run_is_started_again_although_it_is_refused_now() {
         let mut process = supervised();
         let mut now = process.started + PERIOD;
         process.on_exit(&failure(1), now);

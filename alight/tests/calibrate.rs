@@ -109,7 +109,7 @@ fn a_camera_is_calibrated_from_pictures_to_a_tenth_of_a_pixel() -> anyhow::Resul
     let error_px = map_error_px(&camera)?;
     ensure!(error_px < 0.1, "{error_px}");
     println!("{camera:?}: {error_px:.4} px off at most");
-    // Another calibration does not take its place unasked, and is told so before the pictures are read.
+    // Another calibration does not replace it without `--replace`, and the error comes before the pictures are read.
     let again = alight(&["calibrate", "board", "none", "-o", "camera.yaml"], folder.path())?;
     let problem = String::from_utf8_lossy(&again.stderr).into_owned();
     ensure!(!again.status.success() && problem.contains("`--replace`"), "{again:?}");

@@ -40,7 +40,7 @@ fn a_marker_that_was_made_is_found_where_it_was_drawn() -> anyhow::Result<()> {
 }
 
 #[test]
-fn markers_without_a_size_are_told_once() -> anyhow::Result<()> {
+fn markers_without_a_size_are_reported_once() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     for name in ["a.png", "b.png"] {
         let made = ["marker", "apriltag-36h11:3", "--size", "0.1", "--dpi", "60", "-o", name];
@@ -48,10 +48,10 @@ fn markers_without_a_size_are_told_once() -> anyhow::Result<()> {
     }
     let args = ["detect", "--marker", "apriltag-36h11:*", "--focal-px", "1818", "."];
     let found = alight(&args, folder.path())?;
-    let told = String::from_utf8(found.stderr)?;
+    let warnings = String::from_utf8(found.stderr)?;
     ensure!(
-        found.status.success() && told.matches("the marker has no size").count() == 1,
-        "{told}"
+        found.status.success() && warnings.matches("the marker has no size").count() == 1,
+        "{warnings}"
     );
     Ok(())
 }

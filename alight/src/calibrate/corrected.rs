@@ -1,5 +1,5 @@
-//! What a calibration from a flight changes of camera-pub's configuration: each TOML key (delay, mount, focal
-//! length, distortion) with its value before and after, for people and as tables.
+//! The keys of camera-pub's configuration that a calibration from a flight changes (delay, mount, focal length, distortion), each with its
+//! value before and after, as text and as TOML tables.
 
 use calibration::flight::QUANTITIES;
 use calibration::{FlightCalibration, Quantity};
@@ -8,7 +8,7 @@ use toml::Value;
 
 use super::recorded::RecordedFlight;
 
-/// What a calibration changes of a camera's configuration.
+/// The changes of a camera's configuration by a calibration.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Changes {
     /// The keys, those of a table together.
@@ -27,7 +27,7 @@ pub(super) struct Change {
     pub(super) before: Before,
 }
 
-/// What a key was in the camera's configuration.
+/// The value of a key in the camera's configuration before the calibration.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Before {
     /// The recording has no configuration of the camera.
@@ -68,7 +68,7 @@ fn is_same(one: &Value, other: &Value) -> bool {
     }
 }
 
-/// What changes; nothing when nothing was observable.
+/// The changes; none if no quantity was observable.
 pub(super) fn changes(flight: &RecordedFlight, result: &FlightCalibration) -> Changes {
     let correction = |wanted: Quantity| {
         let index = QUANTITIES.iter().position(|quantity| *quantity == wanted)?;
@@ -97,7 +97,7 @@ pub(super) fn changes(flight: &RecordedFlight, result: &FlightCalibration) -> Ch
         };
         let numbers: Vec<String> = numbers.iter().map(|number| format!("{number:.9}")).collect();
         set("calibration", "file", "\"\"".to_owned());
-        // What converts a file's camera is refused without one.
+        // camera-pub refuses keys that convert the camera of a file if no file is given.
         for (key, nothing) in [("binning", "0"), ("region_px", "[]")] {
             if matches!(before(flight, "calibration", key), Before::Was(_)) {
                 set("calibration", key, nothing.to_owned());
@@ -112,7 +112,7 @@ pub(super) fn changes(flight: &RecordedFlight, result: &FlightCalibration) -> Ch
     if turns.into_iter().any(|quantity| correction(quantity).is_some()) {
         let [w, x, y, z] = result.camera.body_from_camera.rotation().wxyz();
         set("mount", "orientation", "\"quaternion\"".to_owned());
-        // Angles that have no effect any more are refused.
+        // camera-pub refuses angles that no longer have an effect.
         if matches!(before(flight, "mount", "roll_pitch_yaw_deg"), Before::Was(_)) {
             set("mount", "roll_pitch_yaw_deg", "[0.0, 0.0, 90.0]".to_owned());
         }
@@ -130,19 +130,19 @@ fn before(flight: &RecordedFlight, table: &str, key: &str) -> Before {
 /// The delay that makes stamps right.
 ///
 /// # Errors
-/// Why no key does, and what to do.
+/// The reason why no key does, and what to do.
 fn delay_ms(flight: &RecordedFlight, offset_ms: f64) -> Result<f64, String> {
-    let told = format!("frames are exposed {offset_ms:+.2} ms after their stamps, and");
+    let offset = format!("frames are exposed {offset_ms:+.2} ms after their stamps, and");
     if flight.is_stamped_by_camera {
         return Err(format!(
-            "{told} no key corrects that, as the camera stamps them itself: check `source.stamp_at`, `source.readout_ms` and the \
+            "{offset} no key corrects that, as the camera stamps them itself: check `source.stamp_at`, `source.readout_ms` and the \
              delay of the autopilot's telemetry"
         ));
     }
     let delay = before(flight, "source", "delay_ms");
     let Before::Was(delay) = delay else {
         return Err(format!(
-            "{told} what `source.delay_ms` was is not known, as the recording has no configuration of camera-pub `{}`: make it \
+            "{offset} the previous `source.delay_ms` is not known, as the recording has no configuration of camera-pub `{}`: make it \
              smaller by {offset_ms:.2}, or stamp them later if another program is the camera",
             // The name comes from a file.
             flight.camera.escape_debug()
@@ -153,7 +153,7 @@ fn delay_ms(flight: &RecordedFlight, offset_ms: f64) -> Result<f64, String> {
         return Ok(delay_ms);
     }
     Err(format!(
-        "{told} `source.delay_ms` = {delay} cannot be made smaller by that: check the delay of the autopilot's telemetry"
+        "{offset} `source.delay_ms` = {delay} cannot be made smaller by that: check the delay of the autopilot's telemetry"
     ))
 }
 
@@ -185,13 +185,13 @@ impl Changes {
         text
     }
 
-    /// For people: what happens to each key, and what is left.
+    /// Text lines: the change of each key, and the error that no key corrects.
     pub(super) fn lines(&self, camera: &str) -> Vec<String> {
         let key = |change: &Change| {
             let name = change.name();
             match &change.before {
                 Before::Unknown => format!(
-                    "set: `{name}` = {} (what it was is not known: the recording has no configuration of camera-pub `{}`)",
+                    "set: `{name}` = {} (the previous value is not known: the recording has no configuration of camera-pub `{}`)",
                     change.value,
                     camera.escape_debug()
                 ),

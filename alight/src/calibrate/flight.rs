@@ -31,7 +31,7 @@ pub(crate) struct FlightArgs {
     /// The marker, FAMILY or FAMILY:ID [default: the one that was landed on].
     #[arg(long, value_name = "MARKER")]
     marker: Option<String>,
-    /// Write what changes, as tables of camera-pub's configuration (TOML).
+    /// Write the keys that change, as tables of camera-pub's configuration (TOML).
     #[arg(short, long, value_name = "FILE.toml", value_parser = toml_file)]
     output: Option<PathBuf>,
     /// Replace the file of `--output` where it is there already, as of another flight; without it that file is refused.
@@ -68,7 +68,7 @@ pub(super) fn run(args: &FlightArgs) -> anyhow::Result<ExitCode> {
     let count = changes.keys.len();
     write_error(&match output {
         Some(path) => {
-            // Also where no key changes: a file that is replaced says nothing of another flight.
+            // Also where no key changes: a replaced file must not contain values of another flight.
             write_atomically(path, changes.toml(&flight.camera).as_bytes())
                 .with_context(|| format!("writing {path:?}; name another file with `--output`"))?;
             match count {
@@ -98,7 +98,7 @@ fn name(quantity: Quantity) -> (&'static str, &'static str, f64) {
     }
 }
 
-/// What is said of an estimate.
+/// The verdict on an estimate.
 fn verdict(estimate: &FlightEstimate, changes: &Changes) -> String {
     let stays = match (estimate.is_observable(), estimate.deviation.is_finite()) {
         (true, _) if estimate.may_be_as_configured() => "stays: it may be as configured",
@@ -110,7 +110,7 @@ fn verdict(estimate: &FlightEstimate, changes: &Changes) -> String {
         }
         (false, true) => "not observable, stays: too uncertain",
         (false, false) => {
-            "not observable, stays: the vehicle did not move so that it shows, or its attitude errs by too much for that"
+            "not observable, stays: the vehicle's motion does not show it, or its attitude error is too large"
         }
     };
     stays.to_owned()
@@ -158,7 +158,7 @@ fn text(flight: &RecordedFlight, result: &FlightCalibration, changes: &Changes) 
     });
     lines.push(format!("before: {before}\nafter:  {after}"));
     lines.push(format!(
-        "the mount is meant against the autopilot's level; its position erred by about {:.0} mm, its attitude by {:.2} deg",
+        "the mount is relative to the autopilot's level; its position erred by about {:.0} mm, its attitude by {:.2} deg",
         1e3 * result.drift.position_m,
         result.drift.lean_rad.to_degrees()
     ));
@@ -263,7 +263,7 @@ mod tests {
     struct Landed {
         flight: RecordedFlight,
         result: FlightCalibration,
-        /// What the autopilot's level errs by: the mount is meant against it.
+        /// Error of the autopilot's level, to which the mount refers.
         level: Rotation<Body, Body>,
     }
 
@@ -291,14 +291,14 @@ mod tests {
             Some((attitude(state.ned_from_body_wxyz), attitude(truth.ned_from_body_wxyz)))
         });
         let pairs: Vec<_> = pairs.collect();
-        let turn = pairs.iter().map(|(told, truth)| {
-            let turn: Rotation<Ned, Ned> = *truth * told.inverse();
+        let turn = pairs.iter().map(|(estimated, truth)| {
+            let turn: Rotation<Ned, Ned> = *truth * estimated.inverse();
             turn.quaternion.scaled_axis()
         });
         let turn = turn.sum::<Vector3<f64>>() / pairs.len() as f64;
         let heading = Rotation::<Ned, Ned>::from_rotation_vector(Vector::new(0.0, 0.0, turn.z));
-        let tilt = pairs.iter().map(|(told, truth)| {
-            let tilt: Rotation<Body, Body> = (heading * *told).inverse() * *truth;
+        let tilt = pairs.iter().map(|(estimated, truth)| {
+            let tilt: Rotation<Body, Body> = (heading * *estimated).inverse() * *truth;
             tilt.quaternion.scaled_axis()
         });
         let tilt = tilt.sum::<Vector3<f64>>() / pairs.len() as f64;
@@ -345,9 +345,9 @@ mod tests {
     }
 
     #[test]
-    fn what_is_told_to_be_corrected_is_a_key_that_changes() {
+    fn each_key_named_as_a_correction_is_one_that_changes() {
         let Landed { mut flight, result, .. } = landed(&planned(6200, WRONG, &[])).unwrap();
-        let told = |flight: &RecordedFlight| {
+        let described = |flight: &RecordedFlight| {
             let changes = corrected::changes(flight, &result);
             let toml: toml::Table = changes.toml(&flight.camera).parse().unwrap();
             let text = text(flight, &result, &changes);
@@ -363,26 +363,26 @@ mod tests {
             }
         };
         // The simulator has no configuration of camera-pub, and stamps frames itself.
-        let (text, toml) = told(&flight);
+        let (text, toml) = described(&flight);
         all(&text, &["stays, although it is off: see below", "left: frames are exposed +"]);
         all(&text, &["no key corrects that", "set: `mount.rotation_wxyz` = ["]);
         assert!(toml.get("source").is_none(), "{toml}");
         flight.is_stamped_by_camera = false;
-        all(&told(&flight).0, &["left: ", "what `source.delay_ms` was is not known"]);
+        all(&described(&flight).0, &["left: ", "the previous `source.delay_ms` is not known"]);
         let configuration = "source.delay_ms = 50.0\nmount.orientation = \"down\"";
         flight.configuration = Some(configuration.parse().unwrap());
-        let (text, toml) = told(&flight);
+        let (text, toml) = described(&flight);
         all(&text, &["corrected by `source.delay_ms`", "changed: `source.delay_ms` from 50.0 to "]);
         all(&text, &["changed: `mount.orientation` from \"down\" to \"quaternion\""]);
         all(&text, &["added: `mount.rotation_wxyz` = ["]);
         let delay_ms = toml["source"]["delay_ms"].as_float().unwrap();
         assert!((delay_ms - 10.0).abs() < 2.0 && !text.contains("left: "), "{text}");
         flight.configuration = Some("source.delay_ms = 5.0".parse().unwrap());
-        all(&told(&flight).0, &["left: ", "`source.delay_ms` = 5.0 cannot be made smaller"]);
+        all(&described(&flight).0, &["left: ", "`source.delay_ms` = 5.0 cannot be made smaller"]);
     }
 
     #[test]
-    fn a_file_of_another_flight_is_refused_and_says_nothing_more_once_it_is_replaced() {
+    fn a_file_of_another_flight_is_refused_and_contains_none_of_it_once_replaced() {
         let folder = tempfile::tempdir().unwrap();
         let [file, output] = ["flight.mcap", "changes.toml"].map(|name| folder.path().join(name));
         std::fs::write(&output, "[source]\ndelay_ms = 7.0\n").unwrap();
@@ -408,7 +408,7 @@ mod tests {
     }
 
     #[test]
-    fn a_recording_without_detections_or_telemetry_is_told() {
+    fn a_recording_without_detections_or_telemetry_is_reported() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("empty.mcap");
         let wanted = Wanted { camera: None, detector: None, marker: None };
@@ -446,7 +446,7 @@ mod tests {
         error_m.unwrap_or(f64::INFINITY)
     }
 
-    /// What is still wrong after the correction.
+    /// The errors of the camera that remain after the correction.
     fn left(wrong: Wrong, result: &FlightCalibration) -> Wrong {
         let [offset_s, roll, pitch, yaw, ..] =
             result.estimates.map(|estimate| estimate.correction());

@@ -1,4 +1,4 @@
-//! Frames of a camera that is running, until enough of them show the board.
+//! Takes frames of a running camera until enough of them show the board, and shows which views are still missing.
 
 use anyhow::{Context, ensure};
 use calibration::calibrate_unjudged;
@@ -14,13 +14,13 @@ use crate::grey::grey;
 use crate::runtime::with_node;
 use crate::terminal::{print, write_error};
 
-/// Without a frame for so long there is no camera.
-const PATIENCE: std::time::Duration = std::time::Duration::from_secs(10);
-/// After so many more views the first solution is made anew.
+/// Without a frame for this time, the camera counts as absent.
+const FRAME_TIMEOUT: std::time::Duration = std::time::Duration::from_secs(10);
+/// After this many further views the initial solution is computed again.
 const VIEWS_PER_SOLUTION: usize = 4;
 
-/// Takes frames in which the board has moved and is held still, and says what to show next, until nothing is missing or the
-/// person ends it (Ctrl-C).
+/// Takes frames in which the board has moved and is held still, and shows which view is needed next, until no view is missing or the user
+/// ends it (Ctrl-C).
 ///
 /// # Errors
 /// When no frames come, or the network cannot be joined.
@@ -38,14 +38,14 @@ pub(super) fn watch_camera(
         write_error("Show the board to the camera; Ctrl-C when it is enough.");
         loop {
             let next = tokio::select! {
-                next = tokio::time::timeout(PATIENCE, frames.next()) => next,
+                next = tokio::time::timeout(FRAME_TIMEOUT, frames.next()) => next,
                 () = shutdown.requested() => break,
             };
             let Ok(next) = next else {
                 ensure!(
                     found.images > 0,
-                    "no frame of the camera {camera:?} within {} s: is camera-pub running? `alight doctor` tells",
-                    PATIENCE.as_secs()
+                    "no frame of the camera {camera:?} within {} s: is camera-pub running? `alight doctor` checks it",
+                    FRAME_TIMEOUT.as_secs()
                 );
                 write_error("The camera sends no more frames.");
                 break;
@@ -75,7 +75,7 @@ fn picture(frame: &Frame, converter: &mut Converter) -> anyhow::Result<Picture> 
     Ok(Picture { name: format!("frame {sequence}"), image, origin: Origin::Live })
 }
 
-/// Says what is missing, when there is something new; whether nothing is.
+/// Shows which views are missing, when that has changed. Returns whether none is missing.
 fn say(found: &FoundImages, args: &BoardArgs, said: &mut Option<Shown>) -> anyhow::Result<bool> {
     let views = found.views.len();
     if said.as_ref().is_some_and(|before| before.views == views) {

@@ -43,9 +43,9 @@ pub(crate) struct CalibrateArgs {
 
 #[derive(Subcommand)]
 enum What {
-    /// A camera's intrinsics from images of a printed board: print it with --print (a grid of AprilTags; a chessboard or another board is not
-    /// found: calibrate with OpenCV from those, whose file is read as well), take 20 to 60 pictures (tilted by up to
-    /// 45 degrees to all sides, near and far, in every corner of the image), then calibrate.
+    /// A camera's intrinsics from images of a printed board: print it with --print (a grid of AprilTags; a chessboard or another board is
+    /// not found: calibrate with OpenCV from those, whose file is read as well), take 20 to 60 pictures (tilted by up to 45 degrees to all
+    /// sides, near and far, in every corner of the image), then calibrate.
     Board(BoardArgs),
     /// A camera's time offset, mount, focal length and first radial coefficient (k1) from the recording of a landing
     /// (`alight land --record`, `alight record`) on a pad of known size that does not move. A landing with turns of the heading
@@ -136,7 +136,7 @@ fn accept(
         rms_px: calibration.rms_px,
         uncertainty_px: calibration.worst_uncertainty_px(),
     };
-    // The result is told first: a file that cannot be written does not take it along.
+    // The result is printed first, so it is not lost if the file cannot be written.
     match args.format {
         Format::Text => {
             print(report::found_text(found, shown).trim_end())?;
@@ -196,8 +196,9 @@ mod tests {
         let file = folder.path().join("camera.yaml");
         check_output(&file, false, "").unwrap();
         assert!(!file.exists());
-        let told = check_output(&folder.path().join("missing/camera.yaml"), false, "").unwrap_err();
-        assert!(format!("{told:#}").contains("make its folder"), "{told:#}");
+        let error =
+            check_output(&folder.path().join("missing/camera.yaml"), false, "").unwrap_err();
+        assert!(format!("{error:#}").contains("make its folder"), "{error:#}");
         std::fs::write(&file, "in use").unwrap();
         assert!(check_output(&file, false, "").is_err());
         check_output(&file, true, "").unwrap();

@@ -20,11 +20,11 @@ pub(super) struct RecordedFlight {
     pub(super) markers: Vec<MarkerSample>,
     /// The marker that was landed on.
     pub(super) marker: String,
-    /// Whether frames tell their exposure: their stamps are the camera's own, and no delay is subtracted from them.
+    /// Whether the camera itself stamps its frames, so that no delay is subtracted from the stamps.
     pub(super) is_stamped_by_camera: bool,
     /// The configuration of camera-pub, every key of it, where it was recorded.
     pub(super) configuration: Option<toml::Table>,
-    /// What of the recording is damaged.
+    /// Descriptions of the damaged parts of the recording.
     pub(super) damage: Vec<String>,
 }
 
@@ -57,8 +57,7 @@ pub(super) fn read(file: &Path, wanted: &Wanted<'_>) -> anyhow::Result<RecordedF
     let marker = marker(&flight, wanted, &found)?;
     ensure!(
         !flight.vehicle.is_empty(),
-        "the vehicle's state (vehicle/state, or a controller's tape) is not in {file:?}: record with a controller that hears the \
-         autopilot"
+        "the vehicle's state (vehicle/state, or a controller's tape) is not in {file:?}: record with a controller that is connected to the autopilot"
     );
     let zero_ns = flight.vehicle.first().map_or(0, |state| state.stamp_ns);
     let at_s = |stamp_ns: i64| stamp_ns.saturating_sub(zero_ns) as f64 * 1e-9;

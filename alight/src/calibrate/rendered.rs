@@ -1,4 +1,4 @@
-//! Boards in rendered images, by lenses whose truth is known, beside OpenCV from the same corners.
+//! Measures the accuracy of calibrations from rendered images of boards through known lenses, and of OpenCV's from the same corners.
 
 use calibration::{Calibration, Lens, Options, Refusal, calibrate};
 use geometry::{Body, CameraModel, Ned, Pixel, Point, Rotation, Transform};
@@ -22,7 +22,7 @@ use synthetic::{Truth, known_error_px, lenses, map_error_px, turned_map_error_px
 
 const VIEWS: usize = 60;
 
-/// What was found, and the calibration.
+/// The images with the board, and the calibration.
 type Judged = (FoundImages, Result<Calibration, Refusal>);
 
 /// The camera before a board on the ground, whose middle it sees anywhere in its image: near and far, tilted to all sides.
@@ -80,8 +80,8 @@ fn found(board: &Board, lens: Lens, camera: &CameraModel, seed: u64) -> Judged {
     (found, result)
 }
 
-/// Errors of a camera: of its focal length in %, its principal point in pixels, and of where it shows what, in pixels, over 95 %
-/// of the image, as it is and after the best rotation.
+/// Errors of a camera: of its focal length in %, its principal point in pixels, and of its projection, in pixels, over 95 % of the image,
+/// as it is and after the best rotation.
 fn errors(truth: &CameraModel, camera: &CameraModel) -> [f64; 4] {
     let focal = (camera.fx / truth.fx - 1.0).abs().max((camera.fy / truth.fy - 1.0).abs());
     let principal = (camera.cx - truth.cx).hypot(camera.cy - truth.cy);
@@ -106,21 +106,21 @@ fn how_exact_cameras_from_rendered_boards_are() {
                     continue;
                 }
             };
-            let told = |[focal, principal, map, turned]: [f64; 4]| {
+            let error_text = |[focal, principal, map, turned]: [f64; 4]| {
                 format!(
                     "focal length {focal:.4} %, principal point {principal:.3} px, map {map:.3} px, turned {turned:.3} px"
                 )
             };
             let ours = errors(&truth, &result.camera);
             let theirs = match opencv::solve(&found.views, lens) {
-                Some(Ok(theirs)) => told(errors(&truth, &theirs.camera)),
+                Some(Ok(theirs)) => error_text(errors(&truth, &theirs.camera)),
                 Some(Err(problem)) => problem,
                 None => "not installed".to_owned(),
             };
             println!(
-                "{name}, seed {seed}, {} images: {}, where it is known {:.3} px, told {:.3} px, {:.0} % unknown; OpenCV: {theirs}",
+                "{name}, seed {seed}, {} images: {}, where it is known {:.3} px, stated {:.3} px, {:.0} % unknown; OpenCV: {theirs}",
                 found.views.len(),
-                told(ours),
+                error_text(ours),
                 known_error_px(&truth, &result),
                 result.worst_uncertainty_px(),
                 100.0 * result.unknown_share()

@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use super::found::{BLURRED_PX, FoundImages};
 use super::shown::Shown;
 
-/// The distance that errors are told at, in metres.
+/// The distance for which errors are given, in metres.
 const FAR_M: f64 = 5.0;
 /// Columns and rows of the maps of residuals and of uncertainty.
 const MAP: [usize; 2] = [6, 4];
@@ -78,7 +78,7 @@ fn blurred(found: &FoundImages) -> impl Iterator<Item = &str> {
     found.edges.iter().filter(|edge| edge.width_px > BLURRED_PX).map(|edge| edge.name.as_str())
 }
 
-/// How the board was shown, and what would help.
+/// How the board was shown, and which views would help.
 pub(super) fn shown_text(shown: &Shown) -> String {
     let mut text = String::new();
     if let (Some(tilt_deg), Some(ratio)) = (shown.tilt_deg, shown.distance_ratio) {
@@ -96,7 +96,7 @@ pub(super) fn shown_text(shown: &Shown) -> String {
     text
 }
 
-/// The camera, and what it is worth.
+/// The camera and its accuracy.
 pub(super) fn worth_text(calibration: &Calibration) -> String {
     let CameraModel { width, height, fx, fy, cx, cy, .. } = calibration.camera;
     let sigma = |i: usize| calibration.covariance[(i, i)].max(0.0).sqrt();
@@ -128,7 +128,7 @@ pub(super) fn worth_text(calibration: &Calibration) -> String {
     if unknown > 0.0 {
         let _ = writeln!(
             text,
-            "not known: {:.0} % of the image, farther from its middle than the board was seen ({:.0} px): show it nearer to the edges, or use no marker there",
+            "not known: {:.0} % of the image, farther from its centre than the board was seen ({:.0} px): show it nearer to the edges, or use no marker there",
             (100.0 * unknown).ceil(),
             calibration.seen_radius_px
         );
@@ -154,15 +154,15 @@ pub(super) fn worth_text(calibration: &Calibration) -> String {
     text
 }
 
-/// What is left of the points, and how sure the projection is, by place.
+/// Maps of the residuals of the points and of the uncertainty of the projection.
 fn maps_text(calibration: &Calibration) -> String {
     let [columns, rows] = MAP;
     let residuals = calibration.residual_map(columns, rows);
     let uncertainty = calibration.uncertainty_map(columns, rows);
     let cell = |value: Option<f64>| value.map_or("    -".to_owned(), |px| format!("{px:>6.3}"));
     let mut text = format!(
-        "{:width$}uncertainty by place, px\n",
-        "residuals by place, px",
+        "{:width$}uncertainty by position, px\n",
+        "residuals by position, px",
         width = 7 * columns + 3
     );
     for (left, right) in residuals.chunks(columns).zip(uncertainty.chunks(columns)) {
@@ -175,7 +175,7 @@ fn maps_text(calibration: &Calibration) -> String {
     text
 }
 
-/// A number with two digits that say something.
+/// A number with two significant digits.
 fn two_digits(value: f64) -> String {
     let before_point = if value > 0.0 { value.log10().floor() as i32 } else { 0 };
     let decimals = usize::try_from(1 - before_point).unwrap_or(0).min(4);
@@ -275,12 +275,12 @@ mod tests {
     use calibration::{ImageSize, View};
 
     #[test]
-    fn images_without_the_board_are_told_which_board_is_meant() {
+    fn images_without_the_board_are_reported_with_the_board_that_is_meant() {
         let refusal = Refusal::TooFewViews { views: 0, min_views: 3, min_points: 12 };
         let mut found = FoundImages::default();
-        let told = refusal_text(&found, &refusal);
-        assert!(told.contains("AprilTags") && told.contains("chessboard"), "{told}");
-        assert!(told.contains("OpenCV") && !told.contains("more pictures"), "{told}");
+        let text = refusal_text(&found, &refusal);
+        assert!(text.contains("AprilTags") && text.contains("chessboard"), "{text}");
+        assert!(text.contains("OpenCV") && !text.contains("more pictures"), "{text}");
         let size = ImageSize { width: 640, height: 480 };
         found.views.push(View { name: "a.png".to_owned(), size, points: Vec::new() });
         assert_eq!(refusal_text(&found, &refusal), refusal.to_string());

@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_without_a_picture_is_told_with_what_is_wrong_with_its_frames() {
+    fn a_camera_without_a_picture_is_reported_with_the_error_of_its_frames() {
         let damaged = r"while sleep 0.05; do printf '\377\330\377\331'; done";
         let problem = of_script(damaged, Duration::from_secs(2)).unwrap_err().to_string();
         let said = "camera `down` gave no picture within 2 s: unreadable image (";

@@ -104,7 +104,7 @@ struct Examiner {
     lacks_drawing: AtomicBool,
     /// Whether an image was of another size than the calibration.
     lacks_poses: AtomicBool,
-    was_told_of_turns: AtomicBool,
+    turn_was_reported: AtomicBool,
     /// How many more are searched without the camera, in doubt of it.
     looks_without_camera: AtomicUsize,
     was_doubted: AtomicBool,
@@ -144,7 +144,7 @@ impl Examiner {
             gallery: args.draw.as_deref().map(Gallery::new).transpose()?,
             lacks_drawing: AtomicBool::new(false),
             lacks_poses: AtomicBool::new(false),
-            was_told_of_turns: AtomicBool::new(false),
+            turn_was_reported: AtomicBool::new(false),
             looks_without_camera: AtomicUsize::new(MAX_LOOKS_WITHOUT_CAMERA),
             was_doubted: AtomicBool::new(false),
             camera_option: match (&args.camera, args.focal_px) {
@@ -223,7 +223,7 @@ impl Examiner {
         {
             write_error(&warning);
         }
-        // What was found counts without its drawing.
+        // The detections count even if their drawing cannot be written.
         if let Some(gallery) = &self.gallery
             && let Err(problem) = gallery.add(stem, image, found, camera.as_ref())
         {
@@ -245,8 +245,8 @@ impl Examiner {
         })
     }
 
-    /// A warning where a marker is found without the camera only: what is no circle or square in space, as the camera would show
-    /// it, is no marker. That others are found says little of the camera: seen head-on they fit any focal length.
+    /// A warning if a marker is found only without the camera: a shape that the camera model does not map back to a circle or square in
+    /// space is rejected. Other detected markers say little about the camera: seen head-on they fit any focal length.
     fn doubt_of_camera(&self, view: GrayView<'_>, name: &str) -> Option<String> {
         let looks = &self.looks_without_camera;
         let one_less = |left: usize| left.checked_sub(1);
@@ -279,10 +279,10 @@ impl Examiner {
         }
     }
 
-    /// What is said of the first image that a viewer would turn: it is searched as it is stored.
+    /// The note on the first image that a viewer would turn: it is searched as it is stored.
     fn note_of_turn(&self, still: &StillImage, name: &str) -> Option<String> {
         let orientation = still.exif_orientation?;
-        if self.was_told_of_turns.swap(true, Ordering::Relaxed) {
+        if self.turn_was_reported.swap(true, Ordering::Relaxed) {
             return None;
         }
         Some(format!(
@@ -314,7 +314,7 @@ impl Examiner {
     }
 }
 
-/// What is said of the first image of another size than the calibration's.
+/// The warning for the first image of another size than the calibration's.
 fn warning_of_size(camera: &CameraModel, still: &StillImage, name: &str) -> String {
     let (width, height) = (still.grey.width() as u32, still.grey.height() as u32);
     let mut warning = format!(
@@ -475,17 +475,20 @@ mod tests {
         assert_eq!(found(&examiner("300")), 1);
         let wrong = examiner("30");
         let view = image.grey.view().unwrap();
-        let told = wrong.doubt_of_camera(view, "a.png").unwrap();
+        let warning = wrong.doubt_of_camera(view, "a.png").unwrap();
         for part in ["a.png", "rings", "`--focal-px 30`", "320 x 240"] {
-            assert!(told.contains(part), "`{part}` is not in: {told}");
+            assert!(warning.contains(part), "`{part}` is not in: {warning}");
         }
         assert_eq!(wrong.doubt_of_camera(view, "a.png"), None);
         let args = args(&["--marker", "rings:0.2", "--camera", "wide.yaml", "a.png"]).unwrap();
         let camera = CameraModel::pinhole(320, 240, 30.0);
         let calibrated = Examiner::new(&args, Lens::Calibrated(camera)).unwrap();
-        let told = calibrated.doubt_of_camera(view, "a.png").unwrap();
-        assert!(told.contains("`--camera wide.yaml`") && told.contains("calibration"), "{told}");
-        assert!(!told.contains("in pixels"), "{told}");
+        let warning = calibrated.doubt_of_camera(view, "a.png").unwrap();
+        assert!(
+            warning.contains("`--camera wide.yaml`") && warning.contains("calibration"),
+            "{warning}"
+        );
+        assert!(!warning.contains("in pixels"), "{warning}");
         let other = examiner("30");
         assert_eq!(found(&other), 0);
         assert!(other.was_doubted.load(Ordering::Relaxed));
@@ -522,11 +525,11 @@ mod tests {
         assert!(lines.iter().all(|line| place(line) == place(&lines[0])), "{lines:?}");
         let orientations: Vec<_> = lines.iter().map(|it| it["exif_orientation"].as_u64()).collect();
         assert_eq!(orientations, [None, Some(3), Some(6)]);
-        assert!(examiner.was_told_of_turns.load(Ordering::Relaxed));
+        assert!(examiner.turn_was_reported.load(Ordering::Relaxed));
     }
 
     #[test]
-    fn a_picture_that_exif_would_turn_is_told_once() {
+    fn a_picture_that_exif_would_turn_is_reported_once() {
         let examiner =
             Examiner::new(&args(&["--marker", "rings", "a.jpg"]).unwrap(), Lens::Unknown).unwrap();
         let still = |exif_orientation| {
@@ -534,12 +537,12 @@ mod tests {
             StillImage { grey, exif_orientation }
         };
         assert_eq!(examiner.note_of_turn(&still(None), "a.jpg"), None);
-        let told = examiner.note_of_turn(&still(Some(3)), "b.jpg").unwrap();
-        assert!(told.contains("b.jpg") && told.contains("Exif orientation 3"), "{told}");
+        let note = examiner.note_of_turn(&still(Some(3)), "b.jpg").unwrap();
+        assert!(note.contains("b.jpg") && note.contains("Exif orientation 3"), "{note}");
         assert_eq!(examiner.note_of_turn(&still(Some(3)), "c.jpg"), None);
         let upright = CameraModel::pinhole(240, 320, 300.0);
-        let told = warning_of_size(&upright, &still(Some(6)), "a.jpg");
-        assert!(told.contains("320 x 240") && told.contains("Exif"), "{told}");
+        let warning = warning_of_size(&upright, &still(Some(6)), "a.jpg");
+        assert!(warning.contains("320 x 240") && warning.contains("Exif"), "{warning}");
         assert!(!warning_of_size(&upright, &still(None), "a.jpg").contains("Exif"));
         let larger = CameraModel::pinhole(640, 480, 300.0);
         assert!(!warning_of_size(&larger, &still(Some(6)), "a.jpg").contains("Exif"));
@@ -590,31 +593,31 @@ mod tests {
     }
 
     #[test]
-    fn markers_without_a_size_are_told_where_a_camera_would_give_poses() {
-        let told_beside = |has_pad: bool, markers: &[&str], lens: &Lens| {
+    fn markers_without_a_size_are_reported_where_a_camera_would_give_poses() {
+        let warning_with = |has_pad: bool, markers: &[&str], lens: &Lens| {
             let markers: Vec<Marker> = markers.iter().map(|it| it.parse().unwrap()).collect();
             lack_of_sizes(&markers, has_pad, lens)
         };
-        let told = |markers: &[&str], lens: &Lens| told_beside(false, markers, lens);
+        let warning = |markers: &[&str], lens: &Lens| warning_with(false, markers, lens);
         let ideal = Lens::Ideal { focal_px: 1818.0 };
-        let any = told(&["apriltag-36h11:*"], &ideal).unwrap();
+        let any = warning(&["apriltag-36h11:*"], &ideal).unwrap();
         assert_eq!(any, "no poses: the marker has no size (FAMILY:ID:SIZE_M)");
-        let rings = told(&["aruco-4x4-50:7:0.2", "rings"], &ideal).unwrap();
+        let rings = warning(&["aruco-4x4-50:7:0.2", "rings"], &ideal).unwrap();
         assert_eq!(rings, "no poses of `rings`: the marker has no size (FAMILY:SIZE_M)");
-        let both = told(&["aruco-4x4-50:7:0.2", "rings", "stag-hd23:4"], &ideal).unwrap();
+        let both = warning(&["aruco-4x4-50:7:0.2", "rings", "stag-hd23:4"], &ideal).unwrap();
         let forms = "(FAMILY:ID:SIZE_M, FAMILY:SIZE_M)";
         assert_eq!(
             both,
             format!("no poses of `rings`, `stag-hd23:4`: the markers have no size {forms}")
         );
-        let all = told(&["rings", "stag-hd23:4"], &ideal).unwrap();
+        let all = warning(&["rings", "stag-hd23:4"], &ideal).unwrap();
         assert_eq!(all, format!("no poses: the markers have no size {forms}"));
-        let beside_pad = told_beside(true, &["rings"], &ideal).unwrap();
-        assert_eq!(beside_pad, "no poses of `rings`: the marker has no size (FAMILY:SIZE_M)");
-        assert_eq!(told_beside(true, &[], &ideal), None);
-        assert_eq!(told(&["apriltag-36h11:*:0.1", "rings:0.1"], &ideal), None);
-        assert_eq!(told(&["apriltag-36h11:*"], &Lens::Unknown), None);
-        assert_eq!(told(&[], &ideal), None);
+        let with_pad = warning_with(true, &["rings"], &ideal).unwrap();
+        assert_eq!(with_pad, "no poses of `rings`: the marker has no size (FAMILY:SIZE_M)");
+        assert_eq!(warning_with(true, &[], &ideal), None);
+        assert_eq!(warning(&["apriltag-36h11:*:0.1", "rings:0.1"], &ideal), None);
+        assert_eq!(warning(&["apriltag-36h11:*"], &Lens::Unknown), None);
+        assert_eq!(warning(&[], &ideal), None);
     }
 
     #[test]

@@ -78,10 +78,10 @@ impl Source {
         stem
     }
 
-    /// What is said of the images in folders that are of formats that are not read; `None` where there are none.
+    /// The note on the images in folders whose formats are not read; `None` if there are none.
     pub(crate) fn note_of_others(paths: &[PathBuf]) -> Option<String> {
         let folders = paths.iter().filter(|path| path.is_dir());
-        // What cannot be listed is told where it is read.
+        // A folder that cannot be listed is reported where it is read.
         let others = folders.filter_map(|path| files_in(path, &[OTHER_IMAGE_EXTENSIONS]).ok());
         let others: Vec<PathBuf> = others.flatten().collect();
         let shown = others.iter().take(MAX_NAMES).map(|path| path.display().to_string());
@@ -204,12 +204,12 @@ mod tests {
         ["a.jpg", "notes.txt", "flight.mp4"].into_iter().for_each(write);
         assert_eq!(note(), None);
         write("b.HEIC");
-        let told = note().unwrap();
-        assert!(told.starts_with("1 image is left out") && told.contains("b.HEIC"), "{told}");
+        let text = note().unwrap();
+        assert!(text.starts_with("1 image is left out") && text.contains("b.HEIC"), "{text}");
         ["c.bmp", "d.tiff", "e.webp", "f.gif", "g.dng"].into_iter().for_each(write);
-        let told = note().unwrap();
-        assert!(told.starts_with("6 images are left out, as neither PNG nor JPEG"), "{told}");
-        assert!(told.contains("f.gif and 1 more") && !told.contains("g.dng"), "{told}");
+        let text = note().unwrap();
+        assert!(text.starts_with("6 images are left out, as neither PNG nor JPEG"), "{text}");
+        assert!(text.contains("f.gif and 1 more") && !text.contains("g.dng"), "{text}");
     }
 
     #[test]

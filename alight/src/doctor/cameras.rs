@@ -8,7 +8,7 @@ use node::{clock_name, stats};
 
 use super::{Findings, ReceivedFrame, Seen, Watched};
 
-/// Maximum age of a frame on arrival, in milliseconds; a larger one is a wrong clock, or a link that is of no use.
+/// Maximum age of a frame on arrival, in milliseconds; a larger one means a wrong clock or an unusable link.
 const MAX_AGE_MS: f64 = 1000.0;
 /// A brisk turn of the vehicle, in radians per second, at which the blur is stated.
 const TURN_RAD_S: f64 = 0.5;
@@ -33,7 +33,7 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_
             let text = format!("camera `{camera}` is not calibrated, so distances are unknown");
             let advice =
                 "calibrate it (`alight calibrate board`), and set `calibration.file` of camera-pub";
-            // What is searched for markers is to be landed by.
+            // A camera whose frames are searched for markers is meant for the landing.
             if seen.is_searched(camera) {
                 findings.wrong("calibration", format!("{text} and no landing starts"), advice);
             } else {
@@ -96,7 +96,7 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_
         }
     }
     let is_needed = has_camera || seen.lands();
-    let are_silent = is_needed && tell_silent(findings, seen, watched);
+    let are_silent = is_needed && report_silent(findings, seen, watched);
     if all.is_empty() && !seen.peers.is_empty() && !are_silent {
         findings.doubtful(
             "camera",
@@ -106,8 +106,8 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_
     }
 }
 
-/// Tells of cameras whose frames have ended, or of none at all, where frames are needed; false when there is nothing to tell.
-fn tell_silent(findings: &mut Findings, seen: &Seen, watched: Watched) -> bool {
+/// Reports cameras whose frames have ended, or that no camera sends any, if frames are needed. Returns whether it reported any.
+fn report_silent(findings: &mut Findings, seen: &Seen, watched: Watched) -> bool {
     let watched_s = watched.duration.as_secs_f64();
     let frames = || seen.frames.iter().chain(&seen.raw_frames);
     let mut names: Vec<&str> = frames().map(|frame| frame.header.camera.as_str()).collect();
@@ -194,7 +194,7 @@ fn check_stamps(findings: &mut Findings, camera: &str, frames: &[&ReceivedFrame]
         );
     }
     let exact = frames.iter().filter(|frame| frame.header.exposure_ns > 0).count();
-    let text = format!("camera `{camera}`: {exact} of {} are told by the camera", frames.len());
+    let text = format!("camera `{camera}`: {exact} of {} are stamped by the camera", frames.len());
     if exact * 10 >= frames.len() * 9 {
         findings.good("stamps", text);
     } else {
@@ -293,13 +293,13 @@ fn check_drops(findings: &mut Findings, camera: &str, healths: &[Health]) {
     let reasons: Vec<_> =
         health.drops.iter().map(|drop| format!("{} ({})", drop.reason, drop.count)).collect();
     let text = format!(
-        "camera `{camera}` dropped {dropped} beside {frames} frames: {}",
+        "camera `{camera}` dropped {dropped} in addition to {frames} frames: {}",
         reasons.join(", ")
     );
     if dropped as f64 <= MAX_DROPPED * frames as f64 {
         findings.good("camera", text);
     } else {
-        findings.doubtful("camera", text, "docs/camera.md says what each of them comes from");
+        findings.doubtful("camera", text, "docs/camera.md explains the cause of each of them");
     }
 }
 
@@ -333,7 +333,7 @@ mod tests {
         ReceivedFrame { header, bytes: 640 * 480, received_ns, edge_width_px: None }
     }
 
-    /// What is said about a camera with these frames.
+    /// The findings on a camera with these frames.
     fn text(frames: Vec<ReceivedFrame>, width: u32, healths: Vec<Health>) -> String {
         let model = geometry::CameraModel::pinhole(width, 480, 1800.0);
         let mount = geometry::Transform::identity();
@@ -360,13 +360,13 @@ mod tests {
         let text =
             text(vec![frame(30, 2_000_000), frame(31, 2_000_000)], 640, vec![health(Vec::new())]);
         assert!(text.ends_with("Nothing is wrong."), "{text}");
-        assert!(text.contains("2 of 2 are told by the camera"), "{text}");
+        assert!(text.contains("2 of 2 are stamped by the camera"), "{text}");
         assert!(text.contains("2.00 ms, which blurs by 1.8 pixels"), "{text}");
         assert!(text.contains("dropped none of 1000 frames"), "{text}");
     }
 
     #[test]
-    fn estimated_and_impossible_stamps_long_exposures_and_drops_are_told() {
+    fn estimated_and_impossible_stamps_long_exposures_and_drops_are_reported() {
         assert!(text(vec![frame(30, 0)], 640, Vec::new()).contains("the others are estimates"));
         let early = text(vec![frame(30, 1), frame(-5, 1)], 640, Vec::new());
         assert!(early.contains("stamps a frame -5 ms before it arrives"), "{early}");
@@ -376,11 +376,14 @@ mod tests {
         assert!(long.contains("for the marker"), "{long}");
         let drops = vec![Count { reason: "frames that were queued".into(), count: 50 }];
         let dropping = text(vec![frame(30, 1)], 640, vec![health(drops)]);
-        assert!(dropping.contains("dropped 50 beside 1000 frames: frames that were queued (50)"));
+        assert!(
+            dropping
+                .contains("dropped 50 in addition to 1000 frames: frames that were queued (50)")
+        );
     }
 
     #[test]
-    fn a_blurred_picture_is_told_and_one_without_edges_is_not_judged() {
+    fn a_blurred_picture_is_reported_and_one_without_edges_is_not_judged() {
         let of = |widths: [Option<f64>; 3]| {
             let frames =
                 widths.map(|edge_width_px| ReceivedFrame { edge_width_px, ..frame(30, 1) });
@@ -408,7 +411,7 @@ mod tests {
     fn a_camera_without_a_calibration_is_wrong_where_a_detector_searches_its_frames() {
         let model = geometry::CameraModel::pinhole(640, 480, 1800.0);
         let info = CameraInfo::new("down", &model, &geometry::Transform::identity());
-        let told = |searched: &str| {
+        let findings_text = |searched: &str| {
             let mut findings = Findings::default();
             let watched = Watched { duration: Duration::from_secs(3), has_raw_frames: true };
             let seen = Seen {
@@ -419,10 +422,10 @@ mod tests {
             check(&mut findings, &seen, watched, false);
             findings.text()
         };
-        let needed = told("down");
+        let needed = findings_text("down");
         assert!(needed.contains("no landing starts") && needed.contains("1 wrong"), "{needed}");
-        let beside = told("front");
-        assert!(beside.contains("not calibrated") && beside.contains("0 wrong"), "{beside}");
+        let other = findings_text("front");
+        assert!(other.contains("not calibrated") && other.contains("0 wrong"), "{other}");
     }
 
     #[test]
@@ -430,31 +433,32 @@ mod tests {
         let model = geometry::CameraModel::pinhole(640, 480, 1800.0);
         let info = CameraInfo::new("down", &model, &geometry::Transform::identity());
         let status = |phase| ControllerStatus { phase, ..ControllerStatus::default() };
-        let told = |phase, is_of_site, frames: Vec<ReceivedFrame>, cameras, ended_s: i64| {
-            let mut findings = Findings::default();
-            let watched = Watched { duration: Duration::from_secs(3), has_raw_frames: true };
-            let seen = Seen {
-                peers: vec![("controller".into(), "main".into())],
-                status: Some(status(phase)),
-                ended_ns: 1_000_000_000_000 + ended_s * 1_000_000_000,
-                raw_frames: frames,
-                cameras,
-                ..Seen::default()
+        let findings_text =
+            |phase, is_of_site, frames: Vec<ReceivedFrame>, cameras, ended_s: i64| {
+                let mut findings = Findings::default();
+                let watched = Watched { duration: Duration::from_secs(3), has_raw_frames: true };
+                let seen = Seen {
+                    peers: vec![("controller".into(), "main".into())],
+                    status: Some(status(phase)),
+                    ended_ns: 1_000_000_000_000 + ended_s * 1_000_000_000,
+                    raw_frames: frames,
+                    cameras,
+                    ..Seen::default()
+                };
+                check(&mut findings, &seen, watched, is_of_site);
+                findings.text()
             };
-            check(&mut findings, &seen, watched, is_of_site);
-            findings.text()
-        };
         let dead = "WRONG  camera        no frame from camera `down` for 3 s";
-        let silent = told(Phase::Search, false, Vec::new(), vec![info.clone()], 3);
+        let silent = findings_text(Phase::Search, false, Vec::new(), vec![info.clone()], 3);
         assert!(silent.contains(dead) && silent.contains("on the drone"), "{silent}");
-        let ended = told(Phase::Search, false, vec![frame(30, 1)], vec![info.clone()], 3);
+        let ended = findings_text(Phase::Search, false, vec![frame(30, 1)], vec![info.clone()], 3);
         assert!(ended.contains(dead), "{ended}");
-        let here = told(Phase::Idle, true, Vec::new(), Vec::new(), 3);
+        let here = findings_text(Phase::Idle, true, Vec::new(), Vec::new(), 3);
         assert!(here.contains("no frame from any camera for 3 s"), "{here}");
-        // It sends frames, or nobody needs them.
-        let well = told(Phase::Search, false, vec![frame(30, 1)], vec![info.clone()], 1);
+        // It sends frames, or no landing needs them.
+        let well = findings_text(Phase::Search, false, vec![frame(30, 1)], vec![info.clone()], 1);
         assert!(well.ends_with("Nothing is wrong."), "{well}");
-        let idle = told(Phase::Idle, false, Vec::new(), vec![info], 3);
+        let idle = findings_text(Phase::Idle, false, Vec::new(), vec![info], 3);
         assert!(idle.contains("0 wrong, 1 doubtful"), "{idle}");
     }
 }

@@ -1,4 +1,4 @@
-//! How sharp the pictures of cameras are.
+//! Measures the sharpness (edge width) of received camera frames for `alight doctor`.
 
 use std::collections::BTreeMap;
 
@@ -20,7 +20,7 @@ pub(super) struct Focus {
 }
 
 impl Focus {
-    /// What is kept of a frame.
+    /// The header, size and, twice a second, the edge width of a frame.
     pub(super) fn received(&mut self, frame: Frame) -> ReceivedFrame {
         let received_ns = now_ns();
         let bytes = frame.bytes().len();
@@ -33,7 +33,7 @@ impl Focus {
         let mut edge_width = None;
         if is_due {
             self.looked_ns.insert(camera.clone(), received_ns);
-            // What cannot be decoded is the detector's to tell.
+            // The detector reports frames that cannot be decoded.
             let image = crate::grey::grey(&frame, &mut self.converter).ok();
             let view = image.as_ref().and_then(GrayImage::view);
             edge_width = view.and_then(edge_width_px);

@@ -19,10 +19,10 @@ use crate::site::Job;
 const EXPIRES_SOON_S: i64 = 30 * DAY_S;
 const DAY_S: i64 = 86_400;
 const COPY_HOLDERS: &str =
-    "copy it from the authority's folder again, and start what reads it anew";
+    "copy it from the authority's folder again, and restart the processes that read it";
 const COPY_BOTH: &str = "copy certificate and key from one `alight keys issue`";
 
-/// What was checked already, so that it is told once.
+/// The files that were checked already, so that each is reported once.
 #[derive(Default)]
 pub(super) struct Checked {
     keys: BTreeSet<(PathBuf, String)>,
@@ -46,7 +46,7 @@ impl Checked {
     /// Checks the files of a network's key by their name.
     fn key(&mut self, findings: &mut Findings, network: &Network, name: &str) {
         let Some(keys) = network.keys.as_deref() else { return };
-        // What is wrong with the network's file is told where the network is joined.
+        // An error in the network's file is reported where the network is joined.
         let Ok(vehicle) = network.vehicle_name() else { return };
         let vehicle = vehicle.as_str();
         if !self.keys.insert((keys.to_owned(), name.to_owned())) {
@@ -73,8 +73,8 @@ impl Checked {
         let is_there = ["pem", "key"].map(|end| keys.join(format!("{name}.{end}")).exists());
         if is_there == [false; 2] {
             let place = keys.display();
-            let told = format!("there is no key `{name}` in {place}{}", without(name));
-            findings.wrong("keys", told, &issue(name, vehicle));
+            let text = format!("there is no key `{name}` in {place}{}", without(name));
+            findings.wrong("keys", text, &issue(name, vehicle));
         } else {
             check_certificate(findings, keys, name, vehicle);
             check_key(findings, keys, name, vehicle);
@@ -94,7 +94,7 @@ fn issue(name: &str, vehicle: &str) -> String {
     )
 }
 
-/// What cannot be done without a key.
+/// The consequence of a missing key.
 fn without(name: &str) -> &'static str {
     match name {
         OPERATOR => ": without it this machine can neither command nor see what runs on the drone",
@@ -106,15 +106,15 @@ fn check_authority(findings: &mut Findings, path: &Path) {
     let again = "copy it again from where `alight keys init` made it";
     match certificate(path) {
         Err(problem) => findings.wrong("keys", format!("the authority: {problem:#}"), again),
-        Ok(read) => tell_validity(findings, &read, "the authority", path, "make a new authority"),
+        Ok(read) => report_validity(findings, &read, "the authority", path, "make a new authority"),
     }
 }
 
-/// Tells from when until when a certificate is valid.
-fn tell_validity(
+/// Reports whether a certificate is valid now, and for how long.
+fn report_validity(
     findings: &mut Findings,
     read: &Certificate,
-    whose: &str,
+    subject: &str,
     path: &Path,
     again: &str,
 ) {
@@ -124,7 +124,7 @@ fn tell_validity(
         findings.wrong(
             "keys",
             format!(
-                "{whose} is not valid yet, for {days} days more: the clock of this machine is behind, or that of the machine that made \
+                "{subject} is not valid yet, for {days} days more: the clock of this machine is behind, or that of the machine that made \
                  it was ahead: {path}"
             ),
             "set the clock (`timedatectl` shows it, and whether NTP keeps it), then run this again",
@@ -136,21 +136,21 @@ fn tell_validity(
         ..0 => findings.wrong(
             "keys",
             format!(
-                "{whose} has expired {days} days ago, or the clock of this machine is wrong: {path}"
+                "{subject} has expired {days} days ago, or the clock of this machine is wrong: {path}"
             ),
             again,
         ),
         0..EXPIRES_SOON_S => {
-            findings.doubtful("keys", format!("{whose} expires in {days} days: {path}"), again);
+            findings.doubtful("keys", format!("{subject} expires in {days} days: {path}"), again);
         }
-        _ => findings.good("keys", format!("{whose} is valid for {days} days: {path}")),
+        _ => findings.good("keys", format!("{subject} is valid for {days} days: {path}")),
     }
 }
 
-/// Checks a certificate: whose it is, for which vehicle, and whether the authority has signed it and the list of holders names it.
+/// Checks a certificate: its holder, its vehicle, whether the authority has signed it, and whether the list of holders names it.
 fn check_certificate(findings: &mut Findings, keys: &Path, name: &str, vehicle: &str) {
     let path = keys.join(format!("{name}.pem"));
-    let told = path.display();
+    let file = path.display();
     let again = issue(name, vehicle);
     let read = match certificate(&path) {
         Ok(read) => read,
@@ -162,8 +162,8 @@ fn check_certificate(findings: &mut Findings, keys: &Path, name: &str, vehicle: 
     let holder = match read.common_name.parse::<Holder>() {
         Ok(holder) if holder.key_name() == name => holder,
         _ => {
-            let whose = format!("{told} is of `{}`, not of a `{name}`", read.common_name);
-            findings.wrong("keys", whose, "keep the file names of `alight keys issue`");
+            let text = format!("{file} is of `{}`, not of a `{name}`", read.common_name);
+            findings.wrong("keys", text, "keep the file names of `alight keys issue`");
             return;
         }
     };
@@ -171,7 +171,7 @@ fn check_certificate(findings: &mut Findings, keys: &Path, name: &str, vehicle: 
         findings.wrong(
             "keys",
             format!(
-                "{told} is of `{holder}`, and the vehicle here is `{vehicle}`, which refuses it"
+                "{file} is of `{holder}`, and the vehicle here is `{vehicle}`, which refuses it"
             ),
             &format!("correct `vehicle` in the site, or {again}"),
         );
@@ -179,15 +179,15 @@ fn check_certificate(findings: &mut Findings, keys: &Path, name: &str, vehicle: 
     }
     match is_signed_by(&path, &keys.join(AUTHORITY)) {
         Ok(true) => {
-            let whose = format!("the key of `{holder}`, signed by the authority here,");
-            tell_validity(findings, &read, &whose, &path, &again);
+            let subject = format!("the key of `{holder}`, signed by the authority here,");
+            report_validity(findings, &read, &subject, &path, &again);
         }
         Ok(false) => findings.wrong(
             "keys",
-            format!("{told} is not signed by the authority whose certificate lies beside it, so no process accepts it"),
+            format!("{file} is not signed by the authority whose certificate is in the same directory, so no process accepts it"),
             "copy all files from one directory of `alight keys issue`, of one authority",
         ),
-        // It was told above that the authority's certificate cannot be read.
+        // That the authority's certificate cannot be read was reported above.
         Err(_) => {}
     }
     let listed = std::fs::read_to_string(keys.join(HOLDERS)).ok();
@@ -206,15 +206,15 @@ fn check_certificate(findings: &mut Findings, keys: &Path, name: &str, vehicle: 
 /// Checks a private key: whether it is there, for this user alone, and belongs to its certificate.
 fn check_key(findings: &mut Findings, keys: &Path, name: &str, vehicle: &str) {
     let path = keys.join(format!("{name}.key"));
-    let told = path.display();
+    let file = path.display();
     match File::open(&path) {
         Err(cause) if cause.kind() == ErrorKind::NotFound => {
-            let told = format!("{told} does not exist{}", without(name));
-            findings.wrong("keys", told, &issue(name, vehicle));
+            let text = format!("{file} does not exist{}", without(name));
+            findings.wrong("keys", text, &issue(name, vehicle));
             return;
         }
         Err(cause) => {
-            findings.wrong("keys", format!("{told} cannot be read: {cause}"), COPY_BOTH);
+            findings.wrong("keys", format!("{file} cannot be read: {cause}"), COPY_BOTH);
             return;
         }
         Ok(_) => {}
@@ -230,19 +230,19 @@ fn check_key(findings: &mut Findings, keys: &Path, name: &str, vehicle: &str) {
     }
 }
 
-/// Checks that a list of holders among the keys names the drone: processes beside an older one refuse its relay.
+/// Checks that a list of holders among the keys names the drone: processes with an older list refuse its relay.
 fn check_holders(findings: &mut Findings, keys: &Path, vehicle: &str) {
     let path = keys.join(HOLDERS);
     let text = match std::fs::read_to_string(&path) {
         Ok(text) => text,
-        // Where one is needed, that is told where the network is joined.
+        // A missing list that is needed is reported where the network is joined.
         Err(cause) if cause.kind() == ErrorKind::NotFound => return,
         Err(cause) => {
-            let told = path.display();
+            let file = path.display();
             findings.wrong(
                 "keys",
-                format!("{told} cannot be read ({cause}), so what changes in it, as who is revoked, has no effect"),
-                &format!("it holds no secret: `sudo chmod 644 {told}`, or {COPY_HOLDERS}"),
+                format!("{file} cannot be read ({cause}), so changes of it, such as a revoked holder, have no effect"),
+                &format!("it holds no secret: `sudo chmod 644 {file}`, or {COPY_HOLDERS}"),
             );
             return;
         }
@@ -272,24 +272,24 @@ mod tests {
         Network { keys: Some(keys.to_owned()), vehicle, ..Network::default() }
     }
 
-    /// What is told of the operator's key in a folder.
-    fn told(keys: &Path) -> String {
+    /// The findings on the operator's key in a folder.
+    fn findings_text(keys: &Path) -> String {
         let mut findings = Findings::default();
         Checked::default().operator(&mut findings, &network(keys, None));
         findings.text()
     }
 
     #[test]
-    fn the_operators_key_is_told_with_its_holder_and_what_is_wrong_with_it() {
+    fn the_operators_key_is_reported_with_its_holder_and_its_errors() {
         let folder = tempfile::tempdir().unwrap();
         let [here, other] = ["here", "other"].map(|name| folder.path().join(name));
         for keys in [&here, &other] {
             make_for_tests(keys, &[]).unwrap();
         }
-        let good = told(&here);
+        let good = findings_text(&here);
         assert!(good.ends_with("Nothing is wrong."), "{good}");
-        let whose = "the key of `operator@drone`, signed by the authority here, ";
-        assert!(good.contains(whose), "{good}");
+        let valid = "the key of `operator@drone`, signed by the authority here, ";
+        assert!(good.contains(valid), "{good}");
         let file = |name: &str| here.join(name);
         let copy = |from: &Path, name: &str| {
             std::fs::copy(from, file(name)).unwrap();
@@ -345,7 +345,7 @@ mod tests {
         ];
         for (name, change, part) in changes {
             change();
-            let text = told(&here);
+            let text = findings_text(&here);
             assert!(text.contains(part) && text.contains("WRONG"), "{name}: {text}");
             std::fs::remove_dir_all(&here).unwrap();
             make_for_tests(&here, &[]).unwrap();
@@ -353,17 +353,17 @@ mod tests {
     }
 
     #[test]
-    fn a_list_of_holders_that_cannot_be_read_is_told() {
+    fn a_list_of_holders_that_cannot_be_read_is_reported() {
         let folder = tempfile::tempdir().unwrap();
         make_for_tests(folder.path(), &[]).unwrap();
         let list = folder.path().join(HOLDERS);
-        // Whoever runs the tests may be allowed to read any file, but a directory is none.
+        // The user of the tests may be allowed to read any file (root), but a directory is not a file.
         std::fs::remove_file(&list).unwrap();
-        let without = told(folder.path());
+        let without = findings_text(folder.path());
         assert!(without.ends_with("Nothing is wrong."), "{without}");
         std::fs::create_dir(&list).unwrap();
-        let text = told(folder.path());
-        for part in ["WRONG", "holders.txt cannot be read", "has no effect", "chmod 644"] {
+        let text = findings_text(folder.path());
+        for part in ["WRONG", "holders.txt cannot be read", "have no effect", "chmod 644"] {
             assert!(text.contains(part), "`{part}` is not in: {text}");
         }
     }
@@ -389,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn a_certificate_that_is_not_valid_yet_is_told_with_the_clock() {
+    fn a_certificate_that_is_not_valid_yet_is_reported_with_the_clock() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(AUTHORITY);
         let mut params = rcgen::CertificateParams::default();
@@ -407,16 +407,24 @@ mod tests {
     }
 
     #[test]
-    fn a_certificate_that_ends_soon_or_has_ended_is_told() {
-        let told = |expires_in_s| {
+    fn a_certificate_that_ends_soon_or_has_ended_is_reported() {
+        let findings_text = |expires_in_s| {
             let mut findings = Findings::default();
             let begins_in_s = -DAY_S;
             let read = Certificate { common_name: String::new(), begins_in_s, expires_in_s };
-            tell_validity(&mut findings, &read, "the key", Path::new("x.pem"), "again");
+            report_validity(&mut findings, &read, "the key", Path::new("x.pem"), "again");
             findings.text()
         };
-        assert!(told(400 * DAY_S).contains("ok     keys          the key is valid for 400 days"));
-        assert!(told(3 * DAY_S).contains("?      keys          the key expires in 3 days"));
-        assert!(told(-3 * DAY_S).contains("WRONG  keys          the key has expired 3 days ago"));
+        assert!(
+            findings_text(400 * DAY_S)
+                .contains("ok     keys          the key is valid for 400 days")
+        );
+        assert!(
+            findings_text(3 * DAY_S).contains("?      keys          the key expires in 3 days")
+        );
+        assert!(
+            findings_text(-3 * DAY_S)
+                .contains("WRONG  keys          the key has expired 3 days ago")
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! Whether the ports of the machines to which this one connects accept connections.
+//! Checks whether the ports of the machines to which this one connects accept connections.
 
 use std::net::{TcpStream, ToSocketAddrs};
 use std::time::Duration;
@@ -20,8 +20,8 @@ pub(super) struct Target {
     remedy: &'static str,
 }
 
-/// The machines whose ports are to be tried. The relay counts a connection to its ports as a denial, so they are only where nothing
-/// else tells that it is there: `sees_any` service, `sees_drone`.
+/// The machines whose ports are to be tried. The relay counts a connection to its ports as a denial, so they are tried only if no message
+/// shows that it is there: `sees_any` service, `sees_drone`.
 pub(super) fn targets(
     role: Option<Role>,
     site: Option<&Site>,
@@ -87,19 +87,19 @@ mod tests {
     #[test]
     fn a_base_station_tries_its_own_relay_and_the_drone() {
         let site: Site = toml::from_str("address = '10.42.0.1'\ninsecure = true").unwrap();
-        let told = |role: Role, sees_any: bool, sees_drone: bool| {
+        let addresses = |role: Role, sees_any: bool, sees_drone: bool| {
             let network = site.network(role);
             let all = targets(Some(role), Some(&site), &network, sees_any, sees_drone);
             let all = all.iter().map(|it| (it.address.clone(), it.remedy.contains("up drone")));
             all.collect::<Vec<_>>()
         };
         let (own, drone) = (("127.0.0.1".into(), false), ("10.42.0.1".into(), true));
-        assert_eq!(told(Role::Relay, false, false), [own, drone.clone()]);
-        assert_eq!(told(Role::Relay, true, false), std::slice::from_ref(&drone));
-        assert_eq!(told(Role::Relay, true, true), []);
-        assert_eq!(told(Role::Ground, false, false), [drone]);
-        assert_eq!(told(Role::Ground, true, false), []);
-        assert_eq!(told(Role::Drone, false, false), []);
+        assert_eq!(addresses(Role::Relay, false, false), [own, drone.clone()]);
+        assert_eq!(addresses(Role::Relay, true, false), std::slice::from_ref(&drone));
+        assert_eq!(addresses(Role::Relay, true, true), []);
+        assert_eq!(addresses(Role::Ground, false, false), [drone]);
+        assert_eq!(addresses(Role::Ground, true, false), []);
+        assert_eq!(addresses(Role::Drone, false, false), []);
     }
 
     #[test]

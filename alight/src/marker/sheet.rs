@@ -346,7 +346,7 @@ fn kinds(markers: impl Iterator<Item = Marker>) -> Vec<Kind> {
             None => kinds.push((marker, marker.id.into_iter().collect())),
         }
     }
-    let told = kinds.into_iter().map(|(Marker { family, size_m, .. }, mut ids)| {
+    let kinds = kinds.into_iter().map(|(Marker { family, size_m, .. }, mut ids)| {
         let size = size_m.map_or_else(String::new, |size_m| format!(" {size_m} m"));
         if ids.is_empty() {
             let name = format!("{family}{size}");
@@ -356,7 +356,7 @@ fn kinds(markers: impl Iterator<Item = Marker>) -> Vec<Kind> {
         let full = format!("{family}:{}{size}", ranges(&ids).join(","));
         Kind { full, short: format!("{family}: {} of{size}", ids.len()) }
     });
-    told.collect()
+    kinds.collect()
 }
 
 /// Sorted numbers, with those in a row as the first and the last of them.

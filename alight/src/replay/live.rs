@@ -17,11 +17,11 @@ use crate::args::NetworkArgs;
 use crate::runtime::with_node;
 use crate::terminal::{print, write_error};
 
-/// The services whose messages are published. Who watches and relays is there himself.
+/// The services whose messages are published. Services that watch or relay are running themselves.
 const PLAYED: [&str; 4] = ["camera-pub", "simulator", "detector", "controller"];
 /// Maximum number of messages that were read and are not due yet.
 const MAX_READ_AHEAD: usize = 64;
-/// Pauses before each look for services that run: a new session hears of them one by one.
+/// Pauses before each look for services that run: a new session receives their announcements one by one.
 const LOOKS: [Duration; 4] = [
     Duration::from_millis(200),
     Duration::from_millis(500),
@@ -33,7 +33,7 @@ const BEGIN: Duration = Duration::from_millis(500);
 /// A service is shown as ready for this time after its last health report, which comes every second.
 const ALIVE_NS: i64 = 1_500_000_000;
 
-/// What is to be published.
+/// A message or a frame to publish.
 enum Item {
     Message { key: String, payload: Vec<u8> },
     Frame { header: FrameHeader, pixels: Vec<u8> },
@@ -64,22 +64,22 @@ impl Name {
     }
 }
 
-/// What a recording says before it is published.
+/// The facts about a recording that are needed before it is published.
 #[derive(Default)]
 struct Overview {
-    /// When the first message came that is published and no state from before, in nanoseconds.
+    /// When the first published message was received that is no earlier state, in nanoseconds.
     first_ns: Option<i64>,
     last_ns: i64,
     /// The name of the recorder's clock.
     clock: Option<String>,
     /// When the last health report of each service and instance came.
     services: BTreeMap<Name, i64>,
-    /// What cannot be read of it, as sentences.
+    /// The unreadable parts of it, as sentences.
     damage: Vec<String>,
 }
 
-/// The topic of a key, if it is published again. What goes to the autopilot never is, nor what tells of the recording
-/// itself or of the ground stations of then.
+/// The topic of a key, if it is published again. Messages to the autopilot never are, nor statuses of the recorder or of the ground
+/// stations at that time.
 fn played(key: &str, without: &[String]) -> Option<&'static Row> {
     let is_same = |row: &&Row| {
         let mut wanted = row.key.split('/');
@@ -124,7 +124,7 @@ pub(crate) fn run(
     let unreadable = with_node(network, "replay", async |node| {
         for pause in LOOKS {
             sleep(pause).await;
-            nobody_is_doubled(node, &overview).await?;
+            refuse_duplicates(node, &overview).await?;
         }
         let mut player = Player::new(node, without.to_vec());
         sleep(BEGIN).await;
@@ -147,7 +147,7 @@ pub(crate) fn run(
         }
         // A channel without its receiver ends it.
         let unreadable = reading.await?;
-        player.tell()?;
+        player.print_totals()?;
         Ok(unreadable)
     })?;
     if unreadable > 0 {
@@ -156,7 +156,7 @@ pub(crate) fn run(
     Ok(if is_whole && unreadable == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// The files of a recording in the order in which they were written, and what they say together.
+/// The files of a recording in the order in which they were written, and their common overview.
 fn in_order(files: Vec<Vec<u8>>, without: &[String]) -> anyhow::Result<(Vec<Vec<u8>>, Overview)> {
     let mut whole = Overview::default();
     let mut parts = Vec::new();
@@ -176,7 +176,7 @@ fn in_order(files: Vec<Vec<u8>>, without: &[String]) -> anyhow::Result<(Vec<Vec<
     Ok((parts.into_iter().map(|(_, file)| file).collect(), whole))
 }
 
-/// The begin of a file, and what it says.
+/// The begin of a file, and its overview.
 fn overview(file: &[u8], without: &[String]) -> anyhow::Result<(Begin, Overview)> {
     let (mut begin, mut overview) = (Begin::default(), Overview::default());
     let reading = flightlog::read(file, |entry| {
@@ -205,8 +205,8 @@ fn overview(file: &[u8], without: &[String]) -> anyhow::Result<(Begin, Overview)
     Ok((begin, overview))
 }
 
-/// A controller that flies now must not be taken for one of a recording, nor the other way round.
-async fn nobody_is_doubled(node: &Node, overview: &Overview) -> anyhow::Result<()> {
+/// Refuses services that run already: a flying controller must not be mistaken for one of a recording, nor the other way round.
+async fn refuse_duplicates(node: &Node, overview: &Overview) -> anyhow::Result<()> {
     let running = node.list_peers().await?;
     let services: BTreeSet<&str> =
         overview.services.keys().map(|name| name.service.as_str()).collect();
@@ -229,7 +229,7 @@ async fn nobody_is_doubled(node: &Node, overview: &Overview) -> anyhow::Result<(
     );
 }
 
-/// Reads the recording as far ahead as there is room, until nobody listens any more. The result is how many pictures could not be
+/// Reads the recording as far ahead as there is room, until the receiver is closed. The result is the number of pictures that could not be
 /// read.
 fn read_all(
     files: &[Vec<u8>],
@@ -275,7 +275,7 @@ fn is_message(key: &str, without: &[String]) -> bool {
     played(key, without).is_some() && topic::FRAME.first_name(key).is_none()
 }
 
-/// Publishes what is due.
+/// Publishes the messages and frames that are due.
 struct Player<'a> {
     node: &'a Node,
     without: Vec<String>,
@@ -313,7 +313,7 @@ impl<'a> Player<'a> {
             }
             match item {
                 Item::Message { key, payload } => {
-                    // What is a state from before has no time of its own to keep.
+                    // An earlier state has no due time.
                     if !self.is_state(&key) {
                         let late_ns = now_ns().saturating_sub(at_ns).max(0);
                         self.latest = self.latest.max(Duration::from_nanos(late_ns.unsigned_abs()));
@@ -373,7 +373,7 @@ impl<'a> Player<'a> {
         Ok(())
     }
 
-    fn tell(&self) -> anyhow::Result<()> {
+    fn print_totals(&self) -> anyhow::Result<()> {
         print(&format!(
             "published {} messages and {} frames, at most {:.0} ms late",
             self.messages,
@@ -389,7 +389,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn nothing_goes_to_an_autopilot_again_and_what_is_left_out_is() {
+    fn nothing_goes_to_an_autopilot_again_and_services_are_left_out() {
         for key in ["mavlink/to-autopilot", "controller/tape", "recorder/main/status", "gcs/status"]
         {
             assert!(played(key, &[]).is_none(), "{key}");
@@ -435,7 +435,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_read_is_counted() {
+    fn unreadable_pictures_are_counted() {
         let mut file = recording(b"no JPEG file");
         let (_, overview) = in_order(vec![file.clone()], &[]).unwrap();
         assert!(overview.damage.is_empty(), "{:?}", overview.damage);

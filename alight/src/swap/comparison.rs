@@ -1,5 +1,5 @@
-//! In what a new detector differs from the one in use: the marker's position in the frames that both have searched, by axes, and its heading
-//! where the vehicle turns to it, against what the controller lets differ.
+//! Compares a new detector with the one in use in the frames that both have searched: the marker's position by axes, and its heading if the
+//! vehicle turns to it, against the controller's tolerances.
 
 use std::collections::VecDeque;
 
@@ -12,7 +12,7 @@ const MAX_FRAMES: usize = 32;
 /// Share of the distance that lies along the view, above which the two differ in range.
 const IN_RANGE: f64 = 0.8;
 
-/// What two detectors see in the same frames.
+/// The marker's poses by two detectors in the same frames.
 #[derive(Default)]
 pub(super) struct Comparison {
     controller: Option<controller::Config>,
@@ -49,7 +49,7 @@ impl Comparison {
         }
     }
 
-    /// Takes the controller's configuration, which says which marker is looked for and how far apart two positions agree.
+    /// Takes the controller's configuration, which contains the marker and the tolerance between two positions.
     pub(super) fn configured(&mut self, configuration: &Configuration) {
         if configuration.service == "controller"
             && let Ok(read) = node::from_toml("the controller's", &configuration.toml, &[])
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn the_difference_is_told_by_axes_and_against_its_limit() {
+    fn the_difference_is_reported_by_axes_and_against_its_limit() {
         let mut comparison = Comparison::default();
         comparison.of(Some("main"), "new");
         comparison.found(&found("main", 1, [0.0, 0.0, 5.0]));
@@ -221,8 +221,8 @@ mod tests {
     }
 
     #[test]
-    fn a_turned_marker_is_told_where_the_vehicle_turns_to_it() {
-        for (turn_rad_s, is_told) in [(0.0, false), (0.3, true)] {
+    fn a_turned_marker_is_reported_where_the_vehicle_turns_to_it() {
+        for (turn_rad_s, is_reported) in [(0.0, false), (0.3, true)] {
             let mut comparison = Comparison::default();
             comparison.of(Some("main"), "new");
             comparison.configured(&Configuration {
@@ -246,12 +246,12 @@ mod tests {
                 comparison.found(&message);
             }
             let text = comparison.text().unwrap();
-            assert_eq!(text.contains("turned by 90 degrees"), is_told, "{text}");
+            assert_eq!(text.contains("turned by 90 degrees"), is_reported, "{text}");
         }
     }
 
     #[test]
-    fn a_wrong_size_is_told_by_the_range() {
+    fn a_wrong_size_is_recognised_by_the_range() {
         let mut comparison = Comparison::default();
         comparison.of(Some("main"), "new");
         comparison.found(&found("main", 1, [0.5, 0.0, 5.0]));
