@@ -35,7 +35,7 @@ use crate::vehicle::Vehicle;
 
 /// Period of heartbeats in MAVLink.
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// Period at which what is due is sent: the marker's place, also when no frame comes, and parameters.
+/// Period at which what is due is sent: the marker's position, also when no frame comes, and parameters.
 const TICK: Duration = Duration::from_millis(50);
 /// Silence of the ground station after which all texts are repeated, in nanoseconds.
 const GROUND_TIMEOUT_NS: i64 = 10_000_000_000;
@@ -69,7 +69,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let targets = node.subscriber(topic::TARGET, &[]).await?;
     let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
     let controllers = node.presence("controller").await?;
-    // A relay that takes anybody's commands says so in its health.
+    // A relay without keys, which passes on the commands of any host, reports that in its health.
     let relays = node.subscriber(topic::HEALTH, &["relay", "*"]).await?;
     let recorders = node.subscriber(topic::RECORDER_STATUS, &[]).await?;
     let configurations = node.subscriber(topic::CONFIGURATION, &["controller", "*"]).await?;
@@ -93,7 +93,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
         tokio::select! {
             () = shutdown.requested() => return Ok(()),
             event = ground.recv() => {
-                // An arming or a mode that waited while this process was frozen is not wanted any more.
+                // An arming or a mode that waited while this process was frozen is no longer wanted.
                 let is_late = standstill.step(now_ns()).is_some();
                 match event {
                     LinkEvent::Packet { packet, .. } if is_late => bridge.too_late(now_ns(), &packet),
@@ -121,8 +121,8 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                 bridge.track(now_ns());
                 bridge.send_parameters(now_ns());
                 let system = bridge.vehicle.system(now_ns());
-                if let Some(told) = bridge.ground_status.due(now_ns(), system, counts(&ground)) {
-                    ground_statuses.publish(&told).await;
+                if let Some(status) = bridge.ground_status.due(now_ns(), system, counts(&ground)) {
+                    ground_statuses.publish(&status).await;
                 }
             }
             change = controllers.next() => {
@@ -141,7 +141,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     }
 }
 
-/// What the link to the ground has counted.
+/// The counts of the link to the ground.
 fn counts(ground: &Link) -> LinkCounts {
     LinkCounts {
         strangers: ground.strangers(),
@@ -151,29 +151,30 @@ fn counts(ground: &Link) -> LinkCounts {
     }
 }
 
-/// Why what only the companion or the camera could answer is refused; without an acknowledgement it is dropped for the same reason.
+/// The reason why a request that only the companion or the camera could answer is refused; without an acknowledgement it is dropped for the
+/// same reason.
 const NOT_OF_COMPANION: &str = "for the companion, and not supported";
 const NOT_OF_CAMERA: &str = "for the camera, and not supported";
 
 /// Maximum number of controllers that are followed; there is one, and another while it is replaced.
 const MAX_CONTROLLERS: usize = 16;
-/// Maximum number of recorders whose problems are told, and of characters of a problem.
+/// Maximum number of recorders whose problems are reported, and of characters of a problem.
 const MAX_RECORDERS: usize = 16;
 const MAX_PROBLEM_CHARS: usize = 120;
 /// Minimum pause between two texts about refused packets, in nanoseconds.
 const REFUSAL_PAUSE_NS: i64 = 5_000_000_000;
 
-/// Maximum number of the camera's heartbeats that are known when they come back: those of a minute, as long as the backlog of a link
+/// Maximum number of the camera's heartbeats that are recognised when they return: those of a minute, as long as the backlog of a link
 /// may be under way.
 const MAX_CAMERA_HEARTBEATS: usize = 60;
 
 /// Maximum number of texts that wait for their sending.
-const MAX_TO_TELL: usize = 16;
+const MAX_UNSENT_TEXTS: usize = 16;
 
-/// A relay that has not said for this time that it is insecure is so no more, in nanoseconds.
+/// A relay that has not reported itself as insecure for this time counts as secure, in nanoseconds.
 const INSECURE_NS: i64 = 10_000_000_000;
 
-/// What is said when the last controller has gone.
+/// The text when the last controller has gone.
 const ABANDONED: &str = "Alight: the controller is gone";
 
 const CLOSED: &str = "the network session was closed";
@@ -184,18 +185,18 @@ struct Bridge {
     /// The camera's component id; 0 for none.
     camera_component: u8,
     camera: Camera,
-    /// Another component has the camera's id, and that was told.
+    /// Another component has the camera's id, and that was reported.
     camera_is_taken: bool,
     parameters: Parameters,
     permission: Permission,
-    /// When the ground station was told of a refusal.
+    /// When a refusal was last reported to the ground station.
     refusal_ns: Option<i64>,
     ground: LinkSender,
-    /// What is published of the ground stations.
+    /// The published status of the ground stations.
     ground_status: GroundStatus,
     health: Arc<HealthCounters>,
     vehicle: Vehicle,
-    /// Reads what comes from the autopilot's topic.
+    /// Reads the bytes of the autopilot's topic.
     parser: Parser,
     texts: StatusTextSender,
     targets: LandingTargetPublisher,
@@ -203,11 +204,11 @@ struct Bridge {
     controllers: BTreeSet<String>,
     /// True once the last controller has gone.
     is_abandoned: bool,
-    /// When a relay last said that it takes anybody's commands.
+    /// When a relay last reported that it has no keys.
     insecure_ns: Option<i64>,
-    /// The ground station has been told so.
-    insecure_told: bool,
-    /// Recorders of which the ground station has been told that they keep nothing.
+    /// Whether that was reported to the ground station.
+    insecure_reported: bool,
+    /// Recorders that were reported to the ground station as not recording.
     not_recording: BTreeSet<String>,
     ground_ns: Option<i64>,
     /// Bytes that are not packets, and packets not read in time, as counted so far.
@@ -217,7 +218,7 @@ struct Bridge {
     /// Packets refused because of their signatures, as counted so far.
     refusals: Refusals,
     /// Texts that could not be sent yet.
-    to_tell: VecDeque<(MavSeverity, String)>,
+    unsent_texts: VecDeque<(MavSeverity, String)>,
     /// Sequence numbers of our next packets: the companion's and the camera's.
     sequence: u8,
     camera_sequence: u8,
@@ -254,14 +255,14 @@ impl Bridge {
             controllers: BTreeSet::new(),
             is_abandoned: false,
             insecure_ns: None,
-            insecure_told: false,
+            insecure_reported: false,
             not_recording: BTreeSet::new(),
             ground_ns: None,
             bad_bytes: 0,
             unread: 0,
             strangers: 0,
             refusals: Refusals::default(),
-            to_tell: VecDeque::new(),
+            unsent_texts: VecDeque::new(),
             sequence: 0,
             camera_sequence: 0,
             camera_heartbeats: VecDeque::new(),
@@ -324,7 +325,7 @@ impl Bridge {
             LinkEvent::Connected { peer } => {
                 tracing::info!(peer, "Link to the ground station is up");
                 self.ground_status.up(&peer);
-                // It may be another one, and what was said meanwhile is lost.
+                // It may be another one, and texts that were sent meanwhile are lost.
                 self.ground_ns = None;
                 None
             }
@@ -344,7 +345,7 @@ impl Bridge {
     fn too_late(&mut self, now_ns: i64, packet: &Packet) {
         self.health.dropped("packets of the ground station: too late");
         if route::from_ground(packet, self.own(now_ns), &self.vehicle) != Route::Drop(ECHO) {
-            self.ground_status.heard(now_ns, packet);
+            self.ground_status.received(now_ns, packet);
             self.ground_status.refused(packet, "too late");
         }
     }
@@ -352,12 +353,12 @@ impl Bridge {
     fn packet_from_ground(&mut self, now_ns: i64, packet: Packet) -> Option<Vec<u8>> {
         self.health.count("from ground");
         let route = route::from_ground(&packet, self.own(now_ns), &self.vehicle);
-        // Nobody on the ground asked for anything.
+        // No ground station sent this packet.
         if route == Route::Drop(ECHO) {
             self.health.dropped(ECHO);
             return None;
         }
-        self.ground_status.heard(now_ns, &packet);
+        self.ground_status.received(now_ns, &packet);
         let asked = self.me(now_ns).and_then(|me| Ask::of(&packet, me));
         let mut is_unset = false;
         if let Some(asked) = asked {
@@ -455,7 +456,7 @@ impl Bridge {
 
     /// Takes the configuration of a controller.
     fn configuration(&mut self, now_ns: i64, configuration: &Configuration) {
-        if !self.parameters.hear(now_ns, configuration) {
+        if !self.parameters.update(now_ns, configuration) {
             self.health.dropped("configuration of a controller: not readable");
         }
     }
@@ -469,13 +470,13 @@ impl Bridge {
         }
     }
 
-    /// Takes what a detector found in a frame.
+    /// Takes the detections of a frame.
     fn detections(&mut self, now_ns: i64, detector: &str, found: &Detections) {
         self.camera.sees(now_ns, detector, self.status.as_ref(), found);
         self.track(now_ns);
     }
 
-    /// Sends the tracked marker's place, when it is due.
+    /// Sends the tracked marker's position, when it is due.
     fn track(&mut self, now_ns: i64) {
         if let Some(message) = self.camera.due_tracking(now_ns) {
             self.health.count("tracked markers");
@@ -483,7 +484,7 @@ impl Bridge {
         }
     }
 
-    /// Counts a packet that the ground station may not send, and tells it.
+    /// Counts a packet that the ground station may not send, and reports it to the ground station.
     fn refuse(&mut self, now_ns: i64, packet: &Packet, refusal: &'static str) {
         let to = packet.sender;
         self.ground_status.refused(packet, refusal);
@@ -513,21 +514,21 @@ impl Bridge {
         if health.errors.iter().any(|error| error.reason == INSECURE) {
             self.insecure_ns = Some(now_ns);
         }
-        self.tell_insecure(now_ns);
+        self.warn_insecure(now_ns);
     }
 
-    /// Tells that a recorder keeps nothing, and when it does again.
+    /// Reports that a recorder does not record, and when it does again.
     fn recorder(&mut self, now_ns: i64, status: &RecorderStatus) {
-        let was_told = self.not_recording.contains(&status.recorder);
+        let was_reported = self.not_recording.contains(&status.recorder);
         match &status.problem {
-            Some(problem) if !was_told && self.not_recording.len() < MAX_RECORDERS => {
+            Some(problem) if !was_reported && self.not_recording.len() < MAX_RECORDERS => {
                 let short: String = problem.chars().take(MAX_PROBLEM_CHARS).collect();
                 let text = format!("Alight: not recording: {short}");
                 if self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text) {
                     self.not_recording.insert(status.recorder.clone());
                 }
             }
-            None if was_told => {
+            None if was_reported => {
                 let text = "Alight: recording again";
                 if self.send_text(now_ns, MavSeverity::MAV_SEVERITY_INFO, text) {
                     self.not_recording.remove(&status.recorder);
@@ -537,13 +538,14 @@ impl Bridge {
         }
     }
 
-    /// Tells each ground station once that anybody may command the vehicle.
-    fn tell_insecure(&mut self, now_ns: i64) {
+    /// Warns each ground station once that any host can command the vehicle.
+    fn warn_insecure(&mut self, now_ns: i64) {
         let is_insecure =
             self.insecure_ns.is_some_and(|last| now_ns.saturating_sub(last) < INSECURE_NS);
-        if is_insecure && !self.insecure_told && self.me(now_ns).is_some() {
+        if is_insecure && !self.insecure_reported && self.me(now_ns).is_some() {
             let text = "Alight: insecure: anyone in reach can command the vehicle";
-            self.insecure_told = self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, text);
+            self.insecure_reported =
+                self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, text);
         }
     }
 
@@ -553,13 +555,13 @@ impl Bridge {
             let Sender { system, component } = sender;
             tracing::info!(system, component, "Ground station found");
             self.texts.reset();
-            self.insecure_told = false;
+            self.insecure_reported = false;
             self.not_recording.clear();
             if self.is_abandoned {
-                self.tell(now_ns, MavSeverity::MAV_SEVERITY_WARNING, ABANDONED);
+                self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, ABANDONED);
             }
             self.send_texts(now_ns);
-            self.tell_insecure(now_ns);
+            self.warn_insecure(now_ns);
         }
     }
 
@@ -569,7 +571,7 @@ impl Bridge {
         self.send_texts(now_ns);
     }
 
-    /// Sends what is new in the controller's status.
+    /// Sends the texts on changes in the controller's status.
     fn send_texts(&mut self, now_ns: i64) {
         // A text counts as sent only if it can be sent.
         if self.me(now_ns).is_none() {
@@ -593,7 +595,7 @@ impl Bridge {
         }
     }
 
-    /// Reports when the last controller leaves, and when one is back.
+    /// Reports when the last controller has gone, and when one is there again.
     fn controller(&mut self, now_ns: i64, controller: String, is_there: bool) {
         if !is_there {
             self.controllers.remove(&controller);
@@ -615,25 +617,25 @@ impl Bridge {
         } else {
             (MavSeverity::MAV_SEVERITY_NOTICE, "Alight: the controller is back")
         };
-        self.tell(now_ns, severity, text);
+        self.send_or_queue(now_ns, severity, text);
     }
 
-    /// Sends a text now, or as soon as we have a system id and it does not exceed the rate.
-    fn tell(&mut self, now_ns: i64, severity: MavSeverity, text: &str) {
-        let is_new = !self.to_tell.iter().any(|(_, it)| it == text);
-        if is_new && self.to_tell.len() < MAX_TO_TELL {
-            self.to_tell.push_back((severity, text.to_owned()));
+    /// Sends a text now, or as soon as the system id is known and it does not exceed the rate.
+    fn send_or_queue(&mut self, now_ns: i64, severity: MavSeverity, text: &str) {
+        let is_new = !self.unsent_texts.iter().any(|(_, it)| it == text);
+        if is_new && self.unsent_texts.len() < MAX_UNSENT_TEXTS {
+            self.unsent_texts.push_back((severity, text.to_owned()));
         } else if is_new {
             self.health.dropped("texts: too many");
         }
-        self.tell_more(now_ns);
+        self.send_queued(now_ns);
     }
 
     /// Sends the texts that could not be sent yet.
-    fn tell_more(&mut self, now_ns: i64) {
-        while let Some((severity, text)) = self.to_tell.pop_front() {
+    fn send_queued(&mut self, now_ns: i64) {
+        while let Some((severity, text)) = self.unsent_texts.pop_front() {
             if !self.send_text(now_ns, severity, &text) {
-                self.to_tell.push_front((severity, text));
+                self.unsent_texts.push_front((severity, text));
                 return;
             }
         }
@@ -667,7 +669,7 @@ impl Bridge {
         }
     }
 
-    /// Counts what others than the ground station have sent since the last second.
+    /// Counts the packets and connections of unknown senders since the last second.
     fn count_strangers(&mut self, strangers: u64) {
         let more = strangers.saturating_sub(self.strangers);
         if more > 0 {
@@ -677,13 +679,13 @@ impl Bridge {
         self.strangers = strangers;
     }
 
-    /// Counts what was refused because of its signature, and tells the ground station once of each reason: it may just have no
-    /// key.
+    /// Counts the packets that were refused because of their signatures, and reports each reason once to the ground station: it may just
+    /// have no key.
     fn count_refusals(&mut self, now_ns: i64, refusals: Refusals) {
         for (reason, more) in refusals.since(self.refusals) {
             if self.health.failed_times(&format!("from ground: refused: {reason}"), more) {
                 let text = format!("Alight: packets refused: {reason}");
-                self.tell(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text);
+                self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text);
             }
         }
         self.refusals = refusals;
@@ -705,18 +707,18 @@ impl Bridge {
     fn every_second(&mut self, now_ns: i64) {
         self.send_own(now_ns, &self.heartbeat());
         if let Some(heartbeat) = self.camera.heartbeat(now_ns) {
-            self.tell_taken(now_ns);
+            self.warn_if_taken(now_ns);
             self.camera_heartbeats.truncate(MAX_CAMERA_HEARTBEATS - 1);
             self.camera_heartbeats.push_front((self.camera_sequence, heartbeat.clone()));
             self.send_from_camera(now_ns, &MavMessage::HEARTBEAT(heartbeat));
         }
-        self.tell_more(now_ns);
+        self.send_queued(now_ns);
         self.send_texts(now_ns);
-        self.tell_insecure(now_ns);
+        self.warn_insecure(now_ns);
     }
 
-    /// Tells once that the vehicle has another camera with our camera's id, so that ours is not shown.
-    fn tell_taken(&mut self, now_ns: i64) {
+    /// Warns once that the vehicle has another camera with our camera's id, so that ours is not shown.
+    fn warn_if_taken(&mut self, now_ns: i64) {
         let component = self.camera_component;
         let is_taken =
             component != 0 && self.me(now_ns).is_some() && self.camera_sender(now_ns).is_none();
@@ -805,7 +807,7 @@ mod tests {
         })
     }
 
-    /// A bridge that has heard its autopilot, and the link that it must not lose.
+    /// A bridge that has received its autopilot's heartbeat, and the link that it must not lose.
     async fn bridge(set: &[&str]) -> (Bridge, Link) {
         let set = set.iter().map(|text| (*text).to_owned()).collect();
         let config = Layers { file: None, set }.load::<Config>().unwrap().settings;
@@ -816,13 +818,13 @@ mod tests {
         (bridge, link)
     }
 
-    /// What is told a second later.
-    fn told(bridge: &mut Bridge) -> GcsStatus {
+    /// The status a second later.
+    fn status(bridge: &mut Bridge) -> GcsStatus {
         bridge.ground_status.due(1_000_000_000, None, LinkCounts::default()).unwrap()
     }
 
-    fn by_reason(told: &GcsStatus) -> BTreeMap<&str, u64> {
-        told.refused.iter().map(|it| (it.reason.as_str(), it.count)).collect()
+    fn by_reason(status: &GcsStatus) -> BTreeMap<&str, u64> {
+        status.refused.iter().map(|it| (it.reason.as_str(), it.count)).collect()
     }
 
     #[tokio::test]
@@ -861,7 +863,7 @@ mod tests {
         for packet in packets.chain([unknown]) {
             assert_eq!(bridge.packet_from_ground(0, packet), None);
         }
-        let told = told(&mut bridge);
+        let status = status(&mut bridge);
         let expected = BTreeMap::from([
             (NOT_OF_COMPANION, 1),
             (NOT_OF_CAMERA, 2),
@@ -869,29 +871,29 @@ mod tests {
             ("a parameter is not set from there", 1),
             ("only monitoring", 2),
         ]);
-        assert_eq!(by_reason(&told), expected);
-        let [station] = told.stations.as_slice() else { panic!("{told:?}") };
+        assert_eq!(by_reason(&status), expected);
+        let [station] = status.stations.as_slice() else { panic!("{status:?}") };
         assert_eq!((station.packets, station.refused), (9, 7));
     }
 
     #[tokio::test]
-    async fn an_echo_of_the_vehicle_is_of_no_station_and_refused_to_nobody() {
+    async fn an_echo_of_the_vehicle_belongs_to_no_station_and_is_not_refused() {
         let (mut bridge, _link) = bridge(&[]).await;
         for _ in 0..3 {
             assert_eq!(bridge.packet_from_ground(0, heartbeat_of(AUTOPILOT)), None);
             bridge.too_late(0, &heartbeat_of(AUTOPILOT));
         }
-        let told = told(&mut bridge);
-        assert_eq!((told.stations.len(), told.refused.len()), (0, 0), "{told:?}");
+        let status = status(&mut bridge);
+        assert_eq!((status.stations.len(), status.refused.len()), (0, 0), "{status:?}");
     }
 
     #[tokio::test]
-    async fn what_comes_too_late_is_of_its_sender() {
+    async fn a_packet_that_is_too_late_counts_for_its_sender() {
         let (mut bridge, _link) = bridge(&[]).await;
         bridge.too_late(0, &heartbeat_of(GROUND));
-        let told = told(&mut bridge);
-        assert_eq!(by_reason(&told), BTreeMap::from([("too late", 1)]));
-        let [station] = told.stations.as_slice() else { panic!("{told:?}") };
+        let status = status(&mut bridge);
+        assert_eq!(by_reason(&status), BTreeMap::from([("too late", 1)]));
+        let [station] = status.stations.as_slice() else { panic!("{status:?}") };
         assert_eq!((station.system, station.packets, station.refused), (GROUND.system, 1, 1));
     }
 }

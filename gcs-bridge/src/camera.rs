@@ -1,8 +1,8 @@
 //! The camera as a MAVLink component of the vehicle: its heartbeat, information and video stream, and the marker of the
 //! detector in use as a tracked rectangle.
 //!
-//! The messages are those of <https://mavlink.io/en/services/camera.html>. The camera is there while a detector tells of
-//! its frames. What it shows as tracked is the best marker of the detector whose detections the controller uses.
+//! The messages are those of <https://mavlink.io/en/services/camera.html>. The camera is there while a detector publishes detections in its
+//! frames. It shows as tracked the best marker of the detector whose detections the controller uses.
 
 use autopilot::compose::heartbeat;
 use autopilot::dialect::{
@@ -31,7 +31,7 @@ pub(crate) struct Camera {
     video: Option<Video>,
     started_ns: i64,
     seen: Option<Frame>,
-    /// Period of the tracked marker's place, in nanoseconds, while the ground station wants it.
+    /// Period of the tracked marker's position, in nanoseconds, while the ground station wants it.
     period_ns: Option<i64>,
     due_ns: i64,
 }
@@ -60,7 +60,7 @@ impl Rectangle {
         (0..2).all(|axis| self.min[axis] <= other.max[axis] && other.min[axis] <= self.max[axis])
     }
 
-    /// The bounds of a marker in a frame, of which pixel (0, 0) reaches from -0.5 to 0.5.
+    /// The bounds of a marker in a frame, whose pixel (0, 0) extends from -0.5 to 0.5.
     fn of(detection: &Detection, width: u32, height: u32) -> Option<Self> {
         let [x, y] = detection.centre_px;
         let half_px = detection.size_px / 2.0;
@@ -88,8 +88,8 @@ impl Camera {
         Self { video, started_ns: now_ns, seen: None, period_ns: None, due_ns: i64::MIN }
     }
 
-    /// Takes what a detector found in a frame, when it is the one that the controller uses; without one, the one that was heard
-    /// first. Of its markers it is the landing's, as far as that is known.
+    /// Takes the detections of a frame, if their detector is the one that the controller uses; without one, the one that was received
+    /// first. Of its markers the landing's is tracked, as far as that is known.
     pub(crate) fn sees(
         &mut self,
         now_ns: i64,
@@ -130,13 +130,13 @@ impl Camera {
         })
     }
 
-    /// Sends the tracked marker's place with this period from now on, in nanoseconds; no more without one.
+    /// Sends the tracked marker's position with this period from now on, in nanoseconds; no longer without one.
     pub(crate) fn set_period(&mut self, period_ns: Option<i64>) {
         self.period_ns = period_ns;
         self.due_ns = i64::MIN;
     }
 
-    /// The tracked marker's place, when it is due.
+    /// The tracked marker's position, when it is due.
     pub(crate) fn due_tracking(&mut self, now_ns: i64) -> Option<MavMessage> {
         let period_ns = self.period_ns?;
         self.frame(now_ns)?;
@@ -340,22 +340,22 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_seen_any_more_is_not_tracked_any_more() {
+    fn a_marker_that_is_no_longer_seen_is_no_longer_tracked() {
         let mut camera = camera_with(&found(None));
         camera.set_period(Some(SECOND_NS / 5));
         let status = |camera: &mut Camera, now_ns| match camera.due_tracking(now_ns) {
-            Some(MavMessage::CAMERA_TRACKING_IMAGE_STATUS(told)) => told,
+            Some(MavMessage::CAMERA_TRACKING_IMAGE_STATUS(message)) => message,
             other => panic!("{other:?}"),
         };
-        let told = status(&mut camera, 0);
-        assert_eq!(told.tracking_status.bits(), 1);
-        assert_eq!((told.rec_top_x, told.rec_bottom_y), (0.45, 0.6));
+        let message = status(&mut camera, 0);
+        assert_eq!(message.tracking_status.bits(), 1);
+        assert_eq!((message.rec_top_x, message.rec_bottom_y), (0.45, 0.6));
         assert_eq!(camera.due_tracking(SECOND_NS / 5 - 1), None);
         // Its detector has fallen silent.
-        let told = status(&mut camera, SECOND_NS / 2);
-        assert_eq!(told.tracking_status.bits(), 0);
-        assert!(told.rec_top_x.is_nan());
-        // It says that there is none.
+        let message = status(&mut camera, SECOND_NS / 2);
+        assert_eq!(message.tracking_status.bits(), 0);
+        assert!(message.rec_top_x.is_nan());
+        // It reports that there is none.
         let nothing = Detections { detections: Vec::new(), ..found(None) };
         camera.sees(SECOND_NS, "onboard", None, &nothing);
         assert_eq!(status(&mut camera, SECOND_NS).tracking_status.bits(), 0);

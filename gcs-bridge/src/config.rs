@@ -1,5 +1,5 @@
-//! The bridge's configuration, `gcs-bridge.toml`: link to the ground stations, ids, who of them is heard and
-//! may send what, signing key, rate of landing targets, the camera's video.
+//! The bridge's configuration, `gcs-bridge.toml`: link to the ground stations, ids, accepted ground stations and their permission, signing
+//! key, rate of landing targets, the camera's video.
 
 use std::net::IpAddr;
 use std::time::Duration;
@@ -30,7 +30,7 @@ pub struct Config {
     pub video: String,
     /// IP addresses of the ground stations; any if there are none.
     pub ground_stations: Vec<String>,
-    /// Silence after which another ground station is heard, and one counts as silent, in seconds.
+    /// Silence after which another ground station is accepted, and one counts as silent, in seconds.
     pub ground_silence_s: f64,
     /// File with the key of signed packets, or nothing.
     pub signing_key: String,
@@ -81,7 +81,7 @@ impl Config {
         self.video.parse().ok()
     }
 
-    /// Whether it listens beyond this machine for any ground station, which may change something.
+    /// Whether it listens beyond this machine for any ground station, with the permission to change the vehicle's state.
     pub(crate) fn is_open(&self) -> bool {
         let host = match self.ground.parse() {
             Ok(Address::UdpIn(at) | Address::TcpIn(at)) => at.host,
@@ -104,7 +104,7 @@ impl Config {
         SigningConfig::read(path, self.component_id, state_directory(), &name).map(Some)
     }
 
-    /// Whom the link to the ground station talks to.
+    /// The peers of the link to the ground station.
     pub(crate) fn peering(&self) -> Peering {
         Peering::GroundStation {
             known: self.ground_stations.iter().filter_map(|text| text.parse().ok()).collect(),
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bridge_that_listens_for_anybody_beyond_this_machine_is_open() {
+    fn a_bridge_that_listens_for_any_host_beyond_this_machine_is_open() {
         for (ground, further, is_open) in [
             ("udpin:0.0.0.0:14550", "ground_stations=[]", true),
             ("tcpin:10.0.0.2:5760", "ground_stations=[]", true),

@@ -1,15 +1,15 @@
-//! Topics to and from the ground station.
+//! Bridges the topics to the ground station (MAVLink).
 //!
 //! The ground station gets the autopilot's packets through this service, and those of a companion: its
 //! heartbeat, the phases of the landing as texts, and the landing point; and those of a camera, in whose picture the
-//! marker is tracked. The service knows nothing of how a landing is decided. Only the ground station's own packets go to the autopilot, never one that the service
-//! makes. Landings do not depend on it.
+//! marker is tracked. The service does not depend on how a landing is decided. Only the ground station's own packets go to the autopilot,
+//! never one that the service makes. Landings do not depend on it.
 //!
 //! Modules in reading order: [`config`]; `bridge` is the service; `vehicle` finds the vehicle's system id,
 //! `route` decides which packets pass, `text` and `target` turn the controller's status and estimate into
 //! MAVLink; `camera` shows the detector's camera, whose `video` another program serves, and `request` is what a ground
 //! station asks of it; `params` shows it the keys of the controller's
-//! configuration that are in `parameter_table`; `status` is what is published of the ground.
+//! configuration that are in `parameter_table`; `status` is the published status of the ground stations.
 
 pub mod config;
 

@@ -29,7 +29,7 @@ struct Entry {
     value: f32,
 }
 
-/// What a ground station asks of the companion's parameters.
+/// A ground station's request for the companion's parameters.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Ask {
     /// All of them.
@@ -42,13 +42,13 @@ pub(crate) enum Ask {
     Set {
         /// Its name.
         name: String,
-        /// The wanted value.
+        /// The requested value.
         value: f32,
     },
 }
 
 impl Ask {
-    /// What a packet asks of the parameters of the companion; a list is asked of all components at once.
+    /// The request for the parameters of the companion in a packet; a list is asked of all components at once.
     pub(crate) fn of(packet: &Packet, companion: Sender) -> Option<Self> {
         let message = packet.message.as_ref()?;
         let is_for = |system: u8, component: u8| {
@@ -86,10 +86,10 @@ impl Ask {
     }
 }
 
-/// The answer to what was asked.
+/// The answer to a request.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Answer {
-    /// The value as it is, if it was asked for.
+    /// The present value, if it was requested.
     pub(crate) message: Option<MavMessage>,
     /// Why nothing was changed, for a person.
     pub(crate) why: Option<String>,
@@ -98,7 +98,7 @@ pub(crate) struct Answer {
 /// The parameters of the companion.
 #[derive(Debug, Default)]
 pub(crate) struct Parameters {
-    /// The controller whose configuration it is, and when that was heard.
+    /// The controller whose configuration it is, and when that was received.
     controller: Option<(String, i64)>,
     /// Those of the table that the configuration has.
     list: Vec<Entry>,
@@ -110,11 +110,12 @@ pub(crate) struct Parameters {
 
 impl Parameters {
     /// Takes a controller's configuration. False for one that cannot be read.
-    pub(crate) fn hear(&mut self, now_ns: i64, configuration: &Configuration) -> bool {
-        let is_silent = |heard_ns: i64| now_ns.saturating_sub(heard_ns) > CONTROLLER_TIMEOUT_NS;
-        if let Some((instance, heard_ns)) = &self.controller
+    pub(crate) fn update(&mut self, now_ns: i64, configuration: &Configuration) -> bool {
+        let is_silent =
+            |received_ns: i64| now_ns.saturating_sub(received_ns) > CONTROLLER_TIMEOUT_NS;
+        if let Some((instance, received_ns)) = &self.controller
             && *instance != configuration.instance
-            && !is_silent(*heard_ns)
+            && !is_silent(*received_ns)
         {
             return true;
         }
@@ -161,7 +162,7 @@ impl Parameters {
             _ => None,
         };
         let message = place.and_then(|place| self.value(place));
-        // Who reads a single one has lost it before, so it is sent once more.
+        // A ground station that reads a single value has lost it before, so it is sent once more.
         self.due.extend(place.filter(|_| message.is_some()));
         Answer { message, why }
     }
@@ -223,9 +224,9 @@ mod tests {
         }
     }
 
-    fn heard(toml: &str) -> Parameters {
+    fn parameters_of(toml: &str) -> Parameters {
         let mut parameters = Parameters::default();
-        assert!(parameters.hear(0, &configuration("main", toml)));
+        assert!(parameters.update(0, &configuration("main", toml)));
         parameters
     }
 
@@ -247,7 +248,7 @@ mod tests {
 
     #[test]
     fn every_parameter_is_a_key_of_the_controller_and_has_a_name_of_its_own() {
-        let mut parameters = heard(CONTROLLER);
+        let mut parameters = parameters_of(CONTROLLER);
         assert_eq!(parameters.list.len(), TABLE.len());
         assert_eq!(parameters.answer(&Ask::List), Answer::default());
         let listed = all(&mut parameters);
@@ -281,7 +282,7 @@ mod tests {
 
     #[test]
     fn one_is_read_by_name_or_place_and_never_changed() {
-        let mut parameters = heard("start = 'resume'\n[metric]\nmax_descend_m_s = 2.0");
+        let mut parameters = parameters_of("start = 'resume'\n[metric]\nmax_descend_m_s = 2.0");
         let named = parameters.answer(&Ask::Named("AL_DESC_SPEED".into())).message.unwrap();
         let value = data(&named).clone();
         assert_eq!((value.param_value, value.param_count), (2.0, 2));
@@ -304,28 +305,28 @@ mod tests {
     }
 
     #[test]
-    fn what_changes_is_told_to_who_has_the_list() {
-        let mut parameters = heard("[metric]\nfunnel_m = 1.0\nblind_s = 2.0");
+    fn changed_values_are_sent_to_a_ground_station_that_has_the_list() {
+        let mut parameters = parameters_of("[metric]\nfunnel_m = 1.0\nblind_s = 2.0");
         assert!(
-            parameters.hear(1, &configuration("main", "[metric]\nfunnel_m = 1.0\nblind_s = 3.0"))
+            parameters.update(1, &configuration("main", "[metric]\nfunnel_m = 1.0\nblind_s = 3.0"))
         );
-        assert_eq!(parameters.due(), [], "nobody has asked");
+        assert_eq!(parameters.due(), [], "no ground station has asked");
         parameters.answer(&Ask::List);
         assert_eq!(all(&mut parameters).len(), 2);
         assert!(
-            parameters.hear(2, &configuration("main", "[metric]\nfunnel_m = 1.0\nblind_s = 4.0"))
+            parameters.update(2, &configuration("main", "[metric]\nfunnel_m = 1.0\nblind_s = 4.0"))
         );
         let changed = all(&mut parameters);
         assert_eq!(changed.iter().map(|it| it.param_value).collect::<Vec<_>>(), [4.0]);
-        // Another controller beside it is shown only when this one is silent.
+        // Another controller in parallel is shown only when this one is silent.
         let other = configuration("spare", "[metric]\nfunnel_m = 7.0\nblind_s = 4.0");
-        assert!(parameters.hear(3, &other) && parameters.due().is_empty());
-        assert!(parameters.hear(3 + CONTROLLER_TIMEOUT_NS, &other));
+        assert!(parameters.update(3, &other) && parameters.due().is_empty());
+        assert!(parameters.update(3 + CONTROLLER_TIMEOUT_NS, &other));
         assert_eq!(all(&mut parameters).len(), 1);
-        // What cannot be read changes nothing.
-        assert!(!parameters.hear(4 + CONTROLLER_TIMEOUT_NS, &configuration("spare", "[metric")));
+        // An unreadable configuration changes nothing.
+        assert!(!parameters.update(4 + CONTROLLER_TIMEOUT_NS, &configuration("spare", "[metric")));
         let long = " ".repeat(MAX_TOML + 1);
-        assert!(!parameters.hear(4 + CONTROLLER_TIMEOUT_NS, &configuration("spare", &long)));
+        assert!(!parameters.update(4 + CONTROLLER_TIMEOUT_NS, &configuration("spare", &long)));
         assert_eq!(parameters.list.len(), 2);
     }
 

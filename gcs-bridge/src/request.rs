@@ -10,7 +10,7 @@ use autopilot::dialect::{
 
 use crate::camera::{Camera, Rectangle, STREAM};
 
-/// Period of the tracked marker's place when the ground station leaves it to the camera, in nanoseconds.
+/// Period of the tracked marker's position when the ground station leaves it to the camera, in nanoseconds.
 const DEFAULT_PERIOD_NS: i64 = 200_000_000;
 /// Bounds of that period, in nanoseconds: 20 Hz, and one a minute.
 const PERIODS_NS: (i64, i64) = (50_000_000, 60_000_000_000);
@@ -51,9 +51,9 @@ impl Command {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Answer {
     pub(crate) result: MavResult,
-    /// What was asked for; it follows the acknowledgement.
+    /// The requested message; it follows the acknowledgement.
     pub(crate) message: Option<MavMessage>,
-    /// What follows that without being asked for.
+    /// A message that follows it without a request.
     pub(crate) next: Option<MavMessage>,
     /// Why it was refused, for a person.
     pub(crate) why: Option<&'static str>,
@@ -91,7 +91,7 @@ pub(crate) fn answer(camera: &mut Camera, now_ns: i64, asked: Command) -> Answer
         _ => {
             let asked = message_id(asked);
             let message = asked.and_then(|(id, which)| message(camera, now_ns, id, which));
-            // MAVSDK asks for a camera's streams every 20 s only, and takes what it is told.
+            // MAVSDK asks for a camera's streams every 20 s only, and uses the answer until then.
             let is_introduction = asked.is_some_and(|(id, _)| id == CAMERA_INFORMATION_DATA::ID);
             let next = if is_introduction { camera.stream_information() } else { None };
             Answer { next, ..Answer::with(message) }
@@ -131,7 +131,7 @@ fn message(camera: &Camera, now_ns: i64, id: u32, stream: f32) -> Option<MavMess
     })
 }
 
-/// Only the tracked marker's place is sent regularly: -1 ends it, 0 leaves the period to the camera.
+/// Only the tracked marker's position is sent regularly: -1 ends it, 0 leaves the period to the camera.
 fn set_interval(camera: &mut Camera, id: f32, interval_us: f32) -> Answer {
     if id as u32 != CAMERA_TRACKING_IMAGE_STATUS_DATA::ID {
         return Answer::only(MavResult::MAV_RESULT_UNSUPPORTED);
@@ -150,7 +150,7 @@ fn set_interval(camera: &mut Camera, id: f32, interval_us: f32) -> Answer {
     Answer::only(MavResult::MAV_RESULT_ACCEPTED)
 }
 
-/// Nothing but the landing marker is tracked, so what a person points at must be that.
+/// Only the landing marker is tracked, so a person must point at that.
 fn track(camera: &mut Camera, now_ns: i64, asked: Command) -> Answer {
     let denied = |why| Answer { why: Some(why), ..Answer::only(MavResult::MAV_RESULT_DENIED) };
     let [left, top, right, bottom] = asked.params;

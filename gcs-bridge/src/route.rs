@@ -35,7 +35,7 @@ pub(crate) enum Route {
     Camera(Command),
     /// About the companion's parameters, answered already.
     Parameters,
-    /// A command that nobody here knows.
+    /// A command that neither companion nor camera supports.
     Unknown(GivenCommand),
     /// A key for signed packets, which must not travel further.
     Key,
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_for_the_companion_is_answered_here() {
+    fn commands_for_the_companion_are_answered_here() {
         let Route::Answer(answer) = up(GROUND, &command(ME)) else { panic!("no answer") };
         let MavMessage::COMMAND_ACK(ack) = *answer else { panic!("{answer:?}") };
         assert_eq!(ack.command, MavCmd::MAV_CMD_REQUEST_MESSAGE);

@@ -32,7 +32,7 @@ pub(crate) struct LinkCounts {
     pub(crate) refusals: Refusals,
 }
 
-/// What is known of the ground.
+/// The status of the link to the ground and of the ground stations.
 #[derive(Debug)]
 pub(crate) struct GroundStatus {
     /// The status so far; its stations' silence, its refused packets and its state of signing are computed when it is published.
@@ -44,7 +44,7 @@ pub(crate) struct GroundStatus {
 }
 
 impl GroundStatus {
-    /// Nobody was heard yet. `link_id` is that of the signatures, with a key.
+    /// A status without ground stations. `link_id` is that of the signatures, with a key.
     pub(crate) fn new(config: &Config, link_id: Option<u8>) -> Self {
         let so_far = GcsStatus {
             bridge: config.id.clone(),
@@ -69,12 +69,12 @@ impl GroundStatus {
         self.so_far.problem = Some(short(reason));
     }
 
-    /// A packet came from the ground, and is no echo of the vehicle. What a radio adds to the line by itself is of no station.
-    pub(crate) fn heard(&mut self, now_ns: i64, packet: &Packet) {
+    /// Takes a packet from the ground that is no echo of the vehicle. Packets that a radio adds on its own belong to no station.
+    pub(crate) fn received(&mut self, now_ns: i64, packet: &Packet) {
         if packet.message_id == RADIO_STATUS_DATA::ID {
             return;
         }
-        // With a key, the link lets in nothing else, and takes the signatures away.
+        // With a key, the link accepts only verified packets, and removes the signatures.
         let has_key = self.so_far.signing.link_id.is_some();
         let signature = match packet.is_signed() {
             _ if has_key => PacketSignature::Verified,
@@ -107,7 +107,7 @@ impl GroundStatus {
         });
     }
 
-    /// A packet that was heard was refused; once for each.
+    /// Counts a refused packet, after `received`; once for each.
     pub(crate) fn refused(&mut self, packet: &Packet, reason: &'static str) {
         *self.refused.entry(reason).or_default() += 1;
         let is_of_radio = packet.message_id == RADIO_STATUS_DATA::ID;
@@ -130,7 +130,7 @@ impl GroundStatus {
         }
         let status = self.status(now_ns, system, counts);
         let has_changed =
-            self.published.as_ref().is_none_or(|last| matter(last) != matter(&status));
+            self.published.as_ref().is_none_or(|last| content(last) != content(&status));
         if !has_changed && passed_ns < MAX_PERIOD_NS {
             return None;
         }
@@ -174,8 +174,8 @@ impl GroundStatus {
         now_ns.saturating_sub(station.last_ns) > self.silence_ns
     }
 
-    /// Whether one more station can be listed: in a full list, one that is silent gives way, and never one that speaks, or a flood
-    /// of senders would hide the operator's station.
+    /// Whether one more station can be listed: in a full list, a silent one is replaced, and never one that sends packets, or a flood of
+    /// senders would hide the operator's station.
     fn has_room(&mut self, now_ns: i64) -> bool {
         if self.so_far.stations.len() < MAX_STATIONS {
             return true;
@@ -187,15 +187,16 @@ impl GroundStatus {
     }
 }
 
-/// Whether a station signs, by its last packet; what one that is silent did long ago no longer tells, unless nobody speaks since.
+/// Whether a station signs, by its last packet. The last packet of a silent station does not count, unless no other station has sent one
+/// since.
 fn is_signing(stations: &[GroundStation]) -> bool {
     let newest_ns = stations.iter().map(|it| it.last_ns).max();
     let mut that_count = stations.iter().filter(|it| !it.silent || Some(it.last_ns) == newest_ns);
     that_count.any(|it| it.signature == PacketSignature::Unchecked)
 }
 
-/// What is worth a message at once: all but what every packet changes.
-fn matter(status: &GcsStatus) -> GcsStatus {
+/// The part of a status that is published at once when it changes: all but the fields that every packet changes.
+fn content(status: &GcsStatus) -> GcsStatus {
     let mut status = GcsStatus { stamp_ns: 0, unlisted: 0, ..status.clone() };
     status.signing.verified_ns = None;
     for station in &mut status.stations {
@@ -241,13 +242,16 @@ mod tests {
     }
 
     #[test]
-    fn a_station_is_listed_with_the_peer_and_told_once_it_is_silent() {
+    fn a_station_is_listed_with_its_peer_and_as_silent_once_it_is() {
         let mut status = ground(None);
         status.up("10.0.0.2:14550");
-        status.heard(SECOND_NS, &heartbeat(GROUND));
-        status.heard(2 * SECOND_NS, &heartbeat(GROUND));
-        let told = now(&status, 12 * SECOND_NS);
-        assert_eq!((told.system, told.peer.as_deref()), (Some(7), Some("10.0.0.2:14550")));
+        status.received(SECOND_NS, &heartbeat(GROUND));
+        status.received(2 * SECOND_NS, &heartbeat(GROUND));
+        let status_now = now(&status, 12 * SECOND_NS);
+        assert_eq!(
+            (status_now.system, status_now.peer.as_deref()),
+            (Some(7), Some("10.0.0.2:14550"))
+        );
         let expected = GroundStation {
             system: 255,
             component: 190,
@@ -258,13 +262,13 @@ mod tests {
             refused: 0,
             signature: PacketSignature::Unsigned,
         };
-        assert_eq!(told.stations, [expected]);
+        assert_eq!(status_now.stations, [expected]);
         assert!(now(&status, 12 * SECOND_NS + 1).stations[0].silent);
-        // It speaks again, at another place.
+        // It sends again, from another address.
         status.up("10.0.0.3:14550");
-        status.heard(20 * SECOND_NS, &heartbeat(GROUND));
-        let told = now(&status, 20 * SECOND_NS).stations.remove(0);
-        assert_eq!((told.silent, told.peer.as_str()), (false, "10.0.0.3:14550"));
+        status.received(20 * SECOND_NS, &heartbeat(GROUND));
+        let status_now = now(&status, 20 * SECOND_NS).stations.remove(0);
+        assert_eq!((status_now.silent, status_now.peer.as_str()), (false, "10.0.0.3:14550"));
     }
 
     #[test]
@@ -273,8 +277,11 @@ mod tests {
         assert_eq!(now(&status, 0).peer, None);
         status.up("10.0.0.2:14550");
         status.down(&"x".repeat(1000));
-        let told = now(&status, 0);
-        assert_eq!((told.peer, told.problem.map(|it| it.len())), (None, Some(MAX_CHARS)));
+        let status_now = now(&status, 0);
+        assert_eq!(
+            (status_now.peer, status_now.problem.map(|it| it.len())),
+            (None, Some(MAX_CHARS))
+        );
         status.up("10.0.0.2:14550");
         assert_eq!(now(&status, 0).problem, None);
     }
@@ -283,32 +290,32 @@ mod tests {
     fn a_radio_is_no_ground_station() {
         let mut status = ground(Some(191));
         let radio = MavMessage::RADIO_STATUS(RADIO_STATUS_DATA::default());
-        status.heard(0, &packet(Sender { system: 51, component: 68 }, &radio));
-        let told = now(&status, 0);
-        assert!(told.stations.is_empty() && told.signing.state == SigningState::Wanted);
+        status.received(0, &packet(Sender { system: 51, component: 68 }, &radio));
+        let status_now = now(&status, 0);
+        assert!(status_now.stations.is_empty() && status_now.signing.state == SigningState::Wanted);
     }
 
     #[test]
     fn refused_packets_are_counted_by_reason_and_by_station() {
         let mut status = ground(None);
-        status.heard(0, &heartbeat(GROUND));
+        status.received(0, &heartbeat(GROUND));
         status.refused(&heartbeat(GROUND), "only monitoring");
         status.refused(&heartbeat(GROUND), "only monitoring");
-        // Neither a station that is not listed, nor what a radio says that has a station's ids.
+        // Neither a station that is not listed, nor a packet of a radio with a station's ids.
         status.refused(&heartbeat(Sender { system: 254, ..GROUND }), "too late");
         let radio = MavMessage::RADIO_STATUS(RADIO_STATUS_DATA::default());
         status.refused(&packet(GROUND, &radio), "too late");
         let counts = LinkCounts { strangers: 40, bad_checksums: 3, ..LinkCounts::default() };
-        let told = status.status(0, None, counts);
+        let status_now = status.status(0, None, counts);
         let counted = |reason: &str| {
-            told.refused.iter().find(|it| it.reason == reason).map_or(0, |it| it.count)
+            status_now.refused.iter().find(|it| it.reason == reason).map_or(0, |it| it.count)
         };
         assert_eq!(counted("only monitoring"), 2);
         assert_eq!(counted("too late"), 2);
         assert_eq!(counted("packets or connections of an unknown sender"), 40);
         assert_eq!(counted("wrong checksum"), 3);
-        assert_eq!(told.refused.len(), 4, "what was never refused is not named");
-        assert_eq!(told.stations[0].refused, 2);
+        assert_eq!(status_now.refused.len(), 4, "reasons without a refused packet are not named");
+        assert_eq!(status_now.stations[0].refused, 2);
     }
 
     #[test]
@@ -317,24 +324,24 @@ mod tests {
         assert_eq!(now(&status, 0).signing, GcsSigning::default());
         let mut signed = heartbeat(GROUND);
         signed.raw[2] = 1;
-        status.heard(0, &signed);
+        status.received(0, &signed);
         assert_eq!(now(&status, 0).stations[0].signature, PacketSignature::Unchecked);
         assert_eq!(now(&status, 0).signing.state, SigningState::NoKey);
-        // It signs no more.
-        status.heard(1, &heartbeat(GROUND));
+        // It no longer signs.
+        status.received(1, &heartbeat(GROUND));
         assert_eq!(now(&status, 1).signing.state, SigningState::Off);
-        // It was silent after a signed one: that is known as long as nobody else speaks.
-        status.heard(2, &signed);
+        // It was silent after a signed one: that counts as long as no other station sends.
+        status.received(2, &signed);
         assert_eq!(now(&status, 60 * SECOND_NS).signing.state, SigningState::NoKey);
-        status.heard(60 * SECOND_NS, &heartbeat(Sender { system: 254, ..GROUND }));
+        status.received(60 * SECOND_NS, &heartbeat(Sender { system: 254, ..GROUND }));
         assert_eq!(now(&status, 60 * SECOND_NS).signing.state, SigningState::Off);
 
         let mut status = ground(Some(191));
         let wanted =
             GcsSigning { state: SigningState::Wanted, link_id: Some(191), verified_ns: None };
         assert_eq!(now(&status, 0).signing, wanted);
-        // As the link lets it in: verified, and without its signature.
-        status.heard(5, &heartbeat(GROUND));
+        // As the link passes it on: verified, and without its signature.
+        status.received(5, &heartbeat(GROUND));
         let in_force = GcsSigning { state: SigningState::InForce, verified_ns: Some(5), ..wanted };
         assert_eq!(now(&status, 0).signing, in_force);
         assert_eq!(now(&status, 0).stations[0].signature, PacketSignature::Verified);
@@ -347,22 +354,26 @@ mod tests {
             system: (number / 250) as u8 + 1,
             component: (number % 250) as u8,
         };
-        status.heard(0, &heartbeat(GROUND));
+        status.received(0, &heartbeat(GROUND));
         for number in 0..300 {
-            status.heard(1, &heartbeat(sender(number)));
+            status.received(1, &heartbeat(sender(number)));
         }
-        let told = now(&status, 1);
-        assert_eq!((told.stations.len(), told.unlisted), (MAX_STATIONS, 285));
-        assert_eq!((told.stations[0].system, told.stations[0].component), (255, 190));
+        let status_now = now(&status, 1);
+        assert_eq!((status_now.stations.len(), status_now.unlisted), (MAX_STATIONS, 285));
+        assert_eq!((status_now.stations[0].system, status_now.stations[0].component), (255, 190));
         // Once they are silent, a new one takes the place of the oldest.
         let later_ns = 11 * SECOND_NS;
-        status.heard(later_ns, &heartbeat(sender(299)));
-        let told = now(&status, later_ns);
-        assert_eq!((told.stations.len(), told.unlisted), (MAX_STATIONS, 285));
-        let last = told.stations.last().unwrap();
+        status.received(later_ns, &heartbeat(sender(299)));
+        let status_now = now(&status, later_ns);
+        assert_eq!((status_now.stations.len(), status_now.unlisted), (MAX_STATIONS, 285));
+        let last = status_now.stations.last().unwrap();
         assert_eq!((last.system, last.component, last.silent), (2, 49, false));
-        assert!(told.stations.iter().all(|it| it.system != 255), "the oldest gave way");
-        assert!(messages::encode(&told).len() < 1000, "{}", messages::encode(&told).len());
+        assert!(status_now.stations.iter().all(|it| it.system != 255), "the oldest gave way");
+        assert!(
+            messages::encode(&status_now).len() < 1000,
+            "{}",
+            messages::encode(&status_now).len()
+        );
     }
 
     #[test]
@@ -373,7 +384,7 @@ mod tests {
         for step in 0..400_i64 {
             let now_ns = step * 50_000_000;
             if (20..55).contains(&step) {
-                status.heard(now_ns, &heartbeat(GROUND));
+                status.received(now_ns, &heartbeat(GROUND));
             }
             published.extend(status.due(now_ns, None, LinkCounts::default()));
         }
@@ -383,7 +394,7 @@ mod tests {
         let silent: Vec<bool> =
             published.iter().flat_map(|it| &it.stations).map(|it| it.silent).collect();
         assert_eq!(silent.iter().filter(|it| **it).count(), 4);
-        // A flood of refused packets is told twice a second.
+        // A flood of refused packets is reported twice a second.
         let mut times = 0;
         for step in 0..200_i64 {
             status.refused(&heartbeat(GROUND), "only monitoring");

@@ -29,7 +29,7 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::{interval, sleep, timeout};
 
-const PATIENCE: Duration = Duration::from_secs(30);
+const TIMEOUT: Duration = Duration::from_secs(30);
 const AUTOPILOT: Sender = Sender { system: 7, component: 1 };
 const COMPANION: Sender = Sender { system: 7, component: 191 };
 const CAMERA: Sender = Sender { system: 7, component: 100 };
@@ -86,9 +86,9 @@ async fn only_the_grounds_own_packets_go_up_unchanged() -> anyhow::Result<()> {
     ground.expect(|f| f.sender == COMPANION).await?;
 
     let first = encode(GROUND, 1, &param_request(1));
-    let arriving = timeout(PATIENCE, vehicle.next_packet());
+    let arriving = timeout(TIMEOUT, vehicle.next_packet());
     let calling = async {
-        // Until the two sessions know each other, what is sent is lost.
+        // Until the two sessions know each other, packets are lost.
         loop {
             ground.send(&first).await?;
             sleep(Duration::from_millis(20)).await;
@@ -117,7 +117,7 @@ async fn only_the_grounds_own_packets_go_up_unchanged() -> anyhow::Result<()> {
     }
     let mut others = Vec::new();
     loop {
-        let packet = timeout(PATIENCE, vehicle.next_packet()).await??;
+        let packet = timeout(TIMEOUT, vehicle.next_packet()).await??;
         if packet == last {
             break;
         }
@@ -135,7 +135,7 @@ async fn only_the_grounds_own_packets_go_up_unchanged() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_ground_station_that_was_heard_first_is_held_and_strangers_are_counted()
+async fn the_first_ground_station_is_kept_and_packets_of_other_senders_are_counted()
 -> anyhow::Result<()> {
     let port = free_port()?;
     let ([], _, listening) = ports::free()?;
@@ -148,7 +148,7 @@ async fn the_ground_station_that_was_heard_first_is_held_and_strangers_are_count
     let to = SocketAddr::from(([127, 0, 0, 1], listening));
     ground.bridge = Some(to);
     let first = encode(GROUND, 1, &param_request(1));
-    let heard = async {
+    let received = async {
         loop {
             ground.send(&first).await?;
             if timeout(Duration::from_millis(50), vehicle.next_packet()).await.is_ok() {
@@ -156,7 +156,7 @@ async fn the_ground_station_that_was_heard_first_is_held_and_strangers_are_count
             }
         }
     };
-    timeout(PATIENCE, heard).await??;
+    timeout(TIMEOUT, received).await??;
     // Disarming in the air, by force; and the heartbeat of an autopilot, as if the stranger were one.
     let disarm = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
         command: MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
@@ -174,8 +174,8 @@ async fn the_ground_station_that_was_heard_first_is_held_and_strangers_are_count
     ensure!(counted == 40, "{counted} of 40 packets counted");
     ground.send(&encode(GROUND, 3, &param_request(3))).await?;
     loop {
-        let packet = timeout(PATIENCE, vehicle.next_packet()).await??;
-        ensure!(packet != disarm, "the stranger was heard");
+        let packet = timeout(TIMEOUT, vehicle.next_packet()).await??;
+        ensure!(packet != disarm, "a packet of the unknown sender was passed on");
         if packet == encode(GROUND, 3, &param_request(3)) {
             break;
         }
@@ -185,7 +185,7 @@ async fn the_ground_station_that_was_heard_first_is_held_and_strangers_are_count
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn only_the_known_ground_stations_are_heard() -> anyhow::Result<()> {
+async fn only_packets_of_known_ground_stations_are_accepted() -> anyhow::Result<()> {
     for kind in ["udpin", "tcpin"] {
         let port = free_port()?;
         let ([tcp], _, udp) = ports::free()?;
@@ -218,7 +218,7 @@ async fn only_the_known_ground_stations_are_heard() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_ground_station_that_may_not_arm_is_told_so() -> anyhow::Result<()> {
+async fn a_ground_station_that_may_not_arm_is_informed_of_the_refusal() -> anyhow::Result<()> {
     let port = free_port()?;
     let mut ground = Ground::open().await?;
     let vehicle = FakeVehicle::start(port).await?;
@@ -257,13 +257,13 @@ async fn a_ground_station_that_may_not_arm_is_told_so() -> anyhow::Result<()> {
             }
         }
     };
-    ensure!(timeout(PATIENCE, passed).await?? == allowed, "the autopilot was armed");
+    ensure!(timeout(TIMEOUT, passed).await?? == allowed, "the autopilot was armed");
     bridge.abort();
     Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_ground_station_is_told_when_anyone_may_command() -> anyhow::Result<()> {
+async fn the_ground_station_is_warned_when_any_host_may_command() -> anyhow::Result<()> {
     let port = free_port()?;
     let mut ground = Ground::open().await?;
     let _vehicle = FakeVehicle::start(port).await?;
@@ -293,7 +293,7 @@ async fn until_error(
             }
         }
     };
-    timeout(PATIENCE, counted).await.with_context(|| format!("`{reason}` was not counted"))?
+    timeout(TIMEOUT, counted).await.with_context(|| format!("`{reason}` was not counted"))?
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -325,8 +325,8 @@ async fn the_bridge_outlives_the_ground_station() -> anyhow::Result<()> {
         let rate = report.rates.into_iter().find(|rate| rate.name == "to ground");
         anyhow::Ok(rate.map_or(0, |rate| rate.count))
     };
-    let before = timeout(PATIENCE, sent()).await??;
-    while timeout(PATIENCE, sent()).await?? <= before {}
+    let before = timeout(TIMEOUT, sent()).await??;
+    while timeout(TIMEOUT, sent()).await?? <= before {}
     let mut ground = Ground { socket: UdpSocket::bind(address).await?, ..Ground::open().await? };
     ground.expect(|f| f.sender == COMPANION && is_heartbeat(f)).await?;
     ground.send(&encode(GROUND, 0, &param_request(1))).await?;
@@ -338,7 +338,7 @@ async fn the_bridge_outlives_the_ground_station() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_ground_station_that_joins_later_is_told_what_was_said_once() -> anyhow::Result<()> {
+async fn a_ground_station_that_joins_later_receives_earlier_texts() -> anyhow::Result<()> {
     let port = free_port()?;
     let ([], _, listening) = ports::free()?;
     let vehicle = FakeVehicle::start(port).await?;
@@ -350,12 +350,12 @@ async fn a_ground_station_that_joins_later_is_told_what_was_said_once() -> anyho
     let to = SocketAddr::from(([127, 0, 0, 1], listening));
     let not_recording = "Alight: not recording: the disk is full";
     let mut first = Ground { bridge: Some(to), ..Ground::open().await? };
-    first.call_until_told(not_recording).await?;
+    first.call_until_text(not_recording).await?;
     vehicle.stop().await;
-    first.call_until_told("Alight: the controller is gone").await?;
+    first.call_until_text("Alight: the controller is gone").await?;
     let mut second = Ground { bridge: Some(to), ..Ground::open().await? };
-    second.call_until_told("Alight: the controller is gone").await?;
-    second.call_until_told(not_recording).await?;
+    second.call_until_text("Alight: the controller is gone").await?;
+    second.call_until_text(not_recording).await?;
     recording.abort();
     bridge.abort();
     Ok(())
@@ -366,7 +366,7 @@ async fn a_port_in_use_is_an_error() -> anyhow::Result<()> {
     let taken = Ground::open().await?;
     let setting = format!("ground=udpin:{}", taken.socket.local_addr()?);
     let bridge = start_bridge(free_port()?, &taken, &[&setting]).await?;
-    let problem = timeout(PATIENCE, bridge).await??.err().context("a port was taken twice")?;
+    let problem = timeout(TIMEOUT, bridge).await??.err().context("a port was taken twice")?;
     assert!(format!("{problem:#}").contains("already in use"), "{problem:#}");
     Ok(())
 }
@@ -420,8 +420,8 @@ async fn a_ground_station_finds_the_camera_its_video_and_the_marker() -> anyhow:
     let area = ["--area", "0.2", "0.2", "0.4", "0.4"];
     for (loss, further) in [("0", &["--commands"][..]), ("0.3", &[])] {
         let further = [&["--loss", loss], &area[..], further].concat();
-        let Some(told) = script("camera.py", address, &further).await? else { return Ok(()) };
-        eprintln!("{told}");
+        let Some(output) = script("camera.py", address, &further).await? else { return Ok(()) };
+        eprintln!("{output}");
         // The sample's marker: within a hundredth of the width of where it was put.
         for part in [
             r#""model": "down""#,
@@ -429,7 +429,7 @@ async fn a_ground_station_finds_the_camera_its_video_and_the_marker() -> anyhow:
             r#""uri": "rtsp://10.0.0.2:8554/down""#,
             r#""tracked": [0.25"#,
         ] {
-            ensure!(told.contains(part), "{part} is not in {told}");
+            ensure!(output.contains(part), "{part} is not in {output}");
         }
     }
     seeing.abort();
@@ -437,7 +437,7 @@ async fn a_ground_station_finds_the_camera_its_video_and_the_marker() -> anyhow:
     Ok(())
 }
 
-/// The camera's packets may come back to the bridge, as an autopilot sends what it hears on one link to all others.
+/// The camera's packets may come back to the bridge, as an autopilot forwards the packets of one link to all others.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_camera_gives_way_to_another_one_and_not_to_its_own_echo() -> anyhow::Result<()> {
     let port = free_port()?;
@@ -465,7 +465,7 @@ async fn a_camera_gives_way_to_another_one_and_not_to_its_own_echo() -> anyhow::
             }
         }
     };
-    timeout(PATIENCE, came).await??;
+    timeout(TIMEOUT, came).await??;
     seeing.abort();
     bridge.abort();
     Ok(())
@@ -479,27 +479,27 @@ async fn a_ground_station_loads_the_companions_parameters_and_changes_none() -> 
     let address = free.socket.local_addr()?;
     let vehicle = FakeVehicle::start(port).await?;
     let toml = include_str!("../../controller/controller.toml").to_owned();
-    let telling = vehicle.node.clone();
-    let telling = tokio::spawn(async move { telling.publish_configuration(toml).await });
+    let publisher = vehicle.node.clone();
+    let publishing = tokio::spawn(async move { publisher.publish_configuration(toml).await });
     let bridge = start_bridge(port, &free, &[]).await?;
     drop(free);
     for (loss, seed) in [("0", "1"), ("0.3", "1"), ("0.3", "2")] {
         let further = ["--loss", loss, "--seed", seed];
-        let told = script("params.py", address, &further).await?;
-        let Some(told) = told else { return Ok(()) };
-        eprintln!("{told}");
+        let output = script("params.py", address, &further).await?;
+        let Some(output) = output else { return Ok(()) };
+        eprintln!("{output}");
         for part in [r#""ok": true"#, r#""parameters": 36, "names": 36"#, r#""value": 2.0"#] {
-            ensure!(told.contains(part), "{part} is not in {told}");
+            ensure!(output.contains(part), "{part} is not in {output}");
         }
     }
-    telling.abort();
+    publishing.abort();
     bridge.abort();
     Ok(())
 }
 
-/// A ground station with a key, with pymavlink as the other side; and what is sent without the key.
+/// A ground station with a key, with pymavlink as the other side; and packets that are sent without the key.
 #[tokio::test(flavor = "multi_thread")]
-async fn only_what_the_ground_station_signs_is_answered() -> anyhow::Result<()> {
+async fn only_signed_packets_of_the_ground_station_are_answered() -> anyhow::Result<()> {
     let port = free_port()?;
     let free = Ground::open().await?;
     let address = free.socket.local_addr()?;
@@ -511,26 +511,25 @@ async fn only_what_the_ground_station_signs_is_answered() -> anyhow::Result<()> 
     let bridge = start_bridge(port, &free, &[&setting]).await?;
     drop(free);
     let further = ["--passphrase", "correct horse battery", "--flood-s", "3"];
-    let Some(told) = script("signing.py", address, &further).await? else { return Ok(()) };
-    eprintln!("{told}");
-    ensure!(told.contains(r#""ok": true"#), "{told}");
+    let Some(output) = script("signing.py", address, &further).await? else { return Ok(()) };
+    eprintln!("{output}");
+    ensure!(output.contains(r#""ok": true"#), "{output}");
     for (reason, times) in
         [("not signed", 1), ("another key", 1000), ("sent before", 1), ("a minute old", 1)]
     {
         until_error(&health, reason, times).await?;
     }
-    // A key that others can read is none.
+    // A key that other users can read is refused.
     std::fs::set_permissions(key.path(), Permissions::from_mode(0o644))?;
     let open = start_bridge(free_port()?, &Ground::open().await?, &[&setting]).await?;
-    let problem = timeout(PATIENCE, open).await??.err().context("a key for all to read")?;
+    let problem = timeout(TIMEOUT, open).await??.err().context("a key for all to read")?;
     ensure!(format!("{problem:#}").contains("chmod 600"), "{problem:#}");
     bridge.abort();
     Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_ground_stations_are_told_with_what_is_refused_and_when_they_are_silent()
--> anyhow::Result<()> {
+async fn the_status_contains_ground_stations_refused_packets_and_silence() -> anyhow::Result<()> {
     let port = free_port()?;
     let ([], _, listening) = ports::free()?;
     let vehicle = FakeVehicle::start(port).await?;
@@ -539,10 +538,10 @@ async fn the_ground_stations_are_told_with_what_is_refused_and_when_they_are_sil
     let setting = format!("ground={link}");
     let settings = [setting.as_str(), "ground_silence_s=1", "ground_may=no-arming"];
     let bridge = start_bridge(port, &Ground::open().await?, &settings).await?;
-    let told = until_told(&statuses, |it| it.system == Some(AUTOPILOT.system)).await?;
-    assert_eq!((told.bridge.as_str(), told.link, told.peer), ("main", link, None));
-    assert_eq!((told.ground_may.as_str(), told.stations.len()), ("no-arming", 0));
-    assert_eq!(told.signing.state, SigningState::Off);
+    let status = until_status(&statuses, |it| it.system == Some(AUTOPILOT.system)).await?;
+    assert_eq!((status.bridge.as_str(), status.link, status.peer), ("main", link, None));
+    assert_eq!((status.ground_may.as_str(), status.stations.len()), ("no-arming", 0));
+    assert_eq!(status.signing.state, SigningState::Off);
 
     // A station, a stranger, a packet that may not pass, and a damaged one.
     let to = SocketAddr::from(([127, 0, 0, 1], listening));
@@ -574,25 +573,25 @@ async fn the_ground_stations_are_told_with_what_is_refused_and_when_they_are_sil
         .iter()
         .all(|reason| it.refused.iter().any(|count| count.reason == *reason))
     };
-    let told = tokio::select! {
-        told = until_told(&statuses, is_all_counted) => told?,
+    let status = tokio::select! {
+        status = until_status(&statuses, is_all_counted) => status?,
         problem = speaking => return problem,
     };
     let address = ground.socket.local_addr()?.to_string();
-    assert_eq!(told.peer.as_ref(), Some(&address));
-    let [station] = told.stations.as_slice() else { bail!("{told:?}") };
+    assert_eq!(status.peer.as_ref(), Some(&address));
+    let [station] = status.stations.as_slice() else { bail!("{status:?}") };
     assert_eq!((station.system, station.component), (GROUND.system, GROUND.component));
     assert_eq!((station.silent, &station.peer), (false, &address));
     ensure!(station.refused > 0 && station.packets > station.refused, "{station:?}");
-    ensure!((0..PATIENCE.as_nanos() as i64).contains(&(now_ns() - station.last_ns)), "{told:?}");
+    ensure!((0..TIMEOUT.as_nanos() as i64).contains(&(now_ns() - station.last_ns)), "{status:?}");
     assert_eq!(station.signature, PacketSignature::Unsigned);
 
-    // It falls silent, which who comes late is told as well.
-    until_told(&statuses, |it| it.stations.iter().all(|station| station.silent)).await?;
+    // It falls silent, which who comes late is status as well.
+    until_status(&statuses, |it| it.stations.iter().all(|station| station.silent)).await?;
     let late = open("dashboard", "main", port).await?;
     let late = late.subscriber(topic::GCS_STATUS, &[]).await?;
-    let told = until_told(&late, |_| true).await?;
-    assert_eq!(told.stations.iter().map(|it| it.silent).collect::<Vec<_>>(), [true]);
+    let status = until_status(&late, |_| true).await?;
+    assert_eq!(status.stations.iter().map(|it| it.silent).collect::<Vec<_>>(), [true]);
 
     // Very many stations behind one address: some are listed, and the others counted.
     for number in 0..300_u16 {
@@ -600,14 +599,14 @@ async fn the_ground_stations_are_told_with_what_is_refused_and_when_they_are_sil
         ground.send(&heartbeat(Sender { system: 100 + high, component })).await?;
         sleep(Duration::from_millis(1)).await;
     }
-    let told = until_told(&statuses, |it| it.unlisted > 0).await?;
-    assert_eq!(told.stations.len(), 16);
+    let status = until_status(&statuses, |it| it.unlisted > 0).await?;
+    assert_eq!(status.stations.len(), 16);
     bridge.abort();
     Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_state_of_signing_is_told() -> anyhow::Result<()> {
+async fn the_state_of_signing_is_published() -> anyhow::Result<()> {
     let port = free_port()?;
     let mut ground = Ground::open().await?;
     let vehicle = FakeVehicle::start(port).await?;
@@ -619,10 +618,10 @@ async fn the_state_of_signing_is_told() -> anyhow::Result<()> {
     ground.expect(|f| f.sender == COMPANION && f.is_signed()).await?;
     ground.send(&encode(GROUND, 1, &param_request(1))).await?;
     let has_refused = |it: &GcsStatus, reason: &str| it.refused.iter().any(|c| c.reason == reason);
-    let told = until_told(&statuses, |it| has_refused(it, "not signed")).await?;
-    assert_eq!(told.signing.state, SigningState::Wanted);
-    assert_eq!((told.signing.link_id, told.signing.verified_ns), (Some(191), None));
-    ensure!(told.stations.is_empty(), "{told:?}");
+    let status = until_status(&statuses, |it| has_refused(it, "not signed")).await?;
+    assert_eq!(status.signing.state, SigningState::Wanted);
+    assert_eq!((status.signing.link_id, status.signing.verified_ns), (Some(191), None));
+    ensure!(status.stations.is_empty(), "{status:?}");
 
     let mut signing = Signing::new("correct horse battery".parse()?, 7, 0);
     let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH)?;
@@ -631,21 +630,21 @@ async fn the_state_of_signing_is_told() -> anyhow::Result<()> {
     for _ in 0..2 {
         ground.send(&signed).await?;
     }
-    let told = until_told(&statuses, |it| has_refused(it, "signed, but sent before")).await?;
-    assert_eq!(told.signing.state, SigningState::InForce);
-    ensure!(told.signing.verified_ns.is_some(), "{told:?}");
-    let [station] = told.stations.as_slice() else { bail!("{told:?}") };
+    let status = until_status(&statuses, |it| has_refused(it, "signed, but sent before")).await?;
+    assert_eq!(status.signing.state, SigningState::InForce);
+    ensure!(status.signing.verified_ns.is_some(), "{status:?}");
+    let [station] = status.stations.as_slice() else { bail!("{status:?}") };
     assert_eq!((station.packets, station.signature), (1, PacketSignature::Verified));
     bridge.abort();
     Ok(())
 }
 
 /// Waits for a status of the bridge.
-async fn until_told(
+async fn until_status(
     statuses: &Subscriber<GcsStatus>,
     wanted: impl Fn(&GcsStatus) -> bool,
 ) -> anyhow::Result<GcsStatus> {
-    let told = async {
+    let found = async {
         loop {
             let status = statuses.next().await.context("status")?;
             if wanted(&status) {
@@ -653,10 +652,10 @@ async fn until_told(
             }
         }
     };
-    timeout(PATIENCE, told).await.context("the status that was expected did not come")?
+    timeout(TIMEOUT, found).await.context("the expected status was not received")?
 }
 
-/// What a script of `tests/gcs` says; none where it cannot run.
+/// The output of a script of `tests/gcs`; none where it cannot run.
 async fn script(
     name: &str,
     address: SocketAddr,
@@ -680,7 +679,7 @@ async fn script(
     }
 }
 
-/// Publishes what the detector in use sees: a marker from a quarter to half of the picture.
+/// Publishes detections of the detector in use: a marker from a quarter to half of the picture.
 async fn see(node: Node) -> anyhow::Result<()> {
     let detections = node.publisher(topic::DETECTIONS, &["spare"]).await?;
     let mut found = Detections::sample();
@@ -759,7 +758,7 @@ impl Ground {
     async fn next(&mut self) -> anyhow::Result<Packet> {
         let mut bytes = [0; 2048];
         while self.waiting.is_empty() {
-            let (count, from) = timeout(PATIENCE, self.socket.recv_from(&mut bytes)).await??;
+            let (count, from) = timeout(TIMEOUT, self.socket.recv_from(&mut bytes)).await??;
             self.bridge = Some(from);
             self.waiting = self.parser.push(&bytes[..count]);
         }
@@ -777,7 +776,7 @@ impl Ground {
                 }
             }
         };
-        timeout(PATIENCE, seen).await.context("what was expected did not come")?
+        timeout(TIMEOUT, seen).await.context("the expected packet was not received")?
     }
 
     /// Waits for a text of the companion, unless it came already.
@@ -788,12 +787,12 @@ impl Ground {
             }
             anyhow::Ok(())
         };
-        let outcome = timeout(PATIENCE, seen).await;
+        let outcome = timeout(TIMEOUT, seen).await;
         outcome.with_context(|| format!("`{wanted}` is not in {:?}", self.texts))?
     }
 
     /// Sends heartbeats until a text of the companion has come.
-    async fn call_until_told(&mut self, wanted: &str) -> anyhow::Result<()> {
+    async fn call_until_text(&mut self, wanted: &str) -> anyhow::Result<()> {
         let heartbeat = encode(GROUND, 0, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()));
         let seen = async {
             while !self.texts.iter().any(|text| text == wanted) {
@@ -804,7 +803,7 @@ impl Ground {
             }
             anyhow::Ok(())
         };
-        let outcome = timeout(PATIENCE, seen).await;
+        let outcome = timeout(TIMEOUT, seen).await;
         outcome.with_context(|| format!("`{wanted}` is not in {:?}", self.texts))?
     }
 
@@ -827,7 +826,7 @@ impl Ground {
     }
 }
 
-/// What the controller publishes, of a vehicle that hovers over its marker.
+/// The controller's messages, of a vehicle that hovers over its marker.
 struct FakeVehicle {
     node: Node,
     status: Arc<watch::Sender<ControllerStatus>>,
