@@ -31,7 +31,7 @@ const PROGRAMS: [(&str, &str); 3] = [
 ];
 /// How long cameras may announce themselves over MAVLink and answer: they send a heartbeat each second.
 const ASK_FOR: Duration = Duration::from_secs(5);
-/// What a table with a stream of RTSP needs.
+/// The hint below a table with a stream of RTSP.
 const RTSP_HINT: &str = if cfg!(feature = "rtsp") {
     ""
 } else {

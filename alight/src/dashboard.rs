@@ -16,7 +16,7 @@ use crate::keys::self_signed;
 use crate::services::{self, Service};
 use crate::terminal::{print, write_error};
 
-/// How far a page stands back when the processor is short.
+/// The priority of a page relative to the processes of the flight (nice value).
 const NICENESS: i32 = 5;
 const DAY_S: u64 = 86_400;
 
@@ -34,7 +34,7 @@ pub(crate) struct DashboardArgs {
 enum Action {
     /// Print a token that opens the page from another machine. It is shown once, and kept as a hash.
     Token {
-        /// What its holder may do.
+        /// The rights of its holder.
         #[arg(long, value_enum, default_value_t)]
         kind: TokenKind,
         /// Days until it ends.
@@ -50,7 +50,7 @@ enum Action {
     /// Make a certificate for the page and its private key, with which it is encrypted. The certificate signs itself, so that
     /// a browser asks once whether to trust it: compare the fingerprint that this prints.
     Certificate {
-        /// Output file; the key is written beside it with the ending `.key` [default: alight/dashboard.pem in the user's
+        /// Output file; the key is written next to it with the ending `.key` [default: alight/dashboard.pem in the user's
         /// state folder].
         #[arg(short, long, value_name = "FILE.pem")]
         output: Option<PathBuf>,
@@ -64,7 +64,7 @@ enum Action {
     },
 }
 
-/// What the holder of a token may do.
+/// The rights of the holder of a token.
 #[derive(Clone, Copy, Debug, Default, ValueEnum)]
 enum TokenKind {
     /// Look.

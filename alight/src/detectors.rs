@@ -18,10 +18,10 @@ use crate::command::send_to_controller;
 use crate::runtime::with_node;
 use crate::terminal::{aligned, print};
 
-/// Duration of listening: every detector publishes its information once a second.
+/// Duration of the subscription: every detector publishes its information once a second.
 const LISTENING: Duration = Duration::from_millis(1500);
 /// Further time for the controller's configuration, which is published every 3 s.
-const CONFIGURATION_PATIENCE: Duration = Duration::from_secs(2);
+const CONFIGURATION_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// The arguments of `alight detectors`.
 #[derive(Args)]
@@ -47,7 +47,7 @@ enum Action {
     },
     /// Prefer detectors that run at this place, while they are healthy, or none to another.
     Prefer {
-        /// The place; `any` takes back what was preferred.
+        /// The place; `any` removes the preference.
         #[arg(value_enum)]
         place: Where,
         #[command(flatten)]
@@ -124,7 +124,7 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
     // Ends by the timeout.
     let _ = tokio::time::timeout(LISTENING, receive).await;
     if status.is_some() && marker.is_none() {
-        let next = tokio::time::timeout(CONFIGURATION_PATIENCE, configurations.next()).await;
+        let next = tokio::time::timeout(CONFIGURATION_TIMEOUT, configurations.next()).await;
         marker = next.ok().flatten().as_ref().and_then(marker_of);
     }
     let ready: BTreeSet<String> = node.alive("detector", "*").await?.into_iter().collect();
@@ -160,9 +160,9 @@ fn marker_of(controller: &Configuration) -> Option<String> {
     table.get("marker")?.as_str().map(str::to_owned)
 }
 
-/// What is known of the controller.
+/// The state of the controller.
 enum Controller {
-    /// None answers, and why.
+    /// No controller answers, with the reason.
     Absent(String),
     /// One is running, and no status of it could be read.
     Unread,
@@ -174,16 +174,16 @@ enum Controller {
 struct Overview {
     /// Whether one is running.
     controller: bool,
-    /// Whether its status could be read: without it nothing is known of which detector is in use.
+    /// Whether its status could be read: without it the detector in use is not known.
     status_read: bool,
     active: Option<String>,
     why: String,
     preference: String,
     changes: u64,
-    /// The marker of the landing; `None` when the controller did not tell it.
+    /// The marker of the landing; `None` when the controller did not publish it.
     marker: Option<String>,
     detectors: Vec<Entry>,
-    /// What the controller refuses, which detectors disagree, and which look for another marker.
+    /// Warnings: refused detections, detectors that disagree, and detectors that look for another marker.
     warnings: Vec<String>,
 }
 
@@ -191,9 +191,10 @@ struct Overview {
 #[derive(Serialize)]
 struct Entry {
     id: String,
-    /// `active`, `shadow`, `stale`, `blind`, `no-pose` for one that is blind because it gives no pose, `outvoted`; `waiting` for one from which the controller has received nothing, and
+    /// `active`, `shadow`, `stale`, `blind`, `no-pose` for one that is blind because it gives no pose, `outvoted`; `waiting` for one from
+    /// which the controller has received nothing, and
     /// `other-marker` for one that answers and never reports the marker of the landing. Where no controller's status is read,
-    /// `publishing`, or `silent` for one of which nothing came.
+    /// `publishing`, or `silent` for one without messages.
     state: &'static str,
     place: Option<Place>,
     host: Option<String>,
@@ -304,7 +305,7 @@ impl Overview {
         let summary = match (self.controller, &self.active) {
             (false, _) => format!("No controller answers, so none is in use: {}", self.why),
             (true, _) if !self.status_read => {
-                "A controller is running, and no status of it can be read: is it of another version, or does it stand still? \
+                "A controller is running, and no status of it can be read: is it of another version, or is it stopped? \
                  Which detector is in use is not known."
                     .to_owned()
             }
@@ -414,20 +415,23 @@ mod tests {
         assert!(lines[3].starts_with("late") && lines[3].contains("waiting"), "{table}");
         assert!(lines[4].contains("preferred: ground; 3 changes"), "{table}");
         assert!(lines[5].starts_with("Warning: detections of `late`"), "{table}");
-        let absent = Controller::Absent("nobody listens at 10.0.0.1:7448".to_owned());
-        let nobody = Overview::new(absent, None, &announced, &running, &none).table();
-        let lines: Vec<&str> = nobody.lines().collect();
-        assert!(lines[1].starts_with("late") && lines[1].contains("silent"), "{nobody}");
-        assert!(lines[2].contains("publishing") && lines[2].contains("10.0 Hz"), "{nobody}");
-        assert!(nobody.contains("No controller answers"), "{nobody}");
-        assert!(nobody.contains("nobody listens at 10.0.0.1:7448"), "{nobody}");
+        let absent = Controller::Absent("no process listens at 10.0.0.1:7448".to_owned());
+        let without_status = Overview::new(absent, None, &announced, &running, &none).table();
+        let lines: Vec<&str> = without_status.lines().collect();
+        assert!(lines[1].starts_with("late") && lines[1].contains("silent"), "{without_status}");
+        assert!(
+            lines[2].contains("publishing") && lines[2].contains("10.0 Hz"),
+            "{without_status}"
+        );
+        assert!(without_status.contains("No controller answers"), "{without_status}");
+        assert!(without_status.contains("no process listens at 10.0.0.1:7448"), "{without_status}");
         // As its configuration is read, whose version is the same.
         let marker = Some("rings".to_owned());
         let unread = Overview::new(Controller::Unread, marker, &announced, &BTreeMap::new(), &none);
         assert!(unread.controller && !unread.status_read);
         let unread = unread.table();
         assert!(unread.starts_with("No detector is there: none is alive"), "{unread}");
-        assert!(!unread.contains("LATENCY") && !nobody.contains("No detector is there"));
+        assert!(!unread.contains("LATENCY") && !without_status.contains("No detector is there"));
         assert!(unread.contains("A controller is running") && !unread.contains("No controller"));
         assert!(unread.contains("is it of another version"), "{unread}");
     }
@@ -438,7 +442,7 @@ mod tests {
             ("main", DetectorState::Active, "rings:0.15341"),
             ("blind", DetectorState::Blind, "rings:0.15341"),
             ("late", DetectorState::Stale, "aruco-4x4-50:7:0.15"),
-            ("liar", DetectorState::Outvoted, "rings:0.15341"),
+            ("faulty", DetectorState::Outvoted, "rings:0.15341"),
             ("tag", DetectorState::Blind, "aruco-4x4-50:7:0.15"),
             ("uncalibrated", DetectorState::Blind, "rings:0.15341"),
         ];
@@ -481,7 +485,8 @@ mod tests {
         let controller = Controller::Read(Box::new(status));
         let overview =
             Overview::new(controller, marker, &announced, &BTreeMap::new(), &without_pose);
-        let told: Vec<_> = overview.detectors.iter().map(|it| (it.id.as_str(), it.state)).collect();
+        let states: Vec<_> =
+            overview.detectors.iter().map(|it| (it.id.as_str(), it.state)).collect();
         let expected = [
             ("main", "active"),
             ("blind", "blind"),
@@ -490,7 +495,7 @@ mod tests {
             ("tag", "other-marker"),
             ("uncalibrated", "no-pose"),
         ];
-        assert_eq!(told, expected);
+        assert_eq!(states, expected);
         let table = overview.table();
         let said =
             "Warning: detector `tag` looks for aruco-4x4-50:7:0.15, and the landing is on rings;";

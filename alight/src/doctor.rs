@@ -58,11 +58,10 @@ const MIN_MEMLOCK: u64 = 64 << 20;
 /// Number of round trips to each process.
 const ROUND_TRIPS: u32 = 10;
 const REPLY_TIMEOUT: Duration = Duration::from_millis(300);
-/// What to do about a network that is open to all.
+/// The remedy for a network that is open to all.
 const MAKE_KEYS: &str = "make keys (`alight keys`, docs/deploy.md), and remove `insecure`";
-/// What to do where no detector is alive.
-const START_ONE: &str =
-    "start one (`alight up`, `alight detector`); the output of the one that ended says why it did";
+/// The remedy if no detector is alive.
+const START_ONE: &str = "start one (`alight up`, `alight detector`); the output of the one that ended contains the reason";
 const OPEN_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The severity of a finding.
@@ -81,7 +80,7 @@ struct Finding {
     about: &'static str,
     /// The observation.
     finding: String,
-    /// What to do about it.
+    /// The remedy.
     remedy: Option<String>,
 }
 
@@ -141,7 +140,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     let mut network = args.network.network();
     let mut expected = Vec::new();
     let mut checked = Checked::default();
-    // On the drone what is asked stays on the machine, and needs no key.
+    // On the drone the requests stay on the machine, and need no key.
     let mut needs_key = true;
     if let (Some(role), None) = (args.role, &args.config) {
         bail!(WrongUse(without_site(role)));
@@ -193,7 +192,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
         })?,
         Err(_) if is_key_wrong => findings.doubtful(
             "network",
-            "not looked at, as the operator's key cannot be used".to_owned(),
+            "not checked, as the operator's key cannot be used".to_owned(),
             "fix the key, then run this again",
         ),
         Err(problem) => findings.wrong(
@@ -216,7 +215,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::from(u8::from(findings.count(Verdict::Wrong) > 0)))
 }
 
-/// What to say to a role without the site in which its processes stand.
+/// The error for a role without the site that lists its processes.
 fn without_site(role: Role) -> String {
     let role = role.name();
     format!(
@@ -321,21 +320,20 @@ fn check_devices(findings: &mut Findings, job: &Job, service: Service, folder: &
     }
 }
 
-/// Checks that the autopilots' serial ports can be opened. `has_controller` says whether one is ready, which holds its port for
-/// itself alone.
+/// Checks that the autopilots' serial ports can be opened. `has_controller`: one is ready, which has exclusive use of its port.
 fn check_serial_ports(findings: &mut Findings, jobs: &[Job], has_controller: bool) {
     for job in jobs.iter().filter(|job| job.service == Some(Service::Controller)) {
         let Ok(config) = job.layers.load::<controller::Config>() else { continue };
         if let Some(device) = config.settings.serial_device()
             && let Err(cause) = std::fs::OpenOptions::new().read(true).write(true).open(&device)
         {
-            tell_unopened(findings, &device, &cause, has_controller);
+            report_unopened(findings, &device, &cause, has_controller);
         }
     }
 }
 
-/// Tells what it means that a serial port cannot be opened.
-fn tell_unopened(findings: &mut Findings, device: &str, cause: &Error, has_controller: bool) {
+/// Reports that a serial port cannot be opened, with the cause and the remedy.
+fn report_unopened(findings: &mut Findings, device: &str, cause: &Error, has_controller: bool) {
     match cause.kind() {
         ErrorKind::ResourceBusy if has_controller => findings.good(
             "autopilot",
@@ -356,21 +354,21 @@ fn tell_unopened(findings: &mut Findings, device: &str, cause: &Error, has_contr
     }
 }
 
-/// What to watch of the network.
+/// For how long and with which frames the network is watched.
 #[derive(Clone, Copy)]
 struct Watched {
     duration: Duration,
     has_raw_frames: bool,
 }
 
-/// What was received from the network.
+/// The messages that were received from the network.
 #[derive(Default)]
 struct Seen {
     peers: Vec<(String, String)>,
     healths: Vec<Health>,
     cameras: Vec<CameraInfo>,
     status: Option<ControllerStatus>,
-    /// What came of each detector's detections, by its name; some detectors tell no health.
+    /// The number of frames and detections of each detector, by its name; some detectors publish no health.
     detectors: BTreeMap<String, Searched>,
     /// The cameras whose frames they search.
     searched: BTreeSet<String>,
@@ -382,8 +380,8 @@ struct Seen {
 }
 
 impl Seen {
-    /// Whether a camera or a detector was heard by what it is there for.
-    fn hears(&self, service: &str, instance: &str) -> bool {
+    /// Whether frames of a camera or detections of a detector were received.
+    fn has_received(&self, service: &str, instance: &str) -> bool {
         match service {
             "detector" => self.detectors.contains_key(instance),
             "camera-pub" => {
@@ -405,7 +403,7 @@ impl Seen {
         self.peers.iter().any(|(service, _)| service == "controller")
     }
 
-    /// Whether a detector is alive: it is ready, or heard by its detections or by what it tells of itself.
+    /// Whether a detector is alive: it is ready, or its detections or its information were received.
     fn has_detector(&self) -> bool {
         !self.detectors.is_empty() || self.peers.iter().any(|(service, _)| service == "detector")
     }
@@ -445,11 +443,11 @@ struct ReceivedFrame {
     header: FrameHeader,
     bytes: usize,
     received_ns: i64,
-    /// The width of edges in it, where that was looked at.
+    /// The width of edges in it, if that was measured.
     edge_width_px: Option<f64>,
 }
 
-/// Checks what is heard on the network, and returns that.
+/// Checks the messages on the network, and returns them.
 async fn check_network(
     findings: &mut Findings,
     node: Node,
@@ -612,7 +610,7 @@ fn check_reply(
 ) {
     let is_its = |health: &&Health| health.service == service && health.instance == instance;
     let health = seen.healths.iter().find(is_its);
-    let who = match health {
+    let process = match health {
         Some(health) => {
             format!("{service} `{instance}` on {} (alight {})", health.host, health.version)
         }
@@ -620,17 +618,18 @@ fn check_reply(
     };
     let lost = ROUND_TRIPS as usize - times_ms.len().min(ROUND_TRIPS as usize);
     let Some(median_ms) = stats::quantile(times_ms, 0.5) else {
-        // Cameras and detectors of others need not tell it (docs/wire-format.md).
-        if health.is_none() && seen.hears(service, instance) {
-            return findings.good("services", format!("{who} is present (publishes no health)"));
+        // Cameras and detectors of other programs need not publish it (docs/wire-format.md).
+        if health.is_none() && seen.has_received(service, instance) {
+            return findings
+                .good("services", format!("{process} is present (publishes no health)"));
         }
         return findings.wrong(
             "services",
-            format!("{who} does not answer"),
+            format!("{process} does not answer"),
             "it has another version, or it or the link hangs; see its log",
         );
     };
-    let took = format!("{who} answers in {median_ms:.1} ms");
+    let took = format!("{process} answers in {median_ms:.1} ms");
     match lost {
         0 => findings.good("services", took),
         _ => findings.doubtful(
@@ -643,17 +642,17 @@ fn check_reply(
 
 fn check_healths(findings: &mut Findings, seen: &Seen) {
     for health in &seen.healths {
-        let who = format!("{} `{}`", health.service, health.instance);
-        check_version(findings, &who, &health.version, node::version());
+        let process = format!("{} `{}`", health.service, health.instance);
+        check_version(findings, &process, &health.version, node::version());
         if health.errors.iter().any(|error| error.reason == INSECURE) {
-            findings.doubtful("security", format!("{who}: {INSECURE}"), MAKE_KEYS);
+            findings.doubtful("security", format!("{process}: {INSECURE}"), MAKE_KEYS);
         }
         let others = health.errors.iter().filter(|error| error.reason != INSECURE);
         let errors: Vec<_> = others.map(|e| format!("{} ({} times)", e.reason, e.count)).collect();
         if !errors.is_empty() {
             findings.doubtful(
                 "services",
-                format!("{who} counted errors since its start: {}", errors.join(", ")),
+                format!("{process} counted errors since its start: {}", errors.join(", ")),
                 "its log has the first one of each reason",
             );
         }
@@ -679,16 +678,16 @@ fn check_detectors(findings: &mut Findings, seen: &Seen, watched: Watched) {
 }
 
 /// Compares the version of another process with that of this program.
-fn check_version(findings: &mut Findings, who: &str, theirs: &str, ours: &str) {
-    let told = format!("{who} is alight {theirs}, this is {ours}");
+fn check_version(findings: &mut Findings, process: &str, theirs: &str, ours: &str) {
+    let text = format!("{process} is alight {theirs}, this is {ours}");
     match release(theirs) == release(ours) {
         true if theirs == ours => {}
         true => findings.doubtful(
             "versions",
-            told,
+            text,
             "install the same build on all machines, or know that they fit each other",
         ),
-        false => findings.wrong("versions", told, "install the same version on all machines"),
+        false => findings.wrong("versions", text, "install the same version on all machines"),
     }
 }
 
@@ -696,15 +695,15 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
     let Some(status) = &seen.status else { return };
     let text = format!("{} ({}); autopilot: {}", status.phase, status.why, status.autopilot);
     findings.good("controller", text);
-    // The state of the link is told as text only: `system 1 in GUIDED` where the autopilot is heard.
+    // The state of the link is published as text only: `system 1 in GUIDED` if the autopilot's heartbeat is received.
     let link = &status.autopilot;
-    let is_heard = link.starts_with("system ") && !link.ends_with("is silent");
-    if !is_heard {
+    let is_received = link.starts_with("system ") && !link.ends_with("is silent");
+    if !is_received {
         findings.wrong(
             "autopilot",
-            format!("the controller does not hear it: {link}"),
+            format!("the controller does not receive its heartbeat: {link}"),
             match link.contains(": ") {
-                true => "no landing starts without it: do as the controller says above",
+                true => "no landing starts without it: do as the controller advises above",
                 false => "no landing starts without it: check that it is on, its cable, and `autopilot.address`",
             },
         );
@@ -714,10 +713,10 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
             "setpoint timeout",
             format!("without setpoints the autopilot stops after {seconds:.1} s; a landing shortens this to `autopilot.setpoint_timeout_s`"),
         ),
-        None if !is_heard => {}
+        None if !is_received => {}
         None => findings.doubtful(
             "setpoint timeout",
-            "the autopilot has not told its GUID_TIMEOUT or COM_OF_LOSS_T; landings are slower for it".to_owned(),
+            "the autopilot has not reported its GUID_TIMEOUT or COM_OF_LOSS_T; landings are slower for it".to_owned(),
             "check that it answers parameter requests on this link",
         ),
     }
@@ -780,14 +779,14 @@ mod tests {
         let args = |words: &[&str]| Tool::try_parse_from(words).unwrap().doctor;
         let problem = run(&args(&["alight", "local"])).unwrap_err();
         assert!(problem.is::<WrongUse>());
-        let told = problem.to_string();
-        assert!(told.contains("`alight doctor local --config site.toml`"), "{told}");
-        assert!(told.contains("without a role, `alight doctor` checks this machine"), "{told}");
+        let error = problem.to_string();
+        assert!(error.contains("`alight doctor local --config site.toml`"), "{error}");
+        assert!(error.contains("without a role, `alight doctor` checks this machine"), "{error}");
     }
 
     #[test]
     fn another_build_of_the_same_version_is_doubtful() {
-        let told = |theirs: &str| {
+        let counts = |theirs: &str| {
             let mut findings = Findings::default();
             check_version(
                 &mut findings,
@@ -797,29 +796,29 @@ mod tests {
             );
             (findings.count(Verdict::Doubtful), findings.count(Verdict::Wrong))
         };
-        assert_eq!(told("0.1.0 (1a2b3c4d5, 2026-11-27)"), (0, 0));
-        assert_eq!(told("0.1.0 (1a2b3c4d5, 2026-11-27, changed)"), (1, 0));
-        assert_eq!(told("0.1.0"), (1, 0));
-        assert_eq!(told("0.2.0 (1a2b3c4d5, 2026-11-27)"), (0, 1));
+        assert_eq!(counts("0.1.0 (1a2b3c4d5, 2026-11-27)"), (0, 0));
+        assert_eq!(counts("0.1.0 (1a2b3c4d5, 2026-11-27, changed)"), (1, 0));
+        assert_eq!(counts("0.1.0"), (1, 0));
+        assert_eq!(counts("0.2.0 (1a2b3c4d5, 2026-11-27)"), (0, 1));
     }
 
     #[test]
-    fn what_came_instead_of_the_autopilots_heartbeat_is_told() {
-        let told = |autopilot: &str| {
+    fn the_reason_for_a_missing_heartbeat_is_reported() {
+        let findings_text = |autopilot: &str| {
             let status =
                 ControllerStatus { autopilot: autopilot.into(), ..ControllerStatus::default() };
             let mut findings = Findings::default();
             check_landing(&mut findings, &Seen { status: Some(status), ..Seen::default() });
             findings.text()
         };
-        let other = told(
+        let other = findings_text(
             "no heartbeat of system 7 yet, but of 1: set `autopilot.system_id` to the vehicle's",
         );
         assert!(
-            other.contains("but of 1: set") && other.contains("do as the controller says"),
+            other.contains("but of 1: set") && other.contains("do as the controller advises"),
             "{other}"
         );
-        let silent = told("no heartbeat yet, nothing came");
+        let silent = findings_text("no heartbeat yet, nothing came");
         assert!(silent.contains("nothing came") && silent.contains("its cable"), "{silent}");
     }
 
@@ -848,7 +847,7 @@ mod tests {
             state,
             ..Candidate::sample()
         };
-        let told = |peers: &[&str], candidate: Option<Candidate>| {
+        let findings_text = |peers: &[&str], candidate: Option<Candidate>| {
             let status = ControllerStatus {
                 active_detector: candidate.as_ref().map(|it| it.detector.clone()),
                 detector_why: "the last one has gone".into(),
@@ -863,16 +862,19 @@ mod tests {
         };
         let both = ["controller", "detector"];
         let active = Some(candidate(true, DetectorState::Active));
-        assert!(told(&both, active.clone()).ends_with("Nothing is wrong."));
-        let none = told(&["controller"], None);
+        assert!(findings_text(&both, active.clone()).ends_with("Nothing is wrong."));
+        let none = findings_text(&["controller"], None);
         assert!(none.contains("WRONG  detector      none is alive"), "{none}");
         assert!(none.contains("the last one has gone"), "{none}");
-        assert!(told(&["controller"], active).contains("none is alive"), "it is used no more");
-        let gone = told(&both, Some(candidate(false, DetectorState::Stale)));
+        assert!(
+            findings_text(&["controller"], active).contains("none is alive"),
+            "it is no longer used"
+        );
+        let gone = findings_text(&both, Some(candidate(false, DetectorState::Stale)));
         assert!(gone.contains("WRONG") && gone.contains("`main` was in use"), "{gone}");
-        let late = told(&both, Some(candidate(true, DetectorState::Stale)));
+        let late = findings_text(&both, Some(candidate(true, DetectorState::Stale)));
         assert!(late.ends_with("0 wrong, 1 doubtful."), "{late}");
-        assert!(told(&both, None).ends_with("0 wrong, 1 doubtful."));
+        assert!(findings_text(&both, None).ends_with("0 wrong, 1 doubtful."));
     }
 
     #[test]
@@ -882,7 +884,7 @@ mod tests {
         )
         .unwrap();
         let expected = site.jobs(Role::Ground).unwrap();
-        let told = |ready: &[&str]| {
+        let findings_text = |ready: &[&str]| {
             let peers = ready.iter().map(|name| ("detector".to_owned(), (*name).to_owned()));
             let peers = [("controller".to_owned(), "main".to_owned())].into_iter().chain(peers);
             let seen = Seen { peers: peers.collect(), ..Seen::default() };
@@ -891,29 +893,29 @@ mod tests {
             check_presence(&mut findings, &seen, &expected, watched);
             findings.text()
         };
-        assert!(told(&["onboard", "ground"]).ends_with("Nothing is wrong."));
-        let another = told(&["onboard"]);
+        assert!(findings_text(&["onboard", "ground"]).ends_with("Nothing is wrong."));
+        let another = findings_text(&["onboard"]);
         assert!(another.contains("no detector `ground` is ready"), "{another}");
         assert!(another.ends_with("0 wrong, 1 doubtful."), "{another}");
-        assert!(told(&[]).ends_with("1 wrong, 0 doubtful."));
+        assert!(findings_text(&[]).ends_with("1 wrong, 0 doubtful."));
     }
 
     #[test]
     fn a_serial_port_that_is_in_use_is_well_while_a_controller_runs() {
-        let told = |kind: ErrorKind, has_controller| {
+        let findings_text = |kind: ErrorKind, has_controller| {
             let mut findings = Findings::default();
-            tell_unopened(&mut findings, "/dev/ttyAMA0", &kind.into(), has_controller);
+            report_unopened(&mut findings, "/dev/ttyAMA0", &kind.into(), has_controller);
             findings.text()
         };
-        let held = told(ErrorKind::ResourceBusy, true);
+        let held = findings_text(ErrorKind::ResourceBusy, true);
         assert!(held.contains("/dev/ttyAMA0 is in use by another program"), "{held}");
         assert!(held.ends_with("Nothing is wrong."), "{held}");
-        let taken = told(ErrorKind::ResourceBusy, false);
+        let taken = findings_text(ErrorKind::ResourceBusy, false);
         assert!(taken.contains("no controller is ready") && taken.contains("fuser"), "{taken}");
         assert!(taken.ends_with("0 wrong, 1 doubtful."), "{taken}");
         for kind in [ErrorKind::NotFound, ErrorKind::PermissionDenied] {
             for has_controller in [true, false] {
-                let text = told(kind, has_controller);
+                let text = findings_text(kind, has_controller);
                 assert!(text.contains("cannot be opened") && text.contains("dialout"), "{text}");
                 assert!(text.ends_with("1 wrong, 0 doubtful."), "{text}");
             }
@@ -921,7 +923,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_or_detector_that_tells_no_health_is_well_while_it_is_heard() {
+    fn a_camera_or_detector_without_health_is_well_while_its_messages_come() {
         let model = geometry::CameraModel::pinhole(640, 480, 1800.0);
         let info = CameraInfo::new("down", &model, &geometry::Transform::identity());
         let seen = Seen {
@@ -929,20 +931,20 @@ mod tests {
             detectors: BTreeMap::from([("mine".to_owned(), Searched::default())]),
             ..Seen::default()
         };
-        let told = |service, instance| {
+        let findings_text = |service, instance| {
             let mut findings = Findings::default();
             check_reply(&mut findings, &seen, service, instance, &[]);
             findings.text()
         };
         for (service, instance) in [("camera-pub", "down"), ("detector", "mine")] {
-            let text = told(service, instance);
+            let text = findings_text(service, instance);
             let well = format!("{service} `{instance}` is present (publishes no health)");
             assert!(text.contains(&well) && text.ends_with("Nothing is wrong."), "{text}");
         }
         for (service, instance) in
             [("camera-pub", "up"), ("detector", "no"), ("controller", "mine")]
         {
-            let text = told(service, instance);
+            let text = findings_text(service, instance);
             assert!(text.contains("does not answer") && text.contains("1 wrong"), "{text}");
         }
     }

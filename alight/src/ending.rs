@@ -1,4 +1,4 @@
-//! The ending of a file's name, which says its format.
+//! Chooses a file's format by the ending of its name, and refuses other endings.
 
 use std::path::{Path, PathBuf};
 
@@ -18,7 +18,7 @@ impl<T> Ending<T> {
 /// The format that the ending of a file's name stands for, in upper or lower case.
 ///
 /// # Errors
-/// Which endings there are.
+/// The known endings.
 pub(crate) fn format_of<T: Copy>(file: &Path, formats: &[Ending<T>]) -> Result<T, String> {
     let ending = file.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     let named = formats.iter().find(|known| known.name == ending).map(|known| known.format);

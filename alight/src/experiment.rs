@@ -151,7 +151,7 @@ struct MarkersArgs {
     /// Folder of photographs with `labels.jsonl`, to test on as well.
     #[arg(long, value_name = "DIR")]
     photographs: Option<PathBuf>,
-    /// What the camera makes of the light on its sensor: linear (nothing), usb, raspberry-pi, industrial,
+    /// The camera's processing of the light on its sensor: linear (none), usb, raspberry-pi, industrial,
     /// action-camera, phone or ip-camera. May be repeated; then a table compares them.
     #[arg(long = "processing", value_name = "NAME", default_value = "linear")]
     processings: Vec<Preset>,

@@ -1,5 +1,5 @@
-//! A UDP proxy between the simulated autopilot and the controller, in real time: it delays, drops and changes
-//! MAVLink packets while a fault of the link lasts.
+//! A UDP proxy between the simulated autopilot and the controller, in real time: it delays, drops and changes MAVLink packets while a fault
+//! of the link persists.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -27,7 +27,7 @@ pub(crate) struct Proxy {
 }
 
 impl Proxy {
-    /// Passes on what arrives at `world_port` to the controller's port, and back.
+    /// Forwards datagrams from `world_port` to the controller's port, and back.
     ///
     /// # Errors
     /// When a port is in use.
@@ -65,7 +65,7 @@ async fn pass(
     let mut autopilot: Option<SocketAddr> = None;
     let mut due = interval(PERIOD);
     loop {
-        // An error of a socket is that of a peer which is away, and passes.
+        // An error of a socket means that the peer is not there at the moment.
         tokio::select! {
             Ok((length, peer)) = world.recv_from(&mut from) => {
                 autopilot = Some(peer);

@@ -1,5 +1,5 @@
-//! The grey image of a camera's frame received from a topic: raw samples converted, JPEG decoded; of a frame
-//! in parts the largest at full resolution.
+//! Converts a frame received from a topic into a grey image: raw samples converted, JPEG decoded; of a frame in parts the largest at full
+//! resolution.
 
 use std::path::Path;
 

@@ -2,8 +2,8 @@
 //! keeps the list of holders, and makes passphrases for signed MAVLink packets.
 //!
 //! The common name of a certificate is its role with its vehicle, and of a detector its name
-//! (`crates/node/src/access.rs`); `zenoh-config/secured.json5` has the rights of each role. The list of holders
-//! beside the authority's key says who may connect; who is revoked there stays out.
+//! (`crates/node/src/access.rs`); `zenoh-config/secured.json5` has the rights of each role. The list of holders next to the authority's key
+//! names the holders that may connect; a revoked holder stays refused.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions, Permissions};
@@ -60,7 +60,7 @@ enum Action {
         days: u32,
     },
     /// Make a key and its certificate: `ROLE.key` and `ROLE.pem`, of a detector `detector.NAME`; with `authority.pem`
-    /// and the list of holders, `holders.txt`, beside them.
+    /// and the list of holders, `holders.txt`, next to them.
     Issue {
         /// Role of the holder, which has its access rights.
         #[arg(long, value_enum)]
@@ -69,7 +69,7 @@ enum Action {
         /// [default for a detector: main].
         #[arg(long, value_name = "NAME")]
         name: Option<String>,
-        /// The vehicle's name; the key is worth nothing at another one.
+        /// The vehicle's name; other vehicles refuse the key.
         #[arg(long, value_name = "NAME", default_value = "drone")]
         vehicle: String,
         /// Output directory.
@@ -86,7 +86,7 @@ enum Action {
         #[arg(long, value_name = "DAYS", default_value_t = 365, value_parser = clap::value_parser!(u32).range(1..=36_500))]
         days: u32,
     },
-    /// List who may connect, by the list of holders in a directory (the authority's, or its copy on any machine), and the keys
+    /// List the holders that may connect, by the list in a directory (the authority's, or its copy on any machine), and the keys
     /// that are there.
     List {
         /// The directory.
@@ -103,7 +103,7 @@ enum Action {
         #[arg(short, long, value_name = "FILE")]
         output: PathBuf,
     },
-    /// Shut the holder of a key out, for good: copy the list of holders that this writes to the keys of every relay
+    /// Revoke the key of a holder permanently: copy the list of holders that this writes to the keys of every relay
     /// (`alight up drone`, `alight up relay`), which take it up within a second.
     Revoke {
         /// The holder as the list names it: ROLE@VEHICLE or ROLE.NAME@VEHICLE.
@@ -166,7 +166,7 @@ impl Role {
     }
 }
 
-/// Who may connect, by name.
+/// The holders that may connect, by name.
 #[derive(Debug, Serialize)]
 struct HolderList {
     holders: Vec<Listed>,
@@ -182,11 +182,11 @@ struct Listed {
     file: Option<String>,
     /// Days until the certificate expires; negative when it has.
     expires_in_days: Option<i64>,
-    /// By this machine's clock the certificate is of the future.
+    /// By this machine's clock the certificate is not valid yet.
     is_not_valid_yet: bool,
 }
 
-/// What the list of holders says of one.
+/// The state of a holder in the list.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 enum Standing {
@@ -368,7 +368,7 @@ fn issue(
     Ok(files.into())
 }
 
-/// Shuts a holder out; returns the list, which is to be copied to the relays.
+/// Revokes a holder; returns the list, which is to be copied to the relays.
 fn revoke(holder: &Holder, authority: &Path) -> anyhow::Result<PathBuf> {
     let mut holders = read_holders(authority)?;
     holders.revoke(holder)?;
@@ -425,7 +425,7 @@ fn read_holders(authority: &Path) -> anyhow::Result<Holders> {
     }
 }
 
-/// Replaces the list in a directory, at once: a relay never reads half of it.
+/// Replaces the list in a directory atomically: a relay never reads half of it.
 fn write_holders(directory: &Path, holders: &Holders) -> anyhow::Result<PathBuf> {
     let path = directory.join(HOLDERS);
     let written = tempfile::NamedTempFile::new_in(directory).and_then(|mut file| {
@@ -437,11 +437,11 @@ fn write_holders(directory: &Path, holders: &Holders) -> anyhow::Result<PathBuf>
     Ok(path)
 }
 
-/// Gives a new list owner and mode of the one that it replaces: a relay that may not read it goes on with the old one.
+/// Gives a new list owner and mode of the one that it replaces: a relay that may not read it continues with the old one.
 fn keep_access(file: &File, replaced: &Path) -> io::Result<()> {
     let mode = match fs::metadata(replaced) {
         Ok(before) => {
-            // Who may not give it to another user leaves it readable for that one.
+            // A user without the right to change the owner leaves it readable for the owner.
             let is_kept = fchown(file, Some(before.uid()), Some(before.gid())).is_ok();
             before.permissions().mode() & 0o777 | if is_kept { 0 } else { LIST_MODE }
         }
@@ -490,7 +490,7 @@ fn parameters(name: &str, addresses: &[String], days: u32) -> anyhow::Result<Cer
     Ok(params)
 }
 
-/// Writes the authority's certificate beside the keys, unless it is there.
+/// Writes the authority's certificate next to the keys, unless it is there.
 fn put_authority(path: &Path, certificate: &str) -> anyhow::Result<()> {
     match fs::read_to_string(path) {
         Ok(there) => {

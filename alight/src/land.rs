@@ -369,7 +369,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     children.stop_one(&Service::Controller, &mut note_end).await;
     children.stop_all_but(&Service::Recorder, &mut note_end).await;
     children.stop(note_end).await;
-    // In a user's own network, and beside another landing, detectors may be meant to go on.
+    // In a user's own network, and in parallel to another landing, detectors may be meant to continue.
     if args.zenoh.is_none()
         && rendezvous.unusual_port.is_none()
         && let Ok(landing) = &watched
@@ -394,7 +394,7 @@ fn error_in(line: &str) -> Option<&str> {
     line.strip_prefix("alight: ")
 }
 
-/// What ends the watch of a landing that is not over.
+/// The limits that end the watch of a landing that is not over.
 struct Limits {
     shutdown: Shutdown,
     deadline: Instant,
@@ -516,7 +516,7 @@ async fn another_detector(node: &Node, settings: &ServiceSettings) -> anyhow::Re
     Ok(node.alive("detector", "*").await?.iter().any(|other| *other != own))
 }
 
-/// What the exit of the detector that was started here means for the landing, by the controller's newest status.
+/// The consequence of the exit of the detector that was started here, by the controller's newest status.
 fn without_detector(own: &str, status: Option<&ControllerStatus>) -> String {
     let candidates = status.map_or(&[][..], |status| &status.candidates);
     let mut others = candidates.iter().filter(|it| it.alive && it.detector != own);
@@ -560,7 +560,7 @@ fn is_running(pid: u32) -> bool {
     pid.is_some_and(|pid| test_kill_process(pid) != Err(Errno::SRCH))
 }
 
-/// What the exit of another service means for the landing.
+/// The consequence of the exit of another service for the landing.
 fn consequence(service: Service) -> &'static str {
     match service {
         Service::Controller => {

@@ -1,13 +1,13 @@
 //! Lands a UAV on a printed marker: every service and tool as a subcommand of one program.
 //!
 //! Modules in reading order: `cli` is the command line, with the shared `args`; `services` runs one
-//! service in this process, `record` a recorder or the repair of its file, `replay` a recording back into decisions, `report` one on a page, `dashboard` a page or a token for it, `relay` connects drone and ground; `up` runs the processes of a `site` on
-//! this machine, follows its `peers`, keeps `notes` for the case of a crash and knows the `programs` they need, `keys` makes the site's keys, `doctor` diagnoses it, `cameras` lists what sees; `land`
-//! runs all services as processes and watches the landing, with `children` for the processes, `progress`
-//! for the display and `outcome` for the result; `command` sends a command, `detectors` lists the
-//! running detectors and `swap` replaces one; `detect`, `calibrate`, `rectify`, `marker` and `experiment` with
-//! its campaign of `faults`, flown in `real_time` over a `fault_link` as well, are tools.
-//! `runtime`, `terminal`, `interruption` and `ending` serve all of them.
+//! service in this process, `record` a recorder or the repair of its file, `replay` a recording back into decisions, `report` one on a
+//! page, `dashboard` a page or a token for it, `relay` connects drone and ground; `up` runs the processes of a `site` on
+//! this machine, follows its `peers`, keeps `notes` for the case of a crash and finds the `programs` they need, `keys` makes the site's
+//! keys, `doctor` diagnoses it, `cameras` lists the cameras; `land` runs all services as processes and watches the landing, with `children`
+//! for the processes, `progress` for the display and `outcome` for the result; `command` sends a command, `detectors` lists the running
+//! detectors and `swap` replaces one; `detect`, `calibrate`, `rectify`, `marker` and `experiment` with its campaign of `faults`, flown in
+//! `real_time` over a `fault_link` as well, are tools. `runtime`, `terminal`, `interruption` and `ending` serve all of them.
 
 mod args;
 mod calibrate;

@@ -17,7 +17,7 @@ pub(crate) struct Notes {
     pub(crate) landing: Note,
 }
 
-/// A file that is there while something holds. It counts until the machine is started anew, wherever it is.
+/// A file that exists while a state holds. It counts until the machine is restarted, in any directory.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Note {
     file: Option<PathBuf>,
@@ -92,7 +92,7 @@ impl Note {
         }
     }
 
-    /// Whether it is there, and the machine was not started anew since. A note that is there and cannot be read, as after a full disk,
+    /// Whether it is there, and the machine was not restarted since. A note that is there and cannot be read, as after a full disk,
     /// counts.
     pub(crate) fn is_there(&self) -> bool {
         match self.read() {
@@ -101,7 +101,7 @@ impl Note {
         }
     }
 
-    /// How long ago it was written, if it is there and the machine was not started anew since.
+    /// How long ago it was written, if it is there and the machine was not restarted since.
     pub(crate) fn age(&self) -> Option<Duration> {
         let content = self.read().ok().filter(|content| content.clock == clock_name())?;
         let age_ns = u64::try_from(now_ns().saturating_sub(content.stamp_ns)).ok()?;
@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn a_note_counts_until_it_is_removed_or_the_machine_is_started_anew() {
+    fn a_note_counts_until_it_is_removed_or_the_machine_is_restarted() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("x.landing");
         let note = Note { file: Some(file.clone()) };
@@ -169,7 +169,7 @@ mod tests {
         let long = Duration::from_secs(30);
         assert!(age_of(clock_name(), long).unwrap() >= long);
         assert!(note.is_there());
-        assert_eq!(age_of("before the machine was started anew", Duration::ZERO), None);
+        assert_eq!(age_of("before the machine was restarted", Duration::ZERO), None);
         assert!(!note.is_there());
         // Half of it, and a thing that is no file: it is there, of whatever age.
         std::fs::write(&file, "{").unwrap();

@@ -377,7 +377,7 @@ impl Outcome {
         self.landed && (is_recorded || !self.is_to_be_recorded)
     }
 
-    /// The result beside that of the thesis, as a table.
+    /// The result and that of the thesis, as a table.
     pub(crate) fn table(&self) -> String {
         let mut text = String::new();
         let verdict = match self.landed {
@@ -654,7 +654,7 @@ mod tests {
         let table = landing.outcome().table();
         assert!(table.contains("its file is complete") && !table.contains("--repair"), "{table}");
         landing.recorder(reported("main", "flight-2.mcap", None));
-        assert!(is_done(&landing), "another recorder goes on");
+        assert!(is_done(&landing), "another recorder continues");
         let losing = |key: &str| RecorderStatus {
             dropped: vec![RecorderCount { key: key.into(), count: 3 }],
             ..reported("main", "flight-2.mcap", None)

@@ -173,7 +173,7 @@ impl PeerTable {
         detector.alive = alive;
     }
 
-    /// What is known of a detector; `None` where there is no room for a further one.
+    /// The entry of a detector; `None` if there is no room for a further one.
     fn detector(&mut self, name: &str) -> Option<&mut KnownDetector> {
         let is_full = |table: &Self| {
             table.detectors.len() >= MAX_DETECTORS && !table.detectors.contains_key(name)

@@ -249,7 +249,7 @@ impl Steps {
         self.line(|| name.to_owned());
     }
 
-    /// Prints beside the bar.
+    /// Prints while the bar is suspended.
     pub(crate) fn beside<T>(&self, print: impl FnOnce() -> T) -> T {
         self.bar.suspend(print)
     }

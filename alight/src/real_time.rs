@@ -265,11 +265,11 @@ impl<'a> RealFlight<'a> {
             self.check_parts()?;
             self.begin_and_end_faults()?;
             self.describe();
-            let (since, patience_s) = match self.started {
+            let (since, timeout_s) = match self.started {
                 Some(started) => (started, TIMEOUT_S),
                 None => (opened, START_TIMEOUT_S),
             };
-            if self.is_over() || since.elapsed().as_secs_f64() > patience_s {
+            if self.is_over() || since.elapsed().as_secs_f64() > timeout_s {
                 break;
             }
         }

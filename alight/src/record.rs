@@ -1,4 +1,4 @@
-//! `alight record`: the recorder, and the repair of a file whose recorder was killed.
+//! `alight record`: runs the recorder, or repairs a file whose recorder was killed.
 
 use std::fs::Permissions;
 use std::io::BufWriter;
@@ -15,11 +15,11 @@ use crate::ending::recording;
 use crate::services::{self, Service};
 use crate::terminal::print;
 
-/// How far a recorder stands back when the processor is short.
+/// The priority of a recorder relative to the processes of the flight (nice value).
 const NICENESS: i32 = 5;
 
-/// What the exit status says of a recorder.
-const EXIT_STATUS: &str = "Exit status of a recorder: 1 also when messages that came are in no file, or a file lacks its end, although it goes on \
+/// The meaning of the exit status of a recorder.
+const EXIT_STATUS: &str = "Exit status of a recorder: 1 also when messages that came are in no file, or a file lacks its end, although it continues \
                            recording then; frames that never came to it are counted and are no loss of its.";
 
 /// The arguments of a recorder.
@@ -27,7 +27,7 @@ const EXIT_STATUS: &str = "Exit status of a recorder: 1 also when messages that 
 #[command(after_help = EXIT_STATUS)]
 pub(crate) struct RecordArgs {
     /// The recording, an MCAP file: short for `--set file=FILE`. With `--repair`: the repaired copy [default:
-    /// NAME-repaired.mcap beside it].
+    /// NAME-repaired.mcap in its folder].
     #[arg(short, long, value_name = "FILE.mcap", value_parser = recording)]
     output: Option<PathBuf>,
     /// Let Foxglove and Lichtblick follow the flight at this address, such as 127.0.0.1:8765 (`docs/recording.md`): short for
@@ -37,8 +37,8 @@ pub(crate) struct RecordArgs {
     /// Only serve, and write no file: short for `--set file=`.
     #[arg(long, requires = "serve", conflicts_with = "output")]
     no_file: bool,
-    /// End a recording properly whose recorder was killed, or save what is whole of a damaged one, as a copy. Exit status
-    /// 0 when it was whole, 1 when something is missing.
+    /// End a recording properly whose recorder was killed, or save the readable part of a damaged one, as a copy. Exit status 0 when it was
+    /// complete, 1 when something is missing.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["config", "set", "serve"])]
     repair: Option<PathBuf>,
     #[command(flatten)]
@@ -78,8 +78,8 @@ fn repair(file: &Path, output: Option<&Path>) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     let stem = file.file_stem().unwrap_or_default().to_string_lossy();
-    let beside = file.with_file_name(format!("{stem}-repaired.mcap"));
-    let output = output.unwrap_or(&beside);
+    let default = file.with_file_name(format!("{stem}-repaired.mcap"));
+    let output = output.unwrap_or(&default);
     let doing = || format!("writing {output:?}; name another file with `-o`");
     ensure!(!output.exists(), "{output:?} is there already; name another file with `-o`");
     let found = write_repaired(&recording, output).with_context(doing)?;
@@ -95,7 +95,7 @@ fn repair(file: &Path, output: Option<&Path>) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::FAILURE)
 }
 
-/// Writes the repaired copy, which is there once it is whole: what a full disk lets be written only in part is removed.
+/// Writes the repaired copy, which is there once it is complete: a copy that a full disk cuts short is removed.
 fn write_repaired(recording: &[u8], output: &Path) -> anyhow::Result<flightlog::Repaired> {
     let part = tempfile::Builder::new()
         .prefix(".")
@@ -115,7 +115,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_copy_that_is_not_whole_is_not_left() {
+    fn an_incomplete_copy_is_not_left() {
         let folder = tempfile::tempdir().unwrap();
         let copy = folder.path().join("flight-repaired.mcap");
         assert!(write_repaired(b"no recording", &copy).is_err());

@@ -25,7 +25,7 @@ pub(crate) struct RectifyArgs {
     /// Folder for the images, as PNG in grey, and for `camera.yaml`, the calibration that they have.
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// Replace files that are in the output folder already; without it they are refused. What is read is never replaced.
+    /// Replace files that are in the output folder already; without it they are refused. Input files are never replaced.
     #[arg(long)]
     replace: bool,
     /// Bayer pattern of grey images with a sensor's raw samples: RGGB, GRBG, GBRG or BGGR.

@@ -30,7 +30,7 @@ const PORTS_TIMEOUT: Duration = Duration::from_secs(2);
 /// Pause before it restarts after a panic, so that one at every start does not use all of a core.
 const RELAUNCH_PAUSE: Duration = Duration::from_millis(200);
 
-/// What the health says of a list of holders that cannot be read.
+/// The error in the health of a list of holders that cannot be read.
 const NOT_TAKEN_UP: &str =
     "the list of holders is not taken up, so holders that were revoked since are not shut out";
 
@@ -91,7 +91,7 @@ fn relaunch_after_panics() {
         report(panic);
         std::thread::sleep(RELAUNCH_PAUSE);
         let problem = node::relaunch(&[]);
-        tracing::error!(%problem, "Starting this process anew failed; ending it");
+        tracing::error!(%problem, "Restarting this process failed; ending it");
         std::process::abort();
     }));
 }
@@ -111,8 +111,8 @@ async fn relay(node: Node, shutdown: Shutdown, holders: HoldersFile) -> anyhow::
             _ = reads.tick() => {
                 // Zenoh reads its rights once.
                 if holders.has_changed(node.health()) {
-                    tracing::info!("The list of holders has changed; joining the network anew");
-                    return Err(node::relaunch(&[])).context("starting this process anew");
+                    tracing::info!("The list of holders has changed; joining the network again");
+                    return Err(node::relaunch(&[])).context("restarting this process");
                 }
             }
             () = shutdown.requested() => return Ok(()),
@@ -120,8 +120,8 @@ async fn relay(node: Node, shutdown: Shutdown, holders: HoldersFile) -> anyhow::
         // The peers have given up some of the connections, and none of them reopens those that gossip made. A
         // session that is closed in order meanwhile takes new connections from the others, which are then lost.
         if last.elapsed() > FROZEN {
-            tracing::warn!(gap = ?last.elapsed(), "This process was frozen; joining the network anew");
-            return Err(node::relaunch(&[])).context("starting this process anew");
+            tracing::warn!(gap = ?last.elapsed(), "This process was frozen; joining the network again");
+            return Err(node::relaunch(&[])).context("restarting this process");
         }
         last = Instant::now();
     }

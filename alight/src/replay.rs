@@ -175,7 +175,7 @@ fn compared(searched: &Searched) -> String {
     if searched.unreadable > 0 {
         text.push_str(&format!("{} pictures cannot be read\n", searched.unreadable));
     }
-    let share = |part: usize, of: usize| match of {
+    let fraction = |part: usize, of: usize| match of {
         0 => "-".to_owned(),
         of => format!("{:.1} % ({part} of {of})", 100.0 * part as f64 / of as f64),
     };
@@ -188,9 +188,9 @@ fn compared(searched: &Searched) -> String {
         rows.push([name.into(), of(then), of(now)]);
     };
     row("marker", &|it| it.marker.clone());
-    row("found", &|it| share(it.frames, searched.searched));
+    row("found", &|it| fraction(it.frames, searched.searched));
     if let Some(showing) = searched.showing_the_pad {
-        row("found in flight, pad in the picture", &|it| share(it.visible, showing));
+        row("found in flight, pad in the picture", &|it| fraction(it.visible, showing));
         row("error in space, median", &|it| at(&it.errors_m, 0.5, 1e3, 2, "mm"));
         row("error in space, 95 %", &|it| at(&it.errors_m, 0.95, 1e3, 2, "mm"));
     }

@@ -15,7 +15,7 @@ use crate::args::{WrongUse, whole_number};
 use crate::ending::{Ending, format_of};
 use crate::terminal::{print, write_error};
 
-/// What the exit status says of a report.
+/// The meaning of the exit status of a report.
 const EXIT_STATUS: &str = "Exit status 1 also when there is a page and something of a recording could not be read: a damaged part, its end, \
                            messages of another version. The page says what.";
 
@@ -29,7 +29,7 @@ pub(crate) struct ReportArgs {
     /// Which landing of each recording, from 1 on, where it has several [default: the last].
     #[arg(long, value_name = "N", value_parser = whole_number::<usize>(1..=1_000_000))]
     landing: Option<usize>,
-    /// The page [default: beside the first recording, with its name, `flight.html`; of two flights `one-and-other.html`, with
+    /// The page [default: next to the first recording, with its name, `flight.html`; of two flights `one-and-other.html`, with
     /// `--landing 2` `flight-landing-2.html`]. Its name ends in .html, or in .pdf for a PDF document.
     #[arg(short, long, value_name = "FILE")]
     output: Option<Page>,
@@ -37,11 +37,11 @@ pub(crate) struct ReportArgs {
     /// the folders `1` and `2` in it.
     #[arg(long, value_name = "FOLDER")]
     figures: Option<PathBuf>,
-    /// Replace a page or figures that are there already, which may be another flight's; without it they are refused. The page of
-    /// the same flights is written anew in any case, as is that of one recording with its name and beside it.
+    /// Replace a page or figures that are there already, which may be another flight's; without it they are refused. The page of the same
+    /// flights is written again in any case, as is that of one recording with its name and in its folder.
     #[arg(long)]
     replace: bool,
-    /// What is printed: a line for a bug report, or the flight in numbers as one JSON object; or the line, and the page is a
+    /// Format of the output: a line for a bug report, or the flight in numbers as one JSON object; or the line, and the page is a
     /// PDF document.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
@@ -99,7 +99,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
             args.files
         ))
     );
-    // Also where there is a reason against the page.
+    // Also if the page is refused.
     for flight in &flights {
         let summary = summary(flight);
         match args.format {
@@ -159,7 +159,7 @@ impl ReportArgs {
         Ok(())
     }
 
-    /// The page's place where none is named: beside the first recording, and no other flight's or landing's.
+    /// The page's path if none is named: next to the first recording, and not that of another flight or landing.
     fn beside(&self, flights: &[Flight], extension: &str) -> PathBuf {
         let Some(first) = self.files.first() else { return PathBuf::new() };
         let stem =
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_no_recording_is_named_with_what_is_wrong() {
+    fn a_file_that_is_no_recording_is_named_with_its_error() {
         assert!(refusal(None).contains("reading \"") && refusal(None).contains("flight.mcap"));
         assert!(refusal(Some(b"text")).contains("flight.mcap\" is no recording (MCAP file)"));
         let about = flightlog::About::default();
@@ -370,7 +370,7 @@ mod tests {
         fly(&one, 1);
         fly(&other, 2);
         let text = |name: &str| std::fs::read_to_string(path(name)).unwrap();
-        // Each has its own, and its own is written anew.
+        // Each flight has its own page, which is written again.
         reported(&[&one], &[]).unwrap();
         reported(&[&other], &[]).unwrap();
         reported(&[&one, &other], &[]).unwrap();
@@ -381,7 +381,7 @@ mod tests {
         std::fs::write(path("one.html"), "old").unwrap();
         reported(&[&one], &[]).unwrap();
         assert!(text("one.html") != "old");
-        // A place that was named is of whoever was there first.
+        // A named path belongs to the flight that was written there first.
         let [page, charts] = ["page.html", "charts"].map(|name| path(name).display().to_string());
         let named = ["-o", &page, "--figures", &charts];
         reported(&[&one], &named).unwrap();
@@ -414,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn a_page_of_what_could_not_all_be_read_is_no_success() {
+    fn a_page_of_a_partly_unreadable_recording_is_no_success() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
         let [whole, cut, damaged] = ["whole.mcap", "cut.mcap", "damaged.mcap"].map(path);
@@ -437,7 +437,7 @@ mod tests {
     }
 
     #[test]
-    fn the_page_of_the_same_flight_is_written_anew() {
+    fn the_page_of_the_same_flight_is_written_again() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
         let [one, other] = ["one.mcap", "other.mcap"].map(path);
@@ -456,7 +456,7 @@ mod tests {
             assert!(reported(&[&one, &other], &page) && reported(&[&one, &other], &page));
             assert!(!reported(&[&one], &page) && !reported(&[&other, &one], &page));
         }
-        // Nothing is left beside the pages.
+        // No other file is left next to the pages.
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 4);
     }
 }

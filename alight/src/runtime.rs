@@ -39,7 +39,7 @@ pub(crate) fn with_node<T>(
 }
 
 impl ParentArgs {
-    /// Has this process stop with its parent, if one is named; false when the parent has ended already.
+    /// Lets this process stop with its parent, if one is named; false when the parent has ended already.
     pub(crate) fn follow(&self) -> bool {
         self.stop_with_parent.is_none_or(stop_with_parent)
     }

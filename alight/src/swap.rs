@@ -1,8 +1,8 @@
-//! `alight swap`: starts a new detector beside the one in use, waits until by the controller's comparison both agree, has the
-//! controller change over in flight without a gap, and stops the old one.
+//! `alight swap`: starts a new detector in parallel to the one in use, waits until both agree in the controller's comparison, lets the
+//! controller switch to it in flight without a gap, and stops the old one.
 //!
 //! The new detector is started as a process that outlives this one. On any failure before the old one is stopped, the old one
-//! stays in use, the operator's preference is what it was, and the new one is stopped, unless the old one has gone meanwhile and
+//! stays in use, the operator's preference is restored, and the new one is stopped, unless the old one has gone meanwhile and
 //! no other is left.
 
 mod comparison;
@@ -129,7 +129,7 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
     };
     let mut existing: BTreeSet<String> = node.alive("detector", "*").await?.into_iter().collect();
     existing.extend(first.candidates.iter().map(|candidate| candidate.detector.clone()));
-    // What has the preferred name is used soon, whether it agrees or not.
+    // A detector with the preferred name is used soon, whether it agrees or not.
     if let ControllerCommand::UseDetector(preferred) = preferring(&first.preference, &first) {
         existing.insert(preferred);
     }
@@ -262,7 +262,7 @@ impl NewDetector {
 }
 
 /// A new folder for temporary files that only this user can access: a file of a predictable name in a shared
-/// directory could be a link that somebody else placed there.
+/// directory could be a link that another user placed there.
 fn private_folder() -> anyhow::Result<TempDir> {
     let folder = tempfile::Builder::new().prefix("alight-").tempdir();
     folder.context("making a private folder for the log")
@@ -286,7 +286,7 @@ struct Swap<'a> {
     detections: Subscriber<Detections>,
     configurations: Subscriber<Configuration>,
     comparison: Comparison,
-    /// What the operator preferred before: a detector's name, a place or nothing.
+    /// The operator's preference before: a detector's name, a place or nothing.
     preference: String,
     latest: ControllerStatus,
     presence: Presence,
@@ -443,7 +443,7 @@ impl Swap<'_> {
         {}
     }
 
-    /// In what it differs.
+    /// How it differs, as a text.
     fn difference(&self, shadow: &Candidate) -> String {
         match (shadow.disagreement_m, self.comparison.text()) {
             (None, _) if self.comparison.lacks_pose() => {
@@ -457,7 +457,7 @@ impl Swap<'_> {
         }
     }
 
-    async fn tell(&self, command: &ControllerCommand) -> anyhow::Result<()> {
+    async fn send(&self, command: &ControllerCommand) -> anyhow::Result<()> {
         taken(&self.ask(command).await?)
     }
 
@@ -512,13 +512,13 @@ impl Swap<'_> {
         }
     }
 
-    /// Switches back to the old detector and to what was preferred, and stops the new one, unless it is the last.
+    /// Switches back to the old detector and to the previous preference, and stops the new one, unless it is the last.
     async fn roll_back(&mut self, report: &mut Report) {
         self.learn_status().await;
-        // That the controller was asked for the new one is undone before that ends, so that no frame is missed.
+        // The request for the new one is undone before that one ends, so that no frame is missed.
         let old = report.from.as_deref().filter(|old| self.is_asked && is_alive(&self.latest, old));
         if let Some(old) = old
-            && let Err(problem) = self.tell(&ControllerCommand::UseDetector(old.to_owned())).await
+            && let Err(problem) = self.send(&ControllerCommand::UseDetector(old.to_owned())).await
         {
             write_error(&format!("going back to {old}: {problem:#}"));
         }
@@ -528,7 +528,7 @@ impl Swap<'_> {
             self.end_child().await;
         }
         if self.is_asked
-            && let Err(problem) = self.tell(&preferring(&self.preference, &self.latest)).await
+            && let Err(problem) = self.send(&preferring(&self.preference, &self.latest)).await
         {
             let before = Some(self.preference.as_str()).filter(|it| !it.is_empty());
             let before = before.unwrap_or("any detector");
@@ -572,7 +572,7 @@ fn is_alive(status: &ControllerStatus, name: &str) -> bool {
     find(status, name).is_some_and(|candidate| candidate.alive)
 }
 
-/// A detector that is there beside the new one, best the one that is used.
+/// A detector that is there in addition to the new one, preferably the one in use.
 fn other_there<'a>(report: &Report, status: &'a ControllerStatus) -> Option<&'a str> {
     let new = report.to.as_deref();
     let is_other = |it: &&Candidate| it.alive && new != Some(it.detector.as_str());
@@ -589,7 +589,7 @@ fn is_last(report: &Report, status: &ControllerStatus) -> bool {
     report.from.is_some() && other_there(report, status).is_none()
 }
 
-/// What is left after a swap that failed, in words.
+/// The state after a failed swap, as a text.
 fn left(report: &Report, status: &ControllerStatus) -> String {
     let Some(old) = &report.from else { return "none stays in use".to_owned() };
     let new = report.to.as_deref().unwrap_or_default();
@@ -612,8 +612,8 @@ fn taken(reply: &CommandReply) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The command after which this is preferred; an empty name is none. The controller's status does not tell a place from a detector of
-/// that name: it is taken for the detector while that is there.
+/// The command after which this is preferred; an empty name is none. The controller's status does not distinguish a place from a detector
+/// of that name: it counts as the detector while that is there.
 fn preferring(preference: &str, status: &ControllerStatus) -> ControllerCommand {
     let place = [Place::Onboard, Place::Ground].into_iter().find(|it| it.name() == preference);
     match place.filter(|_| !is_alive(status, preference)) {
@@ -650,7 +650,7 @@ fn agreement(shadow: &Candidate) -> f64 {
     f64::from(shadow.agreed) / f64::from(shadow.compared)
 }
 
-/// What keeps a detector that agrees from being used.
+/// Why a detector that agrees cannot be used.
 fn unfit_because(shadow: &Candidate, frames: u32) -> Option<String> {
     let Candidate { state, agreed, compared, age_ms, latency_ms, .. } = shadow;
     let agrees = *compared >= frames && agreement(shadow) >= MIN_AGREEMENT;
@@ -729,7 +729,7 @@ mod tests {
         };
         let (old, new) = (known("old", true), known("new", true));
         let (gone, spare) = (known("old", false), known("spare", true));
-        for (status, is_kept, told) in [
+        for (status, is_kept, part) in [
             (status(&[old.clone(), new.clone()], Some("old")), false, "old stays in use"),
             // It is silent for a while.
             (status(&[old, new.clone()], None), false, "old stays in use"),
@@ -746,7 +746,7 @@ mod tests {
         ] {
             assert_eq!(is_last(&report(false), &status), is_kept, "{status:?}");
             let left = left(&report(is_kept), &status);
-            assert!(left.contains(told), "{left}");
+            assert!(left.contains(part), "{left}");
         }
         // The new one has ended as well.
         let left = left(&report(false), &status(&[gone], None));
@@ -755,7 +755,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_preferred_is_preferred_again() {
+    fn the_previous_preference_is_restored() {
         let place = ControllerCommand::PreferDetectors;
         let named = |name: &str| ControllerCommand::UseDetector(name.into());
         let with = |alive: bool| ControllerStatus {

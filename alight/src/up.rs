@@ -608,9 +608,9 @@ mod tests {
         assert_eq!(before().by_now(false), Before::Crash);
         notes.landing.write_aged(node::clock_name(), STALE_AFTER);
         assert_eq!(before(), Before::Crash, "a note of so long ago");
-        notes.landing.write_aged("before the machine was started anew", Duration::ZERO);
+        notes.landing.write_aged("before the machine was restarted", Duration::ZERO);
         assert_eq!(before(), Before::Crash);
-        notes.running.write_aged("before the machine was started anew", Duration::ZERO);
+        notes.running.write_aged("before the machine was restarted", Duration::ZERO);
         assert_eq!(before(), Before::Nothing);
         std::fs::write(folder.path().join("alight-x.running"), "half of").unwrap();
         assert_eq!(before(), Before::Crash, "it is there, whatever is in it");

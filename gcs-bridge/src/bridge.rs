@@ -81,7 +81,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     if config.is_open() && node.health().failed(OPEN) {
         tracing::warn!(
             ground = config.ground,
-            "OPEN: whoever speaks first may command the vehicle; name the ground stations (`ground_stations`), or \
+            "OPEN: the first sender may command the vehicle; name the ground stations (`ground_stations`), or \
              let them only look (`ground_may = \"monitor\"`)"
         );
     }

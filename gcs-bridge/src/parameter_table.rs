@@ -1,4 +1,4 @@
-//! Which keys of the controller's configuration are parameters at the ground station, and by which names.
+//! Lists the keys of the controller's configuration that are parameters at the ground station, with their names.
 
 /// A parameter: its name in MAVLink and its key.
 #[derive(Debug, PartialEq)]
@@ -7,7 +7,7 @@ pub(crate) struct Parameter {
     pub(crate) name: &'static str,
     /// Key of the controller's configuration, with its unit in the name.
     pub(crate) key: &'static str,
-    /// The words that the key may be, each with its place as its number; none for a number, and for yes or no.
+    /// The possible words of the key, each with its index as its number; none for a number, and for yes or no.
     pub(crate) words: &'static [&'static str],
 }
 

@@ -17,7 +17,7 @@ use crate::parameter_table::{Parameter, TABLE};
 
 /// Maximum length of a configuration that is read, in bytes.
 const MAX_TOML: usize = 200_000;
-/// Values sent at once; a list has an autopilot's beside it on the same line.
+/// Values sent at once; a list shares the line with the autopilot's list.
 const BURST: usize = 3;
 /// Silence of its controller after which another one's configuration is shown, in nanoseconds; it is repeated every 3 s.
 const CONTROLLER_TIMEOUT_NS: i64 = 10_000_000_000;

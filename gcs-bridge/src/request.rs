@@ -247,9 +247,9 @@ mod tests {
     fn only_the_marker_can_be_tracked() {
         let mut camera = camera(None);
         let rectangle = MavCmd::MAV_CMD_CAMERA_TRACK_RECTANGLE;
-        let beside = ask(&mut camera, rectangle, [0.5, 0.5, 0.6, 0.6]);
-        assert_eq!(beside.result, MavResult::MAV_RESULT_DENIED);
-        assert!(beside.why.is_some());
+        let outside = ask(&mut camera, rectangle, [0.5, 0.5, 0.6, 0.6]);
+        assert_eq!(outside.result, MavResult::MAV_RESULT_DENIED);
+        assert!(outside.why.is_some());
         assert_eq!(camera.due_tracking(0), None);
         let on_it = ask(&mut camera, rectangle, [0.15, 0.0, 0.6, 0.6]);
         assert_eq!(on_it.result, MavResult::MAV_RESULT_ACCEPTED);

@@ -1,4 +1,4 @@
-//! Which packets pass between the autopilot and the ground station, and which are answered here.
+//! Decides which packets pass between the autopilot and the ground station, and which are answered here.
 //!
 //! The rules are those of <https://mavlink.io/en/guide/routing.html>: a packet for a component goes to that
 //! component, every other packet to all, and none back to where it came from.
@@ -219,7 +219,7 @@ mod tests {
         let (target_system, target_component) = (CAMERA.system, CAMERA.component);
         let list = PARAM_REQUEST_LIST_DATA { target_system, target_component };
         assert!(matches!(up(GROUND, &MavMessage::PARAM_REQUEST_LIST(list)), Route::Drop(_)));
-        // Another camera has that id: what is for it goes to it.
+        // Another camera has that id: its packets go to it.
         let own = Own { camera: None, ..OWN };
         assert_eq!(from_ground(&packet(GROUND, &asked), Some(own), &vehicle()), Route::Pass);
     }
@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn the_ground_hears_the_vehicle_but_not_its_talk_with_the_companion() {
+    fn the_ground_receives_the_vehicles_packets_but_not_its_answers_to_the_companion() {
         let down =
             |sender, message: &MavMessage| from_autopilot(&packet(sender, message), Some(OWN));
         assert_eq!(down(AUTOPILOT, &heartbeat()), Route::Pass);

@@ -1,4 +1,4 @@
-//! The landing point for the ground station's display (LANDING_TARGET in local NED).
+//! Makes the message with the landing point for the ground station's display (LANDING_TARGET in local NED).
 //!
 //! It never goes to the autopilot, which would use it for its own precision landing.
 

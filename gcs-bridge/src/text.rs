@@ -9,7 +9,7 @@ use messages::{ControllerStatus, Phase, matter};
 const MAX_TEXT: usize = 199;
 /// Maximum number of texts sent at once.
 const MAX_BURST: u32 = 6;
-/// Number of these that are kept for what happens, when answers to requests are sent.
+/// Number of these that are reserved for events, when answers to requests are sent.
 const KEPT_OF_BURST: u32 = 3;
 /// Maximum number of warnings that are followed.
 const MAX_WARNINGS: usize = 16;
@@ -43,8 +43,7 @@ impl StatusTextSender {
         }
     }
 
-    /// The texts for what is new in a status. What exceeds the rate is sent with a later status, if it still
-    /// holds.
+    /// The texts for changes in a status. A text that exceeds the rate is sent with a later status, if it still holds.
     pub(crate) fn status(&mut self, now_ns: i64, status: &ControllerStatus) -> Vec<MavMessage> {
         let mut packets = Vec::new();
         let text = format!("Alight: {}", status.sentence());
@@ -106,7 +105,7 @@ impl StatusTextSender {
         Some(packets)
     }
 
-    /// The packets of the answer to a request; none when it exceeds the rate, or leaves too little for what happens: a ground
+    /// The packets of the answer to a request; none when it exceeds the rate, or leaves too few for events: a ground
     /// station may ask for hundreds of things at once.
     pub(crate) fn answer(
         &mut self,

@@ -1,4 +1,4 @@
-//! The vehicle whose companion the bridge is: the autopilot's system id, and the components on board.
+//! Finds the autopilot's system id and the components on board from the packets of the autopilot's side.
 
 use std::collections::HashSet;
 

@@ -1,4 +1,4 @@
-//! Where a ground station finds the camera's video, which another program serves.
+//! Parses the address of the camera's video for the ground station; another program serves the video.
 
 use std::fmt;
 use std::str::FromStr;
@@ -27,7 +27,7 @@ impl Video {
     }
 }
 
-/// Why a text is no video's address.
+/// The error of a text that is no address of a video.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct NoVideo;
 

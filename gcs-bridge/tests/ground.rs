@@ -437,7 +437,7 @@ async fn a_ground_station_finds_the_camera_its_video_and_the_marker() -> anyhow:
     Ok(())
 }
 
-/// The camera's packets may come back to the bridge, as an autopilot forwards the packets of one link to all others.
+/// The camera's packets may return to the bridge, as an autopilot forwards the packets of one link to all others.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_camera_gives_way_to_another_one_and_not_to_its_own_echo() -> anyhow::Result<()> {
     let port = free_port()?;
@@ -586,7 +586,7 @@ async fn the_status_contains_ground_stations_refused_packets_and_silence() -> an
     ensure!((0..TIMEOUT.as_nanos() as i64).contains(&(now_ns() - station.last_ns)), "{status:?}");
     assert_eq!(station.signature, PacketSignature::Unsigned);
 
-    // It falls silent, which who comes late is status as well.
+    // It falls silent, which a subscriber that joins later receives as well.
     until_status(&statuses, |it| it.stations.iter().all(|station| station.silent)).await?;
     let late = open("dashboard", "main", port).await?;
     let late = late.subscriber(topic::GCS_STATUS, &[]).await?;

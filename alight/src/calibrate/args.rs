@@ -65,7 +65,7 @@ pub(crate) struct BoardArgs {
     /// The calibration file's format [default: ros, or opencv where the file's name ends in .json or .xml].
     #[arg(long, value_enum)]
     file_format: Option<FileFormat>,
-    /// Format of what is printed: text, or JSON, one object for the result and with --live one for each frame that was taken.
+    /// Format of the output: text, or JSON, one object for the result and with --live one for each frame that was taken.
     #[arg(long, value_enum, default_value_t)]
     pub(super) format: Format,
     /// A camera that is running, by its name (camera-pub's `id`): frames are taken while the board is held still in places where
@@ -86,7 +86,7 @@ impl BoardArgs {
         Board::new(self.columns, self.rows, self.tag, self.gap)
     }
 
-    /// Whether the file can hold what will be found; it would be a pity to learn that afterwards.
+    /// Checks before the calibration that the file's format can hold its result.
     ///
     /// # Errors
     /// Brown-Conrady with more than four numbers for Kalibr, and an ending that only OpenCV's files have.
@@ -101,7 +101,7 @@ impl BoardArgs {
         }
     }
 
-    /// The file's format: as it was said, or as its name's ending says.
+    /// The file's format: by its option, or by the ending of its name.
     pub(super) fn file_format(&self) -> FileFormat {
         self.file_format.unwrap_or(match &self.output {
             Some(path) if is_of_open_cv(path) => FileFormat::Opencv,
@@ -114,7 +114,7 @@ impl BoardArgs {
         Options { solve_bend: !self.flat }
     }
 
-    /// How the images come from the sensor, where it was said.
+    /// The conversion from the sensor to the images, if it was given.
     pub(super) fn on_sensor(&self) -> Option<OnSensor> {
         let [width, height] = self.sensor?;
         let region = self.region.unwrap_or_else(|| SensorRegion::whole(width, height));

@@ -37,7 +37,7 @@ pub(crate) struct FlightArgs {
     /// Replace the file of `--output` where it is there already, as of another flight; without it that file is refused.
     #[arg(long)]
     replace: bool,
-    /// Format of what is printed: a table, or one JSON object.
+    /// Format of the output: a table, or one JSON object.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
 }

@@ -17,11 +17,11 @@ use crate::terminal::write_error;
 
 /// Pixels of all images that are kept to be looked at again: a gigabyte of memory.
 const MAX_KEPT_PIXELS: usize = 1 << 30;
-/// Images whose board is looked at; of a longer video the rest says nothing new.
+/// Images whose board is looked at; of a longer video the rest adds no information.
 const MAX_VIEWS: usize = 400;
-/// By what share of the image's width the board has moved in a video's frame that is taken.
+/// Motion of the board between two frames of a video that are taken, as a fraction of the image's width.
 const MIN_MOVE: f64 = 0.03;
-/// By what share of the image's width the board may move between two frames of a running camera to be held still.
+/// Maximum motion of the board between two frames of a running camera in which it is held still, as a fraction of the image's width.
 const MAX_SHAKE: f64 = 0.005;
 /// Corners whose standard deviation is larger are not used where the lens is known, in pixels: those at a fisheye's rim that
 /// could not be refined are a pixel off, and not by chance. Refined ones are known to some hundredths.
@@ -32,13 +32,13 @@ pub(super) const BLURRED_PX: f64 = 5.0;
 /// The images that were looked at.
 #[derive(Debug, Default)]
 pub(super) struct FoundImages {
-    /// What those show that show the board.
+    /// The views of the images that show the board.
     pub(super) views: Vec<View>,
     /// Those images, to be looked at again.
     kept: Vec<GrayImage>,
     /// The width of the tags' outlines in each of them, where it can be measured.
     pub(super) edges: Vec<EdgeWidth>,
-    /// How many were looked at.
+    /// Number of images that were searched.
     pub(super) images: usize,
     /// Those without the board.
     pub(super) empty: Vec<String>,
@@ -48,7 +48,7 @@ pub(super) struct FoundImages {
     pub(super) unmoved: usize,
     /// Frames of a running camera in which the board was not held still.
     pub(super) shaken: usize,
-    /// What the frame before showed.
+    /// The view in the previous frame.
     last: Option<View>,
     /// Whether there were more than can be kept.
     pub(super) is_full: bool,
@@ -85,7 +85,7 @@ pub(super) enum Origin {
     Live,
 }
 
-/// What an image shows of the board.
+/// The tags of the board in an image.
 struct Seen {
     view: View,
     edge_px: Option<f64>,
@@ -116,7 +116,7 @@ impl<'a> Finder<'a> {
             if tag.wrong_bits > 1 {
                 continue;
             }
-            // Of four corners that are equally sure the middle has half of the deviation.
+            // Of four corners that are equally sure the centre has half of the deviation.
             let corner_px = (2.0 * tag.centre_covariance_px2.trace()).sqrt();
             if camera.is_some() && corner_px > MAX_CORNER_PX {
                 has_unsure = true;
@@ -171,7 +171,7 @@ impl FoundImages {
                 if !seen.view.points.is_empty() {
                     view = seen.view;
                 } else if seen.has_unsure {
-                    // What the first look found is as unsure.
+                    // The result of the first search is as uncertain.
                     continue;
                 }
             }
@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn a_board_that_stands_still_is_taken_once() {
+    fn a_stationary_board_is_taken_once() {
         assert!(has_moved(&view(0.0), &[]));
         assert!(!has_moved(&view(10.0), &[view(0.0)]));
         assert!(has_moved(&view(40.0), &[view(0.0)]));

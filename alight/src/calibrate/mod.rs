@@ -71,7 +71,7 @@ fn check_output(path: &Path, is_replaced: bool, may_be: &str) -> anyhow::Result<
         is_replaced || !path.exists(),
         "{path:?} is there already, {may_be}: name another with `--output`, or replace it with `--replace`"
     );
-    // A device or a pipe is written as it is, as is a file where nothing can be put beside it.
+    // A device or a pipe is written as it is, as is a file in a folder where no other file can be created.
     if path.exists() && (!path.is_file() || OpenOptions::new().append(true).open(path).is_ok()) {
         return Ok(());
     }

@@ -1,12 +1,12 @@
-//! How wide a tag's outline is blurred.
+//! Measures the width over which a tag's outline is blurred.
 
 use geometry::Pixel;
 use imaging::{GrayView, sample::bilinear};
 
-/// How far from the outline it is looked at, in pixels, and in which steps.
+/// Distance from the outline up to which samples are taken, in pixels, and their step.
 const REACH_PX: f64 = 6.0;
 const STEP_PX: f64 = 0.5;
-/// Contrast without which an edge says nothing, in grey levels.
+/// Minimum contrast of an edge, in grey levels.
 const MIN_CONTRAST: f64 = 20.0;
 
 /// The width over which the outline of a tag changes from black to white, in pixels: its contrast by its steepest slope, in
@@ -20,7 +20,7 @@ pub(super) fn edge_width_px(view: GrayView<'_>, corners: &[Pixel; 4]) -> Option<
 
 fn side_width_px(view: GrayView<'_>, from: Pixel, to: Pixel) -> Option<f64> {
     let length = from.distance(&to);
-    // Within a fourth of the tag's cell nothing else is met: a cell is an eighth of the side.
+    // Within a fourth of the tag's cell there is no other edge: a cell is an eighth of the side.
     let reach = REACH_PX.min(length / 8.0);
     if reach < 2.0 * STEP_PX {
         return None;

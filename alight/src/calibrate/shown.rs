@@ -1,4 +1,5 @@
-//! How the calibration board has been shown so far (views, parts of the image, tilt, distances), and where and how to show it next.
+//! Summarises how the calibration board has been shown so far (views, parts of the image, tilt, distances), and advises which view is
+//! needed next.
 
 use calibration::{Calibration, View};
 use serde_json::{Value, json};
@@ -13,7 +14,7 @@ const GOOD_VIEWS: usize = 20;
 const GOOD_TILT_DEG: f64 = 30.0;
 const GOOD_DISTANCES: f64 = 1.8;
 const GOOD_COVERED: f64 = 0.95;
-/// Points without which a part of the image is said to lack them.
+/// Minimum number of points in a part of the image; a part with fewer is reported.
 const FEW_POINTS: usize = 8;
 
 /// How the board was shown, and what is still missing.
@@ -28,7 +29,7 @@ pub(super) struct Shown {
     pub(super) distance_ratio: Option<f64>,
     /// Images with wide outlines.
     pub(super) blurred: usize,
-    /// What to do next, the most useful first; empty when nothing is missing.
+    /// Advice for the next views, the most useful first; empty when nothing is missing.
     pub(super) next: Vec<String>,
 }
 
@@ -47,7 +48,7 @@ impl Shown {
         shown
     }
 
-    /// The share of the image's parts in which there are points.
+    /// The fraction of the image's parts in which there are points.
     pub(super) fn covered(&self) -> f64 {
         let parts = self.point_counts.iter().flatten();
         parts.filter(|count| **count > 0).count() as f64 / (COLUMNS * ROWS) as f64
@@ -70,7 +71,7 @@ impl Shown {
         line
     }
 
-    /// What to do next, the most useful first.
+    /// Advice for the next views, the most useful first.
     pub(super) fn advice(&self) -> Vec<String> {
         let mut next = Vec::new();
         if 2 * self.blurred > self.views {
@@ -147,7 +148,7 @@ fn point_counts(views: &[View]) -> [[usize; COLUMNS]; ROWS] {
     let mut counts = [[0; COLUMNS]; ROWS];
     for view in views {
         let part = |at: f64, edge: u32, parts: usize| {
-            // The cast takes what is negative to zero.
+            // The cast maps negative values to zero.
             (((at + 0.5) / f64::from(edge) * parts as f64) as usize).min(parts - 1)
         };
         for point in &view.points {

@@ -1,4 +1,4 @@
-//! A picture as `camera-pub` publishes it, whatever its configuration reads: a device, a program, a stream or files.
+//! Takes a picture as `camera-pub` publishes it, from any source of its configuration: a device, a program, a stream or files.
 
 use std::pin::pin;
 use std::time::Duration;
@@ -23,7 +23,7 @@ const NO_NETWORK: &str = r#"{
 /// Number of frames in which a camera's own metering settles.
 const SETTLING_FRAMES: usize = 15;
 /// Maximum time until there is a picture: programs of cameras take seconds to start.
-const PATIENCE: Duration = Duration::from_secs(20);
+const PICTURE_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// A picture of the camera with this configuration, as a detector would get it: the fifteenth frame, or the last of as many as
 /// come within 20 s.
@@ -31,24 +31,24 @@ const PATIENCE: Duration = Duration::from_secs(20);
 /// # Errors
 /// When the camera cannot be read, or gives no frame in that time.
 pub(super) fn published(config: Config) -> anyhow::Result<GrayImage> {
-    published_within(config, PATIENCE)
+    published_within(config, PICTURE_TIMEOUT)
 }
 
-fn published_within(config: Config, patience: Duration) -> anyhow::Result<GrayImage> {
+fn published_within(config: Config, limit: Duration) -> anyhow::Result<GrayImage> {
     block_on(async {
         let identity = Identity { service: "camera-pub", instance: config.instance().to_owned() };
         let node = Node::open(identity, &ZenohSource::Text(NO_NETWORK.to_owned())).await?;
-        let taken = take(&node, config, patience).await;
+        let taken = take(&node, config, limit).await;
         node.close().await;
         taken
     })?
 }
 
-async fn take(node: &Node, config: Config, patience: Duration) -> anyhow::Result<GrayImage> {
+async fn take(node: &Node, config: Config, limit: Duration) -> anyhow::Result<GrayImage> {
     let camera = config.instance().to_owned();
     let frames = node.frame_subscriber(topic::FRAME, &[&*camera]).await?;
     let mut service = camera_pub::run(node.clone(), config, Shutdown::on_signals()?);
-    let mut late = pin!(tokio::time::sleep(patience));
+    let mut late = pin!(tokio::time::sleep(limit));
     let mut converter = Converter::default();
     let mut newest = None;
     for _ in 0..SETTLING_FRAMES {
@@ -69,12 +69,12 @@ async fn take(node: &Node, config: Config, patience: Duration) -> anyhow::Result
         newest = Some(grey(&frame, &mut converter)?);
     }
     newest.with_context(|| {
-        let seconds = patience.as_secs();
+        let seconds = limit.as_secs();
         format!("camera `{camera}` gave no picture within {seconds} s{}", reasons(node))
     })
 }
 
-/// What the camera's service has counted of frames that it did not publish.
+/// The counts of the camera's service of frames that it did not publish.
 fn reasons(node: &Node) -> String {
     let health = node.health().report(node.identity(), now_ns());
     let counts = health.errors.iter().chain(&health.drops);
@@ -88,11 +88,11 @@ mod tests {
     use super::*;
 
     /// The picture of a program that is run by a shell and writes JPEG files of 8 x 8 pixels.
-    fn of_script(script: &str, patience: Duration) -> anyhow::Result<GrayImage> {
+    fn of_script(script: &str, limit: Duration) -> anyhow::Result<GrayImage> {
         let command = format!("source.command=[\"sh\", \"-c\", {script:?}]");
         let set = [&*command, "source.pixels=mjpeg", "source.size_px=[8, 8]"];
         let layers = node::Layers { file: None, set: set.map(str::to_owned).into() };
-        published_within(layers.load::<Config>()?.settings, patience)
+        published_within(layers.load::<Config>()?.settings, limit)
     }
 
     #[test]

@@ -267,7 +267,7 @@ impl Examiner {
         ))
     }
 
-    /// What the option that gives the camera must be for an image.
+    /// The right value of the option that gives the camera, for an image.
     fn camera_needs(&self, view: GrayView<'_>) -> String {
         match self.lens {
             Lens::Calibrated(_) => {

@@ -182,7 +182,7 @@ impl Brush {
         }
     }
 
-    /// Draws name, confidence and position; beside other markers only as much as fits.
+    /// Draws name, confidence and position; next to other markers only as much as fits.
     fn label(&mut self, seen: &Observation, all: &[Observation]) {
         let id = seen.id.map_or_else(String::new, |id| format!(":{id}"));
         let wrong = match seen.wrong_bits {
@@ -212,7 +212,7 @@ impl Brush {
         };
         let reach = if seen.size_px * self.scale < MIN_VISIBLE_PX { MIN_VISIBLE_PX } else { reach };
         let dot = self.dot_px as f64;
-        // At the lower edge all lines move up together: each by itself would end on the others.
+        // At the lower edge all lines move up together: moved one by one they would overlap.
         let lowest = self.canvas.height as f64 - LINE * dot * lines.len() as f64;
         let first = (y + reach + 4.0 * dot).min(lowest).max(0.0);
         for (index, text) in (0..).zip(&lines) {

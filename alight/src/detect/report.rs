@@ -1,4 +1,4 @@
-//! The output of `alight detect`: one line per image, as text or JSON.
+//! Formats the output of `alight detect`: one line per image, as text or JSON.
 
 use std::fmt::Write;
 
@@ -28,11 +28,11 @@ pub(super) enum Line {
 pub(super) struct Found {
     pub(super) width: usize,
     pub(super) height: usize,
-    /// How its Exif data want the image turned to be looked at, which is not done.
+    /// The rotation for viewing by its Exif data, which is not applied.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) exif_orientation: Option<u8>,
     pub(super) detect_ms: f64,
-    /// Why nothing in it has a pose although the camera is known.
+    /// Why no detection has a pose although the camera is known.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) no_poses: Option<String>,
     pub(super) detections: Vec<Detection>,

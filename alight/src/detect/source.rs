@@ -1,4 +1,4 @@
-//! The images of files, folders and videos, in order.
+//! Iterates over the images of files, folders and videos, in order.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};

@@ -16,7 +16,7 @@ const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
 pub(super) struct Target {
     /// HOST or HOST:PORT.
     address: String,
-    /// What to do where it does not answer.
+    /// The remedy if it does not answer.
     remedy: &'static str,
 }
 

@@ -1,4 +1,4 @@
-//! A dot-matrix font as rectangles on the sheet.
+//! Draws text in a dot-matrix font as rectangles on the sheet.
 
 use fiducial::overlay::font::rows;
 

@@ -22,9 +22,8 @@ pub(crate) use sheet::{Paper, Sheet, SheetError};
 /// The arguments of `alight marker`.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct MarkerArgs {
-    /// The marker: FAMILY:ID, or FAMILY for a family without ids (rings). A wrong name lists all families; `rings-thesis` is the thesis' own
-    /// detection of the same rings, kept for comparison, and finds few markers in pictures of ordinary
-    /// cameras.
+    /// The marker: FAMILY:ID, or FAMILY for a family without ids (rings). A wrong name lists all families; `rings-thesis` is the thesis'
+    /// own detection of the same rings, kept for comparison, and finds few markers in pictures of ordinary cameras.
     #[arg(required_unless_present = "pad")]
     marker: Option<Marker>,
     /// A pad of several markers instead of one marker: the built-in `a4`, or a TOML file.
@@ -128,8 +127,8 @@ pub(crate) fn run(args: &MarkerArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn stated_size(beside: Option<f64>, marker: &Marker) -> Result<f64, SheetError> {
-    match (beside, marker.size_m) {
+fn stated_size(by_option: Option<f64>, marker: &Marker) -> Result<f64, SheetError> {
+    match (by_option, marker.size_m) {
         (Some(size), Some(other)) if size != other => Err(SheetError::TwoSizes { size, other }),
         (Some(size), _) | (None, Some(size)) => Ok(size),
         (None, None) => Err(SheetError::NoSize),

@@ -1,4 +1,4 @@
-//! The sheet as PDF: vectors in units of 1/72 inch.
+//! Writes the sheet as PDF: vectors in units of 1/72 inch.
 
 use markers::Ink;
 use pdf_writer::{Content, Name, Pdf, Rect, Ref, Str};

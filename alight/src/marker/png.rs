@@ -1,4 +1,4 @@
-//! The sheet as PNG, with the size of its pixels, anti-aliased.
+//! Writes the sheet as PNG, with the size of its pixels, anti-aliased.
 
 use anyhow::Context;
 use image::GrayImage;

@@ -6,7 +6,7 @@ use markers::{Board, Drawing, Ink, Marker, Pad, Shape};
 
 /// Margin that printers leave blank, in millimetres.
 const MARGIN_MM: f64 = 5.0;
-/// Height of what is below the marker (cut marks, ruler, two lines of text), in millimetres.
+/// Height of the area below the marker (cut marks, ruler, two lines of text), in millimetres.
 const BELOW_MM: f64 = 33.0;
 /// Around a board, and below it for the ruler and three lines of text, in millimetres.
 const BOARD_TOP_MM: f64 = 12.0;
@@ -23,7 +23,7 @@ const CUT_MARK_GAP_MM: f64 = 1.0;
 const CUT_MARK_LENGTH_MM: f64 = 3.5;
 /// Font size, in millimetres.
 pub(super) const TEXT_MM: f64 = 3.2;
-/// No letter is wider than this share of the font size.
+/// No letter is wider than this fraction of the font size.
 const LETTER: f64 = 0.75;
 
 /// Paper sizes, upright.
@@ -93,7 +93,7 @@ impl Paper {
 pub(crate) enum SheetError {
     /// The marker does not fit on the paper.
     TooLarge {
-        /// What does not fit, and what would.
+        /// The marker that does not fit, and the largest size that does.
         problem: String,
     },
     /// The marker has no id.
@@ -199,15 +199,15 @@ impl Sheet {
         Ok(Self::from_drawing(&drawing, &titles, paper))
     }
 
-    /// A sheet with a calibration board, and what to do with it.
+    /// A sheet with a calibration board and its instructions.
     pub(crate) fn with_board(board: &Board, paper: Paper) -> Result<Self, SheetError> {
         let [width_mm, height_mm] = board.size_m().map(|edge| edge * 1e3);
         let [page_width, page_height] = paper.size_mm();
         let room = [page_width - 2.0 * BOARD_TOP_MM, page_height - BOARD_TOP_MM - BOARD_BELOW_MM];
         if width_mm > room[0] + ROUNDING_MM || height_mm > room[1] + ROUNDING_MM {
-            let share = (room[0] / width_mm).min(room[1] / height_mm);
+            let scale = (room[0] / width_mm).min(room[1] / height_mm);
             // Rounded down to tenths of millimetres, so that the stated sizes fit.
-            let fitting = |m: f64| (m * share * 1e4).floor() / 1e4;
+            let fitting = |m: f64| (m * scale * 1e4).floor() / 1e4;
             let problem = format!(
                 "the board is {width_mm:.1} x {height_mm:.1} mm, and {} has {:.1} x {:.1} mm; `--tag {} --gap {}` fit",
                 paper.name(),
@@ -369,7 +369,7 @@ fn ranges(sorted: &[u32]) -> Vec<String> {
     texts.collect()
 }
 
-/// As many kinds of markers as there is room for beside the ruler's left end, with their ids or else with their numbers; the others are
+/// As many kinds of markers as there is room for next to the ruler's left end, with their ids or else with their numbers; the others are
 /// counted.
 fn in_one_line(kinds: &[Kind], paper: Paper) -> String {
     let [width, _] = paper.size_mm();

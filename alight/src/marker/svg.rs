@@ -89,7 +89,7 @@ mod tests {
                 _ => None,
             })
             .collect();
-        // The black square, the white cells on it, and the lines beside it.
+        // The black square, the white cells on it, and the lines next to it.
         assert_eq!(paths.len(), 3);
         assert_eq!(paths[0], ("M45,88.5 H165 V208.5 H45 z".to_owned(), "black".to_owned()));
         assert_eq!(paths[1].1, "white");
