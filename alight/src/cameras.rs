@@ -1,5 +1,5 @@
 //! `alight cameras`: lists the cameras of this machine with formats and sizes, and those announced over MAVLink with their video's
-//! encoding and address, says how to configure each, and takes a picture.
+//! encoding and address, shows how to configure each, and takes a picture.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -23,7 +23,7 @@ mod picture;
 
 /// Where the system has its devices.
 const DEVICES: &str = "/dev";
-/// Programs that write a camera's frames, and what they are for.
+/// Programs that write a camera's frames, and their purpose.
 const PROGRAMS: [(&str, &str); 3] = [
     ("rpicam-vid", "Raspberry Pi cameras, with exact stamps"),
     ("gst-launch-1.0", "anything GStreamer reads, Jetson cameras among them"),
@@ -43,8 +43,8 @@ const MAX_SIZES: usize = 6;
 /// The arguments of `alight cameras`.
 #[derive(Args)]
 pub(crate) struct CamerasArgs {
-    /// Take a picture (PNG), as a detector will get it, with the camera that is listed first, with `--device`, or as `--config`
-    /// says. Only while nothing else reads the camera.
+    /// Take a picture (PNG), as a detector will get it, with the camera that is listed first, with `--device`, or with `--config`. Only
+    /// while nothing else reads the camera.
     #[arg(long, value_name = "FILE.png", value_parser = png_file)]
     picture: Option<PathBuf>,
     /// Take the picture as camera-pub does with this configuration: its source, size and exposure.
@@ -372,7 +372,7 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_without_cameras_says_so_and_what_would_help() {
+    fn a_machine_without_cameras_is_reported_with_the_remedy() {
         let folder = tempfile::tempdir().unwrap();
         let listing = listing(folder.path(), None);
         let text = text(&listing);

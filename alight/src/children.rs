@@ -78,7 +78,7 @@ pub(crate) fn without_network(command: &mut Command) {
 /// Which processes of a child's group are asked to stop; all that is left of it in the end is killed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Reach {
-    /// The child, which stops what it started itself.
+    /// The child, which stops the processes that it started.
     Leader,
     /// All: a script may have started the program that is meant.
     Group,
@@ -293,7 +293,7 @@ async fn follow<K: Clone>(
     drop(events.send(ChildEvent::Exited(key, exit)).await);
 }
 
-/// Sends the lines of a child, whatever its encoding; a very long one in pieces.
+/// Sends the lines of a child, in any encoding; a very long one in pieces.
 async fn forward<K: Clone>(
     key: K,
     stderr: impl AsyncRead + Unpin,

@@ -151,8 +151,8 @@ fn perform(cli: Cli) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// A command whose options take a negative number as a value, and report what is wrong with it. Otherwise it is reported as an unknown
-/// option.
+/// A command whose options take a negative number as a value, and report the error of an invalid one. Otherwise it is reported as an
+/// unknown option.
 fn with_negative_numbers(command: clap::Command) -> clap::Command {
     let takes_one =
         |argument: &clap::Arg| !argument.is_positional() && argument.get_action().takes_values();
@@ -249,7 +249,7 @@ mod tests {
         );
     }
 
-    /// Performs what the words of a command line say.
+    /// Runs the command of a command line.
     fn performed(words: &[&str]) -> anyhow::Result<ExitCode> {
         perform(Cli::try_parse_from(["alight"].iter().chain(words)).unwrap())
     }

@@ -70,7 +70,7 @@ enum TokenKind {
     /// Look.
     #[default]
     Monitor,
-    /// Command as well, where the dashboard says `commands = "token"`: on its machine, and from elsewhere when the page has a
+    /// Command as well, where the dashboard has `commands = "token"`: on its machine, and from elsewhere when the page has a
     /// certificate.
     Command,
 }

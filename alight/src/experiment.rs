@@ -89,7 +89,7 @@ struct LandingArgs {
     faults: Vec<Faults>,
     /// Marker to land on, of pad, detector and controller together: FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family without ids. A pad that
     /// moves or heaves has it half as large again. Modelled vision has the errors of `rings` whatever the marker, of which only the size
-    /// counts, and a warning says so: compare markers with `--vision rendered`.
+    /// counts, and a warning reports that: compare markers with `--vision rendered`.
     #[arg(long, value_name = "MARKER", value_parser = sized_marker)]
     marker: Option<Marker>,
     /// One further setting: simulator.KEY=VALUE or controller.KEY=VALUE. May be repeated.
@@ -118,7 +118,7 @@ struct CompareArgs {
     /// Replace the results of an experiment that are in the output folder; without it they are refused.
     #[arg(long, requires = "output")]
     replace: bool,
-    /// Format of what is printed: tables in Markdown, or one JSON object.
+    /// Format of the output: tables in Markdown, or one JSON object.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
 }
@@ -294,7 +294,7 @@ fn run_compare(args: &CompareArgs) -> anyhow::Result<ExitCode> {
     let comparison = Comparison::new(&Run::read(first)?, &Run::read(second)?)?;
     let command = this_command();
     if let Some(output) = &args.output {
-        // Replacing what is there would remove the flights that were read.
+        // Replacing the folder's files would remove the flights that were read.
         let output_is = |run: &PathBuf| run.canonicalize().ok() == output.canonicalize().ok();
         if output.exists() && args.runs.iter().any(output_is) {
             let rule = "`-o` is the folder of one of the runs; name another one";
@@ -363,7 +363,7 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
         };
         let findings = experiments::markers::run(&request, &mut begins)
             .with_context(|| format!("working in {}", args.output.display()))?;
-        steps.beside(|| print(&findings.report))?;
+        steps.suspended(|| print(&findings.report))?;
         write_error(&format!("tables and figures: {}", request.results_in.display()));
         done.push(request);
         if findings.is_interrupted {

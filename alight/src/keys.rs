@@ -134,7 +134,7 @@ pub(crate) enum Role {
     Controller,
     /// Forwards MAVLink between the autopilot and the ground station.
     GcsBridge,
-    /// Subscribes, and publishes what it has recorded.
+    /// Subscribes, and publishes its recorded messages.
     Recorder,
     /// Shows a landing in browsers, and commands as its configuration allows.
     Dashboard,
@@ -142,7 +142,7 @@ pub(crate) enum Role {
     Simulator,
 }
 
-/// The name of a key's files by what is written at the command line: ROLE, or `detector.NAME`.
+/// The name of a key's files from the command line's argument: ROLE, or `detector.NAME`.
 pub(crate) fn key_name_of(text: &str) -> Result<String, String> {
     let (role, name) = text.split_once('.').map_or((text, None), |(role, name)| (role, Some(name)));
     let is_role = Role::from_str(role, false).is_ok() && (role == "detector") == name.is_some();

@@ -579,7 +579,7 @@ struct Rendezvous {
     description: String,
     /// The port, if it is not the one at which other commands look for it.
     unusual_port: Option<u16>,
-    /// Is deleted at the end, with what is in it.
+    /// Is deleted at the end, with its contents.
     directory: TempDir,
     /// Keeps the port from other landings until the end.
     _claim: Option<UdpSocket>,
@@ -619,8 +619,8 @@ fn claim(port: u16) -> std::io::Result<UdpSocket> {
     TcpListener::bind((LOOPBACK, port)).map(|_| lock)
 }
 
-/// Ports outside of Linux' ephemeral range (`ip_local_port_range` begins at 32768) and of what tests choose from, so that one
-/// that is free now is still free when its service binds it.
+/// Ports outside of Linux' ephemeral range (`ip_local_port_range` begins at 32768) and of the ports that tests choose from. So a port that
+/// is free now is still free when its service binds it.
 const PORTS: std::ops::Range<u16> = 26_000..32_000;
 
 /// A port that is free for TCP and UDP, and its lock. No number is returned twice by one process, so a port may be bound later than
@@ -699,7 +699,7 @@ mod tests {
     }
 
     #[test]
-    fn the_environment_says_where_a_landing_meets() {
+    fn the_environment_sets_the_port_of_a_landing() {
         use clap::CommandFactory as _;
         let tool = Tool::command();
         let meet = tool.get_arguments().find(|argument| argument.get_id() == "meet").unwrap();
@@ -848,7 +848,7 @@ mod tests {
     }
 
     #[tokio::test(flavor = "multi_thread")]
-    async fn a_detector_whose_process_has_ended_is_not_said_to_be_left() -> anyhow::Result<()> {
+    async fn a_detector_whose_process_has_ended_is_not_reported_as_left() -> anyhow::Result<()> {
         let (port, _lock) = free_port()?;
         let zenoh = ZenohSource::Text(node::session::local_config(port));
         let node = Node::open(tool_identity("land"), &zenoh).await?;

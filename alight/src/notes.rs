@@ -171,7 +171,7 @@ mod tests {
         assert!(note.is_there());
         assert_eq!(age_of("before the machine was restarted", Duration::ZERO), None);
         assert!(!note.is_there());
-        // Half of it, and a thing that is no file: it is there, of whatever age.
+        // Half of it, and a directory in its place: it is there, and its age is unknown.
         std::fs::write(&file, "{").unwrap();
         assert!(note.age().is_none() && note.is_there());
         std::fs::remove_file(&file).unwrap();

@@ -1,5 +1,5 @@
 //! The result of a landing, collected from statuses, true poses, health reports and the recorder's status: time, touchdown error and
-//! speed, latency, each process's load, and what was recorded.
+//! speed, latency, each process's load, and the recording.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;

@@ -133,7 +133,7 @@ impl Progress {
     /// Shows a change of phase or of detector.
     pub(crate) fn status(&mut self, status: &ControllerStatus) {
         let why = subject(&status.why);
-        // An autopilot may take a minute until it lets the vehicle take off, and says what it waits for.
+        // An autopilot may take a minute until it lets the vehicle take off, and reports the reason.
         let is_other_reason = self.live.is_none()
             && matches!(status.phase, Phase::Idle | Phase::Takeoff)
             && self.why != why;
@@ -151,7 +151,7 @@ impl Progress {
         }
     }
 
-    /// Shows a line of a service's standard error; one of the controller's not, where its status has said that.
+    /// Shows a line of a service's standard error; a line of the controller is not shown if its status has reported the same.
     pub(crate) fn line(&mut self, service: Service, line: &str) {
         if service != Service::Controller || self.warnings.is_new_line(Instant::now(), line) {
             self.say(&format!("{}: {line}", service.name()));
@@ -250,7 +250,7 @@ impl Steps {
     }
 
     /// Prints while the bar is suspended.
-    pub(crate) fn beside<T>(&self, print: impl FnOnce() -> T) -> T {
+    pub(crate) fn suspended<T>(&self, print: impl FnOnce() -> T) -> T {
         self.bar.suspend(print)
     }
 

@@ -1,5 +1,5 @@
 //! `alight replay`: verifies the controller's tapes in a recording, flies them again with other settings, or searches its frames again, and
-//! prints what is different.
+//! prints the differences.
 
 mod live;
 
@@ -20,7 +20,7 @@ use crate::terminal::{aligned, print, write_error};
 
 #[derive(Args)]
 pub(crate) struct ReplayArgs {
-    /// The recording, an MCAP file; of a recording in several files all, in whatever order.
+    /// The recording, an MCAP file; of a recording in several files all, in any order.
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Compare the result of each event with the recorded one, to the bit. The first event that gives another result is named, with the
@@ -40,7 +40,7 @@ pub(crate) struct ReplayArgs {
     /// recording has several.
     #[arg(long, value_name = "NAME")]
     detector: Option<String>,
-    /// Publish what was recorded on the network, at the pace at which it was recorded and with stamps of now: to a dashboard, a
+    /// Publish the recorded messages on the network, at the recorded pace and with present stamps: to a dashboard, a
     /// gcs-bridge with its ground station, a viewer, or a detector to try. Nothing is sent to an autopilot. Exit status 1 when
     /// a part of the recording is damaged or a picture cannot be read, which is left out.
     #[arg(long, conflicts_with_all = ["verify", "from", "set", "detector"])]
@@ -142,7 +142,7 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// Searches the frames again, and prints what is different; true when all pictures could be read and all tapes replayed.
+/// Searches the frames again, and prints the differences; true when all pictures could be read and all tapes replayed.
 fn from_frames(
     recordings: &[Vec<u8>],
     tapes: &[RecordedTape],

@@ -23,7 +23,7 @@ const EXIT_STATUS: &str = "Exit status 1 also when there is a page and something
 #[command(after_help = EXIT_STATUS)]
 pub(crate) struct ReportArgs {
     /// The recording of a flight (MCAP), or those of two to compare. Files that share a controller's tape and the recorder's clock are
-    /// one flight, in whatever order they are named, as a recorder begins a new file when one is large.
+    /// one flight, in any order of their names, as a recorder begins a new file when one is large.
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Which landing of each recording, from 1 on, where it has several [default: the last].
@@ -354,7 +354,7 @@ mod tests {
         fly_recorded(&plan.flights()[0], std::fs::File::create(file).unwrap()).unwrap();
     }
 
-    /// Runs `alight report`, or says why not.
+    /// Runs `alight report`; an error if it fails.
     fn reported(files: &[&Path], options: &[&str]) -> Result<ExitCode, String> {
         let files = files.iter().map(|file| file.as_os_str());
         let options = options.iter().map(|option| (*option).as_ref());

@@ -77,7 +77,7 @@ pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
     if let Some(problem) = marker_problem {
         say(&format!("warning: {problem}"));
     }
-    // In the air the other processes continue without a camera; camera-pub reports what is missing, and is started again.
+    // In the air the other processes continue without a camera; camera-pub reports the missing device or program, and is started again.
     if let Some(problem) = jobs.iter().find_map(|job| missing(job, &site.folder, &search)) {
         bail!(problem);
     }

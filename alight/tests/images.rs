@@ -125,7 +125,7 @@ fn picture(set: &[&str], folder: &Path) -> anyhow::Result<(Output, Option<image:
 }
 
 #[test]
-fn a_picture_is_what_a_detector_would_get_of_a_file_or_a_program() -> anyhow::Result<()> {
+fn a_picture_equals_the_frame_of_a_file_or_a_program_for_a_detector() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let pixels: Vec<u8> = (0..64 * 48).map(|i| (i % 251) as u8).collect();
     let path = folder.path().join("a.png");

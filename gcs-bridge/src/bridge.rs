@@ -35,7 +35,7 @@ use crate::vehicle::Vehicle;
 
 /// Period of heartbeats in MAVLink.
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// Period at which what is due is sent: the marker's position, also when no frame comes, and parameters.
+/// Period at which due messages are sent: the marker's position, also when no frame comes, and parameters.
 const TICK: Duration = Duration::from_millis(50);
 /// Silence of the ground station after which all texts are repeated, in nanoseconds.
 const GROUND_TIMEOUT_NS: i64 = 10_000_000_000;
@@ -421,7 +421,7 @@ impl Bridge {
         None
     }
 
-    /// Acknowledges a command to the camera with the result, and sends what it asks for.
+    /// Acknowledges a command to the camera with the result, and sends the requested messages.
     fn command_camera(
         &mut self,
         now_ns: i64,
@@ -441,7 +441,7 @@ impl Bridge {
         answer.result
     }
 
-    /// Answers what the ground station asks of our parameters; false where it would set one, which it may not.
+    /// Answers a request of the ground station for our parameters; false where it would set one, which it may not.
     fn asked_for_parameters(&mut self, now_ns: i64, asked: &Ask) -> bool {
         let answer = self.parameters.answer(asked);
         if let Some(message) = &answer.message {
@@ -855,7 +855,7 @@ mod tests {
             command(CAMERA, MavCmd::MAV_CMD_CAMERA_STOP_TRACKING),
             command(AUTOPILOT.component, MavCmd::MAV_CMD_COMPONENT_ARM_DISARM),
             parameter(AUTOPILOT.system),
-            // To all of this component, whatever their system: refused here, and not passed on.
+            // To all components with this id, of any system: refused here, and not passed on.
             parameter(0),
             asked,
         ];

@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn the_defaults_are_what_qgroundcontrol_expects() {
+    fn the_defaults_match_qgroundcontrol() {
         let config = load(&[]).unwrap();
         assert_eq!(config.ground, "udpout:127.0.0.1:14550");
         assert_eq!((config.system_id, config.component_id), (0, 191));

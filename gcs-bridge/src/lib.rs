@@ -7,9 +7,9 @@
 //!
 //! Modules in reading order: [`config`]; `bridge` is the service; `vehicle` finds the vehicle's system id,
 //! `route` decides which packets pass, `text` and `target` turn the controller's status and estimate into
-//! MAVLink; `camera` shows the detector's camera, whose `video` another program serves, and `request` is what a ground
-//! station asks of it; `params` shows it the keys of the controller's
-//! configuration that are in `parameter_table`; `status` is the published status of the ground stations.
+//! MAVLink; `camera` shows the detector's camera, whose `video` another program serves, and `request` reads and answers the ground
+//! station's commands to it; `params` shows it the keys of the controller's configuration that are in `parameter_table`; `status` is the
+//! published status of the ground stations.
 
 pub mod config;
 

@@ -138,7 +138,7 @@ impl Parameters {
         true
     }
 
-    /// Answers what a ground station asks; a list comes bit by bit.
+    /// Answers a request of a ground station; a list is sent in small groups by `due`.
     pub(crate) fn answer(&mut self, ask: &Ask) -> Answer {
         let place = match ask {
             Ask::List => {

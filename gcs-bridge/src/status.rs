@@ -272,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_that_is_down_says_why_in_a_bounded_text() {
+    fn a_link_that_is_down_has_its_reason_in_a_bounded_text() {
         let mut status = ground(None);
         assert_eq!(now(&status, 0).peer, None);
         status.up("10.0.0.2:14550");
@@ -380,7 +380,7 @@ mod tests {
     fn a_change_is_published_soon_and_all_else_from_time_to_time() {
         let mut status = ground(None);
         let mut published = Vec::new();
-        // 20 s in steps of 50 ms; the station speaks from 1 s to 2.7 s.
+        // 20 s in steps of 50 ms; the station sends from 1 s to 2.7 s.
         for step in 0..400_i64 {
             let now_ns = step * 50_000_000;
             if (20..55).contains(&step) {

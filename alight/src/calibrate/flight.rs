@@ -42,7 +42,7 @@ pub(crate) struct FlightArgs {
     format: Format,
 }
 
-/// Calibrates, and prints what was found.
+/// Calibrates, and prints the estimates and changes.
 ///
 /// # Errors
 /// When the recording cannot be read, has no detections, telemetry or calibration, or contradicts itself.

@@ -81,7 +81,7 @@ pub(super) enum Origin {
     File,
     /// Of a video: those in which the board has moved are used.
     Video,
-    /// Of a running camera: of those the ones in which it is held still, as the person sees what is missing.
+    /// Of a running camera: of those the ones in which the board is held still, as the user sees which views are missing.
     Live,
 }
 

@@ -49,7 +49,7 @@ enum What {
     Board(BoardArgs),
     /// A camera's time offset, mount, focal length and first radial coefficient (k1) from the recording of a landing
     /// (`alight land --record`, `alight record`) on a pad of known size that does not move. A landing with turns of the heading
-    /// and swift moves to all sides shows all of it; what a flight does not show stays as it was. Exit status 1 when it shows
+    /// and swift moves to all sides shows all of it; quantities that a flight does not show keep their values. Exit status 1 when it shows
     /// nothing.
     Flight(FlightArgs),
 }

@@ -1,4 +1,4 @@
-//! Reads from a recording what a calibration from a flight takes: the vehicle's poses, one detector's detections of a
+//! Reads the data for a calibration from a flight from its recording: the vehicle's poses, one detector's detections of a
 //! marker, the camera's information and configuration.
 
 use std::collections::BTreeMap;

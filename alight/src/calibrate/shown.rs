@@ -17,7 +17,7 @@ const GOOD_COVERED: f64 = 0.95;
 /// Minimum number of points in a part of the image; a part with fewer is reported.
 const FEW_POINTS: usize = 8;
 
-/// How the board was shown, and what is still missing.
+/// How the board was shown, and which views are still missing.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Shown {
     pub(super) views: usize,
@@ -54,7 +54,7 @@ impl Shown {
         parts.filter(|count| **count > 0).count() as f64 / (COLUMNS * ROWS) as f64
     }
 
-    /// For a person who holds the board.
+    /// A line for the person with the board.
     pub(super) fn line(&self) -> String {
         let mut line =
             format!("{} views, {:.0} % of the image", self.views, 100.0 * self.covered());

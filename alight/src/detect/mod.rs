@@ -246,7 +246,7 @@ impl Examiner {
     }
 
     /// A warning if a marker is found only without the camera: a shape that the camera model does not map back to a circle or square in
-    /// space is rejected. Other detected markers say little about the camera: seen head-on they fit any focal length.
+    /// space is rejected. Other detected markers show little about the camera: seen head-on they fit any focal length.
     fn doubt_of_camera(&self, view: GrayView<'_>, name: &str) -> Option<String> {
         let looks = &self.looks_without_camera;
         let one_less = |left: usize| left.checked_sub(1);
@@ -549,7 +549,7 @@ mod tests {
     }
 
     #[test]
-    fn images_of_another_size_than_the_calibration_lack_their_poses_and_say_so() {
+    fn images_of_another_size_than_the_calibration_lack_their_poses_with_the_reason() {
         let folder = folder();
         let photo = folder.path().join("0.png");
         let camera = folder.path().join("camera.yaml");

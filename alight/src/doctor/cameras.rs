@@ -23,7 +23,7 @@ const MAX_DROPPED: f64 = 0.02;
 /// Silence after which a camera whose frames are needed is dead, in seconds.
 const MAX_SILENCE_S: f64 = 2.0;
 
-/// Checks the cameras that were seen: calibration, frames, stamps, exposure, and what was dropped. A site may have `has_camera`
+/// Checks the cameras that were seen: calibration, frames, stamps, exposure, and drops. A site may have `has_camera`
 /// run on this machine.
 pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_camera: bool) {
     let seconds = watched.duration.as_secs();

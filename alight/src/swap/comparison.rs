@@ -63,7 +63,7 @@ impl Comparison {
         self.controller.is_some()
     }
 
-    /// Takes what a detector found in a frame.
+    /// Takes the detections of a frame.
     pub(super) fn found(&mut self, message: &Detections) {
         let detection = match &self.controller {
             Some(controller) => message.first_of(&controller.marker),
