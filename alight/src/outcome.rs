@@ -118,8 +118,8 @@ impl OurRecorder {
 
     /// Whether it is the file, or one with a number after its name: a recorder takes those when the first is taken or fails.
     fn may_write(&self, other: &Path) -> bool {
-        let whole = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
-        let (wanted, other) = (whole(&self.file), whole(other));
+        let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+        let (wanted, other) = (absolute(&self.file), absolute(other));
         let stem = |path: &Path| path.file_stem().map(|it| it.to_string_lossy().into_owned());
         let (Some(wanted_stem), Some(other_stem)) = (stem(&wanted), stem(&other)) else {
             return false;
@@ -371,9 +371,9 @@ impl Outcome {
     /// Whether everything requested is done: it landed on the pad, and it was recorded if that was requested. Frames that never reached the
     /// recorder do not count as lost.
     pub(crate) fn is_done(&self) -> bool {
-        let is_whole =
+        let is_complete =
             |recording: &Recording| recording.problem.is_none() && recording.dropped == 0;
-        let is_recorded = self.recording.as_ref().is_none_or(is_whole);
+        let is_recorded = self.recording.as_ref().is_none_or(is_complete);
         self.landed && (is_recorded || !self.is_to_be_recorded)
     }
 

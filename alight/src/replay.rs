@@ -115,15 +115,15 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     }
     let damage = reader.damage().to_vec();
     damage.iter().for_each(|damage| write_error(damage));
-    let mut is_whole = damage.is_empty();
+    let mut is_complete = damage.is_empty();
     let tapes = reader.tapes();
     let again = args.again();
     let unused: BTreeSet<String> =
         tapes.iter().filter_map(|tape| of_unused_guidance(tape, &again.of_controller)).collect();
     unused.iter().for_each(|setting| write_error(setting));
     if args.from == From::Frames {
-        is_whole &= from_frames(&recordings, &tapes, &again)?;
-        return Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE });
+        is_complete &= from_frames(&recordings, &tapes, &again)?;
+        return Ok(if is_complete { ExitCode::SUCCESS } else { ExitCode::FAILURE });
     }
     ensure!(
         !tapes.is_empty() || damage.is_empty(),
@@ -137,9 +137,9 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
         args.files
     );
     for tape in &tapes {
-        is_whole &= one(tape, args, &again.of_controller)?;
+        is_complete &= one(tape, args, &again.of_controller)?;
     }
-    Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    Ok(if is_complete { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 /// Searches the frames again, and prints the differences; true when all pictures could be read and all tapes replayed.
@@ -156,11 +156,11 @@ fn from_frames(
             print(&stop.to_string())?;
         }
     }
-    Ok(is_whole(&searched))
+    Ok(is_complete(&searched))
 }
 
 /// Whether every picture of a frame that was searched then could be read, and every tape be replayed to its end.
-fn is_whole(searched: &Searched) -> bool {
+fn is_complete(searched: &Searched) -> bool {
     searched.unreadable == 0 && searched.changes.iter().all(|change| change.end.stop.is_none())
 }
 
@@ -341,14 +341,14 @@ mod tests {
 
     #[test]
     fn pictures_that_cannot_be_read_and_tapes_that_stop_are_losses() {
-        assert!(is_whole(&Searched::default()));
-        assert!(!is_whole(&Searched { unreadable: 1, ..Searched::default() }));
+        assert!(is_complete(&Searched::default()));
+        assert!(!is_complete(&Searched { unreadable: 1, ..Searched::default() }));
         let stopped = |stop| {
             let end = End { stop, ..End::default() };
             Searched { changes: vec![Change { end, ..Change::default() }], ..Searched::default() }
         };
-        assert!(is_whole(&stopped(None)));
-        assert!(!is_whole(&stopped(Some(replay::Stop::NoBeginning { first: 3 }))));
+        assert!(is_complete(&stopped(None)));
+        assert!(!is_complete(&stopped(Some(replay::Stop::NoBeginning { first: 3 }))));
     }
 
     #[test]

@@ -417,9 +417,9 @@ mod tests {
     fn a_page_of_a_partly_unreadable_recording_is_no_success() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
-        let [whole, cut, damaged] = ["whole.mcap", "cut.mcap", "damaged.mcap"].map(path);
-        fly(&whole, 1);
-        let recording = std::fs::read(&whole).unwrap();
+        let [complete, cut, damaged] = ["complete.mcap", "cut.mcap", "damaged.mcap"].map(path);
+        fly(&complete, 1);
+        let recording = std::fs::read(&complete).unwrap();
         std::fs::write(&cut, &recording[..recording.len() * 3 / 4]).unwrap();
         let mut bytes = recording;
         let middle = bytes.len() / 2;
@@ -427,10 +427,10 @@ mod tests {
         std::fs::write(&damaged, bytes).unwrap();
         let status = |files: &[&Path]| format!("{:?}", reported(files, &[]).unwrap());
         let [success, failure] = [ExitCode::SUCCESS, ExitCode::FAILURE].map(|it| format!("{it:?}"));
-        assert_eq!(status(&[&whole]), success);
+        assert_eq!(status(&[&complete]), success);
         assert_eq!(status(&[&cut]), failure);
         assert_eq!(status(&[&damaged]), failure);
-        assert_eq!(status(&[&whole, &cut]), failure);
+        assert_eq!(status(&[&complete, &cut]), failure);
         for page in ["cut.html", "damaged.html"] {
             assert!(path(page).is_file(), "{page}");
         }

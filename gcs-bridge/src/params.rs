@@ -36,7 +36,7 @@ pub(crate) enum Ask {
     List,
     /// One, by its name.
     Named(String),
-    /// One, by its place.
+    /// One, by its index.
     Numbered(u16),
     /// To change one.
     Set {
@@ -102,7 +102,7 @@ pub(crate) struct Parameters {
     controller: Option<(String, i64)>,
     /// Those of the table that the configuration has.
     list: Vec<Entry>,
-    /// Places of those that are to be sent.
+    /// Indices of those that are to be sent.
     due: BTreeSet<u16>,
     /// A ground station has asked for the list.
     is_listed: bool,
@@ -128,10 +128,10 @@ impl Parameters {
         self.controller = Some((configuration.instance.clone(), now_ns));
         if self.is_listed {
             let is_other = list.len() != self.list.len();
-            let places = (0..).zip(&list).filter(|(place, entry)| {
-                is_other || self.list.get(usize::from(*place)) != Some(entry)
+            let indices = (0..).zip(&list).filter(|(index, entry)| {
+                is_other || self.list.get(usize::from(*index)) != Some(entry)
             });
-            let changed: Vec<u16> = places.map(|(place, _)| place).collect();
+            let changed: Vec<u16> = indices.map(|(index, _)| index).collect();
             self.due.extend(changed);
         }
         self.list = list;
@@ -140,19 +140,19 @@ impl Parameters {
 
     /// Answers a request of a ground station; a list is sent in small groups by `due`.
     pub(crate) fn answer(&mut self, ask: &Ask) -> Answer {
-        let place = match ask {
+        let index = match ask {
             Ask::List => {
                 self.is_listed = true;
                 self.due = (0..).take(self.list.len()).collect();
                 return Answer::default();
             }
-            Ask::Numbered(place) => Some(*place),
+            Ask::Numbered(index) => Some(*index),
             Ask::Named(name) | Ask::Set { name, .. } => (0..)
                 .zip(&self.list)
                 .find(|(_, it)| it.parameter.name == name)
-                .map(|(place, _)| place),
+                .map(|(index, _)| index),
         };
-        let found = place.and_then(|place| Some((place, self.list.get(usize::from(place))?)));
+        let found = index.and_then(|index| Some((index, self.list.get(usize::from(index))?)));
         let why = match (ask, found) {
             (Ask::Set { name, .. }, None) => Some(format!("there is no parameter {name}")),
             (Ask::Set { value, .. }, Some((_, it))) if *value != it.value => Some(format!(
@@ -161,27 +161,27 @@ impl Parameters {
             )),
             _ => None,
         };
-        let message = place.and_then(|place| self.value(place));
+        let message = index.and_then(|index| self.value(index));
         // A ground station that reads a single value has lost it before, so it is sent once more.
-        self.due.extend(place.filter(|_| message.is_some()));
+        self.due.extend(index.filter(|_| message.is_some()));
         Answer { message, why }
     }
 
     /// The next values of a list that was asked for.
     pub(crate) fn due(&mut self) -> Vec<MavMessage> {
-        let places: Vec<u16> = self.due.iter().take(BURST).copied().collect();
-        for place in &places {
-            self.due.remove(place);
+        let indices: Vec<u16> = self.due.iter().take(BURST).copied().collect();
+        for index in &indices {
+            self.due.remove(index);
         }
-        places.into_iter().filter_map(|place| self.value(place)).collect()
+        indices.into_iter().filter_map(|index| self.value(index)).collect()
     }
 
-    fn value(&self, place: u16) -> Option<MavMessage> {
-        let Entry { parameter, value } = self.list.get(usize::from(place))?;
+    fn value(&self, index: u16) -> Option<MavMessage> {
+        let Entry { parameter, value } = self.list.get(usize::from(index))?;
         Some(MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
             param_value: *value,
             param_count: self.list.len() as u16,
-            param_index: place,
+            param_index: index,
             param_id: parameter.name.into(),
             param_type: MavParamType::MAV_PARAM_TYPE_REAL32,
         }))
@@ -197,7 +197,7 @@ fn value(table: &Table, parameter: &Parameter) -> Option<f32> {
         Value::Integer(number) => Some(*number as f32),
         Value::Boolean(is_on) => Some(f32::from(u8::from(*is_on))),
         Value::String(word) => {
-            parameter.words.iter().position(|it| it == word).map(|place| place as f32)
+            parameter.words.iter().position(|it| it == word).map(|index| index as f32)
         }
         _ => None,
     }
@@ -254,12 +254,12 @@ mod tests {
         let listed = all(&mut parameters);
         assert_eq!(listed.len(), TABLE.len());
         let mut names = BTreeSet::new();
-        for (place, value) in (0..).zip(&listed) {
+        for (index, value) in (0..).zip(&listed) {
             assert_eq!(usize::from(value.param_count), TABLE.len());
-            assert_eq!(value.param_index, place);
+            assert_eq!(value.param_index, index);
             assert_eq!(value.param_type, MavParamType::MAV_PARAM_TYPE_REAL32);
             // Longer ones would be cut.
-            assert_eq!(value.param_id.to_str(), Ok(TABLE[usize::from(place)].name));
+            assert_eq!(value.param_id.to_str(), Ok(TABLE[usize::from(index)].name));
             names.insert(value.param_id.to_str().unwrap());
         }
         assert_eq!(names.len(), TABLE.len());

@@ -184,8 +184,8 @@ mod tests {
     #[test]
     fn the_part_of_the_image_that_lacks_points_is_named() {
         let next = |found: &FoundImages| Shown::new(found, None).next.join("; ");
-        let whole = next(&seen_in(|_, _| true));
-        assert_eq!(whole, "take 19 more images");
+        let everywhere = next(&seen_in(|_, _| true));
+        assert_eq!(everywhere, "take 19 more images");
         let no_right = next(&seen_in(|row, column| column < 6 || !(2..4).contains(&row)));
         assert!(no_right.contains("at the right edge of the image"), "{no_right}");
         let corner = next(&seen_in(|row, column| row < 4 || column > 1));

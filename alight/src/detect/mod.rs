@@ -47,9 +47,9 @@ pub(crate) fn run(args: &DetectArgs) -> anyhow::Result<ExitCode> {
     let source = Source::new(&args.images);
     let printed = examiner.examine_all(source, threads, args.format, Output)?;
     let lacks = [&examiner.lacks_drawing, &examiner.lacks_poses];
-    let is_whole =
+    let is_complete =
         printed.unreadable == 0 && !lacks.iter().any(|lacks| lacks.load(Ordering::Relaxed));
-    Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    Ok(if is_complete { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 /// The camera model for poses.
@@ -129,7 +129,7 @@ impl Examiner {
         }
         if !pads.is_empty() && matches!(lens, Lens::Unknown) {
             write_error(
-                "a pad as a whole is found only by a camera that is known: give --camera or --focal-px; now its markers are found one by one",
+                "the pose of a pad needs a known camera: give --camera or --focal-px; now its markers are found one by one",
             );
         }
         if let Some(warning) = lack_of_sizes(&args.markers, !pads.is_empty(), &lens) {

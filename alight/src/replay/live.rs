@@ -120,7 +120,7 @@ pub(crate) fn run(
     let (files, overview) = in_order(files, without)?;
     overview.damage.iter().for_each(|damage| write_error(damage));
     let first_ns = overview.first_ns.context("nothing in the recording is to be published")?;
-    let is_whole = overview.damage.is_empty();
+    let is_complete = overview.damage.is_empty();
     let unreadable = with_node(network, "replay", async |node| {
         for pause in LOOKS {
             sleep(pause).await;
@@ -153,27 +153,27 @@ pub(crate) fn run(
     if unreadable > 0 {
         write_error(&format!("{unreadable} pictures cannot be read, and were left out"));
     }
-    Ok(if is_whole && unreadable == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    Ok(if is_complete && unreadable == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 /// The files of a recording in the order in which they were written, and their common overview.
 fn in_order(files: Vec<Vec<u8>>, without: &[String]) -> anyhow::Result<(Vec<Vec<u8>>, Overview)> {
-    let mut whole = Overview::default();
+    let mut all = Overview::default();
     let mut parts = Vec::new();
     for file in files {
         let (begin, part) = overview(&file, without)?;
-        whole.first_ns = whole.first_ns.into_iter().chain(part.first_ns).min();
-        whole.last_ns = whole.last_ns.max(part.last_ns);
-        whole.clock = whole.clock.or(part.clock);
-        whole.damage.extend(part.damage);
+        all.first_ns = all.first_ns.into_iter().chain(part.first_ns).min();
+        all.last_ns = all.last_ns.max(part.last_ns);
+        all.clock = all.clock.or(part.clock);
+        all.damage.extend(part.damage);
         for (name, last_ns) in part.services {
-            let newest_ns = whole.services.entry(name).or_insert(last_ns);
+            let newest_ns = all.services.entry(name).or_insert(last_ns);
             *newest_ns = last_ns.max(*newest_ns);
         }
         parts.push((begin, file));
     }
     parts.sort_by_key(|(begin, _)| *begin);
-    Ok((parts.into_iter().map(|(_, file)| file).collect(), whole))
+    Ok((parts.into_iter().map(|(_, file)| file).collect(), all))
 }
 
 /// The begin of a file, and its overview.
