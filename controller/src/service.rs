@@ -137,7 +137,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                     flight.refused_version(now_ns());
                 }
                 flight.tick(now_ns());
-                unreadable.step(now_ns(), &node.health().unreadable());
+                unreadable.step(now_ns(), node.health());
                 let more = link.strangers().saturating_sub(strangers);
                 if more > 0 {
                     strangers += more;

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use messages::{ControllerStatus, topic};
+use node::HealthCounters;
 use node::health::Unreadable;
 
 use crate::refusals::Refusals;
@@ -13,20 +14,23 @@ use crate::selection::MAX_DETECTORS;
 pub struct UnreadableDetections {
     /// How many there were the last time.
     counted: BTreeMap<String, u64>,
+    /// How many of all keys.
+    known: u64,
     refusals: Refusals,
 }
 
 impl UnreadableDetections {
-    /// Takes what could not be read so far, by key.
-    pub fn step(&mut self, now_ns: i64, unreadable: &[Unreadable]) {
+    /// Takes what could not be read since the last call.
+    pub fn step(&mut self, now_ns: i64, health: &HealthCounters) {
+        let Some(unreadable) = health.more_unreadable(&mut self.known) else { return };
         for Unreadable { key, count, why, .. } in unreadable {
-            let Some(detector) = topic::DETECTIONS.first_name(key) else { continue };
+            let Some(detector) = topic::DETECTIONS.first_name(&key) else { continue };
             let is_known = self.counted.contains_key(detector);
             if !is_known && self.counted.len() >= MAX_DETECTORS {
                 continue;
             }
-            let before = self.counted.insert(detector.to_owned(), *count).unwrap_or(0);
-            if *count > before {
+            let before = self.counted.insert(detector.to_owned(), count).unwrap_or(0);
+            if count > before {
                 self.refusals.add_of(now_ns, "unreadable", detector, || {
                     format!("detections of `{detector}` cannot be read: {why}; its frames are not missing (docs/wire-format.md has every byte)")
                 });
@@ -43,8 +47,6 @@ impl UnreadableDetections {
 
 #[cfg(test)]
 mod tests {
-    use node::HealthCounters;
-
     use super::*;
 
     #[test]
@@ -65,7 +67,7 @@ mod tests {
                     health.unreadable_payload(ms, key, "a Detections of 9 bytes is cut".into());
                 }
             }
-            unreadable.step(ms * 1_000_000, &health.unreadable());
+            unreadable.step(ms * 1_000_000, &health);
             let told = told(&unreadable, ms);
             match ms {
                 1000..2000 => {

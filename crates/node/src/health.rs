@@ -48,6 +48,8 @@ struct Counters {
     drops: BTreeMap<String, u64>,
     errors: BTreeMap<String, u64>,
     unreadable: Vec<Unreadable>,
+    /// How many of them there were.
+    unreadable_count: u64,
     last_report_ns: Option<i64>,
 }
 
@@ -101,6 +103,7 @@ impl HealthCounters {
     /// Counts a payload that could not be read, by its key. Returns how many are not logged yet, if they are to be logged now.
     pub fn unreadable_payload(&self, now_ns: i64, key: &str, why: String) -> Option<u64> {
         let mut counters = self.lock();
+        counters.unreadable_count += 1;
         let all = &mut counters.unreadable;
         let known = all.iter().position(|it| it.key == key);
         let others = || all.iter().position(|it| it.key == OTHER_KEYS);
@@ -121,9 +124,11 @@ impl HealthCounters {
         Some(refused.count - std::mem::replace(&mut refused.logged, refused.count))
     }
 
-    /// The payloads that could not be read so far, by key.
-    pub fn unreadable(&self) -> Vec<Unreadable> {
-        self.lock().unreadable.clone()
+    /// The payloads that could not be read so far, by key; `None` where there are no more than `known`, which becomes their number.
+    pub fn more_unreadable(&self, known: &mut u64) -> Option<Vec<Unreadable>> {
+        let counters = self.lock();
+        let before = std::mem::replace(known, counters.unreadable_count);
+        (counters.unreadable_count > before).then(|| counters.unreadable.clone())
     }
 
     /// Failures of this reason so far.
@@ -245,7 +250,11 @@ mod tests {
         for i in 0..1000 {
             counters.unreadable_payload(1, &format!("{i}"), String::new());
         }
-        let all = counters.unreadable();
+        let mut known = 0;
+        let all = counters.more_unreadable(&mut known).unwrap();
+        assert_eq!((known, counters.more_unreadable(&mut known)), (1251, None), "once");
+        counters.unreadable_payload(1, "detector/b/detections", "cut".into());
+        assert!(counters.more_unreadable(&mut known).is_some());
         assert_eq!(all.len(), MAX_KEYS + 1);
         assert_eq!((all[0].count, all[1].why.as_str()), (250, "cut"));
         assert_eq!(all.last().map(|it| it.count), Some(1000 - MAX_KEYS as u64 + 2));
