@@ -695,18 +695,13 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
     let Some(status) = &seen.status else { return };
     let text = format!("{} ({}); autopilot: {}", status.phase, status.why, status.autopilot);
     findings.good("controller", text);
-    // The state of the link is published as text only: `system 1 in GUIDED` if the autopilot's heartbeat is received.
+    // The state of the link is published as text only: `system 1 in GUIDED` if the autopilot's heartbeat is received. Otherwise the text
+    // contains the advice.
     let link = &status.autopilot;
-    let is_received = link.starts_with("system ") && !link.ends_with("is silent");
+    let is_received = link.starts_with("system ") && !link.contains("is silent");
     if !is_received {
-        findings.wrong(
-            "autopilot",
-            format!("the controller does not receive its heartbeat: {link}"),
-            match link.contains(": ") {
-                true => "no landing starts without it: do as the controller advises above",
-                false => "no landing starts without it: check that it is on, its cable, and `autopilot.address`",
-            },
-        );
+        let text = "the controller does not receive its heartbeat, and no landing starts without it";
+        findings.wrong("autopilot", text.to_owned(), link);
     }
     match status.setpoint_timeout_s {
         Some(seconds) => findings.good(
@@ -814,12 +809,11 @@ mod tests {
         let other = findings_text(
             "no heartbeat of system 7 yet, but of 1: set `autopilot.system_id` to the vehicle's",
         );
-        assert!(
-            other.contains("but of 1: set") && other.contains("do as the controller advises"),
-            "{other}"
-        );
-        let silent = findings_text("no heartbeat yet, nothing came");
-        assert!(silent.contains("nothing came") && silent.contains("its cable"), "{silent}");
+        assert!(other.contains("does not receive its heartbeat") && other.contains("->"), "{other}");
+        assert_eq!(other.matches("but of 1: set `autopilot.system_id`").count(), 2, "{other}");
+        let silent = findings_text("system 1 is silent: check its cable");
+        assert!(silent.contains("does not receive") && silent.contains("-> "), "{silent}");
+        assert!(!findings_text("system 1 in GUIDED").contains("does not receive"));
     }
 
     #[test]

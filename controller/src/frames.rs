@@ -124,7 +124,7 @@ impl Frames {
         if message.detector != publisher {
             return self.refuse(now_ns, "another-detectors-name", || {
                 format!(
-                    "detections are refused: `{publisher}` gives them the name of `{}`",
+                    "detections are refused: `{publisher}` gives them the name of `{}`; the detector that publishes them must give its own id as `detector` (docs/wire-format.md)",
                     message.detector
                 )
             });
@@ -142,10 +142,11 @@ impl Frames {
         // Refused here, because later stamps are compared with the newest: one from the future would block
         // them all.
         let ahead_s = header.stamp_ns.saturating_sub(now_ns) as f64 * 1e-9;
-        if ahead_s > self.max_future_s {
+        let max_s = self.max_future_s;
+        if ahead_s > max_s {
             return self.refuse(now_ns, "from-the-future", || {
                 format!(
-                    "detections of `{publisher}` are refused: the stamps of camera `{}` lie {ahead_s:.1} s in the future",
+                    "detections of `{publisher}` are refused: the stamps of camera `{}` lie {ahead_s:.2} s in the future, and {max_s} s are allowed; stamp frames with this host's monotonic clock, or set `target.max_future_s` higher",
                     header.camera
                 )
             });
@@ -164,8 +165,8 @@ impl Frames {
         if mount.is_none() && message.detections.iter().any(|detection| detection.pose.is_some()) {
             self.refusals.add(now_ns, "unknown-camera", || {
                 format!(
-                    "markers seen by `{publisher}` have no place: nothing is known of the mount of camera `{}`",
-                    header.camera
+                    "markers seen by `{publisher}` have no place: nothing is known of the mount of camera `{}`; set `mount` in its camera-pub, or publish its camera info with one (`camera/{}/info`)",
+                    header.camera, header.camera
                 )
             });
         } else {

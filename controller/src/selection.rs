@@ -811,8 +811,9 @@ fn said(fault: &Fault) -> String {
 /// What is told of a detector that gives no pose.
 fn without_pose(name: &str) -> String {
     format!(
-        "detector `{name}` gives no pose of the marker, only its place in the image, and the landing needs one: it lacks the marker's size, or the \
-         camera's calibration at this image size"
+        "detector `{name}` gives no pose of the marker, only its place in the image, in three or more of four of its latest frames with the marker, and \
+         the landing needs one: say the marker's size in the detector's `markers` (FAMILY:ID:SIZE_M), or calibrate the camera at this image size \
+         (`alight calibrate`)"
     )
 }
 

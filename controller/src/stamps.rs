@@ -68,7 +68,8 @@ impl Stamps {
             self.differing.add_of(now_ns, "another-stamp", &format!("{first} {second}"), || {
                 format!(
                     "detectors `{first}` and `{second}` give frames of camera `{camera}` stamps that lie {:.1} ms apart, as frame {sequence}: one of them does \
-                     not pass the frame's header on unchanged, and what it sees is taken for that of another moment",
+                     not pass the frame's header on unchanged (0 ms are allowed), and what it sees is taken for that of another moment; stop it, or have it copy \
+                     `header` as it came",
                     apart_ns.abs() as f64 * 1e-6
                 )
             });
@@ -114,6 +115,7 @@ mod tests {
         let shifted = told(20, counted);
         assert_eq!(shifted.len(), 1, "{shifted:?}");
         assert!(shifted[0].contains("`main` and `mine`") && shifted[0].contains("20.0 ms apart"));
+        assert!(shifted[0].contains("0 ms are allowed") && shifted[0].contains("stop it"));
         assert!(told(0, counted).is_empty());
         // A camera that began anew, and one that does not count.
         assert!(told(5000, counted).is_empty());

@@ -284,8 +284,10 @@ impl View<'_> {
                 let mode = mode.map_or_else(String::new, |mode| format!(" in {mode}"));
                 format!("system {system}{mode}")
             }
-            (Some(system), false) => format!("system {system} is silent"),
-            (None, _) => "no heartbeat yet".to_owned(),
+            (Some(system), false) => {
+                format!("system {system} is silent: check that it is on, and its cable or radio")
+            }
+            (None, _) => "no heartbeat yet: check that the autopilot is on, its cable, and `autopilot.address`".to_owned(),
         }
     }
 

@@ -512,6 +512,36 @@ fn a_start_is_refused_while_all_detections_are_and_the_reason_is_told() {
 }
 
 #[test]
+fn what_is_told_of_refused_detections_has_the_value_its_limit_and_what_to_do() {
+    let of = |camera: &str, ahead_ms: i64, detector: &str, ms: i64| Detections {
+        header: FrameHeader { camera: camera.into(), ..header((ms + ahead_ms) * MS) },
+        detector: detector.into(),
+        ..Detections::sample()
+    };
+    for (camera, ahead_ms, detector, told) in [
+        (
+            "down",
+            300,
+            "main",
+            &["0.30 s in the future", "0.05 s are allowed", "target.max_future_s"][..],
+        ),
+        ("down", -20, "mine", &["`main` gives them the name of `mine`", "must give its own id"]),
+        ("front", -20, "main", &["mount of camera `front`", "`camera/front/info`"]),
+    ] {
+        let mut flight = in_flight("command");
+        flight.camera(0, CameraInfo::sample());
+        for ms in (20..1600).step_by(20) {
+            pose(&mut flight, ms * MS);
+            flight.detections(ms * MS, "main", &of(camera, ahead_ms, detector, ms));
+            flight.tick(ms * MS + 3);
+        }
+        let warnings = flight.status(1600 * MS).warnings;
+        let has_all = |text: &String| told.iter().all(|part| text.contains(part));
+        assert!(warnings.iter().any(has_all), "{told:?}: {warnings:?}");
+    }
+}
+
+#[test]
 fn a_detector_that_puts_the_marker_where_none_can_be_is_refused_told_and_passed_over() {
     for place_m in [[0.0, 0.0, -5.0], [0.0, 0.0, 1e9], [f64::NAN, 0.0, 5.0]] {
         let health = Arc::<HealthCounters>::default();

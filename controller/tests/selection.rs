@@ -681,7 +681,9 @@ fn one_that_gives_no_pose_is_told_and_gives_way_to_one_that_does() {
         let mine = ("mine", 20 * MS, without_position(false));
         let took_ms = warned_ms(&mut bench, 0..40, &[mine], "`mine` gives no pose").unwrap();
         assert!(took_ms < 1000, "{took_ms} ms");
-        assert!(bench.selection.no_pose().unwrap().contains("`mine` gives no pose"));
+        let told = bench.selection.no_pose().unwrap();
+        let parts = ["`mine` gives no pose", "in three or more of four", "FAMILY:ID:SIZE_M"];
+        assert!(parts.iter().all(|part| told.contains(part)), "{told}");
         assert_eq!(bench.state("mine"), DetectorState::Blind);
         assert_eq!(bench.selection.active(), Some("mine"), "there is no other");
         for i in 40..60 {

@@ -33,12 +33,12 @@ impl Heard {
                 systems.join(", ")
             ),
             _ if packets > 0 => format!(
-                "no heartbeat of an autopilot yet, but {packets} other MAVLink packets: check what is connected there"
+                "no heartbeat of an autopilot yet, but {packets} other MAVLink packets: check what is connected there, and that the autopilot sends heartbeats on this port"
             ),
             _ if bad_bytes + bad_checksums + unknown_ids > 0 => format!(
                 "no heartbeat yet, and in {bad_bytes} bytes that came no MAVLink packet: check the speed (baud) on both sides, and that the autopilot's port speaks MAVLink"
             ),
-            _ => "no heartbeat yet, nothing came".to_owned(),
+            _ => "no heartbeat yet, nothing came: check that the autopilot is on, its cable, and `autopilot.address`".to_owned(),
         }
     }
 }
@@ -74,6 +74,7 @@ mod tests {
             noise.contains("in 3000 bytes that came no MAVLink packet: check the speed"),
             "{noise}"
         );
-        assert!(told(&[], Counters::default(), Some(1)).ends_with("nothing came"));
+        let nothing = told(&[], Counters::default(), Some(1));
+        assert!(nothing.contains("nothing came: check that the autopilot is on"), "{nothing}");
     }
 }
