@@ -1,5 +1,5 @@
-//! How slow the link to the autopilot is, as the landing reckons with it: what is measured, what was measured last, or what is assumed
-//! of a link that never tells.
+//! How slow the link to the autopilot is, as the landing reckons with it: what is measured, for a while what was measured last, or what is
+//! assumed of a link that does not tell.
 
 use autopilot::Autopilot;
 
@@ -7,7 +7,7 @@ use crate::refusals::Warning;
 
 /// Change of the delay that the lander is told of, in seconds.
 const STEP_S: f64 = 0.01;
-/// The delay of a link, both ways together, that never tells it, in seconds: that of a telemetry radio. A delay that is taken for none
+/// The delay of a link, both ways together, that does not tell it, in seconds: that of a telemetry radio. A delay that is taken for none
 /// makes the vehicle swing over the pad, and one that is taken for longer than it is only makes the landing slower.
 const UNKNOWN_S: f64 = 0.3;
 
@@ -23,8 +23,8 @@ impl LinkDelay {
         self.seconds
     }
 
-    /// Follows the link's delay; in seconds when the lander is to be told of another one. Not known for a moment, or not any more, it
-    /// is taken for what it was.
+    /// Follows the link's delay; in seconds when the lander is to be told of another one. Where it is not measured any more, or the
+    /// vehicle is silent, it is taken for what it was, until [`Autopilot::lacks_link_delay`].
     pub fn step(&mut self, now_ns: i64, autopilot: &Autopilot) -> Option<f64> {
         let seconds = match autopilot.link_delay(now_ns) {
             Some(delay) => delay.as_secs_f64(),

@@ -809,6 +809,10 @@ fn a_low_battery_leads_to_what_is_configured() {
     assert_eq!((status.phase, status.why.as_str()), (Phase::Hold, "the battery is low"));
 }
 
+fn warns_of_link_delay(flight: &Flight, now_ns: i64) -> bool {
+    flight.status(now_ns).warnings.iter().any(|it| it.contains("TIMESYNC"))
+}
+
 #[test]
 fn a_link_whose_delay_is_not_known_counts_as_slow_and_is_told_of() {
     for (set, is_told) in [("autopilot.timesync=true", true), ("autopilot.timesync=false", false)] {
@@ -817,10 +821,7 @@ fn a_link_whose_delay_is_not_known_counts_as_slow_and_is_told_of() {
         flight.camera(0, CameraInfo::sample());
         receive(&mut flight, 0, &heartbeat(4, true));
         receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
-        let warns = |flight: &Flight, ms: i64| {
-            let warnings = flight.status(ms * MS).warnings;
-            warnings.iter().any(|it| it.contains("TIMESYNC"))
-        };
+        let warns = |flight: &Flight, ms: i64| warns_of_link_delay(flight, ms * MS);
         hover(&mut flight, 20, 2500, 4);
         assert!(!warns(&flight, 2500) && flight.link_delay_s() < 0.01, "it may still answer");
         hover(&mut flight, 2500, 6000, 4);
@@ -858,11 +859,49 @@ fn a_delay_that_is_not_known_any_more_is_taken_for_what_it_was() {
             let answer = TIMESYNC_DATA { tc1: (asked_ms + 200) * MS, ..question };
             receive(&mut flight, now_ns, &MavMessage::TIMESYNC(answer));
         }
-        if ms >= 5000 {
-            assert!(flight.link_delay_s() > 0.15, "after {ms} ms: {} s", flight.link_delay_s());
+        // The age of positions tells it for 30 s more, and 10 s later it counts as not known.
+        let (delay_s, is_told) = (flight.link_delay_s(), warns_of_link_delay(&flight, now_ns));
+        match ms {
+            5000..44_000 => {
+                assert!(!is_told && (0.15..0.25).contains(&delay_s), "after {ms} ms: {delay_s} s");
+            }
+            47_000.. => {
+                assert!(is_told && (delay_s - 0.3).abs() < 0.01, "after {ms} ms: {delay_s} s");
+            }
+            _ => {}
         }
     }
-    assert!(flight.status(60_000 * MS).warnings.iter().all(|it| !it.contains("TIMESYNC")));
+}
+
+#[test]
+fn a_link_that_was_unsteady_is_not_taken_for_a_slow_one_for_good() {
+    let mut flight = flight("airborne");
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    let mut slow_s: f64 = 0.0;
+    for ms in (20..30_000).step_by(20) {
+        let now_ns = ms * MS;
+        if ms % 1000 == 0 {
+            receive(&mut flight, now_ns, &heartbeat(4, true));
+        }
+        // TIMESYNC is answered at once for 2 s; from 3 s to 8 s most packets are late by a time of their own.
+        let is_unsteady = (3000..8000).contains(&ms);
+        let late_ms = if is_unsteady { (ms * 7) % 900 } else { 0 };
+        receive(&mut flight, now_ns, &attitude(now_ns - late_ms * MS));
+        receive(&mut flight, now_ns + 1, &position(now_ns - late_ms * MS, 5.0));
+        flight.tick(now_ns + 3);
+        while let Some(packet) = flight.poll_outgoing() {
+            for packet in Parser::new().push(&packet) {
+                if let (Some(MavMessage::TIMESYNC(question)), true) = (packet.message, ms < 2000) {
+                    let answer = TIMESYNC_DATA { tc1: now_ns, ..question };
+                    receive(&mut flight, now_ns + 4, &MavMessage::TIMESYNC(answer));
+                }
+            }
+        }
+        slow_s = slow_s.max(flight.link_delay_s());
+    }
+    assert!(slow_s >= 1.0, "{slow_s} s");
+    assert!(flight.link_delay_s() < 0.35, "{} s", flight.link_delay_s());
 }
 
 /// A ground station's heartbeat.

@@ -51,6 +51,8 @@ const SAME_ADDRESS_NS: i64 = 10_000_000_000;
 const LISTENS_NS: i64 = 2_500_000_000;
 /// Time within which the clock's answers tell how slow the link is, in nanoseconds: it is asked for ten times a second.
 const LINK_DELAY_DUE_NS: i64 = 3_000_000_000;
+/// Time for which a delay counts that is not measured any more, in nanoseconds.
+const MAX_LINK_DELAY_AGE_NS: i64 = 10_000_000_000;
 /// Maximum age of a position whose vertical speed says whether the vehicle stands, in nanoseconds.
 const MAX_SPEED_AGE_NS: i64 = 500_000_000;
 
@@ -74,8 +76,8 @@ pub struct Autopilot {
     heartbeat_due_ns: i64,
     /// The system id of the first other vehicle that was heard.
     other_system: Option<u8>,
-    /// The link's delay was known once.
-    knew_link_delay: bool,
+    /// When the clock told the link's delay last.
+    link_delay_ns: Option<i64>,
     /// When a packet of another companion with our ids came last.
     same_address_ns: Option<i64>,
     refused_numbers: u64,
@@ -91,6 +93,8 @@ struct Vehicle {
     simulation: Simulation,
     /// When it was found.
     found_ns: i64,
+    /// Since when its heartbeats have come without a break.
+    contact_ns: i64,
     heartbeat_ns: i64,
     /// When its mode was shown last.
     mode_ns: i64,
@@ -130,7 +134,7 @@ impl Autopilot {
             sequence: 0,
             heartbeat_due_ns: i64::MIN,
             other_system: None,
-            knew_link_delay: false,
+            link_delay_ns: None,
             same_address_ns: None,
             refused_numbers: 0,
             late: 0,
@@ -211,6 +215,9 @@ impl Autopilot {
             self.ask_for_checks(now_ns);
         }
         self.prove_setpoints(now_ns);
+        if self.clock.link_delay_ns(now_ns).is_some() {
+            self.link_delay_ns = Some(now_ns);
+        }
         self.standstill.tick(now_ns);
         self.step_requests(now_ns, !self.standstill.is_mode_old());
     }
@@ -309,12 +316,14 @@ impl Autopilot {
         self.clock.link_delay_ns(now_ns).map(|ns| Duration::from_nanos(ns.max(0).unsigned_abs()))
     }
 
-    /// Whether a connected vehicle has had time to tell how slow the link is, and never has: its clock is not asked for
-    /// ([`Config::timesync`]), or the link does not pass the questions or the answers.
+    /// Whether a connected vehicle has had 3 s to tell how slow the link is, and has not, or has not any more for 10 s: its clock is not
+    /// asked for ([`Config::timesync`]), or the link does not pass the questions or the answers.
     pub fn lacks_link_delay(&self, now_ns: i64) -> bool {
         let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.state.connected);
-        let heard_ns = vehicle.map_or(0, |vehicle| now_ns.saturating_sub(vehicle.found_ns));
-        !self.knew_link_delay && heard_ns >= LINK_DELAY_DUE_NS
+        let Some(vehicle) = vehicle else { return false };
+        let has_passed = |since_ns: i64, limit_ns: i64| now_ns.saturating_sub(since_ns) >= limit_ns;
+        has_passed(vehicle.contact_ns, LINK_DELAY_DUE_NS)
+            && self.link_delay_ns.is_none_or(|at_ns| has_passed(at_ns, MAX_LINK_DELAY_AGE_NS))
     }
 
     /// Whether another companion on this link uses our ids: probably a second controller of the same vehicle.
@@ -557,7 +566,6 @@ impl Autopilot {
             self.send(&timesync(now_ns, message.ts1, from));
         } else if self.config.timesync {
             self.clock.answered(now_ns, message.tc1, message.ts1);
-            self.knew_link_delay |= self.clock.link_delay_ns(now_ns).is_some();
         }
     }
 

@@ -58,6 +58,7 @@ impl Autopilot {
             readiness: Readiness::default(),
             simulation: Simulation::default(),
             found_ns: now_ns,
+            contact_ns: now_ns,
             heartbeat_ns: now_ns,
             mode_ns: now_ns,
             mode_since_ns: now_ns,
@@ -84,6 +85,7 @@ impl Autopilot {
         vehicle.heard_ns = now_ns;
         state.stamp_ns = now_ns;
         let returned = !std::mem::replace(&mut state.connected, true);
+        vehicle.contact_ns = if returned { now_ns } else { vehicle.contact_ns };
         let armed_changed = std::mem::replace(&mut state.armed, armed) != armed;
         let landed = if armed { state.landed } else { vehicle.contact.disarmed() };
         let landed_before = std::mem::replace(&mut state.landed, landed);
