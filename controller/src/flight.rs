@@ -522,7 +522,7 @@ impl Flight {
             self.mission.begin(now_ns, true);
         }
         let is_leading_out = self.offboard.is_leading_out();
-        if is_leading_out || self.waits_for_battery(now_ns) || self.waits_for_detector() {
+        if is_leading_out || self.waits_for_battery(now_ns) || self.waits_for_detector(now_ns) {
             return;
         }
         // The lander refuses a start without a fresh state, and the mission would not try again.
@@ -596,11 +596,9 @@ impl Flight {
     }
 
     /// A take-off does not begin while no detector looks for the marker. True while it waits for one.
-    fn waits_for_detector(&mut self) -> bool {
-        let stands = self.autopilot.state().is_some_and(|state| !state.armed);
+    fn waits_for_detector(&mut self, now_ns: i64) -> bool {
         let why = self.frames.nobody_looks_for_marker();
-        let why = why.filter(|_| stands && self.mission.is_taking_off());
-        why.is_some_and(|why| self.mission.wait(why))
+        why.is_some_and(|why| self.mission.put_off(now_ns, &mut self.autopilot, why))
     }
 
     fn handle_autopilot_events(&mut self, now_ns: i64) {

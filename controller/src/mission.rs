@@ -143,11 +143,15 @@ impl Mission {
         matches!(self.state, State::TakingControl { .. })
     }
 
-    /// A take-off waits for this reason, which is told; true where there is one.
-    pub fn wait(&mut self, reason: String) -> bool {
-        let State::TakingOff { why, .. } = &mut self.state else { return false };
-        *why = reason;
-        true
+    /// Puts off a take-off that has not begun, for this reason, which is told: nothing asks for its motors, and its times stand still. True
+    /// where there is one.
+    pub fn put_off(&mut self, now_ns: i64, autopilot: &mut Autopilot, reason: String) -> bool {
+        let State::TakingOff { takeoff, why, .. } = &mut self.state else { return false };
+        let is_put_off = takeoff.put_off(now_ns, autopilot);
+        if is_put_off {
+            *why = reason;
+        }
+        is_put_off
     }
 
     /// Asks a PX4 that holds its place to follow setpoints. The landing begins once it does.

@@ -831,7 +831,7 @@ fn a_link_whose_delay_is_not_known_counts_as_slow_and_is_told_of() {
 }
 
 #[test]
-fn a_delay_that_is_not_known_any_more_is_taken_for_what_it_was() {
+fn a_delay_that_is_not_known_any_more_is_taken_for_what_it_was_for_a_while() {
     let mut flight = flight("airborne");
     receive(&mut flight, 0, &heartbeat(4, true));
     receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
@@ -1236,6 +1236,70 @@ fn a_landing_on_a_marker_that_no_detector_looks_for_is_refused_and_no_motor_star
         assert_eq!(arms, is_armed, "{commands:?}, {}", status.why);
         assert_eq!(status.why.contains(told), !is_armed, "{status:?}");
         assert!(is_armed || status.phase == Phase::Takeoff, "{status:?}");
+    }
+}
+
+/// A vehicle that stands, ready or not, in this mode.
+fn stand(flight: &mut Flight, ms: i64, mode: u32, is_ready: bool) {
+    if ms % 1000 == 0 {
+        receive(flight, ms * MS, &heartbeat(mode, false));
+        let on_ground = MavLandedState::MAV_LANDED_STATE_ON_GROUND;
+        receive(flight, ms * MS, &contact(on_ground));
+        let flags = EkfStatusFlags::from_bits_retain(if is_ready { 831 } else { 0 });
+        let estimate = EKF_STATUS_REPORT_DATA { flags, ..Default::default() };
+        receive(flight, ms * MS, &MavMessage::EKF_STATUS_REPORT(estimate));
+    }
+    pose_at(flight, ms * MS, 0.0);
+    if ms % 200 == 0 {
+        let searched = Detections { detections: Vec::new(), ..seen((ms - 40) * MS) };
+        flight.detections(ms * MS + 2, "main", &searched);
+    }
+    flight.tick(ms * MS + 3);
+}
+
+#[test]
+fn a_takeoff_that_waits_for_a_detector_asks_for_no_motors_and_its_time_stands_still() {
+    // The wait comes before the vehicle is ready, and once its motors are asked for.
+    for asks_first in [false, true] {
+        let mut flight = flight_with("takeoff", &["autopilot.system_id=1"]);
+        flight.presence(0, "main", true);
+        let look = |flight: &mut Flight, ms: i64, marker: &str| {
+            flight.on_detector_info(ms * MS, "main", &looking_for("main", &[marker]));
+        };
+        let arms = |flight: &mut Flight| {
+            let arm = MavCmd::MAV_CMD_COMPONENT_ARM_DISARM;
+            sent(flight).1.iter().filter(|it| **it == arm).count()
+        };
+        look(&mut flight, 0, "rings:0.15341");
+        let mut ms = 0;
+        let mut asked = 0;
+        while ms < 50_000 && asked == 0 {
+            stand(&mut flight, ms, 4, asks_first);
+            asked += arms(&mut flight);
+            ms += 20;
+        }
+        assert_eq!(asked > 0, asks_first, "{:?}", flight.status(ms * MS));
+        look(&mut flight, ms, "aruco-4x4-50:7:0.15");
+        let until_ms = ms + 55_000;
+        while ms < until_ms {
+            stand(&mut flight, ms, 4, asks_first);
+            ms += 20;
+            let status = flight.status(ms * MS);
+            let is_told = status.why.contains("no detector looks for the landing's marker");
+            assert!(status.phase == Phase::Takeoff && is_told, "{status:?}");
+            assert_eq!(arms(&mut flight), 0, "at {ms} ms");
+        }
+        // It is there: what was left of the time is left still, and the motors are asked for.
+        look(&mut flight, ms, "rings:0.15341");
+        let until_ms = ms + 60_000;
+        let mut asked = 0;
+        while ms < until_ms && asked == 0 {
+            stand(&mut flight, ms, 4, asks_first || ms > until_ms - 10_000);
+            asked += arms(&mut flight);
+            ms += 20;
+        }
+        let status = flight.status(ms * MS);
+        assert!(asked > 0 && status.phase == Phase::Takeoff, "{asks_first}: {asked} {status:?}");
     }
 }
 

@@ -68,6 +68,8 @@ pub struct Takeoff {
     is_listening: bool,
     /// The timeout of that question.
     simulation_until_ns: Option<i64>,
+    /// When it was stepped, or put off, last.
+    stepped_ns: Option<i64>,
 }
 
 /// The progress of a takeoff.
@@ -166,6 +168,8 @@ struct Arming {
     /// The mode in which it began.
     mode: Option<FlightMode>,
     request: Option<CommandId>,
+    /// It was asked for, if not now: motors that run may be ours.
+    was_asked: bool,
     retry_ns: i64,
     refused: Option<CommandError>,
 }
@@ -191,6 +195,7 @@ impl Takeoff {
             only_simulated: false,
             is_listening: false,
             simulation_until_ns: None,
+            stepped_ns: None,
         }
     }
 
@@ -206,11 +211,37 @@ impl Takeoff {
     /// A vehicle that already flies in GUIDED is done at once; one that flies in another mode is left alone.
     /// One that stands with armed motors is left on the ground: it may have landed a moment ago.
     pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> TakeoffProgress {
+        self.stepped_ns = Some(now_ns);
         if let Err(error) = self.advance(now_ns, autopilot) {
             autopilot.withdraw();
             self.part = Part::Failed(error);
         }
         self.progress(autopilot)
+    }
+
+    /// Puts it off, instead of a step, while something else than the vehicle keeps it from beginning: its times stand still, and the motors
+    /// are not asked to start. False where it has begun, as the motors run, and where no vehicle is known: then it must be stepped.
+    pub fn put_off(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
+        let Some(state) = autopilot.state() else { return false };
+        // An arming that was withdrawn may be carried out all the same.
+        let is_ours = matches!(&self.part, Part::Arm(it) if it.was_asked || it.request.is_some());
+        let stands = is_ours && state.landed == LandedState::OnGround;
+        if self.is_finished() || state.armed && !stands {
+            return false;
+        }
+        let passed_ns = self.stepped_ns.map_or(0, |last_ns| now_ns.saturating_sub(last_ns));
+        self.stepped_ns = Some(now_ns);
+        for until_ns in self.until_ns.iter_mut().chain(&mut self.simulation_until_ns) {
+            *until_ns = until_ns.saturating_add(passed_ns);
+        }
+        if let Part::Arm(arming) = &mut self.part {
+            if arming.request.take().is_some() {
+                autopilot.withdraw();
+                arming.was_asked = true;
+            }
+            arming.retry_ns = now_ns;
+        }
+        true
     }
 
     /// True when it is done or has failed.
@@ -265,7 +296,8 @@ impl Takeoff {
                     let leaves_land = mode.is_landing() && state.mode == FlightMode::AUTO_HOLD;
                     mode != state.mode && !leaves_land
                 });
-                self.guided || is_changed || state.armed && arming.request.is_none()
+                let is_ours = arming.request.is_some() || arming.was_asked;
+                self.guided || is_changed || state.armed && !is_ours
             }
             _ => self.guided,
         };
@@ -367,7 +399,8 @@ impl Takeoff {
 
     fn begin_arming(&mut self, now_ns: i64, autopilot: &Autopilot) {
         let mode = autopilot.state().map(|state| state.mode);
-        let arming = Arming { mode, request: None, retry_ns: now_ns, refused: None };
+        let arming =
+            Arming { mode, request: None, was_asked: false, retry_ns: now_ns, refused: None };
         self.begin(now_ns, Part::Arm(arming), self.limits.arm);
     }
 
@@ -397,8 +430,8 @@ impl Takeoff {
                 if self.until_ns.is_some_and(|until_ns| now_ns < until_ns) =>
             {
                 let retry_ns = now_ns.saturating_add(ns(ARM_RETRY));
-                let refused = Some(error);
-                self.part = Part::Arm(Arming { request: None, retry_ns, refused, ..arming });
+                let (request, was_asked, refused) = (None, false, Some(error));
+                self.part = Part::Arm(Arming { request, was_asked, retry_ns, refused, ..arming });
             }
             Err(error) => return Err(error.into()),
         }
