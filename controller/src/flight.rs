@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use autopilot::dialect::{MavMessage, MavType};
-use autopilot::{Autopilot, Event, FlightMode, LandedState, Packet};
+use autopilot::{Autopilot, Event, FlightMode, LISTENING, LandedState, Packet};
 use landing::{
     Action, Alarm, AlarmAction, Decision, Event as LanderEvent, FrameObservation, Lander,
     OperatorCommand, Phase, Reason, Timestamp,
@@ -533,10 +533,13 @@ impl Flight {
         });
         // A landing that would see nothing waits; what it waits for stands in the status. One of a vehicle that another controller may
         // fly, or that may be the wrong one, too; a vehicle that took off for us is ours.
-        let conflict = self.autopilot.conflict(now_ns);
-        let conflict = conflict.filter(|_| self.mission.is_awaiting_takeoff());
+        let begins_by_itself = self.mission.is_awaiting_takeoff();
+        let conflict = self.autopilot.conflict(now_ns).filter(|_| begins_by_itself);
         let obstacle = match conflict {
             Some(conflict) => Some(conflict.to_string()),
+            None if begins_by_itself && !self.autopilot.has_listened(now_ns) => {
+                Some(LISTENING.to_owned())
+            }
             None if is_fresh => self.frames.obstacle(now_ns),
             None => Some("waiting for attitude and position".to_owned()),
         };

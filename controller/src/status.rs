@@ -1,7 +1,7 @@
 //! Builds the status and the target estimate that the controller publishes: phase and its reason in words, warnings, detector in
 //! use, height, link and ages.
 
-use autopilot::{Autopilot, LandedState};
+use autopilot::{Autopilot, LISTENING, LandedState};
 use landing::{Action, Decision, Lander, Reason};
 use messages::{ControllerStatus, Phase, Setpoint, TargetEstimate};
 
@@ -153,9 +153,12 @@ impl View<'_> {
                 (Phase::Idle, "waiting for the autopilot's heartbeat".to_owned())
             }
             (State::AwaitingTakeoff, None) => {
-                let waits = "waiting for the vehicle to fly in GUIDED".to_owned();
+                let waits = match self.autopilot.has_listened(now_ns) {
+                    true => "waiting for the vehicle to fly in GUIDED",
+                    false => LISTENING,
+                };
                 let conflict = self.autopilot.conflict(now_ns).map(|it| it.to_string());
-                (Phase::Idle, conflict.unwrap_or(waits))
+                (Phase::Idle, conflict.unwrap_or_else(|| waits.to_owned()))
             }
             (State::TakingOff { why, .. }, _) => (Phase::Takeoff, why.clone()),
             (State::TakingControl { .. }, _) => {

@@ -943,9 +943,14 @@ fn others() -> [(Sender, MavMessage, &'static str); 2] {
 
 #[test]
 fn no_landing_begins_where_another_vehicle_or_another_controller_is_on_the_link() {
+    let unpinned = |start: &str| {
+        let mut flight = in_flight_with(start, &["autopilot.system_id=0"]);
+        flight.camera(0, CameraInfo::sample());
+        flight
+    };
     for (sender, message, told) in others() {
         // By command.
-        let mut flight = in_flight("command");
+        let mut flight = unpinned("command");
         receive_from(&mut flight, 2 * MS, sender, &message);
         hover(&mut flight, 20, 3000, 4);
         for command in [ControllerCommand::Start, ControllerCommand::LandHere] {
@@ -957,7 +962,7 @@ fn no_landing_begins_where_another_vehicle_or_another_controller_is_on_the_link(
         assert_eq!(hover(&mut flight, 3020, 3500, 4).setpoints, 0);
         // By itself.
         for start in ["airborne", "resume", "takeoff"] {
-            let mut flight = in_flight(start);
+            let mut flight = unpinned(start);
             receive_from(&mut flight, 2 * MS, sender, &message);
             sent(&mut flight);
             let asked = hover(&mut flight, 20, 3000, 4);
@@ -969,14 +974,14 @@ fn no_landing_begins_where_another_vehicle_or_another_controller_is_on_the_link(
     }
     // A landing that goes on is not ended.
     for (sender, message, _) in others() {
-        let mut flight = in_flight("airborne");
+        let mut flight = unpinned("airborne");
         hover(&mut flight, 20, 3000, 4);
         receive_from(&mut flight, 3000 * MS, sender, &message);
         assert!(hover(&mut flight, 3000, 4000, 4).setpoints > 10);
     }
     // Nor is the vehicle that it has flown kept from landing where it is, and, beside another vehicle, from beginning anew.
     for (number, (sender, message, told)) in others().into_iter().enumerate() {
-        let mut flight = in_flight("airborne");
+        let mut flight = unpinned("airborne");
         hover(&mut flight, 20, 3000, 4);
         receive_from(&mut flight, 3000 * MS, sender, &message);
         hover(&mut flight, 3000, 3500, 4);
@@ -995,6 +1000,33 @@ fn no_landing_begins_where_another_vehicle_or_another_controller_is_on_the_link(
     receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
     receive_from(&mut flight, 2 * MS, sender, &message);
     assert!(hover(&mut flight, 20, 3000, 4).setpoints > 10);
+}
+
+#[test]
+fn no_landing_begins_by_itself_before_another_vehicle_would_have_been_heard() {
+    let [(other, of_other, told), _] = others();
+    for start in ["airborne", "resume"] {
+        for is_alone in [true, false] {
+            let mut flight = in_flight_with(start, &["autopilot.system_id=0"]);
+            flight.camera(0, CameraInfo::sample());
+            flight.presence(0, "main", true);
+            // What is resumed is stopped at once.
+            sent(&mut flight);
+            assert_eq!(hover(&mut flight, 20, 900, 4).setpoints, 0);
+            let status = flight.status(900 * MS);
+            let listens = "listening for 2.5 s whether another vehicle is on the link";
+            assert!(status.phase == Phase::Idle && status.why.contains(listens), "{status:?}");
+            assert!(status.why.contains("`autopilot.system_id`"), "{status:?}");
+            if !is_alone {
+                receive_from(&mut flight, 900 * MS, other, &of_other);
+            }
+            assert_eq!(hover(&mut flight, 920, 2480, 4).setpoints, 0);
+            let sent = hover(&mut flight, 2500, 4000, 4);
+            assert_eq!(sent.setpoints > 10, is_alone, "{start}: {sent:?}");
+            let status = flight.status(4000 * MS);
+            assert_eq!(status.why.contains(told), !is_alone, "{status:?}");
+        }
+    }
 }
 
 #[test]

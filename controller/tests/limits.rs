@@ -40,7 +40,8 @@ impl Conversation {
     }
 
     fn with(set: &[&str], timeout_s: f32) -> Self {
-        let set = set.iter().map(|&it| it.to_owned()).collect();
+        // Pinned, it need not listen for other vehicles.
+        let set = ["autopilot.system_id=1"].iter().chain(set).map(|&it| it.to_owned()).collect();
         let layers = Layers { file: None, set };
         let config = layers.load::<Config>().unwrap().settings;
         Self {

@@ -3,6 +3,9 @@
 
 use crate::packet::Sender;
 
+/// What is told while another vehicle on the link might not have been heard yet.
+pub const LISTENING: &str = "listening for 2.5 s whether another vehicle is on the link; nothing is listened for where `autopilot.system_id` is set";
+
 /// Why neither a take-off nor a landing may begin.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Conflict {

@@ -65,7 +65,7 @@ pub use address::Address;
 pub use client::Autopilot;
 pub use command::{Command, CommandError, CommandId, CommandStatus};
 pub use config::Config;
-pub use conflict::Conflict;
+pub use conflict::{Conflict, LISTENING};
 pub use event::Event;
 pub use given::GivenCommand;
 pub use key_file::{KeyFileError, SigningConfig};

@@ -9,7 +9,7 @@ use libm::fmax;
 
 use crate::client::Autopilot;
 use crate::command::{Command, CommandError, CommandId, CommandStatus, ns};
-use crate::conflict::Conflict;
+use crate::conflict::{Conflict, LISTENING};
 use crate::mode::{Firmware, FlightMode};
 use crate::state::{LandedState, VehicleState};
 
@@ -501,7 +501,7 @@ impl Takeoff {
                     reasons.insert(0, "waiting for it to say that it is a simulation".to_owned());
                 }
                 if self.is_listening && autopilot.is_connected() {
-                    reasons.push("listening whether another vehicle is on the link".to_owned());
+                    reasons.push(LISTENING.to_owned());
                 }
                 TakeoffProgress::Waiting(reasons)
             }

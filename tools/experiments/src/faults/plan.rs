@@ -252,7 +252,7 @@ impl Planned {
             format!("start.heading_deg={:.2}", drawn_angle(seed, 8).to_degrees()),
             "begin_height_m=1000".to_owned(),
         ];
-        self.controller = vec!["start=airborne".to_owned()];
+        self.controller = ["start=airborne", "autopilot.system_id=1"].map(str::to_owned).to_vec();
         if self.faults.iter().any(|fault| fault.kind.prefers_a_faulty_detector()) {
             self.controller.push(format!("detectors.preferred=\"{FAULTY_DETECTOR}\""));
         }

@@ -344,7 +344,8 @@ impl Plan {
             "begin_height_m=1000".to_owned(),
         ];
         simulator.extend(fault.simulator);
-        let mut controller = vec!["start=airborne".to_owned()];
+        let mut controller =
+            ["start=airborne", "autopilot.system_id=1"].map(str::to_owned).to_vec();
         controller.extend(fault.controller);
         if let Some(mut marker) = self.marker {
             // To a thousandth of a millimetre.
