@@ -521,6 +521,9 @@ impl Flight {
             // Somebody else began it; it is followed like our own.
             self.mission.begin(now_ns, true);
         }
+        if !may_recall {
+            self.mission.leave_in_land(&mut self.autopilot);
+        }
         let is_leading_out = self.offboard.is_leading_out();
         if is_leading_out || self.waits_for_battery(now_ns) || self.waits_for_detector(now_ns) {
             return;

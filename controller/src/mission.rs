@@ -49,7 +49,7 @@ pub enum State {
         /// The mission waited for the vehicle to fly, and does so again if the change fails.
         awaits_takeoff: bool,
     },
-    /// A PX4 that may be in OFFBOARD is taken back to HOLD.
+    /// A PX4 that may be in OFFBOARD, or in a LAND that is called back, is taken back to HOLD.
     LeavingOffboard {
         /// The way out.
         exit: OffboardExit,
@@ -201,6 +201,40 @@ impl Mission {
         None
     }
 
+    /// True where a PX4 that is asked for LAND may have taken it, as the request was sent.
+    pub fn may_be_in_land(&self, autopilot: &Autopilot) -> bool {
+        self.land_sent_ns(autopilot, i64::MAX).is_some()
+    }
+
+    /// When LAND was asked for last, where a PX4 may have taken it; now, where it shows it.
+    fn land_sent_ns(&self, autopilot: &Autopilot, now_ns: i64) -> Option<i64> {
+        let State::AskingForLand { request } = self.state else { return None };
+        let lands = autopilot.state().is_some_and(|state| state.mode == FlightMode::AUTO_LAND);
+        autopilot.sent_ns(request).or(lands.then_some(now_ns))
+    }
+
+    /// Gives up a request for LAND, for this reason: a PX4 that may have taken it is taken back to HOLD. True while that goes on.
+    pub fn call_back_land(&mut self, now_ns: i64, autopilot: &mut Autopilot, why: &str) -> bool {
+        let Some(sent_ns) = self.land_sent_ns(autopilot, now_ns) else {
+            self.fail(autopilot, why.to_owned());
+            return false;
+        };
+        let exit = OffboardExit::begin_out_of_land(now_ns, sent_ns, autopilot);
+        let why =
+            format!("{why}; a LAND that the vehicle has taken already is called back to HOLD");
+        self.state = State::LeavingOffboard { exit, why, awaits_takeoff: false };
+        self.advance_exit(now_ns, autopilot)
+    }
+
+    /// A LAND that is called back goes on, as the vehicle is too low to be held there.
+    pub fn leave_in_land(&mut self, autopilot: &mut Autopilot) {
+        let lands = autopilot.state().is_some_and(|state| state.mode == FlightMode::AUTO_LAND);
+        if lands && let State::LeavingOffboard { .. } = self.state {
+            let why = "ended by the operator, too low for it: the LAND that the vehicle has taken goes on; the pilot's mode switch stops it";
+            self.fail(autopilot, why.to_owned());
+        }
+    }
+
     /// Why a PX4 that may be in OFFBOARD is taken back to HOLD; `None` when it is not.
     pub fn leaves_offboard_because(&self) -> Option<&str> {
         match &self.state {
@@ -243,8 +277,12 @@ impl Mission {
             return true;
         }
         // In OFFBOARD still, the landing that was given up would begin by itself.
-        let is_out = autopilot.state().is_none_or(|state| !state.mode.is_guided());
-        let (why, awaits_takeoff) = (std::mem::take(why), *awaits_takeoff && is_out);
+        let mode = autopilot.state().filter(|state| state.armed).map(|state| state.mode);
+        let is_out = !autopilot.is_in_offboard();
+        let (mut why, awaits_takeoff) = (std::mem::take(why), *awaits_takeoff && is_out);
+        if mode == Some(FlightMode::AUTO_LAND) {
+            why.push_str(", and it stays in LAND all the same: the pilot's mode switch stops it");
+        }
         self.fail(autopilot, why);
         if awaits_takeoff {
             self.stand_down(true);

@@ -235,6 +235,60 @@ fn a_px4_that_holds_its_place_lands_there_by_command() {
         assert!(sent.modes.is_empty() && sent.setpoints == 0, "{sent:?}");
         assert_eq!(flight.status(9000 * MS).phase, Phase::Failed);
     }
+    // The command was on its way already, or taken, and its mode shows only after the operator's abort: back to HOLD.
+    for shows_before in [false, true] {
+        let mut flight = px4_in(HOLD, "command", &[]);
+        asked(&mut flight, 1000);
+        assert_eq!(hover(&mut flight, 1020, 1100, HOLD).modes, [4.0]);
+        if shows_before {
+            // Attitude and position are missing, so that no landing has begun.
+            for ms in (1100..1900).step_by(20) {
+                flight.tick(ms * MS);
+            }
+            receive(&mut flight, 1900 * MS, &heartbeat(LAND, true));
+            flight.tick(1910 * MS);
+            assert!(flight.status(1910 * MS).started_ns.is_none());
+        }
+        let at_ms = if shows_before { 1920 } else { 1100 };
+        let mut sent = Sent::default();
+        sent.take(&mut flight);
+        let reply = flight.command(at_ms * MS, &ControllerCommand::Abort);
+        assert!(reply.accepted && reply.reason.contains("called back to HOLD"), "{reply:?}");
+        assert!(!flight.command((at_ms + 10) * MS, &ControllerCommand::Start).accepted);
+        // The heartbeat of 2 s shows it.
+        let sent = hover(&mut flight, at_ms + 20, 2980, LAND);
+        assert_eq!(sent.modes.len(), 1, "asked for once, just after the heartbeat: {sent:?}");
+        let status = flight.status(2980 * MS);
+        assert!(status.phase == Phase::Idle && status.why.contains("called back"), "{status:?}");
+        let sent = hover(&mut flight, 3000, 3900, HOLD);
+        assert!(sent.modes.is_empty(), "{sent:?}");
+        assert_eq!(flight.status(3900 * MS).phase, Phase::Failed);
+    }
+    // Nor is it called back against a pilot, once it is low, or for longer than PX4 may need.
+    let called_back = |set: &[&str]| {
+        let mut flight = px4_in(HOLD, "command", set);
+        asked(&mut flight, 1000);
+        hover(&mut flight, 1020, 1100, HOLD);
+        let reply = flight.command(1100 * MS, &ControllerCommand::Abort);
+        (flight, reply)
+    };
+    let (mut flight, _) = called_back(&[]);
+    receive(&mut flight, 1200 * MS, &heartbeat(POSITION, true));
+    let sent = hover(&mut flight, 1220, 1980, POSITION);
+    assert!(sent.modes.is_empty(), "{sent:?}");
+    let sent = hover(&mut flight, 2000, 9000, POSITION);
+    assert!(sent.modes.is_empty() && sent.setpoints <= 2, "{sent:?}");
+    let (mut flight, _) = called_back(&[]);
+    let sent = hover(&mut flight, 1120, 12_000, LAND);
+    assert!((3..=8).contains(&sent.modes.len()), "{sent:?}");
+    let status = flight.status(12_000 * MS);
+    assert!(
+        status.why.contains("stays in LAND") && status.why.contains("mode switch"),
+        "{status:?}"
+    );
+    let (flight, reply) = called_back(&["phases.no_return_height_m=10"]);
+    assert!(!reply.accepted && reply.reason.contains("mode switch stops it"), "{reply:?}");
+    assert_eq!(flight.status(1100 * MS).phase, Phase::Final);
     // A change to OFFBOARD that was asked for before is carried out in between.
     let mut flight = px4_asked_for_offboard("command");
     asked(&mut flight, 3100);

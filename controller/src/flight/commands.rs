@@ -168,8 +168,18 @@ impl Flight {
             if command == OperatorCommand::Resume {
                 return Err("the vehicle is asked to land; there is nothing to resume".to_owned());
             }
+            if self.mission.may_be_in_land(&self.autopilot) && !self.lander.may_recall() {
+                return Err(format!(
+                    "LAND was asked for already, and below {} m it is not interrupted; the pilot's mode switch stops it",
+                    self.config.phases.no_return_height_m
+                ));
+            }
             let why = "ended by the operator before the vehicle landed";
-            self.mission.fail(&mut self.autopilot, why.to_owned());
+            if self.mission.call_back_land(now_ns, &mut self.autopilot, why) {
+                return Ok(format!(
+                    "{why}; a LAND that it has taken already is called back to HOLD, and the pilot's mode switch stops it at once"
+                ));
+            }
             return Ok(why.to_owned());
         }
         if !self.is_landing() {

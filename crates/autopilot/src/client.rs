@@ -412,6 +412,11 @@ impl Autopilot {
         outcome.map_or(CommandStatus::Unknown, |(_, status)| status.clone())
     }
 
+    /// When a request that is pending was sent last; `None` before that.
+    pub fn sent_ns(&self, id: CommandId) -> Option<i64> {
+        self.requests.iter().find(|request| request.id == id).and_then(Request::sent_ns)
+    }
+
     /// Time since the vehicle showed its mode last, in ns; `None` before the first heartbeat.
     pub fn mode_age_ns(&self, now_ns: i64) -> Option<i64> {
         self.vehicle.as_ref().map(|vehicle| now_ns.saturating_sub(vehicle.mode_ns))

@@ -362,6 +362,11 @@ impl Request {
         }
     }
 
+    /// When it was sent last; `None` before that.
+    pub(crate) fn sent_ns(&self) -> Option<i64> {
+        (self.attempts > 0).then_some(self.sent_ns)
+    }
+
     /// The same was requested again: without an acknowledgement it is sent again now; after one the timeout
     /// of the change stays.
     pub(crate) fn repeat(&mut self, now_ns: i64) {

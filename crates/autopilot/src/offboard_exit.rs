@@ -1,9 +1,9 @@
-//! The way out of PX4's OFFBOARD.
+//! The way out of PX4's OFFBOARD, and of a LAND that is called back.
 //!
 //! PX4 takes silence in OFFBOARD for a failure of its companion, and without a remote control it then descends and drifts with
 //! the wind (`COM_OBL_RC_ACT`). Setpoints of zero velocity, which every other mode ignores, therefore go on until it shows HOLD.
 //! HOLD is requested only just after a message that shows OFFBOARD, because a later request could undo a pilot's switch; and a
-//! request for OFFBOARD that was sent before may still be carried out.
+//! request for OFFBOARD that was sent before may still be carried out. The same holds of LAND, where it was asked for and is called back.
 
 use crate::client::Autopilot;
 use crate::command::{Command, CommandId, CommandStatus};
@@ -14,19 +14,26 @@ const MAX_EXIT_NS: i64 = 6_000_000_000;
 /// Time that PX4 takes to carry out a request, in nanoseconds, besides the link's delay.
 const REACTION_NS: i64 = 200_000_000;
 
-/// The end of OFFBOARD, or of a request for it.
+/// The end of OFFBOARD, or of a request for it; where it is called back, of LAND as well.
 #[derive(Clone, Debug)]
 pub struct OffboardExit {
     since_ns: i64,
     /// The request for HOLD.
     request: Option<CommandId>,
+    /// When the LAND that is called back was asked for last.
+    land_sent_ns: Option<i64>,
 }
 
 impl OffboardExit {
     /// Begins it: nothing that was requested before is sent again.
     pub fn begin(now_ns: i64, autopilot: &mut Autopilot) -> Self {
         autopilot.withdraw();
-        Self { since_ns: now_ns, request: None }
+        Self { since_ns: now_ns, request: None, land_sent_ns: None }
+    }
+
+    /// The same, out of LAND as well, which was asked for at this time and may be carried out yet.
+    pub fn begin_out_of_land(now_ns: i64, land_sent_ns: i64, autopilot: &mut Autopilot) -> Self {
+        Self { land_sent_ns: Some(land_sent_ns), ..Self::begin(now_ns, autopilot) }
     }
 
     /// Advances it; to be called with each tick. True while it goes on.
@@ -34,7 +41,9 @@ impl OffboardExit {
         let goes_on = self.goes_on(now_ns, autopilot);
         if goes_on {
             self.request_hold(now_ns, autopilot);
-            autopilot.send_zeros(now_ns);
+            if self.land_sent_ns.is_none() || autopilot.offboard_sent_ns().is_some() {
+                autopilot.send_zeros(now_ns);
+            }
         } else {
             autopilot.withdraw();
         }
@@ -47,23 +56,33 @@ impl OffboardExit {
         if !is_armed || now_ns.saturating_sub(self.since_ns) > MAX_EXIT_NS {
             return false;
         }
-        if autopilot.is_in_offboard() {
+        if self.is_in_mode_to_leave(autopilot) {
             return true;
         }
         // What was shown earlier says nothing of a request that was sent.
-        let Some(sent_ns) = autopilot.offboard_sent_ns() else { return false };
+        let sent_ns = autopilot.offboard_sent_ns().max(self.land_sent_ns);
+        let Some(sent_ns) = sent_ns else { return false };
         let delay_ns = autopilot.link_delay(now_ns).map_or(0, |delay| delay.as_nanos() as i64);
         let effect_ns = sent_ns.saturating_add(REACTION_NS).saturating_add(delay_ns);
         let shown_ns = autopilot.mode_age_ns(now_ns).map(|age_ns| now_ns.saturating_sub(age_ns));
         shown_ns.is_none_or(|shown_ns| shown_ns < effect_ns)
     }
 
+    fn is_in_mode_to_leave(&self, autopilot: &Autopilot) -> bool {
+        let lands = autopilot.state().is_some_and(|state| state.mode == FlightMode::AUTO_LAND);
+        autopilot.is_in_offboard() || lands && self.land_sent_ns.is_some()
+    }
+
     fn request_hold(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
         let is_requested =
             self.request.is_some_and(|id| autopilot.status(id) == CommandStatus::Pending);
-        if autopilot.is_in_offboard() && !is_requested && autopilot.shows_mode_of_now(now_ns) {
+        let is_of_now = autopilot.shows_mode_of_now(now_ns);
+        if self.is_in_mode_to_leave(autopilot) && !is_requested && is_of_now {
             let hold = Command::SetMode(FlightMode::AUTO_HOLD);
             self.request = Some(autopilot.request(now_ns, hold));
+        } else if is_requested && !is_of_now && !autopilot.is_in_offboard() {
+            // Out of LAND nothing else keeps it from being sent again when a pilot may have changed the mode.
+            autopilot.withdraw();
         }
     }
 }
