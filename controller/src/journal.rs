@@ -175,7 +175,7 @@ impl Journal {
                 "Another vehicle is on the link; it is ignored, and no flight begins until ours is pinned with `autopilot.system_id`"
             ),
             Event::SameAddress { .. } => tracing::warn!(
-                "Another companion uses our system and component id, and no flight begins until it ends; change `autopilot.component_id` on one of them"
+                "Another program uses our system and component id, and no flight begins until it ends; the status says what it sends, and what to do"
             ),
             Event::Lost { silence } => {
                 let silence = format_args!("{:.1} s", silence.as_secs_f64());

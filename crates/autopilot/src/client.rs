@@ -30,6 +30,7 @@ use crate::mode::{Firmware, FlightMode};
 use crate::packet::{self, AUTOPILOT, Packet, Sender};
 use crate::parameter::{Parameter, Parameters};
 use crate::px4_listener::Listener;
+use crate::same_address::SameAddress;
 use crate::setpoint_stream::SetpointStream;
 use crate::simulation::Simulation;
 use crate::standstill::Standstill;
@@ -45,8 +46,6 @@ const MAX_OUTCOMES: usize = 32;
 const HEARTBEAT_NS: i64 = 1_000_000_000;
 /// What an unsteady link counts as.
 const UNSTEADY: Duration = Duration::from_secs(1);
-/// Silence after which another companion with our ids counts as gone, in nanoseconds.
-const SAME_ADDRESS_NS: i64 = 10_000_000_000;
 /// Time in which another vehicle on the link is heard, in nanoseconds: two heartbeats, which come once a second, and a little.
 const LISTENS_NS: i64 = 2_500_000_000;
 /// Time within which the clock's answers tell how slow the link is, in nanoseconds: it is asked for ten times a second.
@@ -72,14 +71,16 @@ pub struct Autopilot {
     next_id: u64,
     events: VecDeque<Event>,
     outgoing: VecDeque<Vec<u8>>,
-    sequence: u8,
+    /// The number of the next packet.
+    sequence: Option<u8>,
     heartbeat_due_ns: i64,
     /// The system id of the first other vehicle that was heard.
     other_system: Option<u8>,
     /// When the clock told the link's delay last.
     link_delay_ns: Option<i64>,
-    /// When a packet of another companion with our ids came last.
-    same_address_ns: Option<i64>,
+    same_address: SameAddress,
+    /// The time of the last packet or tick.
+    now_ns: i64,
     refused_numbers: u64,
     late: u64,
 }
@@ -131,11 +132,12 @@ impl Autopilot {
             next_id: 1,
             events: VecDeque::new(),
             outgoing: VecDeque::new(),
-            sequence: 0,
+            sequence: None,
             heartbeat_due_ns: i64::MIN,
             other_system: None,
             link_delay_ns: None,
-            same_address_ns: None,
+            same_address: SameAddress::default(),
+            now_ns: i64::MIN,
             refused_numbers: 0,
             late: 0,
         }
@@ -143,12 +145,10 @@ impl Autopilot {
 
     /// Handles a packet received at `now_ns`.
     pub fn handle(&mut self, now_ns: i64, packet: &Packet) {
+        self.now_ns = now_ns;
         let Some(message) = &packet.message else { return };
-        if packet.sender == self.our_address() {
-            if !self.shares_our_address(now_ns) {
-                self.push(Event::SameAddress { sender: packet.sender });
-            }
-            self.same_address_ns = Some(now_ns);
+        if packet.sender == self.our_address() && self.same_address.take(now_ns, packet, message) {
+            self.push(Event::SameAddress { sender: packet.sender });
         }
         if packet.sender.component != AUTOPILOT {
             return;
@@ -191,6 +191,7 @@ impl Autopilot {
 
     /// Lets time pass: to be called at 20 Hz or more, also when nothing is received.
     pub fn tick(&mut self, now_ns: i64) {
+        self.now_ns = now_ns;
         if self.config.heartbeat && now_ns >= self.heartbeat_due_ns {
             self.send(&MavMessage::HEARTBEAT(compose::heartbeat()));
             // The next one is due a second after this one was, unless time jumped ahead.
@@ -326,19 +327,14 @@ impl Autopilot {
             && self.link_delay_ns.is_none_or(|at_ns| has_passed(at_ns, MAX_LINK_DELAY_AGE_NS))
     }
 
-    /// Whether another companion on this link uses our ids: probably a second controller of the same vehicle.
-    pub fn shares_our_address(&self, now_ns: i64) -> bool {
-        self.same_address_ns.is_some_and(|last| now_ns.saturating_sub(last) < SAME_ADDRESS_NS)
-    }
-
-    /// Why neither a take-off nor a landing may begin now: a second controller, or, where [`Config::system_id`] pins none, a second
-    /// vehicle that was ever heard.
+    /// Why neither a take-off nor a landing may begin now: another companion with our ids, or, where [`Config::system_id`] pins none, a
+    /// second vehicle that was ever heard. Our own packets are none, where they come back over the link within 2 s.
     pub fn conflict(&self, now_ns: i64) -> Option<Conflict> {
-        if self.shares_our_address(now_ns) {
-            return Some(Conflict::SameAddress { sender: self.our_address() });
-        }
-        let (system, other) = self.system().zip(self.other_system)?;
-        Some(Conflict::SeveralVehicles { system, other })
+        let several = || {
+            let (system, other) = self.system().zip(self.other_system)?;
+            Some(Conflict::SeveralVehicles { system, other })
+        };
+        self.same_address.conflict(now_ns, self.our_address()).or_else(several)
     }
 
     /// Whether another vehicle on the link would have been heard by now, or it would not matter as ours is pinned.
@@ -517,8 +513,11 @@ impl Autopilot {
 
     /// Sends a message under our ids (LANDING_TARGET, STATUSTEXT, ...).
     pub fn send(&mut self, message: &MavMessage) {
-        let packet = packet::encode(self.our_address(), self.sequence, message);
-        self.sequence = self.sequence.wrapping_add(1);
+        // Two controllers that were started together should not have the same numbers.
+        let sequence = self.sequence.unwrap_or((self.now_ns / 1_000) as u8);
+        let packet = packet::encode(self.our_address(), sequence, message);
+        self.same_address.sent(self.now_ns, sequence, &packet);
+        self.sequence = Some(sequence.wrapping_add(1));
         if self.outgoing.len() >= MAX_QUEUED {
             self.outgoing.pop_front();
         }

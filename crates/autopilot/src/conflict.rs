@@ -9,16 +9,30 @@ pub const LISTENING: &str = "listening for 2.5 s whether another vehicle is on t
 /// Why neither a take-off nor a landing may begin.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Conflict {
-    /// Another companion uses our ids.
+    /// Another companion uses our ids, and steers.
     #[error(
-        "another companion with our system and component id ({} and {}) is on the autopilot's link, probably a \
-         second controller of this vehicle, which may fly it. End that one, check the address of the autopilot, or change \
-         `autopilot.component_id` on one of them",
+        "another controller with our system and component id ({} and {}) is on the autopilot's link: it sends {message}, and may fly \
+         this vehicle. End that one, or check the address of the autopilot",
+        sender.system, sender.component
+    )]
+    SecondController {
+        /// Our ids.
+        sender: Sender,
+        /// The message by which it steers.
+        message: &'static str,
+    },
+    /// Another companion uses our ids, and has not steered so far.
+    #[error(
+        "another program with our system and component id ({} and {}) is on the autopilot's link: it sends {message}, and no setpoints so \
+         far. It may be a second controller of this vehicle, which may fly it. End that one, or check the address of the autopilot; where it is \
+         something else, set `autopilot.component_id` to another id (192, for example), as the autopilot's answers would go to both",
         sender.system, sender.component
     )]
     SameAddress {
         /// Our ids.
         sender: Sender,
+        /// The newest message of it.
+        message: &'static str,
     },
     /// Two autopilots are on the link, and the configuration does not say which one is flown.
     #[error(

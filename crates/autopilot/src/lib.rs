@@ -15,7 +15,7 @@
 //! [`state`] and [`parameter`] are what the vehicle reports, [`clock`] converts its time stamps, `boot` and
 //! `contact` say which of its reports are believed, `standstill` whether its mode is of after a pause of this process, `simulation` asks whether it is simulated, [`client`] is the
 //! conversation with it with the settings of [`config`], [`event`] its events, [`command`] is what can be requested
-//! and why it may fail, [`conflict`] says why neither a take-off nor a landing may begin, [`takeoff`] arms the vehicle and takes off, [`offboard_exit`] ends PX4's OFFBOARD, which needs the `setpoint_stream`, [`permission`] is what a ground station may send,
+//! and why it may fail, [`conflict`] says why neither a take-off nor a landing may begin, of which `same_address` finds one, [`takeoff`] arms the vehicle and takes off, [`offboard_exit`] ends PX4's OFFBOARD, which needs the `setpoint_stream`, [`permission`] is what a ground station may send,
 //! [`compose`] makes the messages that a companion sends, and `given` the answer to a command that is not carried out.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
@@ -45,6 +45,7 @@ pub mod peers;
 pub mod permission;
 mod px4_events;
 mod px4_listener;
+mod same_address;
 mod setpoint_stream;
 pub mod signing;
 mod simulation;

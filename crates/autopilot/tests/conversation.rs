@@ -8,7 +8,7 @@
     reason = "helpers of tests may fail like tests"
 )]
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
 use autopilot::command::SetpointError;
 use autopilot::dialect::{
@@ -258,6 +258,9 @@ struct World {
     fake: Fake,
     events: Vec<Event>,
     sequence: u8,
+    /// After how many steps the client's packets come back to it; 0: never.
+    echo_steps: usize,
+    echoes: VecDeque<Vec<Vec<u8>>>,
 }
 
 impl World {
@@ -272,6 +275,8 @@ impl World {
             fake,
             events: Vec::new(),
             sequence: 0,
+            echo_steps: 0,
+            echoes: VecDeque::new(),
         }
     }
 
@@ -304,11 +309,27 @@ impl World {
             self.receive(AUTOPILOT, &message);
         }
         self.client.tick(self.now);
+        let mut sent = Vec::new();
         while let Some(packet) = self.client.poll_outgoing() {
             self.fake.receive(&packet);
+            sent.push(packet);
         }
+        self.echo(sent);
         while let Some(event) = self.client.poll_event() {
             self.events.push(event);
+        }
+    }
+
+    /// A router sends what was sent back, some steps later.
+    fn echo(&mut self, sent: Vec<Vec<u8>>) {
+        self.echoes.push_back(sent);
+        if self.echo_steps == 0 || self.echoes.len() <= self.echo_steps {
+            return;
+        }
+        for packet in self.echoes.pop_front().unwrap_or_default() {
+            for packet in Parser::new().push(&packet) {
+                self.client.handle(self.now, &packet);
+            }
         }
     }
 
@@ -436,6 +457,17 @@ fn a_second_controller_with_our_ids_is_reported_once() {
         world.step();
     }
     assert_eq!(world.count(|event| *event == Event::SameAddress { sender: companion }), 1);
+}
+
+#[test]
+fn our_own_packets_that_a_router_sends_back_are_no_second_controller() {
+    // Each of them comes back 0.4 s later.
+    let mut world = World { echo_steps: 20, ..World::new() };
+    let mut takeoff = Takeoff::new(10.0);
+    let (end, _) = world.take_off(&mut takeoff, 60);
+    assert_eq!(end, TakeoffProgress::Done);
+    let is_told = |event: &Event| matches!(event, Event::SameAddress { .. });
+    assert_eq!(world.count(is_told), 0);
 }
 
 #[test]
@@ -884,8 +916,9 @@ fn a_vehicle_of_another_controller_with_our_ids_is_neither_lifted_nor_taken_over
         let companion = Sender { system: 1, component: 191 };
         world.receive(companion, &MavMessage::HEARTBEAT(autopilot::compose::heartbeat()));
         let (end, _) = world.take_off(&mut Takeoff::new(10.0), 5);
-        let TakeoffProgress::Failed(TakeoffError::Conflict(Conflict::SameAddress { sender })) =
-            &end
+        let TakeoffProgress::Failed(TakeoffError::Conflict(Conflict::SameAddress {
+            sender, ..
+        })) = &end
         else {
             panic!("{end:?}")
         };
