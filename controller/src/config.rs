@@ -319,6 +319,13 @@ impl Config {
         Some(self.autopilot.system_id).filter(|id| *id != 0)
     }
 
+    /// Pins the vehicle that an earlier controller was landing, by its system id, where a landing is to be resumed and none is pinned.
+    pub fn go_on_with(&mut self, landed: Option<u8>) {
+        if let (Start::Resume, None, Some(system)) = (self.start, self.system_id(), landed) {
+            self.autopilot.system_id = system;
+        }
+    }
+
     /// The clock whose frames are used.
     pub(crate) fn clock(&self) -> &str {
         if self.clock.is_empty() { clock_name() } else { &self.clock }

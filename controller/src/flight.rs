@@ -227,6 +227,15 @@ impl Flight {
         self.pad_notes.take_over(note);
     }
 
+    /// The system id of the vehicle that is landed, or whose landing is to be resumed, for the controller that is started next.
+    pub fn landed_system(&self) -> Option<u8> {
+        if self.is_landing() {
+            return self.autopilot.system();
+        }
+        let resumes = self.config.start == Start::Resume && self.mission.is_awaiting_takeoff();
+        self.config.system_id().filter(|_| resumes)
+    }
+
     fn note_pad(&mut self) {
         let is_landing = self.is_landing() && self.landing_target.is_none();
         let seen = self.lander.pad_to_remember();

@@ -1,4 +1,4 @@
-//! The files that keep, beyond a crash, what must be put back in the autopilot's parameters, and where the pad is.
+//! The files that keep, beyond a crash, what must be put back in the autopilot's parameters, where the pad is, and which vehicle is landed.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -160,6 +160,53 @@ impl PadFile {
     }
 }
 
+/// The file with the system id of the vehicle that is landed: of two on one link nothing else says with which one a controller goes on
+/// that resumes a landing.
+#[derive(Debug)]
+pub struct LandingFile {
+    file: NoteFile<LandedVehicle>,
+    address: String,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct LandedVehicle {
+    /// The name of the clock, which is another one after each boot of this host.
+    clock: String,
+    /// The link's address.
+    address: String,
+    /// The vehicle's MAVLink system id.
+    system: u8,
+}
+
+impl LandingFile {
+    /// The file of the controller with this id for the autopilot at this address.
+    pub fn new(id: &str, address: &str) -> Self {
+        let file = NoteFile::named(&format!("{}-landing", file_name(id, address)));
+        Self { file, address: address.to_owned() }
+    }
+
+    /// The vehicle that an earlier controller was landing since this host was started. What is left is removed by
+    /// [`LandingFile::keep`], whatever it is.
+    pub fn read(&mut self) -> Option<u8> {
+        self.file.written = self.file.read();
+        let left = self.file.written.as_ref()?;
+        let is_ours = left.clock == clock_name() && left.address == self.address;
+        is_ours.then_some(left.system)
+    }
+
+    /// Keeps the system id of the vehicle that is landed, or removes the file when none is.
+    pub fn keep(&mut self, system: Option<u8>) {
+        if self.file.written.as_ref().map(|it| it.system) == system {
+            return;
+        }
+        let note = system.map(|system| {
+            let (clock, address) = (clock_name().to_owned(), self.address.clone());
+            LandedVehicle { clock, address, system }
+        });
+        self.file.keep(note.as_ref());
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -182,6 +229,33 @@ mod tests {
         file.keep(None);
         assert_eq!(file.read(), None);
         std::fs::remove_dir_all(directory).unwrap();
+    }
+
+    #[test]
+    fn the_vehicle_that_is_landed_is_known_to_the_next_controller_until_the_landing_is_over() {
+        let path = std::env::temp_dir().join(format!("alight-landing-{}.json", std::process::id()));
+        let open = |address: &str| {
+            let file = NoteFile { path: Some(path.clone()), written: None };
+            LandingFile { file, address: address.to_owned() }
+        };
+        let mut file = open("udpin:0.0.0.0:14550");
+        assert_eq!(file.read(), None);
+        file.keep(Some(7));
+        assert_eq!(open("udpin:0.0.0.0:14560").read(), None, "another link's");
+        // The next controller goes on with it, and it is forgotten with the landing.
+        let mut next = open("udpin:0.0.0.0:14550");
+        assert_eq!(next.read(), Some(7));
+        next.keep(Some(7));
+        assert!(path.exists());
+        next.keep(None);
+        assert!(!path.exists());
+        // What one left before this host was started tells nothing, and goes.
+        let left = r#"{"clock":"monotonic/earlier","address":"udpin:0.0.0.0:14550","system":7}"#;
+        std::fs::write(&path, left).unwrap();
+        let mut file = open("udpin:0.0.0.0:14550");
+        assert_eq!(file.read(), None);
+        file.keep(None);
+        assert!(!path.exists());
     }
 
     #[test]

@@ -19,7 +19,7 @@ use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
 use crate::config::{Config, TICK};
 use crate::flight::Flight;
-use crate::note_file::{NoteFile, PadFile, remove_useless_pads};
+use crate::note_file::{LandingFile, NoteFile, PadFile, remove_useless_pads};
 use crate::tape::TapedFlight;
 use crate::unreadable::UnreadableDetections;
 
@@ -64,9 +64,11 @@ pub fn run(
     Box::pin(run_service(node, config, shutdown))
 }
 
-async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
+async fn run_service(node: Node, mut config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name("*").await?;
     let address: Address = config.autopilot.address.parse()?;
+    let mut landing_file = LandingFile::new(&config.id, &config.autopilot.address);
+    config.go_on_with(landing_file.read());
     let wanted = config.system_id();
     let peering = Peering::Autopilot { system: wanted };
     let permission: Permission = config.autopilot.ground_may.parse()?;
@@ -184,6 +186,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
         // Written before the packet that changes the parameter is sent.
         note_file.keep(flight.flight().note());
         pad_file.keep(flight.flight().pad_note());
+        landing_file.keep(flight.flight().landed_system());
         send(&node, &link, &mut flight);
         tapes.pass_on(&mut flight);
         let instead = || link.heard().instead(wanted);

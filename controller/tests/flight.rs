@@ -21,8 +21,8 @@ use messages::{
 };
 use node::{HealthCounters, Identity, clock_name};
 use packets::{
-    MS, Sent, attitude, contact, flight, flight_counting, flight_with, header, heartbeat, hover,
-    in_flight, in_flight_with, pose, pose_at, position, receive, receive_from, seen, sent,
+    MS, Sent, attitude, config, contact, flight, flight_counting, flight_with, header, heartbeat,
+    hover, in_flight, in_flight_with, pose, pose_at, position, receive, receive_from, seen, sent,
 };
 
 #[test]
@@ -1026,6 +1026,46 @@ fn no_landing_begins_by_itself_before_another_vehicle_would_have_been_heard() {
             let status = flight.status(4000 * MS);
             assert_eq!(status.why.contains(told), !is_alone, "{status:?}");
         }
+    }
+}
+
+#[test]
+fn a_landing_is_resumed_with_its_own_vehicle_beside_another_one() {
+    let [(other, of_other, told), _] = others();
+    let on_ground = contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND);
+    for landed in [None, Some(1)] {
+        let mut config = config("resume", &["autopilot.system_id=0"]);
+        config.go_on_with(landed);
+        let mut flight = Flight::new(config, Arc::default()).unwrap();
+        flight.presence(0, "main", true);
+        assert_eq!(flight.landed_system(), landed, "it is to be resumed");
+        // The other one is heard first.
+        receive_from(&mut flight, 0, other, &of_other);
+        receive(&mut flight, MS, &heartbeat(4, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        let sent = hover(&mut flight, 20, 5000, 4);
+        let status = flight.status(5000 * MS);
+        if landed.is_none() {
+            let is_told = ["system ids 2 and 1", told].iter().any(|it| status.why.contains(it));
+            assert!(status.phase == Phase::Idle && is_told, "{status:?}");
+            continue;
+        }
+        assert!(status.phase == Phase::Search && sent.setpoints > 50, "{status:?} {sent:?}");
+        assert!(status.autopilot.contains("system 1"), "{status:?}");
+        assert_eq!(flight.landed_system(), Some(1));
+        receive(&mut flight, 5000 * MS, &heartbeat(4, false));
+        receive(&mut flight, 5001 * MS, &on_ground);
+        pose_at(&mut flight, 5020 * MS, 0.0);
+        flight.tick(5030 * MS);
+        assert_eq!(flight.landed_system(), None, "{:?}", flight.status(5030 * MS));
+    }
+    // Who is pinned stays so, and no other start takes over what was landed.
+    for (start, set, pinned) in
+        [("resume", "autopilot.system_id=3", 3), ("airborne", "autopilot.system_id=0", 0)]
+    {
+        let mut config = config(start, &[set]);
+        config.go_on_with(Some(7));
+        assert_eq!(config.autopilot.system_id, pinned);
     }
 }
 

@@ -79,13 +79,17 @@ pub(crate) fn flight_with(start: &str, set: &[&str]) -> Flight {
 
 /// A flight that counts into `health`.
 pub(crate) fn flight_counting(start: &str, set: &[&str], health: &Arc<HealthCounters>) -> Flight {
+    Flight::new(config(start, set), Arc::clone(health)).unwrap()
+}
+
+pub(crate) fn config(start: &str, set: &[&str]) -> Config {
     // Pinned, it need not listen for other vehicles.
     let mut all =
         ["takeoff_real_vehicle=true", "autopilot.system_id=1"].map(str::to_owned).to_vec();
     all.push(format!("start={start}"));
     all.extend(set.iter().map(|s| (*s).to_owned()));
     let layers = Layers { file: None, set: all };
-    Flight::new(layers.load::<Config>().unwrap().settings, Arc::clone(health)).unwrap()
+    layers.load::<Config>().unwrap().settings
 }
 
 /// Attitude and position 5 m over the origin.
