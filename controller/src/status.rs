@@ -16,6 +16,9 @@ use crate::mount;
 use crate::refusals::Warning;
 use crate::wire;
 
+/// What an operator must know of a vehicle that an abort does not lift.
+const LEFT_LOW: &str = "the vehicle is not lifted, as it may stand on the ground, and its motors run; give `land-here`, or take over and land or disarm it";
+
 /// The parts of a flight that its status shows.
 pub struct View<'a> {
     /// The configuration.
@@ -119,6 +122,10 @@ impl View<'_> {
         if self.config.autopilot.timesync {
             warnings.extend(link_delay::warning(now_ns, self.autopilot));
         }
+        warnings.extend(self.is_left_low().then(|| Warning {
+            matter: "aborted low".to_owned(),
+            text: format!("the landing was aborted: {LEFT_LOW}"),
+        }));
         let size_ratio = self.lander.marker_size_ratio();
         warnings.extend(mount::warnings(&self.lander.mount_findings(), size_ratio));
         let configured_m = self.config.metric.standing_height_m;
@@ -184,6 +191,11 @@ impl View<'_> {
         self.lander.mismatch().or(dispute).or(is_ambiguous.then_some(Reason::Ambiguous))
     }
 
+    /// Whether an aborted landing leaves the vehicle where it may stand.
+    fn is_left_low(&self) -> bool {
+        matches!(self.mission.state(), State::Landing) && self.lander.is_left_low()
+    }
+
     /// Whether a landing was to be resumed, and the motors of a vehicle run that is said to stand.
     fn is_said_to_stand(&self) -> bool {
         self.config.start == Start::Resume
@@ -219,6 +231,9 @@ impl View<'_> {
                 landing::Phase::Landed => format!("{why}: {reason}"),
                 _ => format!("{reason}: {why}"),
             };
+        }
+        if self.is_left_low() {
+            return format!("{why}: {LEFT_LOW}");
         }
         match self.autopilot.state() {
             // It may as well be the autopilot's failsafe: when PX4 misses setpoints it leaves OFFBOARD.

@@ -162,6 +162,51 @@ fn motors_said_to_be_off_high_up_are_no_touchdown() {
     assert!(status.why.contains("disarmed"), "{}", status.why);
 }
 
+/// Hovers at a height over the marker.
+fn hover_at(flight: &mut Flight, from_ms: i64, to_ms: i64, mode: u32, height_m: f32) {
+    let height_scale = f64::from(height_m) / 5.0;
+    for ms in (from_ms..to_ms).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(flight, ms * MS, &heartbeat(mode, true));
+        }
+        pose_at(flight, ms * MS, height_m);
+        if ms % 60 == 0 {
+            let mut message = seen(ms * MS - 40 * MS);
+            for pose in message.detections.iter_mut().filter_map(|it| it.pose.as_mut()) {
+                pose.translation_m = pose.translation_m.map(|metres| metres * height_scale);
+            }
+            flight.detections(ms * MS + 2, "main", &message);
+        }
+        flight.tick(ms * MS + 3);
+    }
+}
+
+#[test]
+fn an_aborted_vehicle_that_may_stand_is_reported_with_its_motors_and_what_to_do() {
+    let mut flight = in_flight("airborne");
+    flight.presence(0, "main", true);
+    flight.camera(0, CameraInfo::sample());
+    hover_at(&mut flight, 20, 1000, 4, 0.3);
+    flight.command(1000 * MS, &ControllerCommand::Hold);
+    hover_at(&mut flight, 1000, 3000, 4, 0.3);
+    let reply = flight.command(3000 * MS, &ControllerCommand::Abort);
+    for word in ["aborted by the operator", "not lifted", "motors run", "land-here", "take over"] {
+        assert!(reply.accepted && reply.reason.contains(word), "{}", reply.reason);
+    }
+    // Setpoints have stopped long before the end.
+    for ms in [3100, 12_000] {
+        hover_at(&mut flight, ms - 80, ms, 4, 0.3);
+        let status = flight.status(ms * MS);
+        assert_eq!(status.phase, Phase::Aborted);
+        assert!(status.why.contains("not lifted"), "{}", status.why);
+        let warnings = status.warnings.iter().filter(|it| it.contains("not lifted"));
+        assert_eq!(warnings.count(), 1, "{:?}", status.warnings);
+    }
+    receive(&mut flight, 12_000 * MS, &heartbeat(4, false));
+    let status = flight.status(12_000 * MS);
+    assert!(!status.why.contains("motors run") && status.warnings.is_empty(), "{status:?}");
+}
+
 #[test]
 fn without_the_heartbeat_alone_it_hovers_and_then_goes_on() {
     let mut flight = in_flight("airborne");

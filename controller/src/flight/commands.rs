@@ -213,6 +213,7 @@ impl Flight {
         if before == after && !is_held {
             return Err(format!("no effect in phase `{after}`: {why}"));
         }
+        let why = if self.lander.is_left_low() { self.view().phase(now_ns).1 } else { why };
         Ok(format!("in phase `{after}`: {why}"))
     }
 }

@@ -247,7 +247,8 @@ settings! {
         /// `search_height_m`.
         abort_height_m: f64 = 10.0, 0.0..=100.0;
         /// Minimum height at which an aborted landing hovers, in m, over the same as `search_height_m`: lower, it first
-        /// climbs, but not above the height where the landing started. 0 never climbs.
+        /// climbs, but not above the height where the landing started. 0 never climbs. A vehicle that is still and may stand on
+        /// the ground is not lifted.
         abort_hover_m: f64 = 2.5, 0.0..=20.0;
         /// Hover time of an aborted landing before setpoints stop, in s.
         release_after_s: f64 = 5.0, 0.0..=60.0;

@@ -109,6 +109,8 @@ pub struct Lander {
     retry_to_m: Option<f64>,
     /// How an aborted landing changes its height.
     abort_climb: AbortClimb,
+    /// The aborted vehicle is not lifted, as it may stand.
+    is_left_low: bool,
     /// Since when states of an aborted vehicle are received.
     received_since: Option<Timestamp>,
     /// Smallest angle from the image's centre to its edge, in radians.
@@ -152,6 +154,7 @@ impl Lander {
             land_requested: None,
             retry_to_m: None,
             abort_climb: AbortClimb::default(),
+            is_left_low: false,
             received_since: None,
             half_view_rad: None,
             square: None,
@@ -575,7 +578,7 @@ impl Lander {
             self.retry_to_m = None;
         }
         if self.state_machine.phase() != Phase::Aborted {
-            self.abort_climb = AbortClimb::default();
+            (self.abort_climb, self.is_left_low) = (AbortClimb::default(), false);
             self.received_since = None;
         }
         if !guided && !handing_over && !retrying {

@@ -25,7 +25,7 @@ pub(crate) const MAX_STANDING_M_S: f64 = 0.2;
 /// Maximum height over the one it stands with, in metres, distance from the pad, and standard deviation of that, in metres,
 /// at which a still vehicle may stand on the pad. From there LAND is safe if it does not. The height of a vehicle that the guidance
 /// steers, which notices a touchdown on its own, is less: in wind LAND is led by a velocity that may err.
-const MAX_STANDING_M: f64 = 0.3;
+pub(crate) const MAX_STANDING_M: f64 = 0.3;
 const MAX_STEERED_STANDING_M: f64 = 0.15;
 const MAX_STANDING_LATERAL_M: f64 = 0.3;
 const MAX_STANDING_DEVIATION_M: f64 = 0.2;

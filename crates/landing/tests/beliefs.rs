@@ -473,6 +473,57 @@ fn a_vehicle_that_may_stand_is_not_lifted_by_an_abort() {
     assert!((harness.position.z() + 2.5).abs() < 0.2, "{:?}", harness.position);
 }
 
+/// Where the standing height is configured and the autopilot reports a flight, an aborted vehicle is lifted from lower heights.
+#[test]
+fn an_abort_in_a_low_hold_climbs_only_where_the_vehicle_certainly_flies() {
+    let aborted = |standing_height_m: f64, landed: Landed, height_m: f64| {
+        let metric = MetricConfig { standing_height_m, ..MetricConfig::default() };
+        let config = Config { guidance: GuidanceConfig::Metric(metric), ..Config::default() };
+        let mut flight = Told::started(config, 5.0);
+        flight.pad = Some(Point::origin());
+        while flight.position.z() < -height_m {
+            flight.fly(STEP_S);
+        }
+        flight.tell(Event::Operator(OperatorCommand::Hold));
+        flight.velocity = Vector::zero();
+        flight.status.landed = landed;
+        flight.run(2.0, true);
+        flight.tell(Event::Operator(OperatorCommand::Abort));
+        let is_left_low = flight.lander.is_left_low();
+        flight.fly(7.0);
+        assert_eq!(flight.lander.is_left_low(), is_left_low, "after the last setpoint");
+        (-flight.position.z() > 2.3, is_left_low)
+    };
+    assert_eq!(aborted(0.1, Landed::InAir, 0.47), (true, false));
+    for (standing_height_m, landed, height_m) in [
+        (0.1, Landed::InAir, 0.35),
+        (0.1, Landed::Unknown, 0.45),
+        (0.0, Landed::InAir, 0.45),
+        (0.25, Landed::InAir, 0.45),
+    ] {
+        let low = aborted(standing_height_m, landed, height_m);
+        assert_eq!(low, (false, true), "{standing_height_m} m, {landed:?}, {height_m} m");
+    }
+    // Pilot and ground end the warning.
+    let mut flight = Told::started(Config::default(), 5.0);
+    flight.pad = Some(Point::origin());
+    while flight.position.z() < -0.3 {
+        flight.fly(STEP_S);
+    }
+    flight.velocity = Vector::zero();
+    flight.run(0.1, true);
+    flight.tell(Event::Operator(OperatorCommand::Abort));
+    assert!(flight.lander.is_left_low());
+    flight.status.mode = Mode::Other;
+    flight.run(1.0, true);
+    assert!(flight.lander.is_left_low(), "a PX4 in HOLD");
+    flight.velocity = Vector::new(0.0, 0.0, -0.5);
+    flight.run(0.1, true);
+    flight.velocity = Vector::zero();
+    flight.run(0.1, true);
+    assert!(!flight.lander.is_left_low());
+}
+
 #[test]
 fn a_retry_stays_below_the_fence() {
     let mut config = Config::default();

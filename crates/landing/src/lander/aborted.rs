@@ -6,14 +6,14 @@ use super::Lander;
 use crate::config::OnAbort;
 use crate::decision::{Action, Reason};
 use crate::event::{Landed, Mode};
-use crate::standing::MAX_STANDING_M_S;
+use crate::standing::{MAX_STANDING_M, MAX_STANDING_M_S, standing_height_m};
 use crate::time::Timestamp;
 
 /// Time an aborted landing climbs and holds before it stops sending setpoints, in seconds.
 const CLIMB_AWAY_S: f64 = 60.0;
 
-/// Height up to which a vehicle that is still may stand, in metres: it carries its sensors above the ground, and heights err by
-/// decimetres.
+/// Height up to which a vehicle that is still may stand, in metres: it carries its sensors up to 0.3 m above the ground, and heights err
+/// by decimetres. Where the standing height is configured only the error is left.
 pub(super) const MIN_FLYING_M: f64 = 0.5;
 
 /// Height that may be missing from the one at which an aborted landing hovers, in metres.
@@ -48,7 +48,23 @@ impl Lander {
         !is_known || self.state_machine.is_high(vehicle)
     }
 
+    /// True while an aborted vehicle is not lifted because it may stand on the ground, and its motors run.
+    pub fn is_left_low(&self) -> bool {
+        self.is_left_low
+    }
+
     pub(super) fn aborted(&mut self, now: Timestamp) -> Action {
+        let action = self.abort_action(now);
+        let status = self.status;
+        let is_hovering = matches!(self.abort_climb, AbortClimb::Hovers { may_climb: true, .. })
+            && self.config.phases.on_abort != OnAbort::Land;
+        let may_stand = status.is_some_and(|status| status.armed && status.mode != Mode::Land)
+            && self.may_stand_after_abort(now);
+        self.is_left_low = (self.is_left_low || is_hovering) && may_stand;
+        action
+    }
+
+    fn abort_action(&mut self, now: Timestamp) -> Action {
         let phases = self.config.phases;
         if self.state_machine.is_recalling() {
             return self.recall(now);
@@ -129,9 +145,22 @@ impl Lander {
             .history
             .newest()
             .is_some_and(|vehicle| (vehicle.velocity - pad).norm() <= MAX_STANDING_M_S);
-        let is_low = self.known_height_m(now).is_none_or(|height_m| height_m < MIN_FLYING_M);
+        let is_low =
+            self.known_height_m(now).is_none_or(|height_m| height_m < self.min_flying_m());
         let is_refused = self.state_machine.reason() == Reason::LandRefused;
         is_still && (is_low || is_refused) || self.may_stand(now)
+    }
+
+    /// The height from which a vehicle flies although it is still. The autopilot's report that it flies is needed for the lower one, and
+    /// is no proof: it comes seconds late.
+    fn min_flying_m(&self) -> f64 {
+        let standing_m = standing_height_m(&self.config);
+        let is_in_air = self.status.is_some_and(|status| status.landed == Landed::InAir);
+        if is_in_air && standing_m > 0.0 {
+            libm::fmin(standing_m + MAX_STANDING_M, MIN_FLYING_M)
+        } else {
+            MIN_FLYING_M
+        }
     }
 
     /// The height that is missing from `abort_hover_m`, from the fence or from where the landing began, in metres; `None` if none is, and
@@ -152,6 +181,7 @@ impl Lander {
     /// Climbs to `abort_height_m` and stays there. One that may stand is not lifted, until it moves.
     fn climb_away(&mut self, now: Timestamp) -> Action {
         if self.abort_climb != AbortClimb::Climbs && self.may_stand_after_abort(now) {
+            self.abort_climb = AbortClimb::Hovers { since: now, may_climb: true };
             return Action::hover();
         }
         self.abort_climb = AbortClimb::Climbs;
