@@ -224,6 +224,8 @@ named! {
         ModeUnknown = "mode-unknown", "no heartbeat of the autopilot for seconds, so its mode is not known, holding";
         /// Over the link to the autopilot setpoints arrive too late to steer by.
         LinkSlow = "link-slow", "the link to the autopilot takes more than 0.7 s both ways, too slow to steer, holding";
+        /// The controller did not run for a time after which no landing continues automatically.
+        Standstill = "standstill", "the controller did not run for more than 15 s, holding: `resume` continues the landing, `abort` ends it";
         /// No detector is alive.
         NoDetector = "no-detector", "no detector is alive, nothing descends";
         /// No progress in the time allowed.

@@ -71,6 +71,10 @@ const MAX_HOVER_M_S: f64 = 0.3;
 /// Minimum time of a search by a lander that takes over before it climbs, in seconds: the vehicle may stand.
 const MIN_RESUMED_LOOK_S: f64 = 1.5;
 
+/// Maximum time between two events, which are 25 ms apart, after which a landing continues automatically, in seconds. A controller that
+/// is started again resumes one that is as old.
+const MAX_STANDSTILL_S: f64 = 15.0;
+
 /// Maximum age of the newest detection, in seconds, up to which heights are those over the target.
 const MAX_TARGET_AGE_S: f64 = 20.0;
 
@@ -167,6 +171,8 @@ impl Lander {
     /// The decision after `event`. A `now` earlier than the last one counts as the last one.
     pub fn step(&mut self, now: Timestamp, event: Event) -> Decision {
         let now = self.now.map_or(now, |last| last.max(now));
+        let has_stood_still =
+            self.now.is_some_and(|last| now.seconds_since(last) > MAX_STANDSTILL_S);
         self.now = Some(now);
         let result = match event {
             Event::Vehicle(state) => self.vehicle(now, state),
@@ -216,6 +222,7 @@ impl Lander {
             may_descend: self.is_axis_check_done(now),
             is_link_slow: self.is_link_slow,
             may_stand: self.may_stand(now),
+            has_stood_still,
         };
         let was_active = !self.phase().is_terminal();
         let has_started = self.state_machine.advance(&inputs);

@@ -37,6 +37,7 @@
 //! | the axes of camera and autopilot, or the marker's size, are not as configured | Hold |
 //! | the vehicle's state is stale, or its mode not known | Hold; Final waits |
 //! | the link to the autopilot is slow | Hold |
+//! | the controller has stood still for long | Hold; not in Final, where LAND has been asked for |
 //! | a mode that is neither GUIDED nor the requested LAND; GUIDED again in LAND, `MAX_OVERTAKEN_S` after it began | PilotInCommand |
 //! | on the ground; still and low over the pad, where Search or Retry would follow, in Search, or where the link is slow | Final |
 //! | disarmed | Landed on the ground or in LAND, else, half a second later, Aborted |
@@ -113,6 +114,8 @@ pub struct Inputs {
     pub is_link_slow: bool,
     /// The vehicle is still, and so low over the pad that it may stand on it.
     pub may_stand: bool,
+    /// The controller has just not run for so long that no landing continues automatically.
+    pub has_stood_still: bool,
 }
 
 /// The vehicle as far as the phases need it.
@@ -463,6 +466,7 @@ impl StateMachine {
         {
             match action {
                 AlarmAction::Ignore => {}
+                AlarmAction::Hold if inputs.has_stood_still => {}
                 // A hold for another reason continues when the link is back.
                 AlarmAction::Hold
                     if reason == Reason::AutopilotLost
@@ -472,6 +476,14 @@ impl StateMachine {
                 AlarmAction::Abort => return Some((Phase::Aborted, reason)),
                 AlarmAction::Land => return Some((Phase::Final, reason)),
             }
+        }
+        let continues = match self.phase {
+            Phase::Search | Phase::Approach | Phase::Descend | Phase::Retry => true,
+            Phase::Hold => end_of_hold(self.reason).is_some(),
+            _ => false,
+        };
+        if inputs.has_stood_still && continues {
+            return Some((Phase::Hold, Reason::Standstill));
         }
         // While LAND is requested a hold would let the vehicle enter it unwatched; an abort calls it back.
         let asks_for_land = self.phase == Phase::Final && self.reason != Reason::LandingBySetpoints;
@@ -661,6 +673,7 @@ impl StateMachine {
                 | Reason::OperatorLost
                 | Reason::Disputed
                 | Reason::MarkerSize
+                | Reason::Standstill
         );
         let timeout_s = if by_operator {
             self.config.operator_hold_timeout_s
@@ -670,7 +683,8 @@ impl StateMachine {
         if self.timed_out(inputs, timeout_s) {
             return Some((Phase::Aborted, Reason::HeldTooLong));
         }
-        if self.reason == Reason::LinkSlow && inputs.may_stand && !is_stale {
+        let may_end_on_pad = matches!(self.reason, Reason::LinkSlow | Reason::Standstill);
+        if may_end_on_pad && inputs.may_stand && !is_stale {
             return Some((Phase::Final, Reason::MayStand));
         }
         let resumes = match end_of_hold(self.reason) {

@@ -68,6 +68,29 @@ fn after_a_long_silence_no_landing_is_asked_for_high_up() {
     }
 }
 
+/// A controller that is started again resumes a landing for the same time.
+#[test]
+fn after_a_silence_of_more_than_15_s_nothing_descends_without_a_command() {
+    for (below_m, for_s) in [(6.0, 15.5), (3.0, 20.0), (7.0, 42.0)] {
+        let flight =
+            silent(0, 0.0, Silence { below_m, for_s, then: Then::GoesOn }).fly();
+        let mut pairs = flight.samples.windows(2);
+        let end = pairs.find(|pair| pair[1].seconds - pair[0].seconds > 0.5 * for_s);
+        let end_s = end.map_or(f64::INFINITY, |pair| pair[1].seconds);
+        let after: Vec<&Sample> = flight.samples.iter().filter(|it| it.seconds >= end_s).collect();
+        assert!(after.len() > 100, "{} samples", after.len());
+        for sample in after {
+            let decision = sample.decision;
+            let found = (decision.phase, decision.why);
+            assert_eq!(found, (landing::Phase::Hold, landing::Reason::Standstill), "{below_m} m");
+            let landing::Action::Velocity { velocity, .. } = decision.action else {
+                panic!("{decision:?}")
+            };
+            assert!(velocity.z() <= 0.0, "{decision:?}");
+        }
+    }
+}
+
 #[test]
 fn an_autopilot_with_a_long_timeout_is_descended_with_slowly() {
     check(&[0.0], &[f64::INFINITY, 2.0], |scene| scene.setpoint_timeout_s = 3.0);

@@ -32,6 +32,7 @@ fn at(seconds: f64) -> Inputs {
         may_descend: true,
         is_link_slow: false,
         may_stand: false,
+        has_stood_still: false,
     }
 }
 
@@ -532,6 +533,40 @@ fn a_vehicle_that_may_stand_is_landed_and_not_lifted_when_its_link_becomes_slow(
     // Another hold is the operator's to end.
     let held = commanded(3.0, OperatorCommand::Hold);
     check(&[a, b, c, held, slow(3.5, true)], Phase::Hold, Reason::OperatorHold);
+}
+
+#[test]
+fn after_a_long_standstill_of_the_controller_the_operator_decides() {
+    let stopped = |seconds| Inputs { has_stood_still: true, ..seen(seconds, Progress::Descending) };
+    let descending = [start(), seen(1.0, Progress::Unchanged), seen(2.0, Progress::Descending)];
+    let [a, b, c] = descending;
+    let on = [seen(30.5, Progress::Descending), seen(90.0, Progress::Descending)];
+    check(&[a, b, c, stopped(30.0), on[0], on[1]], Phase::Hold, Reason::Standstill);
+    let resumed = Inputs { operator: Some(OperatorCommand::Resume), ..at(31.0) };
+    check(&[a, b, c, stopped(30.0), on[0], resumed], Phase::Search, Reason::Searching);
+    check(&[a, b, c, stopped(30.0), at(211.0)], Phase::Aborted, Reason::HeldTooLong);
+    // A hold that would end without a command, and an alarm whose hold would.
+    let slow = Inputs { is_link_slow: true, ..at(3.0) };
+    check(&[a, b, c, slow, stopped(30.0), on[0]], Phase::Hold, Reason::Standstill);
+    let lost = Inputs { alarm: Some((AlarmAction::Hold, Reason::AutopilotLost)), ..stopped(30.0) };
+    check(&[a, b, c, lost, on[0]], Phase::Hold, Reason::Standstill);
+    // Commands, alarms that end the landing, and the ground come first.
+    let held = commanded(3.0, OperatorCommand::Hold);
+    check(&[a, b, c, held, stopped(30.0)], Phase::Hold, Reason::OperatorHold);
+    let abort = Inputs { operator: Some(OperatorCommand::Abort), ..stopped(30.0) };
+    check(&[a, b, c, abort], Phase::Aborted, Reason::OperatorAbort);
+    let empty = Inputs { alarm: Some((AlarmAction::Land, Reason::BatteryCritical)), ..abort };
+    check(&[a, b, c, Inputs { operator: None, ..empty }], Phase::Final, Reason::BatteryCritical);
+    let stands = Inputs { may_stand: true, ..at(31.0) };
+    check(&[a, b, c, stopped(30.0), stands], Phase::Final, Reason::MayStand);
+    // LAND has been asked for.
+    let ready = seen(3.0, Progress::Ready(Reason::LowAndAligned));
+    check(&[a, b, c, ready, stopped(30.0)], Phase::Final, Reason::LandingBySetpoints);
+    let mut machine = StateMachine::new(PhaseConfig::default());
+    for inputs in [a, b, c, stopped(30.0)] {
+        machine.advance(&inputs);
+    }
+    assert!(machine.waits_for_operator());
 }
 
 #[test]

@@ -137,6 +137,7 @@ fn alphabet() -> Vec<Inputs> {
                             may_descend: true,
                             is_link_slow: false,
                             may_stand: false,
+                            has_stood_still: false,
                         });
                     }
                 }
@@ -146,6 +147,7 @@ fn alphabet() -> Vec<Inputs> {
     let turned = Some(Reason::CameraTurned);
     all.push(Inputs { is_link_slow: true, now: now(), ..at(0.0) });
     all.push(Inputs { target_refused: true, target_known: true, now: now(), ..at(0.0) });
+    all.push(Inputs { has_stood_still: true, now: now(), ..at(0.0) });
     all.push(Inputs { may_stand: true, now: now(), ..at(0.0) });
     all.push(Inputs { may_stand: true, target_known: true, now: now(), ..at(0.0) });
     all.push(Inputs { mismatch: turned, may_descend: false, now: now(), ..at(0.0) });
