@@ -29,13 +29,13 @@ pub(crate) struct CommandArgs {
 enum OperatorCommand {
     /// Start the landing.
     Start,
-    /// Stop and hover.
+    /// Stop and hover; not while the autopilot lands in LAND, as after `land-here`.
     Hold,
     /// Continue after a hold.
     Resume,
-    /// Abort the landing.
+    /// Abort the landing; in LAND only above `phases.no_return_height_m` (1 m).
     Abort,
-    /// Land straight down where the vehicle is, without the marker.
+    /// Land straight down where the vehicle is, without the marker; above 1 m `abort` stops it.
     LandHere,
     /// Use a detector from now on.
     UseDetector,

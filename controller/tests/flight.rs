@@ -208,6 +208,32 @@ fn an_aborted_vehicle_that_may_stand_is_reported_with_its_motors_and_what_to_do(
 }
 
 #[test]
+fn a_hold_that_land_refuses_names_the_commands_that_stop_it() {
+    for (set, height_m, expected) in [
+        (&[][..], 3.0, "above 1 m `abort` takes the vehicle back"),
+        (&[], 0.7, "below 1 m LAND is neither held nor aborted"),
+        (&["phases.on_abort=\"land\""], 3.0, "an abort lands as well"),
+    ] {
+        let mut flight = in_flight_with("airborne", set);
+        flight.presence(0, "main", true);
+        flight.camera(0, CameraInfo::sample());
+        hover_at(&mut flight, 20, 1000, 4, height_m);
+        assert!(flight.command(1000 * MS, &ControllerCommand::LandHere).accepted);
+        for (from_ms, mode) in [(1000, 4), (2000, 9)] {
+            hover_at(&mut flight, from_ms, from_ms + 400, mode, height_m);
+            let reply = flight.command((from_ms + 400) * MS, &ControllerCommand::Hold);
+            assert!(!reply.accepted, "{}", reply.reason);
+            for text in ["phase `final`", expected, "the pilot's mode switch stops it"] {
+                assert!(reply.reason.contains(text), "`{text}` is not in {}", reply.reason);
+            }
+        }
+        let end_ms = 2500;
+        let reply = flight.command(end_ms * MS, &ControllerCommand::Abort);
+        assert_eq!(reply.accepted, expected.starts_with("above"), "{}", reply.reason);
+    }
+}
+
+#[test]
 fn without_the_heartbeat_alone_it_hovers_and_then_goes_on() {
     let mut flight = in_flight("airborne");
     flight.presence(0, "main", true);

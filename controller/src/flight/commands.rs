@@ -1,7 +1,7 @@
 //! The operator's commands to a flight: start, hold, resume, abort and land here, carried out or refused with the reason.
 
 use autopilot::Conflict;
-use landing::{Event as LanderEvent, OperatorCommand, Phase};
+use landing::{Event as LanderEvent, OnAbort, OperatorCommand, Phase};
 
 use super::Flight;
 use crate::control::{is_holding_px4, pilots_px4_mode};
@@ -211,9 +211,29 @@ impl Flight {
         // Held already for another reason, it is held by the operator.
         let is_held = command == OperatorCommand::Hold && after == Phase::Hold;
         if before == after && !is_held {
-            return Err(format!("no effect in phase `{after}`: {why}"));
+            let instead = match (command, after) {
+                (OperatorCommand::Hold, Phase::Final) => self.instead_of_hold(),
+                _ => String::new(),
+            };
+            return Err(format!("no effect in phase `{after}`: {why}{instead}"));
         }
         let why = if self.lander.is_left_low() { self.view().phase(now_ns).1 } else { why };
         Ok(format!("in phase `{after}`: {why}"))
+    }
+
+    /// What stops a vehicle that the autopilot lands, or is asked to land, where `hold` does not.
+    fn instead_of_hold(&self) -> String {
+        let phases = &self.config.phases;
+        let no_return_m = phases.no_return_height_m;
+        let pilot = "the pilot's mode switch stops it";
+        if phases.on_abort == OnAbort::Land {
+            return format!("; LAND is not held, and an abort lands as well; {pilot}");
+        }
+        if self.lander.may_recall() {
+            return format!(
+                "; LAND is not held: above {no_return_m} m `abort` takes the vehicle back from it; {pilot} at any height"
+            );
+        }
+        format!("; below {no_return_m} m LAND is neither held nor aborted; {pilot}")
     }
 }
