@@ -7,7 +7,7 @@ use std::time::Duration;
 use autopilot::Event;
 use autopilot::command::SetpointError;
 use autopilot::dialect::MavSeverity;
-use landing::{Alarm, Decision, Phase};
+use landing::{Alarm, Decision, Phase, Reason};
 use node::HealthCounters;
 
 use crate::refusals::Warning;
@@ -161,7 +161,14 @@ impl Journal {
 
     /// Logs a change of the lander's phase.
     pub fn phase_changed(&self, from: Phase, decision: &Decision) {
-        tracing::info!(%from, to = %decision.phase, why = %decision.why, "Phase");
+        let Decision { phase: to, why, .. } = decision;
+        let by_operator = matches!(why, Reason::OperatorHold | Reason::OperatorAbort);
+        match to {
+            Phase::Retry | Phase::Hold | Phase::Aborted if !by_operator => {
+                tracing::warn!(%from, %to, %why, "Phase");
+            }
+            _ => tracing::info!(%from, %to, %why, "Phase"),
+        }
     }
 
     /// Logs an event of the autopilot.
@@ -243,6 +250,7 @@ mod tests {
     use std::sync::{Mutex, PoisonError};
 
     use autopilot::FlightMode;
+    use landing::Action;
 
     use super::*;
 
@@ -291,6 +299,23 @@ mod tests {
         });
         assert_eq!(told.matches("they differ").count(), 3, "{told}");
         assert_eq!(told.matches("Over").count(), 1, "{told}");
+    }
+
+    #[test]
+    fn a_phase_that_ends_the_descent_is_a_warning_unless_the_operator_asked_for_it() {
+        for (phase, why, level) in [
+            (Phase::Retry, Reason::Retrying, "WARN"),
+            (Phase::Hold, Reason::TargetLost, "WARN"),
+            (Phase::Aborted, Reason::RetriesUsed, "WARN"),
+            (Phase::Hold, Reason::OperatorHold, "INFO"),
+            (Phase::Descend, Reason::Descending, "INFO"),
+        ] {
+            let decision =
+                Decision { phase, why, action: Action::None, target: None, rejected: None };
+            let line =
+                logged(|| Journal::new(Arc::default()).phase_changed(Phase::Search, &decision));
+            assert!(line.contains(level) && line.contains(&why.to_string()), "{line}");
+        }
     }
 
     #[test]

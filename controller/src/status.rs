@@ -122,10 +122,14 @@ impl View<'_> {
         if self.config.autopilot.timesync {
             warnings.extend(link_delay::warning(now_ns, self.autopilot));
         }
-        warnings.extend(self.is_left_low().then(|| Warning {
-            matter: "aborted low".to_owned(),
-            text: format!("the landing was aborted: {LEFT_LOW}"),
+        let is_alone = self.is_blind() && self.no_frame(now_ns).is_none();
+        warnings.extend(is_alone.then(|| Warning {
+            matter: "no detector".to_owned(),
+            text: Reason::NoDetector.to_string(),
         }));
+        let left_low = self.left_low();
+        warnings
+            .extend(left_low.map(|text| Warning { matter: "aborted low".to_owned(), text }));
         let size_ratio = self.lander.marker_size_ratio();
         warnings.extend(mount::warnings(&self.lander.mount_findings(), size_ratio));
         let configured_m = self.config.metric.standing_height_m;
@@ -191,9 +195,11 @@ impl View<'_> {
         self.lander.mismatch().or(dispute).or(is_ambiguous.then_some(Reason::Ambiguous))
     }
 
-    /// Whether an aborted landing leaves the vehicle where it may stand.
-    fn is_left_low(&self) -> bool {
-        matches!(self.mission.state(), State::Landing) && self.lander.is_left_low()
+    /// That an aborted landing leaves the vehicle where it may stand, with the reason for the abort.
+    fn left_low(&self) -> Option<String> {
+        let is_left = matches!(self.mission.state(), State::Landing) && self.lander.is_left_low();
+        let decision = self.decision.filter(|_| is_left)?;
+        Some(format!("{}: {LEFT_LOW}", decision.why))
     }
 
     /// Whether a landing was to be resumed, and the motors of a vehicle run that is said to stand.
@@ -204,10 +210,8 @@ impl View<'_> {
 
     /// The reason for the lander's phase.
     fn reason(&self, now_ns: i64) -> String {
-        // In LAND it descends whatever is seen.
-        let needs_marker = self.is_landing() && self.lander.phase() != landing::Phase::Final;
-        let is_blind = needs_marker && self.frames.selection.is_blind();
-        let no_frame = self.frames.camera_watch.no_frame(now_ns).filter(|_| needs_marker);
+        let is_blind = self.is_blind();
+        let no_frame = self.no_frame(now_ns);
         let reason = self.decision.map(|decision| decision.why);
         let why = match (reason, no_frame) {
             // A detector that has searched nothing for long is forgotten by the selection, and is there all the same.
@@ -232,8 +236,8 @@ impl View<'_> {
                 _ => format!("{reason}: {why}"),
             };
         }
-        if self.is_left_low() {
-            return format!("{why}: {LEFT_LOW}");
+        if let Some(left_low) = self.left_low() {
+            return left_low;
         }
         match self.autopilot.state() {
             // It may as well be the autopilot's failsafe: when PX4 misses setpoints it leaves OFFBOARD.
@@ -242,6 +246,21 @@ impl View<'_> {
             }
             _ => why,
         }
+    }
+
+    /// In LAND the vehicle descends without the marker.
+    fn needs_marker(&self) -> bool {
+        self.is_landing() && self.lander.phase() != landing::Phase::Final
+    }
+
+    /// Whether a landing needs the marker, and no detector is alive.
+    fn is_blind(&self) -> bool {
+        self.needs_marker() && self.frames.selection.is_blind()
+    }
+
+    /// Why the detectors get no frames, where a landing needs the marker.
+    fn no_frame(&self, now_ns: i64) -> Option<String> {
+        self.frames.camera_watch.no_frame(now_ns).filter(|_| self.needs_marker())
     }
 
     /// What the vehicle lands for where that is no marker, once the decision's own reason no longer tells it.

@@ -269,6 +269,9 @@ fn the_end_of_the_last_detector_levels_the_next_setpoint() {
     flight.presence(5000 * MS, "main", false);
     flight.tick(5001 * MS);
     assert!(down(&flight) <= 0.0, "{}", down(&flight));
+    let status = flight.status(5001 * MS);
+    assert!(status.why.contains("no detector is alive"), "{}", status.why);
+    assert!(status.warnings.contains(&status.why), "{:?}", status.warnings);
 }
 
 #[test]

@@ -49,11 +49,18 @@ impl StatusTextSender {
         let text = format!("Alight: {}", status.sentence());
         // A change of digits alone, as of a height, is not sent.
         let change = matter(&text);
+        // A reason that is a warning as well is sent once.
+        let is_warning = status.warnings.contains(&status.why);
+        let severity = match severity(status.phase) {
+            MavSeverity::MAV_SEVERITY_INFO if is_warning => MavSeverity::MAV_SEVERITY_WARNING,
+            severity => severity,
+        };
         if self.last.as_ref() != Some(&change)
-            && let Some(text) = self.text(now_ns, severity(status.phase), &text)
+            && let Some(text) = self.text(now_ns, severity, &text)
         {
             packets.extend(text);
             self.last = Some(change);
+            self.warnings.extend(is_warning.then(|| matter(&status.why)));
         }
         if self.detector != status.active_detector {
             let (severity, text) = match &status.active_detector {
@@ -139,7 +146,7 @@ impl StatusTextSender {
 fn severity(phase: Phase) -> MavSeverity {
     match phase {
         Phase::Aborted | Phase::Failed => MavSeverity::MAV_SEVERITY_CRITICAL,
-        Phase::Hold => MavSeverity::MAV_SEVERITY_WARNING,
+        Phase::Hold | Phase::Retry => MavSeverity::MAV_SEVERITY_WARNING,
         Phase::Landed | Phase::PilotInCommand => MavSeverity::MAV_SEVERITY_NOTICE,
         _ => MavSeverity::MAV_SEVERITY_INFO,
     }
@@ -179,6 +186,21 @@ mod tests {
     }
 
     /// The texts as a ground station joins them, with their severities.
+    #[test]
+    fn a_lost_marker_and_the_loss_of_the_last_detector_are_warnings() {
+        let mut texts = StatusTextSender::new(0);
+        let lost = status(Phase::Retry, "marker lost, climbing to see it again", Some("main"));
+        assert_eq!(join(&texts.status(0, &lost))[0].0, MavSeverity::MAV_SEVERITY_WARNING);
+        let mut texts = StatusTextSender::new(0);
+        let why = "no detector is alive, nothing descends";
+        let mut blind = status(Phase::Approach, why, None);
+        blind.warnings = vec![why.to_owned()];
+        let sent = join(&texts.status(0, &blind));
+        let expected = format!("Alight: {}", blind.sentence());
+        assert_eq!(sent, [(MavSeverity::MAV_SEVERITY_WARNING, expected)], "once");
+        assert_eq!(join(&texts.status(1, &blind)), []);
+    }
+
     fn join(packets: &[MavMessage]) -> Vec<(MavSeverity, String)> {
         let mut texts: Vec<(MavSeverity, String)> = Vec::new();
         for packet in packets {
