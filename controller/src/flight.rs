@@ -27,7 +27,7 @@ use crate::config::{Config, Mode, Start};
 use crate::control::is_holding_px4;
 use crate::frames::{Arrival, Frames};
 use crate::journal::Journal;
-use crate::landing_target::{self, LandingTargetMode};
+use crate::landing_target::{self, LandingTargetMode, Situation};
 use crate::limits::{Limits, Note};
 use crate::link_delay::LinkDelay;
 use crate::mission::{Mission, Trigger, is_flying_guided};
@@ -522,9 +522,14 @@ impl Flight {
     }
 
     fn advance_mission(&mut self, now_ns: i64) {
-        let (may_recall, distrust) = (self.lander.may_recall(), self.view().distrust());
+        let may_recall = self.lander.may_recall();
+        let situation = Situation {
+            may_recall,
+            distrust: self.view().distrust(),
+            is_flying: self.lander.is_flying(),
+        };
         if let Some(landing_target) = &mut self.landing_target
-            && landing_target.step(now_ns, may_recall, distrust, &mut self.autopilot)
+            && landing_target.step(now_ns, situation, &mut self.autopilot)
             && !self.mission.is_sending_landing_target()
         {
             // Somebody else began it; it is followed like our own.
@@ -638,7 +643,10 @@ impl Flight {
                 Event::ArmedChanged(armed) => {
                     let is_finished = self.view().is_finished();
                     let why = self.decision.map(|decision| decision.why);
-                    let by_motors = matches!(why, Some(Reason::TouchedDown | Reason::Disarmed));
+                    let by_motors = matches!(
+                        why,
+                        Some(Reason::TouchedDown | Reason::Disarmed | Reason::StoppedInAir)
+                    );
                     self.mission.armed_changed(now_ns, armed, is_finished, by_motors);
                 }
                 Event::Restarted { started_ns }

@@ -69,6 +69,17 @@ enum State {
     Ended(String),
 }
 
+/// The vehicle as the lander follows it.
+#[derive(Copy, Clone, Debug)]
+pub struct Situation {
+    /// It is so high that it can be taken back from landing.
+    pub may_recall: bool,
+    /// Why no target is sent.
+    pub distrust: Option<Reason>,
+    /// It is certainly in the air.
+    pub is_flying: bool,
+}
+
 impl LandingTargetMode {
     /// A mode in which nothing was sent yet; a landing that begins waits `timeout_s` for the marker.
     pub fn new(settings: LandingTargetSettings, timeout_s: f64) -> Self {
@@ -109,18 +120,20 @@ impl LandingTargetMode {
         self.state = State::Stabilising(now_ns);
     }
 
-    /// Follows what the autopilot does; true when it has just begun to land, whoever requested it. Only while it `may_recall` is the
-    /// vehicle so high that it is taken back from landing; `distrust` is why no target is sent.
+    /// Follows what the autopilot does; true when it has just begun to land, whoever requested it.
     pub fn step(
         &mut self,
         now_ns: i64,
-        may_recall: bool,
-        distrust: Option<Reason>,
+        situation: Situation,
         autopilot: &mut Autopilot,
     ) -> bool {
+        let Situation { may_recall, distrust, is_flying } = situation;
         let Some(state) = autopilot.state().copied() else { return false };
         let lands = state.armed && state.mode.is_landing();
         match self.state.clone() {
+            State::Landing if !state.armed && is_flying => {
+                self.state = State::Ended(Reason::StoppedInAir.to_string());
+            }
             State::Landing if !state.armed => self.state = State::Landed,
             State::Landing if !lands => {
                 self.state = State::Ended(format!("the flight mode was changed to {}", state.mode));

@@ -256,8 +256,10 @@ named! {
         LandRefused = "land-refused", "aborted: the autopilot did not enter LAND";
         /// The autopilot did not report the ground.
         TouchdownOverdue = "touchdown-overdue", "aborted: the autopilot reported no touchdown in the time allowed";
-        /// The motors stopped during the landing.
+        /// The motors stopped during the landing, and no report of the ground came.
         Disarmed = "disarmed", "aborted: disarmed before the touchdown";
+        /// The motors stopped while the vehicle flew.
+        StoppedInAir = "stopped-in-air", "aborted: the motors were stopped (disarmed) in the air";
         /// The flight mode was changed by the pilot or another program.
         PilotTookOver = "pilot-took-over", "the flight mode was changed, the pilot flies";
     }

@@ -387,6 +387,28 @@ impl Lander {
         if moves || is_high { Landed::InAir } else { Landed::OnGround }
     }
 
+    /// Whether the vehicle is certainly in the air, although its motors are off: it falls, or, where its autopilot does not report the ground,
+    /// sinks or is high over a target that was seen lately. A vehicle stands still for a second before its autopilot stops the motors.
+    fn flies(&self, now: Timestamp) -> bool {
+        let (Some(vehicle), Some(status)) = (self.history.newest(), self.status) else {
+            return false;
+        };
+        let is_recent = now.seconds_since(vehicle.stamp) <= self.config.phases.stale_vehicle_s;
+        let down_m_s = vehicle.velocity.z() - self.config.estimator.pad_heave_m_s;
+        let standing_m = standing_height_m(&self.config);
+        let is_high = self
+            .recent_target(now)
+            .is_some_and(|target| target.height_m - standing_m > MAX_CONTACT_M);
+        let sinks = down_m_s > MAX_STANDING_M_S;
+        let falls = down_m_s > MAX_CONTACT_M_S;
+        is_recent && (falls || status.landed != Landed::OnGround && (sinks || is_high))
+    }
+
+    /// The same now.
+    pub fn is_flying(&self) -> bool {
+        self.now.is_some_and(|now| self.flies(now))
+    }
+
     fn frame(&mut self, now: Timestamp, frame: &FrameObservation) -> Result<(), Rejection> {
         if frame.image_size.0 == 0
             || frame.image_size.1 == 0
@@ -451,6 +473,7 @@ impl Lander {
             sinks: age_s <= self.config.phases.stale_vehicle_s
                 && state.velocity.z() > MAX_STANDING_M_S + self.config.estimator.pad_heave_m_s,
             land_m_s: self.limits.land_m_s,
+            flies: self.flies(now),
         })
     }
 

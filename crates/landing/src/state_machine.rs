@@ -40,7 +40,7 @@
 //! | the controller has stood still for long | Hold; not in Final, where LAND has been asked for |
 //! | a mode that is neither GUIDED nor the requested LAND; GUIDED again in LAND, `MAX_OVERTAKEN_S` after it began | PilotInCommand |
 //! | on the ground; still and low over the pad, where Search or Retry would follow, in Search, or where the link is slow | Final |
-//! | disarmed | Landed on the ground or in LAND, else, half a second later, Aborted |
+//! | disarmed | Aborted in the air; else Landed on the ground or in LAND; else, half a second later, Aborted |
 //! | an alarm | as configured for it |
 //!
 //! Idle, Landed, Aborted and PilotInCommand are terminal: only a new start leaves them, or the command to land here, which
@@ -137,6 +137,8 @@ pub struct VehicleInputs {
     pub sinks: bool,
     /// Speed of the autopilot's LAND near the ground, in m/s.
     pub land_m_s: f64,
+    /// It is certainly in the air: it falls, or, not reported to stand, sinks or is high over the target.
+    pub flies: bool,
 }
 
 /// The state: a phase, since when, and the reason.
@@ -163,6 +165,8 @@ pub struct StateMachine {
     retries: u32,
     /// When the motors were first seen to be off.
     disarmed: Option<Timestamp>,
+    /// They stopped in the air.
+    stopped_in_air: bool,
     /// The alarm or command that the vehicle lands for, until the next phase after that landing.
     cause: Option<Reason>,
 }
@@ -222,6 +226,7 @@ impl StateMachine {
             expects_land: false,
             retries: 0,
             disarmed: None,
+            stopped_in_air: false,
             cause: None,
         }
     }
@@ -294,6 +299,8 @@ impl StateMachine {
         }
         let is_disarmed = inputs.vehicle.is_some_and(|vehicle| !vehicle.armed);
         self.disarmed = is_disarmed.then(|| self.disarmed.unwrap_or(inputs.now));
+        let flies = inputs.vehicle.is_some_and(|vehicle| vehicle.flies);
+        self.stopped_in_air = is_disarmed && (self.stopped_in_air || flies);
         if let Some((phase, reason)) = self.interruption(inputs).or_else(|| self.next(inputs)) {
             // Search and retry climb, and so does a low hold over a slow link. An autopilot reports the ground seconds late:
             // ArduPilot 7 s after the touchdown.
@@ -435,7 +442,10 @@ impl StateMachine {
         if let Some(vehicle) = inputs.vehicle {
             // PX4 leaves LAND as it stops the motors (seen with 1.17); that is not the pilot.
             if self.landing && !vehicle.armed {
-                return Some((Phase::Landed, Reason::TouchedDown));
+                return Some(match self.stopped_in_air {
+                    true => (Phase::Aborted, Reason::StoppedInAir),
+                    false => (Phase::Landed, Reason::TouchedDown),
+                });
             }
             let is_ours = match vehicle.mode {
                 Mode::Guided => !self.landing || self.elapsed_s(inputs.now) < MAX_OVERTAKEN_S,
@@ -503,7 +513,7 @@ impl StateMachine {
             return Some((Phase::Hold, reason));
         }
         let on_ground = inputs.vehicle.is_some_and(|vehicle| vehicle.landed == Landed::OnGround);
-        if on_ground && self.phase != Phase::Final {
+        if on_ground && self.phase != Phase::Final && self.disarmed.is_none() {
             return Some((Phase::Final, Reason::TouchedEarly));
         }
         None
@@ -530,11 +540,12 @@ impl StateMachine {
 
     /// The end of a landing whose motors are off.
     fn disarmed(&self, now: Timestamp, vehicle: VehicleInputs) -> Option<(Phase, Reason)> {
-        if !vehicle.armed && vehicle.landed == Landed::OnGround {
+        if !vehicle.armed && vehicle.landed == Landed::OnGround && !self.stopped_in_air {
             return Some((Phase::Landed, Reason::TouchedDown));
         }
+        let reason = if self.stopped_in_air { Reason::StoppedInAir } else { Reason::Disarmed };
         let waited_s = now.seconds_since(self.disarmed?);
-        (waited_s >= MAX_CONTACT_WAIT_S).then_some((Phase::Aborted, Reason::Disarmed))
+        (waited_s >= MAX_CONTACT_WAIT_S).then_some((Phase::Aborted, reason))
     }
 
     /// The transitions of the present phase.

@@ -525,6 +525,54 @@ fn an_abort_in_a_low_hold_climbs_only_where_the_vehicle_certainly_flies() {
 }
 
 #[test]
+fn motors_that_are_stopped_in_the_air_end_no_landing_as_a_touchdown() {
+    for (mode, height_m) in
+        [(Mode::Guided, 0.43), (Mode::Guided, 3.0), (Mode::Land, 0.43), (Mode::Land, 2.0)]
+    {
+        let mut flight = Told::started(Config::default(), 5.0);
+        flight.pad = Some(Point::origin());
+        while flight.position.z() < -height_m {
+            flight.fly(STEP_S);
+        }
+        if mode == Mode::Land {
+            flight.tell(Event::Operator(OperatorCommand::LandHere));
+            flight.velocity = Vector::new(0.0, 0.0, 0.3);
+            flight.status.mode = mode;
+            flight.run(STEP_S, true);
+            assert_eq!(flight.phase(), Phase::Final);
+        } else {
+            flight.velocity = Vector::zero();
+        }
+        flight.status.armed = false;
+        flight.tell(Event::Status(flight.status));
+        while flight.position.z() < 0.0 {
+            flight.velocity = flight.velocity + Vector::new(0.0, 0.0, 9.8 * STEP_S);
+            flight.position = flight.position + flight.velocity * STEP_S;
+            flight.run(STEP_S, true);
+        }
+        flight.velocity = Vector::zero();
+        flight.status.landed = Landed::OnGround;
+        flight.run(1.0, true);
+        let decision = flight.decisions.last().unwrap().1;
+        let end = (decision.phase, decision.why);
+        assert_eq!(end, (Phase::Aborted, Reason::StoppedInAir), "{mode:?}, {height_m} m");
+    }
+    // The report of the ground may come after the motors have stopped.
+    let mut flight = Told::started(Config::default(), 1.0);
+    flight.pad = Some(Point::origin());
+    flight.run(1.0, true);
+    flight.tell(Event::Operator(OperatorCommand::LandHere));
+    (flight.velocity, flight.status.mode) = (Vector::new(0.0, 0.0, 0.3), Mode::Land);
+    flight.run(1.0, true);
+    flight.position = Point::origin();
+    flight.velocity = Vector::zero();
+    flight.run(1.0, true);
+    flight.status.armed = false;
+    flight.run(0.1, true);
+    assert_eq!(flight.phase(), Phase::Landed);
+}
+
+#[test]
 fn a_retry_stays_below_the_fence() {
     let mut config = Config::default();
     config.phases.fence_height_m = 4.0;

@@ -14,6 +14,7 @@ const FLYING: VehicleInputs = VehicleInputs {
     is_over_target: true,
     sinks: false,
     land_m_s: 0.5,
+    flies: false,
 };
 
 fn at(seconds: f64) -> Inputs {
@@ -489,6 +490,23 @@ fn disarmed_motors_end_the_landing() {
         Phase::Final,
         Reason::TouchedEarly,
     );
+}
+
+#[test]
+fn motors_that_stop_in_the_air_are_no_touchdown() {
+    let falls = |seconds| flown(seconds, |v| (v.armed, v.flies) = (false, true));
+    let down = |v: &mut VehicleInputs| (v.armed, v.landed) = (false, Landed::OnGround);
+    let fell = (Phase::Aborted, Reason::StoppedInAir);
+    check(&[start(), falls(1.0), flown(1.3, down)], Phase::Search, Reason::Searching);
+    check(&[start(), falls(1.0), flown(1.3, down), flown(1.5, down)], fell.0, fell.1);
+    let ready = seen(9.0, Progress::Ready(Reason::LowAndAligned));
+    let land = flown(9.1, |v| v.mode = Mode::Land);
+    let finals = [start(), seen(1.0, Progress::Unchanged), ready, land];
+    let [a, b, c, d] = finals;
+    check(&[a, b, c, d, falls(9.5)], fell.0, fell.1);
+    check(&[a, b, c, d, falls(9.5), flown(9.8, down)], fell.0, fell.1);
+    // Motors that run again were not off.
+    check(&[start(), falls(1.0), at(1.2), flown(9.0, down)], Phase::Landed, Reason::TouchedDown);
 }
 
 #[test]

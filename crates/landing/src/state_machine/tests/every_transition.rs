@@ -6,7 +6,7 @@ use std::collections::hash_map::Entry;
 use std::collections::{HashMap, VecDeque};
 
 /// The values that distinguish two states.
-type Key = (Phase, Reason, [bool; 5], u32, [bool; 4], bool);
+type Key = (Phase, Reason, [bool; 6], u32, [bool; 4], bool);
 
 const LONG_S: f64 = 1e6;
 
@@ -38,6 +38,7 @@ fn key(machine: &StateMachine) -> Key {
         released,
         machine.is_recalling,
         waited_s.is_some() && !terminal,
+        machine.stopped_in_air && !terminal,
         waited_s.is_some_and(|s| s >= MAX_CONTACT_WAIT_S) && !terminal,
     ];
     (machine.phase, machine.reason, flags, retries, over, late)
@@ -75,6 +76,7 @@ fn vehicles() -> Vec<Option<VehicleInputs>> {
         change(|v| v.mode = Mode::Other),
         change(|v| v.mode = Mode::Unknown),
         change(|v| v.armed = false),
+        change(|v| (v.armed, v.flies) = (false, true)),
         change(|v| (v.armed, v.landed) = (false, Landed::OnGround)),
         change(|v| (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround)),
         change(|v| v.landed = Landed::OnGround),
@@ -177,6 +179,7 @@ fn check_step(before: &StateMachine, inputs: &Inputs, after: &StateMachine) {
     }
     if to == Phase::Landed {
         assert!(vehicle.is_some_and(|v| !v.armed || v.landed == Landed::OnGround), "{step}");
+        assert!(vehicle.is_some_and(|v| v.armed || !v.flies), "landed in the air: {step}");
     }
     if inputs.operator == Some(OperatorCommand::Abort) {
         let lands = before.landing || vehicle.is_some_and(|v| v.mode == Mode::Land);
