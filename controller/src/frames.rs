@@ -20,6 +20,10 @@ use crate::wire;
 /// nanoseconds.
 const UNUSABLE_NS: i64 = 1_000_000_000;
 
+/// Time for which a detector must give no pose before it is reported, in seconds: at a start its first frames come before the calibration,
+/// which camera-pub repeats each second.
+const NO_POSE_AFTER_S: f64 = 2.0;
+
 /// The newest frame of each detector, and the choice among them.
 #[derive(Debug)]
 pub struct Frames {
@@ -241,7 +245,7 @@ impl Frames {
 
     /// Why a landing that an operator starts would not be led to the marker.
     pub fn start_obstacle(&self, now_ns: i64) -> Option<String> {
-        let others = self.obstacle(now_ns).or_else(|| self.selection.no_pose());
+        let others = self.obstacle(now_ns).or_else(|| self.selection.no_pose(now_ns));
         others.or_else(|| self.nobody_looks_for_marker())
     }
 
@@ -256,7 +260,7 @@ impl Frames {
             let active = self.selection.active()?;
             self.announced.seen_instead(now_ns, active, &self.marker)
         };
-        self.selection.no_pose().or_else(|| self.nobody_looks_for_marker()).or_else(instead)
+        self.selection.no_pose(now_ns).or_else(|| self.nobody_looks_for_marker()).or_else(instead)
     }
 
     /// The frame to be used now: the active detector's newest, if it is newer than all that were used.
@@ -296,6 +300,7 @@ fn selection(config: &Config) -> Selection {
         return_after_s: settings.return_after_s,
         tolerance: config.tolerance(),
         needs_pose: config.needs_pose(),
+        no_pose_after_s: NO_POSE_AFTER_S,
     };
     let detector = Some(settings.preferred.clone()).filter(|name| !name.is_empty());
     let place = match settings.place {

@@ -30,6 +30,8 @@ pub struct Journal {
 #[derive(Debug)]
 struct Told {
     matter: String,
+    /// The warning as it was logged.
+    text: String,
     /// When, in nanoseconds.
     at_ns: i64,
     /// Since when it is over, in nanoseconds; `None` while it lasts.
@@ -50,12 +52,13 @@ impl Journal {
         for Warning { matter, text } in warnings {
             let Some(told) = self.told.iter_mut().find(|told| told.matter == *matter) else {
                 tracing::warn!("{text}");
-                self.told.push(Told { matter: matter.clone(), at_ns: now_ns, over_ns: None });
+                let (matter, text) = (matter.clone(), text.clone());
+                self.told.push(Told { matter, text, at_ns: now_ns, over_ns: None });
                 continue;
             };
             if told.over_ns.take().is_some() && now_ns.saturating_sub(told.at_ns) >= QUIET_NS {
                 tracing::warn!("{text}");
-                told.at_ns = now_ns;
+                (told.at_ns, told.text) = (now_ns, text.clone());
             }
         }
         self.told.retain_mut(|told| {
@@ -65,7 +68,7 @@ impl Journal {
             let over_ns = *told.over_ns.get_or_insert(now_ns);
             let is_over = now_ns.saturating_sub(over_ns) >= QUIET_NS;
             if is_over {
-                tracing::info!(matter = told.matter, "Over");
+                tracing::info!("No longer: {}", told.text);
             }
             !is_over
         });
@@ -297,8 +300,9 @@ mod tests {
                 journal.warnings(i * 25_000_000, &[]);
             }
         });
-        assert_eq!(told.matches("they differ").count(), 3, "{told}");
-        assert_eq!(told.matches("Over").count(), 1, "{told}");
+        assert_eq!(told.matches("WARN").count(), 3, "{told}");
+        assert_eq!(told.matches("they differ").count(), 4, "{told}");
+        assert_eq!(told.matches("No longer: they differ").count(), 1, "{told}");
     }
 
     #[test]

@@ -68,6 +68,8 @@ pub struct Limits {
     pub tolerance: Tolerance,
     /// Whether one without poses leads no landing.
     pub needs_pose: bool,
+    /// Time for which a detector must give no pose before it is reported, in seconds.
+    pub no_pose_after_s: f64,
 }
 
 /// What a detector is worth when there is no room for all; a better one takes the place of a worse one.
@@ -137,6 +139,8 @@ struct Known {
     disagreement_m: Option<f64>,
     /// Why it is not believed although it answers.
     fault: Option<Fault>,
+    /// Since when it has given no pose.
+    no_pose_ns: Option<i64>,
 }
 
 impl Selection {
@@ -319,10 +323,19 @@ impl Selection {
         self.dispute.as_ref()
     }
 
-    /// That the detector in use gives no pose, without which nothing descends.
-    pub fn no_pose(&self) -> Option<String> {
-        let active = self.known_active().filter(|active| active.fault == Some(Fault::NoPose));
+    /// That the detector in use gives no pose, without which nothing descends, once that is more than a start: its first frames may come
+    /// before the calibration.
+    pub fn no_pose(&self, now_ns: i64) -> Option<String> {
+        let active = self.known_active().filter(|active| self.lacks_pose(now_ns, active));
         active.map(|active| without_pose(&active.name))
+    }
+
+    /// Whether a detector has given no pose for long enough to be reported.
+    fn lacks_pose(&self, now_ns: i64, known: &Known) -> bool {
+        let since_ns = known.no_pose_ns.filter(|_| known.fault == Some(Fault::NoPose));
+        since_ns.is_some_and(|since_ns| {
+            now_ns.saturating_sub(since_ns) as f64 * 1e-9 >= self.limits.no_pose_after_s
+        })
     }
 
     /// What the operator should know of the detectors.
@@ -354,7 +367,10 @@ impl Selection {
                     warn(format!("blind {name}"), text);
                 }
                 Fault::Blind { .. } => {}
-                Fault::NoPose => warn(format!("no pose {name}"), without_pose(name)),
+                Fault::NoPose if self.lacks_pose(now_ns, known) => {
+                    warn(format!("no pose {name}"), without_pose(name));
+                }
+                Fault::NoPose => {}
             }
         }
         if self.crowded_ns.is_some_and(|at| now_ns.saturating_sub(at) < CROWDED_NS) {
@@ -476,6 +492,7 @@ impl Selection {
         for ((known, fault), answers) in self.known.iter_mut().zip(found).zip(answers) {
             let lacks_pose = answers && needs_pose && agreement::gives_no_pose(&known.sights);
             known.fault = fault.or(lacks_pose.then_some(Fault::NoPose));
+            known.no_pose_ns = lacks_pose.then(|| known.no_pose_ns.unwrap_or(now_ns));
         }
         self.dispute = self.present_dispute(now_ns, tolerance);
     }
@@ -696,6 +713,7 @@ impl Known {
             verdicts: VecDeque::new(),
             disagreement_m: None,
             fault: None,
+            no_pose_ns: None,
         }
     }
 

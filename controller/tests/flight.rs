@@ -1308,6 +1308,32 @@ fn a_landing_on_centres_without_poses_is_refused_with_its_reason_and_one_under_w
     }
 }
 
+/// At a start a detector searches frames before the camera's calibration arrives.
+#[test]
+fn first_frames_without_poses_are_no_warning() {
+    let mut flight = flight_with("command", &[]);
+    flight.camera(0, CameraInfo::sample());
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    for ms in (20..6000).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(&mut flight, ms * MS, &heartbeat(4, true));
+        }
+        pose(&mut flight, ms * MS);
+        if ms % 60 == 0 {
+            let mut seen = seen(ms * MS - 40 * MS);
+            if ms < 1500 {
+                seen.detections[0].pose = None;
+            }
+            flight.detections(ms * MS + 2, "main", &seen);
+        }
+        flight.tick(ms * MS + 3);
+        let status = flight.status(ms * MS + 3);
+        assert!(!status.warnings.iter().any(|it| it.contains("pose")), "{ms} ms: {status:?}");
+        assert!(!status.why.contains("pose"), "{ms} ms: {status:?}");
+    }
+}
+
 /// What a detector tells that looks for these markers.
 fn looking_for(detector: &str, markers: &[&str]) -> DetectorInfo {
     let markers = markers.iter().map(|it| (*it).to_owned()).collect();

@@ -20,6 +20,7 @@ fn limits() -> Limits {
         return_after_s: 2.0,
         tolerance: Tolerance { base_m: 0.1, per_m: 0.03, heading_rad: Some(HEADING_TOLERANCE_RAD) },
         needs_pose: true,
+        no_pose_after_s: 0.0,
     }
 }
 
@@ -681,7 +682,7 @@ fn one_that_gives_no_pose_is_told_and_gives_way_to_one_that_does() {
         let mine = ("mine", 20 * MS, without_position(false));
         let took_ms = warned_ms(&mut bench, 0..40, &[mine], "`mine` gives no pose").unwrap();
         assert!(took_ms < 1000, "{took_ms} ms");
-        let told = bench.selection.no_pose().unwrap();
+        let told = bench.selection.no_pose(bench.now_ns).unwrap();
         let parts = ["`mine` gives no pose", "in three or more of four", "FAMILY:ID:SIZE_M"];
         assert!(parts.iter().all(|part| told.contains(part)), "{told}");
         assert_eq!(bench.state("mine"), DetectorState::Blind);
@@ -692,7 +693,7 @@ fn one_that_gives_no_pose_is_told_and_gives_way_to_one_that_does() {
         assert_eq!(bench.selection.active(), Some("main"));
         let why = bench.selection.why().to_owned();
         assert!(why.contains("mine: it gives no pose"), "{why}");
-        assert_eq!((bench.selection.no_pose(), bench.selection.dispute()), (None, None));
+        assert_eq!((bench.selection.no_pose(bench.now_ns), bench.selection.dispute()), (None, None));
         let answer = bench.selection.prefer(bench.now_ns, "mine").unwrap();
         assert!(answer.contains("as soon as it is healthy; now it gives no pose"), "{answer}");
         // Its camera is calibrated now.
