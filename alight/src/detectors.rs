@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
 use messages::{
-    Candidate, Configuration, ControllerCommand, ControllerStatus, Detection, DetectorInfo,
-    DetectorState, Place, looks_for_others, topic,
+    Candidate, Configuration, ControllerCommand, ControllerStatus, DetectorInfo, DetectorState,
+    Place, looks_for_others, topic,
 };
 use node::Node;
 use serde::Serialize;
@@ -99,7 +99,6 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
     let configurations = node.subscriber(topic::CONFIGURATION, &["controller"]).await?;
     let (mut status, mut announced, mut marker) = (None, BTreeMap::new(), None);
     let mut published: BTreeMap<String, u32> = BTreeMap::new();
-    let mut found: BTreeMap<String, Vec<Detection>> = BTreeMap::new();
     let receive = async {
         loop {
             tokio::select! {
@@ -109,12 +108,9 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
                     let name = topic::DETECTOR_INFO.first_name(&key).unwrap_or_default();
                     announced.insert(name.to_owned(), info);
                 }
-                Some((key, message)) = detections.next_with_key() => {
+                Some((key, _)) = detections.next_with_key() => {
                     let name = topic::DETECTIONS.first_name(&key).unwrap_or_default();
                     *published.entry(name.to_owned()).or_default() += 1;
-                    if !message.detections.is_empty() {
-                        found.insert(name.to_owned(), message.detections);
-                    }
                 }
                 Some(configuration) = configurations.next() => marker = marker_of(&configuration),
                 else => return,
@@ -138,20 +134,7 @@ async fn listen(node: &Node) -> anyhow::Result<Overview> {
         }
         (None, _) => Controller::Unread,
     };
-    let without_pose = without_pose(&found, marker.as_deref());
-    Ok(Overview::new(controller, marker, &announced, &running, &without_pose))
-}
-
-/// The detectors that found this marker, and gave no pose of it, in the latest frame in which they found any.
-fn without_pose(
-    found: &BTreeMap<String, Vec<Detection>>,
-    marker: Option<&str>,
-) -> BTreeSet<String> {
-    let lacks_pose = |found: &Vec<Detection>| {
-        let wanted = found.iter().find(|it| marker.is_none_or(|marker| it.is_of(marker)));
-        wanted.is_some_and(|it| it.pose.is_none())
-    };
-    found.iter().filter(|(_, found)| lacks_pose(found)).map(|(name, _)| name.clone()).collect()
+    Ok(Overview::new(controller, marker, &announced, &running))
 }
 
 /// The marker of a controller's landing.
@@ -191,8 +174,7 @@ struct Overview {
 #[derive(Serialize)]
 struct Entry {
     id: String,
-    /// `active`, `shadow`, `stale`, `blind`, `no-pose` for one that is blind because it gives no pose, `outvoted`; `waiting` for one from
-    /// which the controller has received nothing, and
+    /// `active`, `shadow`, `stale`, `blind`, `no-pose`, `outvoted`; `waiting` for one from which the controller has received nothing, and
     /// `other-marker` for one that answers and never reports the marker of the landing. Where no controller's status is read,
     /// `publishing`, or `silent` for one without messages.
     state: &'static str,
@@ -214,7 +196,6 @@ impl Overview {
         marker: Option<String>,
         announced: &BTreeMap<String, DetectorInfo>,
         running: &BTreeMap<String, f64>,
-        without_pose: &BTreeSet<String>,
     ) -> Self {
         let (controller, status_read, status) = match controller {
             Controller::Absent(detector_why) => {
@@ -230,12 +211,7 @@ impl Overview {
         let entry = |name: &str| {
             let (candidate, info) = (candidates.get(name).copied(), announced.get(name));
             let received_hz = running.get(name).copied().filter(|rate_hz| *rate_hz > 0.0);
-            let entry =
-                Entry::new(name, candidate, info, marker.as_deref(), status_read, received_hz);
-            match entry.state {
-                "blind" if without_pose.contains(name) => Entry { state: "no-pose", ..entry },
-                _ => entry,
-            }
+            Entry::new(name, candidate, info, marker.as_deref(), status_read, received_hz)
         };
         let mut detectors: Vec<Entry> = names.into_iter().map(entry).collect();
         detectors.sort_by_key(|entry| entry.state != "active");
@@ -348,6 +324,7 @@ impl Entry {
                 Some(DetectorState::Shadow) => "shadow",
                 Some(DetectorState::Blind) => "blind",
                 Some(DetectorState::Outvoted) => "outvoted",
+                Some(DetectorState::NoPose) => "no-pose",
                 None if status_read => "waiting",
                 None if received_hz.is_some() => "publishing",
                 None => "silent",
@@ -407,8 +384,7 @@ mod tests {
         let announced = [("main".to_owned(), info)].into();
         let running = [("main".to_owned(), 10.0), ("late".to_owned(), 0.0)].into();
         let controller = Controller::Read(Box::new(status));
-        let none = BTreeSet::new();
-        let table = Overview::new(controller, None, &announced, &running, &none).table();
+        let table = Overview::new(controller, None, &announced, &running).table();
         let lines: Vec<&str> = table.lines().collect();
         assert!(lines[1].starts_with("main") && lines[1].contains("rings:0.15341"), "{table}");
         assert!(lines[2].contains("shadow") && lines[2].contains("29 of 30, 0.012 m"), "{table}");
@@ -416,7 +392,7 @@ mod tests {
         assert!(lines[4].contains("preferred: ground; 3 changes"), "{table}");
         assert!(lines[5].starts_with("Warning: detections of `late`"), "{table}");
         let absent = Controller::Absent("no process listens at 10.0.0.1:7448".to_owned());
-        let without_status = Overview::new(absent, None, &announced, &running, &none).table();
+        let without_status = Overview::new(absent, None, &announced, &running).table();
         let lines: Vec<&str> = without_status.lines().collect();
         assert!(lines[1].starts_with("late") && lines[1].contains("silent"), "{without_status}");
         assert!(
@@ -427,7 +403,7 @@ mod tests {
         assert!(without_status.contains("no process listens at 10.0.0.1:7448"), "{without_status}");
         // As its configuration is read, whose version is the same.
         let marker = Some("rings".to_owned());
-        let unread = Overview::new(Controller::Unread, marker, &announced, &BTreeMap::new(), &none);
+        let unread = Overview::new(Controller::Unread, marker, &announced, &BTreeMap::new());
         assert!(unread.controller && !unread.status_read);
         let unread = unread.table();
         assert!(unread.starts_with("No detector is there: none is alive"), "{unread}");
@@ -444,7 +420,7 @@ mod tests {
             ("late", DetectorState::Stale, "aruco-4x4-50:7:0.15"),
             ("faulty", DetectorState::Outvoted, "rings:0.15341"),
             ("tag", DetectorState::Blind, "aruco-4x4-50:7:0.15"),
-            ("uncalibrated", DetectorState::Blind, "rings:0.15341"),
+            ("uncalibrated", DetectorState::NoPose, "rings:0.15341"),
         ];
         let candidates = states.map(|(name, state, _)| Candidate {
             detector: name.into(),
@@ -470,21 +446,8 @@ mod tests {
             version: "0.1.0".into(),
             toml: "marker = \"rings\"".into(),
         });
-        let seen = |family: &str, has_pose: bool| {
-            let seen = Detection { family: family.into(), ..Detection::sample() };
-            let pose = seen.pose.filter(|_| has_pose);
-            vec![Detection { pose, ..seen }]
-        };
-        let found = [
-            ("blind", seen("rings", true)),
-            ("tag", seen("aruco-4x4-50", false)),
-            ("uncalibrated", seen("rings", false)),
-        ];
-        let found = found.map(|(name, found)| (name.to_owned(), found)).into();
-        let without_pose = without_pose(&found, marker.as_deref());
         let controller = Controller::Read(Box::new(status));
-        let overview =
-            Overview::new(controller, marker, &announced, &BTreeMap::new(), &without_pose);
+        let overview = Overview::new(controller, marker, &announced, &BTreeMap::new());
         let states: Vec<_> =
             overview.detectors.iter().map(|it| (it.id.as_str(), it.state)).collect();
         let expected = [

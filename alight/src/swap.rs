@@ -656,13 +656,14 @@ fn unfit_because(shadow: &Candidate, frames: u32) -> Option<String> {
     let agrees = *compared >= frames && agreement(shadow) >= MIN_AGREEMENT;
     let what = match state {
         DetectorState::Active | DetectorState::Shadow => return None,
-        DetectorState::Stale => "stale",
-        DetectorState::Blind => "blind",
-        DetectorState::Outvoted => "outvoted",
+        DetectorState::Stale => "is stale",
+        DetectorState::Blind => "is blind",
+        DetectorState::Outvoted => "is outvoted",
+        DetectorState::NoPose => "gives no pose of the marker",
     };
     agrees.then(|| {
         format!(
-            "it can be used: it agrees in {agreed} of {compared} frames and is {what} (detections come {latency_ms:.0} ms after their \
+            "it can be used: it agrees in {agreed} of {compared} frames and {what} (detections come {latency_ms:.0} ms after their \
              frames, the newest frame is {age_ms:.0} ms old)"
         )
     })
@@ -701,6 +702,10 @@ mod tests {
             unfit.contains("30 of 30 frames and is stale") && unfit.contains("201 ms"),
             "{unfit}"
         );
+        let centres_only = Candidate { state: DetectorState::NoPose, ..shadow(30, 30) };
+        assert!(verdict(&centres_only, 15).is_none());
+        let unfit = unfit_because(&centres_only, 15).unwrap();
+        assert!(unfit.contains("30 of 30 frames and gives no pose of the marker"), "{unfit}");
         assert_eq!(unfit_because(&shadow(30, 30), 15), None);
         let refused = Verdict::Differs("it agrees in only 3 of 15 frames".into());
         assert_eq!(verdict(&shadow(15, 3), 15), Some(refused));

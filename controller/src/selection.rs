@@ -406,7 +406,8 @@ impl Selection {
             detector: known.name.clone(),
             state: match (self.ailment(now_ns, known), &known.fault) {
                 (Some(_), _) => DetectorState::Stale,
-                (None, Some(Fault::Blind { .. } | Fault::NoPose)) => DetectorState::Blind,
+                (None, Some(Fault::Blind { .. })) => DetectorState::Blind,
+                (None, Some(Fault::NoPose)) => DetectorState::NoPose,
                 (None, Some(Fault::Outvoted { .. })) => DetectorState::Outvoted,
                 (None, None) if self.active.as_ref() == Some(&known.name) => DetectorState::Active,
                 (None, None) => DetectorState::Shadow,

@@ -682,10 +682,10 @@ fn one_that_gives_no_pose_is_told_and_gives_way_to_one_that_does() {
         let mine = ("mine", 20 * MS, without_position(false));
         let took_ms = warned_ms(&mut bench, 0..40, &[mine], "`mine` gives no pose").unwrap();
         assert!(took_ms < 1000, "{took_ms} ms");
-        let told = bench.selection.no_pose(bench.now_ns).unwrap();
+        let text = bench.selection.no_pose(bench.now_ns).unwrap();
         let parts = ["`mine` gives no pose", "in three or more of four", "FAMILY:ID:SIZE_M"];
-        assert!(parts.iter().all(|part| told.contains(part)), "{told}");
-        assert_eq!(bench.state("mine"), DetectorState::Blind);
+        assert!(parts.iter().all(|part| text.contains(part)), "{text}");
+        assert_eq!(bench.state("mine"), DetectorState::NoPose);
         assert_eq!(bench.selection.active(), Some("mine"), "there is no other");
         for i in 40..60 {
             bench.frame_seen(i * PERIOD, &[mine, ("main", 30 * MS, at(0.0))]);

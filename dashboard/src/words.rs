@@ -60,8 +60,9 @@ pub fn detector(state: DetectorState) -> &'static str {
         DetectorState::Active => "in use",
         DetectorState::Shadow => "standby",
         DetectorState::Stale => "silent or late",
-        DetectorState::Blind => "no marker or no pose",
+        DetectorState::Blind => "sees no marker",
         DetectorState::Outvoted => "outvoted",
+        DetectorState::NoPose => "gives no pose",
     }
 }
 
@@ -73,5 +74,16 @@ pub fn landed(state: LandedState) -> &'static str {
         LandedState::TakingOff => "taking off",
         LandedState::InAir => "in the air",
         LandedState::Landing => "landing",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_detector_without_a_pose_is_told_from_one_that_sees_no_marker() {
+        assert_eq!(detector(DetectorState::Blind), "sees no marker");
+        assert_eq!(detector(DetectorState::NoPose), "gives no pose");
     }
 }

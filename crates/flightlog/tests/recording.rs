@@ -181,6 +181,7 @@ fn the_spellings_of_variants_in_json_are_those_of_the_documentation() {
         DetectorState::Stale,
         DetectorState::Blind,
         DetectorState::Outvoted,
+        DetectorState::NoPose,
     ];
     let setters = [ExposureSetter::Fixed, ExposureSetter::Camera, ExposureSetter::Marker];
     let reasons = [

@@ -10,7 +10,7 @@ use crate::detector::{Place, marker_name};
 
 wire! {
     TargetEstimate = 6 v 2;
-    ControllerStatus = 7 v 8;
+    ControllerStatus = 7 v 9;
     ControllerCommand = 8 v 3;
     CommandReply = 9 v 1;
 }
@@ -90,10 +90,12 @@ pub enum DetectorState {
     Shadow,
     /// It is silent, late, slow or gone.
     Stale,
-    /// It answers in time, and sees no marker where another one sees it, or gives no pose of it where the landing needs one.
+    /// It answers in time, and sees no marker where another one sees it.
     Blind,
     /// It answers in time, and others see the marker elsewhere.
     Outvoted,
+    /// It answers in time and sees the marker, and gives no pose of it where the landing needs one.
+    NoPose,
 }
 
 /// The phase of a flight.

@@ -16,7 +16,7 @@ use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, Targe
 use crate::detector::{Detections, DetectorInfo};
 
 wire! {
-    Tape = 19 v 6;
+    Tape = 19 v 7;
 }
 
 /// Length of the hash at the end of each record, in bytes.

@@ -419,7 +419,7 @@ fn controller_status() {
     };
     check(
         &message,
-        "41070802040177066d65747269630572696e6773026f6b01046d61696e01790667726f756e640201046d61696e000100000000000000f03f00000000000000400000000000002e4001000f0e000000010000000000000000000000000000000000000000000000000000000000000000000000010901000000000000f03f000000000000004001000000000000e03f010178",
+        "41070902040177066d65747269630572696e6773026f6b01046d61696e01790667726f756e640201046d61696e000100000000000000f03f00000000000000400000000000002e4001000f0e000000010000000000000000000000000000000000000000000000000000000000000000000000010901000000000000f03f000000000000004001000000000000e03f010178",
     );
 }
 
@@ -442,6 +442,25 @@ fn phases() {
     for (number, phase) in (0..).zip(phases) {
         let message = ControllerStatus { phase, ..ControllerStatus::default() };
         assert_eq!(encode(&message)[4], number, "{phase}");
+    }
+}
+
+#[test]
+fn detector_states() {
+    let states = [
+        DetectorState::Active,
+        DetectorState::Shadow,
+        DetectorState::Stale,
+        DetectorState::Blind,
+        DetectorState::Outvoted,
+        DetectorState::NoPose,
+    ];
+    for (number, state) in (0..).zip(states) {
+        let candidate = Candidate { detector: String::new(), state, ..Candidate::sample() };
+        let message =
+            ControllerStatus { candidates: vec![candidate], ..ControllerStatus::default() };
+        // Head, ten empty fields, a list of one, an empty name.
+        assert_eq!(encode(&message).get(15), Some(&number), "{state:?}");
     }
 }
 
@@ -487,7 +506,7 @@ fn truth() {
 #[test]
 fn tape() {
     let message = Tape { begun_ns: 1, first: 300, count: 2, records: vec![7, 0] };
-    check(&message, "41130602ac0202020700");
+    check(&message, "41130702ac0202020700");
 }
 
 /// A record with one event: its bytes without the hash, which the bytes give.
