@@ -482,6 +482,25 @@ fn a_camera_is_ready_once_its_first_frame_is_there() -> anyhow::Result<()> {
     Ok(())
 }
 
+#[test]
+fn a_camera_of_image_files_reports_once_that_it_is_ready() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let ([meet], _, _) = ports::free()?;
+    image::GrayImage::new(64, 48).save(folder.path().join("frame.png"))?;
+    let set = ["--set", "source.paths=['frame.png']", "--set", "source.wait_for_subscriber=false"];
+    let output = Command::new(ALIGHT)
+        .args(["camera-pub", "--set", "source.repeat=false", "--meet", &meet.to_string()])
+        .args(set)
+        .current_dir(folder.path())
+        .env("ALIGHT_LOG", "info")
+        .stdin(Stdio::null())
+        .output()?;
+    let text = String::from_utf8_lossy(&output.stderr);
+    let times = text.matches("Ready").count();
+    ensure!(output.status.success() && times == 1, "{output:?}");
+    Ok(())
+}
+
 /// A web server, which answers after the first bytes of a client, until this is dropped.
 struct WebServer {
     port: u16,

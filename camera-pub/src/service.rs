@@ -710,6 +710,10 @@ impl Stream {
         if picture == Picture::New {
             let sequence = self.sequence;
             self.publish(frame, exposure).await;
+            if sequence == 0 {
+                let instance = self.config.instance();
+                tracing::info!(instance, "Ready, the first frame is published");
+            }
             return Some(sequence);
         }
         self.health.dropped("frames that repeat the picture before");
@@ -747,10 +751,6 @@ impl Stream {
             self.rect.offer(&header, grey);
         }
         self.frames.publish(&header, frame.pixels).await;
-        if self.sequence == 0 {
-            let instance = self.config.instance();
-            tracing::info!(instance, "Ready, the first frame is published");
-        }
         self.sequence += 1;
     }
 }
