@@ -19,6 +19,12 @@ const BLUE: Colour = [70, 140, 255];
 const YELLOW: Colour = [255, 235, 80];
 const WHITE: Colour = [255, 255, 255];
 
+/// Width of a drawing for each pixel of its lines, in pixels.
+const WIDTH_PER_LINE_PX: usize = 640;
+/// The same for each pixel of a dot of its letters, which are 7 dots high.
+const WIDTH_PER_DOT_PX: usize = 450;
+/// Distance from one letter to the next, in dots.
+const LETTER: f64 = 6.0;
 /// Images narrower than this, in pixels, are enlarged to make room for labels.
 const MIN_WIDTH_PX: usize = 900;
 /// Markers smaller than this, in pixels of the drawing, get a circle of this radius.
@@ -66,7 +72,8 @@ fn draw(view: GrayView<'_>, found: &[Observation], camera: Option<&CameraModel>)
     let mut brush = Brush {
         canvas: RgbImageBuf::default(),
         scale: enlarged as f64,
-        dot_px: (view.width() * enlarged / 640).clamp(1, 6),
+        line_px: (view.width() * enlarged / WIDTH_PER_LINE_PX).clamp(1, 6),
+        dot_px: (view.width() * enlarged / WIDTH_PER_DOT_PX).clamp(1, 8),
     };
     brush.draw_image(view, enlarged);
     for seen in found {
@@ -74,7 +81,9 @@ fn draw(view: GrayView<'_>, found: &[Observation], camera: Option<&CameraModel>)
     }
     for seen in found {
         brush.axes(seen, camera);
-        brush.label(seen, found);
+    }
+    for label in brush.labels(found) {
+        brush.write(&label);
     }
     if found.is_empty() {
         brush.canvas.text([0.0, 0.0], "no marker", brush.dot_px, YELLOW);
@@ -85,8 +94,46 @@ fn draw(view: GrayView<'_>, found: &[Observation], camera: Option<&CameraModel>)
 struct Brush {
     canvas: RgbImageBuf,
     scale: f64,
-    /// Width of a dot of the font, in pixels of the drawing.
+    /// Width of lines, in pixels of the drawing.
+    line_px: usize,
+    /// Width of a dot of the font where there is room, in pixels of the drawing.
     dot_px: usize,
+}
+
+/// What is written of a marker, and where.
+struct Label {
+    lines: Vec<String>,
+    /// Width of a dot of its letters, in pixels of the drawing.
+    dot_px: usize,
+    /// The middle of its upper edge, in the drawing.
+    at: [f64; 2],
+    area: Area,
+}
+
+/// An upright rectangle in the drawing.
+#[derive(Clone, Copy, Debug)]
+struct Area {
+    min: [f64; 2],
+    max: [f64; 2],
+}
+
+impl Area {
+    fn of(points: &[[f64; 2]]) -> Self {
+        let corner = |from: f64, choose: fn(f64, f64) -> f64| {
+            [0, 1].map(|axis: usize| points.iter().map(|it| it[axis]).fold(from, choose))
+        };
+        Self { min: corner(f64::INFINITY, f64::min), max: corner(f64::NEG_INFINITY, f64::max) }
+    }
+
+    fn has(&self, point: [f64; 2]) -> bool {
+        self.overlaps(&Self { min: point, max: point })
+    }
+
+    fn overlaps(&self, other: &Self) -> bool {
+        [0, 1].into_iter().all(|axis: usize| {
+            self.min[axis] <= other.max[axis] && other.min[axis] <= self.max[axis]
+        })
+    }
 }
 
 impl Brush {
@@ -113,7 +160,7 @@ impl Brush {
     }
 
     fn line_px(&self) -> f64 {
-        self.dot_px as f64
+        self.line_px as f64
     }
 
     /// Draws the marker's outline, with a red circle at its own top-left corner.
@@ -182,45 +229,90 @@ impl Brush {
         }
     }
 
-    /// Draws name, confidence and position; next to other markers only as much as fits.
-    fn label(&mut self, seen: &Observation, all: &[Observation]) {
-        let id = seen.id.map_or_else(String::new, |id| format!(":{id}"));
+    /// Name, confidence and position of each marker; beside others only as much as ends neither on them nor on their labels.
+    fn labels(&self, found: &[Observation]) -> Vec<Label> {
+        let markers: Vec<Area> = found.iter().map(|seen| self.area(seen)).collect();
+        let all: Vec<[Label; 4]> = found.iter().map(|seen| self.texts(seen)).collect();
+        // Each of a marker's labels lies in the longer ones before it. So two are apart also where the one chosen for the other is longer.
+        let is_free = |own: usize, rank: usize, label: &Label| {
+            let centre = found.get(own).map(|seen| self.to_drawing(seen.centre));
+            // A pad has its markers in it.
+            let is_around = |area: &Area| centre.is_some_and(|centre| area.has(centre));
+            let ends_on = |area: &Area| area.overlaps(&label.area);
+            let others = all.iter().enumerate().filter(|(other, _)| *other != own);
+            let mut others = others.filter_map(|(_, labels)| labels.get(rank));
+            !markers.iter().any(|it| ends_on(it) && !is_around(it))
+                && !others.any(|it| ends_on(&it.area))
+        };
+        let chosen = |(own, labels): (usize, &[Label; 4])| {
+            let mut ranked = labels.iter().enumerate();
+            ranked.find(|(rank, label)| is_free(own, *rank, label)).map_or(3, |(rank, _)| rank)
+        };
+        let chosen: Vec<usize> = all.iter().enumerate().map(chosen).collect();
+        let labels = all.into_iter().zip(chosen);
+        labels.filter_map(|(labels, rank)| labels.into_iter().nth(rank)).collect()
+    }
+
+    /// Labels of a marker, the longest first.
+    fn texts(&self, seen: &Observation) -> [Label; 4] {
+        let id = seen.id.map_or_else(String::new, |id| id.to_string());
+        let name = match seen.id {
+            Some(id) => format!("{}:{id}", seen.family),
+            None => seen.family.to_string(),
+        };
         let wrong = match seen.wrong_bits {
             0 => String::new(),
             bits => format!("  {bits} wrong"),
         };
-        let mut lines = vec![format!("{}{id}  {:.2}{wrong}", seen.family, seen.confidence)];
+        let mut all = vec![format!("{name}  {:.2}{wrong}", seen.confidence)];
         if let Some(pose) = &seen.pose {
             let at = pose.camera_from_marker.origin();
-            lines.push(format!("{:.3}, {:.3}, {:.3} {METRES}", at.x(), at.y(), at.z()));
+            all.push(format!("{:.3}, {:.3}, {:.3} {METRES}", at.x(), at.y(), at.z()));
         }
-        let others = all.iter().filter(|other| other.centre != seen.centre);
-        let room = others.map(|other| other.centre.distance(&seen.centre) * self.scale);
-        let letters = room.fold(f64::INFINITY, f64::min) / (6.0 * self.dot_px as f64);
-        if lines.iter().any(|line| line.len() as f64 > letters) {
-            lines = vec![format!("{id} {:.2}", seen.confidence)];
-            if lines.iter().any(|line| line.len() as f64 > letters) {
-                lines = vec![id.trim_start_matches(':').to_owned()];
-            }
-        }
-        let [x, y] = self.to_drawing(seen.centre);
-        let reach = match seen.corners {
-            Some(corners) => {
-                corners.map(|c| self.to_drawing(c)[1] - y).into_iter().fold(0.0, f64::max)
-            }
-            None => seen.size_px * self.scale / 2.0,
-        };
-        let reach = if seen.size_px * self.scale < MIN_VISIBLE_PX { MIN_VISIBLE_PX } else { reach };
-        let dot = self.dot_px as f64;
-        // At the lower edge all lines move up together: moved one by one they would overlap.
-        let lowest = self.canvas.height as f64 - LINE * dot * lines.len() as f64;
-        let first = (y + reach + 4.0 * dot).min(lowest).max(0.0);
-        for (index, text) in (0..).zip(&lines) {
-            let left = x - 3.0 * dot * text.len() as f64;
-            let top = first + LINE * dot * f64::from(index);
+        let short = format!("{id} {:.2}", seen.confidence).trim().to_owned();
+        let shorter = [
+            (all, self.dot_px),
+            (vec![short], self.dot_px),
+            (vec![id.clone()], self.dot_px),
+            (vec![id], self.line_px),
+        ];
+        shorter.map(|(lines, dot_px)| self.label(seen, lines, dot_px))
+    }
+
+    /// Lines under a marker.
+    fn label(&self, seen: &Observation, lines: Vec<String>, dot_px: usize) -> Label {
+        let ([x, y], area) = (self.to_drawing(seen.centre), self.area(seen));
+        let is_small = seen.size_px * self.scale < MIN_VISIBLE_PX;
+        let reach = if is_small { MIN_VISIBLE_PX } else { area.max[1] - y };
+        let dot = dot_px as f64;
+        let letters = lines.iter().map(|line| line.chars().count()).max().unwrap_or(0);
+        let (width, height) = (LETTER * dot * letters as f64, LINE * dot * lines.len() as f64);
+        // At the lower edge all lines move up together: each by itself would end on the others.
+        let lowest = self.canvas.height as f64 - height;
+        let top = (y + reach + 2.0 * self.line_px()).min(lowest).max(0.0);
+        let left = (x - 0.5 * width).min(self.canvas.width as f64 - width).max(0.0);
+        let area = Area { min: [left, top], max: [left + width, top + height] };
+        Label { lines, dot_px, at: [x, top], area }
+    }
+
+    fn write(&mut self, label: &Label) {
+        let ([x, top], dot) = (label.at, label.dot_px as f64);
+        for (index, text) in (0..).zip(&label.lines) {
+            let left = x - 0.5 * LETTER * dot * text.chars().count() as f64;
             let colour = if index == 0 { YELLOW } else { WHITE };
-            self.canvas.text([left, top], text, self.dot_px, colour);
+            let at = [left, top + LINE * dot * f64::from(index)];
+            self.canvas.text(at, text, label.dot_px, colour);
         }
+    }
+
+    /// The marker in the drawing.
+    fn area(&self, seen: &Observation) -> Area {
+        let corners = seen.corners.unwrap_or_else(|| {
+            let radius = 0.5 * seen.size_px;
+            [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]
+                .map(|[x, y]| Pixel::new(seen.centre.x + x * radius, seen.centre.y + y * radius))
+        });
+        Area::of(&corners.map(|corner| self.to_drawing(corner)))
     }
 }
 
@@ -276,8 +368,7 @@ mod tests {
         assert!(drawn.data.chunks(3).any(|pixel| pixel == YELLOW));
     }
 
-    #[test]
-    fn the_lines_of_a_label_at_the_lower_edge_are_apart() {
+    fn marker(id: Option<u32>, centre: Pixel, size_px: f64) -> Observation {
         let place = Transform::new(geometry::Rotation::identity(), Point::new(0.0, 0.1, 1.0));
         let pose = fiducial::MarkerPose {
             camera_from_marker: place,
@@ -285,18 +376,68 @@ mod tests {
             covariance: nalgebra::Matrix6::identity(),
             alternative: None,
         };
-        let seen = Observation {
+        Observation {
             family: markers::Family::Rings,
-            id: None,
-            centre: Pixel::new(450.0, 590.0),
+            id,
+            centre,
             centre_covariance_px2: nalgebra::Matrix2::identity(),
             corners: None,
             wrong_bits: 0,
-            size_px: 60.0,
+            size_px,
             confidence: 1.0,
             pose: Some(pose),
             response: None,
-        };
+        }
+    }
+
+    fn brush(width: usize, height: usize) -> Brush {
+        let mut brush = Brush { canvas: RgbImageBuf::default(), scale: 1.0, line_px: 1, dot_px: 2 };
+        brush.draw_image(GrayImage::filled(width, height, 80).view().unwrap(), 1);
+        brush
+    }
+
+    #[test]
+    fn labels_beside_each_other_are_shorter_and_end_on_no_other_marker_and_label() {
+        let brush = brush(960, 720);
+        for (pitch, lines, longest) in [(300.0, 2, 21), (120.0, 1, 8), (75.0, 1, 3), (52.0, 1, 3)] {
+            let at = |n: f64| 150.0 + pitch * n;
+            let cell = |n: u32| Pixel::new(at(f64::from(n % 3)), at(f64::from(n / 3)));
+            let found: Vec<_> = (0..6).map(|n| marker(Some(120 + n), cell(n), 40.0)).collect();
+            let labels = brush.labels(&found);
+            let markers: Vec<Area> = found.iter().map(|seen| brush.area(seen)).collect();
+            assert_eq!(labels.len(), found.len());
+            for (n, label) in labels.iter().enumerate() {
+                let length = label.lines.iter().map(|it| it.chars().count()).max();
+                assert_eq!((label.lines.len(), length), (lines, Some(longest)), "{pitch}");
+                assert!(label.lines[0].contains(&format!("{}", 120 + n)), "{:?}", label.lines);
+                let others = labels.iter().enumerate().filter(|(other, _)| *other != n);
+                let others = others.map(|(_, it)| &it.area).chain(&markers);
+                assert_eq!(others.filter(|it| it.overlaps(&label.area)).count(), 0, "{pitch}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_marker_of_a_pad_has_its_whole_label() {
+        let brush = brush(960, 720);
+        let [pad, inner] = [(None, 300.0), (Some(7), 60.0)]
+            .map(|(id, size_px)| marker(id, Pixel::new(400.0, 200.0), size_px));
+        let lines: Vec<usize> =
+            brush.labels(&[pad, inner]).iter().map(|label| label.lines.len()).collect();
+        assert_eq!(lines, [2, 2]);
+    }
+
+    #[test]
+    fn letters_are_14_pixels_high_in_the_smallest_drawing() {
+        let image = GrayImage::filled(900, 300, 80);
+        let drawn = draw(image.view().unwrap(), &[], None);
+        let is_in = |row: &&[u8]| row.chunks(3).any(|pixel| pixel == YELLOW);
+        assert_eq!(drawn.data.chunks(900 * 3).filter(is_in).count(), 14);
+    }
+
+    #[test]
+    fn the_lines_of_a_label_at_the_lower_edge_are_apart() {
+        let seen = marker(None, Pixel::new(450.0, 590.0), 60.0);
         let image = GrayImage::filled(900, 600, 80);
         let drawn = draw(image.view().unwrap(), &[seen], None);
         let rows = |colour: Colour| {
