@@ -27,8 +27,11 @@ const put = (where, text) => {
   if (node.textContent !== text) node.textContent = text;
 };
 
+/** Zero has no sign. @param {number} value @param {number} digits */
+const fixed = (value, digits) => value.toFixed(digits).replace(/^-(?=[0.]+$)/, '');
+
 /** @param {number | null | undefined} value @param {number} digits @param {string} unit */
-const number = (value, digits, unit) => (value == null ? '-' : `${value.toFixed(digits)} ${unit}`);
+const number = (value, digits, unit) => (value == null ? '-' : `${fixed(value, digits)} ${unit}`);
 
 /** @param {number} ms */
 const age = (ms) => (ms < 9950 ? `${(ms / 1000).toFixed(1)} s` : `${Math.round(ms / 1000)} s`);
@@ -212,7 +215,7 @@ function showNow({ status, target, vehicle, now_ms: stampMs }, at) {
     put('detection-age', number(status.detection_age_ms, 0, 'ms'));
     put('latency', status.latency_ms ? `${status.latency_ms[0].toFixed(0)} to ${status.latency_ms[1].toFixed(0)} ms` : '-');
     const [vn, ve, vd] = status.setpoint_m_s ?? [];
-    put('setpoint', status.setpoint_m_s ? `${Math.hypot(vn, ve).toFixed(2)} ↓ ${vd.toFixed(2)} m/s` : '-');
+    put('setpoint', status.setpoint_m_s ? `${Math.hypot(vn, ve).toFixed(2)} ↓ ${fixed(vd, 2)} m/s` : '-');
     put('since', number(status.since_start_s, 1, 's'));
     put('autopilot', `${status.autopilot}${status.setpoint_timeout_s == null ? '' : `; stops ${status.setpoint_timeout_s} s after the last setpoint`}`);
     put('detector-why', `${status.detector ? `In use: ${status.detector}` : 'None is in use'} (${status.detector_why}); preferred: ${status.preference || 'none'}; ${status.detector_changes} changes.`);
@@ -295,7 +298,8 @@ function showSlow({ detectors, services, recorders, bridges, checks }) {
       it.sees ?? (it.seen === 0 ? 'no marker' : '-'),
     ];
     texts.forEach((text, n) => put(/** @type {HTMLElement} */ (line.children[n]), text));
-    line.children[1].className = it.in_use ? 'good' : it.state === 'standby' ? '' : 'bad';
+    // One that is in use for want of a better one is not in a good state.
+    line.children[1].className = it.state === 'in use' ? 'good' : it.state === 'standby' ? '' : 'bad';
     line.dataset.age = it.age_ms == null ? '' : String(it.age_ms);
     if (!line.querySelector('button')) {
       const button = document.createElement('button');
@@ -373,7 +377,7 @@ function showLog({ now_ms: now, entries }) {
   list.replaceChildren(...entries.map((/** @type {any} */ it) => {
     const line = document.createElement('li');
     const at = document.createElement('time');
-    at.textContent = new Date(Date.now() - (now - it.at_ms)).toLocaleTimeString();
+    at.textContent = new Date(Date.now() - (now - it.at_ms)).toLocaleTimeString([], { hourCycle: 'h23' });
     at.className = 'quiet';
     const text = document.createElement('span');
     text.textContent = it.text;

@@ -33,6 +33,13 @@ SPREAD = """(selector) => {
 LINES = "(selector) => [...document.querySelectorAll(selector)].map((it) => getComputedStyle(it).textDecorationLine)"
 # Elements that show the state of the landing, each in its own way, and are never empty.
 STATE_ELEMENTS = ["#height", "#why", "#mode", "#detector-why", "#detectors td", "#services td", "#recorders", "#checks span", "#strips span:last-child", "#video-text"]
+# Whether each of these elements takes one line only, whatever the height of its row.
+ONE_LINE = """(selector) => [...document.querySelectorAll(selector)].every((it) => {
+  const range = document.createRange();
+  range.selectNodeContents(it);
+  return range.getClientRects().length === 1;
+})"""
+SIGNED_ZERO = "[...document.querySelectorAll('dd')].map((it) => it.textContent).find((it) => /-0([.]0*)? /.test(it))"
 CONNECTED = "document.getElementById('connection').textContent === 'connected'"
 # A button that is pressed shortly and then held, before the server has answered the first press.
 TWICE = """(button) => {
@@ -296,6 +303,11 @@ def main():
             holds = "===" if command == "hold" else "!=="
             wait(page, f"document.getElementById('phase').textContent {holds} 'Holding the position'")
         page.screenshot(path=FOLDER / "holding.png", full_page=True)
+        # A hovering vehicle moves up and down alternately.
+        for _ in range(40):
+            signed = page.evaluate(SIGNED_ZERO)
+            assert signed is None, f"zero with a sign: {signed}"
+            time.sleep(0.05)
         for selector in STATE_ELEMENTS:
             wait(page, f"/^none(,none)*$/.test(({LINES})({json.dumps(selector)}))", 10)
 
@@ -326,6 +338,13 @@ def main():
         tops = [page.locator(it).bounding_box()["y"] for it in ["#commands-title", "#checks-title", "#strips-title", "#detectors-title"]]
         assert tops == sorted(tops), tops
         page.screenshot(path=FOLDER / "telephone.png", full_page=True)
+        assert page.evaluate(ONE_LINE, "#log time"), "a time in the log takes more than a line"
+        # Neither on a screen that is not wide.
+        page.set_viewport_size({"width": 1280, "height": 800})
+        time.sleep(0.5)
+        for table in page.locator(".scroll").all():
+            cut = table.evaluate("(it) => it.scrollWidth - it.clientWidth")
+            assert cut <= 0, f"{cut} px of a table are cut off on a screen"
         page.set_viewport_size({"width": 1440, "height": 1150})
         page.locator("#theme").click()
         page.screenshot(path=FOLDER / "sunlight.png", full_page=True)
