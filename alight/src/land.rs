@@ -328,10 +328,17 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
             wanted = args.meet.unwrap_or(node::session::LOCAL_PORT)
         ));
     }
-    if let Some(vehicle) = &args.vehicle {
+    let port = args.meet.filter(|port| *port != node::session::LOCAL_PORT);
+    let variables = [
+        args.vehicle.as_ref().map(|vehicle| format!("{}={vehicle}", variable::VEHICLE)),
+        port.filter(|_| rendezvous.unusual_port.is_none())
+            .map(|port| format!("{}={port}", variable::MEET)),
+    ];
+    let variables: Vec<String> = variables.into_iter().flatten().collect();
+    if !variables.is_empty() {
         progress.say(&format!(
-            "Other commands find this vehicle with `export {}={vehicle}`",
-            variable::VEHICLE
+            "Other commands find this vehicle with `export {}`",
+            variables.join(" ")
         ));
     }
     if let Some(page) = &page {
@@ -381,6 +388,13 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
             ));
         }
     }
+    if let Ok(landing) = &watched
+        && landing.may_be_in_the_air()
+        && !settings.is_simulated()
+    {
+        progress.say(IN_THE_AIR);
+        progress.say(&format!("To continue the landing: {resume}"));
+    }
     node.close().await;
     let mut landing = watched?;
     if let Some(exit) = recorders_end {
@@ -388,6 +402,10 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     }
     Ok(landing)
 }
+
+/// The warning after a landing that was interrupted in the air.
+const IN_THE_AIR: &str = "The vehicle may be in the air with its motors running, and Alight does not steer it any more: an ArduPilot hovers \
+                          in GUIDED, a PX4 in HOLD. Take over with the mode switch";
 
 /// The error with which a service ended, where a line of its standard error is that.
 fn error_in(line: &str) -> Option<&str> {

@@ -252,6 +252,15 @@ impl LandingSummary {
         healths
     }
 
+    /// Whether a landing that was interrupted may have left its vehicle in the air.
+    pub(crate) fn may_be_in_the_air(&self) -> bool {
+        let is_down = self.last_truth.as_ref().is_some_and(|truth| truth.on_ground);
+        self.interrupted.is_some()
+            && self.started_ns.is_some()
+            && self.disarmed_ns.is_none()
+            && !is_down
+    }
+
     /// True while no landing has begun.
     pub(crate) fn never_flew(&self) -> bool {
         self.started_ns.is_none()
@@ -699,5 +708,17 @@ mod tests {
         landing.timed_out(Some("signal: 9 (SIGKILL)"));
         let outcome = landing.outcome().outcome;
         assert!(outcome.starts_with("the controller exited (signal: 9 (SIGKILL))"), "{outcome}");
+    }
+
+    #[test]
+    fn only_a_landing_that_was_interrupted_may_leave_its_vehicle_in_the_air() {
+        let mut landing = LandingSummary { started_ns: Some(1), ..LandingSummary::default() };
+        assert!(!landing.may_be_in_the_air(), "it was not interrupted");
+        landing.interrupted("interrupted");
+        assert!(landing.may_be_in_the_air());
+        landing.last_truth = Some(Truth { on_ground: true, ..truth(None) });
+        assert!(!landing.may_be_in_the_air(), "it is on the ground");
+        let landing = LandingSummary { started_ns: None, last_truth: None, ..landing };
+        assert!(!landing.may_be_in_the_air(), "no landing had begun");
     }
 }

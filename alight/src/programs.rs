@@ -29,8 +29,8 @@ pub(crate) fn missing_of_service(job: &Job, folder: &Path, search: &OsStr) -> Op
     })
 }
 
-/// The devices and files that a service reads and that are not there, with what to do: the autopilot's serial port, a camera, images, a
-/// calibration.
+/// The missing devices and files of a service, with the remedy: the autopilot's serial port, a camera, images, a calibration, a key for
+/// signed packets.
 pub(crate) fn missing_devices(job: &Job, folder: &Path) -> Vec<String> {
     let Some(config) = job.service.and_then(|it| it.effective_config(&job.layers).ok()) else {
         return Vec::new();
@@ -46,6 +46,15 @@ pub(crate) fn missing_devices(job: &Job, folder: &Path) -> Vec<String> {
             let device = settings.ok().and_then(|it| it.serial_device());
             let advice = "connect the autopilot, or correct `autopilot.address`";
             wanted.extend(device.map(|device| (device, "device", advice)));
+            let key = text("autopilot", "signing_key").map(str::to_owned);
+            let advice = "make it (`alight keys signing`), or correct `autopilot.signing_key`";
+            wanted.extend(key.map(|key| (key, "file", advice)));
+        }
+        Some(Service::GcsBridge) => {
+            let key = config.get("signing_key").and_then(toml::Value::as_str);
+            let key = key.filter(|key| !key.is_empty()).map(str::to_owned);
+            let advice = "make it (`alight keys signing`), or correct `signing_key`";
+            wanted.extend(key.map(|key| (key, "file", advice)));
         }
         Some(Service::CameraPub) => {
             let device = text("source", "device").map(str::to_owned);
@@ -139,6 +148,17 @@ mod tests {
         );
         let line = missing(Service::Controller, &["autopilot.address=udpin:0.0.0.0:14550"]);
         assert_eq!(line, Vec::<String>::new());
+        let line = missing(Service::Controller, &["autopilot.signing_key=no-such.signing"]);
+        assert!(
+            line[0].contains("controller: there is no file no-such.signing; make it"),
+            "{line:?}"
+        );
+        let line = missing(Service::GcsBridge, &["signing_key=no-such.signing"]);
+        assert!(
+            line[0].contains("gcs-bridge: there is no file no-such.signing; make it"),
+            "{line:?}"
+        );
+        assert_eq!(missing(Service::GcsBridge, &["signing_key=there"]), Vec::<String>::new());
         let size = "source.size_px=[64, 48]";
         let camera = missing(
             Service::CameraPub,

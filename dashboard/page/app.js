@@ -185,6 +185,8 @@ function showHello(hello) {
   put('vehicle-name', hello.vehicle);
   put('host', `${hello.host}, version ${hello.version}`);
   put('commands-note', hello.no_commands ? `No commands: ${hello.no_commands}.` : 'Hold a button, or the space bar on it, for one second.');
+  // A page that may be viewed without a token may need one for commands.
+  element('login').hidden = !hello.needs_token;
   enable();
 }
 
@@ -521,6 +523,10 @@ element('login').addEventListener('submit', async (event) => {
   token.value = '';
   if (answer.ok) {
     put('login-problem', '');
+    // A connection keeps the rights with which it was opened.
+    const old = socket;
+    socket = null;
+    old?.close();
     begin();
   } else {
     put('login-problem', 'This token is not valid.');

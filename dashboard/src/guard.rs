@@ -63,11 +63,16 @@ pub struct Guard {
     is_encrypted: bool,
 }
 
+/// Why a page that could command with a token may not command without one.
+const NEEDS_TOKEN: &str = "a token for commands is needed: `alight dashboard token --kind command`";
+
 /// What a connection may do.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Access {
     /// Why it may not command; `None` when it may.
     pub no_commands: Option<&'static str>,
+    /// Whether a token for commands would let it command.
+    pub needs_token: bool,
 }
 
 impl Guard {
@@ -139,11 +144,9 @@ impl Guard {
             ),
             Commands::Here => None,
             Commands::Token if session == Some(Kind::Command) => None,
-            Commands::Token => {
-                Some("a token for commands is needed: `alight dashboard token --kind command`")
-            }
+            Commands::Token => Some(NEEDS_TOKEN),
         };
-        Ok(Access { no_commands })
+        Ok(Access { no_commands, needs_token: no_commands == Some(NEEDS_TOKEN) })
     }
 }
 
@@ -194,7 +197,10 @@ mod tests {
         let mapped = "::ffff:127.0.0.1".parse().unwrap();
         let away = "10.0.0.7".parse().unwrap();
         for peer in [here, mapped] {
-            assert_eq!(guard.access(peer, None), Ok(Access { no_commands: None }));
+            assert_eq!(
+                guard.access(peer, None),
+                Ok(Access { no_commands: None, needs_token: false })
+            );
         }
         assert_eq!(guard.access(away, None), Err(Refusal::Token));
         // A token for commands that crossed the air in the clear commands nothing.
@@ -234,5 +240,22 @@ mod tests {
         assert!(may(Commands::Token, None).is_some());
         assert!(may(Commands::Token, Some(Kind::Monitor)).is_some());
         assert!(may(Commands::Token, Some(Kind::Command)).is_none());
+    }
+
+    #[test]
+    fn a_page_asks_for_a_token_only_where_one_lets_it_command() {
+        let here = "127.0.0.1".parse().unwrap();
+        let away = "10.0.0.7".parse().unwrap();
+        let needs = |commands, peer, session| {
+            let guard = Guard { commands, ..guard("0.0.0.0:8080") };
+            guard.access(peer, session).unwrap().needs_token
+        };
+        assert!(needs(Commands::Token, here, None));
+        assert!(needs(Commands::Token, here, Some(Kind::Monitor)));
+        assert!(!needs(Commands::Token, here, Some(Kind::Command)));
+        // Over a network without encryption no token is sufficient.
+        assert!(!needs(Commands::Token, away, Some(Kind::Monitor)));
+        assert!(!needs(Commands::Here, here, None));
+        assert!(!needs(Commands::Never, here, None));
     }
 }

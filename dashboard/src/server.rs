@@ -504,7 +504,7 @@ impl Client {
     async fn talk(&mut self, socket: &mut WebSocket) -> anyhow::Result<()> {
         let hello = json!({
             "kind": "hello", "version": node::version(), "host": host_name(), "vehicle": self.visitor.app.node.vehicle(),
-            "no_commands": self.visitor.access.no_commands, "hold_ms": HOLD_MS, "video": self.visitor.app.config.video.input,
+            "no_commands": self.visitor.access.no_commands, "needs_token": self.visitor.access.needs_token, "hold_ms": HOLD_MS, "video": self.visitor.app.config.video.input,
         });
         send(socket, Message::Text(hello.to_string().into())).await?;
         let texts = self.visitor.app.texts.clone();

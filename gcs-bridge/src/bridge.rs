@@ -174,8 +174,8 @@ const MAX_UNSENT_TEXTS: usize = 16;
 /// A relay that has not reported itself as insecure for this time counts as secure, in nanoseconds.
 const INSECURE_NS: i64 = 10_000_000_000;
 
-/// The text when the last controller has gone.
-const ABANDONED: &str = "Alight: the controller is gone";
+/// The text when the last controller has gone. On the ground, a lost link has the same effect.
+const ABANDONED: &str = "Alight: controller gone, or link to drone lost";
 
 const CLOSED: &str = "the network session was closed";
 

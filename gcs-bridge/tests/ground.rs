@@ -72,7 +72,7 @@ async fn the_ground_gets_the_companions_and_the_vehicles_packets() -> anyhow::Re
     assert_eq!([target.x, target.y, target.z], [1.5, -1.5, 0.0]);
 
     vehicle.stop().await;
-    ground.expect_text("Alight: the controller is gone").await?;
+    ground.expect_text("Alight: controller gone, or link to drone lost").await?;
     bridge.abort();
     Ok(())
 }
@@ -352,9 +352,9 @@ async fn a_ground_station_that_joins_later_receives_earlier_texts() -> anyhow::R
     let mut first = Ground { bridge: Some(to), ..Ground::open().await? };
     first.call_until_text(not_recording).await?;
     vehicle.stop().await;
-    first.call_until_text("Alight: the controller is gone").await?;
+    first.call_until_text("Alight: controller gone, or link to drone lost").await?;
     let mut second = Ground { bridge: Some(to), ..Ground::open().await? };
-    second.call_until_text("Alight: the controller is gone").await?;
+    second.call_until_text("Alight: controller gone, or link to drone lost").await?;
     second.call_until_text(not_recording).await?;
     recording.abort();
     bridge.abort();
