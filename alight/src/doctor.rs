@@ -700,7 +700,8 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
     let link = &status.autopilot;
     let is_received = link.starts_with("system ") && !link.contains("is silent");
     if !is_received {
-        let text = "the controller does not receive its heartbeat, and no landing starts without it";
+        let text =
+            "the controller does not receive its heartbeat, and no landing starts without it";
         findings.wrong("autopilot", text.to_owned(), link);
     }
     match status.setpoint_timeout_s {
@@ -809,7 +810,10 @@ mod tests {
         let other = findings_text(
             "no heartbeat of system 7 yet, but of 1: set `autopilot.system_id` to the vehicle's",
         );
-        assert!(other.contains("does not receive its heartbeat") && other.contains("->"), "{other}");
+        assert!(
+            other.contains("does not receive its heartbeat") && other.contains("->"),
+            "{other}"
+        );
         assert_eq!(other.matches("but of 1: set `autopilot.system_id`").count(), 2, "{other}");
         let silent = findings_text("system 1 is silent: check its cable");
         assert!(silent.contains("does not receive") && silent.contains("-> "), "{silent}");

@@ -121,12 +121,7 @@ impl LandingTargetMode {
     }
 
     /// Follows what the autopilot does; true when it has just begun to land, whoever requested it.
-    pub fn step(
-        &mut self,
-        now_ns: i64,
-        situation: Situation,
-        autopilot: &mut Autopilot,
-    ) -> bool {
+    pub fn step(&mut self, now_ns: i64, situation: Situation, autopilot: &mut Autopilot) -> bool {
         let Situation { may_recall, distrust, is_flying } = situation;
         let Some(state) = autopilot.state().copied() else { return false };
         let lands = state.armed && state.mode.is_landing();

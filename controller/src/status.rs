@@ -128,8 +128,7 @@ impl View<'_> {
             text: Reason::NoDetector.to_string(),
         }));
         let left_low = self.left_low();
-        warnings
-            .extend(left_low.map(|text| Warning { matter: "aborted low".to_owned(), text }));
+        warnings.extend(left_low.map(|text| Warning { matter: "aborted low".to_owned(), text }));
         let size_ratio = self.lander.marker_size_ratio();
         warnings.extend(mount::warnings(&self.lander.mount_findings(), size_ratio));
         let configured_m = self.config.metric.standing_height_m;

@@ -173,7 +173,8 @@ fn hover_at(flight: &mut Flight, from_ms: i64, to_ms: i64, mode: u32, height_m: 
         if ms % 60 == 0 {
             let mut message = seen(ms * MS - 40 * MS);
             for pose in message.detections.iter_mut().filter_map(|it| it.pose.as_mut()) {
-                pose.translation_m = pose.translation_m.map(|metres| metres * height_scale);
+                let position_m = &mut pose.camera_from_marker.translation_m;
+                *position_m = position_m.map(|metres| metres * height_scale);
             }
             flight.detections(ms * MS + 2, "main", &message);
         }

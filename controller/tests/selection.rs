@@ -693,7 +693,10 @@ fn one_that_gives_no_pose_is_told_and_gives_way_to_one_that_does() {
         assert_eq!(bench.selection.active(), Some("main"));
         let why = bench.selection.why().to_owned();
         assert!(why.contains("mine: it gives no pose"), "{why}");
-        assert_eq!((bench.selection.no_pose(bench.now_ns), bench.selection.dispute()), (None, None));
+        assert_eq!(
+            (bench.selection.no_pose(bench.now_ns), bench.selection.dispute()),
+            (None, None)
+        );
         let answer = bench.selection.prefer(bench.now_ns, "mine").unwrap();
         assert!(answer.contains("as soon as it is healthy; now it gives no pose"), "{answer}");
         // Its camera is calibrated now.

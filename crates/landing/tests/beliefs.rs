@@ -479,16 +479,16 @@ fn an_abort_in_a_low_hold_climbs_only_where_the_vehicle_certainly_flies() {
     let aborted = |standing_height_m: f64, landed: Landed, height_m: f64| {
         let metric = MetricConfig { standing_height_m, ..MetricConfig::default() };
         let config = Config { guidance: GuidanceConfig::Metric(metric), ..Config::default() };
-        let mut flight = Told::started(config, 5.0);
+        let mut flight = Harness::started(config, 5.0);
         flight.pad = Some(Point::origin());
         while flight.position.z() < -height_m {
             flight.fly(STEP_S);
         }
-        flight.tell(Event::Operator(OperatorCommand::Hold));
+        flight.step(Event::Operator(OperatorCommand::Hold));
         flight.velocity = Vector::zero();
         flight.status.landed = landed;
         flight.run(2.0, true);
-        flight.tell(Event::Operator(OperatorCommand::Abort));
+        flight.step(Event::Operator(OperatorCommand::Abort));
         let is_left_low = flight.lander.is_left_low();
         flight.fly(7.0);
         assert_eq!(flight.lander.is_left_low(), is_left_low, "after the last setpoint");
@@ -505,14 +505,14 @@ fn an_abort_in_a_low_hold_climbs_only_where_the_vehicle_certainly_flies() {
         assert_eq!(low, (false, true), "{standing_height_m} m, {landed:?}, {height_m} m");
     }
     // Pilot and ground end the warning.
-    let mut flight = Told::started(Config::default(), 5.0);
+    let mut flight = Harness::started(Config::default(), 5.0);
     flight.pad = Some(Point::origin());
     while flight.position.z() < -0.3 {
         flight.fly(STEP_S);
     }
     flight.velocity = Vector::zero();
     flight.run(0.1, true);
-    flight.tell(Event::Operator(OperatorCommand::Abort));
+    flight.step(Event::Operator(OperatorCommand::Abort));
     assert!(flight.lander.is_left_low());
     flight.status.mode = Mode::Other;
     flight.run(1.0, true);
@@ -529,13 +529,13 @@ fn motors_that_are_stopped_in_the_air_end_no_landing_as_a_touchdown() {
     for (mode, height_m) in
         [(Mode::Guided, 0.43), (Mode::Guided, 3.0), (Mode::Land, 0.43), (Mode::Land, 2.0)]
     {
-        let mut flight = Told::started(Config::default(), 5.0);
+        let mut flight = Harness::started(Config::default(), 5.0);
         flight.pad = Some(Point::origin());
         while flight.position.z() < -height_m {
             flight.fly(STEP_S);
         }
         if mode == Mode::Land {
-            flight.tell(Event::Operator(OperatorCommand::LandHere));
+            flight.step(Event::Operator(OperatorCommand::LandHere));
             flight.velocity = Vector::new(0.0, 0.0, 0.3);
             flight.status.mode = mode;
             flight.run(STEP_S, true);
@@ -544,7 +544,7 @@ fn motors_that_are_stopped_in_the_air_end_no_landing_as_a_touchdown() {
             flight.velocity = Vector::zero();
         }
         flight.status.armed = false;
-        flight.tell(Event::Status(flight.status));
+        flight.step(Event::Status(flight.status));
         while flight.position.z() < 0.0 {
             flight.velocity = flight.velocity + Vector::new(0.0, 0.0, 9.8 * STEP_S);
             flight.position = flight.position + flight.velocity * STEP_S;
@@ -558,10 +558,10 @@ fn motors_that_are_stopped_in_the_air_end_no_landing_as_a_touchdown() {
         assert_eq!(end, (Phase::Aborted, Reason::StoppedInAir), "{mode:?}, {height_m} m");
     }
     // The report of the ground may come after the motors have stopped.
-    let mut flight = Told::started(Config::default(), 1.0);
+    let mut flight = Harness::started(Config::default(), 1.0);
     flight.pad = Some(Point::origin());
     flight.run(1.0, true);
-    flight.tell(Event::Operator(OperatorCommand::LandHere));
+    flight.step(Event::Operator(OperatorCommand::LandHere));
     (flight.velocity, flight.status.mode) = (Vector::new(0.0, 0.0, 0.3), Mode::Land);
     flight.run(1.0, true);
     flight.position = Point::origin();

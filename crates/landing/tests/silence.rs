@@ -72,8 +72,7 @@ fn after_a_long_silence_no_landing_is_asked_for_high_up() {
 #[test]
 fn after_a_silence_of_more_than_15_s_nothing_descends_without_a_command() {
     for (below_m, for_s) in [(6.0, 15.5), (3.0, 20.0), (7.0, 42.0)] {
-        let flight =
-            silent(0, 0.0, Silence { below_m, for_s, then: Then::GoesOn }).fly();
+        let flight = silent(0, 0.0, Silence { below_m, for_s, then: Then::Continues }).fly();
         let mut pairs = flight.samples.windows(2);
         let end = pairs.find(|pair| pair[1].seconds - pair[0].seconds > 0.5 * for_s);
         let end_s = end.map_or(f64::INFINITY, |pair| pair[1].seconds);

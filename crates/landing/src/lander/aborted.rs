@@ -145,8 +145,7 @@ impl Lander {
             .history
             .newest()
             .is_some_and(|vehicle| (vehicle.velocity - pad).norm() <= MAX_STANDING_M_S);
-        let is_low =
-            self.known_height_m(now).is_none_or(|height_m| height_m < self.min_flying_m());
+        let is_low = self.known_height_m(now).is_none_or(|height_m| height_m < self.min_flying_m());
         let is_refused = self.state_machine.reason() == Reason::LandRefused;
         is_still && (is_low || is_refused) || self.may_stand(now)
     }
