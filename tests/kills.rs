@@ -91,7 +91,7 @@ impl Picture {
         };
         let steers = status.started_ns.is_some() && status.setpoint.is_some();
         let both = is_received("onboard") && is_received("ground");
-        // One that is started after the touchdown has nothing to steer any more.
+        // A controller that is started after the touchdown has nothing to steer any more.
         there && (self.landed || status.finished || status.phase == Phase::Final || steers && both)
     }
 }

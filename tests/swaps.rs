@@ -38,7 +38,7 @@ fn swap(landing: &Landing, to: &str) -> anyhow::Result<(bool, serde_json::Value)
     Ok((output.status.success(), serde_json::from_str(report)?))
 }
 
-/// The latest health, and the next second's if that is none of now.
+/// The latest health, or that of the next second if the latest is old.
 async fn latest(healths: &Subscriber<Health>) -> anyhow::Result<Health> {
     let mut last = None;
     while let Ok(Some(health)) = timeout(PATIENCE, healths.next()).await {

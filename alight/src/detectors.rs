@@ -418,7 +418,7 @@ mod tests {
             ("main", DetectorState::Active, "rings:0.15341"),
             ("blind", DetectorState::Blind, "rings:0.15341"),
             ("late", DetectorState::Stale, "aruco-4x4-50:7:0.15"),
-            ("faulty", DetectorState::Outvoted, "rings:0.15341"),
+            ("outlier", DetectorState::Outvoted, "rings:0.15341"),
             ("tag", DetectorState::Blind, "aruco-4x4-50:7:0.15"),
             ("uncalibrated", DetectorState::NoPose, "rings:0.15341"),
         ];
@@ -454,7 +454,7 @@ mod tests {
             ("main", "active"),
             ("blind", "blind"),
             ("late", "stale"),
-            ("liar", "outvoted"),
+            ("outlier", "outvoted"),
             ("tag", "other-marker"),
             ("uncalibrated", "no-pose"),
         ];

@@ -410,7 +410,7 @@ impl SourceConfig {
                 readout_ns: self.readout_ns(),
             },
             timeout: Duration::try_from_secs_f64(self.timeout_s)
-                .context("`source.timeout_s` is no time")?,
+                .context("`source.timeout_s` is not a time")?,
         }))
     }
 
@@ -472,7 +472,7 @@ impl SourceConfig {
         let host = self.rtsp.strip_prefix("rtsp://").and_then(|rest| rest.split('/').next());
         ensure!(
             host.is_some_and(|host| !host.is_empty()),
-            "it is no address of the form rtsp://HOST:PORT/STREAM"
+            "it is not an address of the form rtsp://HOST:PORT/STREAM"
         );
         let credentials = &self.rtsp_credentials;
         Ok(Some(RtspConfig {
@@ -545,7 +545,8 @@ impl SourceConfig {
                 format!("`{control}` is not of the form `name=value`, as `gain=10`")
             })?;
             let value = value.trim().parse();
-            let value = value.with_context(|| format!("the value of `{control}` is no number"))?;
+            let value =
+                value.with_context(|| format!("the value of `{control}` is not a number"))?;
             Ok(ControlValue { name: name.trim().to_owned(), value })
         });
         values.collect()

@@ -14,7 +14,7 @@ use crate::metadata::{Metadata, Record};
 const AGREEING_FRAMES: u32 = 5;
 /// Number of records in a row with a stamp that cannot be their frame's after which the clock is refused.
 const IMPOSSIBLE_RECORDS: u32 = 5;
-/// Maximum time from a frame's stamp to its arrival. A longer one is no camera's: it is another clock.
+/// Maximum time from a frame's stamp to its arrival. A longer one is not of a camera but of another clock.
 const MAX_DELAY_NS: i64 = 1_000_000_000;
 /// Maximum number of records that wait for their frame; older ones are dropped.
 const MAX_WAITING: usize = 16;

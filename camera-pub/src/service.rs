@@ -241,7 +241,7 @@ impl Pace {
     }
 }
 
-/// Why a picture is no frame.
+/// Why a picture gives no frame.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 enum NoFrame {
     /// It cannot be read.
@@ -404,7 +404,7 @@ impl Stream {
                 Next::Wait(time) => tokio::time::sleep(time).await,
                 Next::Lost(reason) => drop(self.health.failed(reason)),
             }
-            // An outage is no time of damaged frames.
+            // An outage does not count as a period of damaged frames.
             if video.capture().is_none() {
                 unreadable_since_ns = None;
             }
@@ -543,7 +543,7 @@ impl Stream {
             match capture.expose(decision.order) {
                 Ok(()) => {}
                 Err(Lost::Unplugged) => lost = Some(Lost::Unplugged),
-                // A refused control is no reason to be without frames.
+                // Frames continue after a refused control.
                 Err(refused) => {
                     if self.health.failed("camera's exposure could not be set") {
                         tracing::warn!(%refused, "The exposure cannot be set; it is tried again each second");
@@ -1111,7 +1111,7 @@ mod tests {
     }
 
     #[tokio::test(flavor = "multi_thread")]
-    async fn rectified_frames_are_made_only_while_somebody_subscribes() {
+    async fn rectified_frames_are_made_only_while_there_is_a_subscriber() {
         let folder = tempfile::tempdir().unwrap();
         let picture = picture(320, 240);
         picture.save(folder.path().join("1.png")).unwrap();

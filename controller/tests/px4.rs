@@ -218,6 +218,7 @@ fn a_px4_that_holds_its_place_lands_there_by_command() {
         let status = flight.status(13_000 * MS);
         assert!(status.phase == Phase::Final && status.started_ns.is_some(), "{status:?}");
         assert!(status.why.contains("command to land here"), "{status:?}");
+        receive(&mut flight, 13_000 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
         receive(&mut flight, 13_000 * MS, &heartbeat(LAND, false));
         flight.tick(13_010 * MS);
         assert_eq!(flight.status(13_010 * MS).phase, Phase::Landed);

@@ -88,7 +88,7 @@ fn string_len(rest: &str) -> usize {
     rest.len()
 }
 
-/// The length of a character literal; a lifetime is none.
+/// The length of a character literal; `None` for a lifetime.
 fn character_len(rest: &str) -> Option<usize> {
     let inner = rest.strip_prefix('\'')?;
     let mut chars = inner.char_indices();

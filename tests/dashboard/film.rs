@@ -30,7 +30,7 @@ const PATIENCE: Duration = Duration::from_secs(30);
 /// the detector that is not in use is wrong.
 const SQUARE: usize = 80;
 const SPARE_SHIFT: f64 = 40.0;
-/// Of so many frames in a row the first have detections of both detectors, the next of none, the last of the one that is not in use.
+/// Of this number of frames in a row the first have detections of both detectors, the next of none, the last of the one that is not in use.
 const CYCLE: u64 = 40;
 const BOTH: u64 = 24;
 const NONE: u64 = 32;

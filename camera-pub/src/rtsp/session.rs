@@ -149,7 +149,8 @@ impl Drop for OpenStream {
 
 /// The address as the library has it.
 fn address<T: FromStr<Err: Display>>(text: &str) -> anyhow::Result<T> {
-    text.parse().map_err(|problem| anyhow!("`{text}` of `source.rtsp` is no address: {problem}"))
+    text.parse()
+        .map_err(|problem| anyhow!("`{text}` of `source.rtsp` is not an address: {problem}"))
 }
 
 /// Passes pictures on, on a task of its own: while one is decoded the next gets the time at which it really arrives.

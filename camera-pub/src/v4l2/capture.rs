@@ -131,7 +131,7 @@ pub(crate) struct Identity {
 }
 
 impl Identity {
-    /// Of an open device; `None` where it is no camera.
+    /// Of an open device; `None` where it is not a camera.
     pub(crate) fn of(device: &impl Device) -> Option<Self> {
         let mut capability = Capability::default();
         device.call(Call::QueryCap(&mut capability)).ok()?;
@@ -559,7 +559,7 @@ fn failed<T>(call: &'static str, result: io::Result<T>) -> Result<T, Lost> {
 fn set_format(device: &impl Device, wanted: &Wanted) -> Result<Rows, Lost> {
     let Wanted { fourcc, width, height, .. } = wanted;
     let (Some(pixels), Some(pixelformat)) = (Pixels::of(fourcc), Pixels::number(fourcc)) else {
-        return Err(Lost::Refused(format!("`{fourcc}` is no pixel format that is read")));
+        return Err(Lost::Refused(format!("`{fourcc}` is not a supported pixel format")));
     };
     let pix = PixFormat {
         width: *width,

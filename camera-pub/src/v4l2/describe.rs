@@ -80,7 +80,7 @@ pub struct ControlDescription {
 /// Queries a device's capabilities.
 ///
 /// # Errors
-/// It is no video device, or is gone.
+/// It is not a video device, or is gone.
 pub(crate) fn describe(device: &impl Device) -> io::Result<DeviceDescription> {
     let mut capability = Capability::default();
     device.call(Call::QueryCap(&mut capability))?;

@@ -6,7 +6,7 @@ use std::borrow::Cow;
 use jpeg_encoder::{ColorType, Encoder, EncodingError};
 use messages::{FrameHeader, PixelFormat};
 
-/// A frame as a JPEG file; `None` for one that is no whole grey or Bayer image. A Bayer image is shown as it is, grey.
+/// A frame as a JPEG file; `None` for other than complete grey or Bayer images. A Bayer image is shown as it is, grey.
 pub fn jpeg(header: &FrameHeader, pixels: &[u8], quality: u8) -> Option<Vec<u8>> {
     if header.format == PixelFormat::Jpeg {
         return Some(pixels.to_vec());
@@ -33,7 +33,7 @@ pub(crate) fn encoded(
     Ok(file)
 }
 
-/// The pixels of a frame with 8 bits each; `None` for one that is no whole grey or Bayer image.
+/// The pixels of a frame with 8 bits each; `None` for other than complete grey or Bayer images.
 pub fn grey<'a>(header: &FrameHeader, pixels: &'a [u8]) -> Option<Cow<'a, [u8]>> {
     let bits = match header.format {
         PixelFormat::Jpeg => return None,

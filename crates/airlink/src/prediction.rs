@@ -4,7 +4,7 @@
 //! of the motion widens the ROI. A track ends after two frames in which the detector that saw its marker last does not
 //! see it: one may have been cut off by its ROI. Other detectors may look for other markers, or see less.
 //!
-//! While a controller looks for its marker, others are no reason to send a region instead of the whole frame.
+//! While a controller looks for its marker, other markers do not cause a region to be sent instead of the whole frame.
 
 use messages::{ControllerStatus, Detection, Detections};
 

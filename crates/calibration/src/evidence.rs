@@ -172,7 +172,7 @@ fn tag_residuals(solved: &Solved) -> Vec<TagResidual> {
     tags
 }
 
-/// A point's residual, shortened to the scale of the loss: outliers are no structure.
+/// A point's residual, shortened to the scale of the loss: outliers are not structure.
 fn residual(
     point: &BoardPoint,
     camera: &CameraModel,

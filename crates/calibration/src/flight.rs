@@ -51,7 +51,7 @@ impl FlightEstimate {
         self.deviation <= self.quantity.max_deviation()
     }
 
-    /// Whether the configured value may be right: an estimate that is no surer would make it worse as often as better.
+    /// Whether the configured value may be right: an estimate with no smaller deviation would make it worse as often as better.
     pub fn may_be_as_configured(&self) -> bool {
         self.value.abs() <= MIN_DEVIATIONS * self.deviation
     }
@@ -139,7 +139,7 @@ pub enum FlightRefusal {
         /// By how much, over its standard deviation.
         steps: f64,
     },
-    /// Numbers that are no flight.
+    /// Invalid numbers in the flight.
     #[error("the flight's numbers have no solution: {why}")]
     Numbers {
         /// The error.

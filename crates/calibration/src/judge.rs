@@ -252,7 +252,7 @@ fn worst(comparisons: impl Iterator<Item = CrossValidation>) -> Option<CrossVali
     comparisons.max_by(|a, b| excess(a).total_cmp(&excess(b)))
 }
 
-/// Above 1 where the difference of two halves and its ratio are both beyond their limits, or are no numbers.
+/// Above 1 where the difference of two halves and its ratio are both beyond their limits, or are not finite.
 fn excess(halves: &CrossValidation) -> f64 {
     let [of_difference, of_ratio] =
         [halves.difference_px / limit::MAX_DIFFERENCE_PX, halves.ratio() / limit::MAX_RATIO];

@@ -33,7 +33,9 @@ pub enum Refusal {
         max_points: usize,
     },
     /// A coordinate that is not finite, or far outside of the image.
-    #[error("a point of {view} is no place in an image of {size}: the file of points is damaged")]
+    #[error(
+        "a point of {view} is not a position in an image of {size}: the file of points is damaged"
+    )]
     InvalidPoint {
         /// The view's name.
         view: String,

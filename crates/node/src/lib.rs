@@ -4,12 +4,13 @@
 //! This is the only crate that uses Zenoh. It does not depend on images, markers or autopilots.
 //!
 //! Modules in reading order: [`config`] merges a user's settings into the defaults; [`service`] runs a
-//! service from start to shutdown; [`network`] configures the network, its `endpoint`s and, from [`access`], the rights of others by their [`certificate`]s and the `cipher` of links,
-//! and [`session`] joins it under an [`identity`], for a tool unless `foreign` programs answer there (`reach` finds why no process does), with shared memory where `memory`
-//! allows it; [`topics`] has typed messages and commands, with their `sender`, [`frames`] pixels,
-//! and [`tap`] all messages as bytes; [`health`] counts, with [`stats`]; [`denied`] counts denials of access
-//! control; [`clock`] is the host's clock, [`standstill`] detects that a process was frozen, [`state`] is the folder of
-//! data that survive a reboot, and [`version`](mod@version) the version of the program.
+//! service from start to shutdown; [`network`] configures the network, its `endpoint`s and, from [`access`], the rights of
+//! others by their [`certificate`]s and the `cipher` of links, and [`session`] joins it under an [`identity`], for a tool
+//! unless `foreign` programs answer there (`reach` finds why no process does), with shared memory where `memory` allows it;
+//! [`topics`] has typed messages and commands, with their `sender`, [`frames`] pixels, and [`tap`] all messages as bytes;
+//! [`health`] counts, with [`stats`]; [`denied`] counts denials of access control; [`clock`] is the host's clock,
+//! [`standstill`] detects that a process was frozen, [`state`] is the folder of data that survive a reboot, and
+//! [`version`](mod@version) the version of the program.
 
 pub mod access;
 mod block_on;

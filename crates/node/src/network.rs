@@ -352,7 +352,7 @@ pub fn check_private(path: &Path) -> anyhow::Result<()> {
 /// Checks that the key of this name in a directory belongs to its certificate.
 ///
 /// # Errors
-/// Names the file that is none, or the key of another certificate.
+/// Names the invalid file, or the key of another certificate.
 pub fn check_pair(keys: &Path, key_name: &str) -> anyhow::Result<()> {
     let [certificate, key] = ["pem", "key"].map(|end| keys.join(format!("{key_name}.{end}")));
     key_pair::check(&keys.join(AUTHORITY), &certificate, &key)

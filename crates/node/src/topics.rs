@@ -131,7 +131,7 @@ impl Node {
     /// A publisher of messages that are encoded already, on a key of the row's topic.
     ///
     /// # Errors
-    /// When the session is closed or the key is none.
+    /// When the session is closed or the key is invalid.
     pub async fn encoded_publisher(
         &self,
         row: &Row,

@@ -1,5 +1,5 @@
-//! Specifies and renders one frame of the marker experiment: marker or clutter, camera and path of poses, surface, light, occluder, print and binning,
-//! with centre, corners and pose as truth.
+//! Specifies and renders one frame of the marker experiment: marker or clutter, camera and path of poses, surface, light,
+//! occluder, print and binning, with centre, corners and pose as truth.
 
 use std::collections::HashMap;
 use std::sync::Arc;

@@ -261,7 +261,7 @@ fn append_summary(text: &mut String, runs: &[Run]) {
         let found = if run.set.has_marker() {
             with_interval(s.found, s.frames)
         } else {
-            // There is none to find.
+            // There is no marker to find.
             format!("none in {}", s.frames)
         };
         let _ = writeln!(

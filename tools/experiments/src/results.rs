@@ -396,7 +396,7 @@ mod tests {
         std::fs::create_dir(folder.join(".flights.csv.new")).unwrap();
         Folder::claim(folder, true).unwrap().put(FLIGHTS_AS_CSV, "new").unwrap_err();
         assert_eq!(std::fs::read_to_string(folder.join(FLIGHTS_AS_CSV)).unwrap(), "old");
-        // And this for one that this user may not write.
+        // And this for a folder that this user may not write.
         std::fs::create_dir(folder.join(".writable")).unwrap();
         assert!(refusal(folder, true).starts_with("writing into the folder"));
     }

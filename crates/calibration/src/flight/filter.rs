@@ -67,7 +67,7 @@ pub(super) struct Filtered {
     pub(super) outliers: f64,
 }
 
-/// Solves the equations at a place; `None` where they are no numbers.
+/// Solves the equations at given parameters; `None` where the result is not finite.
 pub(super) fn filtered(
     steps: &[Linearised],
     place: &Parameters,

@@ -10,7 +10,7 @@ use crate::observation::StageObserver;
 use crate::schedule::{FallbackPass, FallbackStep, ImageStrip, PassSchedule};
 use crate::trace::Trace;
 
-/// Outlines of the paper of small square markers whose border is no outline of its own, at two thresholds: a tone curve shows the ground
+/// Outlines of the paper of small square markers whose border has no separate outline, at two thresholds: a tone curve shows the ground
 /// nearly as bright as the paper, and in linear light blur makes the paper of markers of 8 pixels no brighter than the lower one.
 const QUIET_ZONES: [outline::Settings; 2] = [quiet_zones(160), quiet_zones(208)];
 

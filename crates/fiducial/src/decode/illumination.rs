@@ -59,7 +59,7 @@ impl<const N: usize> BorderRatios<N> {
         Self { log_ratios: [0.0; N], seen: 0, low: 0, max_low: quantile(2, places) }
     }
 
-    /// Adds a place; false when it is no border, independent of the others.
+    /// Adds a position; false when it is not a border, independent of the others.
     pub(crate) fn add(&mut self, log_ratio: f32) -> bool {
         if let Some(slot) = self.log_ratios.get_mut(self.seen) {
             *slot = log_ratio;

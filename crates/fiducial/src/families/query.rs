@@ -17,7 +17,7 @@ use crate::response::ResponseEstimate;
 const MIN_SEGMENT_CORNER_PX: f64 = 0.5;
 const SEGMENT_CORNER_RATIO: f64 = 0.015;
 
-/// Corners are no square in space when their mean squared reprojection error is this multiple of their mean variance: one of
+/// Corners are not a square in space when their mean squared reprojection error is this multiple of their mean variance: one of
 /// thousands is so by chance.
 const MIN_MISFIT: f64 = 4.0;
 
@@ -108,7 +108,7 @@ impl FamilyQuery {
         all && self.ids().any(|id| found.clone().all(|known| known != id))
     }
 
-    /// The observation of a marker of the family; `None` of one that is no square in space, or that the frame
+    /// The observation of a marker of the family; `None` for corners that are not a square in space, or that the frame
     /// cuts so that its place is a guess.
     pub(crate) fn observation(
         &self,
@@ -126,7 +126,7 @@ impl FamilyQuery {
         let pose = camera.zip(size_m).and_then(|(camera, size_m)| {
             square_pose(&corners, &refined.covariance_px2, size_m, camera)
         });
-        // Corners that are no square in space, as where one was guessed beyond the frame: the centre is no better.
+        // Corners that are not a square in space, as where one was guessed beyond the frame: the centre is no better.
         let misfit_px2 = pose.map_or(0.0, |pose| pose.reprojection_rms_px.powi(2));
         let max_misfit_px = MAX_MISFIT_PX.max(MAX_MISFIT_RATIO * diagonal_px(&corners));
         if misfit_px2 > max_misfit_px * max_misfit_px {

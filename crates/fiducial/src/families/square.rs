@@ -66,7 +66,7 @@ pub(crate) const INVERTED_FROM: usize = 2;
 /// Standard deviation of the corners of an outline, in pixels.
 const OUTLINE_CORNER_PX: f64 = 0.2;
 
-/// A quad in a quiet zone whose cells are no codeword.
+/// A quad in a quiet zone whose cells are not a codeword.
 #[derive(Copy, Clone, Debug)]
 struct Unread {
     quad: Quad,

@@ -247,7 +247,7 @@ impl StagDetector {
             if self.is_covered(&quad) || !has_dark_border(&quad, input.view) {
                 continue;
             }
-            // A quiet zone without a marker is no refused candidate.
+            // A quiet zone without a marker is not counted as a refused candidate.
             let _ = TONES.into_iter().find(|PaperTone { curve, scale }| {
                 self.add(input, &quad.scaled(*scale), *curve, out).is_ok()
             });

@@ -55,12 +55,13 @@ impl Lander {
 
     pub(super) fn aborted(&mut self, now: Timestamp) -> Action {
         let action = self.abort_action(now);
-        let status = self.status;
-        let is_hovering = matches!(self.abort_climb, AbortClimb::Hovers { may_climb: true, .. })
-            && self.config.phases.on_abort != OnAbort::Land;
-        let may_stand = status.is_some_and(|status| status.armed && status.mode != Mode::Land)
-            && self.may_stand_after_abort(now);
-        self.is_left_low = (self.is_left_low || is_hovering) && may_stand;
+        // In another mode nothing keeps it low but the pilot.
+        let mode = self.status.filter(|status| status.armed).map(|status| status.mode);
+        let is_kept_low = mode == Some(Mode::Guided)
+            && matches!(self.abort_climb, AbortClimb::Hovers { may_climb: true, .. });
+        let is_left = mode.is_some_and(|mode| mode != Mode::Land);
+        self.is_left_low =
+            is_left && (self.is_left_low || is_kept_low) && self.may_stand_after_abort(now);
         action
     }
 

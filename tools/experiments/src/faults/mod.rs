@@ -3,8 +3,8 @@
 //!
 //! Modules in reading order: [`kind`] has the kinds of faults, [`plan`] draws those of a flight; [`flight`]
 //! flies it with the faults that have [`begun`], the process of [`controller`], the autopilot's [`link`] over
-//! the connections of [`channel`], whose packets [`falsify`] changes, and the [`peers`]; [`outcome`] is its result and the bar; [`report`] writes the table,
-//! [`tape_file`] a recording with the controller's tape.
+//! the connections of [`channel`], with the wrong values of [`falsify`], and the [`peers`]; [`outcome`] is its
+//! result and the bar; [`report`] writes the table, [`tape_file`] a recording with the controller's tape.
 
 pub mod begun;
 pub mod channel;

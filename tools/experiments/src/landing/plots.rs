@@ -1,5 +1,5 @@
-//! Draws SVG plots of the landing experiment: error against wind with medians for each fault, touchdown points from above, success of each combination,
-//! the proportion with a larger error.
+//! Draws SVG plots of the landing experiment: error against wind with medians for each fault, touchdown points from above,
+//! success of each combination, the proportion with a larger error.
 
 use anyhow::anyhow;
 use messages::Touchdown;

@@ -28,7 +28,7 @@ pub(crate) use scene::MAX_DIAMETER_PX;
 const MANY_SAMPLES: usize = 200;
 const SPARSE_STRIDE: usize = 3;
 /// Largest residual before each of the first steps: about a third above the largest of 800 markers in a
-/// thousand images. Nine of ten small candidates that are no marker, and half of the larger ones, end here.
+/// thousand images. Nine of ten small candidates other than markers, and half of the larger ones, end here.
 const EARLY_REJECT_RESIDUAL_SMALL: [f64; 3] = [0.27, 0.22, 0.17];
 const EARLY_REJECT_RESIDUAL: [f64; 3] = [0.45, 0.4, 0.35];
 /// Above this residual, in units of the contrast, motion blur and a camera's processing are tried, ...

@@ -337,7 +337,7 @@ pub(super) struct Sums {
     pub(super) count: f64,
     /// Mean squared residual, weighted by the squared dependence on the pose.
     pub(super) pose_variance: f64,
-    /// The part of the cost that is no residual of a pixel.
+    /// The part of the cost other than the pixels' residuals.
     pub(super) prior_cost: f64,
 }
 
