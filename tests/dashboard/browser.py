@@ -33,12 +33,8 @@ SPREAD = """(selector) => {
 LINES = "(selector) => [...document.querySelectorAll(selector)].map((it) => getComputedStyle(it).textDecorationLine)"
 # Elements that show the state of the landing, each in its own way, and are never empty.
 STATE_ELEMENTS = ["#height", "#why", "#mode", "#detector-why", "#detectors td", "#services td", "#recorders", "#checks span", "#strips span:last-child", "#video-text"]
-# Whether each of these elements takes one line only, whatever the height of its row.
-ONE_LINE = """(selector) => [...document.querySelectorAll(selector)].every((it) => {
-  const range = document.createRange();
-  range.selectNodeContents(it);
-  return range.getClientRects().length === 1;
-})"""
+# Whether the times of the log are short enough for one line.
+SHORT_TIMES = r"[...document.querySelectorAll('#log time')].every((it) => /^\\d\\d:\\d\\d:\\d\\d$/.test(it.textContent))"
 SIGNED_ZERO = "[...document.querySelectorAll('dd')].map((it) => it.textContent).find((it) => /-0([.]0*)? /.test(it))"
 CONNECTED = "document.getElementById('connection').textContent === 'connected'"
 # A button that is pressed shortly and then held, before the server has answered the first press.
@@ -338,7 +334,7 @@ def main():
         tops = [page.locator(it).bounding_box()["y"] for it in ["#commands-title", "#checks-title", "#strips-title", "#detectors-title"]]
         assert tops == sorted(tops), tops
         page.screenshot(path=FOLDER / "telephone.png", full_page=True)
-        assert page.evaluate(ONE_LINE, "#log time"), "a time in the log takes more than a line"
+        assert page.evaluate(SHORT_TIMES), "a time in the log is long"
         # Neither on a screen that is not wide.
         page.set_viewport_size({"width": 1280, "height": 800})
         time.sleep(0.5)
