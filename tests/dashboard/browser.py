@@ -34,7 +34,7 @@ LINES = "(selector) => [...document.querySelectorAll(selector)].map((it) => getC
 # Elements that show the state of the landing, each in its own way, and are never empty.
 STATE_ELEMENTS = ["#height", "#why", "#mode", "#detector-why", "#detectors td", "#services td", "#recorders", "#checks span", "#strips span:last-child", "#video-text"]
 # Whether the times of the log are short enough for one line.
-SHORT_TIMES = r"[...document.querySelectorAll('#log time')].every((it) => /^\\d\\d:\\d\\d:\\d\\d$/.test(it.textContent))"
+SHORT_TIMES = r"[...document.querySelectorAll('#log time')].every((it) => /^\d\d:\d\d:\d\d$/.test(it.textContent))"
 SIGNED_ZERO = "[...document.querySelectorAll('dd')].map((it) => it.textContent).find((it) => /-0([.]0*)? /.test(it))"
 CONNECTED = "document.getElementById('connection').textContent === 'connected'"
 # A button that is pressed shortly and then held, before the server has answered the first press.
