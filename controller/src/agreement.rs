@@ -2,7 +2,7 @@
 //! have all searched.
 //!
 //! Two poses in one frame need no vehicle state and no estimate. Whether a pair agrees does not depend on which of the two is
-//! named first. Of two detectors that differ nobody can say which is right; of three or more the majority is believed: at least two
+//! named first. Of two detectors that differ it cannot be decided which is right; of three or more the majority is believed: at least two
 //! that agree with each other and differ from the third.
 
 use std::collections::VecDeque;
@@ -45,15 +45,15 @@ impl Sight {
     }
 }
 
-/// What a detector saw in its latest frames, by stamp, newest last.
+/// The markers that a detector saw in its latest frames, by stamp, newest last.
 pub type Sights = VecDeque<(i64, Option<Sight>)>;
 
-/// A detector that answers, and what it saw.
+/// A detector that answers, with its markers.
 #[derive(Copy, Clone, Debug)]
 pub struct Voter<'a> {
     /// Its name.
     pub name: &'a str,
-    /// What it saw.
+    /// Its markers.
     pub sights: &'a Sights,
 }
 
@@ -96,7 +96,7 @@ pub enum Fault {
     NoPose,
 }
 
-/// Another detector that sees the marker elsewhere or turned, while nobody says which of the two is right.
+/// Another detector that sees the marker elsewhere or turned, while it is not decided which of the two is right.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Dispute {
     /// The active detector.
@@ -183,7 +183,7 @@ impl Common {
         self.both >= MIN_COMMON && self.apart * 2 <= self.both
     }
 
-    /// They agree in at least three of four frames: where they are about as far apart as the tolerance allows, what has begun does not end
+    /// They agree in at least three of four frames: where they are about as far apart as the tolerance allows, a dispute does not end
     /// and begin again with every frame.
     fn agree_clearly(&self) -> bool {
         self.both >= MIN_COMMON && self.apart * 4 <= self.both

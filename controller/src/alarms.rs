@@ -190,10 +190,10 @@ mod tests {
         let settings = alarms().settings;
         let why = |battery| too_empty(&settings, &battery);
         assert_eq!(why(battery(0.11, 10.6)), None);
-        let told = why(battery(0.5, 10.5)).unwrap();
-        assert!(told.contains("10.5 V") && told.contains("battery_critical_v"), "{told}");
-        let told = why(battery(0.1, 12.0)).unwrap();
-        assert!(told.contains("10 %") && told.contains("`alarms.battery_critical`"), "{told}");
+        let text = why(battery(0.5, 10.5)).unwrap();
+        assert!(text.contains("10.5 V") && text.contains("battery_critical_v"), "{text}");
+        let text = why(battery(0.1, 12.0)).unwrap();
+        assert!(text.contains("10 %") && text.contains("`alarms.battery_critical`"), "{text}");
         assert_eq!(why(battery(0.5, 0.0)), None);
         let off = AlarmSettings { battery_critical: 0.0, battery_critical_v: 0.0, ..settings };
         assert_eq!(too_empty(&off, &battery(0.0, 1.0)), None);

@@ -1,4 +1,4 @@
-//! What detectors look for and what they see beside the landing's marker: why none of them leads to it, in words.
+//! The markers that detectors look for, and see instead of the landing's marker: explains in words why none of them leads to it.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use messages::{Detection, Detections, looks_for_others};
 use crate::refusals::Warning;
 use crate::selection::{MAX_DETECTORS, Selection};
 
-/// Time for which a detector must see other markers, and not the landing's, before it is told, in nanoseconds.
+/// Time for which a detector must see other markers, and not the landing's, before a warning, in nanoseconds.
 const MIN_LASTING_NS: i64 = 2_000_000_000;
 /// Time without another marker after which that is over, in nanoseconds.
 const OVER_NS: i64 = 1_500_000_000;
@@ -17,9 +17,9 @@ const MAX_NAMED: usize = 3;
 /// The markers of detectors, by detector: at most [`MAX_DETECTORS`] each.
 #[derive(Debug, Default)]
 pub struct Announced {
-    /// What each looks for, as it tells.
-    wanted: BTreeMap<String, Vec<String>>,
-    /// What each sees instead of the landing's marker.
+    /// The markers that each one looks for, as published.
+    sought: BTreeMap<String, Vec<String>>,
+    /// The markers that each one sees instead of the landing's marker.
     seen: BTreeMap<String, Others>,
 }
 
@@ -32,10 +32,10 @@ struct Others {
 }
 
 impl Announced {
-    /// A detector told what it looks for.
-    pub fn told(&mut self, detector: &str, markers: &[String]) {
-        if self.wanted.len() < MAX_DETECTORS || self.wanted.contains_key(detector) {
-            self.wanted.insert(detector.to_owned(), markers.to_vec());
+    /// A detector published the markers that it looks for.
+    pub fn add(&mut self, detector: &str, markers: &[String]) {
+        if self.sought.len() < MAX_DETECTORS || self.sought.contains_key(detector) {
+            self.sought.insert(detector.to_owned(), markers.to_vec());
         }
     }
 
@@ -60,23 +60,23 @@ impl Announced {
         }
     }
 
-    /// Forgets what a detector told that the selection has forgotten.
+    /// Forgets the markers of detectors that the selection has forgotten.
     pub fn forget(&mut self, selection: &Selection) {
-        self.wanted.retain(|name, _| selection.knows(name));
+        self.sought.retain(|name, _| selection.knows(name));
     }
 
-    /// That no detector which is there looks for the landing's marker; `None` where one does, sees it, or tells nothing of what it looks for.
-    pub fn nobody_looks_for(&self, marker: &str, selection: &Selection) -> Option<String> {
-        let mut told = Vec::new();
+    /// The warning that no present detector looks for the landing's marker; `None` where one does, sees it, or publishes no markers.
+    pub fn no_detector_looks_for(&self, marker: &str, selection: &Selection) -> Option<String> {
+        let mut others = Vec::new();
         for (name, sees) in selection.alive() {
-            let markers = self.wanted.get(name)?;
+            let markers = self.sought.get(name)?;
             if sees || !looks_for_others(markers, marker) {
                 return None;
             }
-            told.push((name, format!("`{name}` looks for {}", markers.join(" "))));
+            others.push((name, format!("`{name}` looks for {}", markers.join(" "))));
         }
-        let (name, _) = told.first()?;
-        let all: Vec<&str> = told.iter().take(MAX_NAMED).map(|(_, text)| text.as_str()).collect();
+        let (name, _) = others.first()?;
+        let all: Vec<&str> = others.iter().take(MAX_NAMED).map(|(_, text)| text.as_str()).collect();
         let all = all.join(", ");
         Some(format!(
             "no detector looks for the landing's marker {marker}: {all}; correct `marker` of the controller, or `markers` of the detector (`alight command \
@@ -84,7 +84,7 @@ impl Announced {
         ))
     }
 
-    /// What this detector sees instead of the landing's marker, where that lasts.
+    /// The warning that this detector sees other markers than the landing's, where that persists.
     pub fn seen_instead(&self, now_ns: i64, detector: &str, marker: &str) -> Option<String> {
         let others = self.seen.get(detector).filter(|it| it.is_lasting(now_ns))?;
         let names = others.names.join(", ");
@@ -93,16 +93,16 @@ impl Announced {
         ))
     }
 
-    /// What the operator should know.
+    /// The warnings for the operator.
     pub fn warnings(&self, now_ns: i64, marker: &str, selection: &Selection) -> Vec<Warning> {
-        let nobody = self
-            .nobody_looks_for(marker, selection)
-            .map(|text| Warning { matter: "nobody looks for the marker".to_owned(), text });
+        let none = self
+            .no_detector_looks_for(marker, selection)
+            .map(|text| Warning { matter: "no detector looks for the marker".to_owned(), text });
         let instead = self.seen.keys().filter_map(|name| {
             let text = self.seen_instead(now_ns, name, marker)?;
             Some(Warning { matter: format!("other markers {name}"), text })
         });
-        nobody.into_iter().chain(instead.take(MAX_NAMED)).collect()
+        none.into_iter().chain(instead.take(MAX_NAMED)).collect()
     }
 }
 

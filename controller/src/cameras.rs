@@ -1,8 +1,8 @@
 //! The information (calibration, mount) of up to 16 cameras: added, replaced or refused, and looked up for
 //! a frame.
 //!
-//! Who may publish is not known here, so a camera's calibration is not replaced by another one while it is
-//! being repeated, and never in flight; and cameras that nobody uses give way.
+//! The permission to publish is not known here, so a camera's calibration is not replaced by another one while it is
+//! being repeated, and never in flight; and unused cameras give way.
 
 use messages::CameraInfo;
 
@@ -24,7 +24,7 @@ pub struct Cameras {
 struct Known {
     info: CameraInfo,
     /// When it was last repeated.
-    heard_ns: i64,
+    repeated_ns: i64,
     /// When a frame was last used with it.
     used_ns: i64,
 }
@@ -34,7 +34,7 @@ struct Known {
 pub enum Reception {
     /// It is known.
     Known,
-    /// It replaces that of a camera which has stopped: with what differs.
+    /// It replaces that of a camera which has stopped: with the difference.
     Replaced(String),
     /// It is refused for this reason, which a sentence explains.
     Refused(&'static str, String),
@@ -48,7 +48,7 @@ impl Cameras {
             return Reception::Refused("camera-info-impossible", text);
         }
         if let Some(known) = self.known.iter_mut().find(|known| known.info.camera == info.camera) {
-            return known.hear(now_ns, info, is_flying);
+            return known.update(now_ns, info, is_flying);
         }
         if self.known.len() >= MAX_CAMERAS {
             let unused = self.known.iter().enumerate().filter(|(_, it)| !it.is_used(now_ns));
@@ -63,7 +63,7 @@ impl Cameras {
                 }
             }
         }
-        self.known.push(Known { info, heard_ns: now_ns, used_ns: i64::MIN });
+        self.known.push(Known { info, repeated_ns: now_ns, used_ns: i64::MIN });
         Reception::Known
     }
 
@@ -76,9 +76,9 @@ impl Cameras {
 }
 
 impl Known {
-    fn hear(&mut self, now_ns: i64, info: CameraInfo, is_flying: bool) -> Reception {
+    fn update(&mut self, now_ns: i64, info: CameraInfo, is_flying: bool) -> Reception {
         let Some(difference) = self.info.difference(&info) else {
-            self.heard_ns = now_ns;
+            self.repeated_ns = now_ns;
             return Reception::Known;
         };
         let camera = &info.camera;
@@ -88,18 +88,18 @@ impl Known {
             );
             return Reception::Refused("another-camera-info", text);
         }
-        if now_ns.saturating_sub(self.heard_ns) < SILENT_NS {
+        if now_ns.saturating_sub(self.repeated_ns) < SILENT_NS {
             let text = format!(
                 "two programs give camera `{camera}` different calibrations: {difference}; stop one of them"
             );
             return Reception::Refused("another-camera-info", text);
         }
-        (self.info, self.heard_ns) = (info, now_ns);
+        (self.info, self.repeated_ns) = (info, now_ns);
         Reception::Replaced(difference)
     }
 
     fn last_ns(&self) -> i64 {
-        self.heard_ns.max(self.used_ns)
+        self.repeated_ns.max(self.used_ns)
     }
 
     fn is_used(&self, now_ns: i64) -> bool {
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_is_refused() {
+    fn an_impossible_calibration_is_refused() {
         let mut cameras = Cameras::default();
         let broken = camera("down", f64::NAN);
         let refused = cameras.add(0, broken, false);

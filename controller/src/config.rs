@@ -36,7 +36,7 @@ pub struct Config {
     pub takeoff_height_m: f64,
     /// Whether the take-off may arm a vehicle that does not say that it is a simulation.
     pub takeoff_real_vehicle: bool,
-    /// Who controls the landing.
+    /// The controller of the landing: this one, or the autopilot.
     pub mode: Mode,
     /// Which guidance is used.
     pub guidance: GuidanceName,
@@ -66,7 +66,7 @@ pub struct Config {
     pub thesis: ThesisConfig,
 }
 
-/// Who controls the landing.
+/// The controller of the landing.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mode {
@@ -158,7 +158,7 @@ pub struct AutopilotSettings {
     pub setpoint_timeout_s: f64,
     /// File with the key of signed packets, or nothing.
     pub signing_key: String,
-    /// What a ground station may send to the autopilot.
+    /// The packets that a ground station may send to the autopilot.
     pub ground_may: String,
     /// Whether to synchronise with the autopilot's clock.
     pub timesync: bool,
@@ -184,7 +184,7 @@ impl AutopilotSettings {
         let fits = rate_hz <= max_hz;
         check.parses(key, fits.then_some(()).ok_or_else(|| {
             format!(
-                "it must be at most {max_hz:.1} over {device} with {baud} baud (`autopilot.address`): a setpoint has {bytes} bytes, and setpoints may take half of what the line carries; lower it, or raise the baud rate here and at the autopilot"
+                "it must be at most {max_hz:.1} over {device} with {baud} baud (`autopilot.address`): a setpoint has {bytes} bytes, and setpoints may take half of its capacity; lower it, or raise the baud rate here and at the autopilot"
             )
         }));
     }
@@ -272,7 +272,7 @@ impl Settings for Config {
         // A marker that is lost and still counts as visible would end all retries at once.
         let (lost_s, stale_s) = (self.phases.lost_target_s, self.phases.stale_target_s);
         check.at_least("phases.lost_target_s", lost_s, "phases.stale_target_s", stale_s);
-        // The deviation of what is not seen grows for as long as that is extrapolated: a descent without the marker must see it grow.
+        // The deviation of an unseen marker grows for as long as it is extrapolated: a descent without the marker must see it grow.
         if self.guidance == GuidanceName::Metric {
             let blind_s = self.metric.stale_target_s + self.metric.blind_s;
             let (key, other) =

@@ -1,6 +1,6 @@
 //! Taking control of a PX4 that holds its place.
 //!
-//! PX4 enters OFFBOARD only while setpoints come, so nobody can choose it by hand before a landing begins, and no landing begins
+//! PX4 enters OFFBOARD only while setpoints come, so it cannot be chosen by hand before a landing begins, and no landing begins
 //! outside of it. A start from HOLD therefore sends setpoints of zero velocity, which every other mode ignores, and asks for
 //! OFFBOARD. A start that is given up is followed by an [`autopilot::OffboardExit`].
 
@@ -90,7 +90,7 @@ pub fn pilots_px4_mode(autopilot: &Autopilot) -> Option<FlightMode> {
     px4_in_flight(autopilot).filter(|mode| !mode.is_guided() && !mode.is_landing())
 }
 
-/// The mode of a PX4 that is heard and flies.
+/// The mode of a connected PX4 that flies.
 fn px4_in_flight(autopilot: &Autopilot) -> Option<FlightMode> {
     let state = autopilot.state().filter(|_| autopilot.firmware() == Some(Firmware::Px4))?;
     (state.connected && state.armed && state.landed.is_flying()).then_some(state.mode)

@@ -46,7 +46,7 @@ pub struct Flight {
     decision: Option<Decision>,
     /// How many decisions there were.
     decisions: u64,
-    /// What the lander was told of the detectors last.
+    /// Whether a detector is alive, as the lander received it last.
     detectors_alive: bool,
     link_delay: LinkDelay,
     mission: Mission,
@@ -125,8 +125,8 @@ impl Flight {
         self.handle_autopilot_events(now_ns);
     }
 
-    /// Stops a vehicle whose landing is to be resumed, from the first packet of its autopilot on: the heartbeat that
-    /// tells the rest may be a second away.
+    /// Stops a vehicle whose landing is to be resumed, from the first packet of its autopilot on: the heartbeat with
+    /// the rest may be a second away.
     fn stop_before_resuming(&mut self, now_ns: i64, packet: &Packet) {
         let pinned = self.config.autopilot.system_id;
         let is_vehicle = packet.sender.component == autopilot::packet::AUTOPILOT
@@ -144,7 +144,7 @@ impl Flight {
         }
     }
 
-    /// Whether a packet is a ground station's heartbeat. Programs on the vehicle may say that they are one, too, and go on when nobody is
+    /// Whether a packet is a ground station's heartbeat. Programs on the vehicle may claim to be one, too, and continue when no ground station is
     /// there any more: they have the vehicle's system id, which a ground station never has.
     fn is_of_ground_station(&self, packet: &Packet) -> bool {
         let Some(MavMessage::HEARTBEAT(heartbeat)) = &packet.message else { return false };
@@ -207,12 +207,12 @@ impl Flight {
         }
     }
 
-    /// What must be put back in the autopilot's parameters; `None` when nothing must.
+    /// The autopilot's parameters to restore; `None` if there are none.
     pub fn note(&self) -> Option<&Note> {
         self.limits.note()
     }
 
-    /// Takes over what an earlier controller left to put back.
+    /// Takes over the parameters that an earlier controller left to restore.
     pub fn take_over(&mut self, note: Note) {
         self.limits.take_over(note);
     }
@@ -243,7 +243,7 @@ impl Flight {
         self.pad_notes.step(is_landing, seen, address, self.autopilot.system());
     }
 
-    /// Logs what the operator should know, and tells the lander of a dispute between detectors.
+    /// Logs the warnings for the operator, and passes a dispute between detectors to the lander.
     fn follow_warnings(&mut self, now_ns: i64) {
         let warnings = self.view().warnings(now_ns);
         self.journal.warnings(now_ns, &warnings);
@@ -286,7 +286,7 @@ impl Flight {
     }
 
     /// Handles the detections that were published on the key of the detector `publisher`. True when a frame
-    /// was used or these detections were refused, and so the target is to be told; false when they wait, as those of a detector on
+    /// was used or these detections were refused, and so the target is to be published; false when they wait, as those of a detector on
     /// standby do, or when what such a detector publishes was refused.
     pub fn detections(&mut self, now_ns: i64, publisher: &str, message: &Detections) -> bool {
         self.journal.count("detections");
@@ -304,8 +304,8 @@ impl Flight {
         self.use_newest(now_ns)
     }
 
-    /// Counts what a detector published and was refused. True when it is the detector in use, or none is: why another one is refused
-    /// says nothing about the target.
+    /// Counts refused detections. True if they are of the detector in use, or none is in use: the reason for another one has nothing to do with
+    /// the target.
     fn refuse(&mut self, publisher: &str, reason: &str) -> bool {
         let active = self.frames.selection.active();
         let is_in_use = active.is_none_or(|active| active == publisher);
@@ -395,7 +395,7 @@ impl Flight {
             self.refuse(publisher, "another-detectors-name");
             return;
         }
-        self.frames.told(now_ns, publisher, info);
+        self.frames.on_detector_info(now_ns, publisher, info);
         self.use_newest(now_ns);
     }
 
@@ -482,7 +482,7 @@ impl Flight {
         self.view().target(now_ns)
     }
 
-    /// What is being done, and why.
+    /// The phase and its reason, and all else of the status.
     pub fn status(&self, now_ns: i64) -> ControllerStatus {
         self.view().status(now_ns)
     }
@@ -532,7 +532,7 @@ impl Flight {
             && landing_target.step(now_ns, situation, &mut self.autopilot)
             && !self.mission.is_sending_landing_target()
         {
-            // Somebody else began it; it is followed like our own.
+            // Another station or the pilot began it; it is followed like our own.
             self.mission.begin(now_ns, true);
         }
         if !may_recall {
@@ -548,8 +548,8 @@ impl Flight {
             let age_s = Timestamp::from_nanos(now_ns).seconds_since(state.stamp);
             age_s <= self.config.phases.stale_vehicle_s
         });
-        // A landing that would see nothing waits; what it waits for stands in the status. One of a vehicle that another controller may
-        // fly, or that may be the wrong one, too; a vehicle that took off for us is ours.
+        // A landing that would see no marker waits, with the reason in the status. So does that of a vehicle that another controller may fly,
+        // or that may be the wrong one; a vehicle that took off for us is ours.
         let begins_by_itself = self.mission.is_awaiting_takeoff();
         let conflict = self.autopilot.conflict(now_ns).filter(|_| begins_by_itself);
         let obstacle = match conflict {
@@ -617,7 +617,7 @@ impl Flight {
 
     /// A take-off does not begin while no detector looks for the marker. True while it waits for one.
     fn waits_for_detector(&mut self, now_ns: i64) -> bool {
-        let why = self.frames.nobody_looks_for_marker();
+        let why = self.frames.no_detector_looks_for_marker();
         why.is_some_and(|why| self.mission.put_off(now_ns, &mut self.autopilot, why))
     }
 
@@ -654,7 +654,7 @@ impl Flight {
                 {
                     let why = "the autopilot restarted in flight".to_owned();
                     self.mission.fail(&mut self.autopilot, why);
-                    // What it went on deciding would stand behind the next start.
+                    // Its further decisions would precede the next start.
                     self.lander.stand_down();
                 }
                 _ => {}
@@ -669,7 +669,7 @@ impl Flight {
         self.view().is_finished() && is_off && was_off
     }
 
-    /// The pilot has taken over: what was requested before is not repeated against the pilot. A take-off passes
+    /// The pilot has taken over: earlier requests are not repeated against the pilot. A take-off passes
     /// through modes of its own, and looks after its requests itself.
     fn withdraw_from(&mut self, mode: FlightMode) {
         if !mode.is_guided() && !mode.is_landing() && !self.mission.is_taking_off() {

@@ -35,7 +35,7 @@ pub struct Frames {
     pub selection: Selection,
     /// The cameras whose detectors get no frames.
     pub camera_watch: CameraWatch,
-    /// What detectors look for, and see beside the landing's marker.
+    /// The markers that detectors look for, and see instead of the landing's marker.
     announced: Announced,
     /// The stamps that they pass on.
     stamps: Stamps,
@@ -105,11 +105,11 @@ impl Frames {
         }
     }
 
-    /// A detector told about itself on its own key.
-    pub fn told(&mut self, now_ns: i64, detector: &str, info: &DetectorInfo) {
-        self.camera_watch.heard(now_ns, detector, &info.camera);
+    /// The information that a detector published on its own key.
+    pub fn on_detector_info(&mut self, now_ns: i64, detector: &str, info: &DetectorInfo) {
+        self.camera_watch.announced(now_ns, detector, &info.camera);
         self.selection.set_place(now_ns, detector, info.place);
-        self.announced.told(detector, &info.markers);
+        self.announced.add(detector, &info.markers);
     }
 
     /// Adds a camera's calibration and mount, or refuses them; `is_flying` says that a landing is active.
@@ -124,7 +124,7 @@ impl Frames {
     /// Adds the detections that were published on the key of the detector `publisher`.
     pub fn add(&mut self, now_ns: i64, publisher: &str, message: &Detections) -> Arrival {
         let header = &message.header;
-        // Who may publish is decided by the key; the name in the message is only a claim.
+        // The key decides which detector may publish; the name in the message is only a claim.
         if message.detector != publisher {
             return self.refuse(now_ns, "another-detectors-name", || {
                 format!(
@@ -224,7 +224,7 @@ impl Frames {
         });
     }
 
-    /// What the operator should know.
+    /// The warnings for the operator.
     pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
         let mut warnings: Vec<_> = self.refusals.lasting(now_ns).collect();
         warnings.extend(self.selection.warnings(now_ns));
@@ -234,8 +234,8 @@ impl Frames {
         warnings
     }
 
-    /// Why a landing would see nothing, or not what it should: all that arrives is refused, or two programs
-    /// give one camera different calibrations.
+    /// Why a landing would see no marker, or see it at a wrong position: all detections are refused, or two programs give one camera
+    /// different calibrations.
     pub fn obstacle(&self, now_ns: i64) -> Option<String> {
         let has_none = now_ns.saturating_sub(self.kept_ns) > UNUSABLE_NS;
         let mut lasting = self.refusals.lasting(now_ns);
@@ -246,12 +246,12 @@ impl Frames {
     /// Why a landing that an operator starts would not be led to the marker.
     pub fn start_obstacle(&self, now_ns: i64) -> Option<String> {
         let others = self.obstacle(now_ns).or_else(|| self.selection.no_pose(now_ns));
-        others.or_else(|| self.nobody_looks_for_marker())
+        others.or_else(|| self.no_detector_looks_for_marker())
     }
 
-    /// That no detector which is there looks for the landing's marker, if that is so.
-    pub fn nobody_looks_for_marker(&self) -> Option<String> {
-        self.announced.nobody_looks_for(&self.marker, &self.selection)
+    /// The warning that no present detector looks for the landing's marker, if that is so.
+    pub fn no_detector_looks_for_marker(&self) -> Option<String> {
+        self.announced.no_detector_looks_for(&self.marker, &self.selection)
     }
 
     /// Why the detector in use leads no landing to the marker although it searches frames.
@@ -260,7 +260,10 @@ impl Frames {
             let active = self.selection.active()?;
             self.announced.seen_instead(now_ns, active, &self.marker)
         };
-        self.selection.no_pose(now_ns).or_else(|| self.nobody_looks_for_marker()).or_else(instead)
+        self.selection
+            .no_pose(now_ns)
+            .or_else(|| self.no_detector_looks_for_marker())
+            .or_else(instead)
     }
 
     /// The frame to be used now: the active detector's newest, if it is newer than all that were used.

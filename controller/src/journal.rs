@@ -16,59 +16,60 @@ use crate::refusals::Warning;
 /// name it.
 const EXPOSURE_TO_SETPOINT: &str = "exposure to setpoint";
 
-/// Writes the log and counts what the health report shows.
+/// Writes the log and counts for the health report.
 #[derive(Debug)]
 pub struct Journal {
     health: Arc<HealthCounters>,
     /// Why the latest detection of the detector in use was rejected, if it was.
     rejection: Option<String>,
-    /// The matters of which the log has told.
-    told: Vec<Told>,
+    /// The warnings that are in the log.
+    logged: Vec<Logged>,
 }
 
-/// A matter of which the log has told.
+/// A warning that is in the log.
 #[derive(Debug)]
-struct Told {
+struct Logged {
     matter: String,
     /// The warning as it was logged.
     text: String,
-    /// When, in nanoseconds.
+    /// When it was logged, in nanoseconds.
     at_ns: i64,
-    /// Since when it is over, in nanoseconds; `None` while it lasts.
+    /// Since when it is over, in nanoseconds; `None` while it persists.
     over_ns: Option<i64>,
 }
 
-/// Minimum time between two lines on one matter that ends and begins again, and for which it must be over before that is told, in nanoseconds.
+/// Minimum time between two lines of one warning that ends and begins again, in nanoseconds; its end is logged after the same time.
 const QUIET_NS: i64 = 5_000_000_000;
 
 impl Journal {
     /// A journal that counts into `health`.
     pub fn new(health: Arc<HealthCounters>) -> Self {
-        Self { health, rejection: None, told: Vec::new() }
+        Self { health, rejection: None, logged: Vec::new() }
     }
 
-    /// Logs what the operator should know when it begins and when it is over, and not every time that it comes and goes.
+    /// Logs the beginning and the end of each warning, and not every short interruption.
     pub fn warnings(&mut self, now_ns: i64, warnings: &[Warning]) {
         for Warning { matter, text } in warnings {
-            let Some(told) = self.told.iter_mut().find(|told| told.matter == *matter) else {
+            let Some(logged) = self.logged.iter_mut().find(|logged| logged.matter == *matter)
+            else {
                 tracing::warn!("{text}");
                 let (matter, text) = (matter.clone(), text.clone());
-                self.told.push(Told { matter, text, at_ns: now_ns, over_ns: None });
+                self.logged.push(Logged { matter, text, at_ns: now_ns, over_ns: None });
                 continue;
             };
-            if told.over_ns.take().is_some() && now_ns.saturating_sub(told.at_ns) >= QUIET_NS {
+            if logged.over_ns.take().is_some() && now_ns.saturating_sub(logged.at_ns) >= QUIET_NS {
                 tracing::warn!("{text}");
-                (told.at_ns, told.text) = (now_ns, text.clone());
+                (logged.at_ns, logged.text) = (now_ns, text.clone());
             }
         }
-        self.told.retain_mut(|told| {
-            if warnings.iter().any(|warning| warning.matter == told.matter) {
+        self.logged.retain_mut(|logged| {
+            if warnings.iter().any(|warning| warning.matter == logged.matter) {
                 return true;
             }
-            let over_ns = *told.over_ns.get_or_insert(now_ns);
+            let over_ns = *logged.over_ns.get_or_insert(now_ns);
             let is_over = now_ns.saturating_sub(over_ns) >= QUIET_NS;
             if is_over {
-                tracing::info!("No longer: {}", told.text);
+                tracing::info!("No longer: {}", logged.text);
             }
             !is_over
         });
@@ -185,7 +186,7 @@ impl Journal {
                 "Another vehicle is on the link; it is ignored, and no flight begins until ours is pinned with `autopilot.system_id`"
             ),
             Event::SameAddress { .. } => tracing::warn!(
-                "Another program uses our system and component id, and no flight begins until it ends; the status says what it sends, and what to do"
+                "Another program uses our system and component id, and no flight begins until it ends; the status shows its messages and the remedy"
             ),
             Event::Lost { silence } => {
                 let silence = format_args!("{:.1} s", silence.as_secs_f64());
@@ -233,7 +234,7 @@ impl Journal {
     }
 }
 
-/// A severity as people call it.
+/// The name of a severity.
 fn severity_name(severity: MavSeverity) -> &'static str {
     match severity {
         MavSeverity::MAV_SEVERITY_EMERGENCY => "emergency",
@@ -271,7 +272,7 @@ mod tests {
         }
     }
 
-    /// What is logged meanwhile.
+    /// The lines that are logged meanwhile.
     fn logged(run: impl FnOnce()) -> String {
         let log = Log::default();
         let writer = log.clone();
@@ -281,14 +282,14 @@ mod tests {
             .with_writer(move || writer.clone())
             .finish();
         tracing::subscriber::with_default(subscriber, run);
-        let told = log.0.lock().unwrap_or_else(PoisonError::into_inner);
-        std::str::from_utf8(&told).unwrap().to_owned()
+        let output = log.0.lock().unwrap_or_else(PoisonError::into_inner);
+        std::str::from_utf8(&output).unwrap().to_owned()
     }
 
     #[test]
-    fn a_matter_that_comes_and_goes_is_told_every_few_seconds_and_its_end_once() {
+    fn a_warning_that_comes_and_goes_is_logged_every_few_seconds_and_its_end_once() {
         let warning = Warning { matter: "dispute a b".into(), text: "they differ".into() };
-        let told = logged(|| {
+        let output = logged(|| {
             let mut journal = Journal::new(Arc::default());
             // It is there in every other call for twelve seconds.
             for i in 0..480_i64 {
@@ -300,9 +301,9 @@ mod tests {
                 journal.warnings(i * 25_000_000, &[]);
             }
         });
-        assert_eq!(told.matches("WARN").count(), 3, "{told}");
-        assert_eq!(told.matches("they differ").count(), 4, "{told}");
-        assert_eq!(told.matches("No longer: they differ").count(), 1, "{told}");
+        assert_eq!(output.matches("WARN").count(), 3, "{output}");
+        assert_eq!(output.matches("they differ").count(), 4, "{output}");
+        assert_eq!(output.matches("No longer: they differ").count(), 1, "{output}");
     }
 
     #[test]
@@ -323,8 +324,8 @@ mod tests {
     }
 
     #[test]
-    fn the_log_says_it_as_people_write_it() {
-        let told = logged(|| {
+    fn the_log_is_written_in_words() {
+        let output = logged(|| {
             let journal = Journal::new(Arc::default());
             journal.alarm(Alarm::AutopilotLost);
             journal.autopilot(&Event::ModeChanged { from: None, to: FlightMode::Guided });
@@ -338,7 +339,7 @@ mod tests {
             journal.autopilot(&Event::Text { severity, text: "Low".to_owned() });
             journal.autopilot(&Event::Lost { silence: Duration::from_millis(3003) });
         });
-        for wanted in [
+        for expected in [
             "Alarm alarm=the link to the autopilot is lost",
             "Flight mode mode=GUIDED",
             "Flight mode from=GUIDED to=LAND",
@@ -346,10 +347,10 @@ mod tests {
             "warning",
             "silence=3.0 s",
         ] {
-            assert!(told.contains(wanted), "`{wanted}` is not in {told}");
+            assert!(output.contains(expected), "`{expected}` is not in {output}");
         }
         for debug in ["Some(", "MAV_", "AutopilotLost", "["] {
-            assert!(!told.contains(debug), "`{debug}` is in {told}");
+            assert!(!output.contains(debug), "`{debug}` is in {output}");
         }
     }
 }

@@ -65,7 +65,7 @@ enum State {
     LeftToLand(i64, String),
     /// On the ground, disarmed.
     Landed,
-    /// Aborted, or somebody took over.
+    /// Aborted, or the pilot took over.
     Ended(String),
 }
 
@@ -120,7 +120,7 @@ impl LandingTargetMode {
         self.state = State::Stabilising(now_ns);
     }
 
-    /// Follows what the autopilot does; true when it has just begun to land, whoever requested it.
+    /// Follows what the autopilot does; true when it has just begun to land, by any request.
     pub fn step(&mut self, now_ns: i64, situation: Situation, autopilot: &mut Autopilot) -> bool {
         let Situation { may_recall, distrust, is_flying } = situation;
         let Some(state) = autopilot.state().copied() else { return false };
@@ -250,7 +250,7 @@ impl LandingTargetMode {
         }
     }
 
-    /// The phase and the reason for it; `problem` is what keeps the autopilot from using landing targets.
+    /// The phase and the reason for it; `problem` is the reason for which the autopilot cannot use landing targets.
     pub fn phase(&self, now_ns: i64, problem: Option<String>) -> (Phase, String) {
         let target = match self.active_stream(now_ns) {
             Some(_) => "sending the landing target",
@@ -288,7 +288,7 @@ impl LandingTargetMode {
         )
     }
 
-    /// True once a landing was aborted, or somebody took over.
+    /// True once a landing was aborted, or the pilot took over.
     pub fn is_aborted(&self) -> bool {
         matches!(self.state, State::AbortedEarly(_) | State::Recalling(..) | State::Ended(_))
     }
@@ -326,7 +326,7 @@ fn hover_mode(autopilot: &Autopilot) -> FlightMode {
     }
 }
 
-/// What keeps this autopilot from using landing targets, and what to do about it.
+/// The reason for which this autopilot cannot use landing targets, and the remedy.
 pub fn problem(autopilot: &Autopilot) -> Option<String> {
     match autopilot.firmware()? {
         // PX4 needs no preparation: its mode PRECISION LAND uses them.

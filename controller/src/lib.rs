@@ -1,16 +1,16 @@
 //! Marker detections in, velocity setpoints out.
 //!
 //! The service receives detections and the autopilot's state, lets the lander decide, and sends setpoints. It
-//! stands between three crates that do not know each other: `messages` (what detectors find), `landing` (what
-//! to do) and `autopilot` (how to do it).
+//! joins three independent crates: `messages` (the detections), `landing` (the decision) and `autopilot` (its
+//! execution).
 //!
 //! Modules in reading order: [`config`] has the settings; [`service`] joins network and link to the
 //! [`flight`] with its [`tape`], an event loop over [`frames`] (detections in, the lander's next frame out, with [`selection`]
-//! of the detector by health and [`agreement`], what they have [`announced`], the [`stamps`] that they pass on, the [`cameras`], and the [`refusals`] that last; [`unreadable`] ones never come so far), [`mount`] (what is said of a camera that is not as configured), [`mission`]
-//! (when a landing begins), [`setpoints`] (the lander's actions to the autopilot), [`control`] (how a PX4 comes to follow setpoints) and [`offboard_watch`] (that it is not left so), [`landing_target`] (the
+//! of the detector by health and [`agreement`], the markers that they have [`announced`], the [`stamps`] that they pass on, the [`cameras`], and the [`refusals`] that persist; [`unreadable`] ones are counted before), [`mount`] (warnings of a camera that is not as configured), [`mission`]
+//! (when a landing begins), [`setpoints`] (the lander's actions to the autopilot), [`control`] (takes a PX4 into OFFBOARD) and [`offboard_watch`] (leads it out again), [`landing_target`] (the
 //! other way to land, by the autopilot's own precision landing), [`limits`] (the autopilot's parameters for
-//! setpoints), [`link_delay`] (how slow the link is), [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is logged and
-//! counted, [`pad_note`] where the pad is, for the controller that is started next, [`note_file`] what must survive a crash, [`wire`] converts messages into the lander's types and
+//! setpoints), [`link_delay`] (the delay of the link), [`alarms`] and [`wind`]; [`status`] is published, [`journal`] logs and
+//! counts, [`pad_note`] has the pad's position for the next controller, [`note_file`] survives a crash, [`wire`] converts messages into the lander's types and
 //! back.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.

@@ -55,10 +55,10 @@ const fn scaled(name: &'static str, scale: f64) -> Scaled {
     Scaled { name, scale }
 }
 
-/// What must be put back, kept outside of the process for the time after a crash.
+/// A parameter to restore, stored outside of the process for the time after a crash.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Note {
-    /// The link's address, which tells vehicles with the same system id apart.
+    /// The link's address, which distinguishes vehicles with the same system id.
     pub address: String,
     /// The vehicle's MAVLink system id.
     pub system: u8,
@@ -76,7 +76,7 @@ pub struct Limits {
     address: String,
     /// The setpoint timeout for a landing, in seconds; 0 leaves the autopilot's.
     wanted_s: f64,
-    /// What an earlier controller left.
+    /// The note of an earlier controller.
     left: Option<Note>,
     note: Option<Note>,
     /// The autopilot did not take the timeout in this landing.
@@ -85,7 +85,8 @@ pub struct Limits {
     is_restoring: bool,
     active_ns: Option<i64>,
     known: Option<AutopilotLimits>,
-    is_told_of_silence: bool,
+    /// The warning of PX4's reaction to a silent controller is in the log.
+    is_silence_logged: bool,
 }
 
 impl Limits {
@@ -100,7 +101,7 @@ impl Limits {
             is_restoring: false,
             active_ns: None,
             known: None,
-            is_told_of_silence: false,
+            is_silence_logged: false,
         }
     }
 
@@ -154,7 +155,7 @@ impl Limits {
         }
         if let Some(action) = value(autopilot, COM_OBL_RC_ACT)
             && action != HOLDS
-            && !std::mem::replace(&mut self.is_told_of_silence, true)
+            && !std::mem::replace(&mut self.is_silence_logged, true)
         {
             tracing::warn!(
                 "{COM_OBL_RC_ACT} is {action}: should this process die, PX4 does that instead of holding its place, and in the modes 0 to 2 it descends and drifts without a remote control; set it to {HOLDS} (hold)"
@@ -171,7 +172,7 @@ impl Limits {
         is_new.then_some(limits)
     }
 
-    /// What must be put back; `None` when nothing must.
+    /// The parameter to restore; `None` if there is none.
     pub fn note(&self) -> Option<&Note> {
         self.note.as_ref().or(self.left.as_ref())
     }
@@ -202,7 +203,7 @@ impl Limits {
             tracing::warn!(
                 parameter = note.parameter,
                 seconds = timeout_s,
-                "Setpoint timeout was changed by somebody else; it stays so"
+                "Setpoint timeout was changed by another program; it stays so"
             );
         } else {
             tracing::info!(
@@ -239,7 +240,7 @@ impl Limits {
         let ours = self.note.as_ref().filter(|note| note.parameter == name);
         let is_begun = ours.is_some_and(|note| note.set_s == self.wanted_s) && !is_restoring;
         if !is_begun {
-            // What an earlier landing set is not the vehicle's own.
+            // A value of an earlier landing is not the vehicle's own.
             let is_ours = |note: &&Note| is_restoring || (timeout_s - note.set_s).abs() < SAME_S;
             let original_s = ours.filter(is_ours).map_or(timeout_s, |note| note.original_s);
             self.note = Some(Note {

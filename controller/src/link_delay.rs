@@ -1,17 +1,17 @@
-//! How slow the link to the autopilot is, as the landing reckons with it: what is measured, for a while what was measured last, or what is
-//! assumed of a link that does not tell.
+//! The delay of the link to the autopilot for the landing: the measured one, for a while the last measurement, or the delay that is assumed
+//! where none can be measured.
 
 use autopilot::Autopilot;
 
 use crate::refusals::Warning;
 
-/// Change of the delay that the lander is told of, in seconds.
+/// Change of the delay that is passed to the lander, in seconds.
 const STEP_S: f64 = 0.01;
-/// The delay of a link, both ways together, that does not tell it, in seconds: that of a telemetry radio. A delay that is taken for none
+/// The delay of a link, both ways together, where it cannot be measured, in seconds: that of a telemetry radio. A delay that is taken for none
 /// makes the vehicle swing over the pad, and one that is taken for longer than it is only makes the landing slower.
 const UNKNOWN_S: f64 = 0.3;
 
-/// The link's delay that the lander was told last.
+/// The link's delay that was passed to the lander last.
 #[derive(Copy, Clone, Debug, Default)]
 pub struct LinkDelay {
     seconds: f64,
@@ -23,8 +23,8 @@ impl LinkDelay {
         self.seconds
     }
 
-    /// Follows the link's delay; in seconds when the lander is to be told of another one. Where it is not measured any more, or the
-    /// vehicle is silent, it is taken for what it was, until [`Autopilot::lacks_link_delay`].
+    /// Follows the link's delay; in seconds when the lander must receive another one. Where it is not measured any more, or the
+    /// vehicle is silent, the last delay is assumed, until [`Autopilot::lacks_link_delay`].
     pub fn step(&mut self, now_ns: i64, autopilot: &Autopilot) -> Option<f64> {
         let seconds = match autopilot.link_delay(now_ns) {
             Some(delay) => delay.as_secs_f64(),
@@ -39,7 +39,7 @@ impl LinkDelay {
     }
 }
 
-/// That nothing tells how slow the link is, although the autopilot is asked.
+/// The warning that the link's delay cannot be measured, although the autopilot is asked.
 pub fn warning(now_ns: i64, autopilot: &Autopilot) -> Option<Warning> {
     autopilot.lacks_link_delay(now_ns).then(|| Warning {
         matter: "link-delay".to_owned(),

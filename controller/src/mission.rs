@@ -9,8 +9,8 @@ use autopilot::{
 use crate::config::Start;
 use crate::control::{ControlProgress, TakingControl, hover_in_offboard, is_holding_px4};
 
-/// Time within which the motors of a vehicle that flies in our mode, and whose landing had ended with them, mean that it had not
-/// ended, in nanoseconds: the autopilot's heartbeat may have been wrong. One that stands has landed.
+/// Time after the stop of the motors had ended a landing, in nanoseconds, within which motors that run again in our mode mean that it had
+/// not ended: the autopilot's heartbeat may have been wrong. One that stands has landed.
 const MAX_REARMED_NS: i64 = 10_000_000_000;
 
 /// The mission of a flight.
@@ -39,7 +39,7 @@ pub enum State {
         takeoff: Takeoff,
         /// It has taken off, and something keeps the landing from beginning.
         waits_in_air: bool,
-        /// What it waits for.
+        /// The reason for which it waits.
         why: String,
     },
     /// A PX4 that holds its place is asked for OFFBOARD.
@@ -143,7 +143,7 @@ impl Mission {
         matches!(self.state, State::TakingControl { .. })
     }
 
-    /// Puts off a take-off that has not begun, for this reason, which is told: nothing asks for its motors, and its times stand still. True
+    /// Puts off a take-off that has not begun, for this reason, which the status shows: nothing asks for its motors, and its times stand still. True
     /// where there is one.
     pub fn put_off(&mut self, now_ns: i64, autopilot: &mut Autopilot, reason: String) -> bool {
         let State::TakingOff { takeoff, why, .. } = &mut self.state else { return false };
@@ -494,7 +494,7 @@ fn end_of_waiting(autopilot: &Autopilot) -> Option<String> {
 }
 
 /// True when there is no landing to resume: it has ended, though the motors may still run, or the pilot flies. A vehicle
-/// whose motors are said to be off, and not that it stands, may fly all the same.
+/// with motors reported as off, but not reported to stand, may fly all the same.
 fn has_no_landing(autopilot: &Autopilot) -> bool {
     autopilot.state().is_some_and(|s| {
         s.landed == LandedState::OnGround || !s.mode.is_guided() && !s.mode.is_landing()

@@ -1,15 +1,15 @@
-//! What is said of a camera whose mount, focal length or marker is not as configured.
+//! Warnings of a camera mount, focal length, marker size or standing height that differs from the configuration.
 
 use landing::{Measured, MountFindings};
 
 use crate::refusals::Warning;
 
-/// Maximum difference between the configured and the measured standing height that is not told, in metres: the error of
+/// Maximum difference between the configured and the measured standing height without a warning, in metres: the error of
 /// the measurement (`landing`'s module `standing`).
 const MAX_STANDING_ERROR_M: f64 = 0.15;
 
-/// The warnings of what was measured in flight. A marker that is so many times as large as configured makes all other errors, so it alone
-/// is told.
+/// The warnings of the measurements in flight. A marker that is so many times as large as configured causes all other errors, so it alone
+/// is reported.
 pub fn warnings(found: &MountFindings, size_ratio: Option<f64>) -> Vec<Warning> {
     if let Some(times) = size_ratio {
         return vec![Warning {
@@ -39,7 +39,7 @@ pub fn warnings(found: &MountFindings, size_ratio: Option<f64>) -> Vec<Warning> 
     let focal = |ratio: Measured| Warning {
         matter: "focal-length".to_owned(),
         text: format!(
-            "the image moves as if the camera's focal length were {} {} than configured: where further flights tell it as well, check its calibration and its zoom; else the autopilot's attitude or velocity was wrong",
+            "the image moves as if the camera's focal length were {} {} than configured: where further flights show it as well, check its calibration and its zoom; else the autopilot's attitude or velocity was wrong",
             percent(ratio),
             larger(ratio)
         ),
@@ -63,15 +63,15 @@ pub fn warnings(found: &MountFindings, size_ratio: Option<f64>) -> Vec<Warning> 
     .collect()
 }
 
-/// What is said of a vehicle that stands higher over the pad than configured; both in metres. Nothing where the marker's size is wrong, by
+/// The warning of a vehicle that stands higher over the pad than configured; both in metres. None where the marker's size is wrong, by
 /// which the height was measured.
 pub fn standing_warning(
     measured_m: f64,
     configured_m: f64,
     size_ratio: Option<f64>,
 ) -> Option<Warning> {
-    let is_told = size_ratio.is_none() && measured_m - configured_m > MAX_STANDING_ERROR_M;
-    is_told.then(|| Warning {
+    let is_higher = size_ratio.is_none() && measured_m - configured_m > MAX_STANDING_ERROR_M;
+    is_higher.then(|| Warning {
         matter: "standing-height".to_owned(),
         text: format!(
             "the vehicle stood about {measured_m:.1} m over the pad, not {configured_m:.2} m: measure how high the autopilot sits over the ground, and write it into `metric.standing_height_m`"
@@ -84,24 +84,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_vehicle_that_stands_higher_than_configured_is_told() {
+    fn a_vehicle_that_stands_higher_than_configured_is_reported() {
         assert!(standing_warning(0.25, 0.2, None).is_none());
         let text = standing_warning(0.25, 0.0, None).unwrap().text;
         assert!(text.contains("about 0.2 m") && text.contains("0.00 m"), "{text}");
     }
 
     #[test]
-    fn of_a_marker_of_another_size_nothing_is_told_that_was_measured_by_it() {
+    fn measurements_by_a_marker_of_another_size_are_not_reported() {
         let pitch_rad = Some(Measured { value: 0.2, deviation: 0.01 });
         let found = MountFindings { pitch_rad, ..MountFindings::default() };
-        let told = warnings(&found, Some(2.04));
-        let [warning] = told.as_slice() else { unreachable!("{told:?}") };
+        let found_warnings = warnings(&found, Some(2.04));
+        let [warning] = found_warnings.as_slice() else { unreachable!("{found_warnings:?}") };
         assert!(warning.text.starts_with("the marker seems 2.0 times as large as configured"));
         assert!(standing_warning(0.5, 0.0, Some(2.04)).is_none());
     }
 
     #[test]
-    fn angles_are_told_in_degrees_and_ratios_in_percent() {
+    fn angles_are_reported_in_degrees_and_ratios_in_percent() {
         assert!(warnings(&MountFindings::default(), None).is_empty());
         let found = MountFindings {
             pitch_rad: Some(Measured { value: -0.0541, deviation: 0.007 }),

@@ -1,4 +1,4 @@
-//! The files that keep, beyond a crash, what must be put back in the autopilot's parameters, where the pad is, and which vehicle is landed.
+//! The files that outlast a crash of the controller: the autopilot's parameters to restore, the pad's position, and the landed vehicle.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -25,7 +25,7 @@ impl<T: Clone + PartialEq + Serialize + DeserializeOwned> NoteFile<T> {
         Self { path: state_directory().map(|it| it.join(format!("{name}.json"))), written: None }
     }
 
-    /// What an earlier controller left; a file that cannot be read counts as none.
+    /// The note of an earlier controller; an unreadable file counts as none.
     pub fn read(&self) -> Option<T> {
         let text = std::fs::read(self.path.as_ref()?).ok()?;
         let note = serde_json::from_slice(&text);
@@ -81,11 +81,11 @@ fn write(path: &Path, note: Option<&impl Serialize>) -> std::io::Result<()> {
 
 /// The end of the name of a file with a pad's place.
 const OF_A_PAD: &str = "-pad";
-/// Age from which the place of a pad is of use to nobody, also where several hosts share the directory.
+/// Age from which the position of a pad is useless, also where several hosts share the directory.
 const MAX_PAD_AGE: Duration = Duration::from_secs(24 * 3600);
 
-/// Removes the places of pads, for any autopilot, that no controller can use: those of an earlier boot, as a flight leaves them whose
-/// controller was killed. The notes of parameters stay, as only their vehicle can tell whether it needs them.
+/// Removes the places of pads, for any autopilot, that no controller can use: those of an earlier boot, as a flight with a
+/// killed controller leaves them. The notes of parameters stay, as only their vehicle shows whether it needs them.
 pub fn remove_useless_pads() {
     if let Some(directory) = state_directory() {
         remove_pads_of_earlier_boots(&directory, clock_name(), SystemTime::now());
@@ -125,7 +125,7 @@ pub struct PadFile {
     writing: Option<JoinHandle<()>>,
 }
 
-/// A pad's place with the name of the clock of its stamp: that of another boot tells nothing.
+/// A pad's position with the name of the clock of its stamp: one of another boot is useless.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Clocked {
     clock: String,
@@ -139,7 +139,7 @@ impl PadFile {
         Self { file: Arc::new(Mutex::new(file)), kept: None, writing: None }
     }
 
-    /// What an earlier controller left since this host was started.
+    /// The note that an earlier controller left since this host was started.
     pub fn read(&self) -> Option<PadNote> {
         let left = self.file.lock().unwrap_or_else(PoisonError::into_inner).read()?;
         (left.clock == clock_name()).then_some(left.pad)
@@ -185,8 +185,8 @@ impl LandingFile {
         Self { file, address: address.to_owned() }
     }
 
-    /// The vehicle that an earlier controller was landing since this host was started. What is left is removed by
-    /// [`LandingFile::keep`], whatever it is.
+    /// The vehicle that an earlier controller was landing since this host was started. Any remaining file is removed by
+    /// [`LandingFile::keep`].
     pub fn read(&mut self) -> Option<u8> {
         self.file.written = self.file.read();
         let left = self.file.written.as_ref()?;
@@ -249,7 +249,7 @@ mod tests {
         assert!(path.exists());
         next.keep(None);
         assert!(!path.exists());
-        // What one left before this host was started tells nothing, and goes.
+        // A note from before this host's start is useless, and is removed.
         let left = r#"{"clock":"monotonic/earlier","address":"udpin:0.0.0.0:14550","system":7}"#;
         std::fs::write(&path, left).unwrap();
         let mut file = open("udpin:0.0.0.0:14550");

@@ -1,17 +1,17 @@
 //! Watches for a PX4 that flies in OFFBOARD while no setpoint is sent to it, and leads it out into HOLD.
 //!
-//! Every part that steers leads the vehicle out of OFFBOARD itself when it ends. This is for what no part expects: a request that
-//! was withdrawn and is carried out late, a takeover that was none, another station that chooses OFFBOARD while zeros are sent.
+//! Every part that steers leads the vehicle out of OFFBOARD itself when it ends. This is for cases that no part expects: a withdrawn
+//! request that is carried out late, a takeover that was none, another station that chooses OFFBOARD while zeros are sent.
 
 use autopilot::{Autopilot, OffboardExit};
 
-/// Time without a setpoint after which nobody steers, in nanoseconds: PX4 waits for half a second or more (`COM_OF_LOSS_T`).
+/// Time without a setpoint after which no part steers, in nanoseconds: PX4 waits for half a second or more (`COM_OF_LOSS_T`).
 const UNSTEERED_NS: i64 = 150_000_000;
 /// Time after our last setpoint or request for OFFBOARD up to which OFFBOARD is ours, in nanoseconds: later it is another
 /// program's.
 const OURS_NS: i64 = 10_000_000_000;
 
-/// Watches for OFFBOARD in which nobody steers.
+/// Watches for OFFBOARD in which no part of the flight steers.
 #[derive(Clone, Debug, Default)]
 pub struct OffboardWatch {
     exit: Option<OffboardExit>,
@@ -20,12 +20,12 @@ pub struct OffboardWatch {
 }
 
 impl OffboardWatch {
-    /// Advances it, after whoever steers was asked; to be called with each tick. True while it leads the vehicle out.
+    /// Advances it, after all parts that may steer; to be called with each tick. True while it leads the vehicle out.
     pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
         self.lead_out(now_ns, autopilot, !is_steered(now_ns, autopilot))
     }
 
-    /// The same when whoever steers ends: a vehicle in OFFBOARD is led out at once.
+    /// The same when the steering part ends: a vehicle in OFFBOARD is led out at once.
     pub fn end(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
         self.lead_out(now_ns, autopilot, true)
     }

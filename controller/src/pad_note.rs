@@ -19,7 +19,7 @@ const CLIMBED_M: f64 = 0.5;
 /// The place of the pad, with the vehicle in whose coordinates it is.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PadNote {
-    /// The link's address, which tells vehicles with the same system id apart.
+    /// The link's address, which distinguishes vehicles with the same system id.
     pub address: String,
     /// The vehicle's MAVLink system id.
     pub system: u8,
@@ -46,7 +46,7 @@ impl PadNotes {
         self.note = Some(note);
     }
 
-    /// What is to be kept; `None` when nothing is.
+    /// The note to store; `None` if there is none.
     pub fn note(&self) -> Option<&PadNote> {
         self.note.as_ref()
     }
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn what_an_earlier_controller_left_stays_until_the_landing_goes_on() {
+    fn a_note_of_an_earlier_controller_stays_until_the_landing_continues() {
         let note = PadNote {
             address: ADDRESS.into(),
             system: 1,

@@ -1,17 +1,17 @@
-//! Follows what is refused, by its reason (detections, camera information, messages of another version),
-//! and warns the operator of what lasts.
+//! Follows refusals by their reason (detections, camera information, messages of another version), and warns the operator of those that
+//! persist.
 
-/// Time for which something must be refused before it is told, in nanoseconds: a single one means little.
+/// Time for which something must be refused before a warning, in nanoseconds: a single refusal means little.
 const MIN_LASTING_NS: i64 = 1_000_000_000;
 /// Time without a refusal after which a matter is over, in nanoseconds.
 const OVER_NS: i64 = 1_500_000_000;
 /// Maximum number of matters; further ones are counted in the health only.
 const MAX_MATTERS: usize = 16;
 
-/// Something that the operator should know.
+/// A warning for the operator.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Warning {
-    /// A short name, the same while it lasts.
+    /// A short name, the same while it persists.
     pub matter: String,
     /// A sentence.
     pub text: String,
@@ -26,8 +26,8 @@ pub struct Refusals {
 #[derive(Debug)]
 struct Matter {
     reason: &'static str,
-    /// Whose, where several may have the same trouble; otherwise empty.
-    whose: String,
+    /// The source, such as a detector, where several may be refused for the same reason; otherwise empty.
+    source: String,
     text: String,
     since_ns: i64,
     last_ns: i64,
@@ -44,20 +44,20 @@ impl Refusals {
         &mut self,
         now_ns: i64,
         reason: &'static str,
-        whose: &str,
+        source: &str,
         text: impl FnOnce() -> String,
     ) {
         self.forget(now_ns);
-        let is_same = |matter: &&mut Matter| matter.reason == reason && matter.whose == whose;
+        let is_same = |matter: &&mut Matter| matter.reason == reason && matter.source == source;
         if let Some(matter) = self.matters.iter_mut().find(is_same) {
             matter.last_ns = now_ns;
         } else if self.matters.len() < MAX_MATTERS {
-            let (whose, text) = (whose.to_owned(), text());
-            self.matters.push(Matter { reason, whose, text, since_ns: now_ns, last_ns: now_ns });
+            let (source, text) = (source.to_owned(), text());
+            self.matters.push(Matter { reason, source, text, since_ns: now_ns, last_ns: now_ns });
         }
     }
 
-    /// What has been refused for a while and still is.
+    /// The warnings of refusals that persist.
     pub fn lasting(&self, now_ns: i64) -> impl Iterator<Item = Warning> {
         let lasting = self.matters.iter().filter(move |matter| matter.is_lasting(now_ns));
         lasting.map(|matter| Warning { matter: matter.name(), text: matter.text.clone() })
@@ -70,9 +70,9 @@ impl Refusals {
 
 impl Matter {
     fn name(&self) -> String {
-        match self.whose.as_str() {
+        match self.source.as_str() {
             "" => self.reason.to_owned(),
-            whose => format!("{} {whose}", self.reason),
+            source => format!("{} {source}", self.reason),
         }
     }
 
@@ -89,7 +89,7 @@ mod tests {
     const S: i64 = 1_000_000_000;
 
     #[test]
-    fn only_what_lasts_is_told_and_only_while_it_lasts() {
+    fn a_refusal_is_reported_only_while_it_persists() {
         let mut refusals = Refusals::default();
         refusals.add(0, "another-clock", || "a".to_owned());
         assert_eq!(refusals.lasting(0).count(), 0);
@@ -103,15 +103,15 @@ mod tests {
     }
 
     #[test]
-    fn what_several_are_refused_for_is_told_of_each() {
+    fn one_reason_of_several_detectors_is_reported_for_each() {
         let mut refusals = Refusals::default();
         for at_ns in [0, S / 2, S] {
-            for whose in ["one", "other"] {
-                refusals.add_of(at_ns, "impossible-marker", whose, || whose.to_owned());
+            for source in ["one", "other"] {
+                refusals.add_of(at_ns, "impossible-marker", source, || source.to_owned());
             }
         }
-        let told: Vec<_> = refusals.lasting(S).map(|it| (it.matter, it.text)).collect();
-        let of = |whose: &str| (format!("impossible-marker {whose}"), whose.to_owned());
-        assert_eq!(told, [of("one"), of("other")]);
+        let reported: Vec<_> = refusals.lasting(S).map(|it| (it.matter, it.text)).collect();
+        let of = |source: &str| (format!("impossible-marker {source}"), source.to_owned());
+        assert_eq!(reported, [of("one"), of("other")]);
     }
 }

@@ -35,7 +35,7 @@ const MAX_SIGHTS: usize = 300;
 const MAX_ALL_SIGHTS: usize = MIN_SIGHTS * MAX_DETECTORS;
 /// Maximum number of detectors that are warned of.
 const MAX_WARNINGS: usize = 4;
-/// Time for which it is told that there is no room for a name, in nanoseconds.
+/// Duration of the warning that there is no room for a name, in nanoseconds.
 const CROWDED_NS: i64 = 5_000_000_000;
 /// Maximum number of comparisons with the active detector kept for each detector.
 pub const MAX_VERDICTS: usize = 30;
@@ -64,7 +64,7 @@ pub struct Limits {
     pub min_rate_hz: f64,
     /// Time for which a preferred detector must have been healthy before it is used, in seconds.
     pub return_after_s: f64,
-    /// Maximum differences between what two detectors see that agree.
+    /// Maximum differences between the markers of two detectors that agree.
     pub tolerance: Tolerance,
     /// Whether one without poses leads no landing.
     pub needs_pose: bool,
@@ -72,7 +72,7 @@ pub struct Limits {
     pub no_pose_after_s: f64,
 }
 
-/// What a detector is worth when there is no room for all; a better one takes the place of a worse one.
+/// The rank of a detector when there is no room for all; a better one takes the place of a worse one.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Worth {
     /// It has gone.
@@ -207,7 +207,7 @@ impl Selection {
         self.choose(now_ns);
     }
 
-    /// Prefers a detector while it is healthy; the answer says what that means now.
+    /// Prefers a detector while it is healthy; the answer states the present consequence.
     ///
     /// # Errors
     /// Names the known detectors when it is not among them, or has gone.
@@ -224,7 +224,7 @@ impl Selection {
         let doubt = known.doubt();
         self.preference.detector = Some(name.to_owned());
         self.is_requested = true;
-        // Who names one while two disagree has decided.
+        // By naming one while two disagree the operator has decided.
         self.overruled = self.in_dispute().filter(|other| other != name).collect();
         self.choose(now_ns);
         Ok(match (trouble, doubt) {
@@ -238,7 +238,7 @@ impl Selection {
         })
     }
 
-    /// Prefers detectors that run at a place while they are healthy; the answer says what that means now.
+    /// Prefers detectors that run at a place while they are healthy; the answer states the present consequence.
     pub fn prefer_place(&mut self, now_ns: i64, place: Place) -> String {
         self.preference = Preference { detector: None, place: Some(place) };
         self.overruled.clear();
@@ -254,7 +254,7 @@ impl Selection {
         }
     }
 
-    /// Prefers no detector to another; the answer says what that means now.
+    /// Prefers no detector to another; the answer states the present consequence.
     pub fn prefer_any(&mut self, now_ns: i64) -> String {
         self.preference = Preference::default();
         self.overruled.clear();
@@ -318,7 +318,7 @@ impl Selection {
         !self.known.iter().any(|known| known.alive)
     }
 
-    /// A detector that sees the marker elsewhere than the active one or turned, while nobody says which is right.
+    /// A detector that sees the marker elsewhere than the active one or turned, while it is not decided which is right.
     pub fn dispute(&self) -> Option<&Dispute> {
         self.dispute.as_ref()
     }
@@ -338,7 +338,7 @@ impl Selection {
         })
     }
 
-    /// What the operator should know of the detectors.
+    /// The warnings of the detectors for the operator.
     pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
         let mut warnings = Vec::new();
         let mut warn = |matter: String, text: String| warnings.push(Warning { matter, text });
@@ -454,7 +454,7 @@ impl Selection {
         self.known.last_mut()
     }
 
-    /// What a known detector is worth when there is no room for another.
+    /// The rank of a known detector when there is no room for another.
     fn worth(&self, now_ns: i64, known: &Known) -> Worth {
         let is_recent = now_ns.saturating_sub(known.received_ns) <= MAX_SILENCE_NS;
         if self.active.as_ref() == Some(&known.name)
@@ -473,7 +473,7 @@ impl Selection {
         }
     }
 
-    /// Compares what all detectors that answer saw in the same frames.
+    /// Compares the markers that all answering detectors saw in the same frames.
     fn compare_all(&mut self, now_ns: i64) {
         let tolerance = self.limits.tolerance;
         let answers: Vec<bool> = self.known.iter().map(|known| known.has_opinion(now_ns)).collect();
@@ -667,7 +667,7 @@ impl Selection {
             return Some((first.name.clone(), "it is the first".to_owned()));
         };
         if let Some(failure) = self.failure(now_ns, active) {
-            // Whoever agreed with one that is not believed is no better.
+            // A detector that agreed with one that is not believed is no better.
             let is_believed = active.fault.is_none();
             let order = |known: &&Known| {
                 (!is_believed || known.doubt().is_none(), self.rank(known), known.stamp_ns)
@@ -718,7 +718,7 @@ impl Known {
         }
     }
 
-    /// True while it searches frames: what it saw in one counts also when it was told late.
+    /// True while it searches frames: late detections count as well.
     fn has_opinion(&self, now_ns: i64) -> bool {
         self.alive && self.has_frame() && now_ns.saturating_sub(self.received_ns) <= MAX_SILENCE_NS
     }
@@ -739,7 +739,7 @@ impl Known {
         self.alive |= stamp_ns > self.gone_ns;
     }
 
-    /// Keeps what it saw in a newer frame, and forgets what is old.
+    /// Stores the marker of a newer frame, and forgets old ones.
     fn keep_sight(&mut self, stamp_ns: i64, sight: Option<Sight>, max: usize) {
         let is_old = |(old_ns, _): &(i64, _)| stamp_ns.saturating_sub(*old_ns) > SIGHTS_NS;
         while self.sights.len() > MIN_SIGHTS && self.sights.front().is_some_and(is_old) {
@@ -827,7 +827,7 @@ fn said(fault: &Fault) -> String {
     }
 }
 
-/// What is told of a detector that gives no pose.
+/// The warning of a detector that gives no pose.
 fn without_pose(name: &str) -> String {
     format!(
         "detector `{name}` gives no pose of the marker, only its place in the image, in three or more of four of its latest frames with the marker, and \

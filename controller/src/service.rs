@@ -38,18 +38,18 @@ const MAX_WAITING_PACKETS: usize = 512;
 /// Period in which the tape is handed over, in nanoseconds; it is earlier when this much of it waits, in bytes.
 const TAPE_PERIOD_NS: i64 = 100_000_000;
 const TAPE_BYTES: usize = 16_000;
-/// Maximum size and number of the parts of the tape that wait until somebody listens, as a recorder may start after the
+/// Maximum size and number of the parts of the tape that wait for a subscriber, as a recorder may start after the
 /// controller: about ten minutes.
 const MAX_WAITING_TAPE_BYTES: usize = 16 << 20;
 const MAX_WAITING_TAPES: usize = 8192;
-/// Pause before it is asked again whether somebody listens to the tape.
-const TAPE_PATIENCE: Duration = Duration::from_millis(100);
+/// Pause before the next check for a subscriber of the tape.
+const SUBSCRIBER_POLL: Duration = Duration::from_millis(100);
 /// Pause between two parts of the tape while further ones wait: sent all at once, some would be dropped, and a recorder
 /// beyond an air link would take the room of its frames.
 const TAPE_PAUSE: Duration = Duration::from_millis(8);
 /// Time for the last packet to be put on the wire.
 const LAST_PACKET: Duration = Duration::from_millis(100);
-/// Time for what waits of the tape at the end.
+/// Time for the waiting parts of the tape at the end.
 const TAPE_END: Duration = Duration::from_millis(200);
 
 /// Runs the service until shutdown.
@@ -219,7 +219,7 @@ fn late_because(
     ))
 }
 
-/// What a packet of a ground station is.
+/// The kind of a ground station's packet.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 enum FromGround {
     /// A command, or a change of mode.
@@ -259,7 +259,7 @@ fn send_up(node: &Node, link: &Link, kind: FromGround, packet: &[u8]) {
     }
 }
 
-/// What a packet of a ground station is that goes to the autopilot, and `None` if it does not; the flight hears it before.
+/// The kind of a ground station's packet that goes to the autopilot, and `None` if it does not; the flight receives it before.
 fn pass_up(
     node: &Node,
     flight: &mut TapedFlight,
@@ -290,7 +290,7 @@ fn pass_up(
     None
 }
 
-/// What is refused of the packets in so many bytes, if anything is.
+/// The kind of the refused packet among those in so many bytes, if one is refused.
 fn refused(permission: Permission, packets: &[Packet], bytes: usize) -> Option<&'static str> {
     // Bytes in which no packet is recognised could be any message.
     let parsed: usize = packets.iter().map(|packet| packet.raw.len()).sum();
@@ -299,7 +299,7 @@ fn refused(permission: Permission, packets: &[Packet], bytes: usize) -> Option<&
     refusal.or((!is_read).then_some("unknown message"))
 }
 
-/// The answers to the commands in refused packets, as of whom they were for: they would be given again until one comes.
+/// The answers to the commands in refused packets, in the name of their target: the commands would be repeated until an answer comes.
 fn denials(packets: &[Packet], system: Option<u8>) -> impl Iterator<Item = Vec<u8>> {
     packets.iter().filter_map(move |it| Some(GivenCommand::of(it)?.denied(system, 0, it.sender)))
 }
@@ -323,11 +323,11 @@ fn has_more_other_versions(health: &HealthCounters, so_far: &mut u64) -> bool {
     std::mem::replace(so_far, refused) < refused
 }
 
-/// Publishes the tape, once somebody listens.
+/// Publishes the tape, once there is a subscriber.
 struct Tapes {
     /// Each part with its share of the room.
     waiting: mpsc::Sender<(Tape, OwnedSemaphorePermit)>,
-    /// Room for what waits, in bytes.
+    /// Room for the waiting parts, in bytes.
     room: Arc<Semaphore>,
     publishing: JoinHandle<()>,
     passed_on_ns: i64,
@@ -343,7 +343,7 @@ impl Tapes {
         let publishing = tokio::spawn(async move {
             while let Some((tape, _share)) = tapes.recv().await {
                 while !publisher.has_subscribers().await {
-                    sleep(TAPE_PATIENCE).await;
+                    sleep(SUBSCRIBER_POLL).await;
                 }
                 publisher.publish(&tape).await;
                 if !tapes.is_empty() {
@@ -356,7 +356,7 @@ impl Tapes {
         Ok(Self { waiting, room, publishing, passed_on_ns: now_ns(), is_cut: false, health })
     }
 
-    /// Hands the tape over at its period. What finds no room is missing, which the numbers of what follows tell.
+    /// Hands the tape over at its period. Parts without room are missing, which the numbers of later parts show.
     fn pass_on(&mut self, flight: &mut TapedFlight) {
         let now = now_ns();
         let is_due = now.saturating_sub(self.passed_on_ns) >= TAPE_PERIOD_NS;
@@ -369,7 +369,7 @@ impl Tapes {
             self.health.dropped("parts of the tape");
             if !std::mem::replace(&mut self.is_cut, true) {
                 tracing::info!(
-                    "No recorder, or one that is too slow: what is recorded from now on cannot be replayed from the start"
+                    "No recorder, or one that is too slow: a recording from now on cannot be replayed from the start"
                 );
             }
         }
@@ -382,7 +382,7 @@ impl Tapes {
         share.is_ok_and(|share| self.waiting.try_send((tape, share)).is_ok())
     }
 
-    /// Publishes what waits, if somebody listens.
+    /// Publishes the waiting parts, if there is a subscriber.
     async fn end(mut self, flight: &mut TapedFlight) {
         self.passed_on_ns = i64::MIN;
         self.pass_on(flight);
@@ -449,7 +449,7 @@ impl Reports {
         }
         self.checked_ns = now;
         let mut status = flight.status(now);
-        unreadable.tell(now, &mut status);
+        unreadable.report(now, &mut status);
         if flight.system().is_none() {
             status.autopilot = instead();
         }
@@ -514,7 +514,7 @@ mod tests {
     }
 
     #[test]
-    fn commands_and_modes_of_a_ground_station_are_told_from_its_other_packets() {
+    fn commands_and_modes_of_a_ground_station_are_distinguished_from_its_other_packets() {
         let kind = |message: &MavMessage| {
             let bytes = encode(Sender { system: 255, component: 190 }, 0, message);
             FromGround::of(&Parser::new().push(&bytes))

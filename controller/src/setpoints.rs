@@ -1,6 +1,6 @@
 //! Sends the lander's actions to the autopilot: velocity setpoints at their rate, LAND and GUIDED, disarming; stops
-//! the vehicle at the end, and leads a PX4 out of OFFBOARD. Actions are sent as they are: what guidance believes is
-//! what was sent.
+//! the vehicle at the end, and leads a PX4 out of OFFBOARD. Actions are sent unchanged: the guidance assumes
+//! so.
 
 use std::time::Duration;
 

@@ -1,6 +1,6 @@
-//! Whether detectors pass on the stamps of frames as they were: what two of them give one frame of a camera, by its number.
+//! Checks that detectors pass on the stamps of frames unchanged: compares the stamps that two of them give one frame of a camera, by its number.
 //!
-//! The controller sees no frames, so it cannot tell that the only detector shifts its stamps; of two that differ it does not know which.
+//! The controller receives no frames, so it cannot detect that the only detector shifts its stamps; of two that differ it cannot determine which.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -41,7 +41,7 @@ impl Stamps {
             }
             return;
         };
-        // A camera that does not count its frames tells nothing by their numbers.
+        // The frame numbers of a camera that does not count are useless.
         let counts = *sequence > std::mem::replace(newest, *sequence);
         if !counts {
             return;
@@ -68,7 +68,7 @@ impl Stamps {
             self.differing.add_of(now_ns, "another-stamp", &format!("{first} {second}"), || {
                 format!(
                     "detectors `{first}` and `{second}` give frames of camera `{camera}` stamps that lie {:.1} ms apart, as frame {sequence}: one of them does \
-                     not pass the frame's header on unchanged (0 ms are allowed), and what it sees is taken for that of another moment; stop it, or have it copy \
+                     not pass the frame's header on unchanged (0 ms are allowed), and its markers are used as of another moment; stop it, or have it copy \
                      `header` as it came",
                     apart_ns.abs() as f64 * 1e-6
                 )
@@ -81,7 +81,7 @@ impl Stamps {
         self.newest.remove(detector);
     }
 
-    /// What the operator should know.
+    /// The warnings for the operator.
     pub fn warnings(&self, now_ns: i64) -> impl Iterator<Item = Warning> {
         self.differing.lasting(now_ns)
     }
@@ -93,8 +93,8 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    /// What is told after two seconds of two detectors, the second of which shifts its stamps.
-    fn told(shift_ms: i64, number: impl Fn(i64) -> u64) -> Vec<String> {
+    /// The warnings after two seconds of two detectors, the second of which shifts its stamps.
+    fn warnings(shift_ms: i64, number: impl Fn(i64) -> u64) -> Vec<String> {
         let mut stamps = Stamps::default();
         for i in 0..30 {
             let header = |shift_ms: i64| FrameHeader {
@@ -110,20 +110,20 @@ mod tests {
     }
 
     #[test]
-    fn two_stamps_of_one_frame_are_told_and_other_frames_are_not() {
+    fn two_stamps_of_one_frame_are_reported_and_those_of_other_frames_are_not() {
         let counted = |i: i64| i as u64;
-        let shifted = told(20, counted);
+        let shifted = warnings(20, counted);
         assert_eq!(shifted.len(), 1, "{shifted:?}");
         assert!(shifted[0].contains("`main` and `mine`") && shifted[0].contains("20.0 ms apart"));
         assert!(shifted[0].contains("0 ms are allowed") && shifted[0].contains("stop it"));
-        assert!(told(0, counted).is_empty());
+        assert!(warnings(0, counted).is_empty());
         // A camera that began anew, and one that does not count.
-        assert!(told(5000, counted).is_empty());
-        assert!(told(20, |_| 7).is_empty());
+        assert!(warnings(5000, counted).is_empty());
+        assert!(warnings(20, |_| 7).is_empty());
     }
 
     #[test]
-    fn what_is_remembered_is_bounded() {
+    fn the_memory_is_bounded() {
         let mut stamps = Stamps::default();
         for i in 0..5000_i64 {
             let header =

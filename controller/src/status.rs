@@ -16,7 +16,7 @@ use crate::mount;
 use crate::refusals::Warning;
 use crate::wire;
 
-/// What an operator must know of a vehicle that an abort does not lift.
+/// The warning of a vehicle that an abort does not lift.
 const LEFT_LOW: &str = "the vehicle is not lifted, as it may stand on the ground, and its motors run; give `land-here`, or take over and land or disarm it";
 
 /// The parts of a flight that its status shows.
@@ -39,7 +39,7 @@ pub struct View<'a> {
     pub journal: &'a Journal,
     /// The last setpoint.
     pub setpoint: Option<Setpoint>,
-    /// What was used of the detections.
+    /// The detections that were used.
     pub used: Used,
     /// Wind velocity to the north and east, in m/s.
     pub wind_ned_m_s: Option<[f64; 2]>,
@@ -75,7 +75,7 @@ impl View<'_> {
         }
     }
 
-    /// What is being done, and why.
+    /// The status: phase and reason, detectors, height, link and warnings.
     pub fn status(&self, now_ns: i64) -> ControllerStatus {
         let target = self.present_target(now_ns);
         let position = self.autopilot.state().and_then(|state| state.position);
@@ -112,7 +112,7 @@ impl View<'_> {
         }
     }
 
-    /// What the operator should know.
+    /// The warnings for the operator.
     pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
         let mut warnings = self.frames.warnings(now_ns);
         warnings.extend(self.autopilot.conflict(now_ns).map(|conflict| Warning {
@@ -183,7 +183,7 @@ impl View<'_> {
         }
     }
 
-    /// Why the autopilot's own landing gets no target: what keeps our own guidance from descending, which the autopilot cannot know.
+    /// Why the autopilot's own landing gets no target: the reason for which our own guidance would not descend, and which the autopilot does not have.
     pub fn distrust(&self) -> Option<Reason> {
         self.landing_target?;
         let checks_disputes = self.config.phases.dispute_height_m > 0.0;
@@ -262,13 +262,13 @@ impl View<'_> {
         self.frames.camera_watch.no_frame(now_ns).filter(|_| self.needs_marker())
     }
 
-    /// What the vehicle lands for where that is no marker, once the decision's own reason no longer tells it.
+    /// The cause of a landing away from the marker, once the decision's own reason no longer states it.
     fn cause(&self) -> Option<String> {
         let reason = self.lander.cause()?;
-        let is_told = self.decision.is_none_or(|decision| decision.why == reason);
-        (!is_told).then(|| match reason {
+        let is_stated = self.decision.is_none_or(|decision| decision.why == reason);
+        (!is_stated).then(|| match reason {
             Reason::OperatorLand => "the operator's command to land here".to_owned(),
-            // The full text says what a hold waits for.
+            // The full text describes a hold.
             Reason::AutopilotLost => "autopilot link lost".to_owned(),
             reason => reason.to_string(),
         })

@@ -196,7 +196,7 @@ impl TapedFlight {
         is_pending
     }
 
-    /// Handles an event of a tape as it was handled then, and writes the state where it was written then. False for what a
+    /// Handles an event of a tape as it was handled then, and writes the state where it was written then. False for events that a
     /// flight cannot handle: a second beginning, and bytes that are no packet.
     pub fn replay(&mut self, now_ns: i64, event: &TapeEvent<'_>) -> bool {
         match event {
@@ -242,7 +242,7 @@ impl TapedFlight {
         self.outgoing.pop_front()
     }
 
-    /// Size of what the tape has not given away yet, in bytes.
+    /// Size of the parts that the tape still contains, in bytes.
     pub fn waiting_bytes(&self) -> usize {
         self.writer.waiting_bytes()
     }

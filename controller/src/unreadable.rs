@@ -1,4 +1,4 @@
-//! The detectors whose detections cannot be read, as the network counts them: told in the status, beside what the flight warns of.
+//! The detectors with unreadable detections, as the network counts them: a warning in the status, next to the warnings of the flight.
 
 use std::collections::BTreeMap;
 
@@ -20,7 +20,7 @@ pub struct UnreadableDetections {
 }
 
 impl UnreadableDetections {
-    /// Takes what could not be read since the last call.
+    /// Takes the unreadable payloads since the last call.
     pub fn step(&mut self, now_ns: i64, health: &HealthCounters) {
         let Some(unreadable) = health.more_unreadable(&mut self.known) else { return };
         for Unreadable { key, count, why, .. } in unreadable {
@@ -38,10 +38,10 @@ impl UnreadableDetections {
         }
     }
 
-    /// Adds to a status what of it lasts, before what may follow from it.
-    pub fn tell(&self, now_ns: i64, status: &mut ControllerStatus) {
-        let told = self.refusals.lasting(now_ns).map(|warning| warning.text);
-        status.warnings.splice(0..0, told);
+    /// Adds the warnings that persist to a status, before the warnings of their consequences.
+    pub fn report(&self, now_ns: i64, status: &mut ControllerStatus) {
+        let texts = self.refusals.lasting(now_ns).map(|warning| warning.text);
+        status.warnings.splice(0..0, texts);
     }
 }
 
@@ -50,15 +50,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_detector_whose_detections_cannot_be_read_is_told_by_name_while_that_lasts() {
+    fn a_detector_with_unreadable_detections_is_named_while_that_persists() {
         let health = HealthCounters::default();
         let mut unreadable = UnreadableDetections::default();
-        let told = |unreadable: &UnreadableDetections, ms: i64| {
+        let warnings = |unreadable: &UnreadableDetections, ms: i64| {
             let mut status = ControllerStatus {
                 warnings: vec!["another".into()],
                 ..ControllerStatus::default()
             };
-            unreadable.tell(ms * 1_000_000, &mut status);
+            unreadable.report(ms * 1_000_000, &mut status);
             status.warnings
         };
         for ms in (0..5000).step_by(25) {
@@ -68,14 +68,14 @@ mod tests {
                 }
             }
             unreadable.step(ms * 1_000_000, &health);
-            let told = told(&unreadable, ms);
+            let warnings = warnings(&unreadable, ms);
             match ms {
                 1000..2000 => {
-                    let [first, last] = &told[..] else { panic!("{told:?}") };
+                    let [first, last] = &warnings[..] else { panic!("{warnings:?}") };
                     assert!(first.contains("`mine` cannot be read: a Detections of 9 bytes"));
                     assert_eq!(last, "another");
                 }
-                4000.. => assert_eq!(told, ["another"]),
+                4000.. => assert_eq!(warnings, ["another"]),
                 _ => {}
             }
         }

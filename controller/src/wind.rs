@@ -112,7 +112,7 @@ mod tests {
         assert_eq!(WindEstimate::default().velocity_m_s(none), None);
     }
 
-    /// What is estimated at a vehicle of this drag that moves in this wind.
+    /// The estimate for a vehicle of this drag that moves in this wind.
     fn estimated(drag: Drag, wind: [f64; 2]) -> Option<[f64; 2]> {
         let mut estimate = WindEstimate::default();
         for i in 0..1500 {

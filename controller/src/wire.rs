@@ -161,7 +161,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_that_are_not_those_of_a_marker_in_view_are_told() {
+    fn impossible_numbers_of_a_marker_are_reported() {
         assert_eq!(impossible_because(&Detection::sample()), None);
         let with = |change: &dyn Fn(&mut Transform3)| {
             let mut detection = Detection::sample();
@@ -170,8 +170,8 @@ mod tests {
         };
         let at = |place_m: [f64; 3]| with(&|pose| pose.translation_m = place_m);
         for z in [0.0, -0.0, -5.0] {
-            let told = at([0.0, 1.0, z]);
-            assert!(told.contains("behind the camera") && told.contains("1.000"), "{told}");
+            let text = at([0.0, 1.0, z]);
+            assert!(text.contains("behind the camera") && text.contains("1.000"), "{text}");
         }
         for number in [f64::NAN, f64::INFINITY, -f64::INFINITY] {
             assert!(at([number, 0.0, 5.0]).contains("place is not finite"), "{number}");

@@ -35,7 +35,7 @@ fn turned_by(heading_deg: f64) -> Sights {
 /// The pose of a marker that lies flat under a level vehicle.
 fn flat(heading_deg: f64) -> Rotation<Body, Marker> {
     let turned = Rotation::<Body, Body>::from_euler(0.0, 0.0, heading_deg.to_radians());
-    // With no turn its upper edge points forward, and what is printed on it up.
+    // With no turn its upper edge points forward, and its printed side up.
     let right = std::f64::consts::FRAC_PI_2;
     let to_body = Rotation::<Body, Marker>::from_euler(std::f64::consts::PI, 0.0, right);
     turned * to_body
@@ -62,13 +62,13 @@ fn of_two_of_which_one_takes_the_marker_for_larger_none_is_outvoted() {
             let all = [below(range_m), below(range_m * factor)];
             let [right, wrong] = [0, 1].map(|i| voters(&all)[i]);
             assert_eq!(faults(&[right, wrong], TOLERANCE), [None, None], "{range_m} {factor}");
-            let is_told = dispute(right, &[wrong], TOLERANCE).is_some();
+            let is_disputed = dispute(right, &[wrong], TOLERANCE).is_some();
             assert_eq!(
-                is_told,
+                is_disputed,
                 dispute(wrong, &[right], TOLERANCE).is_some(),
                 "{range_m} {factor}"
             );
-            assert_ne!(is_told, agree(right, wrong, TOLERANCE), "{range_m} {factor}");
+            assert_ne!(is_disputed, agree(right, wrong, TOLERANCE), "{range_m} {factor}");
         }
     }
 }
@@ -96,7 +96,7 @@ fn two_that_agree_outvote_a_third_and_not_one_that_agrees_with_either() {
 }
 
 #[test]
-fn a_detector_whose_corners_are_in_another_order_is_outvoted_by_two_and_disputed_by_one() {
+fn a_detector_with_corners_in_another_order_is_outvoted_by_two_and_disputed_by_one() {
     for wrong_deg in [90.0, 180.0, -90.0, 25.0] {
         let all = [turned_by(170.0), turned_by(-179.0), turned_by(175.0 + wrong_deg)];
         let all = voters(&all);
@@ -107,8 +107,8 @@ fn a_detector_whose_corners_are_in_another_order_is_outvoted_by_two_and_disputed
         };
         assert!((turned_rad.to_degrees() - f64::abs(wrong_deg)).abs() < 6.1, "{turned_rad}");
         assert_eq!(faults(&all[1..], TOLERANCE), [None, None]);
-        let told = dispute(all[1], &all[2..], TOLERANCE).unwrap();
-        assert!(told.turned_rad.is_some() && told.apart_m == 0.0, "{told:?}");
+        let found = dispute(all[1], &all[2..], TOLERANCE).unwrap();
+        assert!(found.turned_rad.is_some() && found.apart_m == 0.0, "{found:?}");
         assert!(!agree(all[1], all[2], TOLERANCE));
         // Where the vehicle does not turn to the marker nothing comes of it.
         assert_eq!(faults(&all, OF_PLACES), [None, None, None]);
@@ -118,7 +118,7 @@ fn a_detector_whose_corners_are_in_another_order_is_outvoted_by_two_and_disputed
 }
 
 #[test]
-fn of_two_that_differ_in_place_alone_no_turn_is_told() {
+fn of_two_that_differ_in_position_alone_no_turn_is_reported() {
     let all = [below(5.0), below(7.0)];
     let all = voters(&all);
     assert_eq!(dispute(all[0], &all[1..], TOLERANCE).unwrap().turned_rad, None);
@@ -171,7 +171,7 @@ fn seen(range_m: f64) -> impl Strategy<Value = Sight> {
     })
 }
 
-/// What a detector saw: the marker about a place, without a place, or nothing, in some of the frames.
+/// The sights of a detector: the marker about a place, without a place, or nothing, in some of the frames.
 fn sights(range_m: f64) -> impl Strategy<Value = Sights> {
     let sight = prop_oneof![
         6 => seen(range_m).prop_map(Some),
@@ -193,13 +193,13 @@ fn several() -> impl Strategy<Value = Vec<Sights>> {
 
 proptest! {
     #[test]
-    fn of_two_nobody_is_ever_outvoted(one in position(), other in position()) {
+    fn of_two_none_is_ever_outvoted(one in position(), other in position()) {
         let all = [steady(one), steady(other)];
         prop_assert_eq!(faults(&voters(&all), TOLERANCE), [None, None]);
     }
 
     #[test]
-    fn of_two_whatever_they_see_nobody_is_ever_outvoted(all in several()) {
+    fn of_two_none_is_ever_outvoted_whatever_they_see(all in several()) {
         let found = faults(&voters(&all[..2]), TOLERANCE);
         prop_assert!(!found.iter().any(|fault| is_outvoted(fault.as_ref())), "{:?}", found);
     }
@@ -221,7 +221,7 @@ proptest! {
     }
 
     #[test]
-    fn whom_others_outvote_differs_from_at_least_two_that_agree(all in several()) {
+    fn an_outvoted_one_differs_from_at_least_two_that_agree(all in several()) {
         let voters = voters(&all);
         let found = faults(&voters, TOLERANCE);
         for (voter, fault) in voters.iter().zip(&found) {
@@ -246,7 +246,7 @@ proptest! {
     }
 
     #[test]
-    fn the_two_poses_of_a_tilt_that_cannot_be_told_have_one_heading(
+    fn the_two_poses_of_an_ambiguous_tilt_have_one_heading(
         heading_deg in -180.0..180.0_f64, other_deg in -180.0..180.0_f64,
         aside in 0.0..0.7_f64, about in -3.2..3.2_f64,
     ) {
@@ -271,7 +271,7 @@ proptest! {
     }
 
     #[test]
-    fn who_is_outvoted_does_not_depend_on_the_order(all in several()) {
+    fn the_outvoted_one_does_not_depend_on_the_order(all in several()) {
         let mut voters = voters(&all);
         let outvoted = |voters: &[Voter<'_>]| {
             let found = faults(voters, TOLERANCE);

@@ -40,7 +40,7 @@ fn a_landing_begins_only_once_attitude_and_position_are_known() {
 }
 
 #[test]
-fn the_pilots_mode_change_stops_the_setpoints_for_good() {
+fn the_pilots_mode_change_stops_the_setpoints_permanently() {
     let mut flight = in_flight("airborne");
     pose(&mut flight, 30 * MS);
     flight.tick(31 * MS);
@@ -55,7 +55,7 @@ fn the_pilots_mode_change_stops_the_setpoints_for_good() {
     assert_eq!(sent(&mut flight), (0, vec![]));
 }
 
-/// Attitude alone, as an autopilot sends it whose position is lost.
+/// Attitude alone, as from an autopilot that has lost its position.
 fn turn(flight: &mut Flight, now_ns: i64) {
     let time_boot_ms = (now_ns / MS) as u32;
     let attitude = ATTITUDE_DATA { time_boot_ms, ..Default::default() };
@@ -183,7 +183,7 @@ fn hover_at(flight: &mut Flight, from_ms: i64, to_ms: i64, mode: u32, height_m: 
 }
 
 #[test]
-fn an_aborted_vehicle_that_may_stand_is_reported_with_its_motors_and_what_to_do() {
+fn an_aborted_vehicle_that_may_stand_is_reported_with_its_motors_and_the_remedy() {
     let mut flight = in_flight("airborne");
     flight.presence(0, "main", true);
     flight.camera(0, CameraInfo::sample());
@@ -327,7 +327,7 @@ fn a_frame_from_the_future_does_not_shut_out_those_of_now() {
         ..Detections::sample()
     };
     for stamp_ns in [i64::MAX, now_ns + 10_000 * MS, now_ns + 60 * MS] {
-        assert!(flight.detections(now_ns, "main", &seen(stamp_ns)), "the target is told");
+        assert!(flight.detections(now_ns, "main", &seen(stamp_ns)), "the target is published");
         assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("from-the-future"));
     }
     for stamp_ns in [i64::MIN, now_ns - 1] {
@@ -384,7 +384,7 @@ fn precision_landing_gets_the_target_and_no_setpoint() {
     assert_eq!(status.guidance, "landing-target");
 }
 
-/// The autopilot cannot know what keeps our own guidance from descending.
+/// The autopilot has no information about the reasons for which our own guidance would not descend.
 #[test]
 fn no_landing_target_is_sent_while_two_detectors_see_the_marker_at_two_places() {
     for lie_m in [0.0, 1.0] {
@@ -415,7 +415,7 @@ fn no_landing_target_is_sent_while_two_detectors_see_the_marker_at_two_places() 
 }
 
 #[test]
-fn a_precision_landing_that_is_off_is_reported_with_what_to_set() {
+fn a_precision_landing_that_is_off_is_reported_with_the_parameters_to_set() {
     let mut flight = landing_target("command");
     let requested = hover(&mut flight, 1000, 1500, 4).requested;
     assert!(requested.iter().any(|name| name == "PLND_ENABLED"), "{requested:?}");
@@ -470,7 +470,7 @@ fn an_abort_while_land_is_asked_for_takes_the_autopilot_back_from_it() {
     }
 }
 
-/// What is sent in this mode, without a marker, from one height to another.
+/// The packets that are sent in this mode, without a marker, from one height to another.
 fn sent_at(
     flight: &mut Flight,
     mode: u32,
@@ -529,7 +529,7 @@ fn low_over_the_ground_the_autopilot_is_not_taken_back_from_its_precision_landin
 }
 
 #[test]
-fn a_vehicle_that_takes_what_called_it_back_climbs_also_where_it_has_become_low() {
+fn a_vehicle_that_follows_a_late_recall_climbs_also_where_it_has_become_low() {
     let mut flight = in_flight("airborne");
     hover(&mut flight, 20, 1000, 4);
     assert!(flight.command(1000 * MS, &ControllerCommand::LandHere).accepted);
@@ -560,7 +560,7 @@ fn a_vehicle_that_is_called_back_from_land_is_left_to_it_low_over_the_ground() {
 }
 
 #[test]
-fn a_start_is_refused_while_all_detections_are_and_the_reason_is_told() {
+fn a_start_is_refused_with_the_reason_while_all_detections_are() {
     let mut flight = in_flight_with("command", &["autopilot.timesync=false"]);
     flight.camera(0, CameraInfo::sample());
     let foreign = |stamp_ns| Detections {
@@ -575,8 +575,8 @@ fn a_start_is_refused_while_all_detections_are_and_the_reason_is_told() {
         flight.tick(ms * MS + 3);
     }
     let status = flight.status(1600 * MS);
-    let told = status.warnings.join("; ");
-    assert!(told.contains("monotonic/myhost") && told.contains(clock_name()), "{told}");
+    let warnings = status.warnings.join("; ");
+    assert!(warnings.contains("monotonic/myhost") && warnings.contains(clock_name()), "{warnings}");
     let reply = flight.command(1600 * MS, &ControllerCommand::Start);
     assert!(!reply.accepted && reply.reason.contains("monotonic/myhost"), "{reply:?}");
     // With the right clock nothing is in the way any more.
@@ -587,13 +587,13 @@ fn a_start_is_refused_while_all_detections_are_and_the_reason_is_told() {
 }
 
 #[test]
-fn what_is_told_of_refused_detections_has_the_value_its_limit_and_what_to_do() {
+fn a_warning_of_refused_detections_has_the_value_its_limit_and_the_remedy() {
     let of = |camera: &str, ahead_ms: i64, detector: &str, ms: i64| Detections {
         header: FrameHeader { camera: camera.into(), ..header((ms + ahead_ms) * MS) },
         detector: detector.into(),
         ..Detections::sample()
     };
-    for (camera, ahead_ms, detector, told) in [
+    for (camera, ahead_ms, detector, parts) in [
         (
             "down",
             300,
@@ -611,13 +611,13 @@ fn what_is_told_of_refused_detections_has_the_value_its_limit_and_what_to_do() {
             flight.tick(ms * MS + 3);
         }
         let warnings = flight.status(1600 * MS).warnings;
-        let has_all = |text: &String| told.iter().all(|part| text.contains(part));
-        assert!(warnings.iter().any(has_all), "{told:?}: {warnings:?}");
+        let has_all = |text: &String| parts.iter().all(|part| text.contains(part));
+        assert!(warnings.iter().any(has_all), "{parts:?}: {warnings:?}");
     }
 }
 
 #[test]
-fn a_detector_that_puts_the_marker_where_none_can_be_is_refused_told_and_passed_over() {
+fn a_detector_with_an_impossible_marker_is_refused_reported_and_passed_over() {
     for place_m in [[0.0, 0.0, -5.0], [0.0, 0.0, 1e9], [f64::NAN, 0.0, 5.0]] {
         let health = Arc::<HealthCounters>::default();
         let mut flight = flight_counting("airborne", &["detectors.preferred=mine"], &health);
@@ -691,7 +691,7 @@ fn landing_here_needs_neither_detections_nor_a_landing() {
     let (reply, asked, phase) = land_here(&mut flight, 9000);
     assert!(reply.accepted, "{reply:?}");
     assert_eq!((asked.contains(&9.0), phase), (true, Phase::Final), "{asked:?}");
-    // Against a pilot it is refused, and what was going on goes on.
+    // Against a pilot it is refused, and the present state continues.
     let mut flight = in_flight("airborne");
     receive(&mut flight, 2 * MS, &heartbeat(5, true));
     pose(&mut flight, 20 * MS);
@@ -704,7 +704,7 @@ fn landing_here_needs_neither_detections_nor_a_landing() {
 }
 
 #[test]
-fn a_strangers_calibration_is_refused_in_flight_and_told() {
+fn the_calibration_of_another_program_is_refused_in_flight_and_reported() {
     let mut flight = in_flight("airborne");
     flight.camera(0, CameraInfo::sample());
     flight.presence(0, "main", true);
@@ -761,8 +761,8 @@ fn while_two_detectors_see_the_marker_at_two_places_nothing_descends_near_the_gr
 }
 
 #[test]
-fn a_marker_of_another_size_than_configured_is_told_and_holds() {
-    for (size, is_told) in [(1.0, false), (2.0, true)] {
+fn a_marker_of_another_size_than_configured_is_reported_and_holds() {
+    for (size, is_expected) in [(1.0, false), (2.0, true)] {
         let mut flight = flight("airborne");
         flight.camera(0, CameraInfo::sample());
         flight.presence(0, "main", true);
@@ -786,13 +786,13 @@ fn a_marker_of_another_size_than_configured_is_told_and_holds() {
         let status = flight.status(6000 * MS);
         let text = "the marker seems 2.0 times as large as configured";
         let is_warned = status.warnings.iter().any(|warning| warning.contains(text));
-        assert_eq!(is_warned, is_told, "{status:?}");
-        assert_eq!(status.phase == Phase::Hold, is_told, "{status:?}");
-        assert_eq!(status.why.contains("check the size of the printed marker"), is_told);
+        assert_eq!(is_warned, is_expected, "{status:?}");
+        assert_eq!(status.phase == Phase::Hold, is_expected, "{status:?}");
+        assert_eq!(status.why.contains("check the size of the printed marker"), is_expected);
     }
 }
 
-/// What was seen of it while the pilot flew counts.
+/// Frames from the pilot's flight count.
 #[test]
 fn a_landing_on_a_marker_that_was_seen_to_be_of_another_size_does_not_descend() {
     let mut flight = flight("command");
@@ -870,7 +870,7 @@ fn a_detector_with_another_first_corner_counts_where_the_vehicle_turns_to_the_pa
 }
 
 #[test]
-fn a_low_battery_leads_to_what_is_configured() {
+fn a_low_battery_leads_to_the_configured_reaction() {
     let set = ["phases.on_battery_low=\"hold\"", "alarms.battery_s=1"];
     let mut flight = flight_with("airborne", &set);
     receive(&mut flight, 0, &heartbeat(4, true));
@@ -889,8 +889,10 @@ fn warns_of_link_delay(flight: &Flight, now_ns: i64) -> bool {
 }
 
 #[test]
-fn a_link_whose_delay_is_not_known_counts_as_slow_and_is_told_of() {
-    for (set, is_told) in [("autopilot.timesync=true", true), ("autopilot.timesync=false", false)] {
+fn a_link_of_unknown_delay_counts_as_slow_and_is_reported() {
+    for (set, is_expected) in
+        [("autopilot.timesync=true", true), ("autopilot.timesync=false", false)]
+    {
         let mut flight = flight_with("airborne", &[set]);
         flight.presence(0, "main", true);
         flight.camera(0, CameraInfo::sample());
@@ -900,13 +902,13 @@ fn a_link_whose_delay_is_not_known_counts_as_slow_and_is_told_of() {
         hover(&mut flight, 20, 2500, 4);
         assert!(!warns(&flight, 2500) && flight.link_delay_s() < 0.01, "it may still answer");
         hover(&mut flight, 2500, 6000, 4);
-        assert_eq!(warns(&flight, 6000), is_told, "{set}");
+        assert_eq!(warns(&flight, 6000), is_expected, "{set}");
         assert!((flight.link_delay_s() - 0.3).abs() < 0.01, "{set}: {}", flight.link_delay_s());
     }
 }
 
 #[test]
-fn a_delay_that_is_not_known_any_more_is_taken_for_what_it_was_for_a_while() {
+fn the_last_known_delay_is_assumed_for_a_while() {
     let mut flight = flight("airborne");
     receive(&mut flight, 0, &heartbeat(4, true));
     receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
@@ -934,14 +936,17 @@ fn a_delay_that_is_not_known_any_more_is_taken_for_what_it_was_for_a_while() {
             let answer = TIMESYNC_DATA { tc1: (asked_ms + 200) * MS, ..question };
             receive(&mut flight, now_ns, &MavMessage::TIMESYNC(answer));
         }
-        // The age of positions tells it for 30 s more, and 10 s later it counts as not known.
-        let (delay_s, is_told) = (flight.link_delay_s(), warns_of_link_delay(&flight, now_ns));
+        // The age of positions shows it for 30 s more, and 10 s later it counts as not known.
+        let (delay_s, is_reported) = (flight.link_delay_s(), warns_of_link_delay(&flight, now_ns));
         match ms {
             5000..44_000 => {
-                assert!(!is_told && (0.15..0.25).contains(&delay_s), "after {ms} ms: {delay_s} s");
+                assert!(
+                    !is_reported && (0.15..0.25).contains(&delay_s),
+                    "after {ms} ms: {delay_s} s"
+                );
             }
             47_000.. => {
-                assert!(is_told && (delay_s - 0.3).abs() < 0.01, "after {ms} ms: {delay_s} s");
+                assert!(is_reported && (delay_s - 0.3).abs() < 0.01, "after {ms} ms: {delay_s} s");
             }
             _ => {}
         }
@@ -949,7 +954,7 @@ fn a_delay_that_is_not_known_any_more_is_taken_for_what_it_was_for_a_while() {
 }
 
 #[test]
-fn a_link_that_was_unsteady_is_not_taken_for_a_slow_one_for_good() {
+fn a_link_that_was_unsteady_is_not_taken_for_a_slow_one_permanently() {
     let mut flight = flight("airborne");
     receive(&mut flight, 0, &heartbeat(4, true));
     receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
@@ -1023,17 +1028,17 @@ fn no_landing_begins_where_another_vehicle_or_another_controller_is_on_the_link(
         flight.camera(0, CameraInfo::sample());
         flight
     };
-    for (sender, message, told) in others() {
+    for (sender, message, text) in others() {
         // By command.
         let mut flight = unpinned("command");
         receive_from(&mut flight, 2 * MS, sender, &message);
         hover(&mut flight, 20, 3000, 4);
         for command in [ControllerCommand::Start, ControllerCommand::LandHere] {
             let reply = flight.command(3000 * MS, &command);
-            assert!(!reply.accepted && reply.reason.contains(told), "{reply:?}");
+            assert!(!reply.accepted && reply.reason.contains(text), "{reply:?}");
         }
         let status = flight.status(3001 * MS);
-        assert!(status.warnings.iter().any(|it| it.contains(told)), "{:?}", status.warnings);
+        assert!(status.warnings.iter().any(|it| it.contains(text)), "{:?}", status.warnings);
         assert_eq!(hover(&mut flight, 3020, 3500, 4).setpoints, 0);
         // By itself.
         for start in ["airborne", "resume", "takeoff"] {
@@ -1044,7 +1049,7 @@ fn no_landing_begins_where_another_vehicle_or_another_controller_is_on_the_link(
             assert!(asked.setpoints == 0 && asked.modes.is_empty(), "{start}: {asked:?}");
             let status = flight.status(3000 * MS);
             assert!(matches!(status.phase, Phase::Idle | Phase::Failed), "{start}: {status:?}");
-            assert!(status.why.contains(told), "{start}: {}", status.why);
+            assert!(status.why.contains(text), "{start}: {}", status.why);
         }
     }
     // A landing that goes on is not ended.
@@ -1055,7 +1060,7 @@ fn no_landing_begins_where_another_vehicle_or_another_controller_is_on_the_link(
         assert!(hover(&mut flight, 3000, 4000, 4).setpoints > 10);
     }
     // Nor is the vehicle that it has flown kept from landing where it is, and, beside another vehicle, from beginning anew.
-    for (number, (sender, message, told)) in others().into_iter().enumerate() {
+    for (number, (sender, message, text)) in others().into_iter().enumerate() {
         let mut flight = unpinned("airborne");
         hover(&mut flight, 20, 3000, 4);
         receive_from(&mut flight, 3000 * MS, sender, &message);
@@ -1064,7 +1069,7 @@ fn no_landing_begins_where_another_vehicle_or_another_controller_is_on_the_link(
         hover(&mut flight, 3520, 10_000, 4);
         assert_eq!(flight.status(10_000 * MS).phase, Phase::Aborted);
         let again = flight.command(10_000 * MS, &ControllerCommand::Start);
-        assert_eq!(again.reason.contains(told), number == 1, "{again:?}");
+        assert_eq!(again.reason.contains(text), number == 1, "{again:?}");
         let here = flight.command(10_020 * MS, &ControllerCommand::LandHere);
         assert!(here.accepted, "{here:?}");
     }
@@ -1078,14 +1083,14 @@ fn no_landing_begins_where_another_vehicle_or_another_controller_is_on_the_link(
 }
 
 #[test]
-fn no_landing_begins_by_itself_before_another_vehicle_would_have_been_heard() {
-    let [(other, of_other, told), _] = others();
+fn no_landing_begins_automatically_before_packets_of_another_vehicle_would_arrive() {
+    let [(other, of_other, text), _] = others();
     for start in ["airborne", "resume"] {
         for is_alone in [true, false] {
             let mut flight = in_flight_with(start, &["autopilot.system_id=0"]);
             flight.camera(0, CameraInfo::sample());
             flight.presence(0, "main", true);
-            // What is resumed is stopped at once.
+            // A resumed landing is stopped at once.
             sent(&mut flight);
             assert_eq!(hover(&mut flight, 20, 900, 4).setpoints, 0);
             let status = flight.status(900 * MS);
@@ -1099,14 +1104,14 @@ fn no_landing_begins_by_itself_before_another_vehicle_would_have_been_heard() {
             let sent = hover(&mut flight, 2500, 4000, 4);
             assert_eq!(sent.setpoints > 10, is_alone, "{start}: {sent:?}");
             let status = flight.status(4000 * MS);
-            assert_eq!(status.why.contains(told), !is_alone, "{status:?}");
+            assert_eq!(status.why.contains(text), !is_alone, "{status:?}");
         }
     }
 }
 
 #[test]
-fn a_landing_is_resumed_with_its_own_vehicle_beside_another_one() {
-    let [(other, of_other, told), _] = others();
+fn a_landing_is_resumed_with_its_own_vehicle_although_another_one_is_present() {
+    let [(other, of_other, text), _] = others();
     let on_ground = contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND);
     for landed in [None, Some(1)] {
         let mut config = config("resume", &["autopilot.system_id=0"]);
@@ -1114,15 +1119,15 @@ fn a_landing_is_resumed_with_its_own_vehicle_beside_another_one() {
         let mut flight = Flight::new(config, Arc::default()).unwrap();
         flight.presence(0, "main", true);
         assert_eq!(flight.landed_system(), landed, "it is to be resumed");
-        // The other one is heard first.
+        // A packet of the other one arrives first.
         receive_from(&mut flight, 0, other, &of_other);
         receive(&mut flight, MS, &heartbeat(4, true));
         receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
         let sent = hover(&mut flight, 20, 5000, 4);
         let status = flight.status(5000 * MS);
         if landed.is_none() {
-            let is_told = ["system ids 2 and 1", told].iter().any(|it| status.why.contains(it));
-            assert!(status.phase == Phase::Idle && is_told, "{status:?}");
+            let is_reported = ["system ids 2 and 1", text].iter().any(|it| status.why.contains(it));
+            assert!(status.phase == Phase::Idle && is_reported, "{status:?}");
             continue;
         }
         assert!(status.phase == Phase::Search && sent.setpoints > 50, "{status:?} {sent:?}");
@@ -1134,7 +1139,7 @@ fn a_landing_is_resumed_with_its_own_vehicle_beside_another_one() {
         flight.tick(5030 * MS);
         assert_eq!(flight.landed_system(), None, "{:?}", flight.status(5030 * MS));
     }
-    // Who is pinned stays so, and no other start takes over what was landed.
+    // A pinned vehicle stays pinned, and no other start takes over a landing.
     for (start, set, pinned) in
         [("resume", "autopilot.system_id=3", 3), ("airborne", "autopilot.system_id=0", 0)]
     {
@@ -1156,8 +1161,8 @@ fn a_landing_begins_once_the_other_controller_has_ended() {
 }
 
 #[test]
-fn a_landing_for_an_alarm_or_a_command_tells_why_until_after_it() {
-    let told = |set: &[&str], begin: &dyn Fn(&mut Flight)| {
+fn a_landing_for_an_alarm_or_a_command_shows_the_reason_until_after_it() {
+    let reasons = |set: &[&str], begin: &dyn Fn(&mut Flight)| {
         let mut flight = flight_with("airborne", set);
         receive(&mut flight, 0, &heartbeat(4, true));
         receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
@@ -1179,13 +1184,14 @@ fn a_landing_for_an_alarm_or_a_command_tells_why_until_after_it() {
         let battery = SYS_STATUS_DATA { voltage_battery: 12_600, ..Default::default() };
         receive(flight, 2000 * MS, &MavMessage::SYS_STATUS(battery));
     };
-    let (landing, landed) = told(&["alarms.battery_critical_v=13", "alarms.battery_s=0.1"], &empty);
+    let (landing, landed) =
+        reasons(&["alarms.battery_critical_v=13", "alarms.battery_s=0.1"], &empty);
     assert_eq!(landing, "the battery is nearly empty: the autopilot is landing");
     assert_eq!(landed, "on the ground, disarmed: the battery is nearly empty");
     let command = |flight: &mut Flight| {
         assert!(flight.command(2000 * MS, &ControllerCommand::LandHere).accepted);
     };
-    let (landing, landed) = told(&[], &command);
+    let (landing, landed) = reasons(&[], &command);
     assert_eq!(landing, "the operator's command to land here: the autopilot is landing");
     assert_eq!(landed, "on the ground, disarmed: the operator's command to land here");
 }
@@ -1203,12 +1209,13 @@ fn detector_info(detector: &str, camera: &str) -> DetectorInfo {
 }
 
 #[test]
-fn a_camera_that_sends_nothing_is_told_of_and_its_detectors_are_not_said_to_have_gone() {
+fn a_camera_without_frames_is_reported_and_its_detectors_are_not_reported_as_gone() {
     let mut flight = in_flight_with("airborne", &["autopilot.timesync=false"]);
     hover(&mut flight, 1000, 3000, 4);
     let info = detector_info("main", "down");
-    let told = |status: &ControllerStatus| status.warnings.iter().any(|it| it.contains("no frame"));
-    // The frames end; the detector goes on telling about itself. After a minute the selection forgets it.
+    let is_reported =
+        |status: &ControllerStatus| status.warnings.iter().any(|it| it.contains("no frame"));
+    // The frames end; the detector continues to publish its information. After a minute the selection forgets it.
     for ms in (3000..80_000).step_by(20) {
         let now_ns = ms * MS;
         if ms % 1000 == 0 {
@@ -1221,28 +1228,28 @@ fn a_camera_that_sends_nothing_is_told_of_and_its_detectors_are_not_said_to_have
         let gone = ["gone", "no detector is alive"];
         assert!(!gone.iter().any(|it| status.why.contains(it)), "{status:?}");
         assert!(!status.detector_why.contains("gone"), "{status:?}");
-        assert_eq!(told(&status), ms >= 4940, "after {ms} ms: {status:?}");
+        assert_eq!(is_reported(&status), ms >= 4940, "after {ms} ms: {status:?}");
         if ms == 16_000 {
-            let text = "no frame from camera `down` for 13 s: check the camera, and whether its detector hangs or sends what cannot be read";
+            let text = "no frame from camera `down` for 13 s: check the camera, and whether its detector hangs or sends unreadable messages";
             assert_eq!(status.warnings, [text]);
             assert!(status.why.ends_with(text), "{}", status.why);
         }
     }
-    // One that has gone is told as before.
+    // One that has gone is reported as before.
     flight.presence(80_000 * MS, "main", false);
     flight.tick(80_001 * MS);
     let status = flight.status(80_001 * MS);
-    assert!(!told(&status), "{status:?}");
+    assert!(!is_reported(&status), "{status:?}");
     assert_eq!(status.why, "no detector is alive, nothing descends");
 }
 
 #[test]
-fn a_camera_that_sends_nothing_is_told_of_beside_one_that_does() {
+fn a_camera_without_frames_is_reported_next_to_one_with_frames() {
     let mut flight = in_flight("airborne");
     let (main, other) = (detector_info("main", "down"), detector_info("other", "wide"));
     let dead = |s: i64| {
         format!(
-            "no frame from camera `wide` for {s} s: check the camera, and whether its detector hangs or sends what cannot be read"
+            "no frame from camera `wide` for {s} s: check the camera, and whether its detector hangs or sends unreadable messages"
         )
     };
     for s in 1..40 {
@@ -1252,7 +1259,7 @@ fn a_camera_that_sends_nothing_is_told_of_beside_one_that_does() {
         let (since, is_there) = match s {
             // The other camera takes more than ten seconds to start.
             3..18 => (3, true),
-            // Its detector ends and comes back: nothing tells of the camera, and it has time to start again.
+            // Its detector ends and returns: nothing shows the camera, and it has time to start again.
             24..40 => (24, s < 36),
             _ => (s, false),
         };
@@ -1264,10 +1271,10 @@ fn a_camera_that_sends_nothing_is_told_of_beside_one_that_does() {
         }
         let status = flight.status(now_ns);
         let silence_s = s - since;
-        // A detector that tells nothing for three and a half seconds is not there.
+        // A detector without a message for three and a half seconds is not present.
         let is_forgotten = s >= 39;
-        let is_told = silence_s > 10 && !is_forgotten;
-        let expected: Vec<_> = is_told.then(|| dead(silence_s)).into_iter().collect();
+        let is_reported = silence_s > 10 && !is_forgotten;
+        let expected: Vec<_> = is_reported.then(|| dead(silence_s)).into_iter().collect();
         let warnings: Vec<_> =
             status.warnings.iter().filter(|it| it.contains("no frame")).collect();
         assert_eq!(warnings, expected.iter().collect::<Vec<_>>(), "after {s} s: {status:?}");
@@ -1276,8 +1283,8 @@ fn a_camera_that_sends_nothing_is_told_of_beside_one_that_does() {
 }
 
 #[test]
-fn a_landing_on_centres_without_poses_is_refused_with_its_reason_and_one_under_way_tells_it() {
-    for (start, guidance, is_told) in
+fn a_landing_on_centres_without_poses_is_refused_with_its_reason_and_one_under_way_shows_it() {
+    for (start, guidance, is_expected) in
         [("command", "metric", true), ("airborne", "metric", true), ("command", "thesis", false)]
     {
         let mut flight = flight_with(start, &[&format!("guidance=\"{guidance}\"")]);
@@ -1298,13 +1305,13 @@ fn a_landing_on_centres_without_poses_is_refused_with_its_reason_and_one_under_w
         }
         let now_ns = 3000 * MS;
         let status = flight.status(now_ns);
-        let told = "`main` gives no pose";
-        assert_eq!(status.warnings.iter().any(|it| it.contains(told)), is_told, "{status:?}");
+        let text = "`main` gives no pose";
+        assert_eq!(status.warnings.iter().any(|it| it.contains(text)), is_expected, "{status:?}");
         if start == "airborne" {
-            assert!(status.why.contains(told), "{}: {}", status.phase, status.why);
+            assert!(status.why.contains(text), "{}: {}", status.phase, status.why);
         } else {
             let reply = flight.command(now_ns, &ControllerCommand::Start);
-            assert_eq!(!reply.accepted && reply.reason.contains(told), is_told, "{reply:?}");
+            assert_eq!(!reply.accepted && reply.reason.contains(text), is_expected, "{reply:?}");
         }
     }
 }
@@ -1335,7 +1342,7 @@ fn first_frames_without_poses_are_no_warning() {
     }
 }
 
-/// What a detector tells that looks for these markers.
+/// The information of a detector that looks for these markers.
 fn looking_for(detector: &str, markers: &[&str]) -> DetectorInfo {
     let markers = markers.iter().map(|it| (*it).to_owned()).collect();
     DetectorInfo { markers, ..detector_info(detector, "down") }
@@ -1344,7 +1351,7 @@ fn looking_for(detector: &str, markers: &[&str]) -> DetectorInfo {
 #[test]
 fn a_landing_on_a_marker_that_no_detector_looks_for_is_refused_and_no_motor_started() {
     let other = ["aruco-4x4-50:7:0.15"];
-    let told = "no detector looks for the landing's marker rings: `main` looks for aruco-4x4-50:7";
+    let text = "no detector looks for the landing's marker rings: `main` looks for aruco-4x4-50:7";
     let start = |infos: &[DetectorInfo], sees: bool| {
         let mut flight = in_flight("command");
         flight.camera(0, CameraInfo::sample());
@@ -1359,18 +1366,18 @@ fn a_landing_on_a_marker_that_no_detector_looks_for_is_refused_and_no_motor_star
             flight.detections(ms * MS + 2, "main", if sees { &seen } else { &none });
             flight.tick(ms * MS + 3);
         }
-        let warned = flight.status(1000 * MS).warnings.iter().any(|it| it.contains(told));
+        let warned = flight.status(1000 * MS).warnings.iter().any(|it| it.contains(text));
         let reply = flight.command(1000 * MS, &ControllerCommand::Start);
         assert_eq!(!reply.accepted, warned, "{reply:?}");
-        assert!(reply.accepted || reply.reason.contains(told), "{reply:?}");
+        assert!(reply.accepted || reply.reason.contains(text), "{reply:?}");
         reply.accepted
     };
     let main = looking_for("main", &other);
     assert!(!start(std::slice::from_ref(&main), false));
     assert!(!start(&[main.clone(), looking_for("spare", &other)], false));
     assert!(start(&[main.clone(), looking_for("spare", &["rings:0.15"])], false));
-    assert!(start(&[main.clone(), looking_for("mine", &[])], false), "one tells nothing");
-    assert!(start(&[], false), "it tells nothing of itself");
+    assert!(start(&[main.clone(), looking_for("mine", &[])], false), "one states no markers");
+    assert!(start(&[], false), "it publishes no information");
     assert!(start(std::slice::from_ref(&main), true), "it sees the marker all the same");
 
     for (markers, is_armed) in [(&other, false), (&["rings:0.15341"], true)] {
@@ -1407,7 +1414,7 @@ fn a_landing_on_a_marker_that_no_detector_looks_for_is_refused_and_no_motor_star
         let arms = commands.contains(&MavCmd::MAV_CMD_COMPONENT_ARM_DISARM);
         let status = flight.status(20_000 * MS);
         assert_eq!(arms, is_armed, "{commands:?}, {}", status.why);
-        assert_eq!(status.why.contains(told), !is_armed, "{status:?}");
+        assert_eq!(status.why.contains(text), !is_armed, "{status:?}");
         assert!(is_armed || status.phase == Phase::Takeoff, "{status:?}");
     }
 }
@@ -1458,11 +1465,11 @@ fn a_takeoff_that_waits_for_a_detector_asks_for_no_motors_and_its_time_stands_st
             stand(&mut flight, ms, 4, asks_first);
             ms += 20;
             let status = flight.status(ms * MS);
-            let is_told = status.why.contains("no detector looks for the landing's marker");
-            assert!(status.phase == Phase::Takeoff && is_told, "{status:?}");
+            let is_shown = status.why.contains("no detector looks for the landing's marker");
+            assert!(status.phase == Phase::Takeoff && is_shown, "{status:?}");
             assert_eq!(arms(&mut flight), 0, "at {ms} ms");
         }
-        // It is there: what was left of the time is left still, and the motors are asked for.
+        // It is there: the remaining time has not changed, and the motors are requested.
         look(&mut flight, ms, "rings:0.15341");
         let until_ms = ms + 60_000;
         let mut asked = 0;
@@ -1478,7 +1485,7 @@ fn a_takeoff_that_waits_for_a_detector_asks_for_no_motors_and_its_time_stands_st
 
 #[test]
 fn other_markers_that_are_seen_instead_of_the_landings_are_named() {
-    let told = "`main` sees aruco-4x4-50:3, pad:2 and not the landing's marker aruco-4x4-50:7";
+    let text = "`main` sees aruco-4x4-50:3, pad:2 and not the landing's marker aruco-4x4-50:7";
     let seen_as = |ms: i64, id: u32| {
         let mut seen = seen(ms * MS - 40 * MS);
         let found = seen.detections.remove(0);
@@ -1501,12 +1508,12 @@ fn other_markers_that_are_seen_instead_of_the_landings_are_named() {
         }
         flight.tick(ms * MS + 3);
         let status = flight.status(ms * MS + 3);
-        let is_told = status.warnings.iter().any(|it| it.contains(told));
-        let says_why = status.why.contains(told);
+        let is_reported = status.warnings.iter().any(|it| it.contains(text));
+        let says_why = status.why.contains(text);
         match ms {
-            ..2000 => assert!(!is_told && !says_why, "{ms}: {status:?}"),
-            2200..4000 => assert!(is_told && says_why, "{ms}: {status:?}"),
-            4100.. => assert!(!is_told && !says_why, "{ms}: {status:?}"),
+            ..2000 => assert!(!is_reported && !says_why, "{ms}: {status:?}"),
+            2200..4000 => assert!(is_reported && says_why, "{ms}: {status:?}"),
+            4100.. => assert!(!is_reported && !says_why, "{ms}: {status:?}"),
             _ => {}
         }
     }
@@ -1598,7 +1605,7 @@ fn after_a_pilots_landing_the_next_flight_is_landed() {
 }
 
 #[test]
-fn only_a_resumed_landing_begins_by_itself() {
+fn only_a_resumed_landing_begins_automatically() {
     let next_flight = |start: &str, mode: u32, contact_at_start: MavLandedState, armed_ms: i64| {
         let mut flight = flight(start);
         flight.presence(0, "main", true);
@@ -1634,7 +1641,7 @@ fn only_a_resumed_landing_begins_by_itself() {
 }
 
 #[test]
-fn a_pilot_who_arms_again_at_once_after_a_landing_has_the_next_flight_landed() {
+fn arming_again_right_after_a_landing_has_the_next_flight_landed() {
     let mut flight = in_flight("airborne");
     let phase_at = |flight: &mut Flight, from_ms: i64, to_ms: i64| {
         for ms in (from_ms..to_ms).step_by(20) {
@@ -1655,7 +1662,7 @@ fn a_pilot_who_arms_again_at_once_after_a_landing_has_the_next_flight_landed() {
 
 #[test]
 fn a_pilot_ends_the_wait_of_a_vehicle_that_took_off_for_its_landing() {
-    for (mode, armed, told) in [(5, true, "the pilot took over, in LOITER"), (4, false, "stopped")]
+    for (mode, armed, text) in [(5, true, "the pilot took over, in LOITER"), (4, false, "stopped")]
     {
         let mut flight = in_flight("takeoff");
         flight.camera(0, CameraInfo::sample());
@@ -1678,7 +1685,7 @@ fn a_pilot_ends_the_wait_of_a_vehicle_that_took_off_for_its_landing() {
         receive(&mut flight, 2600 * MS, &heartbeat(mode, armed));
         hover(&mut flight, 2620, 2700, mode);
         let status = flight.status(2700 * MS);
-        assert!(status.phase == Phase::Failed && status.why.contains(told), "{status:?}");
+        assert!(status.phase == Phase::Failed && status.why.contains(text), "{status:?}");
         // Back in GUIDED, with nothing in the way any more, only a command begins.
         receive(&mut flight, 5000 * MS, &heartbeat(4, true));
         hover(&mut flight, 5020, 8000, 4);
@@ -1793,23 +1800,23 @@ fn a_start_that_is_refused_takes_nothing_back() {
 }
 
 #[test]
-fn a_pad_that_was_seen_long_ago_is_not_told_as_seen() {
+fn a_pad_that_was_seen_long_ago_is_not_shown() {
     let mut flight = in_flight("airborne");
     flight.camera(0, CameraInfo::sample());
     flight.presence(0, "main", true);
     hover(&mut flight, 20, 2000, 4);
-    let told = |flight: &Flight, now_ms: i64| {
+    let is_shown = |flight: &Flight, now_ms: i64| {
         let status = flight.status(now_ms * MS);
         (status.lateral_error_m.is_some(), flight.target(now_ms * MS).position_ned_m.is_some())
     };
-    assert_eq!(told(&flight, 2000), (true, true));
+    assert_eq!(is_shown(&flight, 2000), (true, true));
     for ms in (2000..14_000).step_by(20) {
         pose(&mut flight, ms * MS);
         flight.tick(ms * MS + 3);
         sent(&mut flight);
     }
-    assert_eq!(told(&flight, 11_000), (true, true));
-    assert_eq!(told(&flight, 14_000), (false, false));
+    assert_eq!(is_shown(&flight, 11_000), (true, true));
+    assert_eq!(is_shown(&flight, 14_000), (false, false));
     assert!(flight.status(14_000 * MS).height_m.is_some(), "over the place of the take-off");
 }
 
@@ -1834,7 +1841,7 @@ fn a_hold_is_taken_in_a_hold_of_another_reason() {
 }
 
 #[test]
-fn a_landing_that_was_held_or_aborted_is_told_to_wait_for_the_operator() {
+fn a_landing_that_was_held_or_aborted_waits_for_the_operator() {
     let waits = |flight: &Flight, ms: i64| flight.status(ms * MS).waits_for_operator;
     let mut flight = in_flight("airborne");
     hover(&mut flight, 20, 1000, 4);
@@ -1882,7 +1889,7 @@ fn an_autopilot_that_is_restarted_after_a_landing_is_no_failure() {
 
 #[test]
 fn an_autopilot_that_restarts_in_flight_has_not_landed() {
-    for (mode, told_ms) in [(9, 11_600), (4, 11_600), (9, 17_000)] {
+    for (mode, shown_ms) in [(9, 11_600), (4, 11_600), (9, 17_000)] {
         let mut flight = in_flight("airborne");
         let poses = |flight: &mut Flight, (from_ms, to_ms): (i64, i64), booted_ms: i64| {
             for ms in (from_ms..to_ms).step_by(20) {
@@ -1898,12 +1905,12 @@ fn an_autopilot_that_restarts_in_flight_has_not_landed() {
         assert_eq!(flight.status(9000 * MS).phase, Phase::Final);
         // It falls silent, and its first heartbeat comes before what shows the time since its start.
         receive(&mut flight, 11_000 * MS, &heartbeat(0, false));
-        poses(&mut flight, (told_ms, told_ms + 800), 10_900);
-        let status = flight.status((told_ms + 800) * MS);
+        poses(&mut flight, (shown_ms, shown_ms + 800), 10_900);
+        let status = flight.status((shown_ms + 800) * MS);
         assert_eq!(status.phase, Phase::Failed, "{}", status.why);
         assert!(status.why.contains("restarted in flight"), "{}", status.why);
-        // What was going on does not go on behind a start.
-        let from_ms = told_ms + 800;
+        // The earlier landing does not continue behind a start.
+        let from_ms = shown_ms + 800;
         receive(&mut flight, from_ms * MS, &heartbeat(4, true));
         receive(&mut flight, from_ms * MS + 1, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
         poses(&mut flight, (from_ms + 20, from_ms + 200), 10_900);
@@ -1914,7 +1921,7 @@ fn an_autopilot_that_restarts_in_flight_has_not_landed() {
 }
 
 #[test]
-fn after_a_restart_of_the_autopilot_nothing_begins_by_itself() {
+fn after_a_restart_of_the_autopilot_nothing_begins_automatically() {
     let mut flight = in_flight("airborne");
     let poses = |flight: &mut Flight, from_ms: i64, to_ms: i64, booted_ms: i64| {
         for ms in (from_ms..to_ms).step_by(20) {
@@ -2008,14 +2015,14 @@ fn a_restarted_controller_does_not_climb_with_a_vehicle_that_may_stand_on_the_pa
     };
     let now_ns = 100_000 * MS;
     for (what, height_m, left, phase) in [
-        ("told", 0.05, Some(note(0.0, 1, now_ns - 5000 * MS)), Phase::Final),
-        ("told, on a pad on a hill", 3.05, Some(note(-3.0, 1, now_ns - 5000 * MS)), Phase::Final),
-        ("told, over it", 1.0, Some(note(0.0, 1, now_ns - 5000 * MS)), Phase::Search),
-        ("told, over a valley", 0.05, Some(note(2.0, 1, now_ns - 5000 * MS)), Phase::Search),
-        ("told long ago", 3.05, Some(note(-3.0, 1, now_ns - 90_000 * MS)), Phase::Search),
-        ("told of another vehicle", 3.05, Some(note(-3.0, 2, now_ns)), Phase::Search),
-        ("not told, still at the height of the origin", 0.05, None, Phase::Final),
-        ("not told, in flight", 5.0, None, Phase::Search),
+        ("noted", 0.05, Some(note(0.0, 1, now_ns - 5000 * MS)), Phase::Final),
+        ("noted, on a pad on a hill", 3.05, Some(note(-3.0, 1, now_ns - 5000 * MS)), Phase::Final),
+        ("noted, over it", 1.0, Some(note(0.0, 1, now_ns - 5000 * MS)), Phase::Search),
+        ("noted, over a valley", 0.05, Some(note(2.0, 1, now_ns - 5000 * MS)), Phase::Search),
+        ("noted long ago", 3.05, Some(note(-3.0, 1, now_ns - 90_000 * MS)), Phase::Search),
+        ("noted for another vehicle", 3.05, Some(note(-3.0, 2, now_ns)), Phase::Search),
+        ("not noted, still at the height of the origin", 0.05, None, Phase::Final),
+        ("not noted, in flight", 5.0, None, Phase::Search),
     ] {
         let mut flight = flight_with("resume", &["autopilot.address=\"udpin:127.0.0.1:14550\""]);
         if let Some(left) = left {

@@ -74,7 +74,7 @@ impl Conversation {
         }
     }
 
-    /// The autopilot handles what was sent to it.
+    /// The autopilot handles the packets that were sent to it.
     fn answer(&mut self) {
         let mut reports = false;
         while let Some(packet) = self.flight.poll_outgoing() {
@@ -144,7 +144,7 @@ fn an_autopilot_that_refuses_is_asked_a_few_times_only() {
 }
 
 #[test]
-fn what_a_killed_controller_left_is_put_back() {
+fn the_parameter_of_a_killed_controller_is_put_back() {
     let mut killed = Conversation::new("airborne", 3.0);
     killed.fly(3, GUIDED);
     let note = killed.flight.note().cloned().unwrap();
@@ -161,7 +161,7 @@ fn what_a_killed_controller_left_is_put_back() {
     assert_eq!((resumed.timeout_s, resumed.set_s.len()), (0.5, 0));
     resumed.fly(4, LOITER);
     assert_eq!(resumed.timeout_s, 3.0);
-    // A value that somebody else chose meanwhile stays, as does that of another vehicle.
+    // A value that another program chose meanwhile stays, as does that of another vehicle.
     let impossible = Note { original_s: 1e9, ..note.clone() };
     for (timeout_s, note) in
         [(1.0, note.clone()), (0.5, Note { system: 7, ..note }), (0.5, impossible)]
@@ -191,7 +191,7 @@ fn an_orderly_end_puts_it_back_at_once_and_sends_no_descent() {
 }
 
 #[test]
-fn a_change_whose_report_was_lost_is_put_back_all_the_same() {
+fn a_change_without_its_report_is_put_back_all_the_same() {
     // An orderly end, within a round trip of the change.
     let mut it = Conversation::new("airborne", 3.0);
     it.fly(1, LOITER);
@@ -248,7 +248,7 @@ fn a_landing_that_begins_while_the_timeout_is_put_back_has_it_shortened_again() 
 }
 
 #[test]
-fn what_an_earlier_controller_set_is_not_taken_for_the_vehicles_own() {
+fn a_value_of_an_earlier_controller_is_not_taken_for_the_vehicles_own() {
     let mut killed = Conversation::new("airborne", 3.0);
     killed.fly(3, GUIDED);
     let note = killed.flight.note().cloned().unwrap();

@@ -1,10 +1,10 @@
 //! Landings over a link to the autopilot that delays, repeats and falsifies packets, in lock-step with the
-//! modelled world: what is wrong on the link ends on the pad or in a hover, never in a hard touchdown.
+//! modelled world: a fault of the link ends on the pad or in a hover, never in a hard touchdown.
 
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,
-    reason = "helpers of tests may fail like tests, and a measurement shows what it found"
+    reason = "helpers of tests may fail like tests, and a measurement shows its result"
 )]
 
 mod packets;
@@ -76,7 +76,7 @@ fn body_from_camera() -> Transform<Body, Camera> {
     Transform::new(rotation, Point::new(0.0, 0.0, -MOUNT_M))
 }
 
-/// What a detector without errors says of the pad.
+/// The detections of the pad by a detector without errors.
 fn detections(world: &World, time_s: f64, sequence: u64) -> Detections {
     let VehicleTruth { position, ned_from_body, .. } = world.truth();
     let ned_from_camera = Transform::new(ned_from_body, position) * body_from_camera();

@@ -16,7 +16,7 @@ use packets::{
 };
 
 #[test]
-fn a_px4_that_holds_its_place_is_asked_to_land_by_itself() {
+fn a_px4_that_holds_its_place_is_asked_to_land_automatically() {
     const PRECISION_LAND: u32 = 0x0904_0000;
     let mut flight = px4_in(POSITION, "command", &["mode=landing-target"]);
     let reply = flight.command(1000 * MS, &ControllerCommand::Start);
@@ -303,20 +303,20 @@ fn a_px4_that_holds_its_place_lands_there_by_command() {
 }
 
 /// A controller goes on to end.
-fn goes_on_ending(flight: &mut Flight, from_ms: i64, to_ms: i64) {
+fn continues_to_end(flight: &mut Flight, from_ms: i64, to_ms: i64) {
     (from_ms..to_ms).step_by(20).for_each(|ms| assert!(flight.shutdown(ms * MS), "at {ms} ms"));
 }
 
 /// A controller that is ended, since 400 ms, sees OFFBOARD, and asks for HOLD until that shows.
 fn ends_in_hold(flight: &mut Flight, from_ms: i64) {
-    goes_on_ending(flight, from_ms - 380, from_ms);
+    continues_to_end(flight, from_ms - 380, from_ms);
     receive(flight, from_ms * MS, &heartbeat(OFFBOARD, true));
     assert!(flight.shutdown((from_ms + 90) * MS));
     assert!(flight.shutdown((from_ms + 110) * MS));
     let mut sent = Sent::default();
     sent.take(flight);
     assert_eq!(sent.modes, [4.0], "{sent:?}");
-    goes_on_ending(flight, from_ms + 130, from_ms + 400);
+    continues_to_end(flight, from_ms + 130, from_ms + 400);
     receive(flight, (from_ms + 400) * MS, &heartbeat(HOLD, true));
     assert!(!flight.shutdown((from_ms + 410) * MS));
 }
@@ -366,7 +366,7 @@ fn a_px4_that_may_have_changed_to_offboard_is_not_left_there_when_the_start_is_g
 }
 
 #[test]
-fn a_px4_whose_state_is_not_known_in_offboard_gets_zeros_and_is_taken_back() {
+fn a_px4_of_unknown_state_in_offboard_gets_zeros_and_is_taken_back() {
     let mut flight = px4_asked_for_offboard("command");
     let mut sent = Sent::default();
     for ms in (3120..9000).step_by(20) {
@@ -438,7 +438,7 @@ fn a_px4_that_was_asked_for_offboard_after_its_takeoff_is_not_left_there() {
         assert!(status.phase == Phase::Failed && status.why.contains("aborted"), "{status:?}");
         // The controller is ended.
         let mut flight = px4_at_the_end_of_its_takeoff();
-        goes_on_ending(&mut flight, 5100, 5500);
+        continues_to_end(&mut flight, 5100, 5500);
         receive(&mut flight, 5500 * MS, &heartbeat(mode, true));
         for ms in (5520..5600).step_by(20) {
             assert_eq!(flight.shutdown(ms * MS), mode == OFFBOARD);
@@ -470,7 +470,7 @@ fn a_px4_is_asked_to_hold_its_place_only_while_its_position_is_no_older_than_con
         receive(&mut flight, 0, &heartbeat(OFFBOARD, true));
         receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
         assert!(hover(&mut flight, 20, 1000, OFFBOARD).setpoints > 20);
-        // It is told to stop 0.7 s after the last position.
+        // It is commanded to stop 0.7 s after the last position.
         assert_eq!(flight.shutdown(1680 * MS), is_asked, "{set}");
     }
 }
@@ -555,7 +555,7 @@ fn a_heartbeat_that_current_mode_overtook_is_no_pilots_switch() {
 
 #[test]
 fn a_px4_that_comes_into_offboard_after_all_is_asked_to_hold_its_place() {
-    // A landing is called back, nothing is heard of it for 5 s, and then the last request is carried out.
+    // A landing is called back, no packet arrives for 5 s, and then the last request is carried out.
     let mut flight = px4_in_land(3980);
     assert!(flight.command(3980 * MS, &ControllerCommand::Abort).accepted);
     hover(&mut flight, 4000, 10_980, LAND);
@@ -579,7 +579,7 @@ fn a_px4_that_comes_into_offboard_after_all_is_asked_to_hold_its_place() {
     let sent = hover(&mut flight, 6000, 7900, OFFBOARD);
     assert!(sent.modes.contains(&4.0) && sent.setpoints > 20, "{sent:?}");
 
-    // Once: who chooses it again has another program for it.
+    // Once: a second choice comes from another program.
     hover(&mut flight, 8000, 8900, HOLD);
     let sent = hover(&mut flight, 9000, 12_000, OFFBOARD);
     assert!(sent.modes.is_empty() && sent.setpoints <= 1, "{sent:?}");

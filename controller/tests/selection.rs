@@ -42,7 +42,7 @@ fn turned(position_m: [f64; 3], heading_deg: f64) -> Sight {
     }
 }
 
-/// Detectors that answer to the frames of one camera, each with its latency, and what was used when.
+/// Detectors that answer to the frames of one camera, each with its latency, and the frames that were used.
 struct Bench {
     selection: Selection,
     now_ns: i64,
@@ -57,7 +57,7 @@ impl Bench {
         Self { selection, now_ns: 0, used: Vec::new(), changes: Vec::new() }
     }
 
-    /// Notes what came of the last call, and checks what must always hold.
+    /// Notes the result of the last call, and checks the invariants.
     fn note(&mut self) {
         if let Some((name, stamp)) = self.selection.next_frame() {
             assert_eq!(self.selection.active(), Some(name.as_str()));
@@ -397,7 +397,7 @@ fn warned_ms(
 }
 
 #[test]
-fn two_that_disagree_are_told_within_a_second_and_until_they_agree_again() {
+fn two_that_disagree_are_reported_within_a_second_and_until_they_agree_again() {
     let mut bench = Bench::new(preferring(Some("liar"), None));
     let honest = ("main", 30 * MS, at(0.0));
     for i in 0..60 {
@@ -463,8 +463,8 @@ fn a_dispute_lasts_while_both_are_late_or_see_nothing() {
     assert_eq!(bench.selection.dispute(), None);
 }
 
-/// Tells of detectors that search frames of a camera with 30 Hz, each every so many frames and with its latency.
-fn told_at_rates(
+/// Runs detectors that search frames of a camera with 30 Hz, each every so many frames and with its latency.
+fn searched_at_rates(
     bench: &mut Bench,
     frames: std::ops::Range<i64>,
     answers: &[(&str, i64, i64, Option<Sight>)],
@@ -498,19 +498,19 @@ fn detectors_of_different_rate_and_latency_are_compared_as_well() {
         let mut bench = Bench::new(preferring(None, None));
         let [quick, slow] = [("quick", 1, 30 * MS), ("slow", every, 30 * MS + late)];
         let seen = |(name, every, late): (_, _, _), sight| (name, every, late, sight);
-        told_at_rates(&mut bench, 0..150, &[seen(quick, at(0.0)), seen(slow, at(1.0))]);
+        searched_at_rates(&mut bench, 0..150, &[seen(quick, at(0.0)), seen(slow, at(1.0))]);
         assert!(bench.selection.dispute().is_some(), "{every} {late}");
         // Until they agree.
-        told_at_rates(&mut bench, 150..300, &[seen(quick, at(0.0)), seen(slow, at(0.0))]);
+        searched_at_rates(&mut bench, 150..300, &[seen(quick, at(0.0)), seen(slow, at(0.0))]);
         assert_eq!(bench.selection.dispute(), None, "{every} {late}");
         // A preferred one that sees nothing.
         let mut bench = Bench::new(preferring(Some("quick"), None));
-        told_at_rates(&mut bench, 0..150, &[seen(quick, None), seen(slow, at(0.0))]);
+        searched_at_rates(&mut bench, 0..150, &[seen(quick, None), seen(slow, at(0.0))]);
         assert_eq!(bench.state("quick"), DetectorState::Blind, "{every} {late}");
         // Of three the odd one.
         let mut bench = Bench::new(preferring(Some("quick"), None));
         let second = ("second", every, 40 * MS + late, at(0.0));
-        told_at_rates(&mut bench, 0..150, &[seen(quick, at(1.0)), seen(slow, at(0.0)), second]);
+        searched_at_rates(&mut bench, 0..150, &[seen(quick, at(1.0)), seen(slow, at(0.0)), second]);
         assert_eq!(bench.state("quick"), DetectorState::Outvoted, "{every} {late}");
     }
 }
@@ -537,7 +537,7 @@ fn a_dispute_outlasts_the_silence_of_one_of_both_and_ends_when_it_is_stopped() {
         bench.frame_seen(90 * PERIOD, &other);
         assert_eq!(bench.selection.dispute(), None, "{silent}");
     }
-    // One of which nothing is heard any more, not even its end, is forgotten.
+    // One without any further message, not even of its end, is forgotten.
     let mut bench = Bench::new(preferring(None, None));
     for i in 0..20 {
         bench.frame_seen(i * PERIOD, &[("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(1.0))]);
@@ -549,7 +549,7 @@ fn a_dispute_outlasts_the_silence_of_one_of_both_and_ends_when_it_is_stopped() {
 }
 
 #[test]
-fn who_names_a_detector_in_a_dispute_has_decided_it() {
+fn naming_a_detector_in_a_dispute_decides_it() {
     let mut bench = Bench::new(preferring(None, None));
     let answers = [("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(1.0))];
     for i in 0..20 {
@@ -604,16 +604,16 @@ impl Bench {
 }
 
 #[test]
-fn two_that_see_the_marker_turned_are_told_and_the_new_one_is_not_trusted() {
+fn two_that_see_the_marker_turned_are_reported_and_the_new_one_is_not_trusted() {
     let mut bench = Bench::new(preferring(Some("turned"), None));
     let answers = [("main", 30 * MS, at(0.0)), ("turned", 35 * MS, quarter_turned())];
-    let told = "0.00 m apart and turned by 90 degrees";
-    let took_ms = warned_ms(&mut bench, 0..30, &answers, told).unwrap();
+    let text = "0.00 m apart and turned by 90 degrees";
+    let took_ms = warned_ms(&mut bench, 0..30, &answers, text).unwrap();
     assert!(took_ms < 1000, "{took_ms} ms");
     let shadow = bench.selection.candidates(bench.now_ns);
     let shadow = shadow.iter().find(|it| it.state == DetectorState::Shadow).unwrap();
     assert!(shadow.compared >= 8 && shadow.agreed == 0, "{shadow:?}");
-    // The turn is told as long as the dispute lasts.
+    // The turn is reported as long as the dispute persists.
     for i in 30..100 {
         bench.frame_seen(i * PERIOD, &[("main", 30 * MS, None), ("turned", 35 * MS, None)]);
     }
@@ -651,7 +651,7 @@ fn where_the_vehicle_does_not_turn_to_the_marker_its_heading_does_not_matter() {
 }
 
 #[test]
-fn a_preferred_one_that_sees_nothing_is_passed_over_and_told() {
+fn a_preferred_one_that_sees_nothing_is_passed_over_and_reported() {
     let mut bench = Bench::new(preferring(Some("blind"), None));
     let answers = [("main", 30 * MS, at(0.0)), ("blind", 20 * MS, None)];
     let took_ms = warned_ms(&mut bench, 0..40, &answers, "`blind` is passed over").unwrap();
@@ -662,7 +662,7 @@ fn a_preferred_one_that_sees_nothing_is_passed_over_and_told() {
     assert_eq!((bench.selection.active(), bench.selection.dispute()), (Some("main"), None));
     // It answers in time, and is not stale.
     assert_eq!(bench.state("blind"), DetectorState::Blind);
-    // Where nobody sees the marker, nobody is blind.
+    // Where none sees the marker, none is blind.
     for i in 120..240 {
         bench.frame_seen(i * PERIOD, &[("main", 30 * MS, None), ("blind", 20 * MS, None)]);
     }
@@ -670,13 +670,13 @@ fn a_preferred_one_that_sees_nothing_is_passed_over_and_told() {
     assert_eq!(bench.selection.active(), Some("blind"));
 }
 
-/// Answers in which the first detector gives no pose, or gives one whose place in the body frame is not known.
+/// Answers in which the first detector gives no pose, or gives one without a known position in the body frame.
 fn without_position(has_pose: bool) -> Option<Sight> {
     Some(Sight { position_m: None, heading_rad: None, has_pose })
 }
 
 #[test]
-fn one_that_gives_no_pose_is_told_and_gives_way_to_one_that_does() {
+fn one_that_gives_no_pose_is_reported_and_gives_way_to_one_that_does() {
     for preferred in [None, Some("mine")] {
         let mut bench = Bench::new(preferring(preferred, None));
         let mine = ("mine", 20 * MS, without_position(false));
@@ -724,7 +724,7 @@ fn poses_are_missed_only_where_the_landing_needs_them_and_the_detector_gives_non
 }
 
 #[test]
-fn names_are_crowded_out_by_better_ones_only() {
+fn names_are_replaced_by_better_ones_only() {
     let mut bench = Bench::new(preferring(Some("preferred"), None));
     let names: Vec<String> = (0..70).map(|i| format!("invented{i}")).collect();
     for name in &names {
@@ -761,12 +761,12 @@ fn names_are_crowded_out_by_better_ones_only() {
     assert_eq!(bench.selection.active(), Some("preferred"));
 }
 
-/// What can happen, after some time.
+/// The possible events, after some time.
 #[derive(Clone, Debug)]
 enum Step {
-    Received { who: usize, stamp_ago_ms: i64, seen: bool },
-    Presence { who: usize, alive: bool },
-    Prefer { who: usize },
+    Received { detector: usize, stamp_ago_ms: i64, seen: bool },
+    Presence { detector: usize, alive: bool },
+    Prefer { detector: usize },
     Place { ground: bool },
     Tick,
 }
@@ -774,9 +774,9 @@ enum Step {
 fn step() -> impl Strategy<Value = (i64, Step)> {
     let what = prop_oneof![
         6 => (0..5_usize, -20..400_i64, any::<bool>())
-            .prop_map(|(who, stamp_ago_ms, seen)| Step::Received { who, stamp_ago_ms, seen }),
-        1 => (0..5_usize, any::<bool>()).prop_map(|(who, alive)| Step::Presence { who, alive }),
-        1 => (0..5_usize).prop_map(|who| Step::Prefer { who }),
+            .prop_map(|(detector, stamp_ago_ms, seen)| Step::Received { detector, stamp_ago_ms, seen }),
+        1 => (0..5_usize, any::<bool>()).prop_map(|(detector, alive)| Step::Presence { detector, alive }),
+        1 => (0..5_usize).prop_map(|detector| Step::Prefer { detector }),
         1 => any::<bool>().prop_map(|ground| Step::Place { ground }),
         3 => Just(Step::Tick),
     ];
@@ -791,26 +791,26 @@ proptest! {
         steps in prop::collection::vec(step(), 1..400),
     ) {
         let mut bench = Bench::new(preferring(None, None));
-        // Those that may be there: heard of since they were last reported as gone.
+        // Those that may be present: a message arrived since they were last reported as gone.
         let mut present = [false; NAMES.len()];
         for (wait_ms, what) in steps {
             bench.now_ns += wait_ms * MS;
             let now = bench.now_ns;
             match what {
-                Step::Received { who, stamp_ago_ms, seen } => {
-                    present[who] = true;
+                Step::Received { detector, stamp_ago_ms, seen } => {
+                    present[detector] = true;
                     let sight = seen.then_some(place([0.0, 0.0, 3.0]));
-                    bench.selection.received(now, NAMES[who], now - stamp_ago_ms * MS, sight);
+                    bench.selection.received(now, NAMES[detector], now - stamp_ago_ms * MS, sight);
                 }
-                Step::Presence { who, alive } => {
-                    present[who] = alive;
-                    bench.selection.presence(now, NAMES[who], alive);
+                Step::Presence { detector, alive } => {
+                    present[detector] = alive;
+                    bench.selection.presence(now, NAMES[detector], alive);
                 }
-                Step::Prefer { who } => drop(bench.selection.prefer(now, NAMES[who])),
+                Step::Prefer { detector } => drop(bench.selection.prefer(now, NAMES[detector])),
                 Step::Place { ground } => {
                     let place = if ground { Place::Ground } else { Place::Onboard };
-                    present[who_of(place)] = true;
-                    bench.selection.set_place(now, NAMES[who_of(place)], place);
+                    present[index_of(place)] = true;
+                    bench.selection.set_place(now, NAMES[index_of(place)], place);
                     bench.selection.prefer_place(now, place);
                 }
                 Step::Tick => bench.selection.tick(now),
@@ -843,14 +843,14 @@ proptest! {
             let before = bench.changes.iter().filter(|(then, _)| (0..30_000 * MS).contains(&(at - then))).count();
             prop_assert!(before <= 12, "{:?}", bench.changes);
         }
-        // The other one is always there, so no gap is long; the period of one that is heard now and then
+        // The other one is always there, so no gap is long; the period of one with rare messages
         // looks longer than it is, but a silence has an end.
         let longest_ms = (MAX_SILENCE_NS + 2 * PERIOD) / MS;
         prop_assert!(bench.longest_gap_ms() <= longest_ms, "{} ms", bench.longest_gap_ms());
     }
 }
 
-fn who_of(place: Place) -> usize {
+fn index_of(place: Place) -> usize {
     match place {
         Place::Onboard => 0,
         Place::Ground => 1,

@@ -61,7 +61,7 @@ impl Flight {
         Ok(format!("in phase `{phase}`: {why}"))
     }
 
-    /// Whether the vehicle took off for us, or has flown a landing of ours and its motors still run: whoever came later does not take the
+    /// Whether the vehicle took off for us, or has flown a landing of ours and its motors still run: a later program does not take the
     /// way down from it.
     fn is_ours(&self) -> bool {
         let is_armed = self.autopilot.state().is_some_and(|state| state.armed);
@@ -89,7 +89,7 @@ impl Flight {
             );
         }
         if let Some(mismatch) = self.lander.mismatch() {
-            // As after a hold for it, the operator who goes on has it looked at again.
+            // As after a hold for it, a second command of the operator repeats the check.
             self.lander.repeat_checks();
             return Err(format!("no landing was started: {mismatch}; a second start begins it"));
         }
@@ -221,7 +221,7 @@ impl Flight {
         Ok(format!("in phase `{after}`: {why}"))
     }
 
-    /// What stops a vehicle that the autopilot lands, or is asked to land, where `hold` does not.
+    /// The commands that stop a vehicle in LAND, or about to enter it, where `hold` does not.
     fn instead_of_hold(&self) -> String {
         let phases = &self.config.phases;
         let no_return_m = phases.no_return_height_m;

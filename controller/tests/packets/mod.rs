@@ -1,5 +1,5 @@
 //! For the controller's tests: MAVLink packets of an autopilot (heartbeat, attitude, position), detections of
-//! a marker below, and what a flight sends for them.
+//! a marker below, and the packets that a flight sends for them.
 
 #![allow(dead_code, reason = "each test uses a part of it")]
 
@@ -37,7 +37,7 @@ pub(crate) fn receive_from(flight: &mut Flight, now_ns: i64, from: Sender, messa
     }
 }
 
-/// A heartbeat in a mode of ArduPilot, or of PX4, whose modes are two numbers in the upper half.
+/// A heartbeat in a mode of ArduPilot, or of PX4, with its two numbers in the upper half.
 pub(crate) fn heartbeat(mode: u32, armed: bool) -> MavMessage {
     let autopilot = match mode >> 16 {
         0 => MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
