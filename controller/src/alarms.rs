@@ -60,7 +60,7 @@ impl Alarms {
         let critical = is_at(s.battery_critical, s.battery_critical_v);
         since(&mut self.low_since_ns, low, now_ns);
         since(&mut self.critical_since_ns, critical, now_ns);
-        let lasts = |from: Option<i64>, limit_s: f64| {
+        let persists = |from: Option<i64>, limit_s: f64| {
             from.is_some_and(|from| now_ns.saturating_sub(from) as f64 * 1e-9 >= limit_s)
         };
         let checks_operator = s.operator_lost_s > 0.0;
@@ -68,11 +68,11 @@ impl Alarms {
         let due = [
             (
                 Alarm::AutopilotLost,
-                checks_autopilot && lasts(self.autopilot_ns, s.autopilot_lost_s),
+                checks_autopilot && persists(self.autopilot_ns, s.autopilot_lost_s),
             ),
-            (Alarm::BatteryCritical, lasts(self.critical_since_ns, s.battery_s)),
-            (Alarm::BatteryLow, lasts(self.low_since_ns, s.battery_s)),
-            (Alarm::OperatorLost, checks_operator && lasts(self.operator_ns, s.operator_lost_s)),
+            (Alarm::BatteryCritical, persists(self.critical_since_ns, s.battery_s)),
+            (Alarm::BatteryLow, persists(self.low_since_ns, s.battery_s)),
+            (Alarm::OperatorLost, checks_operator && persists(self.operator_ns, s.operator_lost_s)),
         ];
         let new = |(alarm, due): &(Alarm, bool)| *due && !self.raised.contains(alarm);
         let (alarm, _) = due.into_iter().find(new)?;
@@ -103,7 +103,7 @@ fn charge_at(battery: &Battery, limit: f64) -> Option<f64> {
     battery.remaining.filter(|charge| limit > 0.0 && *charge <= limit)
 }
 
-/// The same of the voltage in V; an autopilot without a sensor says 0 V.
+/// The same of the voltage in V; an autopilot without a sensor reports 0 V.
 fn volts_at(battery: &Battery, limit_v: f64) -> Option<f64> {
     battery.voltage_v.filter(|volts| *volts > 0.0 && *volts <= limit_v)
 }
@@ -158,7 +158,7 @@ mod tests {
             let alarm = alarms.tick(second * SECOND, Some(&battery(0.2, 12.0)));
             again.extend(alarm.map(|alarm| (second, alarm)));
         }
-        assert_eq!(again, [(603, Alarm::BatteryLow)], "a dip begins anew with the next landing");
+        assert_eq!(again, [(603, Alarm::BatteryLow)], "a dip begins again with the next landing");
     }
 
     #[test]

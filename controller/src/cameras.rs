@@ -29,7 +29,7 @@ struct Known {
     used_ns: i64,
 }
 
-/// What becomes of a camera's information.
+/// The result of the arrival of a camera's information.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Reception {
     /// It is known.
@@ -41,7 +41,7 @@ pub enum Reception {
 }
 
 impl Cameras {
-    /// Adds a camera's information, or refuses it; `is_flying` says that a landing is active.
+    /// Adds a camera's information, or refuses it; `is_flying`: a landing is active.
     pub fn add(&mut self, now_ns: i64, info: CameraInfo, is_flying: bool) -> Reception {
         if let Some(problem) = info.problem() {
             let text = format!("the information of camera `{}` is refused: {problem}", info.camera);

@@ -17,7 +17,7 @@ use crate::wind::Drag;
 
 /// Period of the flight's ticks.
 pub(crate) const TICK: Duration = Duration::from_millis(25);
-/// Maximum part of a serial line that setpoints take: the rest is for those that follow detections, and for what else is sent.
+/// Maximum part of a serial line that setpoints take: the rest is for those that follow detections, and for all other packets.
 const MAX_SETPOINTS_SHARE: f64 = 0.5;
 /// Bits that a byte takes on a serial line.
 const BITS_PER_BYTE: f64 = 10.0;
@@ -358,7 +358,7 @@ impl Config {
     }
 
     /// The differences up to which two detectors agree: in heading where the vehicle turns to the marker's, which it does not where the
-    /// autopilot lands by itself.
+    /// autopilot lands on its own.
     pub fn tolerance(&self) -> Tolerance {
         let is_flown = self.mode != Mode::LandingTarget && self.guidance == GuidanceName::Metric;
         let turns = is_flown && self.metric.turn_rad_s > 0.0;

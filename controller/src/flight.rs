@@ -1,8 +1,8 @@
 //! One vehicle's flight, a state machine without input and output: packets, detections, camera information, commands and ticks
 //! in; setpoints, mode requests, landing targets, status and warnings out.
 //!
-//! The service feeds it packets, detections, commands and the time, and sends what [`Flight::poll_outgoing`]
-//! returns.
+//! The service feeds it packets, detections, commands and the time, and sends the packets that
+//! [`Flight::poll_outgoing`] returns.
 
 mod commands;
 
@@ -287,7 +287,7 @@ impl Flight {
 
     /// Handles the detections that were published on the key of the detector `publisher`. True when a frame
     /// was used or these detections were refused, and so the target is to be published; false when they wait, as those of a detector on
-    /// standby do, or when what such a detector publishes was refused.
+    /// standby do, or when detections of such a detector were refused.
     pub fn detections(&mut self, now_ns: i64, publisher: &str, message: &Detections) -> bool {
         self.journal.count("detections");
         match self.frames.add(now_ns, publisher, message) {
@@ -354,7 +354,7 @@ impl Flight {
         let target = self.decision.and_then(|decision| decision.target);
         let is_trusted = self.view().distrust().is_none();
         let is_low = !self.lander.may_recall();
-        // Low in the autopilot's landing it goes on to the ground all the same.
+        // Low in the autopilot's landing it continues to the ground all the same.
         if let Some(landing_target) = &mut self.landing_target
             && (is_trusted || is_low && landing_target.is_landing())
             && landing_target.send(now_ns, frame, target, &mut self.autopilot)
@@ -399,7 +399,7 @@ impl Flight {
         self.use_newest(now_ns);
     }
 
-    /// Carries out an operator's command, or says why not.
+    /// Carries out an operator's command, or refuses it with the reason.
     pub fn command(&mut self, now_ns: i64, command: &ControllerCommand) -> CommandReply {
         self.alarms.operator_active(now_ns);
         let selection = &mut self.frames.selection;
@@ -594,7 +594,7 @@ impl Flight {
         }
     }
 
-    /// A take-off does not begin with a battery for which the vehicle would land at once, and is refused where that lasts. True while it
+    /// A take-off does not begin with a battery for which the vehicle would land at once, and is refused where that persists. True while it
     /// waits for another reading.
     fn waits_for_battery(&mut self, now_ns: i64) -> bool {
         let phases = &self.config.phases;
@@ -662,7 +662,7 @@ impl Flight {
         }
     }
 
-    /// True after a landing whose motors were off before this time. An autopilot that restarts in flight says so as well, but only then.
+    /// True after a landing whose motors were off before this time. An autopilot that restarts in flight reports motors that are off as well, but only then.
     fn was_over_at(&self, time_ns: i64) -> bool {
         let is_off = self.autopilot.state().is_some_and(|state| !state.armed);
         let was_off = self.mission.disarmed_ns().is_none_or(|off_ns| off_ns < time_ns);

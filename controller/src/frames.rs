@@ -53,7 +53,7 @@ pub struct Frames {
     handover_stamp_ns: i64,
 }
 
-/// What becomes of detections on arrival.
+/// The result of the arrival of detections.
 #[derive(Debug)]
 #[expect(clippy::large_enum_variant, reason = "returned and matched at once, never stored")]
 pub enum Arrival {
@@ -112,7 +112,7 @@ impl Frames {
         self.announced.add(detector, &info.markers);
     }
 
-    /// Adds a camera's calibration and mount, or refuses them; `is_flying` says that a landing is active.
+    /// Adds a camera's calibration and mount, or refuses them; `is_flying`: a landing is active.
     pub fn add_camera(&mut self, now_ns: i64, info: CameraInfo, is_flying: bool) -> Reception {
         let reception = self.cameras.add(now_ns, info, is_flying);
         if let Reception::Refused(reason, text) = &reception {

@@ -61,7 +61,7 @@ enum State {
     AbortedEarly(i64),
     /// The autopilot is taken back from landing, for this reason.
     Recalling(CommandId, String),
-    /// The autopilot, which has become low, is left to its landing; what takes it back may have reached it, until this time.
+    /// The autopilot, which has become low, is left to its landing; the request to take it back may still show its effect, until this time.
     LeftToLand(i64, String),
     /// On the ground, disarmed.
     Landed,

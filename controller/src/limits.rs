@@ -27,7 +27,7 @@ const MPC_LAND_SPEED: [Scaled; 1] = [scaled("MPC_LAND_SPEED", 1.0)];
 /// PX4's time without setpoints until it leaves OFFBOARD, in s.
 const COM_OF_LOSS_T: &str = "COM_OF_LOSS_T";
 
-/// What PX4 does when setpoints stop, and its value for holding the place. By the default, position mode, a vehicle without a remote
+/// PX4's reaction when setpoints stop, and its value for holding the place. By the default, position mode, a vehicle without a remote
 /// control descends and drifts.
 const COM_OBL_RC_ACT: &str = "COM_OBL_RC_ACT";
 const HOLDS: f64 = 5.0;

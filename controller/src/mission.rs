@@ -1,4 +1,4 @@
-//! The mission around a landing: waiting, take-off, the change of a PX4 to OFFBOARD, what triggers the landing or keeps it waiting,
+//! The mission around a landing: waiting, take-off, the change of a PX4 to OFFBOARD, the triggers of the landing and obstacles to it,
 //! and its end after the motors have stopped.
 
 use autopilot::{
@@ -20,7 +20,7 @@ pub struct Mission {
     state: State,
     started_ns: Option<i64>,
     disarmed_ns: Option<i64>,
-    /// Until when the landing that seemed to have ended goes on.
+    /// Until when the landing that seemed to have ended continues.
     goes_on_until_ns: Option<i64>,
     /// The landing that was to go on is over: the next one begins once the vehicle flies.
     awaits_next_flight: bool,
@@ -143,7 +143,7 @@ impl Mission {
         matches!(self.state, State::TakingControl { .. })
     }
 
-    /// Puts off a take-off that has not begun, for this reason, which the status shows: nothing asks for its motors, and its times stand still. True
+    /// Puts off a take-off that has not begun, for this reason, which the status shows: nothing requests its motors, and its times do not advance. True
     /// where there is one.
     pub fn put_off(&mut self, now_ns: i64, autopilot: &mut Autopilot, reason: String) -> bool {
         let State::TakingOff { takeoff, why, .. } = &mut self.state else { return false };
@@ -213,7 +213,7 @@ impl Mission {
         autopilot.sent_ns(request).or(lands.then_some(now_ns))
     }
 
-    /// Gives up a request for LAND, for this reason: a PX4 that may have taken it is taken back to HOLD. True while that goes on.
+    /// Gives up a request for LAND, for this reason: a PX4 that may have taken it is taken back to HOLD. True while that continues.
     pub fn call_back_land(&mut self, now_ns: i64, autopilot: &mut Autopilot, why: &str) -> bool {
         let Some(sent_ns) = self.land_sent_ns(autopilot, now_ns) else {
             self.fail(autopilot, why.to_owned());
@@ -226,11 +226,11 @@ impl Mission {
         self.advance_exit(now_ns, autopilot)
     }
 
-    /// A LAND that is called back goes on, as the vehicle is too low to be held there.
+    /// A LAND that is called back continues, as the vehicle is too low to be held there.
     pub fn leave_in_land(&mut self, autopilot: &mut Autopilot) {
         let lands = autopilot.state().is_some_and(|state| state.mode == FlightMode::AUTO_LAND);
         if lands && let State::LeavingOffboard { .. } = self.state {
-            let why = "ended by the operator, too low for it: the LAND that the vehicle has taken goes on; the pilot's mode switch stops it";
+            let why = "ended by the operator, too low for it: the LAND that the vehicle has taken continues; the pilot's mode switch stops it";
             self.fail(autopilot, why.to_owned());
         }
     }
@@ -244,7 +244,7 @@ impl Mission {
     }
 
     /// Gives up a take-off or a change to OFFBOARD, for this reason, where a PX4 may be in OFFBOARD before a landing, or change to
-    /// it; true while the way out goes on.
+    /// it; true while the way out continues.
     pub fn leave_offboard(&mut self, now_ns: i64, autopilot: &mut Autopilot, why: &str) -> bool {
         let may_be_in_it = autopilot.is_requesting_offboard() || autopilot.is_in_offboard();
         match &self.state {
@@ -268,7 +268,7 @@ impl Mission {
         self.state = State::LeavingOffboard { exit, why, awaits_takeoff };
     }
 
-    /// Advances the way out of OFFBOARD; true while it goes on.
+    /// Advances the way out of OFFBOARD; true while it continues.
     fn advance_exit(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
         let State::LeavingOffboard { exit, why, awaits_takeoff } = &mut self.state else {
             return false;
@@ -276,7 +276,7 @@ impl Mission {
         if exit.step(now_ns, autopilot) {
             return true;
         }
-        // In OFFBOARD still, the landing that was given up would begin by itself.
+        // In OFFBOARD still, the landing that was given up would begin automatically.
         let mode = autopilot.state().filter(|state| state.armed).map(|state| state.mode);
         let is_out = !autopilot.is_in_offboard();
         let (mut why, awaits_takeoff) = (std::mem::take(why), *awaits_takeoff && is_out);
@@ -290,7 +290,7 @@ impl Mission {
         false
     }
 
-    /// True while a landing begins by itself once the vehicle flies.
+    /// True while a landing begins automatically once the vehicle flies.
     pub fn is_awaiting_takeoff(&self) -> bool {
         matches!(self.state, State::AwaitingTakeoff) || self.awaits_next_flight
     }
@@ -348,7 +348,7 @@ impl Mission {
     }
 
     /// Advances take-off and waiting; the trigger when a landing is to begin. An `obstacle` is why none can begin now, such
-    /// as a vehicle's state that is not fresh; `steers` says that our setpoints control the landing.
+    /// as a vehicle's state that is not fresh; `steers`: our setpoints control the landing.
     pub fn step(
         &mut self,
         now_ns: i64,
@@ -454,7 +454,7 @@ impl Mission {
         }
     }
 
-    /// The motors were armed or disarmed; `is_finished` says that the landing had ended, and `by_motors` that their stop had ended it.
+    /// The motors were armed or disarmed; `is_finished`: the landing had ended; `by_motors`: their stop had ended it.
     pub fn armed_changed(&mut self, now_ns: i64, armed: bool, is_finished: bool, by_motors: bool) {
         if !armed && self.started_ns.is_some() {
             self.disarmed_ns = self.disarmed_ns.or(Some(now_ns));
@@ -481,8 +481,8 @@ pub fn is_flying_guided(autopilot: &Autopilot) -> bool {
     autopilot.state().is_some_and(|s| s.armed && s.mode.is_guided() && s.landed.is_flying())
 }
 
-/// What ends the wait of a vehicle that took off for its landing: motors that are off, or a pilot. A PX4 that holds its place does
-/// not end it, as it does so by itself where setpoints are late.
+/// The end of the wait of a vehicle that took off for its landing: motors that are off, or a pilot. A PX4 that holds its position does
+/// not end it, as it does so automatically where setpoints are late.
 fn end_of_waiting(autopilot: &Autopilot) -> Option<String> {
     let state = autopilot.state().filter(|state| state.connected)?;
     let is_ours = state.mode.is_guided() || state.mode.is_landing() || is_holding_px4(autopilot);

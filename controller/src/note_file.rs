@@ -58,8 +58,8 @@ impl NoteFile {
 /// Longest part of an address that stands in a file's name; a file system takes 255 bytes.
 const MAX_ADDRESS_CHARS: usize = 120;
 
-/// Controllers of several vehicles on one machine have the same id, and keep their notes apart by the address. What cannot stand
-/// in a file's name becomes a hyphen; the note has the address as it is.
+/// Controllers of several vehicles on one machine have the same id, and keep their notes apart by the address. Characters that a
+/// file's name cannot have become hyphens; the note has the address unchanged.
 fn file_name(id: &str, address: &str) -> String {
     let part = |c: char| if c.is_ascii_alphanumeric() || c == '.' { c } else { '-' };
     let address: String = address.chars().take(MAX_ADDRESS_CHARS).map(part).collect();
@@ -160,7 +160,7 @@ impl PadFile {
     }
 }
 
-/// The file with the system id of the vehicle that is landed: of two on one link nothing else says with which one a controller goes on
+/// The file with the system id of the vehicle that is landed: of two on one link nothing else shows with which one a controller continues
 /// that resumes a landing.
 #[derive(Debug)]
 pub struct LandingFile {
@@ -242,7 +242,7 @@ mod tests {
         assert_eq!(file.read(), None);
         file.keep(Some(7));
         assert_eq!(open("udpin:0.0.0.0:14560").read(), None, "another link's");
-        // The next controller goes on with it, and it is forgotten with the landing.
+        // The next controller continues with it, and it is forgotten with the landing.
         let mut next = open("udpin:0.0.0.0:14550");
         assert_eq!(next.read(), Some(7));
         next.keep(Some(7));

@@ -1,6 +1,6 @@
 //! Where the pad is during a landing, as a note for the controller that is started after a crash and resumes that landing.
 //!
-//! ArduPilot says up to 7 s late that a vehicle touched down that follows setpoints, and low over the marker the camera does
+//! ArduPilot reports up to 7 s late that a vehicle touched down that follows setpoints, and low over the marker the camera does
 //! not see it. A controller that is started in that time would search, and climb from the ground. It learns from a
 //! [`PadNote`] that the vehicle is right over the pad.
 

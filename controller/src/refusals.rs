@@ -99,7 +99,7 @@ mod tests {
         assert_eq!(refusals.lasting(S).collect::<Vec<_>>(), [warning]);
         assert_eq!(refusals.lasting(3 * S).count(), 0);
         refusals.add(3 * S, "another-clock", || "d".to_owned());
-        assert_eq!(refusals.lasting(3 * S).count(), 0, "it begins anew");
+        assert_eq!(refusals.lasting(3 * S).count(), 0, "it begins again");
     }
 
     #[test]

@@ -498,7 +498,7 @@ impl Selection {
         self.dispute = self.present_dispute(now_ns, tolerance);
     }
 
-    /// The dispute between the active detector and another one. It lasts until they agree: where neither sees
+    /// The dispute between the active detector and another one. It persists until they agree: where neither sees
     /// the marker, or one is silent, nothing is decided.
     fn present_dispute(&self, now_ns: i64, tolerance: Tolerance) -> Option<Dispute> {
         let active = self.known_active().filter(|active| active.fault.is_none())?;

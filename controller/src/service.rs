@@ -429,8 +429,8 @@ impl Reports {
         }
     }
 
-    /// Publishes the vehicle at its rate, and the status when it changes or is due, with what could not be read, and with what came
-    /// over the link before the first heartbeat.
+    /// Publishes the vehicle at its rate, and the status when it changes or is due, with the unreadable detections, and with the packets
+    /// that the link received before the first heartbeat.
     async fn publish(
         &mut self,
         flight: &Flight,

@@ -119,7 +119,7 @@ impl Setpoints {
         self.leave_offboard(now_ns, autopilot)
     }
 
-    /// No setpoint follows: a PX4 that would take that for a failure is led out of OFFBOARD. True while that goes on.
+    /// No setpoint follows: a PX4 that would take that for a failure is led out of OFFBOARD. True while that continues.
     fn leave_offboard(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
         if self.last.is_some() && self.needs_hold(now_ns, autopilot) {
             self.exit = Some(OffboardExit::begin(now_ns, autopilot));
@@ -180,7 +180,7 @@ impl Setpoints {
     }
 }
 
-/// True while a PX4 lands by itself, and flies.
+/// True while a PX4 lands in its own mode, and flies.
 fn is_landing_px4(autopilot: &Autopilot) -> bool {
     autopilot.firmware() == Some(Firmware::Px4)
         && autopilot

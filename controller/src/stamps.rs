@@ -11,7 +11,7 @@ use crate::selection::MAX_DETECTORS;
 
 /// Maximum number of frames that are remembered.
 const MAX_FRAMES: usize = 128;
-/// Maximum difference of two stamps of one frame, in nanoseconds: with a larger one its camera began to count anew.
+/// Maximum difference of two stamps of one frame, in nanoseconds: with a larger one its camera began to count again from its first number.
 const MAX_APART_NS: i64 = 1_000_000_000;
 
 /// The latest frames, each with the stamp that the first detector gave it.
@@ -117,7 +117,7 @@ mod tests {
         assert!(shifted[0].contains("`main` and `mine`") && shifted[0].contains("20.0 ms apart"));
         assert!(shifted[0].contains("0 ms are allowed") && shifted[0].contains("stop it"));
         assert!(warnings(0, counted).is_empty());
-        // A camera that began anew, and one that does not count.
+        // A camera that began to count again, and one that does not count.
         assert!(warnings(5000, counted).is_empty());
         assert!(warnings(20, |_| 7).is_empty());
     }

@@ -155,7 +155,7 @@ impl View<'_> {
                 (Phase::Failed, "no landing target is sent in this mode".to_owned())
             }
             (State::Idle, None) if self.is_said_to_stand() => {
-                let why = "no landing is resumed, as the autopilot says that the vehicle stands on the ground; waiting for the start of one";
+                let why = "no landing is resumed, as the autopilot reports that the vehicle stands on the ground; waiting for the start of one";
                 (Phase::Idle, why.to_owned())
             }
             (State::Idle, None) => (Phase::Idle, "waiting for the start of a landing".to_owned()),
@@ -292,7 +292,7 @@ impl View<'_> {
         }
     }
 
-    /// True while a landing that began is held or aborted and goes on only by a command.
+    /// True while a landing that began is held or aborted and continues only by a command.
     fn waits_for_operator(&self) -> bool {
         match (self.mission.state(), self.landing_target) {
             (State::Landing, _) => self.lander.waits_for_operator(),

@@ -47,7 +47,7 @@ pub fn program() -> String {
     format!("alight {}", node::version())
 }
 
-/// For what this program was built, as the tape names it.
+/// The platform of this program, as the tape names it.
 pub fn build() -> String {
     let library = if cfg!(target_env = "musl") { "musl" } else { "gnu" };
     let profile = if cfg!(debug_assertions) { "debug" } else { "release" };

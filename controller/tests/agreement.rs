@@ -56,7 +56,7 @@ fn below(range_m: f64) -> Sights {
 
 #[test]
 fn of_two_of_which_one_takes_the_marker_for_larger_none_is_outvoted() {
-    // 4.2 % of 8.6 m lie between what both ranges allow.
+    // 4.2 % of 8.6 m lie between the limits of both ranges.
     for range_m in (1..400).map(|step| f64::from(step) * 0.05) {
         for factor in [1.02, 1.042, 1.1] {
             let all = [below(range_m), below(range_m * factor)];

@@ -309,7 +309,7 @@ fn a_start_is_refused_on_the_ground_and_while_taking_off() {
     pose(&mut flight, 2 * MS);
     let reply = flight.command(3 * MS, &ControllerCommand::Start);
     assert!(!reply.accepted && reply.reason.contains("not armed"), "{reply:?}");
-    // It still begins by itself, as configured.
+    // It still begins automatically, as configured.
     receive(&mut flight, 10 * MS, &heartbeat(4, true));
     receive(&mut flight, 11 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
     pose(&mut flight, 12 * MS);
@@ -335,7 +335,7 @@ fn a_frame_from_the_future_does_not_shut_out_those_of_now() {
     }
     assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("no-pose"), "it was looked at");
     assert_eq!(flight.status(now_ns).active_detector.as_deref(), Some("main"));
-    // Detections under another detector's name are refused, which says nothing about those of the detector in use.
+    // Detections under another detector's name are refused, which does not concern those of the detector in use.
     assert!(!flight.detections(now_ns, "intruder", &seen(now_ns)));
     assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("no-pose"));
     assert_eq!(flight.status(now_ns).candidates.len(), 1);
@@ -509,7 +509,7 @@ fn low_over_the_ground_the_autopilot_is_not_taken_back_from_its_precision_landin
     assert!(sent_at(&mut flight, 4, (6020, 8000), (5.0, 0.9)).modes.is_empty());
     assert!(sent_at(&mut flight, 9, (8000, 12_000), (0.9, 0.2)).modes.is_empty());
     assert_eq!(flight.status(12_000 * MS).phase, Phase::Final);
-    // What takes it back is lost, and it becomes low.
+    // The request that takes it back is lost, and it becomes low.
     let mut flight = landing();
     sent_at(&mut flight, 9, (6020, 8000), (5.0, 3.0));
     abort(&mut flight, 8000);
@@ -757,7 +757,7 @@ fn while_two_detectors_see_the_marker_at_two_places_nothing_descends_near_the_gr
     let (down_m_s, status) = descent_from(0.0, 2.0, 1.0);
     assert!(down_m_s == 0.0 && status.why.contains("at two places"), "it began there: {status:?}");
     let (down_m_s, status) = descent(6.0, 1.0);
-    assert!(down_m_s > 0.0, "high up it goes on: {status:?}");
+    assert!(down_m_s > 0.0, "high up it continues: {status:?}");
 }
 
 #[test]
@@ -1052,14 +1052,14 @@ fn no_landing_begins_where_another_vehicle_or_another_controller_is_on_the_link(
             assert!(status.why.contains(text), "{start}: {}", status.why);
         }
     }
-    // A landing that goes on is not ended.
+    // A landing under way is not ended.
     for (sender, message, _) in others() {
         let mut flight = unpinned("airborne");
         hover(&mut flight, 20, 3000, 4);
         receive_from(&mut flight, 3000 * MS, sender, &message);
         assert!(hover(&mut flight, 3000, 4000, 4).setpoints > 10);
     }
-    // Nor is the vehicle that it has flown kept from landing where it is, and, beside another vehicle, from beginning anew.
+    // Nor is the vehicle that it has flown prevented from landing where it is, and, next to another vehicle, from beginning again.
     for (number, (sender, message, text)) in others().into_iter().enumerate() {
         let mut flight = unpinned("airborne");
         hover(&mut flight, 20, 3000, 4);
@@ -1631,7 +1631,7 @@ fn only_a_resumed_landing_begins_automatically() {
         ("resume", 9, landing, Phase::Idle, 20_000, Phase::Idle),
         ("airborne", 4, flying, Phase::Search, 20_000, Phase::Search),
         ("airborne", 5, flying, Phase::Idle, 20_000, Phase::Search),
-        // Motors that run again so soon were not off: the landing goes on.
+        // Motors that run again so soon were not off: the landing continues.
         ("resume", 4, flying, Phase::Search, 5000, Phase::Search),
         ("resume", 5, flying, Phase::Idle, 5000, Phase::Idle),
     ] {
@@ -1780,7 +1780,7 @@ fn a_flight_that_follows_a_landing_within_seconds_is_not_landed_without_a_comman
 
 #[test]
 fn a_start_that_is_refused_takes_nothing_back() {
-    // After a landing the next flight is landed by itself.
+    // After a landing the next flight is landed automatically.
     let mut flight = in_flight("airborne");
     hover(&mut flight, 20, 1000, 4);
     let (off, down) = (heartbeat(4, false), contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
@@ -1903,7 +1903,7 @@ fn an_autopilot_that_restarts_in_flight_has_not_landed() {
         receive(&mut flight, 8010 * MS, &heartbeat(mode, true));
         poses(&mut flight, (8020, 9000), 0);
         assert_eq!(flight.status(9000 * MS).phase, Phase::Final);
-        // It falls silent, and its first heartbeat comes before what shows the time since its start.
+        // It falls silent, and its first heartbeat comes before the packets with the time since its start.
         receive(&mut flight, 11_000 * MS, &heartbeat(0, false));
         poses(&mut flight, (shown_ms, shown_ms + 800), 10_900);
         let status = flight.status((shown_ms + 800) * MS);
@@ -2014,7 +2014,7 @@ fn a_restarted_controller_does_not_climb_with_a_vehicle_that_may_stand_on_the_pa
         deviation_m: 0.02,
     };
     let now_ns = 100_000 * MS;
-    for (what, height_m, left, phase) in [
+    for (case, height_m, left, phase) in [
         ("noted", 0.05, Some(note(0.0, 1, now_ns - 5000 * MS)), Phase::Final),
         ("noted, on a pad on a hill", 3.05, Some(note(-3.0, 1, now_ns - 5000 * MS)), Phase::Final),
         ("noted, over it", 1.0, Some(note(0.0, 1, now_ns - 5000 * MS)), Phase::Search),
@@ -2046,9 +2046,9 @@ fn a_restarted_controller_does_not_climb_with_a_vehicle_that_may_stand_on_the_pa
                 setpoint.map_or(highest_m_s, |it| f64::max(highest_m_s, -it.velocity_ned_m_s[2]));
         }
         let status = flight.status(now_ns + 4000 * MS);
-        assert_eq!(status.phase, phase, "{what}: {status:?}");
-        assert_eq!(land, phase == Phase::Final, "{what}");
-        assert!(!land || highest_m_s <= 0.0, "{what}: it climbed at {highest_m_s} m/s");
+        assert_eq!(status.phase, phase, "{case}: {status:?}");
+        assert_eq!(land, phase == Phase::Final, "{case}");
+        assert!(!land || highest_m_s <= 0.0, "{case}: it climbed at {highest_m_s} m/s");
     }
 }
 

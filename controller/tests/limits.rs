@@ -140,7 +140,7 @@ fn an_autopilot_that_refuses_is_asked_a_few_times_only() {
     it.refuses = true;
     it.fly(8, GUIDED);
     assert!((1..=10).contains(&it.set_s.len()), "{:?}", it.set_s);
-    assert_eq!(it.shown_s(), Some(3.0), "the descent knows");
+    assert_eq!(it.shown_s(), Some(3.0), "the descent takes it into account");
 }
 
 #[test]

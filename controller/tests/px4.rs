@@ -60,7 +60,7 @@ fn a_px4_is_asked_to_hold_its_place_when_setpoints_end() {
         assert_eq!(sent.setpoints > 25, asked.is_some(), "{sent:?}");
         let sent = hover(&mut flight, 8000, 9900, if asked.is_some() { HOLD } else { mode });
         assert!(sent.setpoints <= 2, "{sent:?}");
-        // A controller that is asked to stop, and knows the mode of almost a second ago only.
+        // A controller that is asked to stop, and has only the mode of almost a second ago.
         let mut flight = begun(mode);
         assert_eq!(flight.shutdown(1000 * MS), asked.is_some());
         let mut sent = Sent::default();
@@ -302,7 +302,7 @@ fn a_px4_that_holds_its_place_lands_there_by_command() {
     assert!(!flight.command(1000 * MS, &ControllerCommand::LandHere).accepted);
 }
 
-/// A controller goes on to end.
+/// A controller continues to end.
 fn continues_to_end(flight: &mut Flight, from_ms: i64, to_ms: i64) {
     (from_ms..to_ms).step_by(20).for_each(|ms| assert!(flight.shutdown(ms * MS), "at {ms} ms"));
 }
@@ -481,7 +481,7 @@ fn current_mode(custom_mode: u32) -> MavMessage {
     MavMessage::CURRENT_MODE(CURRENT_MODE_DATA { custom_mode, ..Default::default() })
 }
 
-/// A PX4 that has landed by itself since 2 s, as we asked it to.
+/// A PX4 that has been landing in its own mode for 2 s, as requested.
 fn px4_in_land(to_ms: i64) -> Flight {
     let mut flight = flight("airborne");
     flight.camera(0, CameraInfo::sample());

@@ -772,7 +772,7 @@ enum Step {
 }
 
 fn step() -> impl Strategy<Value = (i64, Step)> {
-    let what = prop_oneof![
+    let event = prop_oneof![
         6 => (0..5_usize, -20..400_i64, any::<bool>())
             .prop_map(|(detector, stamp_ago_ms, seen)| Step::Received { detector, stamp_ago_ms, seen }),
         1 => (0..5_usize, any::<bool>()).prop_map(|(detector, alive)| Step::Presence { detector, alive }),
@@ -780,7 +780,7 @@ fn step() -> impl Strategy<Value = (i64, Step)> {
         1 => any::<bool>().prop_map(|ground| Step::Place { ground }),
         3 => Just(Step::Tick),
     ];
-    (0..120_i64, what)
+    (0..120_i64, event)
 }
 
 const NAMES: [&str; 5] = ["a", "b", "c", "d", "e"];
@@ -793,10 +793,10 @@ proptest! {
         let mut bench = Bench::new(preferring(None, None));
         // Those that may be present: a message arrived since they were last reported as gone.
         let mut present = [false; NAMES.len()];
-        for (wait_ms, what) in steps {
+        for (wait_ms, event) in steps {
             bench.now_ns += wait_ms * MS;
             let now = bench.now_ns;
-            match what {
+            match event {
                 Step::Received { detector, stamp_ago_ms, seen } => {
                     present[detector] = true;
                     let sight = seen.then_some(place([0.0, 0.0, 3.0]));

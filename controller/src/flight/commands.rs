@@ -16,7 +16,7 @@ impl Flight {
             return Err(format!("a landing is active, in phase `{phase}`"));
         }
         if self.mission.is_taking_off() {
-            return Err("the vehicle is taking off; the landing begins by itself".to_owned());
+            return Err("the vehicle is taking off; the landing begins automatically".to_owned());
         }
         if self.mission.is_taking_control() {
             return Err(format!("a start is under way: {}", self.view().phase(now_ns).1));
