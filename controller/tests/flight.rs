@@ -434,6 +434,20 @@ fn a_precision_landing_that_is_off_is_reported_with_the_parameters_to_set() {
 }
 
 #[test]
+fn motors_that_stop_in_the_air_abort_a_precision_landing() {
+    let mut flight = landing_target("command");
+    parameter(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
+    parameter(&mut flight, 2 * MS, "PLND_TYPE", 1.0);
+    hover(&mut flight, 1000, 4000, 4);
+    hover(&mut flight, 4000, 5000, 9);
+    receive(&mut flight, 5000 * MS, &heartbeat(9, false));
+    flight.tick(5001 * MS);
+    let status = flight.status(5001 * MS);
+    assert_eq!(status.phase, Phase::Aborted);
+    assert!(status.why.contains("stopped (disarmed) in the air"), "{}", status.why);
+}
+
+#[test]
 fn the_pilots_landing_gets_the_target_and_is_recalled_from_high_up() {
     let mut flight = landing_target("command");
     parameter(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
