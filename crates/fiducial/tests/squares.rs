@@ -1,12 +1,12 @@
 //! Tests square markers drawn pixel by pixel: borders of two cells, tags seen from the side, calibration grids, scratched,
-//! covered, sharpened and small ones, boards of hundreds.
+//! covered, sharpened and small ones, round tags next to other markers, boards of hundreds.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 
 use fiducial::{Detector, Observation, Settings};
 use geometry::{CameraModel, Pixel};
 use imaging::GrayImage;
 use markers::SquareCode;
-use markers::{Family, Marker};
+use markers::{Drawing, Family, Ink, Marker};
 
 /// Black, white and the ground.
 const GREYS: [f64; 3] = [30.0, 200.0, 120.0];
@@ -356,14 +356,14 @@ fn markers_in_the_other_colours_can_be_left_out() {
 #[test]
 fn a_small_marker_next_to_a_large_one_is_found_by_a_thorough_search() {
     let marker = "rings:1".parse().unwrap();
-    let drawing = markers::Drawing::new(&marker, 1.0).unwrap();
+    let drawing = Drawing::new(&marker, 1.0).unwrap();
     let places = [([150.3, 130.7], 200.0), ([310.6, 80.2], 40.0)];
     let image = picture([360, 260], 1.0, |[x, y]| {
         let on = |(middle, size): ([f64; 2], f64)| {
             let [u, v] = [(x - middle[0]) / size, (middle[1] - y) / size];
             let ink = drawing.ink_at(u, v);
             (u.abs().max(v.abs()) < drawing.half_extent_m)
-                .then_some(GREYS[usize::from(ink == markers::Ink::White)])
+                .then_some(GREYS[usize::from(ink == Ink::White)])
         };
         places.into_iter().find_map(on).unwrap_or(GREYS[2])
     });
@@ -395,4 +395,179 @@ fn every_marker_of_a_board_of_hundreds_is_found() {
     assert_eq!(ids(&image, &["aruco-6x6-1000"], Settings::default()), all);
     let with_others = ["aruco-4x4-50", "aruco-6x6-1000", "apriltag-16h5"];
     assert_eq!(ids(&image, &with_others, Settings::default()), all);
+}
+
+/// One family of each layout and dictionary of the square markers, a STag and the rings.
+const FAMILIES: [Family; 18] = [
+    Family::AprilTag16h5,
+    Family::AprilTag25h9,
+    Family::AprilTag36h10,
+    Family::AprilTag36h11,
+    Family::AprilTagCircle21h7,
+    Family::AprilTagCircle49h12,
+    Family::AprilTagCustom48h12,
+    Family::AprilTagStandard41h12,
+    Family::AprilTagStandard52h13,
+    Family::Aruco4x4_50,
+    Family::Aruco5x5_50,
+    Family::Aruco6x6_50,
+    Family::Aruco7x7_50,
+    Family::ArucoOriginal,
+    Family::ArucoMip36h12,
+    Family::StagHd11,
+    Family::StagHd21,
+    Family::Rings,
+];
+const ROUND: [Family; 2] = [Family::AprilTagCircle21h7, Family::AprilTagCircle49h12];
+
+/// A marker on white paper of its width and a little more; its square, or its largest ring, is `size_px` wide.
+fn sheet(family: Family, id: u32, size_px: f64) -> GrayImage {
+    let id = family.id_count().map(|_| id);
+    let drawing = Drawing::new(&Marker { family, id, size_m: None }, size_px).unwrap();
+    let side = (2.0 * drawing.half_extent_m) as usize + 30;
+    let middle = side as f64 / 2.0 - 0.2;
+    let mut image = GrayImage::filled(side, side, 0);
+    // A fourth of the places of `picture`, as these are large.
+    const ALONG: usize = 3;
+    for y in 0..side {
+        for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+            let within =
+                |at: usize, k: usize| at as f64 + (k as f64 + 0.5) / ALONG as f64 - 0.5 - middle;
+            let grey = |i: usize| {
+                let (right, up) = (within(x, i % ALONG), -within(y, i / ALONG));
+                let is_paper = right.abs().max(up.abs()) > drawing.half_extent_m;
+                GREYS[usize::from(is_paper || drawing.ink_at(right, up) == Ink::White)]
+            };
+            let sum: f64 = (0..ALONG * ALONG).map(grey).sum();
+            *pixel = (sum / (ALONG * ALONG) as f64).round() as u8;
+        }
+    }
+    image
+}
+
+/// Sheets side by side in rows of `columns`, in places as large as the largest sheet.
+fn side_by_side(sheets: &[&GrayImage], columns: usize) -> GrayImage {
+    let place = sheets.iter().map(|sheet| sheet.width()).max().unwrap();
+    let rows = sheets.len().div_ceil(columns);
+    let mut image = GrayImage::filled(columns * place, rows * place, GREYS[1] as u8);
+    for (index, sheet) in sheets.iter().enumerate() {
+        let (left, top) = (index % columns * place, index / columns * place);
+        for y in 0..sheet.height() {
+            let row = sheet.view().unwrap().row(y).to_vec();
+            image.row_mut(top + y)[left..left + sheet.width()].copy_from_slice(&row);
+        }
+    }
+    image
+}
+
+/// The families and ids of the markers that are found, in order.
+fn names(found: &[Observation]) -> Vec<(Family, Option<u32>)> {
+    let mut names: Vec<_> = found.iter().map(|marker| (marker.family, marker.id)).collect();
+    names.sort_unstable_by_key(|(family, id)| (*family as usize, *id));
+    names
+}
+
+#[test]
+fn a_round_tag_is_found_beside_a_marker_of_any_family() {
+    const ID: u32 = 5;
+    for size_px in [20.0, 60.0, 110.0, 200.0] {
+        let sheets = FAMILIES.map(|family| sheet(family, ID, size_px));
+        for (round, other) in ROUND.into_iter().flat_map(|round| FAMILIES.map(|it| (round, it))) {
+            if round == other {
+                continue;
+            }
+            let at = |family| FAMILIES.iter().position(|it| *it == family).unwrap();
+            let image = side_by_side(&[&sheets[at(round)], &sheets[at(other)]], 2);
+            let id = |family: Family| family.id_count().map(|_| ID);
+            let mut expected = [(round, id(round)), (other, id(other))];
+            expected.sort_unstable_by_key(|(family, id)| (*family as usize, *id));
+            let markers = [round, other].map(Family::name);
+            assert_eq!(names(&find(&image, &markers)), expected, "{size_px} px");
+        }
+    }
+}
+
+#[test]
+fn a_round_tag_is_found_alone_where_another_family_is_listed() {
+    for (family, size_px) in
+        ROUND.into_iter().flat_map(|it| [16.0, 20.0, 30.0, 60.0, 200.0].map(|size| (it, size)))
+    {
+        let image = sheet(family, 8, size_px);
+        let found = find(&image, &[family.name(), "apriltag-36h11"]);
+        assert_eq!(names(&found), [(family, Some(8))], "{size_px} px");
+        assert!(found[0].confidence > 0.7, "{size_px} px: {}", found[0].confidence);
+    }
+}
+
+#[test]
+fn a_small_marker_does_not_hide_the_round_tag_of_its_pad() {
+    for round in ROUND {
+        let image =
+            side_by_side(&[&sheet(round, 5, 220.0), &sheet(Family::AprilTag36h11, 5, 88.0)], 2);
+        let listed = [format!("{}:5", round.name()), "apriltag-36h11:5".to_owned()];
+        let found = find(&image, &listed.each_ref().map(String::as_str));
+        let expected = [(Family::AprilTag36h11, Some(5)), (round, Some(5))];
+        assert_eq!(names(&found), expected);
+    }
+}
+
+#[test]
+fn round_tags_are_found_among_sixteen_markers() {
+    let families = [
+        Family::AprilTagStandard41h12,
+        Family::AprilTag36h11,
+        Family::ArucoMip36h12,
+        Family::StagHd21,
+        Family::Aruco7x7_1000,
+        Family::AprilTagCircle21h7,
+        Family::ArucoOriginal,
+        Family::AprilTagCircle49h12,
+    ];
+    let sheets: Vec<GrayImage> =
+        (0..16).map(|index| sheet(families[index % 8], index as u32, 88.0)).collect();
+    let image = side_by_side(&sheets.iter().collect::<Vec<_>>(), 4);
+    for family in ROUND {
+        let first = families.iter().position(|it| *it == family).unwrap() as u32;
+        let expected = [(family, Some(first)), (family, Some(first + 8))];
+        assert_eq!(names(&find(&image, &[family.name()])), expected);
+    }
+    assert_eq!(find(&image, &families.map(Family::name)).len(), 16);
+}
+
+/// The bits that this tag has in common with a round one are a codeword of that.
+#[test]
+fn a_tag_that_contains_a_round_tag_is_one_marker() {
+    let (family, id) = (Family::AprilTagStandard41h12, 704);
+    let image = sheet(family, id, 80.0);
+    for listed in [[family, ROUND[0]], [ROUND[0], family]] {
+        assert_eq!(names(&find(&image, &listed.map(Family::name))), [(family, Some(id))]);
+    }
+}
+
+#[test]
+fn a_round_tag_may_be_cut_out_along_its_outline() {
+    let size_px = 80.0;
+    let other = sheet(Family::AprilTag36h11, 5, size_px);
+    // The distance of the farthest corner from the middle, in sides of the square.
+    for (family, radius) in [
+        (Family::AprilTagCircle21h7, f64::hypot(0.7, 0.7)),
+        (Family::AprilTagCircle49h12, f64::hypot(1.1, 0.3)),
+    ] {
+        for ground in [20, 90, 250] {
+            let mut round = sheet(family, 5, size_px);
+            let middle = round.width() as f64 / 2.0;
+            for y in 0..round.height() {
+                for (x, pixel) in round.row_mut(y).iter_mut().enumerate() {
+                    let [right, down] = [x, y].map(|at| at as f64 - middle);
+                    if right.hypot(down) > radius * size_px + 2.0 {
+                        *pixel = ground;
+                    }
+                }
+            }
+            let image = side_by_side(&[&round, &other], 2);
+            let found = find(&image, &[family.name(), "apriltag-36h11"]);
+            let expected = [(Family::AprilTag36h11, Some(5)), (family, Some(5))];
+            assert_eq!(names(&found), expected, "ground of {ground}");
+        }
+    }
 }

@@ -21,6 +21,8 @@ const MAX_UNKNOWNS: usize = MAX_BITS + 2;
 /// Indices of the unknowns of dark and of bright known cells.
 pub(crate) const DARK: usize = 0;
 pub(crate) const BRIGHT: usize = 1;
+/// Marks cells around the outer bits of a round marker, which have no unknown: they are not part of the marker and may have any colour.
+const BEYOND: u8 = u8::MAX;
 /// Largest number of cells across: up to 12 in the square, and up to 2 on each side.
 const MAX_ACROSS: usize = 16;
 
@@ -35,6 +37,8 @@ const WIDE_CELL_PX: f64 = 2.0;
 /// Prior that pulls bits to the middle of dark and bright, as a fraction of a pixel's weight; it bounds the
 /// noise of cells that are hardly seen.
 const PRIOR: f64 = 0.05;
+/// Largest fraction of a pixel's light from cells that are not part of a round marker. Pixels with more of it do not count.
+const MAX_BEYOND: f64 = 0.15;
 
 /// The cells of one or several codes that have them in common.
 #[derive(Clone, Debug)]
@@ -62,10 +66,12 @@ impl Layout {
         for row in 0..across {
             for column in 0..across {
                 let inside = |at: usize| (margin..margin + cells).contains(&at);
-                // The border's colour in the square, the other one outside; bits are set below.
-                let within = inside(row) && inside(column);
-                let bright = within == code.reversed_border;
-                unknowns[row * MAX_ACROSS + column] = if bright { BRIGHT } else { DARK } as u8;
+                let beside = |at: usize| (margin..margin + cells + 2).contains(&(at + 1));
+                // The border's colour in the square, the other one right outside; bits are set below.
+                let is_bright = (inside(row) && inside(column)) == code.reversed_border;
+                let is_beyond = code.reversed_border && !(beside(row) && beside(column));
+                let known = if is_bright { BRIGHT } else { DARK } as u8;
+                unknowns[row * MAX_ACROSS + column] = if is_beyond { BEYOND } else { known };
             }
         }
         for (index, [column, row]) in code.bits.iter().enumerate() {
@@ -83,6 +89,14 @@ impl Layout {
             && self.cells == usize::from(code.cells + 2 * extra_border)
             && self.reversed == code.reversed_border
             && self.bits == code.bits
+    }
+
+    /// Whether the other layout has the same square, all bits of this one, and more bits.
+    pub(crate) fn is_part_of(&self, other: &Self) -> bool {
+        (other.cells, other.extra_border, other.reversed)
+            == (self.cells, self.extra_border, self.reversed)
+            && other.bits.len() > self.bits.len()
+            && self.bits.iter().all(|bit| other.bits.contains(bit))
     }
 
     fn across(&self) -> usize {
@@ -349,17 +363,29 @@ impl Cells {
         }
         let mut seen = [(0_usize, 0.0); MAX_SEEN * MAX_SEEN];
         let mut seen_count = 0;
+        let mut beyond = 0.0;
         for (j, down) in weights[1].iter().enumerate().take(counts[1]) {
             let row = &layout.unknowns[(firsts[1] + j) * MAX_ACROSS..];
             for (i, right) in weights[0].iter().enumerate().take(counts[0]) {
                 let weight = down * right;
-                if weight > 1e-3 {
-                    seen[seen_count] = (usize::from(row[firsts[0] + i]), weight);
+                let unknown = row[firsts[0] + i];
+                if unknown == BEYOND {
+                    beyond += weight;
+                } else if weight > 1e-3 {
+                    seen[seen_count] = (usize::from(unknown), weight);
                     seen_count += 1;
                 }
             }
         }
-        let seen = &seen[..seen_count];
+        let seen = &mut seen[..seen_count];
+        if beyond > MAX_BEYOND {
+            return;
+        }
+        // The marker's cells in this pixel take the place of the others.
+        if beyond > 0.0 {
+            seen.iter_mut().for_each(|(_, weight)| *weight /= 1.0 - beyond);
+        }
+        let seen = &*seen;
         for (i, (row, weight)) in seen.iter().enumerate() {
             self.right[*row] += weight * grey;
             for (column, other) in &seen[..=i] {

@@ -438,7 +438,10 @@ impl SquareTagDetector {
                 let found =
                     if is_solved { self.match_codewords(quad, layout) } else { Err(Reason::Small) };
                 match found {
-                    Ok(found) => self.accept(found, trace),
+                    Ok(found) => {
+                        self.drop_parts(quad, layout);
+                        self.accept(found, trace);
+                    }
                     Err(reason) => {
                         if reason == Reason::Confidence && self.doubtful.len() < MAX_DOUBTFUL {
                             self.doubtful.push((*quad, layout));
@@ -512,14 +515,33 @@ impl SquareTagDetector {
         }
     }
 
-    /// Whether a marker with this layout was found where the quad is.
+    /// Whether a marker was found in this quad by this layout, or by one that contains it.
     fn is_known(&self, quad: &Quad, layout: usize) -> bool {
-        let has_layout =
-            |found: &&Decoded| self.queries[found.query].layouts.contains(&Some(layout));
+        let contains_it = |other: &Layout| self.layouts[layout].is_part_of(other);
+        // Asked once, as boards have hundreds of markers.
+        let is_contained = self.layouts.iter().any(contains_it);
+        let has_layout = |found: &&Decoded| {
+            let layouts = &self.queries[found.query].layouts;
+            layouts.contains(&Some(layout))
+                || is_contained
+                    && layouts.iter().flatten().any(|other| contains_it(&self.layouts[*other]))
+        };
         self.found
             .iter()
             .filter(has_layout)
             .any(|found| Overlap::new(&found.corners, &quad.corners).is_same_square())
+    }
+
+    /// Drops markers that were found in this quad by a part of this layout's bits: a part of a codeword may be a codeword of a smaller
+    /// code. Four tags of Standard41h12 contain one of Circle21h7.
+    fn drop_parts(&mut self, quad: &Quad, layout: usize) {
+        let Self { found, queries, layouts, .. } = self;
+        found.retain(|other| {
+            let of_other = queries[other.query].layouts;
+            let is_part = |other: &usize| layouts[*other].is_part_of(&layouts[layout]);
+            !of_other.iter().flatten().any(is_part)
+                || !Overlap::new(&other.corners, &quad.corners).is_same_square()
+        });
     }
 
     /// The marker whose codeword is nearest to the cells of a quad.
