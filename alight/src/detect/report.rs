@@ -7,6 +7,12 @@ use geometry::Pixel;
 use markers::Pad;
 use serde::Serialize;
 
+/// A pose does not fit where its residual is larger than both of these: in pixels, and as a fraction of the marker's largest extent.
+/// Corners are uncertain by less than a pixel, and those of a covered marker by 1.5 % of its extent, of which the pose takes up the
+/// larger part. The detector refuses squares from 2 % on.
+const MIN_MISFIT_PX: f64 = 2.0;
+const MIN_MISFIT_RATIO: f64 = 0.01;
+
 /// The output for an image.
 #[derive(Debug, Serialize)]
 #[serde(untagged)]
@@ -169,7 +175,55 @@ impl Detection {
                 "  at ({x:.3}, {y:.3}, {z:.3}) m in the camera frame, rms {:.2} px",
                 pose.reprojection_rms_px
             );
+            let min_misfit_px = MIN_MISFIT_PX.max(MIN_MISFIT_RATIO * self.size_px);
+            if pose.reprojection_rms_px > min_misfit_px {
+                text.push_str(
+                    "\n    note: this pose does not fit the image: the marker is bent or the calibration is wrong",
+                );
+            }
         }
         text.push('\n');
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pose_that_does_not_fit_has_a_note() {
+        let text = |size_px: f64, reprojection_rms_px: f64| {
+            let pose = Pose {
+                translation_m: [0.1, 0.2, 0.3],
+                rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
+                reprojection_rms_px,
+                covariance: Vec::new(),
+                alternative: None,
+            };
+            let detection = Detection {
+                family: "apriltag-36h11",
+                id: Some(7),
+                centre_px: [631.64, 349.48],
+                centre_covariance_px2: [0.01, 0.0, 0.01],
+                corners_px: None,
+                size_px,
+                wrong_bits: 0,
+                confidence: 0.9,
+                pose: Some(pose),
+            };
+            let mut text = String::new();
+            detection.append_text(&mut text);
+            text
+        };
+        let has_note = |size_px, rms_px| text(size_px, rms_px).contains("does not fit the image");
+        assert!(has_note(303.0, 4.35) && has_note(180.0, 2.2));
+        // Noise of a small marker, and a lens that is a little off where the marker fills the image.
+        assert!(!has_note(303.0, 0.8) && !has_note(60.0, 1.1) && !has_note(900.0, 4.35));
+        assert_eq!(
+            text(303.0, 4.35).lines().nth(1),
+            Some(
+                "    note: this pose does not fit the image: the marker is bent or the calibration is wrong"
+            )
+        );
     }
 }
