@@ -1,17 +1,17 @@
 // @ts-check
-// The page: takes what the server tells, shows it, and greys what is no longer current.
-import { answered, connectionLost, doubted, holdable, isHeld, nonceCame, release } from './hold.js';
+// The page: receives the server's messages, shows them, and greys outdated values.
+import { answered, connectionLost, uncertainty, holdable, isHeld, nonceReceived, release } from './hold.js';
 import { Map2 } from './map.js';
 import { follow } from './picture.js';
 import { Strip } from './strips.js';
 
-/** A number older than this is no longer current, in milliseconds. */
+/** A value older than this is no longer current, in milliseconds. */
 const STALE_MS = 700;
-/** What comes once a second is stale after this, in milliseconds. */
+/** Data that are sent once a second are stale after this, in milliseconds. */
 const SLOW_STALE_MS = 2600;
 const RECONNECT_MS = 400;
 const MAX_RECONNECT_MS = 1500;
-/** Without a word for this time the connection is given up, in milliseconds. */
+/** Without a message for this time the connection is closed, in milliseconds. */
 const SILENCE_MS = 3000;
 
 /** @param {string} id */
@@ -27,7 +27,7 @@ const put = (where, text) => {
   if (node.textContent !== text) node.textContent = text;
 };
 
-/** Zero has no sign. @param {number} value @param {number} digits */
+/** Formats a number; zero has no sign. @param {number} value @param {number} digits */
 const fixed = (value, digits) => value.toFixed(digits).replace(/^-(?=[0.]+$)/, '');
 
 /** @param {number | null | undefined} value @param {number} digits @param {string} unit */
@@ -38,26 +38,26 @@ const age = (ms) => (ms < 9950 ? `${(ms / 1000).toFixed(1)} s` : `${Math.round(m
 
 const degrees = (/** @type {number} */ radians) => (radians * 180) / Math.PI;
 
-/** What was told last, and when it came; `toldMs` is the newest stamp of the server.
- * @type {{ now: any, nowAt: number, slow: any, slowAt: number, heardAt: number, toldMs: number | null, hello: any, offset: number | null, bestTrip: number, trip: number | null }} */
-const known = { now: null, nowAt: 0, slow: null, slowAt: 0, heardAt: 0, toldMs: null, hello: null, offset: null, bestTrip: Infinity, trip: null };
+/** The last messages and the times of their arrival; `stampMs` is the newest stamp of the server.
+ * @type {{ now: any, nowAt: number, slow: any, slowAt: number, receivedAt: number, stampMs: number | null, hello: any, offset: number | null, bestTrip: number, trip: number | null }} */
+const known = { now: null, nowAt: 0, slow: null, slowAt: 0, receivedAt: 0, stampMs: null, hello: null, offset: null, bestTrip: Infinity, trip: null };
 /** The picture that was drawn last. @type {{ header: any, at: number, drawn: number } | null} */
 let picture = null;
 let hasVideo = false;
 /** @type {WebSocket | null} */
 let socket = null;
 let pause = RECONNECT_MS;
-/** Why the server takes no connection of this page, and what to do. */
+/** The reason for which the server refuses a connection of this page, with the remedy. */
 let refusal = '';
 const map = new Map2();
-/** What makes the pictures. @type {import('./picture.js').Follower | null} */
+/** Receives and draws the pictures. @type {import('./picture.js').Follower | null} */
 let video = null;
-/** Whether what was refused is to be shown. */
-let isCurious = false;
+/** Whether refused candidates are shown. */
+let showsRefused = false;
 
-/** Time since the server told something, at least: since it came, or by the server's stamp, so that a slow way counts as well.
- * @param {number} at @param {number} cameAt @param {number | null} stampMs */
-const since = (at, cameAt, stampMs) => Math.max(at - cameAt, known.offset === null || stampMs === null ? 0 : at + known.offset - stampMs);
+/** Age of a message, at least: since its arrival, or since the server's stamp, so that a slow link counts as well.
+ * @param {number} at @param {number} arrivedAt @param {number | null} stampMs */
+const since = (at, arrivedAt, stampMs) => Math.max(at - arrivedAt, known.offset === null || stampMs === null ? 0 : at + known.offset - stampMs);
 
 const link = {
   /** @param {object} message */
@@ -67,7 +67,7 @@ const link = {
     return true;
   },
   /** @param {string} text @param {string} mood */
-  tell(text, mood) {
+  report(text, mood) {
     put('reply', text);
     element('reply').className = mood;
   },
@@ -75,7 +75,7 @@ const link = {
 
 const strips = {
   height: new Strip(element('strips'), 'Height', 'm', 2, 1, STALE_MS),
-  lateral: new Strip(element('strips'), 'Beside the pad', 'm', 3, 0.1, STALE_MS),
+  lateral: new Strip(element('strips'), 'Distance from pad', 'm', 3, 0.1, STALE_MS),
   age: new Strip(element('strips'), 'Age of detection', 'ms', 0, 100, STALE_MS),
   picture: new Strip(element('strips'), 'Picture, light to screen', 'ms', 0, 100, STALE_MS),
   trip: new Strip(element('strips'), 'Page to server and back', 'ms', 1, 10, SLOW_STALE_MS),
@@ -108,8 +108,8 @@ async function begin() {
 function connect() {
   const mine = new WebSocket(address('/ws'));
   socket = mine;
-  [known.heardAt, known.toldMs] = [performance.now(), null];
-  // Another way, perhaps another server: its clock is compared anew.
+  [known.receivedAt, known.stampMs] = [performance.now(), null];
+  // A new connection, perhaps to another server: its clock is compared again.
   known.bestTrip = Infinity;
   mine.onopen = () => {
     pause = RECONNECT_MS;
@@ -119,9 +119,9 @@ function connect() {
   mine.onclose = () => { if (socket === mine) disconnect(); };
 }
 
-/** Gives a connection up, and tries another one. */
+/** Closes the connection, and tries another one. */
 function disconnect() {
-  // One that hangs would take long to close.
+  // A connection that hangs would take long to close.
   const old = socket;
   socket = null;
   old?.close();
@@ -133,8 +133,8 @@ function disconnect() {
 /** @param {any} message */
 function take(message) {
   const at = performance.now();
-  known.heardAt = at;
-  if (message.now_ms != null) known.toldMs = Math.max(known.toldMs ?? message.now_ms, message.now_ms);
+  known.receivedAt = at;
+  if (message.now_ms != null) known.stampMs = Math.max(known.stampMs ?? message.now_ms, message.now_ms);
   if (message.kind === 'now') {
     [known.now, known.nowAt] = [message, at];
     showNow(message, at);
@@ -146,7 +146,7 @@ function take(message) {
     showLog(message);
   } else if (message.kind === 'hello') {
     if (known.hello && known.hello.vehicle !== message.vehicle) {
-      startAnew();
+      restart();
       return;
     }
     known.hello = message;
@@ -155,27 +155,27 @@ function take(message) {
     const trip = at - message.at_ms;
     known.trip = trip;
     strips.trip.add(at, trip);
-    // The quickest answer tells the difference of the clocks best; others may have waited.
+    // The fastest answer gives the best difference of the clocks; others may have waited.
     known.bestTrip *= 1.02;
     if (trip <= known.bestTrip) [known.bestTrip, known.offset] = [trip, message.now_ms - (message.at_ms + trip / 2)];
   } else if (message.kind === 'nonce') {
-    nonceCame(link, message);
+    nonceReceived(link, message);
   } else if (message.kind === 'reply') {
     answered(message.command);
     const verdict = `${message.accepted ? 'accepted' : 'refused'} by the ${message.who}`;
-    link.tell(`${message.command}: ${message.who === 'nobody' ? 'no answer' : verdict}: ${message.why}`, message.accepted ? 'good' : 'bad');
+    link.report(`${message.command}: ${message.who === 'nobody' ? 'no answer' : verdict}: ${message.why}`, message.accepted ? 'good' : 'bad');
   }
 }
 
-/** The server is that of another vehicle by now: nothing of the one before is shown beside it, and no button that is held commands it.
- * Only what a command may have done is still told, with the name of its vehicle. */
-function startAnew() {
+/** Reloads the page, as the server now is that of another vehicle: no data of the previous vehicle are shown with it, and no held
+ * button commands it. Only a command without an answer is still reported, with the name of its vehicle. */
+function restart() {
   const old = socket;
   socket = null;
   old?.close();
   connectionLost(link);
-  const doubt = doubted();
-  if (doubt !== null) sessionStorage.setItem('doubt', `${known.hello.vehicle}: ${doubt}.`);
+  const uncertain = uncertainty();
+  if (uncertain !== null) sessionStorage.setItem('uncertain', `${known.hello.vehicle}: ${uncertain}.`);
   location.reload();
 }
 
@@ -190,7 +190,7 @@ function showHello(hello) {
   enable();
 }
 
-/** Buttons that cannot be used say so, and are not held: one that is disabled does not hear that it is let go. */
+/** Enables or disables the buttons. One that is disabled is not held any more, as it gets no event when it is released. */
 function enable() {
   const may = known.hello && !known.hello.no_commands && isConnected();
   if (!may) release(link);
@@ -199,7 +199,7 @@ function enable() {
   }
 }
 
-const isConnected = () => socket !== null && socket.readyState === WebSocket.OPEN && since(performance.now(), known.heardAt, known.toldMs) < STALE_MS;
+const isConnected = () => socket !== null && socket.readyState === WebSocket.OPEN && since(performance.now(), known.receivedAt, known.stampMs) < STALE_MS;
 
 /** Asks for the server's time. */
 const ping = () => link.send({ kind: 'ping', at_ms: performance.now() });
@@ -231,7 +231,7 @@ function showNow({ status, target, vehicle, now_ms: stampMs }, at) {
     put('armed', vehicle.armed ? 'armed' : 'off');
     element('armed').className = vehicle.armed ? 'warn' : '';
     put('landed', vehicle.landed);
-    put('battery', vehicle.battery == null ? 'not told' : `${Math.round(vehicle.battery * 100)} %`);
+    put('battery', vehicle.battery == null ? 'unknown' : `${Math.round(vehicle.battery * 100)} %`);
     const [vn, ve, vd] = vehicle.velocity_m_s;
     put('down', number(vd, 2, 'm/s'));
     put('sideways', number(Math.hypot(vn, ve), 2, 'm/s'));
@@ -245,11 +245,11 @@ function showNow({ status, target, vehicle, now_ms: stampMs }, at) {
   map.take(vehicle, target && target.position_m ? target : null);
 }
 
-/** Makes the children of a list or table be these; those that stay are kept.
- * @param {HTMLElement} parent @param {[string, string, string?][]} wanted */
-function rows(parent, wanted) {
-  while (parent.children.length > wanted.length) parent.lastElementChild?.remove();
-  wanted.forEach(([tag, text, mood = ''], n) => {
+/** Sets the children of a list or table; existing elements are reused.
+ * @param {HTMLElement} parent @param {[string, string, string?][]} entries */
+function rows(parent, entries) {
+  while (parent.children.length > entries.length) parent.lastElementChild?.remove();
+  entries.forEach(([tag, text, mood = ''], n) => {
     let child = /** @type {HTMLElement | undefined} */ (parent.children[n]);
     if (!child) {
       child = document.createElement(tag);
@@ -268,7 +268,7 @@ function row(body, key, cells) {
     found = document.createElement('tr');
     found.dataset.key = key;
     found.setAttribute('role', 'row');
-    // Where a row is a card, each cell says its column.
+    // Where a row is a card, each cell shows the name of its column.
     const columns = [...(body.closest('table')?.querySelectorAll('th') ?? [])];
     for (let n = 0; n < cells; n += 1) {
       const cell = document.createElement('td');
@@ -300,7 +300,7 @@ function showSlow({ detectors, services, recorders, bridges, checks }) {
       it.sees ?? (it.seen === 0 ? 'no marker' : '-'),
     ];
     texts.forEach((text, n) => put(/** @type {HTMLElement} */ (line.children[n]), text));
-    // One that is in use for want of a better one is not in a good state.
+    // A detector that is in use only because there is no better one is not in a good state.
     line.children[1].className = it.state === 'in use' ? 'good' : it.state === 'standby' ? '' : 'bad';
     line.dataset.age = it.age_ms == null ? '' : String(it.age_ms);
     if (!line.querySelector('button')) {
@@ -316,7 +316,7 @@ function showSlow({ detectors, services, recorders, bridges, checks }) {
       enable();
     }
   }
-  // A button that is held stays.
+  // The row of a held button is not removed.
   const held = [...table.querySelectorAll('button')].find((button) => isHeld(button));
   forget(table, [...detectors.map((/** @type {any} */ it) => it.name), held?.dataset.argument ?? '']);
 
@@ -342,7 +342,7 @@ function showSlow({ detectors, services, recorders, bridges, checks }) {
   rows(ground, bridges.map((/** @type {any} */ it, /** @type {number} */ n) => {
     const further = it.unlisted > 0 ? `, and ${it.unlisted} packet${it.unlisted === 1 ? '' : 's'} of further stations` : '';
     const stations = it.problem ?? `${it.stations.join(', ') || 'none yet'}${further}`;
-    // What is grey stays so until it is looked at its age.
+    // A grey line stays grey until its age is checked.
     return ['span', `Ground stations of ${it.name}: ${stations}; ${it.signing}; ${it.refused} refused (${age(it.age_ms)} ago). `, ground.children[n]?.className];
   }));
   bridges.forEach((/** @type {any} */ it, /** @type {number} */ n) => {
@@ -390,13 +390,13 @@ function showLog({ now_ms: now, entries }) {
   if (isAtEnd) list.scrollTop = list.scrollHeight;
 }
 
-/** Greys what is old, and says how old. */
-function lookAtAges() {
+/** Greys outdated values, and shows their age. */
+function checkAges() {
   const at = performance.now();
   const connected = isConnected();
-  // What comes late is no connection either.
-  const silent = at - known.heardAt;
-  const lost = silent < STALE_MS && socket?.readyState === WebSocket.OPEN ? `${age(since(at, known.heardAt, known.toldMs))} behind` : `no connection for ${age(silent)}`;
+  // A connection with late messages does not count as connected either.
+  const silent = at - known.receivedAt;
+  const lost = silent < STALE_MS && socket?.readyState === WebSocket.OPEN ? `${age(since(at, known.receivedAt, known.stampMs))} behind` : `no connection for ${age(silent)}`;
   put('connection', connected ? 'connected' : (!socket && refusal) || lost);
   element('connection').className = `badge ${connected ? 'good' : 'lost'}`;
   document.querySelector('main')?.classList.toggle('cut-off', !connected);
@@ -406,16 +406,16 @@ function lookAtAges() {
   for (const panel of document.querySelectorAll('[data-group]')) {
     const names = (/** @type {HTMLElement} */ (panel).dataset.group ?? '').split(' ');
     const ages = names.map((name) => known.now?.[name]?.age_ms);
-    // A panel that shows several things is as old as the oldest.
+    // A panel with several messages is as old as the oldest one.
     const old = ages.includes(undefined) ? null : Math.max(...ages) + nowOld;
     const isStale = old === null || old > STALE_MS;
     panel.classList.toggle('stale', isStale);
     const label = panel.querySelector('.age');
-    if (label) put(/** @type {HTMLElement} */ (label), old === null ? 'not heard' : isStale ? `${age(old)} old` : '');
+    if (label) put(/** @type {HTMLElement} */ (label), old === null ? 'no data' : isStale ? `${age(old)} old` : '');
   }
   const status = known.now?.status;
   const phaseOld = status ? status.age_ms + nowOld : Infinity;
-  // These are told with the status, and shown in other panels.
+  // These are part of the status, and shown in other panels.
   for (const id of ['autopilot', 'detector-why']) element(id).classList.toggle('old', phaseOld > STALE_MS);
   const badge = element('phase');
   if (phaseOld <= STALE_MS) {
@@ -426,9 +426,9 @@ function lookAtAges() {
     badge.className = 'badge lost';
   }
   for (const line of document.querySelectorAll('tbody tr, #bridges span')) {
-    const told = /** @type {HTMLElement} */ (line).dataset.age;
+    const stated = /** @type {HTMLElement} */ (line).dataset.age;
     const limit = line.closest('#detectors') ? SLOW_STALE_MS - 1000 : line.closest('#bridges') ? SLOW_STALE_MS + 4000 : SLOW_STALE_MS + 1000;
-    line.classList.toggle('old', !told || Number(told) + slowOld > limit);
+    line.classList.toggle('old', !stated || Number(stated) + slowOld > limit);
   }
   for (const id of ['checks', 'recorders', 'bridges']) element(id).classList.toggle('old', slowOld > SLOW_STALE_MS);
   if (picture) {
@@ -444,25 +444,25 @@ function lookAtAges() {
 }
 
 /** @param {any} message */
-function pictureTold(message) {
+function pictureDrawn(message) {
   if (message.kind !== 'drawn') return;
   const at = performance.now();
   const { header } = message;
   picture = { header, at, drawn: message.drawn };
   const light = known.offset === null ? null : at + known.offset - header.taken_ms;
-  // Of another host's clock nobody knows here when the light came.
+  // Stamps of another host's clock do not show here when the frame was exposed.
   strips.picture.add(at, header.is_own_clock ? light : null);
-  const seen = header.markers === null ? 'nobody has told in time what is in it' : `${header.detector}${header.is_used ? '' : ' (not in use)'} found ${header.markers.length} in it`;
+  const seen = header.markers === null ? 'no detections arrived in time' : `${header.detector}${header.is_used ? '' : ' (not in use)'} found ${header.markers.length} in it`;
   showRefused(header);
   put('video-text', `${header.camera} ${header.sequence}, ${header.width} x ${header.height}: ${seen}${light === null ? '' : `; ${light.toFixed(0)} ms after ${header.is_own_clock ? 'the light' : 'it came'}`}.`);
 }
 
-/** What the detector refused in the picture that is shown, by reason.
+/** Shows the candidates that the detector refused in the present picture, by reason.
  * @param {any} header */
 function showRefused({ detector, refused, refused_total: total }) {
   const text = () => {
-    if (!isCurious) return '';
-    if (!refused) return 'The detector has not told in time what it refused.';
+    if (!showsRefused) return '';
+    if (!refused) return 'The refused candidates did not arrive in time.';
     if (total === 0) return `${detector} refused nothing in it.`;
     const counts = new Map();
     for (const { reason } of refused) counts.set(reason, (counts.get(reason) ?? 0) + 1);
@@ -473,16 +473,16 @@ function showRefused({ detector, refused, refused_total: total }) {
 }
 
 element('refused').addEventListener('click', () => {
-  isCurious = !isCurious;
-  element('refused').setAttribute('aria-pressed', String(isCurious));
-  video?.curious(isCurious);
-  if (!isCurious) put('refused-text', '');
+  showsRefused = !showsRefused;
+  element('refused').setAttribute('aria-pressed', String(showsRefused));
+  video?.showRefused(showsRefused);
+  if (!showsRefused) put('refused-text', '');
 });
 
 function startVideo() {
-  // A canvas is handed over once. Its connection comes back by itself where it ends; one that hangs does not tell.
+  // A canvas is transferred once. Its connection is opened again when it ends; one that hangs gives no event.
   if (hasVideo) {
-    video?.again();
+    video?.reconnect();
     return;
   }
   hasVideo = true;
@@ -492,20 +492,20 @@ function startVideo() {
     const image = document.createElement('img');
     [image.id, image.alt, image.src] = ['video', "The camera's picture", '/video.mjpeg'];
     canvas.replaceWith(image);
-    put('video-text', 'This browser cannot draw what was found into its picture, and does not tell how old a picture is.');
+    put('video-text', 'This browser cannot draw detections into the picture, and does not show the age of a picture.');
     element('refused').hidden = true;
-    video = { again: () => { image.src = `/video.mjpeg?${performance.now()}`; }, curious: () => {} };
+    video = { reconnect: () => { image.src = `/video.mjpeg?${performance.now()}`; }, showRefused: () => {} };
   } else if ('transferControlToOffscreen' in canvas && 'Worker' in window) {
     const offscreen = canvas.transferControlToOffscreen();
     const worker = new Worker('/worker.js', { type: 'module' });
-    worker.onmessage = (event) => pictureTold(event.data);
+    worker.onmessage = (event) => pictureDrawn(event.data);
     worker.postMessage({ canvas: offscreen, address: url }, [offscreen]);
     video = {
-      again: () => worker.postMessage({ again: true }),
-      curious: (is) => worker.postMessage({ curious: is }),
+      reconnect: () => worker.postMessage({ reconnect: true }),
+      showRefused: (on) => worker.postMessage({ showRefused: on }),
     };
   } else {
-    video = follow(canvas, url, pictureTold);
+    video = follow(canvas, url, pictureDrawn);
   }
 }
 
@@ -523,7 +523,7 @@ element('login').addEventListener('submit', async (event) => {
   token.value = '';
   if (answer.ok) {
     put('login-problem', '');
-    // A connection keeps the rights with which it was opened.
+    // A connection retains the rights with which it was opened.
     const old = socket;
     socket = null;
     old?.close();
@@ -546,11 +546,11 @@ element('theme').addEventListener('click', () => {
 setTheme(localStorage.getItem('theme') === 'sun' ? 'sun' : 'dark');
 
 for (const button of document.querySelectorAll('button.hold')) holdable(link, /** @type {HTMLButtonElement} */ (button));
-const doubtBefore = sessionStorage.getItem('doubt');
-if (doubtBefore !== null) link.tell(doubtBefore, 'bad');
-sessionStorage.removeItem('doubt');
+const uncertainBefore = sessionStorage.getItem('uncertain');
+if (uncertainBefore !== null) link.report(uncertainBefore, 'bad');
+sessionStorage.removeItem('uncertain');
 enable();
 begin();
-setInterval(lookAtAges, 100);
+setInterval(checkAges, 100);
 setInterval(redraw, 200);
 setInterval(ping, 1000);

@@ -1,5 +1,5 @@
 // @ts-check
-// Pad, vehicle and its path, from above (north up) and from the side.
+// Draws pad, vehicle and its path, from above (north up) and from the side.
 
 const MAX_TRAIL = 1500;
 const MIN_SPACING_M = 0.02;
@@ -122,30 +122,30 @@ export class Map2 {
     if (!prepare || !this.vehicle) return;
     const { context, width, height, ratio } = prepare;
     const pad = this.target?.position_m ?? [0, 0, 0];
-    const points = this.trail.map((it) => ({ beside: Math.hypot(it.north - pad[0], it.east - pad[1]), up: it.up + pad[2] }));
+    const points = this.trail.map((it) => ({ distance: Math.hypot(it.north - pad[0], it.east - pad[1]), up: it.up + pad[2] }));
     const high = points.reduce((a, it) => Math.max(a, it.up), 1) * 1.1;
-    const far = points.reduce((a, it) => Math.max(a, it.beside), 0.3) * 1.1;
-    /** @param {{ beside: number, up: number }} it @returns {[number, number]} */
-    const at = (it) => [30 * ratio + (it.beside / far) * (width - 40 * ratio), height - 20 * ratio - (it.up / high) * (height - 30 * ratio)];
+    const far = points.reduce((a, it) => Math.max(a, it.distance), 0.3) * 1.1;
+    /** @param {{ distance: number, up: number }} it @returns {[number, number]} */
+    const at = (it) => [30 * ratio + (it.distance / far) * (width - 40 * ratio), height - 20 * ratio - (it.up / high) * (height - 30 * ratio)];
     context.strokeStyle = colour('--grid');
     context.fillStyle = colour('--quiet');
     const step = gridStep(high);
     for (let up = 0; up <= high; up += step) {
-      const [, y] = at({ beside: 0, up });
+      const [, y] = at({ distance: 0, up });
       context.beginPath();
       context.moveTo(30 * ratio, y);
       context.lineTo(width, y);
       context.stroke();
       context.fillText(`${up < 1 && up > 0 ? up.toFixed(1) : up.toFixed(0)}`, 4 * ratio, y + 4 * ratio);
     }
-    const said = `m up; to ${far.toFixed(2)} m beside`;
-    context.fillText(this.funnel ? `${said}; dashed: funnel` : said, 34 * ratio, height - 5 * ratio);
+    const label = `m up; to ${far.toFixed(2)} m from the pad`;
+    context.fillText(this.funnel ? `${label}; dashed: funnel` : label, 34 * ratio, height - 5 * ratio);
     if (this.funnel) {
       // Left of it the vehicle may descend.
       context.strokeStyle = colour('--quiet');
       const { radius_m, per_height } = this.funnel;
-      const foot = at({ beside: radius_m, up: 0 });
-      const top = at({ beside: radius_m + per_height * high, up: high });
+      const foot = at({ distance: radius_m, up: 0 });
+      const top = at({ distance: radius_m + per_height * high, up: high });
       context.setLineDash([4 * ratio, 4 * ratio]);
       context.beginPath();
       context.moveTo(...foot);

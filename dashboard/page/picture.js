@@ -1,26 +1,26 @@
 // @ts-check
-// Pictures with what was found in them, drawn in one step. Runs in a worker, or on the page where there are none.
+// Draws pictures together with their detections. Runs in a worker, or on the page where workers are missing.
 
 const RECONNECT_MS = 500;
 const MAX_RECONNECT_MS = 2000;
-/** A connection that brought something within this time does not hang, in milliseconds. */
-const LIVELY_MS = 1000;
-/** Asks the server for what was refused, and for no more of it. */
+/** A connection with a message within this time does not hang, in milliseconds. */
+const ALIVE_MS = 1000;
+/** Messages that request refused candidates from the server, and end that request. */
 const REFUSED = 'refused';
 const NOTHING_REFUSED = 'nothing refused';
 
-/** What follows the pictures: `again` connects anew where nothing comes, `curious` says whether to show what was refused.
- * @typedef {{ again: () => void, curious: (is: boolean) => void }} Follower */
+/** Receives the pictures: `reconnect` connects again if nothing arrives, `showRefused` turns refused candidates on or off.
+ * @typedef {{ reconnect: () => void, showRefused: (on: boolean) => void }} Follower */
 
-/** Follows the pictures and draws each; `told` hears of each, and of the connection.
- * @param {HTMLCanvasElement | OffscreenCanvas} canvas @param {string} address @param {(message: any) => void} told @returns {Follower} */
-export function follow(canvas, address, told) {
+/** Receives the pictures and draws each; `report` gets a message for each, and for the end of a connection.
+ * @param {HTMLCanvasElement | OffscreenCanvas} canvas @param {string} address @param {(message: any) => void} report @returns {Follower} */
+export function follow(canvas, address, report) {
   const context = /** @type {any} */ (canvas.getContext('2d', { alpha: false }));
   let pause = RECONNECT_MS;
   let drawn = 0;
-  let heardAt = -Infinity;
+  let receivedAt = -Infinity;
   let timer = 0;
-  let isCurious = false;
+  let showsRefused = false;
   /** @type {WebSocket | null} */
   let current = null;
   const connect = () => {
@@ -29,48 +29,48 @@ export function follow(canvas, address, told) {
     socket.binaryType = 'arraybuffer';
     socket.onopen = () => {
       pause = RECONNECT_MS;
-      if (isCurious) socket.send(REFUSED);
+      if (showsRefused) socket.send(REFUSED);
     };
     /** @param {ArrayBuffer} message */
     const show = async (message) => {
       const { header, bitmaps } = await decode(message);
-      // Of a connection that was given up nothing is drawn over what is newer.
+      // A picture of a closed connection is not drawn over a newer one.
       if (socket !== current) return;
-      // Another browser may have asked, which is nothing to this one.
-      if (!isCurious) header.refused = null;
+      // The candidates may have been requested by another browser only.
+      if (!showsRefused) header.refused = null;
       draw(canvas, context, header, bitmaps);
       drawn += 1;
-      // Only what was drawn is acknowledged: at most two pictures are on their way.
+      // Only drawn pictures are acknowledged, so at most two are in transit.
       if (socket.readyState === WebSocket.OPEN) socket.send(String(header.number));
-      told({ kind: 'drawn', header, drawn });
+      report({ kind: 'drawn', header, drawn });
     };
     // One after the other, so that no picture is drawn over a newer one.
     let last = Promise.resolve();
     socket.onmessage = (event) => {
-      heardAt = performance.now();
+      receivedAt = performance.now();
       last = last.then(() => show(event.data)).catch(() => socket.close());
     };
     socket.onclose = () => {
       if (socket !== current) return;
-      told({ kind: 'closed' });
+      report({ kind: 'closed' });
       timer = Number(setTimeout(connect, pause));
       pause = Math.min(2 * pause, MAX_RECONNECT_MS);
     };
   };
   connect();
-  const again = () => {
-    if (performance.now() - heardAt < LIVELY_MS) return;
+  const reconnect = () => {
+    if (performance.now() - receivedAt < ALIVE_MS) return;
     clearTimeout(timer);
     const old = current;
     connect();
     old?.close();
   };
-  /** @param {boolean} is */
-  const curious = (is) => {
-    isCurious = is;
-    if (current?.readyState === WebSocket.OPEN) current.send(is ? REFUSED : NOTHING_REFUSED);
+  /** @param {boolean} on */
+  const showRefused = (on) => {
+    showsRefused = on;
+    if (current?.readyState === WebSocket.OPEN) current.send(on ? REFUSED : NOTHING_REFUSED);
   };
-  return { again, curious };
+  return { reconnect, showRefused };
 }
 
 /** Header and bitmaps of a message. @param {ArrayBuffer} message */
@@ -78,8 +78,8 @@ async function decode(message) {
   const length = new DataView(message).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, length)));
   let at = 4 + length;
-  const whole = { x: 0, y: 0, width: header.width, height: header.height, scale: 1, bytes: message.byteLength - at };
-  const parts = header.parts.length > 0 ? header.parts : [whole];
+  const full = { x: 0, y: 0, width: header.width, height: header.height, scale: 1, bytes: message.byteLength - at };
+  const parts = header.parts.length > 0 ? header.parts : [full];
   const bitmaps = [];
   for (const part of parts) {
     const file = new Blob([new Uint8Array(message, at, part.bytes)], { type: 'image/jpeg' });
@@ -87,27 +87,27 @@ async function decode(message) {
     try {
       bitmaps.push({ part, bitmap: await createImageBitmap(file) });
     } catch {
-      // A damaged part leaves its place black.
+      // The area of a damaged part stays black.
     }
   }
   return { header, bitmaps };
 }
 
-/** Draws the parts, the finest on top, and what was found.
+/** Draws the parts, the finest on top, and the detections.
  * @param {HTMLCanvasElement | OffscreenCanvas} canvas @param {any} context @param {any} header @param {any[]} bitmaps */
 function draw(canvas, context, header, bitmaps) {
   if (canvas.width !== header.width || canvas.height !== header.height) {
     canvas.width = header.width;
     canvas.height = header.height;
   }
-  // What was found is never drawn over another picture, also where this one is damaged.
+  // Detections are never drawn over another picture, also if this one is damaged.
   context.fillStyle = '#000';
   context.fillRect(0, 0, canvas.width, canvas.height);
   for (const { part, bitmap } of bitmaps.reverse()) {
     context.drawImage(bitmap, part.x, part.y, part.width * part.scale, part.height * part.scale);
     bitmap.close();
   }
-  // The middle of the first pixel is (0, 0) in detections, and (0.5, 0.5) on a canvas.
+  // The centre of the first pixel is (0, 0) in detections, and (0.5, 0.5) on a canvas.
   context.save();
   context.translate(0.5, 0.5);
   const unit = header.width / 650;
@@ -118,7 +118,7 @@ function draw(canvas, context, header, bitmaps) {
   context.restore();
 }
 
-/** Outlines of candidates that were refused, with the reasons where there is room for them.
+/** Draws outlines of refused candidates, with the reasons where there is room for them.
  * @param {any} context @param {any[]} refused @param {number} unit */
 function refusals(context, refused, unit) {
   context.lineWidth = unit;
@@ -139,7 +139,7 @@ function refusals(context, refused, unit) {
     const x = Math.min(...points.map((/** @type {number[]} */ it) => it[0]));
     const y = Math.max(...points.map((/** @type {number[]} */ it) => it[1]));
     const width = context.measureText(reason).width;
-    // The largest come first, and their words are not written over.
+    // The largest come first, and their text is not covered.
     const isFree = written.every(([left, base, wide]) => Math.abs(base - y) > 11 * unit || x > left + wide || left > x + width);
     if (isFree) {
       context.fillStyle = 'rgba(0, 0, 0, 0.7)';
@@ -151,7 +151,7 @@ function refusals(context, refused, unit) {
   }
 }
 
-/** Outline, centre and name of a marker.
+/** Draws outline, centre and name of a marker.
  * @param {any} context @param {any} marker @param {number} unit @param {string} colour */
 function overlay(context, marker, unit, colour) {
   const [u, v] = marker.centre;

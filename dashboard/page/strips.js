@@ -1,5 +1,5 @@
 // @ts-check
-// Numbers over the last minute.
+// Draws numbers over the last minute.
 
 const SPAN_MS = 60000;
 const MAX_POINTS = 1200;
@@ -48,7 +48,7 @@ export class Strip {
     context.clearRect(0, 0, width, height);
     const values = this.points.flatMap((point) => (point.value === null ? [] : [point.value]));
     const max = values.reduce((a, b) => Math.max(a, b), this.minMax);
-    // A number that no newer one has followed in time is none.
+    // A number without a newer one in time is not shown.
     const newest = this.points.at(-1);
     const last = newest && now - newest.at <= this.staleMs ? newest.value : null;
     this.text.textContent = `${last == null ? '-' : last.toFixed(this.digits)} ${this.unit} (to ${max.toFixed(this.digits)})`;

@@ -1,13 +1,13 @@
 // @ts-check
-// Pictures beside the page's own thread, so that neither waits for the other, also in a hidden tab.
+// Draws pictures in a thread of its own, so that neither it nor the page waits for the other, also in a hidden tab.
 import { follow } from './picture.js';
 
 /** @type {import('./picture.js').Follower | null} */
 let follower = null;
 
 self.onmessage = (event) => {
-  const { canvas, address, again, curious } = event.data;
+  const { canvas, address, reconnect, showRefused } = event.data;
   if (canvas) follower = follow(canvas, address, (message) => self.postMessage(message));
-  if (again) follower?.again();
-  if (curious !== undefined) follower?.curious(curious);
+  if (reconnect) follower?.reconnect();
+  if (showRefused !== undefined) follower?.showRefused(showRefused);
 };

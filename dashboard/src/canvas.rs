@@ -1,4 +1,4 @@
-//! The picture of a camera: its frame, or the parts of the air link's frames over what came before.
+//! Draws the picture of a camera: its frame, or the parts of the air link's frames over the previous picture.
 
 use airlink::Unpacker;
 use airlink::picture::grey;
@@ -8,14 +8,14 @@ use messages::{FrameHeader, FramePart, PixelFormat};
 /// Maximum width and height of a picture, in pixels: receivers at the ground decode Full HD, and a larger frame would take
 /// the time of the next.
 const MAX_EDGE: usize = 1920;
-/// Grey of what has not been seen yet.
+/// Intensity of pixels that have not been received yet.
 const UNSEEN: u8 = 128;
 
 /// The picture of one camera.
 #[derive(Debug, Default)]
 pub(crate) struct Canvas {
     image: GrayImage,
-    /// The frames' size, and by how much the picture is smaller.
+    /// The frames' size, and the factor by which the picture is smaller.
     frame: [u32; 2],
     scale: usize,
     unpacker: Unpacker,
@@ -25,7 +25,7 @@ impl Canvas {
     /// Draws a frame.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// The reason for which the frame cannot be drawn.
     pub(crate) fn draw(
         &mut self,
         header: &FrameHeader,
@@ -40,17 +40,17 @@ impl Canvas {
         }
         if header.format == PixelFormat::Jpeg {
             let mut unpacker = std::mem::take(&mut self.unpacker);
-            let parts = unpacker.unpack(header, bytes).map_err(|problem| problem.to_string())?;
-            // The finest come first, and are drawn last.
+            let parts = unpacker.unpack(header, bytes).map_err(|error| error.to_string())?;
+            // The finest parts are first, and are drawn last.
             for (part, image) in parts.iter().rev() {
                 self.place(part, image.pixels());
             }
             self.unpacker = unpacker;
         } else {
-            let pixels = grey(header, bytes).ok_or("it is no whole grey or Bayer image")?;
+            let pixels = grey(header, bytes).ok_or("it is not a complete grey or Bayer image")?;
             let [width, height] = frame;
-            let whole = FramePart { x: 0, y: 0, width, height, scale: 1, bytes: 0 };
-            self.place(&whole, &pixels);
+            let full = FramePart { x: 0, y: 0, width, height, scale: 1, bytes: 0 };
+            self.place(&full, &pixels);
         }
         Ok(&self.image)
     }
@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_is_drawn_over_what_came_before() {
+    fn a_part_is_drawn_over_the_previous_picture() {
         let mut canvas = Canvas::default();
         canvas.draw(&header(6, 4), &[1; 24]).unwrap();
         let part = FramePart { x: 2, y: 2, width: 2, height: 1, scale: 2, bytes: 0 };

@@ -1,6 +1,5 @@
-//! The list of checks before a flight: a verdict, a finding and what to do for controller, autopilot, camera,
-//! calibration, clock, detector, marker, mount, link, battery, recording, keys and warnings. It turns green
-//! by itself.
+//! Makes the list of checks before a flight: a verdict, a finding and a remedy for controller, autopilot, camera,
+//! calibration, clock, detector, marker, mount, link, battery, recording, keys and warnings.
 
 use messages::{CameraInfo, ControllerStatus, Detections, RecorderStatus, VehicleState};
 use serde::Serialize;
@@ -18,32 +17,32 @@ const MAX_ROUND_TRIP_MS: f64 = 200.0;
 /// Minimum battery, from 0 to 1.
 const MIN_BATTERY: f32 = 0.3;
 
-/// How it stands with a line of the list.
+/// The verdict of a check.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Verdict {
-    /// It is well.
+    /// The check passes.
     Good,
-    /// It may be well, or is not needed.
+    /// The result is not known yet, or not needed.
     Open,
-    /// It is not well.
+    /// The check fails.
     Bad,
 }
 
 /// A line of the list.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Check {
-    /// What is looked at.
+    /// The subject of the check.
     pub name: &'static str,
-    /// How it stands.
+    /// The verdict.
     pub verdict: Verdict,
-    /// What was seen.
+    /// The finding.
     pub text: String,
-    /// What to do.
+    /// The remedy.
     pub todo: &'static str,
 }
 
-/// What the list is made of.
+/// The data from which the list is made.
 #[derive(Clone, Debug, Default)]
 pub struct Facts<'a> {
     /// The controller's status.
@@ -54,27 +53,27 @@ pub struct Facts<'a> {
     pub vehicle: Option<&'a VehicleState>,
     /// Its age in milliseconds.
     pub vehicle_age_ms: Option<f64>,
-    /// What the detector in use found in its newest frame.
+    /// The detections of the detector in use in its newest frame.
     pub found: Option<&'a Detections>,
     /// Its age in milliseconds.
     pub found_age_ms: Option<f64>,
-    /// Frames a second, as the camera's service counts them.
+    /// Frames a second, as counted by the camera's service.
     pub frames_hz: Option<f64>,
     /// The calibration of the camera in use.
     pub calibration: Option<&'a CameraInfo>,
     /// The controller's clock.
     pub controller_clock: Option<&'a str>,
-    /// The time of a query to the controller and its reply, in milliseconds; inside `None` without a reply.
+    /// The time of a query to the controller and its reply, in milliseconds; the inner `None` without a reply.
     pub round_trip_ms: Option<Option<f64>>,
-    /// A recorder that is heard.
+    /// A recorder that is present.
     pub recorder: Option<&'a RecorderStatus>,
-    /// Whether a process listens beyond its machine without keys; `None` while no process is heard.
+    /// Whether a process listens beyond its machine without keys; `None` while no process is present.
     pub is_insecure: Option<bool>,
     /// Services that have fallen silent.
     pub silent: Vec<String>,
 }
 
-/// What was seen of one thing.
+/// The result of one check.
 struct Finding {
     verdict: Verdict,
     text: String,
@@ -85,7 +84,7 @@ fn finding(verdict: Verdict, text: impl Into<String>, todo: &'static str) -> Fin
     Finding { verdict, text: text.into(), todo }
 }
 
-/// Whether what is so old counts as of now.
+/// Whether data of this age count as current.
 pub(crate) fn is_current(age_ms: Option<f64>) -> bool {
     age_ms.is_some_and(|age_ms| age_ms < MAX_AGE_MS)
 }
@@ -119,22 +118,22 @@ pub fn checks(facts: &Facts<'_>) -> Vec<Check> {
 fn controller(facts: &Facts<'_>) -> Finding {
     let todo = "Start `alight controller`, or look into its log.";
     match facts.status_age_ms {
-        None => finding(Verdict::Bad, "none is heard", todo),
+        None => finding(Verdict::Bad, "none is present", todo),
         Some(age_ms) if age_ms >= MAX_AGE_MS => {
             finding(Verdict::Bad, format!("silent for {:.0} s", age_ms / 1000.0), todo)
         }
-        Some(_) => finding(Verdict::Good, "is heard", todo),
+        Some(_) => finding(Verdict::Good, "present", todo),
     }
 }
 
 fn autopilot(facts: &Facts<'_>) -> Finding {
     let todo = "Check the autopilot's power, cable and `autopilot.address`; `alight doctor` tries the link.";
-    let told = facts.status.map_or("", |status| status.autopilot.as_str());
+    let stated = facts.status.map_or("", |status| status.autopilot.as_str());
     if is_current(facts.vehicle_age_ms) {
-        finding(Verdict::Good, told, todo)
+        finding(Verdict::Good, stated, todo)
     } else {
-        let told = if told.is_empty() { "no attitude and position arrive" } else { told };
-        finding(Verdict::Bad, told, todo)
+        let text = if stated.is_empty() { "no attitude and position arrive" } else { stated };
+        finding(Verdict::Bad, text, todo)
     }
 }
 
@@ -155,10 +154,10 @@ fn camera(facts: &Facts<'_>) -> Finding {
 fn calibration(facts: &Facts<'_>) -> Finding {
     let todo = "Calibrate the camera and name the file in its configuration (docs/camera.md).";
     let Some(info) = facts.calibration else {
-        return finding(Verdict::Bad, "nothing is known of the camera in use", todo);
+        return finding(Verdict::Bad, "no calibration of the camera in use has arrived", todo);
     };
     match (info.focal_px, info.problem()) {
-        (_, Some(problem)) => finding(Verdict::Bad, format!("impossible: {problem}"), todo),
+        (_, Some(error)) => finding(Verdict::Bad, format!("impossible: {error}"), todo),
         (None, None) => finding(Verdict::Bad, "the camera is not calibrated", todo),
         (Some([focal_px, _]), None) => {
             finding(Verdict::Good, format!("{}: focal length {focal_px:.0} px", info.camera), todo)
@@ -170,14 +169,14 @@ fn clock(facts: &Facts<'_>) -> Finding {
     let todo = "Run camera and controller on one machine: frames of another clock are not used.";
     match (facts.found.map(|found| found.header.clock.as_str()), facts.controller_clock) {
         (Some(camera), Some(controller)) if camera == controller => {
-            finding(Verdict::Good, "camera and controller share one", todo)
+            finding(Verdict::Good, "camera and controller use the same", todo)
         }
         (Some(camera), Some(controller)) => finding(
             Verdict::Bad,
             format!("the camera has {camera}, the controller {controller}"),
             todo,
         ),
-        _ => finding(Verdict::Bad, "not known before frames are searched", todo),
+        _ => finding(Verdict::Bad, "unknown until frames are searched", todo),
     }
 }
 
@@ -189,7 +188,7 @@ fn detector(facts: &Facts<'_>) -> Finding {
         return finding(Verdict::Bad, format!("none in use: {}", status.detector_why), todo);
     };
     let Some(it) = status.candidates.iter().find(|it| it.detector == *name) else {
-        return finding(Verdict::Bad, format!("nothing is known of `{name}`"), todo);
+        return finding(Verdict::Bad, format!("the controller has no data of `{name}`"), todo);
     };
     let text = format!("{name}: {:.1} Hz, {:.0} ms", it.rate_hz, it.latency_ms);
     let is_quick = it.rate_hz >= MIN_RATE_HZ && it.latency_ms <= MAX_LATENCY_MS;
@@ -202,15 +201,15 @@ fn marker(facts: &Facts<'_>) -> Finding {
         return finding(Verdict::Bad, "no detector searches for it", todo);
     };
     let any = found.detections.first();
-    let wanted = facts.status.and_then(ControllerStatus::landing_marker);
-    match (wanted.map_or(any, |wanted| found.first_of(wanted)), any, wanted) {
+    let requested = facts.status.and_then(ControllerStatus::landing_marker);
+    match (requested.map_or(any, |marker| found.first_of(marker)), any, requested) {
         (Some(it), ..) if it.pose.is_some() => finding(Verdict::Good, in_words(it), todo),
         (Some(_), ..) => finding(Verdict::Bad, "seen, but its size is not configured", todo),
-        (None, Some(other), Some(wanted)) => {
-            let text = format!("sees {}, the landing wants {wanted}", in_words(other));
+        (None, Some(other), Some(requested)) => {
+            let text = format!("sees {}, the landing uses {requested}", in_words(other));
             finding(Verdict::Bad, text, todo)
         }
-        (None, ..) => finding(Verdict::Open, "not in sight; it is looked for in flight", todo),
+        (None, ..) => finding(Verdict::Open, "not in view; the search in flight finds it", todo),
     }
 }
 
@@ -222,7 +221,7 @@ fn mount(facts: &Facts<'_>) -> Finding {
     match about {
         Some(text) => finding(Verdict::Bad, text.as_str(), todo),
         None if status.started_ns.is_some() => {
-            finding(Verdict::Good, "nothing against it so far", todo)
+            finding(Verdict::Good, "no contradiction so far", todo)
         }
         None => finding(Verdict::Open, "is tested in flight, before the descent", "Nothing to do."),
     }
@@ -248,7 +247,7 @@ fn battery(facts: &Facts<'_>) -> Finding {
             finding(Verdict::Good, format!("{:.0} %", 100.0 * level), todo)
         }
         Some(level) => finding(Verdict::Bad, format!("only {:.0} %", 100.0 * level), todo),
-        None => finding(Verdict::Open, "the autopilot reports none", "Look at it yourself."),
+        None => finding(Verdict::Open, "the autopilot reports none", "Check its voltage."),
     }
 }
 
@@ -259,14 +258,14 @@ fn recording(facts: &Facts<'_>) -> Finding {
         Some(RecorderStatus { problem: Some(problem), .. }) => finding(
             Verdict::Bad,
             problem.as_str(),
-            "Make room on the disk, or replace it; it records again by itself.",
+            "Make room on the disk, or replace it; it then records again on its own.",
         ),
         Some(status) => finding(Verdict::Good, status.file.as_str(), todo),
     }
 }
 
 fn keys(facts: &Facts<'_>) -> Finding {
-    let todo = "Make keys (`alight keys`, docs/deploy.md), and name the ground stations: anyone in reach can command the vehicle.";
+    let todo = "Make keys (`alight keys`, docs/deploy.md), and name the ground stations: every computer within range can command the vehicle.";
     match facts.is_insecure {
         Some(true) => {
             finding(Verdict::Bad, "a process listens beyond its machine without keys", todo)
@@ -279,7 +278,7 @@ fn keys(facts: &Facts<'_>) -> Finding {
 }
 
 fn warnings(facts: &Facts<'_>) -> Finding {
-    let todo = "Read them, and mend their cause before the start.";
+    let todo = "Read them, and remove their cause before the start.";
     let mut texts: Vec<&str> =
         facts.status.iter().flat_map(|status| &status.warnings).map(String::as_str).collect();
     let silent = format!("silent: {}", facts.silent.join(", "));
@@ -287,7 +286,7 @@ fn warnings(facts: &Facts<'_>) -> Finding {
         texts.push(&silent);
     }
     match texts.as_slice() {
-        [] if facts.status.is_none() => finding(Verdict::Open, "no controller is heard", todo),
+        [] if facts.status.is_none() => finding(Verdict::Open, "no controller is present", todo),
         [] => finding(Verdict::Good, "none", todo),
         texts => finding(Verdict::Bad, texts.join("; "), todo),
     }
@@ -303,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_known_is_not_well_and_says_what_to_do() {
+    fn without_data_the_checks_fail_and_name_a_remedy() {
         let checks = checks(&Facts::default());
         for name in ["controller", "autopilot", "camera", "calibration", "detector", "marker"] {
             let check = checks.iter().find(|check| check.name == name).unwrap();
@@ -312,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn all_is_well_when_all_is_known_and_new() {
+    fn all_checks_pass_with_complete_and_current_data() {
         let status = ControllerStatus {
             autopilot: "connected".into(),
             marker: "rings".into(),

@@ -1,5 +1,5 @@
-//! The dashboard's configuration, `dashboard.toml`: address, names and certificate of the page, who may
-//! command, pictures as JPEG or H.264, where they come from.
+//! The dashboard's configuration, `dashboard.toml`: address, names and certificate of the page, the permission to
+//! command, source and rate of the pictures, their stream as H.264.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -19,13 +19,13 @@ pub struct Config {
     pub listen: String,
     /// Further names of the page.
     pub names: Vec<String>,
-    /// Who commands, a [`Commands`].
+    /// The clients that may command, a [`Commands`].
     pub commands: String,
     /// The file of the tokens' hashes; empty for the usual one.
     pub tokens: PathBuf,
     /// The certificate of the page (PEM); empty for no encryption.
     pub certificate: PathBuf,
-    /// Its private key (PEM); empty for the certificate's name with `.key`, beside it.
+    /// Its private key (PEM); empty for the certificate's name with `.key`, in the same folder.
     pub key: PathBuf,
     /// Maximum number of browsers.
     pub max_clients: u32,
@@ -37,7 +37,7 @@ pub struct Config {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VideoConfig {
-    /// Where pictures come from, an [`Input`].
+    /// Source of the pictures, an [`Input`].
     pub input: String,
     /// Maximum rate of pictures, in Hz.
     pub max_hz: f64,
@@ -45,19 +45,19 @@ pub struct VideoConfig {
     pub jpeg_quality: u8,
     /// How long a picture waits for its detections, in milliseconds.
     pub hold_ms: u32,
-    /// Where pictures go as H.264 over RTP, an address; empty for nowhere.
+    /// Destination of the pictures as H.264 over RTP, an address; empty for no stream.
     pub rtp: String,
     /// Rate of that stream, in kbit/s.
     pub rtp_kbit_s: u32,
 }
 
-/// Who commands by the page.
+/// The clients that may command by the page.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Commands {
-    /// Nobody.
+    /// No client.
     Never,
-    /// Whoever opens it on this machine.
+    /// Every browser on this machine.
     Here,
     /// Holders of a token for commands: on this machine, and on an encrypted page from elsewhere.
     Token,
@@ -67,13 +67,13 @@ impl Config {
     /// The files of the certificate and its private key; `None` without encryption.
     pub fn certificate(&self) -> Option<[PathBuf; 2]> {
         let certificate = Some(&self.certificate).filter(|path| !path.as_os_str().is_empty())?;
-        let beside = certificate.with_extension("key");
-        let key = if self.key.as_os_str().is_empty() { beside } else { self.key.clone() };
+        let usual = certificate.with_extension("key");
+        let key = if self.key.as_os_str().is_empty() { usual } else { self.key.clone() };
         Some([certificate.clone(), key])
     }
 }
 
-/// Where pictures come from.
+/// Source of the pictures.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Input {
@@ -81,7 +81,7 @@ pub enum Input {
     Frames,
     /// The JPEG frames of the air link.
     Jpeg,
-    /// There are none.
+    /// No pictures.
     None,
 }
 
@@ -99,7 +99,7 @@ impl node::Settings for Config {
         check.parses("names", check_names(&self.names));
         check.parses("commands", node::named::<Commands>(&self.commands));
         if self.certificate.as_os_str().is_empty() && !self.key.as_os_str().is_empty() {
-            let it: Result<(), _> = Err("there is no `certificate` that it belongs to");
+            let it: Result<(), _> = Err("`certificate` is empty, and the key belongs to it");
             check.parses("key", it);
         }
         check.range("max_clients", self.max_clients, 1..=64);
@@ -157,8 +157,8 @@ mod tests {
             ("video.rtp_kbit_s=1", "rtp_kbit_s"),
             ("id=a/b", "letters, digits"),
         ] {
-            let problem = load(setting).unwrap_err();
-            assert!(problem.contains(part), "{setting}: {problem}");
+            let error = load(setting).unwrap_err();
+            assert!(error.contains(part), "{setting}: {error}");
         }
         assert!(load("listen=0.0.0.0:9000").is_ok());
     }

@@ -1,8 +1,8 @@
-//! What a detector found, in short.
+//! Describes a detection in a few words.
 
 use messages::Detection;
 
-/// A marker that was found, in words.
+/// A detected marker in words: its name, size and distance.
 pub fn in_words(found: &Detection) -> String {
     let id = found.id.map_or_else(String::new, |id| format!(":{id}"));
     let distance = found.pose.as_ref().map(|pose| {

@@ -1,4 +1,4 @@
-//! The funnel inside of which a controller descends, of its configuration.
+//! Reads the funnel within which a controller descends from its published configuration.
 
 use messages::Configuration;
 use serde::Serialize;
@@ -7,7 +7,7 @@ use toml::{Table, Value};
 /// Maximum length of a configuration that is read, in bytes.
 const MAX_TOML: usize = 200_000;
 
-/// The limits of the distance beside the pad for a descent.
+/// The maximum horizontal distance from the pad for a descent.
 #[derive(Copy, Clone, Debug, PartialEq, Serialize)]
 pub struct Funnel {
     /// Radius at the pad, in metres.
@@ -17,7 +17,7 @@ pub struct Funnel {
 }
 
 impl Funnel {
-    /// That of a controller with the metric guidance; `None` for any other configuration, or one that cannot be read.
+    /// The funnel of a controller with the metric guidance; `None` for any other or unreadable configuration.
     pub fn of(configuration: &Configuration) -> Option<Self> {
         if configuration.service != "controller" || configuration.toml.len() > MAX_TOML {
             return None;
@@ -55,8 +55,8 @@ mod tests {
     fn the_funnel_is_that_of_the_configuration() {
         let defaults = include_str!("../../controller/controller.toml");
         assert_eq!(of("controller", defaults), Some(Funnel { radius_m: 0.08, per_height: 0.25 }));
-        let whole = "guidance = 'metric'\n[metric]\nfunnel_m = 1\nfunnel_per_height = 0";
-        assert_eq!(of("controller", whole), Some(Funnel { radius_m: 1.0, per_height: 0.0 }));
+        let complete = "guidance = 'metric'\n[metric]\nfunnel_m = 1\nfunnel_per_height = 0";
+        assert_eq!(of("controller", complete), Some(Funnel { radius_m: 1.0, per_height: 0.0 }));
         for none in [
             "",
             "guidance = ",

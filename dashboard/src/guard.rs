@@ -1,15 +1,15 @@
-//! Who may open the page, read and command: by address, headers and token.
+//! Decides which clients may open the page, read and command: by address, headers and token.
 //!
 //! A web site that the operator has open in another tab can make the browser send requests to this machine. It cannot
-//! hide its origin, nor, when it has its name point here (DNS rebinding), its name: both are compared with the address of
-//! the page. What reaches an IP address or `localhost` by name was not rebound.
+//! hide its origin, nor, when its name resolves to this machine (DNS rebinding), its name: both are compared with the address
+//! of the page. A request to an IP address or to `localhost` was not rebound.
 
 use std::net::{IpAddr, SocketAddr};
 
 use crate::config::Commands;
 use crate::tokens::Kind;
 
-/// Why a request is refused.
+/// The reason for refusing a request.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Refusal {
     /// The `Host` header is not of this page.
@@ -36,7 +36,7 @@ impl Refusal {
         }
     }
 
-    /// For people: what to do.
+    /// The reason as a sentence with the remedy.
     pub fn sentence(self) -> &'static str {
         match self {
             Self::Host => {
@@ -63,15 +63,15 @@ pub struct Guard {
     is_encrypted: bool,
 }
 
-/// Why a page that could command with a token may not command without one.
+/// The reason for which a page may not command where a token would permit it.
 const NEEDS_TOKEN: &str = "a token for commands is needed: `alight dashboard token --kind command`";
 
-/// What a connection may do.
+/// The rights of a connection.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Access {
-    /// Why it may not command; `None` when it may.
+    /// The reason for which it may not command; `None` when it may.
     pub no_commands: Option<&'static str>,
-    /// Whether a token for commands would let it command.
+    /// Whether a token for commands would permit it to command.
     pub needs_token: bool,
 }
 
@@ -86,25 +86,25 @@ impl Guard {
         Self { listen, names, commands, is_encrypted }
     }
 
-    /// How the address of the page begins.
+    /// The beginning of the page's address.
     pub fn scheme(&self) -> &'static str {
         if self.is_encrypted { "https://" } else { "http://" }
     }
 
-    /// Whether a request is meant for this page, and of no other site.
+    /// Checks that a request is for this page, and not from another site.
     ///
     /// # Errors
     /// The header that is wrong.
     pub fn check_headers(&self, host: Option<&str>, origin: Option<&str>) -> Result<(), Refusal> {
-        let host = host.filter(|host| self.is_own(host)).ok_or(Refusal::Host)?;
-        // Browsers name the origin with every WebSocket and every POST; other programs have none.
+        let host = host.filter(|host| self.is_of_page(host)).ok_or(Refusal::Host)?;
+        // Browsers send the origin with every WebSocket and every POST; other programs send none.
         let Some(origin) = origin else { return Ok(()) };
         let is_same =
             origin.strip_prefix(self.scheme()).is_some_and(|it| it.eq_ignore_ascii_case(host));
         if is_same { Ok(()) } else { Err(Refusal::Origin) }
     }
 
-    fn is_own(&self, host: &str) -> bool {
+    fn is_of_page(&self, host: &str) -> bool {
         let (name, port) = match host.rsplit_once(':') {
             // The colons of an IPv6 address are inside of brackets.
             Some((name, port)) if !port.contains(']') => (name, port.parse().ok()),
@@ -120,10 +120,10 @@ impl Guard {
         }
         let is_here = name.eq_ignore_ascii_case("localhost");
         (is_here && (listen.is_loopback() || listen.is_unspecified()))
-            || self.names.iter().any(|own| own.eq_ignore_ascii_case(name))
+            || self.names.iter().any(|it| it.eq_ignore_ascii_case(name))
     }
 
-    /// What a connection from this address, with a session of this kind, may do.
+    /// The rights of a connection from this address with a session of this kind.
     ///
     /// # Errors
     /// When it may not even read.

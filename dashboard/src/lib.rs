@@ -1,14 +1,15 @@
-//! Topics to a browser.
+//! Shows a landing in a browser, from the topics of the other services.
 //!
-//! The service shows a landing on a page that is built into the program, and passes an operator's commands on. It
-//! subscribes like anyone, so no other service knows of it or waits for it; it knows nothing of how a landing is decided.
+//! The page is built into the program. The service also passes an operator's commands on. It is an ordinary subscriber, so
+//! no other service depends on it or waits for it, and it contains no logic of the landing.
 //!
-//! Modules in reading order: [`config`]; [`state`] is what is known, as JSON with the age of each number, with [`words`] for
-//! people, what was [`found`], the [`funnel`] of the descent, the [`checks`] before a flight and the [`log`]; [`pairing`] joins a picture with
-//! what was found in it, and [`window`] bounds what is on its way to a browser; [`guard`] decides who may read and command, with
-//! [`nonce`] for each command and [`tokens`] in a file. These are without network. `server` answers browsers, `video` makes pictures,
-//! `mjpeg` gives them to viewers of Motion JPEG, `stream` (with the feature `h264`) sends them as H.264, both on a `canvas` where
-//! a picture comes in parts, and [`service`] follows the topics.
+//! Modules in reading order: [`config`]; [`state`] holds the newest messages and gives them as JSON with the age of each
+//! number, with texts from [`words`] and [`found`], the [`funnel`] of the descent, the [`checks`] before a flight and the
+//! [`log`]; [`pairing`] joins a picture with its detections, and [`window`] bounds the pictures in transit to a browser;
+//! [`guard`] decides which connections may read and command, with a [`nonce`] for each command and [`tokens`] in a file.
+//! These modules use no network. `server` answers browsers, `video` makes pictures, `mjpeg` serves them as Motion JPEG,
+//! `stream` (with the feature `h264`) sends them as H.264; both use a `canvas` where a frame arrives in parts.
+//! [`service`] subscribes to the topics.
 
 mod canvas;
 pub mod checks;

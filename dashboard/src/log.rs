@@ -1,34 +1,34 @@
-//! What happened, newest last, for the page.
+//! Collects the events that the page lists, newest last.
 
 use std::collections::VecDeque;
 
 use serde::Serialize;
 
-/// Maximum number of entries that are kept.
+/// Maximum number of entries that are stored.
 const MAX_ENTRIES: usize = 200;
 /// Maximum length of an entry, in characters.
 const MAX_CHARS: usize = 400;
 
-/// How much an entry matters.
+/// The severity of an entry.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Level {
-    /// It goes on as it should.
+    /// Normal operation.
     Info,
-    /// It goes on, but worse.
+    /// Operation continues, but impaired.
     Warn,
-    /// Something is lost.
+    /// A process, a link or a landing is lost.
     Bad,
 }
 
 /// An entry.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Entry {
-    /// When, in milliseconds of this process' clock.
+    /// Time of the event, in milliseconds of this process' clock.
     pub at_ms: f64,
-    /// How much it matters.
+    /// Its severity.
     pub level: Level,
-    /// What happened.
+    /// The description.
     pub text: String,
 }
 
@@ -50,7 +50,7 @@ impl Log {
         self.version += 1;
     }
 
-    /// Counts the changes.
+    /// Number of changes so far.
     pub fn version(&self) -> u64 {
         self.version
     }
@@ -66,7 +66,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_newest_entries_are_kept() {
+    fn the_newest_entries_are_stored() {
         let mut log = Log::default();
         for number in 0..500 {
             log.add(number, Level::Info, &format!("{number}{}", "x".repeat(1000)));

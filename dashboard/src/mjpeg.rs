@@ -1,4 +1,4 @@
-//! Motion JPEG of one camera for the page: its frames as JPEG files, one after the other in an HTTP answer without end
+//! Serves the pictures of one camera as Motion JPEG: JPEG files one after the other in an HTTP response without end
 //! (multipart/x-mixed-replace).
 
 use std::convert::Infallible;
@@ -21,10 +21,10 @@ use crate::video::{LOOK_PERIOD, Pictures};
 
 const KIND: HeaderValue = HeaderValue::from_static("multipart/x-mixed-replace; boundary=picture");
 const BOUNDARY: &[u8] = b"--picture\r\n";
-/// Who takes no picture within this time is given up with its connection.
+/// A client that takes no picture within this time is disconnected.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Makes each picture one file, while somebody follows.
+/// Makes each picture one file, while there is a viewer.
 pub(crate) async fn run(node: Node, pictures: Pictures, quality: u8) -> anyhow::Result<()> {
     let Pictures { shown, files, .. } = pictures;
     loop {
@@ -34,7 +34,7 @@ pub(crate) async fn run(node: Node, pictures: Pictures, quality: u8) -> anyhow::
         let mut painter = Painter::default();
         let mut shown = shown.subscribe();
         while files.receiver_count() > 0 {
-            // Whether somebody follows is looked at also while no picture comes.
+            // The number of viewers is checked also while no picture arrives.
             let Ok(Ok(())) = timeout(LOOK_PERIOD, shown.changed()).await else { continue };
             let Some(picture) = shown.borrow_and_update().clone() else { continue };
             let paint = move || {
@@ -47,9 +47,9 @@ pub(crate) async fn run(node: Node, pictures: Pictures, quality: u8) -> anyhow::
                 Ok(file) => {
                     files.send_replace(Some(file));
                 }
-                Err(problem) => {
-                    if node.health().failed("no whole picture of a frame") {
-                        tracing::warn!(problem, "A frame cannot be shown as Motion JPEG");
+                Err(error) => {
+                    if node.health().failed("no complete picture of a frame") {
+                        tracing::warn!(error, "A frame cannot be shown as Motion JPEG");
                     }
                 }
             }
@@ -66,7 +66,7 @@ struct Painter {
 }
 
 impl Painter {
-    /// The picture after a frame; what its parts do not show is as it was.
+    /// The picture after a frame; areas outside its parts keep the previous content.
     fn file(&mut self, header: &FrameHeader, files: Bytes, quality: u8) -> Result<Bytes, String> {
         if header.parts.is_empty() {
             return Ok(files);
@@ -87,12 +87,12 @@ impl Painter {
             ..header.clone()
         };
         jpeg(&header, image.pixels(), quality).map(Bytes::from).ok_or_else(|| {
-            format!("{} x {} pixels are no JPEG picture", header.width, header.height)
+            format!("{} x {} pixels cannot be a JPEG picture", header.width, header.height)
         })
     }
 }
 
-/// Whether one file shows the whole frame.
+/// Whether one file shows the full frame.
 fn is_one_file(header: &FrameHeader) -> bool {
     match header.parts.as_slice() {
         [] => true,
@@ -104,7 +104,7 @@ fn is_one_file(header: &FrameHeader) -> bool {
     }
 }
 
-/// The answer with the pictures that come until the end, the newest whenever one was taken.
+/// The response with the pictures until `end`, the newest one whenever the previous one was taken.
 pub(crate) fn answer(
     pictures: watch::Receiver<Option<Bytes>>,
     connection: Connection,
@@ -153,7 +153,7 @@ async fn follow(
     }
 }
 
-/// A picture and the boundary behind it, without which a viewer would show it only when the next comes.
+/// A picture and the boundary after it, without which a viewer would show it only when the next one arrives.
 fn part(jpeg: &[u8]) -> Bytes {
     let head = format!("Content-Type: image/jpeg\r\nContent-Length: {}\r\n\r\n", jpeg.len());
     [head.as_bytes(), jpeg, b"\r\n", BOUNDARY].concat().into()
@@ -189,17 +189,17 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_in_parts_is_one_picture_over_what_came_before() {
+    fn a_frame_in_parts_is_one_picture_over_the_previous_one() {
         let mut painter = Painter::default();
-        let (header, whole) = frame(&[(PART, 200)]);
-        assert_eq!(painter.file(&header, whole.clone(), 90).unwrap(), whole, "as it came");
+        let (header, file) = frame(&[(PART, 200)]);
+        assert_eq!(painter.file(&header, file.clone(), 90).unwrap(), file, "unchanged");
         let region = FramePart { x: 16, y: 16, width: 16, height: 16, ..PART };
         let (header, files) = frame(&[(region, 20)]);
         let picture = painter.file(&header, files, 90).unwrap();
-        let whole = FramePart { bytes: picture.len() as u32, ..PART };
+        let full = FramePart { bytes: picture.len() as u32, ..PART };
         let mut canvas = Canvas::default();
         let image =
-            canvas.draw(&FrameHeader { parts: vec![whole], ..header }, &picture).unwrap().clone();
+            canvas.draw(&FrameHeader { parts: vec![full], ..header }, &picture).unwrap().clone();
         assert_eq!((image.width(), image.height()), (64, 48));
         let grey = |x: usize, y: usize| image.row(y)[x];
         assert!(grey(4, 4) > 190 && grey(24, 24) < 30 && grey(60, 40) > 190);

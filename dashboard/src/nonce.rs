@@ -1,26 +1,26 @@
-//! A nonce for each command: it is asked for when the button goes down, and spent when it was held long enough.
+//! Issues a nonce for each command: it is requested when the button is pressed, and spent once the button was held long enough.
 //!
-//! So a command cannot be repeated, cannot come late, and cannot be given by a touch.
+//! So a command cannot be repeated, cannot arrive late, and cannot be given by a brief touch.
 
 /// Minimum time from a nonce to its command, in nanoseconds; the page holds for a second.
 const MIN_HELD_NS: i64 = 900_000_000;
-/// Maximum time from a nonce to its command, in nanoseconds: a second of holding, and two for the way.
+/// Maximum time from a nonce to its command, in nanoseconds: a second of holding, and two for the transmission.
 const MAX_LIFE_NS: i64 = 3_000_000_000;
 
-/// Why a command is refused before the controller hears of it.
+/// The reason for refusing a command before it is sent to the controller.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub enum NonceProblem {
-    /// No nonce was asked for, it is spent, or it is another one.
+pub enum NonceError {
+    /// No nonce was requested, it is spent, or it is a different one.
     Unknown,
-    /// It was asked for another command.
+    /// It was requested for another command.
     Mismatch,
-    /// It was asked for too short a time ago.
+    /// It was requested too recently.
     Early,
-    /// It was asked for too long ago.
+    /// It was requested too long ago.
     Late,
 }
 
-impl NonceProblem {
+impl NonceError {
     /// A short reason, which is counted in the health of the service.
     pub fn reason(self) -> &'static str {
         match self {
@@ -31,18 +31,18 @@ impl NonceProblem {
         }
     }
 
-    /// For people.
+    /// The reason as a sentence for the operator.
     pub fn sentence(self) -> &'static str {
         match self {
             Self::Unknown => "it was sent twice, or its nonce is not of this connection",
             Self::Mismatch => "its nonce is of another command",
             Self::Early => "it was not held for 1 s",
-            Self::Late => "it came more than 3 s after the button went down",
+            Self::Late => "it arrived more than 3 s after the button was pressed",
         }
     }
 }
 
-/// The open nonce of a connection. A new one takes its place.
+/// The open nonce of a connection. A new one replaces it.
 #[derive(Clone, Debug, Default)]
 pub struct Nonce {
     open: Option<Open>,
@@ -63,18 +63,18 @@ impl Nonce {
         text
     }
 
-    /// Spends the nonce, whether it is right or not.
+    /// Spends the nonce, whether it is valid or not.
     ///
     /// # Errors
-    /// What is wrong with it.
-    pub fn spend(&mut self, now_ns: i64, text: &str, command: &str) -> Result<(), NonceProblem> {
+    /// The reason for which it is not valid.
+    pub fn spend(&mut self, now_ns: i64, text: &str, command: &str) -> Result<(), NonceError> {
         let open = self.open.take().filter(|open| open.text == text);
-        let open = open.ok_or(NonceProblem::Unknown)?;
+        let open = open.ok_or(NonceError::Unknown)?;
         let held_ns = now_ns.saturating_sub(open.at_ns);
         match () {
-            () if open.command != command => Err(NonceProblem::Mismatch),
-            () if held_ns < MIN_HELD_NS => Err(NonceProblem::Early),
-            () if held_ns > MAX_LIFE_NS => Err(NonceProblem::Late),
+            () if open.command != command => Err(NonceError::Mismatch),
+            () if held_ns < MIN_HELD_NS => Err(NonceError::Early),
+            () if held_ns > MAX_LIFE_NS => Err(NonceError::Late),
             () => Ok(()),
         }
     }
@@ -91,24 +91,24 @@ mod tests {
         let mut nonce = Nonce::default();
         let text = nonce.open(0, [7; 16], "hold");
         assert_eq!(nonce.spend(SECOND, &text, "hold"), Ok(()));
-        assert_eq!(nonce.spend(SECOND, &text, "hold"), Err(NonceProblem::Unknown));
+        assert_eq!(nonce.spend(SECOND, &text, "hold"), Err(NonceError::Unknown));
     }
 
     #[test]
-    fn what_is_early_late_or_of_another_command_is_refused_and_spent() {
-        for (at, command, problem) in [
-            (SECOND / 2, "hold", NonceProblem::Early),
-            (4 * SECOND, "hold", NonceProblem::Late),
-            (SECOND, "abort", NonceProblem::Mismatch),
+    fn an_early_or_late_nonce_or_one_of_another_command_is_refused_and_spent() {
+        for (at, command, error) in [
+            (SECOND / 2, "hold", NonceError::Early),
+            (4 * SECOND, "hold", NonceError::Late),
+            (SECOND, "abort", NonceError::Mismatch),
         ] {
             let mut nonce = Nonce::default();
             let text = nonce.open(0, [7; 16], "hold");
-            assert_eq!(nonce.spend(at, &text, command), Err(problem));
-            assert_eq!(nonce.spend(SECOND, &text, "hold"), Err(NonceProblem::Unknown));
+            assert_eq!(nonce.spend(at, &text, command), Err(error));
+            assert_eq!(nonce.spend(SECOND, &text, "hold"), Err(NonceError::Unknown));
         }
         let mut nonce = Nonce::default();
         let first = nonce.open(0, [7; 16], "hold");
         nonce.open(0, [8; 16], "hold");
-        assert_eq!(nonce.spend(SECOND, &first, "hold"), Err(NonceProblem::Unknown));
+        assert_eq!(nonce.spend(SECOND, &first, "hold"), Err(NonceError::Unknown));
     }
 }

@@ -1,5 +1,5 @@
-//! The page's HTTP routes: its files, WebSockets with the state and with pictures, Motion JPEG, login by a token, and commands
-//! with their nonce; each request is checked by the guard.
+//! Serves the page by HTTP: its files, WebSockets with the state and with pictures, Motion JPEG, login by a token, and commands
+//! with their nonce. The guard checks each request.
 
 use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};
@@ -55,28 +55,28 @@ const HTML: &str = "text/html; charset=utf-8";
 const JAVASCRIPT: &str = "text/javascript; charset=utf-8";
 const JSON: &str = "application/json";
 
-/// The page takes everything from its own origin, and nothing inside of the page's text is run.
+/// The page loads everything from its own origin, and no inline script is run.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; worker-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
-/// Maximum size of what a browser sends, in bytes.
+/// Maximum size of a message or request of a browser, in bytes.
 const MAX_REQUEST_BYTES: usize = 4096;
-/// What a browser does not take within this time is given up with its connection.
+/// A browser that does not take a message within this time is disconnected.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
-/// Period in which it is looked whether a browser may still have what it gets: its token may be gone.
+/// Period in which the rights of a connected browser are checked again: its token may have been removed.
 const ACCESS_PERIOD: Duration = Duration::from_secs(1);
-/// Period in which a browser is looked after that gets pictures.
+/// Period in which a browser with pictures is checked for progress.
 const LOOK_PERIOD: Duration = Duration::from_millis(500);
-/// Maximum age of the picture that a browser gets at first, in nanoseconds.
+/// Maximum age of the first picture that a browser gets, in nanoseconds.
 const MAX_FIRST_AGE_NS: i64 = 1_000_000_000;
-/// Replies to commands that wait to be sent to a browser, and its commands under way.
+/// Maximum number of replies that wait to be sent to a browser, and of its commands in progress.
 const MAX_COMMANDS: usize = 4;
-/// What a browser says to be told with each picture what was refused in it, and to be told no more.
+/// Messages by which a browser requests the refused candidates with each picture, and ends that request.
 const REFUSED: &str = "refused";
 const NOTHING_REFUSED: &str = "nothing refused";
-/// Time that a button is held, in milliseconds.
+/// Time for which a button is held, in milliseconds.
 const HOLD_MS: u32 = 1000;
 
-/// What all browsers are told, each as JSON.
+/// The messages to all browsers, each as JSON.
 #[derive(Clone, Default)]
 pub(crate) struct Texts {
     pub(crate) now: Arc<watch::Sender<Utf8Bytes>>,
@@ -84,7 +84,7 @@ pub(crate) struct Texts {
     pub(crate) log: Arc<watch::Sender<Utf8Bytes>>,
 }
 
-/// What the answers need.
+/// The data shared by all requests.
 pub(crate) struct App {
     node: Node,
     guard: Guard,
@@ -99,15 +99,15 @@ pub(crate) struct App {
     viewers: Arc<Semaphore>,
 }
 
-/// What a browser asks for.
+/// A request of a browser.
 #[derive(Deserialize)]
 #[serde(rename_all = "kebab-case", tag = "kind")]
 enum Ask {
-    /// A nonce for a command; the answer names the press of the button that it is for.
+    /// A nonce for a command; the answer has the same number of the press of the button.
     Nonce { command: String, argument: Option<String>, press: Option<u64> },
-    /// To carry out a command.
+    /// The execution of a command.
     Command { command: String, argument: Option<String>, nonce: String },
-    /// The time.
+    /// The server's time.
     Ping { at_ms: f64 },
 }
 
@@ -141,33 +141,33 @@ impl App {
         }))
     }
 
-    /// How the address of the page begins.
+    /// The beginning of the page's address.
     pub(crate) fn scheme(&self) -> &'static str {
         self.guard.scheme()
     }
 
-    /// The value of our cookie in a request.
+    /// The value of this page's cookie in a request.
     fn cookie<'a>(&self, headers: &'a HeaderMap) -> Option<&'a str> {
         let cookies = headers.get_all(COOKIE).iter().filter_map(|value| value.to_str().ok());
         let mut cookies = cookies.flat_map(|text| text.split(';'));
         cookies.find_map(|it| it.trim().strip_prefix(&self.cookie)?.strip_prefix('='))
     }
 
-    /// Who asks, and what they may do.
-    fn admit(self: &Arc<Self>, peer: SocketAddr, headers: &HeaderMap) -> Result<Visitor, Refusal> {
+    /// Identifies the client and its rights.
+    fn admit(self: &Arc<Self>, peer: SocketAddr, headers: &HeaderMap) -> Result<Peer, Refusal> {
         let cookie = self.cookie(headers).map(str::to_owned);
         let access = self.access(peer.ip(), cookie.as_deref())?;
-        Ok(Visitor { app: Arc::clone(self), peer: peer.ip(), cookie, access })
+        Ok(Peer { app: Arc::clone(self), peer: peer.ip(), cookie, access })
     }
 
     fn access(&self, peer: IpAddr, cookie: Option<&str>) -> Result<Access, Refusal> {
         let session = cookie.and_then(|cookie| {
             let tokens = tokio::task::block_in_place(|| Tokens::read_open(&self.token_file()?));
-            if let Err(problem) = &tokens
+            if let Err(error) = &tokens
                 && self.node.health().failed("tokens")
             {
                 tracing::warn!(
-                    problem = format!("{problem:#}"),
+                    error = format!("{error:#}"),
                     "The tokens cannot be read: after a minute all sessions end"
                 );
                 self.log(Level::Warn, "the tokens cannot be read: after a minute all sessions end");
@@ -189,7 +189,7 @@ impl App {
         state.log.add(now_ns(), level, text);
     }
 
-    /// Counts a refusal, and says why.
+    /// Counts a refusal, and gives the reason.
     fn refuse(&self, refusal: Refusal) -> Response {
         self.node.health().dropped(refusal.reason());
         let status = match refusal {
@@ -209,17 +209,17 @@ impl App {
     }
 }
 
-/// Whoever was let in.
-struct Visitor {
+/// An admitted client.
+struct Peer {
     app: Arc<App>,
     peer: IpAddr,
     cookie: Option<String>,
     access: Access,
 }
 
-impl Visitor {
-    /// Comes back when they may no longer do what they could at first, as their token was removed or has ended.
-    async fn loses_access(&self) {
+impl Peer {
+    /// Returns when the client's rights have changed, as its token was removed or has expired.
+    async fn access_changed(&self) {
         let mut look = interval(ACCESS_PERIOD);
         loop {
             look.tick().await;
@@ -230,12 +230,12 @@ impl Visitor {
     }
 }
 
-/// Seconds since 1970, in which tokens end.
+/// Seconds since 1970, the time scale of the tokens' expiry.
 fn now_s() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()
 }
 
-/// Nanoseconds of the clock of sessions, which nobody sets and which counts on while the host sleeps.
+/// Nanoseconds of the clock of sessions, which is monotonic and includes the time in which the host sleeps.
 fn session_ns() -> i64 {
     now_ns().saturating_add(boot_ahead_ns())
 }
@@ -247,7 +247,7 @@ fn answer(status: StatusCode, kind: &'static str, body: impl Into<Body>) -> Resp
     response
 }
 
-/// Answers whoever connects.
+/// Serves all connections.
 pub(crate) async fn serve(listener: TcpListener, app: Arc<App>) -> Infallible {
     let health = app.node.shared_health();
     let mut router = Router::new();
@@ -271,7 +271,7 @@ pub(crate) async fn serve(listener: TcpListener, app: Arc<App>) -> Infallible {
     web::serve(listener, router, encryption, web::Limits::default(), health).await
 }
 
-/// Sends who asks for the page without encryption to the encrypted one; nothing else is answered.
+/// Redirects requests for the page without encryption to the encrypted one; all other requests are refused.
 async fn moved(Shared(app): Shared<Arc<App>>, request: Request) -> Response {
     std::future::ready(()).await;
     let host = request.headers().get(HOST).and_then(|host| host.to_str().ok());
@@ -288,10 +288,10 @@ async fn moved(Shared(app): Shared<Arc<App>>, request: Request) -> Response {
     response
 }
 
-/// Checks every request before anything else, and says to the browser what the page may do.
+/// Checks every request before anything else, and adds the headers that restrict the page in the browser.
 async fn protect(Shared(app): Shared<Arc<App>>, request: Request, next: Next) -> Response {
     let checked = {
-        // What is no text is no address of ours.
+        // A value that is not text is not an address of this page.
         let text = |value: &'_ HeaderValue| value.to_str().unwrap_or("?").to_owned();
         let [host, origin] = [HOST, ORIGIN].map(|name| request.headers().get(name).map(text));
         app.guard.check_headers(host.as_deref(), origin.as_deref())
@@ -314,7 +314,7 @@ async fn protect(Shared(app): Shared<Arc<App>>, request: Request, next: Next) ->
     response
 }
 
-/// What this browser may do, or why it gets no connection: a WebSocket that is refused tells its page nothing.
+/// The rights of this browser, or the reason for a refusal: a page cannot see why its WebSocket is refused.
 async fn session(
     Shared(app): Shared<Arc<App>>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
@@ -324,8 +324,8 @@ async fn session(
     let admitted = app.admit(peer, &headers);
     let admitted = admitted.and_then(|it| has_room.then_some(it).ok_or(Refusal::Full));
     std::future::ready(match admitted {
-        Ok(visitor) => {
-            let text = json!({ "no_commands": visitor.access.no_commands }).to_string();
+        Ok(peer) => {
+            let text = json!({ "no_commands": peer.access.no_commands }).to_string();
             answer(StatusCode::OK, JSON, text)
         }
         Err(refusal) => app.refuse(refusal),
@@ -333,12 +333,12 @@ async fn session(
     .await
 }
 
-/// Changes a token into a session.
+/// Begins a session for a token.
 async fn login(Shared(app): Shared<Arc<App>>, token: String) -> Response {
     let tokens = tokio::task::block_in_place(|| Tokens::read(&app.token_file()?));
-    let tokens = tokens.unwrap_or_else(|problem| {
+    let tokens = tokens.unwrap_or_else(|error| {
         app.node.health().failed("tokens");
-        tracing::warn!(problem = format!("{problem:#}"), "No token is accepted");
+        tracing::warn!(error = format!("{error:#}"), "No token is accepted");
         Tokens::default()
     });
     let token = tokens.of(&token, now_s()).cloned();
@@ -346,7 +346,7 @@ async fn login(Shared(app): Shared<Arc<App>>, token: String) -> Response {
     let Some((token, cookie)) = begun else { return app.refuse(Refusal::Token) };
     let kind = token.kind;
     app.sessions().begin(&cookie, token, now_s(), session_ns());
-    app.log(Level::Info, &format!("a browser has shown a token of the kind `{kind}`"));
+    app.log(Level::Info, &format!("a browser has presented a token of the kind `{kind}`"));
     let secure = if app.tls.is_some() { "; Secure" } else { "" };
     let cookie = format!(
         "{}={cookie}; HttpOnly; SameSite=Strict; Path=/; Max-Age={SESSION_S}{secure}",
@@ -376,8 +376,8 @@ async fn data(
 ) -> Response {
     let permit = Arc::clone(&app.clients).try_acquire_owned().map_err(|_| Refusal::Full);
     match std::future::ready(app.admit(peer, &headers).and_then(|it| Ok((it, permit?)))).await {
-        Ok((visitor, permit)) => {
-            bounded(upgrade).on_upgrade(move |socket| Client::new(visitor).run(socket, permit))
+        Ok((peer, permit)) => {
+            bounded(upgrade).on_upgrade(move |socket| Client::new(peer).run(socket, permit))
         }
         Err(refusal) => app.refuse(refusal),
     }
@@ -391,18 +391,18 @@ async fn video(
 ) -> Response {
     let permit = Arc::clone(&app.viewers).try_acquire_owned().map_err(|_| Refusal::Full);
     match std::future::ready(app.admit(peer, &headers).and_then(|it| Ok((it, permit?)))).await {
-        Ok((visitor, permit)) => bounded(upgrade).on_upgrade(async move |socket| {
+        Ok((peer, permit)) => bounded(upgrade).on_upgrade(async move |socket| {
             tokio::select! {
-                () = pictures(&visitor.app, socket, permit) => {}
-                () = visitor.loses_access() => {}
+                () = pictures(&peer.app, socket, permit) => {}
+                () = peer.access_changed() => {}
             }
         }),
         Err(refusal) => app.refuse(refusal),
     }
 }
 
-/// Video for programs that show nothing else, as ground stations, or browsers without bitmaps: without what was found, as that
-/// is drawn by the page.
+/// Serves video for other programs, such as ground stations, and for browsers without bitmaps. It has no detections, as the page
+/// draws them.
 async fn motion_jpeg(
     Shared(app): Shared<Arc<App>>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
@@ -411,8 +411,8 @@ async fn motion_jpeg(
 ) -> Response {
     let permit = Arc::clone(&app.viewers).try_acquire_owned().map_err(|_| Refusal::Full);
     match std::future::ready(app.admit(peer, &headers).and_then(|it| Ok((it, permit?)))).await {
-        Ok((visitor, permit)) => {
-            let end = async move { visitor.loses_access().await };
+        Ok((peer, permit)) => {
+            let end = async move { peer.access_changed().await };
             mjpeg::answer(app.pictures.files.subscribe(), connection, end, permit)
         }
         Err(refusal) => app.refuse(refusal),
@@ -425,25 +425,25 @@ fn bounded(upgrade: WebSocketUpgrade) -> WebSocketUpgrade {
 
 /// Sends, or fails when the browser takes too long.
 async fn send(socket: &mut WebSocket, message: Message) -> anyhow::Result<()> {
-    timeout(SEND_TIMEOUT, socket.send(message)).await.context("the browser takes nothing")??;
+    timeout(SEND_TIMEOUT, socket.send(message)).await.context("the browser receives nothing")??;
     Ok(())
 }
 
-/// Sends pictures, the newest that there is whenever the browser has drawn one.
+/// Sends pictures, the newest one whenever the browser has drawn one.
 async fn pictures(app: &App, mut socket: WebSocket, _permit: OwnedSemaphorePermit) {
     let mut shown = app.pictures.shown.subscribe();
-    // The newest picture is an old one when the camera stands still.
+    // The newest picture is an old one when the camera has stopped.
     let newest_ns = shown.borrow().as_ref().map(|it| it.at_ns);
     if newest_ns.is_some_and(|at_ns| now_ns() - at_ns <= MAX_FIRST_AGE_NS) {
         shown.mark_changed();
     }
     let mut window = Window::default();
-    // While it is held, detectors tell what they refuse.
-    let mut curious: Option<watch::Receiver<()>> = None;
+    // While this receiver exists, detectors publish refused candidates.
+    let mut refused: Option<watch::Receiver<()>> = None;
     let mut look = interval(LOOK_PERIOD);
     loop {
         tokio::select! {
-            // It never ends while `app` is there.
+            // It never ends while `app` exists.
             changed = shown.changed(), if window.has_room() => {
                 if changed.is_err() {
                     return;
@@ -456,8 +456,8 @@ async fn pictures(app: &App, mut socket: WebSocket, _permit: OwnedSemaphorePermi
             }
             received = socket.recv() => match received {
                 Some(Ok(Message::Text(text))) => match text.as_str() {
-                    REFUSED => drop(curious.replace(app.pictures.curious.subscribe())),
-                    NOTHING_REFUSED => drop(curious.take()),
+                    REFUSED => drop(refused.replace(app.pictures.show_refused.subscribe())),
+                    NOTHING_REFUSED => drop(refused.take()),
                     // An acknowledgement: the number of the picture that was drawn.
                     number => {
                         if !number.parse().is_ok_and(|it| window.acknowledged(now_ns(), it)) {
@@ -480,34 +480,34 @@ async fn pictures(app: &App, mut socket: WebSocket, _permit: OwnedSemaphorePermi
 
 /// A browser that shows the page.
 struct Client {
-    visitor: Arc<Visitor>,
+    peer: Arc<Peer>,
     nonce: Nonce,
     replies: mpsc::Sender<Utf8Bytes>,
     waiting: mpsc::Receiver<Utf8Bytes>,
 }
 
 impl Client {
-    fn new(visitor: Visitor) -> Self {
+    fn new(peer: Peer) -> Self {
         let (replies, waiting) = mpsc::channel(MAX_COMMANDS);
-        Self { visitor: Arc::new(visitor), nonce: Nonce::default(), replies, waiting }
+        Self { peer: Arc::new(peer), nonce: Nonce::default(), replies, waiting }
     }
 
     async fn run(mut self, mut socket: WebSocket, _permit: OwnedSemaphorePermit) {
-        let visitor = Arc::clone(&self.visitor);
+        let peer = Arc::clone(&self.peer);
         tokio::select! {
-            // A browser that goes is no failure.
-            gone = self.talk(&mut socket) => tracing::debug!(?gone, "A browser has gone"),
-            () = visitor.loses_access() => tracing::debug!("A browser may no longer do what it could"),
+            // A browser that disconnects is not a failure.
+            end = self.exchange(&mut socket) => tracing::debug!(?end, "A browser has disconnected"),
+            () = peer.access_changed() => tracing::debug!("The rights of a browser have changed"),
         }
     }
 
-    async fn talk(&mut self, socket: &mut WebSocket) -> anyhow::Result<()> {
+    async fn exchange(&mut self, socket: &mut WebSocket) -> anyhow::Result<()> {
         let hello = json!({
-            "kind": "hello", "version": node::version(), "host": host_name(), "vehicle": self.visitor.app.node.vehicle(),
-            "no_commands": self.visitor.access.no_commands, "needs_token": self.visitor.access.needs_token, "hold_ms": HOLD_MS, "video": self.visitor.app.config.video.input,
+            "kind": "hello", "version": node::version(), "host": host_name(), "vehicle": self.peer.app.node.vehicle(),
+            "no_commands": self.peer.access.no_commands, "needs_token": self.peer.access.needs_token, "hold_ms": HOLD_MS, "video": self.peer.app.config.video.input,
         });
         send(socket, Message::Text(hello.to_string().into())).await?;
-        let texts = self.visitor.app.texts.clone();
+        let texts = self.peer.app.texts.clone();
         let [mut now, mut slow, mut log] = [texts.now, texts.slow, texts.log].map(|text| {
             let mut text = text.subscribe();
             text.mark_changed();
@@ -526,7 +526,7 @@ impl Client {
                     },
                     Some(Ok(Message::Close(_))) | None => return Ok(()),
                     Some(Ok(_)) => continue,
-                    Some(Err(problem)) => return Err(problem.into()),
+                    Some(Err(error)) => return Err(error.into()),
                 },
             };
             if !text.as_str().is_empty() {
@@ -535,10 +535,10 @@ impl Client {
         }
     }
 
-    /// The answer to what a browser asks; of a command that is sent it comes later.
+    /// The answer to a request of a browser; that to a command follows later.
     fn asked(&mut self, text: &str) -> Option<Utf8Bytes> {
         let Ok(ask) = serde_json::from_str(text) else {
-            self.visitor.app.node.health().dropped("unreadable request");
+            self.peer.app.node.health().dropped("unreadable request");
             return Some(
                 json!({ "kind": "problem", "why": "unreadable request" }).to_string().into(),
             );
@@ -559,62 +559,62 @@ impl Client {
                     ));
                 }
                 let nonce =
-                    self.nonce.open(now_ns(), random, &whole(&command, argument.as_deref()));
+                    self.nonce.open(now_ns(), random, &full_command(&command, argument.as_deref()));
                 let answer = json!({ "kind": "nonce", "command": command, "argument": argument, "press": press, "nonce": nonce });
                 Some(answer.to_string().into())
             }
             Ask::Command { command, argument, nonce } => {
-                let whole = whole(&command, argument.as_deref());
-                let checked = self.nonce.spend(now_ns(), &nonce, &whole);
-                if let Some(why) = self.visitor.access.no_commands {
-                    self.visitor.app.node.health().dropped("command without the right");
-                    return Some(refused(&whole, "dashboard", why));
+                let full = full_command(&command, argument.as_deref());
+                let checked = self.nonce.spend(now_ns(), &nonce, &full);
+                if let Some(why) = self.peer.access.no_commands {
+                    self.peer.app.node.health().dropped("command without the right");
+                    return Some(refused(&full, "dashboard", why));
                 }
-                if let Err(problem) = checked {
-                    self.visitor.app.node.health().dropped(problem.reason());
-                    self.visitor.app.log(
+                if let Err(error) = checked {
+                    self.peer.app.node.health().dropped(error.reason());
+                    self.peer.app.log(
                         Level::Warn,
-                        &format!("{whole}: refused here: {}", problem.sentence()),
+                        &format!("{full}: refused by the dashboard: {}", error.sentence()),
                     );
-                    return Some(refused(&whole, "dashboard", problem.sentence()));
+                    return Some(refused(&full, "dashboard", error.sentence()));
                 }
                 let Some(parsed) = parse(&command, argument) else {
-                    return Some(refused(&whole, "dashboard", "there is no such command"));
+                    return Some(refused(&full, "dashboard", "there is no such command"));
                 };
-                self.carry_out(whole, parsed);
+                self.execute(full, parsed);
                 None
             }
         }
     }
 
-    fn carry_out(&self, whole: String, command: ControllerCommand) {
-        let (app, replies) = (Arc::clone(&self.visitor.app), self.replies.clone());
+    fn execute(&self, full: String, command: ControllerCommand) {
+        let (app, replies) = (Arc::clone(&self.peer.app), self.replies.clone());
         tokio::spawn(async move {
             let reply = app.node.command(topic::COMMAND, &[], &command).await;
-            // One that is not answered may have been carried out.
+            // A command without an answer may have been carried out.
             let (accepted, verdict, who, reason) = match reply {
                 Ok(reply) if reply.accepted => {
                     (true, "accepted by the controller", "controller", reply.reason)
                 }
                 Ok(reply) => (false, "refused by the controller", "controller", reply.reason),
-                Err(problem) => (false, "no answer", NOBODY, format!("{problem:#}")),
+                Err(error) => (false, "no answer", NO_PEER, format!("{error:#}")),
             };
             app.node.health().count("commands");
             let level = if accepted { Level::Info } else { Level::Warn };
-            tracing::info!(command = whole, verdict, reason, "A browser's command");
-            app.log(level, &format!("operator: {whole}: {verdict}: {reason}"));
-            let text = reply_json(&whole, accepted, who, &reason);
-            // The browser may have gone.
+            tracing::info!(command = full, verdict, reason, "A browser's command");
+            app.log(level, &format!("operator: {full}: {verdict}: {reason}"));
+            let text = reply_json(&full, accepted, who, &reason);
+            // The browser may have disconnected.
             drop(replies.send(text).await);
         });
     }
 }
 
-/// Who has answered where no answer came.
-const NOBODY: &str = "nobody";
+/// The answering process in a reply without an answer.
+const NO_PEER: &str = "nobody";
 
-/// A command with its argument, as it is compared and shown.
-fn whole(command: &str, argument: Option<&str>) -> String {
+/// A command with its argument, for comparison and display.
+fn full_command(command: &str, argument: Option<&str>) -> String {
     match argument {
         Some(argument) => format!("{command} {argument}"),
         None => command.to_owned(),

@@ -1,5 +1,5 @@
-//! The dashboard's service: subscribes to the topics that the page shows, measures round trips to each
-//! service, makes the texts for all browsers, and runs server and pictures.
+//! Runs the dashboard's service: subscribes to the topics that the page shows, measures round trips to each
+//! service, makes the JSON texts for all browsers, and runs the server and the pictures.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -17,9 +17,9 @@ use crate::server::{App, Texts, serve};
 use crate::state::{Input, State};
 use crate::video::{Pictures, Video};
 
-/// Period of what changes with each frame.
+/// Period of the data that change with each frame.
 const NOW_PERIOD: Duration = Duration::from_millis(100);
-/// Period of what changes slowly, and of the round trips.
+/// Period of the data that change slowly, and of the round trips.
 const SLOW_PERIOD: Duration = Duration::from_secs(1);
 /// Longest wait for the reply of a service.
 const ROUND_TRIP_TIMEOUT: Duration = Duration::from_millis(1000);
@@ -61,7 +61,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     }
     tokio::select! {
         result = follow(&node, &state) => result,
-        result = tell(&state, &texts) => result,
+        result = publish(&state, &texts) => result,
         result = measure(&node, &state) => result,
         result = video.run() => result,
         result = mjpeg => result,
@@ -71,7 +71,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     }
 }
 
-/// Sends pictures as H.264, where the program can.
+/// Sends pictures as H.264, if the program is built with it.
 async fn stream(node: Node, config: &Config, state: Arc<Mutex<State>>) -> anyhow::Result<()> {
     #[cfg(feature = "h264")]
     return crate::stream::Stream::new(node, config.video.clone(), state).run().await;
@@ -82,7 +82,7 @@ async fn stream(node: Node, config: &Config, state: Arc<Mutex<State>>) -> anyhow
     }
 }
 
-// What is known is whole after each message, also when a thread panics.
+// The state is complete after each message, also when a thread panics.
 fn lock(state: &Mutex<State>) -> MutexGuard<'_, State> {
     state.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -105,8 +105,8 @@ async fn follow(node: &Node, state: &Mutex<State>) -> anyhow::Result<()> {
             it = targets.next() => Input::Target(Box::new(it.context(CLOSED)?)),
             it = vehicles.next() => Input::Vehicle(Box::new(it.context(CLOSED)?)),
             it = detections.next_with_key() => {
-                let (key, told) = it.context(CLOSED)?;
-                Input::Detections(name(topic::DETECTIONS.first_name(&key)), Box::new(told))
+                let (key, found) = it.context(CLOSED)?;
+                Input::Detections(name(topic::DETECTIONS.first_name(&key)), Box::new(found))
             }
             it = detectors.next_with_key() => {
                 let (key, info) = it.context(CLOSED)?;
@@ -137,7 +137,7 @@ fn name(name: Option<&str>) -> String {
 }
 
 /// Makes the texts for all browsers.
-async fn tell(state: &Mutex<State>, texts: &Texts) -> anyhow::Result<()> {
+async fn publish(state: &Mutex<State>, texts: &Texts) -> anyhow::Result<()> {
     let mut now = interval(NOW_PERIOD);
     now.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut slow = interval(SLOW_PERIOD);
@@ -167,8 +167,8 @@ async fn measure(node: &Node, state: &Mutex<State>) -> anyhow::Result<()> {
     due.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         due.tick().await;
-        let heard = lock(state).heard();
-        for (service, instance) in heard {
+        let present = lock(state).present();
+        for (service, instance) in present {
             let took = node.round_trip(&service, &instance, ROUND_TRIP_TIMEOUT).await;
             let took_ms = took.map(|took| took.as_secs_f64() * 1e3);
             lock(state).round_trip(now_ns(), &service, &instance, took_ms);

@@ -1,8 +1,8 @@
-//! The newest messages of controller, detectors, cameras, recorder, bridge and every service, made into the JSON of the page
-//! with the age of each number.
+//! Stores the newest messages of controller, detectors, cameras, recorder, bridge and every service, and makes the JSON of the
+//! page from them, with the age of each number.
 //!
-//! The caller gives the time, in nanoseconds of this process' clock. Whoever publishes on a key is believed to have its
-//! name, whatever the message says. All that grows has a bound.
+//! The caller gives the time, in nanoseconds of this process' clock. The name of a sender is the one in its key, not the one
+//! in the message. All collections are bounded.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -20,25 +20,26 @@ use crate::words;
 
 /// Maximum number of detectors, cameras, recorders and bridges, each, and of services.
 const MAX_NAMES: usize = 64;
-/// Maximum number of faults of all services that are told once.
+/// Maximum number of faults of all services, each of which is logged once.
 const MAX_FAULTS: usize = 512;
-/// A service whose health is older is silent, in nanoseconds: it comes every second.
+/// A service whose health is older is silent, in nanoseconds: it is published every second.
 const SILENT_NS: i64 = 3_000_000_000;
-/// A bridge or recorder whose status is older is silent, in nanoseconds: it comes every two seconds, and one may be lost.
+/// A bridge or recorder whose status is older is silent, in nanoseconds: it is published every two seconds, and one
+/// may be lost.
 const SILENT_STATUS_NS: i64 = 6_000_000_000;
-/// A service that is silent for this time is forgotten, in nanoseconds.
-const FORGOTTEN_NS: i64 = 120_000_000_000;
+/// A service that is silent for this time is removed, in nanoseconds.
+const REMOVAL_NS: i64 = 120_000_000_000;
 
-/// A message, and when it came.
+/// A message and the time of its arrival.
 #[derive(Clone, Debug)]
 pub struct Seen<T> {
     /// The message.
     pub value: T,
-    /// When it came, in nanoseconds of this process' clock.
+    /// Time of arrival, in nanoseconds of this process' clock.
     pub received_ns: i64,
 }
 
-/// What a message says, with the name in its key.
+/// A message, with the name in its key.
 #[derive(Clone, Debug)]
 pub enum Input {
     /// The controller's status.
@@ -47,17 +48,17 @@ pub enum Input {
     Target(Box<TargetEstimate>),
     /// The vehicle's state.
     Vehicle(Box<VehicleState>),
-    /// What a detector found.
+    /// A detector's detections.
     Detections(String, Box<Detections>),
-    /// Who a detector is.
+    /// A detector's description.
     Detector(String, Box<DetectorInfo>),
     /// A camera's calibration.
     Camera(String, Box<CameraInfo>),
     /// A service's health, by its name and that of its instance.
     Health(String, String, Box<Health>),
-    /// What a recorder has kept.
+    /// A recorder's status.
     Recorder(String, Box<RecorderStatus>),
-    /// Who is heard on the ground.
+    /// A bridge's ground stations.
     Ground(Box<GcsStatus>),
     /// The controller's configuration.
     Configuration(Box<Configuration>),
@@ -69,14 +70,14 @@ pub struct Service {
     /// Its newest health.
     pub health: Health,
     received_ns: i64,
-    /// Share of one core over the last period, in percent.
+    /// Load of one core over the last period, in percent.
     cpu_percent: Option<f64>,
-    /// The time of a query and its reply, in milliseconds; `None` without a reply. And when it was measured.
+    /// The time of a query and its reply, in milliseconds; `None` without a reply.
     round_trip: Option<Seen<Option<f64>>>,
     is_silent: bool,
 }
 
-/// Everything that the page shows but for the pictures.
+/// All data of the page except the pictures.
 #[derive(Clone, Debug, Default)]
 pub struct State {
     /// The name of this process' clock.
@@ -93,11 +94,11 @@ pub struct State {
     services: BTreeMap<(String, String), Service>,
     faults: BTreeSet<String>,
     warnings: Vec<String>,
-    /// What happened.
+    /// The events.
     pub log: Log,
 }
 
-/// Whether one more may be remembered under this name.
+/// Whether an entry may be stored under this name.
 fn has_room<K: Ord, V>(map: &BTreeMap<K, V>, name: &K) -> bool {
     map.len() < MAX_NAMES || map.contains_key(name)
 }
@@ -118,7 +119,7 @@ fn age_ms(now_ns: i64, since_ns: i64) -> f64 {
 }
 
 impl State {
-    /// Nothing is known yet; the name is that of this process' clock.
+    /// A state without messages; `clock` is the name of this process' clock.
     pub fn new(clock: &str) -> Self {
         Self { clock: clock.to_owned(), ..Self::default() }
     }
@@ -133,7 +134,7 @@ impl State {
             Input::Vehicle(vehicle) => {
                 self.vehicle = Some(Seen { value: *vehicle, received_ns: now_ns });
             }
-            Input::Detections(name, told) => put(&mut self.found, name, *told, now_ns),
+            Input::Detections(name, found) => put(&mut self.found, name, *found, now_ns),
             Input::Detector(name, info) => put(&mut self.detectors, name, *info, now_ns),
             Input::Camera(name, info) => put(&mut self.cameras, name, *info, now_ns),
             Input::Health(service, instance, health) => {
@@ -160,14 +161,14 @@ impl State {
             let text = format!("detector in use: {name}: {}", status.detector_why);
             self.log.add(now_ns, Level::Info, &text);
         }
-        let matters: Vec<String> =
+        let subjects: Vec<String> =
             status.warnings.iter().map(|text| messages::matter(text)).collect();
-        for (text, matter) in status.warnings.iter().zip(&matters) {
-            if !self.warnings.contains(matter) {
+        for (text, subject) in status.warnings.iter().zip(&subjects) {
+            if !self.warnings.contains(subject) {
                 self.log.add(now_ns, Level::Warn, text);
             }
         }
-        self.warnings = matters;
+        self.warnings = subjects;
         self.status = Some(Seen { value: status, received_ns: now_ns });
     }
 
@@ -185,12 +186,12 @@ impl State {
         }
         let before = self.services.get(&key);
         match before {
-            None => self.log.add(now_ns, Level::Info, &format!("{name} is there")),
+            None => self.log.add(now_ns, Level::Info, &format!("{name} is present")),
             Some(before) if before.health.pid != health.pid => {
-                self.log.add(now_ns, Level::Warn, &format!("{name} was started again"));
+                self.log.add(now_ns, Level::Warn, &format!("{name} has restarted"));
             }
             Some(before) if before.is_silent => {
-                self.log.add(now_ns, Level::Info, &format!("{name} is heard again"));
+                self.log.add(now_ns, Level::Info, &format!("{name} is present again"));
             }
             Some(_) => {}
         }
@@ -237,7 +238,7 @@ impl State {
             let was_speaking = before.is_some_and(|it| is_speaking(&it.stations, station));
             let name = format!("ground station {}/{}", station.system, station.component);
             if !station.silent && !was_speaking {
-                self.log.add(now_ns, Level::Info, &format!("{name} is heard"));
+                self.log.add(now_ns, Level::Info, &format!("{name} is present"));
             } else if station.silent && was_speaking {
                 self.log.add(now_ns, Level::Warn, &format!("{name} is silent"));
             }
@@ -255,18 +256,18 @@ impl State {
             known.is_silent = is_silent;
         }
         for (name, bridge) in &mut self.bridges {
-            // Who speaks to a bridge that is gone is heard by nobody.
+            // A ground station is cut off when its bridge is gone.
             let is_silent = now_ns.saturating_sub(bridge.received_ns) > SILENT_STATUS_NS;
             for station in bridge.value.stations.iter_mut().filter(|it| is_silent && !it.silent) {
                 station.silent = true;
                 let GroundStation { system, component, .. } = station;
                 let text = format!(
-                    "ground station {system}/{component} is silent: no word of gcs-bridge {name}"
+                    "ground station {system}/{component} is silent: no status of gcs-bridge {name}"
                 );
                 self.log.add(now_ns, Level::Warn, &text);
             }
         }
-        let is_recent = |received_ns: i64| now_ns.saturating_sub(received_ns) < FORGOTTEN_NS;
+        let is_recent = |received_ns: i64| now_ns.saturating_sub(received_ns) < REMOVAL_NS;
         self.bridges.retain(|_, bridge| is_recent(bridge.received_ns));
         self.services.retain(|_, service| is_recent(service.received_ns));
         self.found.retain(|_, found| is_recent(found.received_ns));
@@ -275,7 +276,7 @@ impl State {
         self.recorders.retain(|_, status| is_recent(status.received_ns));
     }
 
-    /// Notes how long a query to a service and its reply took, in milliseconds; `None` without a reply.
+    /// Stores the time of a query to a service and its reply, in milliseconds; `None` without a reply.
     pub fn round_trip(&mut self, now_ns: i64, service: &str, instance: &str, took_ms: Option<f64>) {
         let key = (service.to_owned(), instance.to_owned());
         if let Some(known) = self.services.get_mut(&key) {
@@ -283,10 +284,10 @@ impl State {
         }
     }
 
-    /// The services that are heard: service and instance.
-    pub fn heard(&self) -> Vec<(String, String)> {
-        let heard = self.services.iter().filter(|(_, service)| !service.is_silent);
-        heard.map(|(key, _)| key.clone()).collect()
+    /// The services that are present: service and instance.
+    pub fn present(&self) -> Vec<(String, String)> {
+        let present = self.services.iter().filter(|(_, service)| !service.is_silent);
+        present.map(|(key, _)| key.clone()).collect()
     }
 
     /// The detector in use.
@@ -299,15 +300,16 @@ impl State {
         self.detectors.get(self.in_use()?).map(|info| info.value.camera.as_str())
     }
 
-    /// Age of a message of the controller, in milliseconds: since its stamp where its clock is ours, else since it came.
+    /// Age of a message of the controller, in milliseconds: since its stamp if its clock is this process', else since its
+    /// arrival.
     fn age_of(&self, now_ns: i64, received_ns: i64, stamp_ns: i64) -> f64 {
         let mut controllers = self.services.iter().filter(|(key, _)| key.0 == "controller");
-        let is_ours = controllers.any(|(_, it)| it.health.clock == self.clock);
-        let since_ns = if is_ours { received_ns.min(stamp_ns) } else { received_ns };
+        let has_same_clock = controllers.any(|(_, it)| it.health.clock == self.clock);
+        let since_ns = if has_same_clock { received_ns.min(stamp_ns) } else { received_ns };
         age_ms(now_ns, since_ns)
     }
 
-    /// What changes with each frame.
+    /// The data that change with each frame.
     pub fn now(&self, now_ns: i64) -> Value {
         let status = self.status.as_ref().map(|seen| {
             let age_ms = self.age_of(now_ns, seen.received_ns, seen.value.stamp_ns);
@@ -348,7 +350,7 @@ impl State {
         json!({ "kind": "now", "now_ms": ms(now_ns), "status": status, "target": target, "vehicle": vehicle })
     }
 
-    /// What changes slowly: detectors, services, recorders, ground stations, and the list before a flight.
+    /// The data that change slowly: detectors, services, recorders, ground stations, and the checks before a flight.
     pub fn slow(&self, now_ns: i64) -> Value {
         let services: Vec<Value> = self.services.iter().map(|(key, it)| {
             let health = &it.health;
@@ -409,7 +411,7 @@ impl State {
         })
     }
 
-    /// What happened, for the page.
+    /// The events, for the page.
     pub fn log_json(&self, now_ns: i64) -> Value {
         let entries: Vec<_> = self.log.entries().collect();
         json!({ "kind": "log", "now_ms": ms(now_ns), "entries": entries })
@@ -431,7 +433,7 @@ impl State {
             let found = self.found.get(name);
             json!({
                 "name": name,
-                "state": candidate.map_or("not heard by the controller", |it| words::detector(it.state)),
+                "state": candidate.map_or("not received by the controller", |it| words::detector(it.state)),
                 "in_use": status.is_some_and(|it| it.active_detector.as_deref() == Some(name)),
                 "place": candidate.and_then(|it| it.place).or(info.map(|it| it.place)),
                 "host": info.map(|it| &it.host), "camera": info.map(|it| &it.camera),
@@ -448,17 +450,17 @@ impl State {
         names.into_iter().map(row).collect()
     }
 
-    /// The rate of the frames of the camera in use, or of any while it is not known. A camera's service has the camera's name;
-    /// others that make frames need not.
+    /// The rate of the frames of the camera in use, or of any camera while that one is not known. The instance of `camera-pub`
+    /// has the camera's name; other services that publish frames need not.
     fn frames_hz(&self) -> Option<f64> {
         let camera = self.camera();
         let is_in_use = |instance: &str| camera == Some(instance);
         // A detector counts the frames that it searched.
         let makers = || self.services.iter().filter(|((service, _), _)| service != "detector");
         let is_known = makers().any(|((_, instance), _)| is_in_use(instance));
-        let heard = makers().filter(|(_, it)| !it.is_silent);
-        let mut wanted = heard.filter(|((_, instance), _)| !is_known || is_in_use(instance));
-        wanted.find_map(|(_, it)| {
+        let present = makers().filter(|(_, it)| !it.is_silent);
+        let mut selected = present.filter(|((_, instance), _)| !is_known || is_in_use(instance));
+        selected.find_map(|(_, it)| {
             it.health.rates.iter().find(|rate| rate.name == "frames").map(|rate| rate.hz)
         })
     }
@@ -582,27 +584,27 @@ mod tests {
 
     #[test]
     fn numbers_have_the_age_of_their_message() {
-        let mut state = State::new("ours");
+        let mut state = State::new("own");
         assert_eq!(state.now(0)["status"], Value::Null);
         state.take(SECOND, status(Phase::Descend, "descending over the marker"));
         let now = state.now(2 * SECOND);
         assert_eq!(now["status"]["age_ms"], 1000.0);
         assert_eq!(now["status"]["title"], "Descending");
         assert_eq!(now["status"]["why"], "descending over the marker");
-        // The controller's clock is ours: the message was old when it came.
-        state.take(SECOND, health("controller", 1, "ours", 0.0, 1.0));
+        // The controller has the same clock: the message was old on arrival.
+        state.take(SECOND, health("controller", 1, "own", 0.0, 1.0));
         assert_eq!(state.now(2 * SECOND)["status"]["age_ms"], 2000.0);
     }
 
     #[test]
-    fn the_log_says_the_word_of_a_phase_once() {
-        let mut state = State::new("ours");
+    fn the_log_names_a_phase_once() {
+        let mut state = State::new("own");
         state.take(SECOND, status(Phase::Aborted, "aborted by the operator"));
         assert!(texts(&state).contains(&"aborted by the operator"), "{:?}", texts(&state));
     }
 
     #[test]
-    fn the_vehicles_attitude_is_told_in_angles() {
+    fn the_vehicles_attitude_is_given_in_angles() {
         let half = std::f64::consts::FRAC_PI_8;
         let vehicle = VehicleState {
             stamp_ns: 0,
@@ -614,7 +616,7 @@ mod tests {
             landed: LandedState::InAir,
             battery: Some(0.5),
         };
-        let mut state = State::new("ours");
+        let mut state = State::new("own");
         state.take(0, Input::Vehicle(Box::new(vehicle)));
         let vehicle = &state.now(0)["vehicle"];
         assert!((vehicle["heading_rad"].as_f64().unwrap() - 2.0 * half).abs() < 1e-12);
@@ -625,8 +627,8 @@ mod tests {
     }
 
     #[test]
-    fn phases_warnings_and_services_are_told_once() {
-        let mut state = State::new("ours");
+    fn phases_warnings_and_services_are_logged_once() {
+        let mut state = State::new("own");
         for _ in 0..3 {
             state.take(0, status(Phase::Search, "looking"));
         }
@@ -642,20 +644,24 @@ mod tests {
         state.every_second(6 * SECOND);
         state.every_second(7 * SECOND);
         assert_eq!(state.slow(SECOND)["services"][0]["silent"], true);
-        assert!(state.heard().is_empty());
+        assert!(state.present().is_empty());
         state.take(8 * SECOND, health("detector", 1, "a", 1.5, 18.0));
         state.take(9 * SECOND, health("detector", 2, "a", 0.0, 1.0));
-        let told = texts(&state);
+        let logged = texts(&state);
         for (text, times) in [
             ("search: looking", 1),
             ("the mount is off by 1 degrees", 1),
             ("detector main: publish", 1),
-            ("detector main is there", 1),
+            ("detector main is present", 1),
             ("detector main is silent", 1),
-            ("detector main is heard again", 1),
-            ("detector main was started again", 1),
+            ("detector main is present again", 1),
+            ("detector main has restarted", 1),
         ] {
-            assert_eq!(told.iter().filter(|it| **it == text).count(), times, "{text}: {told:?}");
+            assert_eq!(
+                logged.iter().filter(|it| **it == text).count(),
+                times,
+                "{text}: {logged:?}"
+            );
         }
         state.every_second(1000 * SECOND);
         assert_eq!(state.slow(0)["services"], json!([]));
@@ -673,13 +679,16 @@ mod tests {
     }
 
     #[test]
-    fn ground_stations_are_shown_and_their_silence_is_told_once() {
-        let mut state = State::new("ours");
+    fn ground_stations_are_shown_and_their_silence_is_logged_once() {
+        let mut state = State::new("own");
         for silent in [false, false, true, true] {
             state.take(0, ground(silent));
         }
-        let told = texts(&state);
-        assert_eq!(told, ["ground station 255/190 is heard", "ground station 255/190 is silent"]);
+        let logged = texts(&state);
+        assert_eq!(
+            logged,
+            ["ground station 255/190 is present", "ground station 255/190 is silent"]
+        );
         let bridge = &state.slow(SECOND)["bridges"][0];
         assert_eq!(bridge["stations"], json!(["255/190 at 10.0.0.2:14550 (silent)"]));
         assert_eq!((&bridge["refused"], &bridge["unlisted"]), (&json!(3), &json!(4)));
@@ -687,8 +696,8 @@ mod tests {
     }
 
     #[test]
-    fn the_stations_of_a_bridge_that_is_gone_are_silent_and_then_forgotten() {
-        let mut state = State::new("ours");
+    fn the_stations_of_a_bridge_that_is_gone_are_silent_and_then_removed() {
+        let mut state = State::new("own");
         state.take(0, ground(false));
         state.every_second(3 * SECOND);
         let stations = |state: &State| state.slow(SECOND)["bridges"][0]["stations"].clone();
@@ -697,12 +706,12 @@ mod tests {
             state.every_second(second * SECOND);
         }
         assert_eq!(stations(&state), json!(["255/190 at 10.0.0.2:14550 (silent)"]));
-        let gone = "ground station 255/190 is silent: no word of gcs-bridge main";
-        assert_eq!(texts(&state), ["ground station 255/190 is heard", gone]);
-        // It is back.
+        let gone = "ground station 255/190 is silent: no status of gcs-bridge main";
+        assert_eq!(texts(&state), ["ground station 255/190 is present", gone]);
+        // The bridge returns.
         state.take(8 * SECOND, ground(false));
         assert_eq!(stations(&state), json!(["255/190 at 10.0.0.2:14550"]));
-        assert_eq!(texts(&state).last(), Some(&"ground station 255/190 is heard"));
+        assert_eq!(texts(&state).last(), Some(&"ground station 255/190 is present"));
         state.every_second(127 * SECOND);
         assert_eq!(state.slow(0)["bridges"].as_array().unwrap().len(), 1);
         state.every_second(128 * SECOND);
@@ -710,8 +719,8 @@ mod tests {
     }
 
     #[test]
-    fn a_detector_joins_what_is_known_of_it() {
-        let mut state = State::new("ours");
+    fn a_detectors_row_joins_all_its_messages() {
+        let mut state = State::new("own");
         state.take(0, status(Phase::Search, "looking"));
         state.take(0, Input::Detections("main".into(), Box::new(Detections::sample())));
         state.take(0, Input::Detections("other".into(), Box::new(Detections::sample())));
@@ -729,12 +738,12 @@ mod tests {
             detectors[0]["sees"].as_str().unwrap().starts_with("rings, 55 px, 5.0"),
             "{detectors}"
         );
-        assert_eq!(detectors[1]["state"], "not heard by the controller");
+        assert_eq!(detectors[1]["state"], "not received by the controller");
     }
 
     #[test]
     fn the_rate_of_frames_is_that_of_the_camera_in_use() {
-        let mut state = State::new("ours");
+        let mut state = State::new("own");
         let make = |service: &str, name: &str, hz| {
             let Input::Health(service, _, health) = health(service, 1, "a", 0.0, 1.0) else {
                 unreachable!()
@@ -743,7 +752,7 @@ mod tests {
             Input::Health(service, name.into(), Box::new(Health { rates, ..*health }))
         };
         state.take(0, make("detector", "main", 7.0));
-        assert_eq!(state.frames_hz(), None, "what a detector takes is no camera's");
+        assert_eq!(state.frames_hz(), None, "the rate of a detector is not that of a camera");
         state.take(0, make("camera-pub", "aft", 15.0));
         assert_eq!(state.frames_hz(), Some(15.0));
         state.take(0, make("camera-pub", "down", 0.0));
@@ -762,8 +771,8 @@ mod tests {
     }
 
     #[test]
-    fn what_is_remembered_is_bounded() {
-        let mut state = State::new("ours");
+    fn the_stored_messages_are_bounded() {
+        let mut state = State::new("own");
         for number in 0..500 {
             let name = format!("n{number}");
             state.take(0, Input::Detections(name.clone(), Box::new(Detections::sample())));
@@ -776,7 +785,7 @@ mod tests {
         assert_eq!((state.found.len(), state.recorders.len()), (MAX_NAMES, MAX_NAMES));
         assert_eq!(state.cameras.len(), MAX_NAMES);
         assert_eq!((state.services.len(), state.bridges.len()), (MAX_NAMES, MAX_NAMES));
-        // What fell silent gives way to what comes.
+        // Silent senders are removed, which makes room for new ones.
         state.every_second(1000 * SECOND);
         assert_eq!((state.found.len(), state.recorders.len(), state.cameras.len()), (0, 0, 0));
         state.take(1000 * SECOND, Input::Recorder("new".into(), Box::default()));
@@ -784,8 +793,8 @@ mod tests {
     }
 
     #[test]
-    fn what_one_bridge_or_recorder_too_many_says_is_not_told_with_each_status() {
-        let mut state = State::new("ours");
+    fn a_bridge_or_recorder_above_the_limit_is_not_logged_with_each_status() {
+        let mut state = State::new("own");
         for number in 0..MAX_NAMES {
             let bridge = GcsStatus { bridge: format!("n{number}"), ..GcsStatus::default() };
             state.take(0, Input::Ground(Box::new(bridge)));

@@ -1,4 +1,4 @@
-//! Pictures as H.264 over RTP, for QGroundControl.
+//! Sends pictures as H.264 over RTP, for QGroundControl.
 
 mod encoder;
 mod rtp;
@@ -27,7 +27,7 @@ pub(crate) struct Stream {
     state: Arc<Mutex<State>>,
 }
 
-/// What makes packets of frames, and goes to another thread for it.
+/// Makes packets of frames, on another thread.
 struct Maker {
     canvas: Canvas,
     encoder: Encoder,
@@ -69,11 +69,11 @@ impl Stream {
         loop {
             let frame = frames.next().await.context("the network session was closed")?;
             let began_ns = now_ns();
-            if !rate.is_due(began_ns) || !self.is_wanted(&frame.header) {
+            if !rate.is_due(began_ns) || !self.is_selected(&frame.header) {
                 continue;
             }
             rate.take(began_ns);
-            // Another host's clock says nothing here, so that frame's time is its arrival.
+            // Stamps of another host's clock cannot be compared, so the time of such a frame is its arrival.
             let is_own_clock = frame.header.clock == clock_name();
             let taken_ns = if is_own_clock { frame.header.stamp_ns } else { began_ns };
             let make = move || {
@@ -87,25 +87,25 @@ impl Stream {
                     self.node.health().dropped("picture left out of the stream, to keep its rate");
                 }
                 Ok(packets) => self.send(&socket, to, &packets, taken_ns).await,
-                Err(problem) => {
+                Err(error) => {
                     if self.node.health().failed("no H.264 of a frame") {
-                        tracing::warn!(%problem, "A frame is not in the stream");
+                        tracing::warn!(%error, "A frame is not in the stream");
                     }
                 }
             }
         }
     }
 
-    /// Of several cameras that of the detector in use is shown.
-    fn is_wanted(&self, header: &FrameHeader) -> bool {
-        // What is known is whole after each message, also when a thread panics.
+    /// Of several cameras the one of the detector in use is shown.
+    fn is_selected(&self, header: &FrameHeader) -> bool {
+        // The state is complete after each message, also when a thread panics.
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         state.camera().is_none_or(|camera| camera == header.camera)
     }
 
     async fn send(&self, socket: &UdpSocket, to: SocketAddr, packets: &[Vec<u8>], taken_ns: i64) {
         for packet in packets {
-            // Nobody may listen yet, or the network may be away for a moment.
+            // There may be no receiver yet, or the network may be unreachable for a moment.
             if socket.send_to(packet, to).await.is_err() {
                 self.node.health().dropped("packets of the stream");
             }

@@ -1,5 +1,5 @@
-//! Tokens for browsers that read or command from elsewhere, kept in a file as hashes with their end, and the sessions by cookie of
-//! browsers that have shown one.
+//! Stores tokens for browsers on other machines in a file, as hashes with their expiry, and the sessions by cookie of browsers
+//! that have presented one.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -14,25 +14,25 @@ use sha2::{Digest, Sha256};
 
 /// Random bytes of a token and of a session.
 const RANDOM_BYTES: usize = 32;
-/// Maximum number of tokens in a file; the oldest goes.
+/// Maximum number of tokens in a file; the oldest is removed.
 const MAX_TOKENS: usize = 64;
 /// Maximum size of the file, in bytes.
 const MAX_FILE_BYTES: u64 = 65_536;
-/// Maximum number of sessions of one token; the one of them that ends first goes, and none of another token.
+/// Maximum number of sessions of one token; the one of this token that ends first is removed, and none of another token.
 const MAX_SESSIONS: usize = 64;
-/// A token that is missing for this time was removed, in nanoseconds: an editor may write a file anew in two steps.
+/// A token that is missing for this time was removed, in nanoseconds: an editor may replace a file in two steps.
 const MISSING_NS: i64 = 2_000_000_000;
-/// A file that cannot be read for this time ends all sessions, in nanoseconds: nobody knows any more who was shut out. A system that
-/// has no more files to open for a while ends nobody's control of a landing.
+/// A file that cannot be read for this time ends all sessions, in nanoseconds, as a token may have been removed. A system that
+/// is out of file handles for a while does not end the control of a landing.
 const UNREADABLE_NS: i64 = 60_000_000_000;
 /// Duration of a session, in seconds.
 pub const SESSION_S: u64 = 12 * 3600;
 
-/// What a token is for.
+/// The right that a token gives.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Kind {
-    /// To look.
+    /// To view.
     Monitor,
     /// To command.
     Command,
@@ -69,7 +69,7 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// The hash of a secret. One round is enough, as nobody guesses 256 random bits.
+/// The hash of a secret. One round is enough, as 256 random bits cannot be guessed.
 fn hash(secret: &str) -> String {
     hex(&Sha256::digest(secret.as_bytes()))
 }
@@ -77,7 +77,7 @@ fn hash(secret: &str) -> String {
 /// A token, without its secret.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Token {
-    /// What it is for.
+    /// The right that it gives.
     pub kind: Kind,
     hash: String,
     /// In seconds since 1970.
@@ -104,7 +104,7 @@ impl Tokens {
         Self::read_open(path)
     }
 
-    /// Reads a file, also one that others may read: which tokens are no longer in it is known all the same.
+    /// Reads a file, also one that others may read: it still shows which tokens were removed.
     ///
     /// # Errors
     /// When it cannot be read, or is damaged.
@@ -121,7 +121,7 @@ impl Tokens {
         text.parse().map_err(anyhow::Error::msg).with_context(|| format!("reading {path:?}"))
     }
 
-    /// Writes them to a file that only its owner reads, at once: nobody reads half of it.
+    /// Writes them to a file that only its owner reads, atomically, so that no reader gets half of it.
     ///
     /// # Errors
     /// When it cannot be written.
@@ -146,7 +146,7 @@ impl Tokens {
             .with_context(|| format!("writing {path:?}"))
     }
 
-    /// Adds a token until a time in seconds since 1970, and forgets those that have expired.
+    /// Adds a token until a time in seconds since 1970, and removes those that have expired.
     pub fn add(&mut self, secret: &str, kind: Kind, now_s: u64, expires_s: u64) {
         self.tokens.retain(|token| token.expires_s > now_s);
         let surplus = (self.tokens.len() + 1).saturating_sub(MAX_TOKENS);
@@ -157,7 +157,7 @@ impl Tokens {
     /// The token of a secret; `None` for one that is wrong or has expired.
     pub fn of(&self, secret: &str, now_s: u64) -> Option<&Token> {
         let hash = hash(secret.trim());
-        // Comparing hashes tells nothing of the secret by its duration.
+        // The duration of comparing hashes reveals nothing about the secret.
         let token = self.tokens.iter().find(|token| token.hash == hash);
         token.filter(|token| token.expires_s > now_s)
     }
@@ -185,7 +185,7 @@ impl FromStr for Tokens {
             let [kind, hash, expires_s] = parts[..] else {
                 return Err("a line is not KIND HASH END".to_owned());
             };
-            let expires_s = expires_s.parse().map_err(|_| "an end is no number".to_owned())?;
+            let expires_s = expires_s.parse().map_err(|_| "an end is not a number".to_owned())?;
             tokens.push(Token { kind: kind.parse()?, hash: hash.to_owned(), expires_s });
         }
         Ok(Self { tokens })
@@ -200,7 +200,7 @@ pub fn usual_file() -> anyhow::Result<PathBuf> {
     Ok(usual_folder()?.join("dashboard-tokens"))
 }
 
-/// The folder of what a dashboard keeps.
+/// The folder of a dashboard's files.
 ///
 /// # Errors
 /// When the environment names none.
@@ -212,7 +212,7 @@ pub fn usual_folder() -> anyhow::Result<PathBuf> {
     Ok(state.join("alight"))
 }
 
-/// Browsers that have shown a token, in memory only. They are known by the hash of their cookie.
+/// Browsers that have presented a token, in memory only, by the hash of their cookie.
 #[derive(Clone, Debug, Default)]
 pub struct Sessions {
     by_hash: BTreeMap<String, Session>,
@@ -221,17 +221,17 @@ pub struct Sessions {
 #[derive(Clone, Debug)]
 struct Session {
     token: Token,
-    /// When it ends, in nanoseconds of the clock that only grows: a clock that is set meanwhile ends no control of a landing.
+    /// Its end, in nanoseconds of a monotonic clock: a wall clock that is set meanwhile does not end the control of a landing.
     ends_ns: i64,
-    /// Since when its token is not in the file, in nanoseconds of that clock.
+    /// Time since which its token is not in the file, in nanoseconds of that clock.
     missing_ns: Option<i64>,
-    /// Since when nobody knows whether it is.
-    unknown_ns: Option<i64>,
+    /// Time since which the file cannot be read.
+    unreadable_ns: Option<i64>,
 }
 
 impl Sessions {
-    /// Begins a session with this cookie, no longer than its token lasts by the time in seconds since 1970. `now_ns` is, here and
-    /// below, of a clock that only grows.
+    /// Begins a session with this cookie, no longer than its token is valid by the time in seconds since 1970. `now_ns` is, here and
+    /// below, of a monotonic clock.
     pub fn begin(&mut self, cookie: &str, token: Token, now_s: u64, now_ns: i64) {
         self.by_hash.retain(|_, session| session.ends_ns > now_ns);
         let of_token = self.by_hash.iter().filter(|(_, session)| session.token == token);
@@ -240,35 +240,36 @@ impl Sessions {
             let first = first.map(|(hash, _)| hash.clone());
             first.and_then(|hash| self.by_hash.remove(&hash));
         }
-        let lasts_s = token.expires_s.saturating_sub(now_s).min(SESSION_S);
-        let ends_ns = now_ns.saturating_add(lasts_s.cast_signed() * 1_000_000_000);
-        let session = Session { token, ends_ns, missing_ns: None, unknown_ns: None };
+        let valid_s = token.expires_s.saturating_sub(now_s).min(SESSION_S);
+        let ends_ns = now_ns.saturating_add(valid_s.cast_signed() * 1_000_000_000);
+        let session = Session { token, ends_ns, missing_ns: None, unreadable_ns: None };
         self.by_hash.insert(hash(cookie), session);
     }
 
-    /// The kind of the session of a cookie, while it lasts.
+    /// The kind of the session of a cookie, until it ends.
     pub fn kind(&self, cookie: &str, now_ns: i64) -> Option<Kind> {
         let session = self.by_hash.get(&hash(cookie))?;
         (session.ends_ns > now_ns).then_some(session.token.kind)
     }
 
-    /// Ends the sessions of tokens that are no longer in their file, and those of a file that cannot be read (`None`) for long; what
-    /// lasts for a moment ends none.
+    /// Ends the sessions of tokens that are no longer in their file, and all sessions while the file cannot be read (`None`) for
+    /// long; a short gap ends none.
     pub fn keep(&mut self, tokens: Option<&Tokens>, now_ns: i64) {
-        let lasts = |since_ns: Option<i64>, for_ns| {
+        let persists = |since_ns: Option<i64>, for_ns| {
             since_ns.is_some_and(|since_ns| now_ns.saturating_sub(since_ns) >= for_ns)
         };
         self.by_hash.retain(|_, session| {
             match tokens.map(|it| it.tokens.contains(&session.token)) {
-                Some(true) => (session.missing_ns, session.unknown_ns) = (None, None),
+                Some(true) => (session.missing_ns, session.unreadable_ns) = (None, None),
                 Some(false) => {
                     session.missing_ns.get_or_insert(now_ns);
                 }
                 None => {
-                    session.unknown_ns.get_or_insert(now_ns);
+                    session.unreadable_ns.get_or_insert(now_ns);
                 }
             }
-            !lasts(session.missing_ns, MISSING_NS) && !lasts(session.unknown_ns, UNREADABLE_NS)
+            !persists(session.missing_ns, MISSING_NS)
+                && !persists(session.unreadable_ns, UNREADABLE_NS)
         });
     }
 
@@ -283,7 +284,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_token_is_kept_as_a_hash_and_expires() {
+    fn a_token_is_stored_as_a_hash_and_expires() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("state/tokens");
         assert_eq!(Tokens::read(&path).unwrap(), Tokens::default());
@@ -344,7 +345,7 @@ mod tests {
         sessions.begin("pilot", token(Kind::Command, "pilot"), 0, 0);
         sessions.begin("guest", token(Kind::Monitor, "guest"), 0, 0);
         for number in 0..1000 {
-            sessions.begin(&number.to_string(), token(Kind::Monitor, "crowd"), 0, number);
+            sessions.begin(&number.to_string(), token(Kind::Monitor, "many"), 0, number);
         }
         assert_eq!(sessions.by_hash.len(), 2 + MAX_SESSIONS);
         assert_eq!(sessions.kind("pilot", 1000), Some(Kind::Command));
@@ -354,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn a_removed_token_ends_its_sessions_and_a_file_that_is_away_for_a_moment_none() {
+    fn a_removed_token_ends_its_sessions_and_a_file_that_is_unreadable_for_a_moment_none() {
         let token =
             |name: &str| Token { kind: Kind::Command, hash: name.into(), expires_s: u64::MAX };
         let mut begun = Sessions::default();
@@ -372,7 +373,7 @@ mod tests {
         sessions.keep(Some(&second), 3 * MISSING_NS);
         assert_eq!(open(&sessions), [false, true]);
 
-        // A token that is known to be removed stays so when the file cannot be read then.
+        // A removed token stays removed when the file cannot be read afterwards.
         let mut sessions = begun.clone();
         sessions.keep(Some(&second), 0);
         sessions.keep(None, MISSING_NS);

@@ -1,5 +1,5 @@
-//! Makes JPEG pictures of the used camera's frames, with the JSON of what the detector found or refused in each, for the
-//! browsers that look; while nobody looks, it makes none.
+//! Makes JPEG pictures of the frames of the camera in use, each with its detections and refused candidates as JSON, while
+//! at least one browser shows them.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -20,9 +20,10 @@ use crate::config::{Input, VideoConfig};
 use crate::pairing::{Pairing, Picture};
 use crate::state::State;
 
-/// Period in which somebody who begins to look is noticed.
+/// Period in which a new viewer is noticed.
 pub(crate) const LOOK_PERIOD: Duration = Duration::from_millis(100);
-/// Frames are received for this time after the last browser has gone: one that loads the page again needs no new start.
+/// Frames are received for this time after the last browser has disconnected, so that a page that is reloaded shows a
+/// picture at once.
 const LINGER: Duration = Duration::from_secs(2);
 /// Maximum size of a picture, in bytes.
 const MAX_BYTES: usize = 16_000_000;
@@ -31,7 +32,7 @@ const MAX_MARKERS: usize = 32;
 /// Maximum number of refused candidates that are drawn.
 const MAX_REFUSALS: usize = 64;
 
-/// A picture as browsers get it.
+/// A picture as it is sent to browsers.
 #[derive(Clone, Debug)]
 pub(crate) struct Shown {
     /// Its number since the start of this process.
@@ -46,24 +47,24 @@ pub(crate) struct Shown {
     pub(crate) files: Bytes,
 }
 
-/// The newest picture, for all who look.
+/// The newest picture, for all viewers.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Pictures {
     /// For the page.
     pub(crate) shown: Arc<watch::Sender<Option<Shown>>>,
-    /// As one JPEG file, for programs that know only Motion JPEG.
+    /// As one JPEG file, for programs that support Motion JPEG only.
     pub(crate) files: Arc<watch::Sender<Option<Bytes>>>,
-    /// Who wants to see what was refused, as its receivers: detectors tell it only while there is one.
-    pub(crate) curious: Arc<watch::Sender<()>>,
+    /// Its receivers are the browsers that show refused candidates: detectors publish these only while there is one.
+    pub(crate) show_refused: Arc<watch::Sender<()>>,
 }
 
-/// Makes pictures while somebody looks.
+/// Makes pictures while there is a viewer.
 pub(crate) struct Video {
     node: Node,
     config: VideoConfig,
     state: Arc<Mutex<State>>,
     shown: Arc<watch::Sender<Option<Shown>>>,
-    curious: Arc<watch::Sender<()>>,
+    show_refused: Arc<watch::Sender<()>>,
     number: u64,
 }
 
@@ -74,8 +75,9 @@ impl Video {
         state: Arc<Mutex<State>>,
         pictures: &Pictures,
     ) -> Self {
-        let (shown, curious) = (Arc::clone(&pictures.shown), Arc::clone(&pictures.curious));
-        Self { node, config, state, shown, curious, number: 0 }
+        let shown = Arc::clone(&pictures.shown);
+        let show_refused = Arc::clone(&pictures.show_refused);
+        Self { node, config, state, shown, show_refused, number: 0 }
     }
 
     /// Makes pictures until the session is closed.
@@ -97,7 +99,7 @@ impl Video {
 
     async fn while_watched(&mut self, topic: messages::Topic<FrameHeader>) -> anyhow::Result<()> {
         let frames = self.node.frame_subscriber(topic, &[]).await?;
-        let told = self.node.subscriber(topic::DETECTIONS, &[]).await?;
+        let detections = self.node.subscriber(topic::DETECTIONS, &[]).await?;
         let mut refused: Option<Subscriber<Refusals>> = None;
         let mut pairing = Pairing::new(i64::from(self.config.hold_ms) * 1_000_000);
         let mut rate = Rate::new(self.config.max_hz);
@@ -107,19 +109,19 @@ impl Video {
             let wait_ns = pairing.deadline_ns().map(|at_ns| at_ns.saturating_sub(now_ns()).max(0));
             let due = wait_ns.map(|ns| Instant::now() + Duration::from_nanos(ns.cast_unsigned()));
             tokio::select! {
-                // In this order: what was found is there before a further picture is made, which takes its time.
+                // In this order: detections are taken before a further picture is made, which takes time.
                 biased;
-                told = told.next_with_key() => {
-                    let (key, told) = told.context("the network session was closed")?;
-                    hear(&mut pairing, &key, told);
+                found = detections.next_with_key() => {
+                    let (key, found) = found.context("the network session was closed")?;
+                    add_detections(&mut pairing, &key, found);
                 }
-                refusals = of_each(refused.as_ref()), if refused.is_some() => {
+                refusals = next_refusals(refused.as_ref()), if refused.is_some() => {
                     let (key, refusals) = refusals.context("the network session was closed")?;
                     let detector = topic::REFUSALS.first_name(&key).unwrap_or_default().to_owned();
                     pairing.refusals(Refusals { detector, ..refusals });
                 }
                 _ = look.tick() => {
-                    match (self.curious.receiver_count() > 0, refused.is_some()) {
+                    match (self.show_refused.receiver_count() > 0, refused.is_some()) {
                         (true, false) => {
                             refused = Some(self.node.subscriber(topic::REFUSALS, &[]).await?);
                         }
@@ -138,13 +140,13 @@ impl Video {
                 () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => {}
                 frame = frames.next() => {
                     let frame = frame.context("the network session was closed")?;
-                    if rate.is_due(now_ns()) && self.is_wanted(&frame.header) {
+                    if rate.is_due(now_ns()) && self.is_selected(&frame.header) {
                         rate.take(now_ns());
                         self.add(frame, &mut pairing).await?;
-                        // What was told while the picture was made is there before the picture's wait ends.
-                        while let Ok(found) = timeout(Duration::ZERO, told.next_with_key()).await {
+                        // Detections that arrived while the picture was made are taken before the picture's wait ends.
+                        while let Ok(found) = timeout(Duration::ZERO, detections.next_with_key()).await {
                             let (key, found) = found.context("the network session was closed")?;
-                            hear(&mut pairing, &key, found);
+                            add_detections(&mut pairing, &key, found);
                         }
                     }
                 }
@@ -156,14 +158,14 @@ impl Video {
         }
     }
 
-    /// Of several cameras that of the detector in use is shown.
-    fn is_wanted(&self, header: &FrameHeader) -> bool {
+    /// Of several cameras the one of the detector in use is shown.
+    fn is_selected(&self, header: &FrameHeader) -> bool {
         self.lock().camera().is_none_or(|camera| camera == header.camera)
     }
 
-    /// Makes the picture of a frame, on a thread for such work.
+    /// Makes the picture of a frame, on a thread for blocking work.
     async fn add(&self, frame: Frame, pairing: &mut Pairing) -> anyhow::Result<()> {
-        // Making it takes its time, and counts.
+        // The time for making it counts.
         let (began, received_ns) = (Instant::now(), now_ns());
         let quality = self.config.jpeg_quality;
         let make = move || {
@@ -182,7 +184,7 @@ impl Video {
                 if self.node.health().failed("no picture of a frame") {
                     tracing::warn!(
                         ?header,
-                        "A frame cannot be shown: it is no whole grey or Bayer image"
+                        "A frame cannot be shown: it is not a complete grey or Bayer image"
                     );
                 }
             }
@@ -208,31 +210,31 @@ impl Video {
         self.shown.send_replace(Some(Shown { number: self.number, at_ns, message, header, files }));
     }
 
-    // What is known is whole after each message, also when a thread panics.
+    // The state is complete after each message, also when a thread panics.
     fn lock(&self) -> std::sync::MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// What a detector refused next; for ever nothing without a subscriber.
-async fn of_each(refused: Option<&Subscriber<Refusals>>) -> Option<(String, Refusals)> {
+/// The next refused candidates of a detector; without a subscriber it waits for ever.
+async fn next_refusals(refused: Option<&Subscriber<Refusals>>) -> Option<(String, Refusals)> {
     match refused {
         Some(refused) => refused.next_with_key().await,
         None => std::future::pending().await,
     }
 }
 
-/// Notes what a detector told; it is known by its key.
-fn hear(pairing: &mut Pairing, key: &str, told: Detections) {
+/// Adds the detections of a detector, whose name is in the key.
+fn add_detections(pairing: &mut Pairing, key: &str, found: Detections) {
     let detector = topic::DETECTIONS.first_name(key).unwrap_or_default().to_owned();
-    pairing.detections(Detections { detector, ..told });
+    pairing.detections(Detections { detector, ..found });
 }
 
-/// The JPEG files of a frame: those that came, or one that is made; `None` when they do not match the header.
+/// The JPEG files of a frame: the received ones, or a new one; `None` when they do not match the header.
 fn files(header: &FrameHeader, bytes: &[u8], quality: u8) -> Option<Vec<u8>> {
-    let told: u64 = header.parts.iter().map(|part| u64::from(part.bytes)).sum();
-    let is_whole = header.parts.is_empty() || told == bytes.len() as u64;
-    is_whole.then(|| jpeg(header, bytes, quality)).flatten()
+    let stated: u64 = header.parts.iter().map(|part| u64::from(part.bytes)).sum();
+    let is_complete = header.parts.is_empty() || stated == bytes.len() as u64;
+    is_complete.then(|| jpeg(header, bytes, quality)).flatten()
 }
 
 fn header_json(number: u64, at_ns: i64, picture: &Picture, clock: &str) -> Value {
@@ -244,7 +246,7 @@ fn header_json(number: u64, at_ns: i64, picture: &Picture, clock: &str) -> Value
             json!({ "x": it.x, "y": it.y, "width": it.width, "height": it.height, "scale": it.scale, "bytes": it.bytes })
         })
         .collect();
-    // Of another host's clock only the arrival can be compared with ours.
+    // Stamps of another host's clock cannot be compared with this host's; the arrival can.
     let is_own_clock = header.clock == clock;
     let taken_ns = if is_own_clock { header.stamp_ns } else { picture.received_ns };
     let found = picture.found.as_ref();
@@ -289,7 +291,7 @@ mod tests {
     use messages::FramePart;
 
     #[test]
-    fn parts_that_do_not_match_their_bytes_are_no_picture() {
+    fn parts_that_do_not_match_their_bytes_give_no_picture() {
         let part = FramePart { x: 0, y: 0, width: 8, height: 8, scale: 1, bytes: 5 };
         let format = messages::PixelFormat::Jpeg;
         let header = FrameHeader { parts: vec![part], format, ..FrameHeader::sample() };
@@ -298,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn the_header_has_the_frame_and_what_was_found_in_it() {
+    fn the_header_has_the_frame_and_its_detections() {
         let picture = Picture {
             header: FrameHeader { sequence: 7, stamp_ns: 2_000_000, ..FrameHeader::sample() },
             files: Arc::default(),
@@ -314,8 +316,8 @@ mod tests {
         let other = header_json(3, 9_000_000, &picture, "another");
         assert_eq!((&other["is_own_clock"], &other["taken_ms"]), (&json!(false), &json!(5.0)));
         assert_eq!((&json["refused"], &json["refused_total"]), (&Value::Null, &Value::Null));
-        let curious = Picture { refused: Some(Refusals::sample()), ..picture.clone() };
-        let json = header_json(3, 9_000_000, &curious, "clock");
+        let with_refused = Picture { refused: Some(Refusals::sample()), ..picture.clone() };
+        let json = header_json(3, 9_000_000, &with_refused, "clock");
         assert_eq!(
             (&json["refused"][0]["reason"], &json["refused_total"]),
             (&json!("code"), &json!(1))

@@ -1,15 +1,15 @@
-//! Phases, states and places in words for an operator.
+//! Describes phases, detector states and ground contact in words for an operator.
 
 use messages::{DetectorState, LandedState, Phase};
 
-/// A phase as an operator reads it.
+/// The description of a phase for an operator.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Words {
-    /// What the vehicle does.
+    /// The vehicle's present action.
     pub title: &'static str,
-    /// What changes it.
+    /// The condition that ends the phase.
     pub next: &'static str,
-    /// How it is shown: `calm`, `busy`, `good`, `warn` or `bad`.
+    /// The style in which it is shown: `calm`, `busy`, `good`, `warn` or `bad`.
     pub mood: &'static str,
 }
 
@@ -42,10 +42,10 @@ pub fn phase(phase: Phase) -> Words {
         Phase::Landed => ("Landed", "Only a new start does anything further.", "good"),
         Phase::Hold => (
             "Holding the position",
-            "Resume goes on, unless the reason still holds; abort ends the landing.",
+            "Resume continues, unless the reason still holds; abort ends the landing.",
             "warn",
         ),
-        Phase::Aborted => ("Aborted", "The pilot or a new start takes the vehicle on.", "bad"),
+        Phase::Aborted => ("Aborted", "The pilot or a new start takes over the vehicle.", "bad"),
         Phase::PilotInCommand => {
             ("The pilot flies", "Nothing is sent to the vehicle until a new start.", "warn")
         }
@@ -69,7 +69,7 @@ pub fn detector(state: DetectorState) -> &'static str {
 /// Contact with the ground.
 pub fn landed(state: LandedState) -> &'static str {
     match state {
-        LandedState::Unknown => "not told",
+        LandedState::Unknown => "unknown",
         LandedState::OnGround => "on the ground",
         LandedState::TakingOff => "taking off",
         LandedState::InAir => "in the air",
@@ -82,7 +82,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_detector_without_a_pose_is_told_from_one_that_sees_no_marker() {
+    fn a_detector_without_a_pose_is_distinguished_from_one_that_sees_no_marker() {
         assert_eq!(detector(DetectorState::Blind), "sees no marker");
         assert_eq!(detector(DetectorState::NoPose), "gives no pose");
     }

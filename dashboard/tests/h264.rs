@@ -1,5 +1,5 @@
-//! The dashboard's H.264 over RTP from a camera made up here, received and decoded without errors by a
-//! program in Python.
+//! Tests the dashboard's H.264 over RTP from a simulated camera: a program in Python receives and decodes it without
+//! errors.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -17,14 +17,14 @@ const WIDTH: usize = 1296;
 const HEIGHT: usize = 972;
 const RATE_HZ: f64 = 15.0;
 const PICTURES: usize = 60;
-const PATIENCE: Duration = Duration::from_secs(90);
+const TIMEOUT: Duration = Duration::from_secs(90);
 
 async fn open(service: &'static str, meet: u16) -> anyhow::Result<Node> {
     let source = ZenohSource::Text(node::session::local_config(meet));
     Node::open(Identity { service, instance: "main".into() }, &source).await
 }
 
-/// A camera whose frames have their number in sixteen squares, over a ground that moves.
+/// A camera whose frames have their number in sixteen squares, over a moving background.
 fn camera(node: Node) -> JoinHandle<anyhow::Result<()>> {
     tokio::spawn(async move {
         let frames = node.frame_publisher(topic::FRAME, &["down"], WIDTH * HEIGHT).await?;
@@ -61,7 +61,7 @@ fn camera(node: Node) -> JoinHandle<anyhow::Result<()>> {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_stream_is_decoded_without_errors() -> anyhow::Result<()> {
     let ([meet, port], neighbours, _) = ports::free()?;
-    // RTP takes an even port, and its control the next one.
+    // RTP uses an even port, and its control the next one.
     let to = (neighbours + 1) & !1;
     let set = [
         format!("listen=127.0.0.1:{port}"),
@@ -78,10 +78,10 @@ async fn a_stream_is_decoded_without_errors() -> anyhow::Result<()> {
         .args([to.to_string(), PICTURES.to_string()])
         .kill_on_drop(true)
         .output();
-    let output = match timeout(PATIENCE, run).await.context("the stream does not end")? {
+    let output = match timeout(TIMEOUT, run).await.context("the stream does not end")? {
         Ok(output) => output,
-        Err(problem) => {
-            testing::skip("python", format_args!("it does not start: {problem}"));
+        Err(error) => {
+            testing::skip("python", format_args!("it does not start: {error}"));
             return Ok(());
         }
     };
@@ -89,13 +89,13 @@ async fn a_stream_is_decoded_without_errors() -> anyhow::Result<()> {
         return Ok(());
     }
     let text = String::from_utf8_lossy(&output.stdout);
-    let told: Value = serde_json::from_str(text.lines().last().context("nothing is told")?)?;
-    ensure!(told["size"] == serde_json::json!([WIDTH, HEIGHT]), "{told}");
-    // A busy machine may leave some out, and a receiver's buffer as well.
-    ensure!(told["steps_of_1"].as_u64() > Some(PICTURES as u64 / 2), "{told}");
+    let result: Value = serde_json::from_str(text.lines().last().context("no output")?)?;
+    ensure!(result["size"] == serde_json::json!([WIDTH, HEIGHT]), "{result}");
+    // A busy machine may leave some out, and so may a receiver's buffer.
+    ensure!(result["steps_of_1"].as_u64() > Some(PICTURES as u64 / 2), "{result}");
     let report = node.health().report(node.identity(), 0);
     let latency = report.latencies.iter().find(|it| it.name == "frame to stream");
-    println!("{told}; frame to stream: {:?}", latency.context("no latency")?);
+    println!("{result}; frame to stream: {:?}", latency.context("no latency")?);
     filming.abort();
     serving.abort();
     Ok(())

@@ -1,5 +1,5 @@
-//! The dashboard's HTTP server and its WebSockets, with a controller and a camera made up here: refused requests,
-//! state with ages, held commands, pictures with detections, tokens, encryption.
+//! Tests the dashboard's HTTP server and WebSockets with a simulated controller and camera: refused requests, state with
+//! ages, held commands, pictures with detections, tokens, encryption.
 
 use std::fs::Permissions;
 use std::net::{IpAddr, SocketAddr, UdpSocket};
@@ -34,13 +34,13 @@ use tokio_tungstenite::tungstenite::http::{HeaderValue, Request};
 use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{WebSocketStream, client_async};
 
-const PATIENCE: Duration = Duration::from_secs(20);
-/// Longer than a button is held.
+const TIMEOUT: Duration = Duration::from_secs(20);
+/// Longer than the time for which a button is held.
 const HELD: Duration = Duration::from_millis(1050);
 
 type Socket = WebSocketStream<TcpStream>;
 
-/// What a WebSocket runs over.
+/// The transport of a WebSocket.
 trait Stream: AsyncRead + AsyncWrite + Unpin {}
 impl<S: AsyncRead + AsyncWrite + Unpin> Stream for S {}
 
@@ -66,12 +66,12 @@ impl Page {
         let shutdown = Shutdown::on_signals()?;
         let task = tokio::spawn(dashboard::run(node.clone(), config, shutdown));
         let address = SocketAddr::new("127.0.0.1".parse()?, port);
-        until("the page listens", PATIENCE, async || TcpStream::connect(address).await.is_ok())
+        until("the page listens", TIMEOUT, async || TcpStream::connect(address).await.is_ok())
             .await?;
         Ok(Self { meet, address, node, task })
     }
 
-    /// What was refused for this reason.
+    /// The number of requests refused for this reason.
     fn refused(&self, reason: &str) -> u64 {
         let drops = self.node.health().report(self.node.identity(), 0).drops;
         drops.iter().find(|it| it.reason == reason).map_or(0, |it| it.count)
@@ -106,11 +106,11 @@ async fn connected(address: SocketAddr, request: Request<()>) -> Result<Socket, 
     Ok(client_async(request, stream).await?.0)
 }
 
-/// The status with which a WebSocket is refused.
+/// The status code of a refused WebSocket.
 async fn refusal(address: SocketAddr, request: Request<()>) -> anyhow::Result<u16> {
     match connected(address, request).await {
         Err(Error::Http(response)) => Ok(response.status().as_u16()),
-        Err(problem) => Err(problem.into()),
+        Err(error) => Err(error.into()),
         Ok(_) => bail!("it was not refused"),
     }
 }
@@ -120,7 +120,7 @@ async fn ask(address: SocketAddr, request: &str) -> anyhow::Result<String> {
     let mut stream = TcpStream::connect(address).await?;
     stream.write_all(request.as_bytes()).await?;
     let mut answer = Vec::new();
-    timeout(PATIENCE, stream.read_to_end(&mut answer)).await??;
+    timeout(TIMEOUT, stream.read_to_end(&mut answer)).await??;
     Ok(String::from_utf8_lossy(&answer).into_owned())
 }
 
@@ -129,28 +129,28 @@ fn get(path: &str, host: &str, more: &str) -> String {
 }
 
 async fn next(socket: &mut WebSocketStream<impl Stream>) -> anyhow::Result<Message> {
-    Ok(timeout(PATIENCE, socket.next()).await?.context("the connection was closed")??)
+    Ok(timeout(TIMEOUT, socket.next()).await?.context("the connection was closed")??)
 }
 
-/// The next message for which something holds.
-async fn told(
+/// The next message that meets a condition.
+async fn receive(
     socket: &mut WebSocketStream<impl Stream>,
-    holds: impl Fn(&Value) -> bool,
+    is_expected: impl Fn(&Value) -> bool,
 ) -> anyhow::Result<Value> {
-    let found = timeout(PATIENCE, async {
+    let found = timeout(TIMEOUT, async {
         loop {
             if let Message::Text(text) = next(socket).await? {
                 let value: Value = serde_json::from_str(&text)?;
-                if holds(&value) {
+                if is_expected(&value) {
                     return anyhow::Ok(value);
                 }
             }
         }
     });
-    found.await.context("waiting to be told")?
+    found.await.context("waiting for a message")?
 }
 
-async fn say(socket: &mut WebSocketStream<impl Stream>, value: Value) -> anyhow::Result<()> {
+async fn send(socket: &mut WebSocketStream<impl Stream>, value: Value) -> anyhow::Result<()> {
     Ok(socket.send(Message::text(value.to_string())).await?)
 }
 
@@ -164,7 +164,7 @@ fn status() -> ControllerStatus {
     }
 }
 
-/// A controller that publishes, and that takes every command but a resume.
+/// A controller that publishes its status, and accepts every command except resume.
 fn controller(node: Node) -> JoinHandle<anyhow::Result<()>> {
     tokio::spawn(async move {
         let statuses = node.publisher(topic::STATUS, &[]).await?;
@@ -176,7 +176,7 @@ fn controller(node: Node) -> JoinHandle<anyhow::Result<()>> {
                 request = commands.next() => {
                     let request = request.context("closed")?;
                     let accepted = request.message != ControllerCommand::Resume;
-                    let reason = format!("{:?} was heard", request.message);
+                    let reason = format!("{:?} was received", request.message);
                     request.answer(&CommandReply { accepted, reason }).await;
                 }
             }
@@ -185,10 +185,10 @@ fn controller(node: Node) -> JoinHandle<anyhow::Result<()>> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_not_of_the_page_is_refused_and_counted() -> anyhow::Result<()> {
+async fn foreign_requests_are_refused_and_counted() -> anyhow::Result<()> {
     let page = Page::start(&["max_clients=2"]).await?;
-    let own = page.address.to_string();
-    let answer = ask(page.address, &get("/", &own, "")).await?.to_lowercase();
+    let address = page.address.to_string();
+    let answer = ask(page.address, &get("/", &address, "")).await?.to_lowercase();
     ensure!(
         answer.starts_with("http/1.1 200") && answer.contains("<title>alight</title>"),
         "{answer}"
@@ -205,7 +205,7 @@ async fn what_is_not_of_the_page_is_refused_and_counted() -> anyhow::Result<()> 
     }
     ensure!(page.refused("wrong Host") == 4, "{}", page.refused("wrong Host"));
     let foreign = "Origin: http://evil.example\r\n";
-    let answer = ask(page.address, &get("/session", &own, foreign)).await?;
+    let answer = ask(page.address, &get("/session", &address, foreign)).await?;
     ensure!(answer.starts_with("HTTP/1.1 403"), "{answer}");
 
     for path in ["/ws", "/video"] {
@@ -221,38 +221,39 @@ async fn what_is_not_of_the_page_is_refused_and_counted() -> anyhow::Result<()> 
     let _two = [page.socket("/ws").await?, page.socket("/ws").await?];
     let third = refusal(page.address, page.request(page.address, "/ws")?).await?;
     ensure!(third == 503 && page.refused("too many browsers") == 1, "{third}");
-    let answer = ask(page.address, &get("/session", &own, "")).await?;
+    let answer = ask(page.address, &get("/session", &address, "")).await?;
     ensure!(answer.starts_with("HTTP/1.1 503") && answer.contains("`max_clients`"), "{answer}");
     Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_state_is_told_with_its_age() -> anyhow::Result<()> {
+async fn the_state_is_sent_with_its_age() -> anyhow::Result<()> {
     let page = Page::start(&[]).await?;
     let controller = controller(open("controller", page.meet).await?);
     let mut socket = page.socket("/ws").await?;
-    let hello = told(&mut socket, |it| it["kind"] == "hello").await?;
+    let hello = receive(&mut socket, |it| it["kind"] == "hello").await?;
     ensure!(hello["no_commands"].as_str().is_some_and(|why| why.contains("only shows")), "{hello}");
     ensure!(hello["vehicle"] == "drone", "{hello}");
     let is_young = |it: &Value| it["status"]["age_ms"].as_f64().is_some_and(|age| age < 700.0);
-    let is_told = |it: &Value| it["status"]["phase"] == "descend" && is_young(it);
-    let now = told(&mut socket, is_told).await?;
+    let is_current = |it: &Value| it["status"]["phase"] == "descend" && is_young(it);
+    let now = receive(&mut socket, is_current).await?;
     ensure!(now["status"]["title"] == "Descending" && now["status"]["height_m"] == 4.2, "{now}");
     let is_entry = |it: &Value| it["text"] == "descend: descending over the marker";
     let has_entry =
         |it: &Value| it["entries"].as_array().is_some_and(|list| list.iter().any(is_entry));
-    // The log is told when it changes, which may have been before: a new page gets it whole.
-    told(&mut page.socket("/ws").await?, has_entry).await?;
-    let slow = told(&mut socket, |it| it["kind"] == "slow").await?;
+    // The log is sent when it changes, which may have been before: a new page gets the complete log.
+    receive(&mut page.socket("/ws").await?, has_entry).await?;
+    let slow = receive(&mut socket, |it| it["kind"] == "slow").await?;
     ensure!(slow["checks"].as_array().is_some_and(|list| list.len() > 10), "{slow}");
     controller.abort();
-    told(&mut socket, |it| it["status"]["age_ms"].as_f64().is_some_and(|age| age > 1500.0)).await?;
+    receive(&mut socket, |it| it["status"]["age_ms"].as_f64().is_some_and(|age| age > 1500.0))
+        .await?;
     Ok(())
 }
 
 async fn nonce(socket: &mut WebSocketStream<impl Stream>, command: &str) -> anyhow::Result<String> {
-    say(socket, json!({ "kind": "nonce", "command": command })).await?;
-    let answer = told(socket, |it| it["kind"] == "nonce").await?;
+    send(socket, json!({ "kind": "nonce", "command": command })).await?;
+    let answer = receive(socket, |it| it["kind"] == "nonce").await?;
     Ok(answer["nonce"].as_str().context("a nonce")?.to_owned())
 }
 
@@ -261,13 +262,13 @@ async fn command(
     command: &str,
     nonce: &str,
 ) -> anyhow::Result<Value> {
-    say(socket, json!({ "kind": "command", "command": command, "nonce": nonce })).await?;
-    told(socket, |it| it["kind"] == "reply").await
+    send(socket, json!({ "kind": "command", "command": command, "nonce": nonce })).await?;
+    receive(socket, |it| it["kind"] == "reply").await
 }
 
-/// It may have been carried out, and was not refused.
+/// The command was not refused, and may have been carried out.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_command_that_nobody_answers_is_told_as_that() -> anyhow::Result<()> {
+async fn a_command_without_an_answer_is_reported_as_such() -> anyhow::Result<()> {
     let page = Page::start(&["commands=here"]).await?;
     let mut socket = page.socket("/ws").await?;
     let nonce = nonce(&mut socket, "hold").await?;
@@ -283,7 +284,7 @@ async fn a_command_is_held_for_a_second_and_given_once() -> anyhow::Result<()> {
     let page = Page::start(&["commands=here"]).await?;
     let _controller = controller(open("controller", page.meet).await?);
     let mut socket = page.socket("/ws").await?;
-    told(&mut socket, |it| it["status"]["phase"] == "descend").await?;
+    receive(&mut socket, |it| it["status"]["phase"] == "descend").await?;
 
     let without = command(&mut socket, "abort", "").await?;
     ensure!(without["accepted"] == false && without["who"] == "dashboard", "{without}");
@@ -294,14 +295,14 @@ async fn a_command_is_held_for_a_second_and_given_once() -> anyhow::Result<()> {
     sleep(HELD).await;
     let held = command(&mut socket, "hold", &second).await?;
     ensure!(held["accepted"] == true && held["who"] == "controller", "{held}");
-    ensure!(held["why"] == "Hold was heard", "{held}");
+    ensure!(held["why"] == "Hold was received", "{held}");
     let third = nonce(&mut socket, "land-here").await?;
     sleep(HELD).await;
     let landing = command(&mut socket, "land-here", &third).await?;
-    ensure!(landing["why"] == "LandHere was heard", "{landing}");
+    ensure!(landing["why"] == "LandHere was received", "{landing}");
     let again = command(&mut socket, "hold", &second).await?;
     ensure!(again["accepted"] == false && again["who"] == "dashboard", "{again}");
-    // A nonce of another browser is none.
+    // The nonce of another browser is not valid.
     let mut other = page.socket("/ws").await?;
     let foreign = nonce(&mut other, "abort").await?;
     let third = nonce(&mut socket, "resume").await?;
@@ -328,7 +329,7 @@ async fn a_command_is_held_for_a_second_and_given_once() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A camera and a detector: frames at 20 Hz, each with what was found in it 30 ms later.
+/// A camera and a detector: frames at 20 Hz, each with its detections 30 ms later.
 fn camera(node: Node) -> JoinHandle<anyhow::Result<()>> {
     tokio::spawn(async move {
         let frames = node.frame_publisher(topic::FRAME, &["down"], 64 * 48).await?;
@@ -354,7 +355,7 @@ fn camera(node: Node) -> JoinHandle<anyhow::Result<()>> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_was_refused_is_told_while_somebody_asks() -> anyhow::Result<()> {
+async fn refused_candidates_are_sent_while_they_are_requested() -> anyhow::Result<()> {
     let page = Page::start(&["video.max_hz=30"]).await?;
     let node = open("detector", page.meet).await?;
     let refusals = node.publisher(topic::REFUSALS, &["main"]).await?;
@@ -362,7 +363,7 @@ async fn what_was_refused_is_told_while_somebody_asks() -> anyhow::Result<()> {
     let _camera = camera(node);
     let _refuses = tokio::spawn(async move {
         while let Some(Detections { header, .. }) = detections.next().await {
-            // As a detector does: for who asks, after what it found.
+            // As a detector does: for subscribers only, after the detections.
             if refusals.has_subscribers().await {
                 let refused = Refusals { header, total: 7, ..Refusals::sample() };
                 refusals.publish(&refused).await;
@@ -370,18 +371,18 @@ async fn what_was_refused_is_told_while_somebody_asks() -> anyhow::Result<()> {
         }
     });
     let mut socket = page.socket("/video").await?;
-    let until = async |socket: &mut Socket, is_told: bool| {
-        let found = timeout(PATIENCE, async {
+    let until = async |socket: &mut Socket, is_expected: bool| {
+        let found = timeout(TIMEOUT, async {
             loop {
                 let Some((header, _)) = picture(socket).await? else { continue };
                 let number = header["number"].to_string();
                 socket.send(Message::text(number)).await?;
-                if header["refused"].is_null() != is_told {
+                if header["refused"].is_null() != is_expected {
                     return anyhow::Ok(header);
                 }
             }
         });
-        found.await.with_context(|| format!("what was refused is told: {is_told}"))?
+        found.await.with_context(|| format!("refused candidates are sent: {is_expected}"))?
     };
     until(&mut socket, false).await?;
     socket.send(Message::text("refused")).await?;
@@ -404,20 +405,19 @@ async fn picture(socket: &mut Socket) -> anyhow::Result<Option<(Value, Vec<u8>)>
     let Ok(message) = timeout(Duration::from_millis(1500), socket.next()).await else {
         return Ok(None);
     };
-    let Some(Ok(Message::Binary(bytes))) = message else { bail!("no picture: {message:?}") };
+    let Some(Ok(Message::Binary(bytes))) = message else { bail!("not a picture: {message:?}") };
     let length = u32::from_le_bytes(bytes.get(..4).context("a length")?.try_into()?) as usize;
     let header = serde_json::from_slice(bytes.get(4..4 + length).context("a header")?)?;
     Ok(Some((header, bytes[4 + length..].to_vec())))
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn two_pictures_are_on_their_way_at_most_each_with_its_own_detections() -> anyhow::Result<()>
-{
+async fn at_most_two_pictures_are_in_transit_each_with_its_own_detections() -> anyhow::Result<()> {
     let page = Page::start(&["video.max_hz=30"]).await?;
     let _camera = camera(open("detector", page.meet).await?);
     let mut socket = page.socket("/video").await?;
     let mut shown = Vec::new();
-    let first = timeout(PATIENCE, async {
+    let first = timeout(TIMEOUT, async {
         loop {
             if let Some(first) = picture(&mut socket).await? {
                 return anyhow::Ok(first);
@@ -446,12 +446,12 @@ async fn two_pictures_are_on_their_way_at_most_each_with_its_own_detections() ->
     }
     ensure!(bare <= 3, "{bare} of {} pictures had no detections", shown.len());
     let sequence = |at: usize| shown[at].0["sequence"].as_u64().context("a number");
-    // What came meanwhile was left out: the third is much newer than the second.
+    // Pictures in between were left out: the third is much newer than the second.
     ensure!(sequence(2)? > sequence(1)? + 20, "{} after {}", sequence(2)?, sequence(1)?);
     Ok(())
 }
 
-/// An address of this machine beside loopback.
+/// An address of this machine other than loopback.
 fn outward() -> Option<IpAddr> {
     let socket = UdpSocket::bind("0.0.0.0:0").ok()?;
     // Nothing is sent.
@@ -490,7 +490,7 @@ async fn encrypted(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_encrypted_page_is_commanded_from_elsewhere_while_its_token_is_there()
+async fn an_encrypted_page_takes_commands_from_other_machines_while_its_token_exists()
 -> anyhow::Result<()> {
     let Some(outward) = outward() else {
         testing::skip("network", "this machine has no address but loopback");
@@ -510,7 +510,7 @@ async fn an_encrypted_page_is_commanded_from_elsewhere_while_its_token_is_there(
     let controller = controller(open("controller", page.meet).await?);
     let from = SocketAddr::new(outward, page.address.port());
 
-    // Without encryption there is only the way to the page.
+    // Without encryption there is only a redirection to the page.
     let moved = ask(from, &get("/", &from.to_string(), "")).await?;
     ensure!(moved.starts_with("HTTP/1.1 307"), "{moved}");
     ensure!(moved.contains(&format!("location: https://{from}/")), "{moved}");
@@ -523,17 +523,17 @@ async fn an_encrypted_page_is_commanded_from_elsewhere_while_its_token_is_there(
     ensure!(refusal(from, page.request(from, "/ws")?).await? == 426);
     ensure!(page.refused("request without TLS") == 2);
 
-    // Who does not trust the certificate says nothing.
+    // A client that does not trust the certificate sends nothing.
     let others = tempfile::tempdir()?;
     let [other, _] = certificate(others.path(), &[outward.to_string()])?;
     ensure!(encrypted(&trusting(&other)?, from).await.is_err());
     let is_counted = async || page.refused("no encrypted connection") == 1;
-    until("a handshake that was given up is counted", PATIENCE, is_counted).await?;
+    until("an aborted handshake is counted", TIMEOUT, is_counted).await?;
     let connector = trusting(&pem)?;
     let mut stream = encrypted(&connector, from).await?;
     stream.write_all(log_in.as_bytes()).await?;
     let mut answer = Vec::new();
-    timeout(PATIENCE, stream.read_to_end(&mut answer)).await??;
+    timeout(TIMEOUT, stream.read_to_end(&mut answer)).await??;
     let answer = String::from_utf8_lossy(&answer).into_owned();
     let cookie = answer.lines().find_map(|line| line.strip_prefix("set-cookie: "));
     let cookie = cookie.with_context(|| answer.clone())?;
@@ -551,14 +551,14 @@ async fn an_encrypted_page_is_commanded_from_elsewhere_while_its_token_is_there(
     ensure!(matches!(wrong, Err(Error::Http(response)) if response.status() == 403));
     let (mut socket, _) =
         client_async(request("https")?, encrypted(&connector, from).await?).await?;
-    let hello = told(&mut socket, |it| it["kind"] == "hello").await?;
+    let hello = receive(&mut socket, |it| it["kind"] == "hello").await?;
     ensure!(hello["no_commands"].is_null(), "{hello}");
     let held = nonce(&mut socket, "hold").await?;
     sleep(HELD).await;
     let reply = command(&mut socket, "hold", &held).await?;
     ensure!(reply["accepted"] == true && reply["who"] == "controller", "{reply}");
 
-    // A file that cannot be read for a moment ends nobody's control, and lets nobody in.
+    // A file that cannot be read for a moment ends no session, and admits no client.
     let away = folder.path().join("away");
     std::fs::rename(&file, &away)?;
     std::fs::create_dir(&file)?;
@@ -570,15 +570,15 @@ async fn an_encrypted_page_is_commanded_from_elsewhere_while_its_token_is_there(
     let mut stream = encrypted(&connector, from).await?;
     stream.write_all(log_in.as_bytes()).await?;
     let mut answer = Vec::new();
-    timeout(PATIENCE, stream.read_to_end(&mut answer)).await??;
+    timeout(TIMEOUT, stream.read_to_end(&mut answer)).await??;
     ensure!(answer.starts_with(b"HTTP/1.1 401"), "{}", String::from_utf8_lossy(&answer));
     std::fs::remove_dir(&file)?;
     std::fs::rename(&away, &file)?;
 
-    // Without its token the page is closed, also where the editor left the file open to others.
+    // The page is closed once its token is removed, also where the editor left the file readable by others.
     Tokens::default().write(&file)?;
     std::fs::set_permissions(&file, Permissions::from_mode(0o644))?;
-    let closed = timeout(PATIENCE, async { while let Some(Ok(_)) = socket.next().await {} });
+    let closed = timeout(TIMEOUT, async { while let Some(Ok(_)) = socket.next().await {} });
     closed.await.context("the page is still open without its token")?;
     let again = client_async(request("https")?, encrypted(&connector, from).await?).await;
     ensure!(matches!(again, Err(Error::Http(response)) if response.status() == 401));
@@ -587,7 +587,7 @@ async fn an_encrypted_page_is_commanded_from_elsewhere_while_its_token_is_there(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn from_elsewhere_a_token_is_needed_and_nothing_is_commanded() -> anyhow::Result<()> {
+async fn other_machines_need_a_token_and_cannot_command_without_encryption() -> anyhow::Result<()> {
     let Some(outward) = outward() else {
         testing::skip("network", "this machine has no address but loopback");
         return Ok(());
@@ -604,7 +604,7 @@ async fn from_elsewhere_a_token_is_needed_and_nothing_is_commanded() -> anyhow::
     let page = Page::start_at("0.0.0.0", &["commands=here", &named]).await?;
     let from = SocketAddr::new(outward, page.address.port());
 
-    // What the page is made of tells nothing.
+    // The files of the page contain no data.
     ensure!(ask(from, &get("/", &from.to_string(), "")).await?.starts_with("HTTP/1.1 200"));
     for path in ["/ws", "/video"] {
         ensure!(refusal(from, page.request(from, path)?).await? == 401, "{path}");
@@ -628,7 +628,7 @@ async fn from_elsewhere_a_token_is_needed_and_nothing_is_commanded() -> anyhow::
     let mut foreign = page.request(from, "/ws")?;
     foreign.headers_mut().insert("cookie", HeaderValue::from_static("alight-80=1; other=2"));
     ensure!(refusal(from, foreign).await? == 401);
-    // Nor is one of our name that no session has.
+    // A cookie with the page's name but no session is refused as well.
     let mut made_up = page.request(from, "/ws")?;
     let cookie_of_none = format!("alight-{}={}", from.port(), secret()?);
     made_up.headers_mut().insert("cookie", HeaderValue::from_str(&cookie_of_none)?);
@@ -643,7 +643,7 @@ async fn from_elsewhere_a_token_is_needed_and_nothing_is_commanded() -> anyhow::
     let mut request = page.request(from, "/ws")?;
     request.headers_mut().insert("cookie", HeaderValue::from_str(cookie)?);
     let mut socket = connected(from, request).await?;
-    let hello = told(&mut socket, |it| it["kind"] == "hello").await?;
+    let hello = receive(&mut socket, |it| it["kind"] == "hello").await?;
     ensure!(
         hello["no_commands"].as_str().is_some_and(|why| why.contains("not encrypted")),
         "{hello}"
@@ -654,7 +654,7 @@ async fn from_elsewhere_a_token_is_needed_and_nothing_is_commanded() -> anyhow::
     ensure!(refused["accepted"] == false && refused["who"] == "dashboard", "{refused}");
     ensure!(page.refused("command without the right") == 1);
 
-    // A session that was ended is none any more.
+    // An ended session is not valid any more.
     let log_out = format!(
         "POST /logout HTTP/1.1\r\nHost: {from}\r\nOrigin: http://{from}\r\nCookie: {cookie}\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
     );

@@ -1,4 +1,4 @@
-//! Grey images to H.264, by OpenH264.
+//! Encodes grey images as H.264, with OpenH264.
 
 use imaging::GrayImage;
 use openh264::OpenH264API;
@@ -7,12 +7,12 @@ use openh264::encoder::{
 };
 use openh264::formats::YUVSlices;
 
-/// Period of pictures that need none before them, in nanoseconds: a receiver that begins, or has lost a packet, waits for the next.
+/// Period of key pictures, in nanoseconds: a receiver that starts, or has lost a packet, waits for the next one.
 const KEY_PERIOD_NS: i64 = 1_000_000_000;
-/// What grey is in both chroma planes.
+/// Value of both chroma planes of a grey image.
 const NO_COLOUR: u8 = 128;
 
-/// Encodes images one after the other; begins anew when their size changes.
+/// Encodes images one after the other; starts again when their size changes.
 pub(super) struct Encoder {
     kbit_s: u32,
     rate_hz: f64,
@@ -24,7 +24,7 @@ pub(super) struct Encoder {
 struct Running {
     encoder: openh264::encoder::Encoder,
     size: [usize; 2],
-    /// When the last picture was made that needs none before it.
+    /// When the last key picture was made.
     key_ns: Option<i64>,
 }
 
@@ -37,7 +37,7 @@ impl Encoder {
     /// or column is left out.
     ///
     /// # Errors
-    /// The encoder's, also for a size that it does not take.
+    /// The encoder's error, also for a size that it does not support.
     pub(super) fn encode(
         &mut self,
         image: &GrayImage,
@@ -60,7 +60,7 @@ impl Encoder {
         let planes = (luma, self.chroma.as_slice(), self.chroma.as_slice());
         let strides = (image.width(), size[0] / 2, size[0] / 2);
         let source = YUVSlices::new(planes, (size[0], size[1]), strides);
-        let encoded = running.encoder.encode(&source).map_err(|problem| problem.to_string())?;
+        let encoded = running.encoder.encode(&source).map_err(|error| error.to_string())?;
         let mut units = Vec::new();
         for layer in (0..encoded.num_layers()).filter_map(|at| encoded.layer(at)) {
             let encoded = (0..layer.nal_count()).filter_map(|at| layer.nal_unit(at));
@@ -76,12 +76,12 @@ impl Encoder {
             .rate_control_mode(RateControlMode::Bitrate)
             .usage_type(UsageType::CameraVideoRealTime)
             .complexity(Complexity::Low)
-            // Without this it keeps no rate.
+            // Without this setting it does not keep the rate.
             .skip_frames(true)
             .vui(VuiConfig::bt709_full());
         let api = OpenH264API::from_source();
         let encoder = openh264::encoder::Encoder::with_api_config(api, config)
-            .map_err(|problem| problem.to_string())?;
+            .map_err(|error| error.to_string())?;
         Ok(Running { encoder, size, key_ns: None })
     }
 }

@@ -1,12 +1,12 @@
-//! RTP packets of H.264 (RFC 3550, RFC 6184, packetisation mode 1).
+//! Makes RTP packets of H.264 (RFC 3550, RFC 6184, packetisation mode 1).
 
 use anyhow::Context;
 
 /// Payload type: the first of those that are not assigned, which receivers expect for H.264.
 const PAYLOAD_TYPE: u8 = 96;
-/// Maximum size of a payload, in bytes, so that no network between here and there parts a packet.
+/// Maximum size of a payload, in bytes, so that no network on the path fragments a packet.
 const MAX_PAYLOAD: usize = 1200;
-/// Type of a unit that has a part of another one (FU-A).
+/// Type of a unit that contains a fragment of another one (FU-A).
 const PART: u8 = 28;
 /// Rate of the time stamps, in Hz.
 const CLOCK_HZ: i128 = 90_000;
@@ -55,7 +55,7 @@ impl Packetizer {
         packets
     }
 
-    /// One packet; the marker says that the picture ends with it.
+    /// One packet; the marker shows that the picture ends with it.
     fn packet(&mut self, time: u32, marker: bool, head: &[u8], payload: &[u8]) -> Vec<u8> {
         let mut packet = Vec::with_capacity(12 + head.len() + payload.len());
         packet.extend_from_slice(&[0x80, (u8::from(marker) << 7) | PAYLOAD_TYPE]);
@@ -73,7 +73,7 @@ impl Packetizer {
 mod tests {
     use super::*;
 
-    /// The units in packets, put together as RFC 6184 says, and the numbers of the packets with a marker.
+    /// The units in packets, reassembled by RFC 6184, and the numbers of the packets with a marker.
     fn units_of(packets: &[Vec<u8>]) -> (Vec<Vec<u8>>, Vec<usize>) {
         let mut units: Vec<Vec<u8>> = Vec::new();
         for packet in packets {
@@ -92,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_is_the_same_behind_the_network() {
+    fn a_picture_is_the_same_after_transmission() {
         let mut packetizer = Packetizer { source: 7, sequence: u16::MAX - 1 };
         for length in [1, 2, 1199, 1200, 1201, 1202, 2397, 2398, 9999] {
             let long: Vec<u8> = (0..length).map(|at| (at % 251) as u8 | 0x65).collect();
