@@ -69,7 +69,7 @@ pub struct Facts<'a> {
     pub recorder: Option<&'a RecorderStatus>,
     /// Whether a process listens beyond its machine without keys; `None` while no process is present.
     pub is_insecure: Option<bool>,
-    /// Services that have fallen silent.
+    /// Services that have become silent.
     pub silent: Vec<String>,
 }
 

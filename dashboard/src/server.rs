@@ -174,7 +174,7 @@ impl App {
             }
             let mut sessions = self.sessions();
             let now_ns = session_ns();
-            sessions.keep(tokens.as_ref().ok(), now_ns);
+            sessions.end_invalid(tokens.as_ref().ok(), now_ns);
             sessions.kind(cookie, now_ns)
         });
         self.guard.access(peer, session)

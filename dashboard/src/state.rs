@@ -246,7 +246,7 @@ impl State {
         put(&mut self.bridges, status.bridge.clone(), status, now_ns);
     }
 
-    /// Looks for services and ground stations that have fallen silent; once a second.
+    /// Detects services and ground stations that have become silent; once a second.
     pub fn every_second(&mut self, now_ns: i64) {
         for ((service, instance), known) in &mut self.services {
             let is_silent = now_ns.saturating_sub(known.received_ns) > SILENT_NS;

@@ -254,7 +254,7 @@ impl Sessions {
 
     /// Ends the sessions of tokens that are no longer in their file, and all sessions while the file cannot be read (`None`) for
     /// long; a short gap ends none.
-    pub fn keep(&mut self, tokens: Option<&Tokens>, now_ns: i64) {
+    pub fn end_invalid(&mut self, tokens: Option<&Tokens>, now_ns: i64) {
         let persists = |since_ns: Option<i64>, for_ns| {
             since_ns.is_some_and(|since_ns| now_ns.saturating_sub(since_ns) >= for_ns)
         };
@@ -366,27 +366,27 @@ mod tests {
         let second = Tokens { tokens: vec![token("two")] };
 
         let mut sessions = begun.clone();
-        sessions.keep(Some(&Tokens::default()), 0);
-        sessions.keep(Some(&both), MISSING_NS);
-        sessions.keep(Some(&second), 2 * MISSING_NS);
+        sessions.end_invalid(Some(&Tokens::default()), 0);
+        sessions.end_invalid(Some(&both), MISSING_NS);
+        sessions.end_invalid(Some(&second), 2 * MISSING_NS);
         assert_eq!(open(&sessions), [true; 2]);
-        sessions.keep(Some(&second), 3 * MISSING_NS);
+        sessions.end_invalid(Some(&second), 3 * MISSING_NS);
         assert_eq!(open(&sessions), [false, true]);
 
         // A removed token stays removed when the file cannot be read afterwards.
         let mut sessions = begun.clone();
-        sessions.keep(Some(&second), 0);
-        sessions.keep(None, MISSING_NS);
+        sessions.end_invalid(Some(&second), 0);
+        sessions.end_invalid(None, MISSING_NS);
         assert_eq!(open(&sessions), [false, true]);
 
         let mut sessions = begun;
-        sessions.keep(None, 0);
-        sessions.keep(None, UNREADABLE_NS - 1);
+        sessions.end_invalid(None, 0);
+        sessions.end_invalid(None, UNREADABLE_NS - 1);
         assert_eq!(open(&sessions), [true; 2]);
-        sessions.keep(Some(&both), UNREADABLE_NS);
-        sessions.keep(None, 2 * UNREADABLE_NS);
+        sessions.end_invalid(Some(&both), UNREADABLE_NS);
+        sessions.end_invalid(None, 2 * UNREADABLE_NS);
         assert_eq!(open(&sessions), [true; 2]);
-        sessions.keep(None, 3 * UNREADABLE_NS);
+        sessions.end_invalid(None, 3 * UNREADABLE_NS);
         assert_eq!(open(&sessions), [false; 2]);
     }
 }
