@@ -337,7 +337,7 @@ function showSlow({ detectors, services, recorders, bridges, checks }) {
     line.dataset.age = String(it.age_ms);
   }
   forget(processes, keys);
-  put('recorders', recorders.length === 0 ? 'Nothing records.' : recorders.map((/** @type {any} */ it) => `Recorder ${it.name}: ${it.problem ?? `${it.file}, ${(it.bytes / 1e6).toFixed(1)} MB, ${it.kept} messages, ${it.lost} lost${it.free_bytes === null ? '' : `, ${(it.free_bytes / 1e9).toFixed(1)} GB free`}`} (${age(it.age_ms)} ago)`).join(' '));
+  put('recorders', recorders.length === 0 ? 'No recorder.' : recorders.map((/** @type {any} */ it) => `Recorder ${it.name}: ${it.problem ?? `${it.file}, ${(it.bytes / 1e6).toFixed(1)} MB, ${it.kept} messages, ${it.lost} lost${it.free_bytes === null ? '' : `, ${(it.free_bytes / 1e9).toFixed(1)} GB free`}`} (${age(it.age_ms)} ago)`).join(' '));
   const ground = element('bridges');
   rows(ground, bridges.map((/** @type {any} */ it, /** @type {number} */ n) => {
     const further = it.unlisted > 0 ? `, and ${it.unlisted} packet${it.unlisted === 1 ? '' : 's'} of further stations` : '';

@@ -116,7 +116,7 @@ pub fn checks(facts: &Facts<'_>) -> Vec<Check> {
 }
 
 fn controller(facts: &Facts<'_>) -> Finding {
-    let todo = "Start `alight controller`, or look into its log.";
+    let todo = "Start `alight controller`, or read its log.";
     match facts.status_age_ms {
         None => finding(Verdict::Bad, "none is present", todo),
         Some(age_ms) if age_ms >= MAX_AGE_MS => {
@@ -254,7 +254,7 @@ fn battery(facts: &Facts<'_>) -> Finding {
 fn recording(facts: &Facts<'_>) -> Finding {
     let todo = "`alight record`, or `run = \"recorder\"` in the site (docs/recording.md).";
     match facts.recorder {
-        None => finding(Verdict::Open, "nothing records this flight", todo),
+        None => finding(Verdict::Open, "no recorder is present", todo),
         Some(RecorderStatus { problem: Some(problem), .. }) => finding(
             Verdict::Bad,
             problem.as_str(),
