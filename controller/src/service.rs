@@ -140,7 +140,7 @@ async fn run_service(node: Node, mut config: Config, shutdown: Shutdown) -> anyh
                 }
                 flight.tick(now_ns());
                 unreadable.step(now_ns(), node.health());
-                let more = link.strangers().saturating_sub(strangers);
+                let more = link.unknown_senders().saturating_sub(strangers);
                 if more > 0 {
                     strangers += more;
                     node.health().failed_times("packets of an unknown sender at the autopilot's port", more);
@@ -189,7 +189,7 @@ async fn run_service(node: Node, mut config: Config, shutdown: Shutdown) -> anyh
         landing_file.keep(flight.flight().landed_system());
         send(&node, &link, &mut flight);
         tapes.pass_on(&mut flight);
-        let instead = || link.heard().instead(wanted);
+        let instead = || link.received().why_no_heartbeat(wanted);
         reports.publish(flight.flight(), &unreadable, instead).await;
     }
     let deadline = tokio::time::Instant::now() + SHUTDOWN_TIMEOUT;

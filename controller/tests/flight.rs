@@ -1108,7 +1108,7 @@ fn no_landing_begins_automatically_before_packets_of_another_vehicle_would_arriv
             sent(&mut flight);
             assert_eq!(hover(&mut flight, 20, 900, 4).setpoints, 0);
             let status = flight.status(900 * MS);
-            let listens = "listening for 2.5 s whether another vehicle is on the link";
+            let listens = "waiting 2.5 s for heartbeats of another vehicle on the link";
             assert!(status.phase == Phase::Idle && status.why.contains(listens), "{status:?}");
             assert!(status.why.contains("`autopilot.system_id`"), "{status:?}");
             if !is_alone {

@@ -133,7 +133,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
             status = recorders.next() => bridge.recorder(now_ns(), &status.context(CLOSED)?),
             _ = second.tick() => {
                 bridge.count_losses(ground.counters(), ground.dropped());
-                bridge.count_strangers(ground.strangers());
+                bridge.count_strangers(ground.unknown_senders());
                 bridge.count_refusals(now_ns(), ground.refusals());
                 bridge.every_second(now_ns());
             }
@@ -144,7 +144,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
 /// The counts of the link to the ground.
 fn counts(ground: &Link) -> LinkCounts {
     LinkCounts {
-        strangers: ground.strangers(),
+        strangers: ground.unknown_senders(),
         bad_checksums: ground.counters().bad_checksums,
         unread: ground.dropped(),
         refusals: ground.refusals(),

@@ -45,10 +45,10 @@ pub struct Endpoint {
 
 /// Why an address is invalid.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("`{text}` is not an address of a MAVLink link: {problem}; {EXPECTED}")]
+#[error("`{text}` is not an address of a MAVLink link: {reason}; {EXPECTED}")]
 pub struct AddressError {
     text: String,
-    problem: String,
+    reason: String,
 }
 
 const EXPECTED: &str = "write udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or \
@@ -58,7 +58,7 @@ impl FromStr for Address {
     type Err = AddressError;
 
     fn from_str(text: &str) -> Result<Self, AddressError> {
-        parse(text).map_err(|problem| AddressError { text: text.into(), problem })
+        parse(text).map_err(|reason| AddressError { text: text.into(), reason })
     }
 }
 
@@ -158,8 +158,8 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_address_says_what_is_wrong_and_shows_a_right_one() {
-        for (text, problem) in [
+    fn an_invalid_address_is_reported_with_the_reason_and_a_valid_example() {
+        for (text, reason) in [
             ("", "no `:`"),
             ("/dev/ttyACM0", "serial:/dev/ttyACM0"),
             ("udp:0.0.0.0:14550", "ambiguous scheme"),
@@ -173,7 +173,7 @@ mod tests {
             ("serial:/dev/ttyS0:99", "from 1200"),
         ] {
             let error = text.parse::<Address>().unwrap_err().to_string();
-            assert!(error.contains(problem), "{text}: {error}");
+            assert!(error.contains(reason), "{text}: {error}");
             assert!(error.contains("for example"), "{error}");
         }
     }

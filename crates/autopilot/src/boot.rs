@@ -1,4 +1,4 @@
-//! The autopilot's time since its start: tells a restart from packets that are late, replayed or wrong.
+//! The autopilot's time since its start: distinguishes a restart from packets that are late, replayed or wrong.
 //!
 //! After a restart every packet has an earlier time than before, and none comes from the old clock any more. A
 //! single packet, or one of a few seconds ago between those of now, is not a restart: it is left out.
@@ -30,8 +30,8 @@ pub(crate) struct BootClock {
     newest: Option<Reading>,
     /// Packets that contradict the newest and agree with each other.
     other: Option<Contradiction>,
-    /// Share of the packets that come later than the quickest ones.
-    late_share: f64,
+    /// Fraction of the packets that come later than the quickest ones.
+    late_fraction: f64,
     is_unsteady: bool,
 }
 
@@ -49,16 +49,16 @@ struct Contradiction {
     packets: u32,
 }
 
-/// Share of late packets at which the link counts as unsteady, the one at which it is steady again, and the
+/// Fraction of late packets at which the link counts as unsteady, the one at which it is steady again, and the
 /// smoothing per packet. Of a link that repeats every packet later half of them are late, and it is as quick as
 /// before.
-const MAX_LATE_SHARE: f64 = 0.6;
-const MAX_STEADY_SHARE: f64 = 0.3;
+const MAX_LATE_FRACTION: f64 = 0.6;
+const MAX_STEADY_FRACTION: f64 = 0.3;
 const LATE_SMOOTHING: f64 = 0.06;
 /// How late such a packet is, in milliseconds.
 const MIN_LATE_MS: i64 = 300;
 
-/// What a packet's time since the start says.
+/// The conclusion from a packet's time since the start.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum BootTime {
     /// The packet is one of now, or a little late.
@@ -80,11 +80,11 @@ impl BootClock {
         let ahead_ms = reading.ahead_ms(newest);
         let passed_ms = reading.passed_ms(newest);
         let is_late = passed_ms - ahead_ms > MIN_LATE_MS;
-        let late_share =
-            self.late_share + LATE_SMOOTHING * (f64::from(u8::from(is_late)) - self.late_share);
-        self.late_share = late_share;
-        let limit = if self.is_unsteady { MAX_STEADY_SHARE } else { MAX_LATE_SHARE };
-        self.is_unsteady = late_share > limit;
+        let late_fraction = self.late_fraction
+            + LATE_SMOOTHING * (f64::from(u8::from(is_late)) - self.late_fraction);
+        self.late_fraction = late_fraction;
+        let limit = if self.is_unsteady { MAX_STEADY_FRACTION } else { MAX_LATE_FRACTION };
+        self.is_unsteady = late_fraction > limit;
         if (0..=passed_ms + MAX_AHEAD_MS).contains(&ahead_ms) {
             (self.newest, self.other) = (Some(reading), None);
             return BootTime::Present;
@@ -111,7 +111,7 @@ impl BootClock {
 }
 
 impl BootClock {
-    /// True while most packets come much later than the quickest ones: so may what is sent.
+    /// True while most packets come much later than the quickest ones: so may sent packets.
     pub(crate) fn is_unsteady(&self) -> bool {
         self.is_unsteady
     }
@@ -148,15 +148,15 @@ mod tests {
     const MS: i64 = 1_000_000;
     const BOOTED_MS: i64 = 100_000;
 
-    /// Packets at 50 Hz from 0 to 10 s, each with the age that a function gives; what each one says.
+    /// The results for packets at 50 Hz from 0 to 10 s, each with the age that a function gives.
     fn seen(age_ms: impl Fn(i64) -> i64) -> Vec<BootTime> {
         let mut clock = BootClock::default();
         let packets = (0..500).map(|i| i * 20);
         packets.map(|ms| clock.take(ms * MS, (BOOTED_MS + ms - age_ms(ms)) as u32)).collect()
     }
 
-    fn count(seen: &[BootTime], wanted: BootTime) -> usize {
-        seen.iter().filter(|it| **it == wanted).count()
+    fn count(seen: &[BootTime], expected: BootTime) -> usize {
+        seen.iter().filter(|it| **it == expected).count()
     }
 
     #[test]

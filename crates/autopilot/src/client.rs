@@ -2,7 +2,7 @@
 //! commands, setpoints, parameters and stream requests out.
 //!
 //! Feed it every packet ([`Autopilot::handle`]) and the time ([`Autopilot::tick`], 20 times a second or
-//! more); send what [`Autopilot::poll_outgoing`] returns and act on what [`Autopilot::poll_event`] returns.
+//! more); send the packets of [`Autopilot::poll_outgoing`] and act on the events of [`Autopilot::poll_event`].
 //! Only the heartbeat, and PX4's CURRENT_MODE, show the mode: an acknowledgement is a promise, and the pilot may have changed
 //! the mode since.
 
@@ -40,19 +40,19 @@ use crate::text::Joiner;
 
 /// Maximum number of events and packets that wait; the oldest are dropped.
 const MAX_QUEUED: usize = 1024;
-/// Maximum number of finished commands whose outcome is kept.
+/// Maximum number of finished commands whose outcome is stored.
 const MAX_OUTCOMES: usize = 32;
 /// Period of our heartbeat, in nanoseconds.
 const HEARTBEAT_NS: i64 = 1_000_000_000;
-/// What an unsteady link counts as.
+/// The delay for which an unsteady link counts.
 const UNSTEADY: Duration = Duration::from_secs(1);
-/// Time in which another vehicle on the link is heard, in nanoseconds: two heartbeats, which come once a second, and a little.
+/// Time within which a heartbeat of another vehicle on the link is received, in nanoseconds: two heartbeats, which come once a second, and a margin.
 const LISTENS_NS: i64 = 2_500_000_000;
-/// Time within which the clock's answers tell how slow the link is, in nanoseconds: it is asked for ten times a second.
+/// Time within which the clock's answers show how slow the link is, in nanoseconds: it is requested ten times a second.
 const LINK_DELAY_DUE_NS: i64 = 3_000_000_000;
 /// Time for which a delay counts that is not measured any more, in nanoseconds.
 const MAX_LINK_DELAY_AGE_NS: i64 = 10_000_000_000;
-/// Maximum age of a position whose vertical speed says whether the vehicle stands, in nanoseconds.
+/// Maximum age of a position whose vertical speed shows whether the vehicle stands, in nanoseconds.
 const MAX_SPEED_AGE_NS: i64 = 500_000_000;
 
 /// The conversation with one autopilot.
@@ -74,9 +74,9 @@ pub struct Autopilot {
     /// The number of the next packet.
     sequence: Option<u8>,
     heartbeat_due_ns: i64,
-    /// The system id of the first other vehicle that was heard.
+    /// The system id of the first other vehicle whose heartbeat was received.
     other_system: Option<u8>,
-    /// When the clock told the link's delay last.
+    /// When the clock gave the link's delay last.
     link_delay_ns: Option<i64>,
     same_address: SameAddress,
     /// The time of the last packet or tick.
@@ -104,10 +104,10 @@ struct Vehicle {
     /// The mode before the last change that CURRENT_MODE showed, and when it did.
     mode_before: Option<(FlightMode, i64)>,
     /// When its last packet was received.
-    heard_ns: i64,
+    received_ns: i64,
     boot: BootClock,
     contact: Contact,
-    /// What SYS_STATUS and BATTERY_STATUS say of the battery.
+    /// The battery by SYS_STATUS and BATTERY_STATUS.
     batteries: [Battery; 2],
     /// Altitude above mean sea level, in m.
     amsl_m: Option<f64>,
@@ -163,7 +163,7 @@ impl Autopilot {
             return;
         }
         if let Some(vehicle) = &mut self.vehicle {
-            vehicle.heard_ns = now_ns;
+            vehicle.received_ns = now_ns;
         }
         self.streams.received(now_ns, packet.message_id);
         match message {
@@ -253,13 +253,13 @@ impl Autopilot {
         self.vehicle.as_ref().is_some_and(|vehicle| vehicle.state.connected)
     }
 
-    /// Whether the vehicle has said that it is a simulation; it is asked by
+    /// Whether the vehicle has reported that it is a simulation; it is asked by
     /// [`Autopilot::ask_whether_simulated`].
     pub fn is_simulated(&self) -> bool {
-        self.vehicle.as_ref().is_some_and(|vehicle| vehicle.simulation.is_said())
+        self.vehicle.as_ref().is_some_and(|vehicle| vehicle.simulation.is_reported())
     }
 
-    /// Asks the vehicle whether it is a simulation, once a second until it has said so.
+    /// Asks the vehicle whether it is a simulation, once a second until it has reported that it is.
     pub fn ask_whether_simulated(&mut self, now_ns: i64) {
         let Some(vehicle) = self.vehicle.as_mut().filter(|vehicle| vehicle.state.connected) else {
             return;
@@ -295,8 +295,8 @@ impl Autopilot {
         self.parameters.is_unanswered(name)
     }
 
-    /// Sends a velocity of zero to a vehicle of which only the system id is known, before its heartbeat says
-    /// more: outside of GUIDED or OFFBOARD an autopilot ignores it.
+    /// Sends a velocity of zero to a vehicle of which only the system id is known, before its heartbeat
+    /// arrives: outside of GUIDED or OFFBOARD an autopilot ignores it.
     pub fn send_stop(&mut self, now_ns: i64, system: u8) {
         let target = Sender { system, component: AUTOPILOT };
         self.send(&compose::velocity((now_ns / 1_000_000) as u32, Vector::zero(), 0.0, target));
@@ -309,7 +309,7 @@ impl Autopilot {
     }
 
     /// How slow the link is now, both ways together; `None` while it is not known. A link that delays most packets
-    /// by a time of their own is as slow as what comes late over it.
+    /// by a varying time is as slow as its late packets.
     pub fn link_delay(&self, now_ns: i64) -> Option<Duration> {
         if self.vehicle.as_ref().is_some_and(|vehicle| vehicle.boot.is_unsteady()) {
             return Some(UNSTEADY);
@@ -317,8 +317,8 @@ impl Autopilot {
         self.clock.link_delay_ns(now_ns).map(|ns| Duration::from_nanos(ns.max(0).unsigned_abs()))
     }
 
-    /// Whether a connected vehicle has had 3 s to tell how slow the link is, and has not, or has not any more for 10 s: its clock is not
-    /// asked for ([`Config::timesync`]), or the link does not pass the questions or the answers.
+    /// Whether the link's delay is unknown after 3 s of connection, or has not been measured for 10 s. Then the clock is not
+    /// requested ([`Config::timesync`]), or the link does not pass the requests or the answers.
     pub fn lacks_link_delay(&self, now_ns: i64) -> bool {
         let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.state.connected);
         let Some(vehicle) = vehicle else { return false };
@@ -328,7 +328,7 @@ impl Autopilot {
     }
 
     /// Why neither a take-off nor a landing may begin now: another companion with our ids, or, where [`Config::system_id`] pins none, a
-    /// second vehicle that was ever heard. Our own packets are none, where they come back over the link within 2 s.
+    /// second vehicle from which a heartbeat was ever received. Our packets that a router returns within 2 s do not count as another's.
     pub fn conflict(&self, now_ns: i64) -> Option<Conflict> {
         let several = || {
             let (system, other) = self.system().zip(self.other_system)?;
@@ -337,7 +337,7 @@ impl Autopilot {
         self.same_address.conflict(now_ns, self.our_address()).or_else(several)
     }
 
-    /// Whether another vehicle on the link would have been heard by now, or it would not matter as ours is pinned.
+    /// Whether a heartbeat of another vehicle on the link would have been received by now, or is irrelevant as ours is pinned.
     pub fn has_listened(&self, now_ns: i64) -> bool {
         let found_ns = self.vehicle.as_ref().map(|vehicle| vehicle.found_ns);
         self.config.system_id.is_some()
@@ -469,7 +469,7 @@ impl Autopilot {
         if !velocity.coords.iter().copied().all(fits) || !fits(yaw_rate) {
             return Err(SetpointError::NotFinite(velocity.coords.into(), yaw_rate));
         }
-        let silence_ns = now_ns.saturating_sub(vehicle.heard_ns);
+        let silence_ns = now_ns.saturating_sub(vehicle.received_ns);
         if silence_ns > ns(self.config.heartbeat_timeout) {
             return Err(SetpointError::NoAutopilot);
         }
@@ -556,7 +556,7 @@ impl Autopilot {
         }
         // Also while only the heartbeat is missing, like every setpoint.
         let limit_ns = now_ns.saturating_sub(ns(self.config.heartbeat_timeout));
-        let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.heard_ns >= limit_ns);
+        let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.received_ns >= limit_ns);
         let Some(system) = vehicle.map(|vehicle| vehicle.system) else { return };
         self.setpoints.sent(now_ns);
         let time_ms = (now_ns / 1_000_000) as u32;
@@ -593,7 +593,7 @@ impl Autopilot {
         let silence_ns = now_ns.saturating_sub(vehicle.heartbeat_ns);
         if vehicle.state.connected && silence_ns > ns(self.config.heartbeat_timeout) {
             vehicle.state.connected = false;
-            // It may have restarted when it returns, or be another one, so what it said does not hold.
+            // It may have restarted when it returns, or be another one, so its earlier reports do not hold.
             vehicle.readiness = Readiness::default();
             vehicle.listener = Listener::default();
             vehicle.simulation = Simulation::default();
@@ -803,15 +803,15 @@ impl Autopilot {
         }
         let is_blind = vehicle.firmware == Firmware::Px4 && vehicle.amsl_m.is_none();
         if matches!(command, Command::Takeoff { .. }) && is_blind {
-            let problem =
+            let reason =
                 "PX4 has not reported its altitude above mean sea level (GLOBAL_POSITION_INT)";
-            return Some(CommandError::Invalid { command, problem });
+            return Some(CommandError::Invalid { command, reason });
         }
-        let problem = command.problem(Some(&vehicle.state))?;
-        Some(CommandError::Invalid { command, problem })
+        let reason = command.why_invalid(Some(&vehicle.state))?;
+        Some(CommandError::Invalid { command, reason })
     }
 
-    /// Advances what is requested. Only a tick may send, as the packet that is read may have waited for this process, and one that shows a
+    /// Advances the requests. Only a tick may send: the packet that is read may have waited for this process, and one that shows a
     /// pilot's mode may still wait behind it.
     fn step_requests(&mut self, now_ns: i64, may_send: bool) {
         let Some(state) = self.state().copied() else { return };

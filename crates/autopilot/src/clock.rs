@@ -15,31 +15,31 @@ const FIRST_NS: i64 = 100 * MS;
 const LATER_NS: i64 = 1_000 * MS;
 /// Number of round trips at the first period.
 const FIRST: usize = 12;
-/// Maximum number of round trips kept.
+/// Maximum number of stored round trips.
 const MAX_TRIPS: usize = 64;
-/// Time for which a round trip is kept, in nanoseconds.
+/// Time for which a round trip is stored, in nanoseconds.
 const WINDOW_NS: i64 = 30_000 * MS;
 /// Maximum number of requests without a reply: 12.8 s of them at the first period.
 const MAX_REQUESTS: usize = 128;
-/// Maximum length of a round trip that is used, in nanoseconds. Also a long one tells more than the time of the
-/// reception, which is wrong by the whole way here.
+/// Maximum length of a round trip that is used, in nanoseconds. Even a long one gives a better stamp than the time of
+/// reception, which is wrong by the complete delay.
 const MAX_TRIP_NS: i64 = 1_500 * MS;
-/// Maximum number and age of the round trips that say how slow the link is now.
+/// Maximum number and age of the round trips that show how slow the link is now.
 const MAX_LENGTHS: usize = 16;
 const MAX_LENGTH_AGE_NS: i64 = 6_000 * MS;
-/// Number of measurements whose age on arrival says the same sooner: the youngest of them, as one may have waited
-/// elsewhere. And the time after which they say nothing any more.
+/// Number of measurements whose age on arrival shows the same sooner: the youngest of them, as one may have waited
+/// elsewhere. And the time after which they do not count any more.
 const AGES: usize = 6;
 const MAX_ARRIVED_NS: i64 = 1_000 * MS;
 /// Time over which the pauses between positions are counted, and their maximum number.
 const PAUSES_NS: i64 = 2_000 * MS;
 const MAX_ARRIVALS: usize = 128;
-/// Mean age of the newest position at 20 Hz without losses, in nanoseconds, beside the link's delay.
+/// Mean age of the newest position at 20 Hz without losses, in nanoseconds, in addition to the link's delay.
 const USUAL_WAIT_NS: i64 = 25 * MS;
-/// What losses delay both ways together, per nanosecond of the positions' mean age beyond that: setpoints go out half as
+/// The delay by losses both ways together, per nanosecond of the positions' mean age beyond that: setpoints go out half as
 /// often as positions come, so theirs is twice as long, and a control loop must bear the long waits, not the mean one.
 const WAITS_PER_AGE: i64 = 5;
-/// Time for which what came behind newer measurements says how the link is, in nanoseconds.
+/// Time for which a measurement that came behind newer ones counts for the state of the link, in nanoseconds.
 const MAX_BEHIND_AGE_NS: i64 = 10_000 * MS;
 /// Maximum drift between two clocks: 100 ppm.
 const DRIFT: f64 = 1e-4;
@@ -68,17 +68,17 @@ pub struct Clock {
     ages: VecDeque<Length>,
     /// When the last positions came.
     arrivals: VecDeque<i64>,
-    /// What came farthest behind newer measurements.
+    /// The largest delay behind newer measurements.
     behind: Option<Length>,
     contradictions: u32,
 }
 
-/// When the autopilot measured what it sent.
+/// When the autopilot made a measurement that it sent.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Measured {
     /// At this time, by our clock.
     At(i64),
-    /// Too long ago for a live link: it says nothing of now.
+    /// Too long ago for a live link: it does not show the present state.
     LongAgo,
     /// The offset of the clocks is unknown, or the time lies in the future.
     Unknown,
@@ -201,14 +201,14 @@ impl Clock {
     }
 
     /// How slow the link is now, both ways together, in ns: by its round trips or, where that is more, twice the
-    /// age with which measurements come; and by what it loses, as the next packet comes later. Round trips are a
-    /// second apart; a vehicle that descends is metres lower before they tell. `None` while neither is known.
+    /// age with which measurements come; and by its losses, as the next packet comes later. Round trips are a
+    /// second apart; a vehicle that descends is metres lower before they show a change. `None` while neither is known.
     pub fn link_delay_ns(&self, now_ns: i64) -> Option<i64> {
         let delay_ns = self.slow_trip_ns(now_ns).max(self.two_ways_ns(now_ns))?;
         Some(delay_ns.saturating_add(self.losses_ns(now_ns)))
     }
 
-    /// By how much losses delay what passes the link, both ways together: known by the pauses between positions. They
+    /// By how much losses delay packets, both ways together: measured by the pauses between positions. They
     /// count with their squares, as in the mean age of the newest position.
     fn losses_ns(&self, now_ns: i64) -> i64 {
         let since_ns = now_ns.saturating_sub(PAUSES_NS);
@@ -346,7 +346,7 @@ mod tests {
         }
 
         #[test]
-        fn nothing_that_is_told_can_harm(
+        fn no_input_causes_a_panic_or_an_implausible_stamp(
             replies in prop::collection::vec((any::<i64>(), any::<i64>(), any::<i64>()), 0..40),
             boot_ms: u32,
         ) {
@@ -363,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn packets_that_come_again_tell_how_late_they_are_for_some_seconds() {
+    fn the_delay_of_repeated_packets_is_known_for_some_seconds() {
         let mut clock = Clock::default();
         assert_eq!(clock.behind_ns(0), 0);
         for (at_ms, behind_ms) in [(0, 300), (100, 800), (200, 20), (300, 60_000), (400, -5)] {
@@ -407,7 +407,7 @@ mod tests {
     }
 
     #[test]
-    fn measurements_that_come_late_tell_of_a_slow_link_at_once() {
+    fn late_measurements_show_a_slow_link_at_once() {
         let (mut clock, now_ns) = synchronised(&[(1, 1)], 20, 0);
         let mut arrive = |ages_ms: &[i64]| {
             for (at_ms, age_ms) in (0..).step_by(10).zip(ages_ms) {
@@ -487,7 +487,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_not_known_or_was_long_ago_tells_nothing() {
+    fn an_unknown_or_outdated_clock_gives_no_stamp() {
         assert_eq!(Clock::default().measured(1_000 * MS, 1_000), Measured::Unknown);
         let (clock, now_ns) = synchronised(&[(1, 1)], 20, 0);
         assert_eq!(clock.measured(now_ns + WINDOW_NS + MS, 0), Measured::Unknown);

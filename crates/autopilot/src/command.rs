@@ -1,5 +1,5 @@
-//! Commands to the autopilot (mode, arm, disarm, take-off): sent, repeated, matched with acknowledgements and the state shown, and why one
-//! failed with what to do about it.
+//! Commands to the autopilot (mode, arm, disarm, take-off): sends and repeats them, matches them with acknowledgements and the state
+//! shown, and explains the failure of one with the remedy.
 
 use std::fmt;
 use std::time::Duration;
@@ -19,7 +19,7 @@ pub enum Command {
     Disarm,
     /// Climb to this height in m above the ground, in GUIDED and armed; done when it is accepted.
     Takeoff {
-        /// The height in m above the place where it was armed.
+        /// The height in m above the position where it was armed.
         height_m: f64,
     },
 }
@@ -41,7 +41,7 @@ pub enum CommandStatus {
     Unknown,
 }
 
-/// Why a command was not carried out, and what to do about it.
+/// Why a command was not carried out, and the remedy.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum CommandError {
     /// No autopilot.
@@ -63,12 +63,12 @@ pub enum CommandError {
         firmware: Firmware,
     },
     /// The command is invalid.
-    #[error("{command}: {problem}")]
+    #[error("{command}: {reason}")]
     Invalid {
         /// The command.
         command: Command,
-        /// The problem.
-        problem: &'static str,
+        /// The reason.
+        reason: &'static str,
     },
     /// Heartbeats are received, but no acknowledgement.
     #[error(
@@ -99,7 +99,7 @@ pub enum CommandError {
     NotConfirmed {
         /// The command.
         command: Command,
-        /// What the heartbeat shows instead.
+        /// The state that the heartbeat shows instead.
         seen: String,
         /// Time waited for the change.
         waited: Duration,
@@ -264,7 +264,7 @@ impl Command {
         *self == Self::SetMode(FlightMode::OFFBOARD)
     }
 
-    pub(crate) fn problem(&self, state: Option<&VehicleState>) -> Option<&'static str> {
+    pub(crate) fn why_invalid(&self, state: Option<&VehicleState>) -> Option<&'static str> {
         match self {
             Self::Takeoff { height_m } if !(0.5..=500.0).contains(height_m) => {
                 Some("the height must be from 0.5 to 500 m")
@@ -340,7 +340,7 @@ pub(crate) const MODE_OF_NOW_NS: i64 = 200_000_000;
 /// Minimum age of it, in nanoseconds: when PX4 has accepted another mode, it sends the former one once more, and up to 48 ms later the new
 /// one (measured with PX4 1.17 in its own simulation).
 pub(crate) const MODE_SETTLES_NS: i64 = 80_000_000;
-/// Maximum number of texts kept as an explanation.
+/// Maximum number of texts stored as an explanation.
 const MAX_TEXTS: usize = 8;
 
 impl Request {
@@ -406,7 +406,7 @@ impl Request {
     pub(crate) fn acknowledge(&mut self, now_ns: i64, result: MavResult, timeouts: &Timeouts) {
         let after = |wait: Duration| now_ns.saturating_add(ns(wait));
         self.phase = match (self.phase, result) {
-            // An acknowledgement of an earlier attempt changes nothing.
+            // An acknowledgement of an earlier attempt has no effect.
             (Phase::Accepted(_) | Phase::Refused(..) | Phase::Due(_), _) => return,
             (_, MavResult::MAV_RESULT_ACCEPTED) => Phase::Accepted(after(timeouts.confirmation)),
             (_, MavResult::MAV_RESULT_IN_PROGRESS) => Phase::Sent(after(timeouts.confirmation)),
@@ -419,8 +419,8 @@ impl Request {
         };
     }
 
-    /// The next step, where `is_of_now` says that the state's mode has just been shown. Nothing is sent, and nothing is given up, unless it
-    /// `may_send`.
+    /// The next step, where `is_of_now` states that the state's mode has just been shown. Unless it `may_send`, no packet is sent and no
+    /// request is given up.
     pub(crate) fn step(
         &mut self,
         now_ns: i64,
@@ -435,7 +435,7 @@ impl Request {
             return Step::Finish(Ok(()));
         }
         let waits = self.needs_mode_of_now() && !is_of_now;
-        if self.needs_mode_of_now() && !self.is_wanted_in(state.mode) {
+        if self.needs_mode_of_now() && !self.is_requested_in(state.mode) {
             return Step::Finish(Err(CommandError::Withdrawn { command }));
         }
         match self.phase {
@@ -474,27 +474,27 @@ impl Request {
     }
 
     /// Whether it is sent only just after a message that shows the mode in which it was requested: OFFBOARD, and HOLD out of it, take the
-    /// vehicle from whoever has changed the mode since.
+    /// vehicle from a pilot who has changed the mode since.
     fn needs_mode_of_now(&self) -> bool {
         let is_hold = self.command == Command::SetMode(FlightMode::AUTO_HOLD);
         self.command.is_offboard() || is_hold && self.from == Some(FlightMode::OFFBOARD)
     }
 
     /// Whether the mode is the one in which it was requested. PX4 ends its own take-off in HOLD.
-    fn is_wanted_in(&self, mode: FlightMode) -> bool {
+    fn is_requested_in(&self, mode: FlightMode) -> bool {
         let rises = [FlightMode::AUTO_TAKEOFF, FlightMode::AUTO_HOLD];
         self.from.is_none_or(|from| mode == from || rises.contains(&mode) && rises.contains(&from))
     }
 
     /// Whether a mode that was accepted a while ago is sent again. All modes have the same acknowledgement, which may be a late one of
-    /// another mode that was asked for before, and this one lost. It is sent only just after a message that shows the mode of before, or it
+    /// another mode that was requested before, and this one lost. It is sent only just after a message that shows the mode of before, or it
     /// could undo a pilot's switch.
     fn is_mode_missing(&self, now_ns: i64, state: &VehicleState, timeouts: &Timeouts) -> bool {
         let is_late = now_ns.saturating_sub(self.sent_ns) >= ns(timeouts.acknowledgement);
         matches!(self.command, Command::SetMode(_))
             && is_late
             && self.attempts < timeouts.attempts
-            && self.is_wanted_in(state.mode)
+            && self.is_requested_in(state.mode)
     }
 
     fn send(&mut self, now_ns: i64, timeouts: &Timeouts) -> Step {

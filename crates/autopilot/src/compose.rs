@@ -84,7 +84,7 @@ pub fn velocity(time_ms: u32, velocity: Vector<Ned>, yaw_rate: f64, target: Send
     })
 }
 
-/// The landing target at a place in the body frame (m from the vehicle's origin): needs no rangefinder.
+/// The landing target at a position in the body frame (m from the vehicle's origin): needs no rangefinder.
 ///
 /// `time_usec` is the capture time by one steady clock. `None` when a number is not finite or the target is
 /// not below.
@@ -107,7 +107,7 @@ pub fn landing_target_position(time_usec: u64, target: Point<Body>) -> Option<Ma
     }))
 }
 
-/// The landing target at a place in local NED (m from the autopilot's origin): the only frame that PX4 takes
+/// The landing target at a position in local NED (m from the autopilot's origin): the only frame that PX4 takes
 /// (<https://docs.px4.io/main/en/advanced_features/precland.html>).
 ///
 /// `time_usec` is the capture time by one steady clock. `None` when a number is not finite.
@@ -142,7 +142,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_text_of_any_length_arrives_whole(text in "[a-z\u{e4}\u{1F681} ]{0,200}") {
+        fn a_text_of_any_length_arrives_complete(text in "[a-z\u{e4}\u{1F681} ]{0,200}") {
             let mut joiner = Joiner::default();
             let mut arrived = String::new();
             for message in status_text(MavSeverity::MAV_SEVERITY_INFO, &text, 0) {
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn a_setpoint_has_the_length_that_is_reckoned_with() {
+    fn a_setpoint_has_the_stated_length() {
         let ours = Sender { system: 1, component: 191 };
         let setpoint = velocity(7, Vector::zero(), 0.0, Sender { system: 1, component: 1 });
         let raw = encode(ours, 0, &setpoint);
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn px4_gets_a_position_and_nothing_else() {
+    fn px4_gets_only_a_position() {
         let message = landing_target_local(7, Point::new(1.0, 2.0, -0.5)).unwrap();
         let MavMessage::LANDING_TARGET(target) = message else { unreachable!() };
         assert_eq!((target.frame as u8, target.position_valid.bits(), target.time_usec), (1, 1, 7));
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn a_target_beside_or_above_is_refused() {
+    fn a_target_to_the_side_or_above_is_refused() {
         assert!(landing_target_position(0, Point::new(1.0, 0.0, 0.0)).is_none());
         assert!(landing_target_position(0, Point::new(0.0, 0.0, -1.0)).is_none());
         assert!(landing_target_position(0, Point::new(0.0, f64::NAN, 1.0)).is_none());

@@ -11,11 +11,11 @@ use crate::stream::{Expected, Stream};
 pub struct Config {
     /// The vehicle's system id; `None` takes the first autopilot found, and keeps it.
     pub system_id: Option<u8>,
-    /// Our own system id; `None` takes the vehicle's.
+    /// Our system id; `None` takes the vehicle's.
     pub our_system: Option<u8>,
-    /// Our own component id.
+    /// Our component id.
     pub our_component: u8,
-    /// Whether to send our own heartbeat once a second.
+    /// Whether to send our heartbeat once a second.
     pub heartbeat: bool,
     /// Silence after which the autopilot counts as lost.
     pub heartbeat_timeout: Duration,
@@ -23,8 +23,8 @@ pub struct Config {
     pub streams: Vec<Stream>,
     /// The parameters to read.
     pub parameters: Vec<&'static str>,
-    /// Whether to synchronise with the autopilot's clock, so that measurements are stamped with their own
-    /// time.
+    /// Whether to synchronise with the autopilot's clock: measurements are then stamped with the time of the
+    /// measurement.
     pub timesync: bool,
     /// Timeouts of commands.
     pub timeouts: Timeouts,

@@ -1,10 +1,10 @@
-//! Why no flight may begin that would begin on the first heartbeat alone: who else is on the link makes it uncertain which vehicle
-//! is flown, or by whom.
+//! Reasons against the start of a flight: with another vehicle or another controller on the link it is uncertain which vehicle is
+//! flown, or by which controller.
 
 use crate::packet::Sender;
 
-/// What is told while another vehicle on the link might not have been heard yet.
-pub const LISTENING: &str = "listening for 2.5 s whether another vehicle is on the link; nothing is listened for where `autopilot.system_id` is set";
+/// The reason that is shown while a heartbeat of another vehicle on the link may still be due.
+pub const LISTENING: &str = "waiting 2.5 s for heartbeats of another vehicle on the link; there is no wait where `autopilot.system_id` is set";
 
 /// Why neither a take-off nor a landing may begin.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -36,11 +36,12 @@ pub enum Conflict {
     },
     /// Two autopilots are on the link, and the configuration does not say which one is flown.
     #[error(
-        "two vehicles are on the autopilot's link, with the system ids {system} and {other}, and nothing says which one is to be \
-         flown. Set `autopilot.system_id` to its id, and start the controller again; in the air the autopilot's own modes go on"
+        "two vehicles are on the autopilot's link, with the system ids {system} and {other}, and the configuration does not \
+         state which one is to be flown. Set `autopilot.system_id` to its id, and start the controller again; in the air the autopilot's \
+         own modes continue"
     )]
     SeveralVehicles {
-        /// The system id of the vehicle that was heard first.
+        /// The system id of the vehicle whose heartbeat was received first.
         system: u8,
         /// The other one's.
         other: u8,

@@ -1,4 +1,4 @@
-//! Opens the sockets and serial lines of a link, and says in words why one cannot be opened.
+//! Opens the sockets and serial lines of a link, and explains why one cannot be opened.
 
 use std::io;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -13,7 +13,7 @@ use crate::address::Endpoint;
 /// Timeout of opening a connection.
 const CONNECT_LIMIT: Duration = Duration::from_secs(3);
 
-/// A socket that listens at a place.
+/// A socket that listens at an endpoint.
 pub(crate) async fn listen_udp(at: &Endpoint) -> io::Result<UdpSocket> {
     UdpSocket::bind(local(at).await?).await
 }
@@ -73,14 +73,14 @@ pub(crate) fn open_serial(device: &str, baud: u32) -> tokio_serial::Result<Seria
     tokio_serial::new(device, baud).open_native_async()
 }
 
-/// What a failed connection means, and what to look at.
+/// The cause of a failed connection, and the things to check.
 pub(crate) fn explain_socket(error: &io::Error, other_side: &str) -> String {
     match error.kind() {
         io::ErrorKind::ConnectionRefused => {
             format!("connection refused; is the {other_side} running?")
         }
         io::ErrorKind::TimedOut => {
-            format!("no reply; is the {other_side} there and in reach?")
+            format!("no reply; is the {other_side} running and in range?")
         }
         _ => format!("cannot reach it: {error}"),
     }
@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_host_with_addresses_of_both_kinds_is_spoken_to_by_ipv4() {
+    fn ipv4_is_used_for_a_host_with_addresses_of_both_kinds() {
         let [v6, v4] = ["[::1]:14550", "127.0.0.1:14550"].map(|text| text.parse().unwrap());
         assert_eq!(in_order([v6, v4].into_iter()), [v4, v6]);
         assert_eq!(in_order([v6].into_iter()), [v6]);

@@ -2,8 +2,8 @@
 //!
 //! A report may be wrong, and one wrong report must not end the control of a flying vehicle. So a vehicle that
 //! was flying stands on the ground only after several reports in a row, during which it hardly moves up or
-//! down; "undefined" says nothing, and a vehicle in the air is not taking off. Where the motors are off
-//! nothing is at stake, and every report is believed.
+//! down; "undefined" is ignored, and a vehicle in the air is not taking off. With the motors off a wrong report
+//! does no harm, and every report is believed.
 
 use crate::state::LandedState;
 
@@ -14,7 +14,7 @@ const MIN_REPORTED_NS: i64 = 350_000_000;
 /// Maximum vertical speed of a vehicle that stands on the ground, in m/s: a deck may heave.
 const MAX_STANDING_M_S: f64 = 0.5;
 
-/// What is believed, and the reports that contradict it.
+/// The believed state, and the reports that contradict it.
 #[derive(Copy, Clone, Debug, Default)]
 pub(crate) struct Contact {
     believed: LandedState,
@@ -30,7 +30,7 @@ struct GroundReports {
 }
 
 impl Contact {
-    /// What is believed after a report. `sinks_m_s` is the vertical speed, where it is known.
+    /// The believed state after a report. `sinks_m_s` is the vertical speed, where it is known.
     pub(crate) fn report(
         &mut self,
         now_ns: i64,
@@ -58,7 +58,7 @@ impl Contact {
         self.believed
     }
 
-    /// What is believed once the motors are off: the last report.
+    /// The believed state once the motors are off: the last report.
     pub(crate) fn disarmed(&mut self) -> LandedState {
         if self.reported != LandedState::Unknown {
             self.believe(self.reported);
@@ -90,7 +90,7 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    /// What is believed after reports at 5 Hz of an armed vehicle with this vertical speed.
+    /// The believed state after reports at 5 Hz of an armed vehicle with this vertical speed.
     fn believed(reports: &[LandedState], sinks_m_s: Option<f64>) -> LandedState {
         let mut contact = Contact::default();
         let mut believed = Unknown;
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn what_says_nothing_or_contradicts_the_flight_is_not_believed() {
+    fn undefined_reports_and_reports_that_contradict_the_flight_are_not_believed() {
         assert_eq!(believed(&[InAir, Unknown, Unknown, Unknown, Unknown], None), InAir);
         assert_eq!(believed(&[InAir, TakingOff, TakingOff, TakingOff, TakingOff], None), InAir);
         assert_eq!(believed(&[InAir, OnGround, OnGround], Some(0.0)), InAir);

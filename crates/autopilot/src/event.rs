@@ -49,9 +49,9 @@ pub enum Event {
     Position(Position),
     /// A new distance measured downwards.
     Range(Range),
-    /// The whole state, after each attitude and position.
+    /// The complete state, after each attitude and position.
     State(VehicleState),
-    /// The whole state, after each heartbeat and each report of the contact with the ground, and when the
+    /// The complete state, after each heartbeat and each report of the contact with the ground, and when the
     /// heartbeat is lost: mode, motors and contact are known also where attitude or position stopped.
     Status(VehicleState),
     /// The flight mode changed.
@@ -74,14 +74,14 @@ pub enum Event {
     ReadyChanged {
         /// Whether it is ready.
         ready: bool,
-        /// What is missing, as texts.
+        /// The missing conditions, as texts.
         reasons: Vec<String>,
     },
     /// A text of the autopilot.
     Text {
         /// Its severity.
         severity: MavSeverity,
-        /// The whole text.
+        /// The complete text.
         text: String,
     },
     /// A command is finished.

@@ -1,4 +1,4 @@
-//! What a link lets through: with a key, only packets of the holders of the same key, and none without a signature goes out.
+//! Filters the packets of a link: with a key, only packets of holders of the same key come in, and only signed packets go out.
 
 use crate::packet::Packet;
 use crate::signing::{Refusal, Refusals, Signing};
@@ -10,13 +10,13 @@ pub(crate) struct Gate {
     refusals: Refusals,
 }
 
-/// What came through.
+/// The packets that came through.
 pub(crate) struct Admitted {
     pub(crate) packets: Vec<Packet>,
-    /// Whether the sender may be the one that the link talks to. A radio's own packets need no signature, and so say nothing of
-    /// who sends them.
+    /// Whether the sender may be the peer of the link. A radio's own packets need no signature, and so do not
+    /// authenticate their sender.
     pub(crate) is_peer: bool,
-    /// A holder of the key may have sent something too old: it needs our newer stamps.
+    /// A holder of the key may have sent a packet that is too old: it needs our newer stamps.
     pub(crate) is_behind: bool,
 }
 
@@ -59,7 +59,7 @@ impl Gate {
         admitted
     }
 
-    /// The packet as it is sent; `None` for what is no packet.
+    /// The packet as it is sent; `None` for bytes that are no packet.
     pub(crate) fn seal(&mut self, stamp: u64, raw: Vec<u8>) -> Option<Vec<u8>> {
         match &mut self.signing {
             Some(signing) => signing.sign(stamp, &raw),

@@ -1,4 +1,4 @@
-//! Commands as they stand in a packet: their number, who they are for, and the answer that they are not carried out.
+//! Reads commands in packets of a ground station (number and recipient), and answers that one is not carried out.
 //!
 //! A ground station repeats a command until it is acknowledged, whatever its number is, and takes no acknowledgement but of the
 //! component that the command was for.
@@ -23,7 +23,7 @@ const CHECKSUM: usize = 2;
 pub struct GivenCommand {
     /// Its number.
     pub number: u16,
-    /// Whom it is for.
+    /// Its recipient.
     pub target: Sender,
 }
 
@@ -47,12 +47,12 @@ impl GivenCommand {
         Self::of(packet).filter(|_| packet.message.is_none())
     }
 
-    /// The packet that says to its sender that the command is not supported.
+    /// The packet that informs its sender that the command is not supported.
     pub fn unsupported(&self, sequence: u8, to: Sender) -> Vec<u8> {
         self.refused(MavResult::MAV_RESULT_UNSUPPORTED, sequence, to)
     }
 
-    /// The packet that says to its sender that the command may not be given; for one to all, as the autopilot of this system, if that
+    /// The packet that informs its sender that the command is not allowed; for one to all, as the autopilot of this system, if that
     /// is known.
     pub fn denied(&self, system: Option<u8>, sequence: u8, to: Sender) -> Vec<u8> {
         let Sender { system: to_system, component: to_component } = self.target;

@@ -1,4 +1,4 @@
-//! The files of signed packets: the key, which its owner alone can read, and the newest stamp, which lives on over a restart.
+//! Reads and writes the files of signed packets: the key, which only its owner can read, and the newest stamp, which outlasts a restart.
 
 use std::io::{self, Write};
 use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
@@ -9,19 +9,19 @@ use std::time::SystemTime;
 
 use crate::signing::Key;
 
-/// How far beyond the newest stamp the file's one is: 20 s. After a restart stamps go on from there, so none is used twice.
+/// How far beyond the newest stamp the file's one is: 20 s. After a restart stamps continue from there, so none is used twice.
 const RESERVE: u64 = 2_000_000;
 /// Maximum size of a key file, in bytes.
 const MAX_KEY_FILE: u64 = 4096;
 
-/// With which key a link's packets are signed.
+/// How a link's packets are signed.
 #[derive(Clone, Debug)]
 pub struct SigningConfig {
     /// The key, the same as the other side's.
     pub key: Key,
     /// The id of this link, which no other sender on the same link has.
     pub link_id: u8,
-    /// The file that keeps the newest stamp beyond a restart; `None` keeps none.
+    /// The file that stores the newest stamp over a restart; `None` stores none.
     pub stamp_file: Option<PathBuf>,
     /// The clock.
     pub clock: fn() -> SystemTime,
@@ -40,7 +40,7 @@ pub enum KeyFileError {
     },
     /// Other users can read it.
     #[error(
-        "the signing key {path:?} is open to other users (mode {mode:o}): `chmod 600 {}`; if somebody may have \
+        "the signing key {path:?} is open to other users (mode {mode:o}): `chmod 600 {}`; if another person may have \
          read it, take another key", path.display()
     )]
     Open {
@@ -60,7 +60,7 @@ pub enum KeyFileError {
 }
 
 impl SigningConfig {
-    /// The key in a file that only its owner can read; in `state`, if there is one, the newest stamp is kept under this
+    /// The key in a file that only its owner can read; in `state`, if there is one, the newest stamp is stored under this
     /// `name`.
     ///
     /// # Errors
@@ -99,7 +99,7 @@ pub(crate) struct StampFile {
 }
 
 impl StampFile {
-    /// Reads it; without one, or with one that cannot be read, nothing is reserved.
+    /// Reads it; without one, or with one that cannot be read, no stamps are reserved.
     pub(crate) fn read(path: PathBuf) -> Self {
         let reserved = match std::fs::read_to_string(&path) {
             Ok(text) => text.trim().parse().unwrap_or_else(|_| {
@@ -109,9 +109,9 @@ impl StampFile {
                 );
                 0
             }),
-            Err(problem) => {
-                if problem.kind() != io::ErrorKind::NotFound {
-                    tracing::warn!(%problem, ?path, "The newest stamp of signed packets cannot be read");
+            Err(error) => {
+                if error.kind() != io::ErrorKind::NotFound {
+                    tracing::warn!(%error, ?path, "The newest stamp of signed packets cannot be read");
                 }
                 0
             }
@@ -128,8 +128,8 @@ impl StampFile {
         let (path, reserved, is_writing) =
             (self.path.clone(), self.reserved, Arc::clone(&self.is_writing));
         tokio::task::spawn_blocking(move || {
-            if let Err(problem) = write(&path, reserved) {
-                tracing::warn!(%problem, ?path, "The newest stamp of signed packets is not kept");
+            if let Err(error) = write(&path, reserved) {
+                tracing::warn!(%error, ?path, "The newest stamp of signed packets is not stored");
             }
             is_writing.store(false, Ordering::Release);
         });

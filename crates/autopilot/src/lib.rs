@@ -1,4 +1,4 @@
-//! The link to the autopilot, and the only crate that knows MAVLink.
+//! The link to the autopilot, and the only crate that depends on MAVLink.
 //!
 //! It finds an autopilot on a serial line or a socket, requests the messages that landing needs, reports the
 //! vehicle's state in this project's types, and sends it commands with acknowledgement, time limit and clear
@@ -6,16 +6,16 @@
 //! 1.17).
 //!
 //! Everything but [`link`] with its `connect` and `newest`, and [`key_file`] is a pure state machine that takes the time as an argument (nanoseconds of any
-//! monotonic clock) and does no input or output. The crate knows nothing of markers, of landing or of other
+//! monotonic clock) and does no input or output. The crate does not depend on markers, on landing or on other
 //! processes.
 //!
-//! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it, of setpoints only the `newest`, and
-//! [`peers`] chooses whom a listening one talks to, [`packet`] finds MAVLink packets in them, [`signing`] signs and verifies
+//! Modules in reading order: [`address`] is the autopilot's address, [`link`] moves bytes to and from it, of setpoints only the `newest`, and
+//! [`peers`] chooses the peer of a listening one, [`received`] explains a missing heartbeat, [`packet`] finds MAVLink packets in them, [`signing`] signs and verifies
 //! them, `gate` is where a link does so, with the files of [`key_file`], [`mode`],
-//! [`state`] and [`parameter`] are what the vehicle reports, [`clock`] converts its time stamps, `boot` and
-//! `contact` say which of its reports are believed, `standstill` whether its mode is of after a pause of this process, `simulation` asks whether it is simulated, [`client`] is the
-//! conversation with it with the settings of [`config`], [`event`] its events, [`command`] is what can be requested
-//! and why it may fail, [`conflict`] says why neither a take-off nor a landing may begin, of which `same_address` finds one, [`takeoff`] arms the vehicle and takes off, [`offboard_exit`] ends PX4's OFFBOARD, which needs the `setpoint_stream`, [`permission`] is what a ground station may send,
+//! [`state`] and [`parameter`] are the vehicle's reports, [`clock`] converts its time stamps, `boot` and
+//! `contact` decide which of its reports are believed, `standstill` whether its mode was received after a pause of this process, `simulation` asks whether it is simulated, [`client`] is the
+//! conversation with it with the settings of [`config`], [`event`] its events, [`command`] has the commands that can be requested
+//! and why they may fail, [`conflict`] has the reasons why neither a take-off nor a landing may begin, of which `same_address` finds one, [`takeoff`] arms the vehicle and takes off, [`offboard_exit`] ends PX4's OFFBOARD, which needs the `setpoint_stream`, [`permission`] restricts the packets of a ground station,
 //! [`compose`] makes the messages that a companion sends, and `given` the answer to a command that is not carried out.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
@@ -33,7 +33,6 @@ mod contact;
 pub mod event;
 mod gate;
 mod given;
-pub mod heard;
 pub mod key_file;
 pub mod link;
 pub mod mode;
@@ -45,6 +44,7 @@ pub mod peers;
 pub mod permission;
 mod px4_events;
 mod px4_listener;
+pub mod received;
 mod same_address;
 mod setpoint_stream;
 pub mod signing;

@@ -1,8 +1,8 @@
 //! Sends and receives MAVLink packets over UDP, TCP or a serial line, to an autopilot or a ground station: bounded queues,
-//! reconnection, signatures, and errors in words.
+//! reconnection, signatures, and explained errors.
 //!
 //! A permanent problem (a port used by another program) is an error at once; a temporary one (no device yet,
-//! no reply, a cable pulled) is retried for ever. Slow readers and slow lines block nothing: queues are
+//! no reply, a cable pulled) is retried without end. Slow readers and slow lines block nothing: queues are
 //! bounded, the oldest received packet is dropped, and a packet that cannot be sent is refused, because a
 //! late command is a wrong one.
 
@@ -29,11 +29,11 @@ use crate::connect::{
     open_serial,
 };
 use crate::gate::{Admitted, Gate};
-use crate::heard::{Heard, note_systems};
 use crate::key_file::{SigningConfig, StampFile};
 use crate::newest::Newest;
 use crate::packet::{Counters, Packet, Parser};
 use crate::peers::{PACKET_GAP, Peering, Peers};
+use crate::received::{Received, note_systems};
 use crate::signing::{Refusals, Signing, stamp};
 
 /// Maximum number of packets received and not yet read, about 4 s of an autopilot's traffic.
@@ -44,9 +44,9 @@ const OUTGOING: usize = 256;
 const SPARE: usize = 16;
 /// Room behind them that only commands of low priority have.
 const COMMANDS: usize = 16;
-/// Maximum time that a line needs for what it has still to send, when one of them or a setpoint is sent.
+/// Maximum time that a line needs for its unsent bytes, when one of them or a setpoint is sent.
 const SPARE_BACKLOG: Duration = Duration::from_millis(50);
-/// Pause before it is looked again how much a line has still to send.
+/// Pause before it is checked again how much a line has still to send.
 const BACKLOG_PAUSE: Duration = Duration::from_millis(10);
 /// Pause before the first retry; it doubles up to the last.
 const FIRST_RETRY: Duration = Duration::from_millis(200);
@@ -54,17 +54,17 @@ const FIRST_RETRY: Duration = Duration::from_millis(200);
 const LAST_RETRY: Duration = Duration::from_secs(2);
 /// Timeout of writing one packet.
 const WRITE_LIMIT: Duration = Duration::from_secs(2);
-/// Time without a datagram that could be sent, after which it is looked whether a UDP connection would have another address.
+/// Time without a datagram that could be sent, after which it is checked whether a UDP connection would have another address.
 const SEND_LIMIT: Duration = Duration::from_secs(2);
 /// Silence after which a TCP connection counts as dead.
 const TCP_SILENCE: Duration = Duration::from_secs(10);
-/// Silence after which an incomplete packet of a TCP connection is noise. It loses no byte, and what a stall holds up comes later; but
+/// Silence after which an incomplete packet of a TCP connection is noise. It loses no byte, and bytes that a stall holds up come later; but
 /// it may begin inside a packet, or bring the noise of a serial line behind it.
 const TCP_GAP: Duration = Duration::from_secs(2);
-/// A time that nothing takes.
+/// A time that no operation takes.
 const NO_LIMIT: Duration = Duration::from_secs(3600);
 
-/// A connection to an autopilot or a ground station that reconnects by itself.
+/// A connection to an autopilot or a ground station that reconnects automatically.
 #[derive(Debug)]
 pub struct Link {
     shared: Arc<Shared>,
@@ -101,7 +101,7 @@ pub enum LinkEvent {
         /// Time of reception of its last byte.
         received: Instant,
     },
-    /// The heartbeat of another autopilot than the one that the link talks to, at a listening UDP port where none is pinned; at most
+    /// The heartbeat of another autopilot than the link's peer, at a listening UDP port where none is pinned; at most
     /// one a second.
     OtherAutopilot {
         /// The heartbeat.
@@ -248,17 +248,17 @@ impl Link {
         *self.shared.counters.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What was heard since the link was opened.
-    pub fn heard(&self) -> Heard {
-        Heard::new(self.shared.systems().clone(), self.counters())
+    /// The traffic received since the link was opened.
+    pub fn received(&self) -> Received {
+        Received::new(self.shared.systems().clone(), self.counters())
     }
 
-    /// Number of packets and connections of others than the peer, which were dropped.
-    pub fn strangers(&self) -> u64 {
-        self.shared.strangers.load(Ordering::Relaxed)
+    /// Number of packets and connections of senders other than the peer, which were dropped.
+    pub fn unknown_senders(&self) -> u64 {
+        self.shared.unknown_senders.load(Ordering::Relaxed)
     }
 
-    /// True when packets with a signature arrived and there is no key here: the other side may refuse what is sent.
+    /// True when packets with a signature arrived and there is no key here: the other side may refuse packets from here.
     pub fn lacks_key(&self) -> bool {
         self.shared.peer_signs.load(Ordering::Relaxed)
     }
@@ -302,13 +302,13 @@ impl LinkSender {
         self.put(&self.spare, packet)
     }
 
-    /// The same for a command, in its order behind what waits: there is room for it where other packets are refused.
+    /// The same for a command, in its order behind the packets that wait: there is room for it where other packets are refused.
     pub fn send_command(&self, packet: &[u8]) -> Result<(), SendError> {
         self.put(&self.spare, packet)
     }
 
     /// Sends a packet that makes those like it before it useless: a setpoint. It waits until a serial line has little left to send, and
-    /// takes the place of one that still waits: a line that is too slow for all of them carries new ones instead of old ones.
+    /// replaces one that still waits: a line that is too slow for all of them carries new ones instead of old ones.
     ///
     /// # Errors
     /// When there is no connection.
@@ -319,7 +319,7 @@ impl LinkSender {
     }
 
     fn check_connected(&self) -> Result<(), SendError> {
-        // The link's task may have ended, which has the other end of the queue.
+        // The link's task, which has the other end of the queue, may have ended.
         let is_connected = self.shared.connected.load(Ordering::Acquire);
         if is_connected && !self.queue.is_closed() { Ok(()) } else { Err(SendError::NotConnected) }
     }
@@ -341,7 +341,7 @@ struct Shared {
     newest: Newest,
     connected: AtomicBool,
     dropped: AtomicU64,
-    strangers: AtomicU64,
+    unknown_senders: AtomicU64,
     counters: Mutex<Counters>,
     /// Systems whose autopilots sent a heartbeat.
     systems: Mutex<BTreeSet<u8>>,
@@ -360,7 +360,7 @@ impl Shared {
             newest: Newest::default(),
             connected: AtomicBool::new(false),
             dropped: AtomicU64::new(0),
-            strangers: AtomicU64::new(0),
+            unknown_senders: AtomicU64::new(0),
             counters: Mutex::new(Counters::default()),
             systems: Mutex::new(BTreeSet::new()),
             refusals: Mutex::new(Refusals::default()),
@@ -381,7 +381,7 @@ impl Shared {
     fn push(&self, event: LinkEvent) {
         let mut events = self.events();
         if events.len() >= INCOMING {
-            // The oldest packet is dropped; events of the connection stay, unless there is nothing else.
+            // The oldest packet is dropped; events of the connection stay, unless there are no packets.
             let oldest = events.iter().position(|event| matches!(event, LinkEvent::Packet { .. }));
             events.remove(oldest.unwrap_or(0));
             self.dropped.fetch_add(1, Ordering::Relaxed);
@@ -391,9 +391,9 @@ impl Shared {
         self.arrived.notify_one();
     }
 
-    /// Counts dropped packets and connections of strangers; true for the first, which is the one to log.
-    fn count_strangers(&self, count: u64) -> bool {
-        self.strangers.fetch_add(count, Ordering::Relaxed) == 0
+    /// Counts dropped packets and connections of unknown senders; true for the first, which is the one to log.
+    fn count_unknown_senders(&self, count: u64) -> bool {
+        self.unknown_senders.fetch_add(count, Ordering::Relaxed) == 0
     }
 
     fn mark_active(&self) {
@@ -507,7 +507,7 @@ impl Port {
         {
             tracing::warn!(
                 advice = "give this side the same key (`signing_key`)",
-                "The other side signs its packets and this one has no key: what is sent from here may be refused there"
+                "The other side signs its packets and this one has no key: packets sent from here may be refused there"
             );
         }
     }
@@ -527,7 +527,7 @@ impl Port {
     }
 }
 
-/// What is bound before anything else, so that a port in use is an error at once.
+/// A socket that is bound first, so that a port in use is an error at once.
 enum Listener {
     None,
     Udp(UdpSocket),
@@ -550,7 +550,7 @@ async fn listen(address: &Address) -> Result<Listener, LinkError> {
     })
 }
 
-/// Serves one connection after the other, with a pause that grows while nothing works.
+/// Serves one connection after the other, with a pause that grows while connections fail.
 async fn run(address: Address, mut listener: Listener, mut port: Port) {
     let mut pause = FIRST_RETRY;
     let mut last_reason = String::new();
@@ -655,14 +655,14 @@ async fn accept_when_silent(
 
 /// Counts a refused connection, and logs the first.
 fn refuse(shared: &Shared, peer: SocketAddr, reason: &str) {
-    if shared.count_strangers(1) {
+    if shared.count_unknown_senders(1) {
         tracing::warn!(%peer, reason, "Connection refused (further ones are only counted)");
     }
 }
 
 /// How a stream is served.
 struct Manner<B> {
-    /// The time that the line needs for what it has still to send.
+    /// The time that the line needs for its unsent bytes.
     backlog: B,
     /// Silence after which an incomplete packet is noise.
     gap: Duration,
@@ -683,21 +683,21 @@ fn tcp(silence: Option<Duration>) -> Manner<impl Fn(&TcpStream) -> Duration> {
     Manner { backlog: |_: &TcpStream| Duration::ZERO, gap: TCP_GAP, silence }
 }
 
-/// What happened on a line: bytes were read, or written.
+/// The event on a line: bytes were read, or written.
 enum Moved {
     Read(io::Result<usize>),
     Written(io::Result<usize>),
 }
 
-/// Writes what there is to write, or reads.
+/// Writes the remaining bytes, or reads.
 fn poll_line<L: AsyncRead + AsyncWrite + Unpin>(
     line: &mut L,
     context: &mut Context<'_>,
     bytes: &mut [u8],
-    rest: &[u8],
+    unsent: &[u8],
 ) -> Poll<Moved> {
-    if !rest.is_empty()
-        && let Poll::Ready(written) = Pin::new(&mut *line).poll_write(context, rest)
+    if !unsent.is_empty()
+        && let Poll::Ready(written) = Pin::new(&mut *line).poll_write(context, unsent)
     {
         return Poll::Ready(Moved::Written(written));
     }
@@ -718,21 +718,21 @@ where
     let mut parser = Parser::new();
     let mut bytes = [0; 4096];
     let mut active = tokio::time::Instant::now();
-    // What is left of the packet that is being written, and since when it is.
-    let mut rest = Vec::new();
+    // The unsent bytes of the packet that is being written, and since when it is.
+    let mut unsent = Vec::new();
     let mut writing = active;
     loop {
         let limit = manner.silence.unwrap_or(NO_LIMIT);
-        let is_writing = !rest.is_empty();
+        let is_writing = !unsent.is_empty();
         let is_free = !is_writing && (manner.backlog)(&line) <= SPARE_BACKLOG;
         tokio::select! {
-            moved = poll_fn(|context| poll_line(&mut line, context, &mut bytes, &rest)) => match moved {
+            moved = poll_fn(|context| poll_line(&mut line, context, &mut bytes, &unsent)) => match moved {
                 Moved::Read(Ok(0)) => return "the other side closed the connection".into(),
                 Moved::Read(Ok(count)) => {
                     active = tokio::time::Instant::now();
                     let packets = parser.push(bytes.get(..count).unwrap_or(&[]));
                     let admitted = port.admit(packets);
-                    // Who has not the key holds nobody's place.
+                    // A client without the key does not keep the connection from others.
                     if port.gate.is_open() || admitted.is_peer {
                         port.shared.mark_active();
                     }
@@ -740,12 +740,12 @@ where
                 }
                 Moved::Read(Err(error)) => return format!("reading failed: {error}"),
                 Moved::Written(Ok(0)) => return "the other side takes no more bytes".into(),
-                Moved::Written(Ok(count)) => drop(rest.drain(..count.min(rest.len()))),
+                Moved::Written(Ok(count)) => drop(unsent.drain(..count.min(unsent.len()))),
                 Moved::Written(Err(error)) => return format!("writing failed: {error}"),
             },
             packet = port.next(is_free), if !is_writing => {
                 let Some(packet) = packet else { return "closed".into() };
-                rest = port.seal(packet).unwrap_or_default();
+                unsent = port.seal(packet).unwrap_or_default();
                 writing = tokio::time::Instant::now();
             }
             () = sleep(BACKLOG_PAUSE), if !is_writing && !is_free => {}
@@ -764,7 +764,7 @@ where
 }
 
 /// Moves datagrams in both directions until the socket breaks; returns why. Without a `fixed` peer,
-/// the peer is whom [`Peering`] says: the sender of the autopilot's heartbeat, or the first ground station.
+/// the peer is chosen by [`Peering`]: the sender of the autopilot's heartbeat, or the first ground station.
 async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr>) -> String {
     let mut peers = Peers::new(fixed, port.peering.clone(), port.first_autopilot);
     if let Some(peer) = fixed {
@@ -784,7 +784,7 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
                     if let Some(peer) = peers.chosen.filter(|_| peers.chosen != before) {
                         port.connected(peer.to_string());
                     }
-                    if taken.strangers > 0 && port.shared.count_strangers(taken.strangers) {
+                    if taken.unknown_senders > 0 && port.shared.count_unknown_senders(taken.unknown_senders) {
                         tracing::warn!(%from, "Packets of an unknown sender dropped (further ones are only counted)");
                     }
                     port.received(taken.packets, taken.counted);
@@ -885,8 +885,8 @@ mod tests {
         let sent = (0..100).take_while(|_| sender.send_spare(b"packet").is_ok()).count();
         assert_eq!(sent, SPARE);
         assert_eq!(sender.send_spare(b"packet"), Err(SendError::Full));
-        assert_eq!(sender.send(b"setpoint"), Ok(()), "our own still goes");
-        assert_eq!(port.next(true).await.unwrap(), b"setpoint", "and goes first");
+        assert_eq!(sender.send(b"setpoint"), Ok(()), "the setpoint is still sent");
+        assert_eq!(port.next(true).await.unwrap(), b"setpoint", "and is sent first");
         assert_eq!(port.next(true).await.unwrap(), b"packet");
         assert_eq!(sender.send_spare(b"packet"), Ok(()));
     }
@@ -967,7 +967,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_comes_is_read_while_nothing_can_be_written() {
+    async fn bytes_are_read_while_none_can_be_written() {
         let (sender, mut port) = pair();
         port.connected("peer".into());
         let (line, mut other_end) = tokio::io::duplex(4);

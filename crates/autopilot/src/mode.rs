@@ -231,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_flown_has_a_mode_for_setpoints_and_one_to_land() {
+    fn each_supported_firmware_has_a_mode_for_setpoints_and_one_to_land() {
         for firmware in [Firmware::Copter, Firmware::Px4] {
             assert!(firmware.guided().is_some_and(FlightMode::is_guided));
             assert!(firmware.land().is_some_and(FlightMode::is_landing));

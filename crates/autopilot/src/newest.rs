@@ -1,11 +1,11 @@
-//! The place of a setpoint that waits for a slow line: a newer one takes it.
+//! Holds the setpoint that waits for a slow line: a newer one replaces it.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::Notify;
 
-/// The newest packet of a kind of which each makes those before it useless.
+/// The newest packet of a kind where each packet makes earlier ones useless.
 #[derive(Debug, Default)]
 pub(crate) struct Newest {
     packet: Mutex<Option<Vec<u8>>>,
@@ -14,9 +14,9 @@ pub(crate) struct Newest {
 }
 
 impl Newest {
-    /// Puts a packet in the place of one that still waits.
+    /// Stores a packet, and drops one that still waits.
     pub(crate) fn put(&self, packet: Vec<u8>) {
-        if self.place().replace(packet).is_some() {
+        if self.slot().replace(packet).is_some() {
             self.replaced.fetch_add(1, Ordering::Relaxed);
         }
         self.waits.notify_one();
@@ -25,7 +25,7 @@ impl Newest {
     /// Waits for a packet and takes it; may be cancelled without losing one.
     pub(crate) async fn take(&self) -> Vec<u8> {
         loop {
-            if let Some(packet) = self.place().take() {
+            if let Some(packet) = self.slot().take() {
                 return packet;
             }
             self.waits.notified().await;
@@ -34,7 +34,7 @@ impl Newest {
 
     /// Forgets the one that waits.
     pub(crate) fn forget(&self) {
-        drop(self.place().take());
+        drop(self.slot().take());
     }
 
     /// Number of packets that were replaced while they waited.
@@ -42,7 +42,7 @@ impl Newest {
         self.replaced.load(Ordering::Relaxed)
     }
 
-    fn place(&self) -> MutexGuard<'_, Option<Vec<u8>>> {
+    fn slot(&self) -> MutexGuard<'_, Option<Vec<u8>>> {
         self.packet.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

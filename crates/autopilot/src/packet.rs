@@ -44,17 +44,17 @@ pub const AUTOPILOT: u8 = 1;
 pub struct Packet {
     /// The packet as it was received, from start byte to checksum or signature.
     pub raw: Vec<u8>,
-    /// Who sent it.
+    /// Its sender.
     pub sender: Sender,
     /// The sender's packet counter.
     pub sequence: u8,
     /// The message id.
     pub message_id: u32,
-    /// The decoded message; `None` when the dialect does not know its id or one of its values.
+    /// The decoded message; `None` when the dialect does not contain its id or one of its values.
     pub message: Option<MavMessage>,
 }
 
-/// What a parser has counted so far.
+/// The counters of a parser.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
     /// Packets passed on.
@@ -63,9 +63,9 @@ pub struct Counters {
     pub bad_bytes: u64,
     /// Candidates with a known message id and a wrong checksum.
     pub bad_checksums: u64,
-    /// Packets with a message id that the dialect does not know, passed on unchanged.
+    /// Packets with a message id that the dialect does not contain, passed on unchanged.
     pub unknown_ids: u64,
-    /// Packets with a correct checksum and a value that the dialect does not know, passed on unchanged.
+    /// Packets with a correct checksum and a value that the dialect does not contain, passed on unchanged.
     pub undecodable: u64,
 }
 
@@ -169,7 +169,7 @@ impl Parser {
 }
 
 impl Packet {
-    /// The packet that is all of these bytes, which a [`Parser`] has found before; its checksum is not looked at again.
+    /// The packet that is all of these bytes, which a [`Parser`] has found before; its checksum is not checked again.
     pub fn from_raw(raw: &[u8]) -> Option<Self> {
         let shape = shape(raw).ok().filter(|shape| shape.length == raw.len())?;
         Some(decode(raw, &shape))
@@ -196,7 +196,7 @@ impl Packet {
         self.raw.first() == Some(&START_V2)
     }
 
-    /// True for MAVLink 2 with a signature, which nothing here has verified.
+    /// True for MAVLink 2 with a signature, which has not been verified here.
     pub fn is_signed(&self) -> bool {
         matches!(*self.raw, [START_V2, _, flags, ..] if flags & SIGNED != 0)
     }
@@ -207,7 +207,7 @@ impl Packet {
         Self { raw: unsigned.unwrap_or(self.raw), ..self }
     }
 
-    /// The message's name; `None` when the dialect does not know it.
+    /// The message's name; `None` when the dialect does not contain it.
     pub fn name(&self) -> Option<&'static str> {
         self.message.as_ref().map(Message::message_name)
     }
@@ -297,8 +297,8 @@ fn look(bytes: &[u8], senders: &[Sender]) -> Verdict {
         return if is_right { Verdict::Packet(shape) } else { Verdict::BadChecksum };
     }
     // The checksum of an unknown message also covers a byte that is not sent (CRC_EXTRA). The packet is
-    // accepted when some value of that byte fits, its sender is known from checked packets, and what follows
-    // begins a packet or has not come yet.
+    // accepted when some value of that byte fits, its sender is known from checked packets, and the bytes behind it
+    // begin a packet or have not come yet.
     let follows = bytes.get(shape.length).is_none_or(|next| [START_V1, START_V2].contains(next));
     let is_plausible =
         follows && senders.contains(&shape.sender) && crc_extra(covered, sent).is_some();
@@ -333,7 +333,7 @@ fn shape(bytes: &[u8]) -> Result<Shape, Verdict> {
             })
         }
         [START_V2, payload, flags, _, sequence, system, component, id0, id1, id2, ..] => {
-            // A receiver must refuse incompatibility flags that it does not know; it knows signing only.
+            // A receiver must refuse incompatibility flags that it does not support; this one supports only signing.
             if flags & !SIGNED != 0 {
                 return Err(Verdict::Noise);
             }
@@ -510,7 +510,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_encoded_is_decoded() {
+    fn an_encoded_message_is_decoded() {
         for kind in 0..3 {
             let sender = Sender { system: 7, component: 191 };
             let raw = encode(sender, 200, &message(kind));
@@ -573,7 +573,7 @@ mod tests {
         assert_eq!((packets.len(), packets[0].is_v2(), packets[0].is_signed()), (1, true, false));
         assert_eq!((packets[0].sequence, &packets[0].message), (9, &Some(message(1))));
 
-        // The checksum of a message that is not known has a byte that is found again.
+        // The extra byte in the checksum of an unknown message is recovered.
         let unknown = unknown(9_999_999, sender);
         assert_eq!(reframe(&unknown, 0), Some(unknown.clone()));
         let flagged = reframe(&unknown, SIGNED).unwrap();

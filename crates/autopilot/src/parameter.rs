@@ -33,12 +33,12 @@ const TOLERANCE: f64 = 1e-5;
 /// The requested parameters.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Parameters {
-    list: Vec<Wanted>,
+    list: Vec<Requested>,
     due_ns: i64,
 }
 
 #[derive(Clone, Debug)]
-struct Wanted {
+struct Requested {
     name: &'static str,
     attempts: u32,
     value: Option<f64>,
@@ -48,7 +48,7 @@ struct Wanted {
     is_unanswered: bool,
 }
 
-impl Wanted {
+impl Requested {
     fn new(name: &'static str) -> Self {
         Self { name, attempts: 0, value: None, set: None, is_unanswered: false }
     }
@@ -82,7 +82,7 @@ impl Wanted {
 
 impl Parameters {
     pub(crate) fn new(names: &[&'static str]) -> Self {
-        Self { list: names.iter().map(|name| Wanted::new(name)).collect(), due_ns: i64::MIN }
+        Self { list: names.iter().map(|name| Requested::new(name)).collect(), due_ns: i64::MIN }
     }
 
     /// Adds parameters to read; those that are known already stay as they are.
@@ -90,7 +90,7 @@ impl Parameters {
         for name in names {
             if self.list.len() < MAX_PARAMETERS && self.list.iter().all(|known| known.name != *name)
             {
-                self.list.push(Wanted::new(name));
+                self.list.push(Requested::new(name));
                 self.due_ns = i64::MIN;
             }
         }
@@ -98,14 +98,14 @@ impl Parameters {
 
     /// Requests everything again.
     pub(crate) fn restart(&mut self) {
-        let names: Vec<_> = self.list.iter().map(|wanted| wanted.name).collect();
+        let names: Vec<_> = self.list.iter().map(|requested| requested.name).collect();
         *self = Self::new(&names);
     }
 
     pub(crate) fn get(&self, name: &str) -> Parameter {
-        match self.list.iter().find(|wanted| wanted.name == name) {
-            Some(Wanted { value: Some(value), .. }) => Parameter::Value(*value),
-            Some(wanted) if wanted.is_silent() => Parameter::Silent,
+        match self.list.iter().find(|requested| requested.name == name) {
+            Some(Requested { value: Some(value), .. }) => Parameter::Value(*value),
+            Some(requested) if requested.is_silent() => Parameter::Silent,
             _ => Parameter::Unknown,
         }
     }
@@ -113,28 +113,28 @@ impl Parameters {
     /// Sets one of the parameters that are read; it must be a 32-bit float. Until the autopilot reports the
     /// value it is sent again, a bounded number of times.
     pub(crate) fn set(&mut self, name: &str, value: f64) {
-        if let Some(wanted) = self.list.iter_mut().find(|wanted| wanted.name == name)
-            && wanted.set.is_none_or(|set| !is_same(set, value))
+        if let Some(requested) = self.list.iter_mut().find(|requested| requested.name == name)
+            && requested.set.is_none_or(|set| !is_same(set, value))
         {
-            wanted.set = Some(value);
-            wanted.is_unanswered = false;
-            wanted.attempts = 0;
+            requested.set = Some(value);
+            requested.is_unanswered = false;
+            requested.attempts = 0;
             self.due_ns = i64::MIN;
         }
     }
 
     /// True while a value is being set.
     pub(crate) fn is_setting(&self, name: &str) -> bool {
-        let is_it = |wanted: &&Wanted| wanted.name == name;
+        let is_it = |requested: &&Requested| requested.name == name;
         self.list
             .iter()
             .find(is_it)
-            .is_some_and(|wanted| wanted.set.is_some() && wanted.is_pending())
+            .is_some_and(|requested| requested.set.is_some() && requested.is_pending())
     }
 
     /// True when a value was set as often as it may be, and none has been reported since.
     pub(crate) fn is_unanswered(&self, name: &str) -> bool {
-        self.list.iter().any(|wanted| wanted.name == name && wanted.is_unanswered)
+        self.list.iter().any(|requested| requested.name == name && requested.is_unanswered)
     }
 
     /// The next request, if one is due.
@@ -144,38 +144,43 @@ impl Parameters {
         }
         // A value to set comes first; then the one with the fewest requests, so that a silent one does not
         // delay the others.
-        let wanted =
-            self.list.iter_mut().filter(|wanted| wanted.is_pending() || wanted.is_silent());
-        let wanted = wanted
-            .min_by_key(|wanted| (wanted.is_silent(), wanted.set.is_none(), wanted.attempts))?;
-        let was_silent = wanted.is_silent();
-        wanted.attempts = wanted.attempts.saturating_add(1);
+        let requested = self
+            .list
+            .iter_mut()
+            .filter(|requested| requested.is_pending() || requested.is_silent());
+        let requested = requested.min_by_key(|requested| {
+            (requested.is_silent(), requested.set.is_none(), requested.attempts)
+        })?;
+        let was_silent = requested.is_silent();
+        requested.attempts = requested.attempts.saturating_add(1);
         let pause_ns = if was_silent { SILENT_NS } else { REPLY_TIMEOUT_NS };
         self.due_ns = now_ns.saturating_add(pause_ns);
-        if !was_silent && wanted.attempts > ATTEMPTS {
-            wanted.is_unanswered = wanted.set.take().is_some();
+        if !was_silent && requested.attempts > ATTEMPTS {
+            requested.is_unanswered = requested.set.take().is_some();
             return None;
         }
-        Some(wanted.request(system, component))
+        Some(requested.request(system, component))
     }
 
-    /// Handles a value, whoever requested it.
+    /// Handles a value, also one that another client requested.
     pub(crate) fn take(&mut self, firmware: Firmware, message: &PARAM_VALUE_DATA) {
         let name = message.param_id.to_str().unwrap_or_default();
-        let Some(wanted) = self.list.iter_mut().find(|wanted| wanted.name == name) else { return };
-        let is_whole = message.param_type == MavParamType::MAV_PARAM_TYPE_INT32;
+        let Some(requested) = self.list.iter_mut().find(|requested| requested.name == name) else {
+            return;
+        };
+        let is_integer = message.param_type == MavParamType::MAV_PARAM_TYPE_INT32;
         let value = match firmware {
-            // PX4 sends the bits of an integer in the place of the float.
-            Firmware::Px4 if is_whole => f64::from(message.param_value.to_bits().cast_signed()),
+            // PX4 sends the bits of an integer instead of a float.
+            Firmware::Px4 if is_integer => f64::from(message.param_value.to_bits().cast_signed()),
             _ => f64::from(message.param_value),
         };
         if value.is_finite() {
-            let was_silent = wanted.is_silent();
-            wanted.value = Some(value);
-            wanted.is_unanswered = false;
+            let was_silent = requested.is_silent();
+            requested.value = Some(value);
+            requested.is_unanswered = false;
             // Before the first request it answers another one.
-            let is_answer = wanted.attempts > 0;
-            wanted.set = wanted.set.filter(|set| !(is_answer && is_same(*set, value)));
+            let is_answer = requested.attempts > 0;
+            requested.set = requested.set.filter(|set| !(is_answer && is_same(*set, value)));
             self.due_ns = i64::MIN;
             // The link works now, so the others may answer as well.
             for other in self.list.iter_mut().filter(|other| was_silent && other.is_silent()) {
@@ -243,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn px4_tells_whole_numbers_by_their_bits() {
+    fn px4_sends_integers_by_their_bits() {
         let mut parameters = Parameters::new(&["PLD_SRCH_TOUT"]);
         let integer = value("PLD_SRCH_TOUT", f32::from_bits(7), MavParamType::MAV_PARAM_TYPE_INT32);
         parameters.take(Firmware::Px4, &integer);
@@ -251,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn a_value_is_set_until_it_is_reported_and_not_for_ever() {
+    fn a_value_is_set_until_it_is_reported_and_a_limited_number_of_times() {
         let mut parameters = Parameters::new(&["GUID_TIMEOUT"]);
         let real = |x| value("GUID_TIMEOUT", x, MavParamType::MAV_PARAM_TYPE_REAL32);
         parameters.take(Firmware::Copter, &real(3.0));

@@ -11,24 +11,24 @@ use crate::packet::{Counters, Packet, Parser};
 pub(crate) const PACKET_GAP: Duration = Duration::from_millis(200);
 /// Silence after which an autopilot is replaced by another one.
 const PEER_SILENCE: Duration = Duration::from_secs(3);
-/// Minimum time between two heartbeats of other autopilots that are handed on: they tell that there are any.
+/// Minimum time between two heartbeats of other autopilots that are passed on: they show that there are others.
 const OTHER_PAUSE: Duration = Duration::from_secs(1);
 /// Maximum number of known UDP peers.
 const MAX_PEERS: usize = 8;
 
-/// Whom a listening link talks to.
+/// The peer of a listening link.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Peering {
     /// An autopilot: the sender of its heartbeat, until that is silent for 3 s and another address sends it.
     Autopilot {
-        /// Its system id; `None` takes that of the first one for good.
+        /// Its system id; `None` takes that of the first one permanently.
         system: Option<u8>,
     },
-    /// A ground station: the first one heard, until that is silent.
+    /// A ground station: the first one whose packet was received, until that is silent.
     GroundStation {
         /// The addresses of the ground stations; any address if there are none.
         known: Vec<IpAddr>,
-        /// Silence after which another one takes its place.
+        /// Silence after which another one replaces it.
         silence: Duration,
     },
 }
@@ -50,7 +50,7 @@ impl Peering {
         }
     }
 
-    /// Whom it talks to, for messages.
+    /// The kind of its peer, for messages.
     pub(crate) fn other_side(&self) -> &'static str {
         match self {
             Self::Autopilot { .. } => "autopilot (or its simulator)",
@@ -67,24 +67,24 @@ impl Peering {
     }
 }
 
-/// The senders to a UDP port, each with its own stream of packets.
+/// The senders to a UDP port, each with a separate stream of packets.
 pub(crate) struct Peers {
     known: Vec<Peer>,
     pub(crate) chosen: Option<SocketAddr>,
     peering: Peering,
     /// The system id of the first autopilot, where none is pinned: a vehicle that is silent for a while must not be replaced by
-    /// another one, for which nothing was decided.
+    /// another one, for which no decision was made.
     pub(crate) first: Option<u8>,
-    /// When the heartbeat of another autopilot was handed on last.
-    other_told: Option<Instant>,
+    /// When the heartbeat of another autopilot was passed on last.
+    other_reported: Option<Instant>,
 }
 
-/// What was in a datagram.
+/// The content of a datagram.
 pub(crate) struct Taken {
     /// The packets of the chosen peer.
     pub(crate) packets: Vec<Packet>,
-    /// Number of packets of others, which were dropped.
-    pub(crate) strangers: u64,
+    /// Number of packets of unknown senders, which were dropped.
+    pub(crate) unknown_senders: u64,
     /// The heartbeat of an autopilot that is another one than the first, where none is pinned.
     pub(crate) other_autopilot: Option<Packet>,
     pub(crate) counted: Counters,
@@ -94,7 +94,7 @@ struct Peer {
     address: SocketAddr,
     parser: Parser,
     /// Time of the last bytes.
-    heard: Instant,
+    received: Instant,
     /// Time of the last packet that was let in; none before the first.
     active: Option<Instant>,
     /// Time of the last autopilot heartbeat from there.
@@ -102,9 +102,9 @@ struct Peer {
 }
 
 impl Peers {
-    /// No sender is known; `first` is the autopilot's system id, if one was heard before.
+    /// No sender is known; `first` is the autopilot's system id, if its heartbeat was received before.
     pub(crate) fn new(chosen: Option<SocketAddr>, peering: Peering, first: Option<u8>) -> Self {
-        Self { known: Vec::new(), chosen, peering, first, other_told: None }
+        Self { known: Vec::new(), chosen, peering, first, other_reported: None }
     }
 
     /// Parses a datagram and returns its packets if they come from the chosen peer and the gate lets them in;
@@ -118,20 +118,20 @@ impl Peers {
         stamp: u64,
     ) -> Taken {
         if !self.peering.admits(from.ip()) {
-            // One datagram is one packet, of almost everyone; a stranger's is not worth parsing.
+            // Almost all senders send one packet per datagram; an unknown sender's is not parsed.
             return Taken {
                 packets: Vec::new(),
-                strangers: 1,
+                unknown_senders: 1,
                 other_autopilot: None,
                 counted: Counters::default(),
             };
         }
         let peer = self.peer(from, now);
-        if now.duration_since(peer.heard) > PACKET_GAP {
+        if now.duration_since(peer.received) > PACKET_GAP {
             // The rest of an incomplete packet is lost.
             peer.parser.finish();
         }
-        peer.heard = now;
+        peer.received = now;
         let admitted = gate.admit(stamp, peer.parser.push(bytes));
         let packets = admitted.packets;
         if admitted.is_peer {
@@ -145,18 +145,18 @@ impl Peers {
         if admitted.is_peer && self.chosen != Some(from) && self.is_replaced(is_autopilot, now) {
             self.chosen = Some(from);
         }
-        // Until it has our stamps, which are newer, all that it sends is too old. Whoever is let in takes its place at once.
+        // Until it has our stamps, which are newer, all its packets are too old. A peer that is let in replaces it at once.
         if admitted.is_behind && self.is_silent(now) {
             self.chosen = Some(from);
         }
         if self.chosen == Some(from) {
             let heartbeat = packets.iter().find(|packet| self.is_heartbeat(packet));
             self.first = self.first.or(heartbeat.map(|packet| packet.sender.system));
-            return Taken { packets, strangers: 0, other_autopilot: None, counted };
+            return Taken { packets, unknown_senders: 0, other_autopilot: None, counted };
         }
-        let strangers = packets.len() as u64;
+        let unknown_senders = packets.len() as u64;
         let other_autopilot = self.other_autopilot(packets, now);
-        Taken { packets: Vec::new(), strangers, other_autopilot, counted }
+        Taken { packets: Vec::new(), unknown_senders, other_autopilot, counted }
     }
 
     /// True for the heartbeat of the autopilot, as opposed to another vehicle's.
@@ -166,14 +166,14 @@ impl Peers {
             && system.or(self.first).is_none_or(|system| system == packet.sender.system)
     }
 
-    /// The heartbeat of another autopilot among a stranger's packets, once a second.
+    /// The heartbeat of another autopilot among an unknown sender's packets, once a second.
     fn other_autopilot(&mut self, packets: Vec<Packet>, now: Instant) -> Option<Packet> {
         let Peering::Autopilot { system: None } = self.peering else { return None };
         let first = self.first?;
-        let is_due = self.other_told.is_none_or(|told| now.duration_since(told) >= OTHER_PAUSE);
+        let is_due = self.other_reported.is_none_or(|at| now.duration_since(at) >= OTHER_PAUSE);
         let is_other = |it: &Packet| it.is_heartbeat_of_autopilot() && it.sender.system != first;
         let heartbeat = packets.into_iter().find(is_other).filter(|_| is_due)?;
-        self.other_told = Some(now);
+        self.other_reported = Some(now);
         Some(heartbeat)
     }
 
@@ -206,7 +206,7 @@ impl Peers {
                 self.known.push(Peer {
                     address,
                     parser: Parser::new(),
-                    heard: now,
+                    received: now,
                     active: None,
                     autopilot: None,
                 });
@@ -222,7 +222,7 @@ impl Peers {
             return;
         }
         let others = self.known.iter().enumerate().filter(|(_, p)| Some(p.address) != self.chosen);
-        if let Some((oldest, _)) = others.min_by_key(|(_, peer)| peer.heard) {
+        if let Some((oldest, _)) = others.min_by_key(|(_, peer)| peer.received) {
             self.known.swap_remove(oldest);
         }
     }
@@ -264,13 +264,13 @@ mod tests {
         let began = Instant::now();
         let bytes = heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID, GROUND);
         assert_eq!(peers.take_any(at(1), &bytes, began).packets.len(), 1);
-        // What a stranger says it is does not matter.
+        // The kind that an unknown sender states has no effect.
         let autopilot = Sender { system: 1, component: 1 };
-        let lie = heartbeat(MavAutopilot::MAV_AUTOPILOT_PX4, autopilot);
+        let false_heartbeat = heartbeat(MavAutopilot::MAV_AUTOPILOT_PX4, autopilot);
         for second in 1..=10 {
             let now = began + Duration::from_secs(second);
-            let taken = peers.take_any(at(2), &lie, now);
-            assert_eq!((taken.packets.len(), taken.strangers), (0, 1), "after {second} s");
+            let taken = peers.take_any(at(2), &false_heartbeat, now);
+            assert_eq!((taken.packets.len(), taken.unknown_senders), (0, 1), "after {second} s");
         }
         assert_eq!(peers.chosen, Some(at(1)));
         let later = began + Duration::from_secs(11);
@@ -279,11 +279,12 @@ mod tests {
             1,
             "the first one is silent"
         );
-        assert_eq!(peers.take_any(at(1), &bytes, later).strangers, 1);
+        assert_eq!(peers.take_any(at(1), &bytes, later).unknown_senders, 1);
     }
 
     #[test]
-    fn who_is_behind_is_heard_once_the_other_is_silent_and_gives_way_to_whoever_is_let_in() {
+    fn a_station_with_old_stamps_is_chosen_once_the_other_is_silent_and_replaced_by_one_that_is_let_in()
+     {
         const NOW: u64 = 34_715_520_000_000;
         let signing = |link_id| Signing::new("correct horse".parse().unwrap(), link_id, 0);
         let bytes = heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID, GROUND);
@@ -300,7 +301,7 @@ mod tests {
         assert_eq!(peers.chosen, Some(at(2)), "it gets our stamps");
         let fresh = third.sign(NOW + 1_000_000_001, &bytes).unwrap();
         assert_eq!(peers.take(at(3), &fresh, later, &mut gate, NOW).packets.len(), 1);
-        assert_eq!(peers.chosen, Some(at(3)), "an old packet holds nobody's place");
+        assert_eq!(peers.chosen, Some(at(3)), "an old packet does not keep the link");
         peers.take(at(2), &behind, later, &mut gate, NOW);
         assert_eq!(peers.chosen, Some(at(3)));
     }
@@ -319,9 +320,9 @@ mod tests {
         for second in 1..60 {
             let now = began + Duration::from_secs(second);
             let taken = peers.take_any(at(2), &of(2), now);
-            assert_eq!((taken.packets.len(), taken.strangers), (0, 1), "after {second} s");
+            assert_eq!((taken.packets.len(), taken.unknown_senders), (0, 1), "after {second} s");
             let other = taken.other_autopilot.map(|packet| packet.sender.system);
-            assert_eq!(other, Some(2), "it is told of, after {second} s");
+            assert_eq!(other, Some(2), "it is reported, after {second} s");
             assert_eq!(peers.take_any(at(2), &of(2), now).other_autopilot, None, "not so often");
         }
         let later = began + Duration::from_secs(60);
@@ -330,11 +331,11 @@ mod tests {
         let mut peers = Peers::new(None, Peering::default(), peers.first);
         peers.take_any(at(2), &of(2), later);
         assert_eq!(peers.take_any(at(1), &of(1), later).packets.len(), 1);
-        assert_eq!(peers.take_any(at(2), &of(2), later).strangers, 1);
+        assert_eq!(peers.take_any(at(2), &of(2), later).unknown_senders, 1);
     }
 
     #[test]
-    fn an_autopilot_that_restarts_is_heard_from_another_port_once_the_old_one_is_silent() {
+    fn an_autopilot_that_restarts_is_received_from_another_port_once_the_old_one_is_silent() {
         let mut peers = Peers::new(None, Peering::default(), None);
         let began = Instant::now();
         peers.take_any(at(1), &of(1), began);
@@ -346,7 +347,7 @@ mod tests {
     }
 
     #[test]
-    fn of_several_vehicles_at_one_port_the_pinned_one_is_heard() {
+    fn of_several_vehicles_at_one_port_only_the_pinned_one_is_received() {
         let mut peers = Peers::new(None, Peering::Autopilot { system: Some(2) }, None);
         let began = Instant::now();
         for second in 0..20 {
@@ -361,17 +362,17 @@ mod tests {
     }
 
     #[test]
-    fn only_known_ground_stations_are_heard() {
+    fn only_packets_of_known_ground_stations_are_received() {
         let mut peers = station(vec![at(3).ip()]);
         let now = Instant::now();
         let bytes = heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID, GROUND);
-        assert_eq!(peers.take_any(at(1), &bytes, now).strangers, 1);
+        assert_eq!(peers.take_any(at(1), &bytes, now).unknown_senders, 1);
         assert_eq!(peers.chosen, None);
         assert_eq!(peers.take_any(at(3), &bytes, now).packets.len(), 1);
     }
 
     #[test]
-    fn bytes_that_are_no_packets_hold_nobodys_place() {
+    fn a_peer_that_sends_only_noise_is_replaced() {
         let mut peers = station(Vec::new());
         let began = Instant::now();
         let bytes = heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID, GROUND);

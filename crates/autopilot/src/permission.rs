@@ -1,5 +1,5 @@
-//! Which packets of a ground station may go to the autopilot: everything, nothing that starts or stops motors, or only what
-//! changes nothing.
+//! Decides which packets of a ground station may go to the autopilot: all, all but those that start or stop motors, or only
+//! those that change nothing.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,15 +7,15 @@ use std::str::FromStr;
 use crate::dialect::{MavCmd, MavMessage, MavModeFlag, MessageData, SETUP_SIGNING_DATA};
 use crate::packet::Packet;
 
-/// What a ground station may send to the autopilot.
+/// The packets that a ground station may send to the autopilot.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub enum Permission {
     /// Everything but the key of signed packets, which no permission lets pass.
     #[default]
     Everything,
-    /// Everything but what starts or stops motors: arming, disarming, the safety switch, ending the flight, restarting.
+    /// Everything but packets that start or stop motors: arming, disarming, the safety switch, ending the flight, restarting.
     NoArming,
-    /// Only what changes nothing: heartbeats, the time, questions for parameters, missions and messages.
+    /// Only packets that change nothing: heartbeats, the time, questions for parameters, missions and messages.
     Monitor,
 }
 
@@ -38,8 +38,8 @@ impl Permission {
 
     /// Why a packet may not be sent, as a short name for counters; `None` when it may.
     ///
-    /// What the dialect does not know may only be sent with [`Permission::Everything`]: it could be anything. SETUP_SIGNING is
-    /// never sent: it has the key in clear text, and an autopilot that took it would refuse all that comes after it from here.
+    /// Packets that the dialect does not contain may only be sent with [`Permission::Everything`]: they could be anything. SETUP_SIGNING is
+    /// never sent: it has the key in clear text, and an autopilot that took it would refuse all later packets from here.
     pub fn refusal(self, packet: &Packet) -> Option<&'static str> {
         if packet.message_id == SETUP_SIGNING_DATA::ID {
             return Some("SETUP_SIGNING");
@@ -88,12 +88,12 @@ fn command(message: &MavMessage) -> Option<MavCmd> {
 struct Order {
     command: MavCmd,
     first_parameter: f32,
-    /// The fifth, sixth and seventh parameters; a mission's place is none.
+    /// The fifth, sixth and seventh parameters; a mission's position is none.
     last_parameters: [f32; 3],
 }
 
 impl Order {
-    #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+    #[allow(deprecated, reason = "ground stations still send superseded messages")]
     fn of(message: &MavMessage) -> Option<Self> {
         let (command, first_parameter, last_parameters) = match message {
             MavMessage::COMMAND_LONG(it) => {
@@ -147,17 +147,17 @@ impl Order {
     }
 }
 
-/// Whether the flags of a mode say that it is one of the firmware's own. Ground stations set that bit, alone or with others.
+/// Whether the flags of a mode mark it as one of the firmware's own. Ground stations set that bit, alone or with others.
 fn is_custom_mode(flags: f32) -> bool {
     let is_byte = (0.0..=255.0).contains(&flags);
     is_byte && flags as u8 & MavModeFlag::MAV_MODE_FLAG_CUSTOM_MODE_ENABLED.bits() != 0
 }
 
 /// SET_MODE counts as well: its flags can arm older autopilots. So do a script or a file that the autopilot would run, MAVLink
-/// packets for another of its links, what goes to its buses past its checks, and what a pilot's sticks, switches and buttons
-/// would do: sticks arm, and a switch may stop the motors in the air (ArduPilot's auxiliary functions, `ARMING_RUDDER`). A
+/// packets for another of its links, data for its buses that bypass its checks, and the effects of a pilot's sticks, switches and
+/// buttons: sticks arm, and a switch may stop the motors in the air (ArduPilot's auxiliary functions, `ARMING_RUDDER`). A
 /// mission's items count like commands, as AUTO carries them out in the air.
-#[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+#[allow(deprecated, reason = "ground stations still send superseded messages")]
 fn starts_or_stops_motors(message: &MavMessage) -> bool {
     Order::of(message).is_some_and(|order| order.starts_or_stops_motors())
         || matches!(
@@ -175,8 +175,8 @@ fn starts_or_stops_motors(message: &MavMessage) -> bool {
         )
 }
 
-/// Requests for streams are not among them: they would take the rates away that the controller has asked for.
-#[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+/// Requests for streams are not among them: they would change the rates that the controller has requested.
+#[allow(deprecated, reason = "ground stations still send superseded messages")]
 fn changes_nothing(message: &MavMessage) -> bool {
     match command(message) {
         Some(command) => matches!(
@@ -204,7 +204,7 @@ fn changes_nothing(message: &MavMessage) -> bool {
 }
 
 #[cfg(test)]
-#[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+#[allow(deprecated, reason = "ground stations still send superseded messages")]
 mod tests {
     use super::*;
     use crate::dialect::{
@@ -241,14 +241,15 @@ mod tests {
         [MavMessage::COMMAND_LONG(long), MavMessage::COMMAND_INT(int)]
     }
 
-    /// Places of missions are not parameters.
+    /// Positions of missions are not parameters.
     fn item(command: MavCmd) -> MavMessage {
-        let place = MISSION_ITEM_INT_DATA { x: 470_000_000, y: 80_000_000, ..Default::default() };
-        MavMessage::MISSION_ITEM_INT(MISSION_ITEM_INT_DATA { command, ..place })
+        let position =
+            MISSION_ITEM_INT_DATA { x: 470_000_000, y: 80_000_000, ..Default::default() };
+        MavMessage::MISSION_ITEM_INT(MISSION_ITEM_INT_DATA { command, ..position })
     }
 
     #[test]
-    fn each_permission_refuses_what_its_name_says() {
+    fn each_permission_refuses_the_packets_outside_its_name() {
         let arming = MavCmd::MAV_CMD_COMPONENT_ARM_DISARM;
         for (message, no_arming, monitor) in [
             (MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()), true, true),
@@ -303,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn without_arming_nothing_passes_that_halts_the_autopilot_or_its_motors() {
+    fn without_arming_no_packet_passes_that_halts_the_autopilot_or_its_motors() {
         for command in [
             MavCmd::MAV_CMD_DO_SET_SAFETY_SWITCH_STATE,
             MavCmd::MAV_CMD_DEBUG_TRAP,
@@ -332,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_known_passes_only_with_everything() {
+    fn unknown_packets_pass_only_with_everything() {
         let packet = Packet { message: None, ..packet(&long(MavCmd::MAV_CMD_NAV_LAND)) };
         assert_eq!(Permission::Everything.refusal(&packet), None);
         assert!(Permission::NoArming.refusal(&packet).is_some());

@@ -1,18 +1,18 @@
 //! Decodes PX4's EVENT messages into texts: failing checks, why it does not arm, failsafes, modes, take-off and landing.
 //!
-//! PX4 sends texts (STATUSTEXT) only over links on which it hears a ground station; events it sends over all of them, as numbers with
+//! PX4 sends texts (STATUSTEXT) only over links on which it receives a ground station; events it sends over all of them, as numbers with
 //! arguments (<https://mavlink.io/en/services/events.html>). The texts here are of the metadata that PX4 v1.17.0-alpha1 is built
-//! with (`events/all_events.json`; BSD 3-clause): the checks before arming and of the health, and what the commander says of arming,
-//! failsafes, modes, take-off and landing, and what it says of setpoints and landing targets. An event that is not among them is
-//! told by its number.
+//! with (`events/all_events.json`; BSD 3-clause): the checks before arming and of the health, and the commander's texts on arming,
+//! failsafes, modes, take-off and landing, setpoints and landing targets. An event that is not among them is
+//! reported by its number.
 
 use crate::dialect::{EVENT_DATA, MavSeverity};
 
-/// Bits of an event's id that tell the event; those above tell the component.
+/// Bits of an event's id that identify the event; those above identify the component.
 const EVENT_BITS: u32 = 0x00ff_ffff;
-/// The least severe of PX4's levels that is told. What is above has no text, or is for programs.
+/// The least severe of PX4's levels that is reported. Levels above it have no text, or are for programs.
 const INFORMATION: u8 = 6;
-/// The least severe level of an event whose text is not known that is told.
+/// The least severe level at which an event with an unknown text is reported.
 const WARNING: u8 = 4;
 /// The events for programs that begin and end a report of all failing checks.
 const CHECKS_BEGIN: u32 = 11_047_904;
@@ -20,7 +20,7 @@ const CHECKS_END: u32 = 1_914_663;
 /// Where the first of them has the modes in which the vehicle can be armed, in bytes.
 const CAN_ARM_AT: usize = 9;
 
-/// What an event is.
+/// A decoded event.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Px4Event {
     /// The first of a report of all failing checks.
@@ -31,12 +31,12 @@ pub(crate) enum Px4Event {
     /// The end of such a report.
     ChecksEnd,
     /// It has a text.
-    Told(Told),
+    Text(TextEvent),
 }
 
-/// What an event says.
+/// An event with a text.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Told {
+pub(crate) struct TextEvent {
     pub(crate) severity: MavSeverity,
     pub(crate) text: String,
     /// Whether the text is PX4's own; else it names the number.
@@ -73,11 +73,11 @@ enum Kind {
 
 use Kind::{Action, Advice, BatteryFault, Cause, EscFault, F32, I16, Mode, Reason, U8, U16};
 
-/// An event's number, whether it is a check before arming, its text, and the arguments in it with their place in bytes.
+/// An event's number, whether it is a check before arming, its text, and the arguments in it with their offset in bytes.
 type Row = (u32, bool, &'static str, &'static [(Kind, usize)]);
 
-/// What PX4 does in a failsafe, why, its modes, why it arms and disarms, faults of batteries and motors, and what to do about
-/// them, by number.
+/// PX4's failsafe actions and their causes, its modes, its reasons to arm and disarm, faults of batteries and motors, and the
+/// advice on them, by number.
 const ACTIONS: [&str; 11] = [
     "nothing",
     "a warning",
@@ -163,7 +163,7 @@ const ESC_FAULTS: [&str; 10] = [
 ];
 const ADVICE: [&str; 3] = ["", "Land now!", "Reduce throttle!"];
 
-/// What an event is; `None` for one that is for programs only. `in_report` after the beginning of a report of all failing
+/// Decodes an event; `None` for one that is for programs only. `in_report` after the beginning of a report of all failing
 /// checks: there, an event whose text is not known is a check as well.
 pub(crate) fn read(event: &EVENT_DATA, in_report: bool) -> Option<Px4Event> {
     let number = event.id & EVENT_BITS;
@@ -184,8 +184,8 @@ pub(crate) fn read(event: &EVENT_DATA, in_report: bool) -> Option<Px4Event> {
             "PX4's event {number}, whose text is not known here: look the number up in all_events.json of PX4's build"
         );
         let check = in_report.then_some(Check { id: (number, [0; 3]), modes });
-        let told = Told { severity, text, is_known: false, check };
-        return (level <= WARNING).then_some(Px4Event::Told(told));
+        let decoded = TextEvent { severity, text, is_known: false, check };
+        return (level <= WARNING).then_some(Px4Event::Text(decoded));
     };
     let mut text = (*text).to_owned();
     for (kind, at) in *arguments {
@@ -199,7 +199,7 @@ pub(crate) fn read(event: &EVENT_DATA, in_report: bool) -> Option<Px4Event> {
         [*slot] = bytes(event, *at);
     }
     let check = is_check.then_some(Check { id: (number, which), modes });
-    Some(Px4Event::Told(Told { severity, text, is_known: true, check }))
+    Some(Px4Event::Text(TextEvent { severity, text, is_known: true, check }))
 }
 
 fn severity(level: u8) -> Option<MavSeverity> {
@@ -424,15 +424,15 @@ mod tests {
         event
     }
 
-    fn told(id: u32, level: u8, arguments: &[u8]) -> Told {
+    fn text_event(id: u32, level: u8, arguments: &[u8]) -> TextEvent {
         match read(&event(id, level, arguments), false) {
-            Some(Px4Event::Told(told)) => told,
+            Some(Px4Event::Text(decoded)) => decoded,
             other => panic!("{other:?}"),
         }
     }
 
     fn text(id: u32, level: u8, arguments: &[u8]) -> String {
-        told(id, level, arguments).text
+        text_event(id, level, arguments).text
     }
 
     #[test]
@@ -440,21 +440,21 @@ mod tests {
         assert!(TABLE.is_sorted_by_key(|row| row.0));
         for (id, is_check, text, arguments) in &TABLE {
             assert_eq!(text.matches("{}").count(), arguments.len(), "{text}");
-            let told = told(0x0100_0000 | id, 2, &[0xff; 40]);
-            assert!(!told.text.contains("{}"), "{}", told.text);
-            assert_eq!(told.check.is_some(), *is_check, "{}", told.text);
+            let decoded = text_event(0x0100_0000 | id, 2, &[0xff; 40]);
+            assert!(!decoded.text.contains("{}"), "{}", decoded.text);
+            assert_eq!(decoded.check.is_some(), *is_check, "{}", decoded.text);
         }
     }
 
     #[test]
-    fn events_as_px4_sent_them_are_told() {
+    fn events_recorded_from_px4_are_decoded() {
         // Recorded from 1.17.
         assert_eq!(
             text(0x0102_089d, 0x62, &[]),
             "Arming denied: Resolve system health failures first"
         );
         assert_eq!(text(0x0190_caf3, 0x66, &[4]), "Armed by external command");
-        let no_stick = told(0x0106_ed29, 0x44, &[0xff, 0xff, 0xff, 0xff, 7]);
+        let no_stick = text_event(0x0106_ed29, 0x44, &[0xff, 0xff, 0xff, 0xff, 7]);
         let check = Check { id: (453_929, [0; 3]), modes: u32::MAX };
         assert_eq!(
             (no_stick.text.as_str(), no_stick.check),
@@ -463,38 +463,38 @@ mod tests {
     }
 
     #[test]
-    fn a_report_of_the_checks_tells_in_which_modes_it_can_be_armed() {
+    fn a_report_of_the_checks_gives_the_modes_in_which_it_can_be_armed() {
         let mut summary = [0; 17];
         summary[9..13].copy_from_slice(&0x0002_8010_u32.to_le_bytes());
         let begin = read(&event(0x01a8_93e0, 0x88, &summary), false);
         assert_eq!(begin, Some(Px4Event::ChecksBegin { can_arm: 0x0002_8010 }));
         assert_eq!(read(&event(0x011d_3727, 0x88, &[]), true), Some(Px4Event::ChecksEnd));
-        let stranger = |in_report| match read(&event(1, 3, &[0x10]), in_report) {
-            Some(Px4Event::Told(told)) => told.check,
+        let unknown = |in_report| match read(&event(1, 3, &[0x10]), in_report) {
+            Some(Px4Event::Text(decoded)) => decoded.check,
             other => panic!("{other:?}"),
         };
-        assert_eq!(stranger(true), Some(Check { id: (1, [0; 3]), modes: 0x10 }));
-        assert_eq!(stranger(false), None);
+        assert_eq!(unknown(true), Some(Check { id: (1, [0; 3]), modes: 0x10 }));
+        assert_eq!(unknown(false), None);
     }
 
     #[test]
-    fn failsafes_name_cause_and_action_and_strangers_their_number() {
+    fn failsafes_name_cause_and_action_and_unknown_events_their_number() {
         let enter = &[0, 0, 0, 0, 5, 2];
         assert_eq!(text(9_751_178, 2, enter), "GCS connection loss: switching to Hold");
         let wait = &[0, 0, 0, 0, 6, 5, 0, 3];
         assert_eq!(text(13_704_694, 4, wait), "Low battery level: switching to RTL in 5 seconds");
         assert_eq!(text(16_017_271, 6, &[77]), "Disarmed by 77");
-        let stranger = text(1, 3, &[]);
+        let unknown = text(1, 3, &[]);
         assert!(
-            stranger.starts_with("PX4's event 1, whose text is not known here: look"),
-            "{stranger}"
+            unknown.starts_with("PX4's event 1, whose text is not known here: look"),
+            "{unknown}"
         );
         assert_eq!(read(&event(1, 6, &[]), false), None);
         assert_eq!(read(&event(1, 0xff, &[]), false), None);
     }
 
     #[test]
-    fn faults_name_what_failed_and_what_to_do() {
+    fn faults_name_the_failed_part_and_the_advice() {
         let battery = text(15_602_498, 0x40, &[0xff, 0xff, 0xff, 0xff, 11, 1, 2, 1]);
         assert_eq!(battery, "Battery 1: One or more battery cells have failed. Land now!");
         let esc = text(6_948_489, 0x33, &[0xff, 0xff, 0xff, 0xff, 8, 4, 5, 0]);

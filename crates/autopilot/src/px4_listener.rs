@@ -1,21 +1,21 @@
 //! Follows a PX4's events: which arming checks fail now, which events are repetitions, and when a report of all checks is requested
 //! again.
 //!
-//! Whenever one check changes PX4 sends all that fail, between two summaries. It sends a check that does not prevent arming as
-//! one that fails in all modes (`HealthAndArmingChecks/Common.cpp: reportedModes`), like one that prevents it in all: what tells
-//! them apart is that after the latter it can be armed in no mode, and the level. Who comes after that is told nothing until the next
-//! change, so a disarmed PX4 is asked to report what fails now (MAV_CMD_RUN_PREARM_CHECKS): `Commander.cpp:
-//! handle_command` then sends its report once more.
+//! Whenever one check changes, PX4 sends all failing checks between two summaries. It sends a check that does not prevent arming as
+//! one that fails in all modes (`HealthAndArmingChecks/Common.cpp: reportedModes`), like one that prevents it in all. The two are
+//! distinguished by the level, and because after the latter it can be armed in no mode. A client that connects later receives no
+//! report until the next change. So a disarmed PX4 is requested to report its failing checks (MAV_CMD_RUN_PREARM_CHECKS):
+//! `Commander.cpp: handle_command` then sends its report once more.
 
 use std::collections::VecDeque;
 
 use crate::compose;
 use crate::dialect::{EVENT_DATA, MavMessage, MavResult, MavSeverity};
-use crate::px4_events::{self, Check, Px4Event, Told};
+use crate::px4_events::{self, Check, Px4Event, TextEvent};
 
-/// PX4's modes to hold, to take off and to land, as a check tells for which it fails.
+/// PX4's modes to hold, to take off and to land, as the bits by which a check lists the modes for which it fails.
 const OUR_MODES: u32 = 0x10 | 0x2_0000 | 0x4_0000;
-/// Maximum number of checks kept; PX4 reports up to 14.
+/// Maximum number of stored checks; PX4 reports up to 14.
 const MAX_CHECKS: usize = 16;
 /// Maximum number of checks named as the reason.
 const MAX_NAMED: usize = 4;
@@ -31,8 +31,8 @@ const QUESTION_PERIOD_NS: i64 = 2_000_000_000;
 pub(crate) struct Listener {
     newest: Option<u16>,
     in_report: bool,
-    /// Whether all of that report came so far.
-    is_whole: bool,
+    /// Whether no part of that report is missing so far.
+    is_complete: bool,
     /// The modes in which it can be armed; none while unknown.
     can_arm: u32,
     checks: Vec<Failing>,
@@ -42,10 +42,10 @@ pub(crate) struct Listener {
     question: Question,
 }
 
-/// What came of the question for a report.
+/// The state of the request for a report.
 #[derive(Copy, Clone, Debug, Default)]
 struct Question {
-    /// A whole report came, asked for or not, or the question was refused.
+    /// A complete report came, requested or not, or the request was refused.
     is_over: bool,
     asked: u8,
     due_ns: Option<i64>,
@@ -58,17 +58,17 @@ struct Failing {
     text: String,
 }
 
-/// What was heard.
+/// The text of an event, and whether it is a repetition.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Heard {
+pub(crate) struct EventText {
     pub(crate) severity: MavSeverity,
     pub(crate) text: String,
     pub(crate) about: About,
-    /// Whether it was told as a text already, or is: where PX4 hears a ground station it sends most both ways.
-    pub(crate) is_told: bool,
+    /// Whether it is reported by a STATUSTEXT as well: where PX4 receives a ground station it sends most texts both ways.
+    pub(crate) is_reported: bool,
 }
 
-/// What a text is about.
+/// The subject of a text.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum About {
     /// A check that prevents arming.
@@ -80,48 +80,48 @@ pub(crate) enum About {
 }
 
 impl Listener {
-    /// What an event says; `None` for one that was heard before, that is for programs, or a check for a mode that no landing
+    /// The text of an event; `None` for one that was received before, that is for programs, or a check for a mode that no landing
     /// needs.
-    pub(crate) fn take(&mut self, event: &EVENT_DATA) -> Option<Heard> {
+    pub(crate) fn take(&mut self, event: &EVENT_DATA) -> Option<EventText> {
         let behind = self.newest.map(|newest| newest.wrapping_sub(event.sequence));
         if behind.is_some_and(|behind| behind < MAX_BEHIND) {
             return None;
         }
         if self.newest.is_some_and(|newest| event.sequence != newest.wrapping_add(1)) {
-            // The end of a report may be among what was lost.
-            (self.in_report, self.is_whole) = (false, false);
+            // The end of a report may be among the lost events.
+            (self.in_report, self.is_complete) = (false, false);
         }
         self.newest = Some(event.sequence);
         match px4_events::read(event, self.in_report)? {
             Px4Event::ChecksBegin { can_arm } => {
                 self.can_arm = can_arm;
                 self.begin_report();
-                self.is_whole = true;
+                self.is_complete = true;
                 None
             }
             Px4Event::ChecksEnd => {
-                self.question.is_over |= self.is_whole;
-                (self.in_report, self.is_whole) = (false, false);
+                self.question.is_over |= self.is_complete;
+                (self.in_report, self.is_complete) = (false, false);
                 None
             }
-            Px4Event::Told(Told { severity, text, is_known, check: None }) => {
-                let is_told = self.texts.is_told(Form::Event { is_known }, &text);
-                Some(Heard { severity, text, about: About::Else, is_told })
+            Px4Event::Text(TextEvent { severity, text, is_known, check: None }) => {
+                let is_reported = self.texts.is_reported(Form::Event { is_known }, &text);
+                Some(EventText { severity, text, about: About::Else, is_reported })
             }
-            Px4Event::Told(Told { severity, text, is_known, check: Some(check) }) => {
+            Px4Event::Text(TextEvent { severity, text, is_known, check: Some(check) }) => {
                 let about = self.take_check(Failing { check, severity, text: text.clone() })?;
-                let is_told = self.texts.is_told(Form::Event { is_known }, &text);
-                Some(Heard { severity, text, about, is_told })
+                let is_reported = self.texts.is_reported(Form::Event { is_known }, &text);
+                Some(EventText { severity, text, about, is_reported })
             }
         }
     }
 
-    /// Whether a text that PX4 marks as one that it sends as an event too was told as that.
-    pub(crate) fn is_told(&mut self, text: &str) -> bool {
-        self.texts.is_told(Form::Text, text)
+    /// Whether a text that PX4 marks as one that it also sends as an event was reported as an event.
+    pub(crate) fn is_reported(&mut self, text: &str) -> bool {
+        self.texts.is_reported(Form::Text, text)
     }
 
-    /// The question for a report of all failing checks, when it is due.
+    /// The request for a report of all failing checks, when it is due.
     pub(crate) fn question(&mut self, now_ns: i64, is_armed: bool) -> Option<MavMessage> {
         let Question { is_over, asked, due_ns } = &mut self.question;
         let is_due = due_ns.is_none_or(|due_ns| now_ns >= due_ns);
@@ -133,8 +133,8 @@ impl Listener {
         Some(compose::run_prearm_checks())
     }
 
-    /// The question was acknowledged. A PX4 that refuses it does so each time, unless it says that it does so for now; of one that
-    /// accepted it the report may be lost.
+    /// The request was acknowledged. A PX4 that refuses it does so each time, unless it marks the refusal as temporary. After an
+    /// acceptance the report may be lost.
     pub(crate) fn acknowledged(&mut self, result: MavResult) {
         let may_report = matches!(
             result,
@@ -192,26 +192,26 @@ impl Listener {
         preventing.take(MAX_NAMED).map(|failing| failing.text.as_str())
     }
 
-    /// Why it cannot be armed, as far as the checks tell.
+    /// Why it cannot be armed, as far as the checks show.
     pub(crate) fn why_not_armed(&self) -> Option<String> {
         let (preventing, others): (Vec<_>, Vec<_>) =
             self.checks.iter().partition(|failing| self.prevents_arming(failing));
         if !preventing.is_empty() {
             return Some(named(&preventing));
         }
-        let also = format!("checks not passed yet; PX4 also says: {}", named(&others));
+        let also = format!("checks not passed yet; PX4 also reports: {}", named(&others));
         (!others.is_empty()).then_some(also)
     }
 }
 
-/// How something is told.
+/// The form of a report.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 enum Form {
     Text,
     Event { is_known: bool },
 }
 
-/// What was told in one form and may come in the other.
+/// Reports that came in one form and may come in the other.
 #[derive(Clone, Debug, Default)]
 struct Twins {
     /// Whether texts come that are events as well.
@@ -220,11 +220,11 @@ struct Twins {
 }
 
 impl Twins {
-    /// Maximum number of those that wait.
+    /// Maximum number of waiting ones.
     const MAX_WAITING: usize = 16;
 
-    /// Whether it was told in the other form, or, an event whose text is not known, is.
-    fn is_told(&mut self, form: Form, words: &str) -> bool {
+    /// Whether it was reported in the other form, or will be, for an event whose text is not known.
+    fn is_reported(&mut self, form: Form, words: &str) -> bool {
         self.has_texts |= form == Form::Text;
         if form == (Form::Event { is_known: false }) {
             return self.has_texts;
@@ -271,7 +271,7 @@ mod tests {
     }
 
     impl Px4 {
-        fn send(&mut self, id: u32, level: u8, arguments: &[u8]) -> Option<Heard> {
+        fn send(&mut self, id: u32, level: u8, arguments: &[u8]) -> Option<EventText> {
             self.sequence = self.sequence.wrapping_add(1);
             let (log_levels, sequence) = (level, self.sequence);
             let mut event = EVENT_DATA { id, log_levels, sequence, ..EVENT_DATA::default() };
@@ -279,17 +279,17 @@ mod tests {
             self.listener.take(&event)
         }
 
-        /// Reports failing checks by number, level and modes; what was heard of each.
+        /// Reports failing checks by number, level and modes; returns the texts' subjects.
         fn report(&mut self, can_arm: u32, checks: &[(u32, u8, u32)]) -> Vec<Option<About>> {
             let mut summary = [0; 17];
             summary[9..13].copy_from_slice(&can_arm.to_le_bytes());
             assert_eq!(self.send(BEGIN, 0x88, &summary), None);
             let send = |(id, level, modes): &(u32, u8, u32)| {
-                self.send(*id, *level, &modes.to_le_bytes()).map(|heard| heard.about)
+                self.send(*id, *level, &modes.to_le_bytes()).map(|received| received.about)
             };
-            let heard = checks.iter().map(send).collect();
+            let received = checks.iter().map(send).collect();
             assert_eq!(self.send(END, 0x88, &[]), None);
-            heard
+            received
         }
 
         fn why(&self) -> String {
@@ -298,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn what_prevents_arming_is_named_and_not_what_is_optional() {
+    fn checks_that_prevent_arming_are_named_and_optional_ones_are_not() {
         let mut px4 = Px4::default();
         let position = (NO_POSITION, 3, OUR_MODES);
         let sticks = (NO_STICKS, 4, ALL);
@@ -308,7 +308,7 @@ mod tests {
         px4.report(0, &[sticks, (SAFETY_BUTTON, 3, ALL)]);
         assert_eq!(px4.why(), "Press safety button first");
         px4.report(ALL, &[sticks, (SAFETY_BUTTON, 3, ALL)]);
-        assert!(px4.why().starts_with("checks not passed yet; PX4 also says: No manual"));
+        assert!(px4.why().starts_with("checks not passed yet; PX4 also reports: No manual"));
         px4.report(0, &[sticks, (SAFETY_BUTTON, 6, ALL)]);
         assert!(px4.why().ends_with("No manual control input; Press safety button first"));
         // For information, and for a mode of no landing.
@@ -317,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cured_cause_is_named_no_more_and_a_stranger_in_a_report_is() {
+    fn a_cured_cause_is_named_no_more_and_an_unknown_one_in_a_report_is() {
         let mut px4 = Px4::default();
         px4.report(0, &[(NO_POSITION, 3, OUR_MODES)]);
         px4.report(0, &[(1, 3, OUR_MODES)]);
@@ -339,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn an_event_is_heard_once_also_over_the_counters_end_and_again_after_a_restart() {
+    fn an_event_is_taken_once_also_over_the_counters_end_and_again_after_a_restart() {
         let mut px4 = Px4 { sequence: u16::MAX - 5, ..Px4::default() };
         for _ in 0..40 {
             assert!(px4.send(TAKEN_OVER, 4, &[]).is_some());
@@ -354,10 +354,10 @@ mod tests {
     }
 
     #[test]
-    fn a_check_that_gets_worse_is_told_again_and_so_is_another_fault_of_a_battery() {
+    fn a_check_that_gets_worse_is_reported_again_and_so_is_another_fault_of_a_battery() {
         const BATTERY: u32 = 15_602_498;
         let mut px4 = Px4::default();
-        let about = |heard: Option<Heard>| heard.map(|heard| heard.about);
+        let about = |received: Option<EventText>| received.map(|received| received.about);
         let new = Some(About::Arming { is_new: true });
         px4.report(0, &[(NO_POSITION, 4, OUR_MODES)]);
         assert_eq!(px4.report(0, &[(NO_POSITION, 3, OUR_MODES)]), [new]);
@@ -373,26 +373,26 @@ mod tests {
     }
 
     #[test]
-    fn a_report_of_which_the_ends_were_lost_is_not_mixed_with_the_next() {
+    fn a_report_whose_ends_were_lost_is_not_mixed_with_the_next() {
         let mut px4 = Px4::default();
         px4.report(0, &[(NO_POSITION, 3, OUR_MODES)]);
         // Its first summary is lost.
         px4.sequence += 1;
         px4.send(SAFETY_BUTTON, 3, &ALL.to_le_bytes());
         assert_eq!(px4.why(), "Press safety button first");
-        // And its last one: what follows is no check.
+        // And its last one: the events behind it are no checks.
         px4.sequence += 1;
-        let stranger = px4.send(1, 3, &[]).map(|heard| heard.about);
-        assert_eq!(stranger, Some(About::Else));
+        let unknown = px4.send(1, 3, &[]).map(|received| received.about);
+        assert_eq!(unknown, Some(About::Else));
     }
 
-    /// How often it is asked from now on.
+    /// The number of further requests.
     fn asked(listener: &mut Listener) -> usize {
         (0..20).filter(|i| listener.question(i * QUESTION_PERIOD_NS, false).is_some()).count()
     }
 
     #[test]
-    fn only_a_whole_report_answers_the_question() {
+    fn only_a_complete_report_ends_the_requests() {
         let mut summary = [0; 17];
         summary[9] = 1;
         let modes = OUR_MODES.to_le_bytes();
@@ -422,7 +422,7 @@ mod tests {
     }
 
     #[test]
-    fn the_question_is_asked_again_unless_it_is_refused_for_good() {
+    fn the_request_is_repeated_unless_it_is_refused_permanently() {
         let answers = [
             (MavResult::MAV_RESULT_ACCEPTED, 2),
             (MavResult::MAV_RESULT_TEMPORARILY_REJECTED, 2),
@@ -440,25 +440,25 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_as_a_text_and_as_an_event_is_told_once_in_either_order_and_each_time() {
+    fn a_text_that_comes_also_as_an_event_is_reported_once_in_either_order_and_each_time() {
         let mut px4 = Px4::default();
-        let words = px4.send(TAKEN_OVER, 4, &[]).map(|heard| heard.text).unwrap_or_default();
-        assert!(px4.listener.is_told(&words));
+        let words = px4.send(TAKEN_OVER, 4, &[]).map(|received| received.text).unwrap_or_default();
+        assert!(px4.listener.is_reported(&words));
         for _ in 0..2 {
-            assert!(!px4.listener.is_told(&words));
-            assert!(px4.send(TAKEN_OVER, 4, &[]).is_some_and(|heard| heard.is_told));
+            assert!(!px4.listener.is_reported(&words));
+            assert!(px4.send(TAKEN_OVER, 4, &[]).is_some_and(|received| received.is_reported));
         }
-        // Its own words are a text where it sends texts.
-        assert!(px4.send(1, 3, &[]).is_some_and(|heard| heard.is_told));
-        assert!(!Px4::default().send(1, 3, &[]).is_some_and(|heard| heard.is_told));
+        // An unknown event comes also as a text where PX4 sends texts.
+        assert!(px4.send(1, 3, &[]).is_some_and(|received| received.is_reported));
+        assert!(!Px4::default().send(1, 3, &[]).is_some_and(|received| received.is_reported));
         for number in 0..100 {
-            assert!(!px4.listener.is_told(&number.to_string()));
+            assert!(!px4.listener.is_reported(&number.to_string()));
         }
         assert_eq!(px4.listener.texts.waiting.len(), Twins::MAX_WAITING);
     }
 
     #[test]
-    fn however_many_checks_fail_few_are_named_and_a_limited_number_is_kept() {
+    fn however_many_checks_fail_few_are_named_and_a_limited_number_is_stored() {
         let mut px4 = Px4::default();
         let checks: Vec<_> = (1..=40).map(|id| (id, 3, OUR_MODES)).collect();
         px4.report(0, &checks);

@@ -9,14 +9,14 @@ use crate::packet::{Packet, Sender};
 
 /// Silence after which another companion with our ids counts as gone, in nanoseconds.
 const GONE_NS: i64 = 10_000_000_000;
-/// Time within which a packet of ours comes back, in nanoseconds. One that comes back later counts as another companion's: the longer the
+/// Time within which a packet of ours returns, in nanoseconds. One that returns later counts as another companion's: the longer the
 /// time, the more packets of that one look like ours by chance.
 const MAX_ECHO_NS: i64 = 2_000_000_000;
 
-/// Who has our ids.
+/// Detects another companion with our ids.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct SameAddress {
-    /// What we sent last with each sequence number.
+    /// The last packet that we sent with each sequence number.
     sent: BTreeMap<u8, Sent>,
     other: Option<Other>,
 }
@@ -27,7 +27,7 @@ struct Sent {
     content: Content,
 }
 
-/// What tells packets with one sequence number apart: the checksum is over all of a packet, from the header on.
+/// Distinguishes packets with one sequence number: the checksum covers the complete packet, from the header on.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 struct Content {
     length: usize,
@@ -89,7 +89,7 @@ impl SameAddress {
         self.other.filter(|other| now_ns.saturating_sub(other.last_ns) < GONE_NS)
     }
 
-    /// Why nothing may begin: another companion has `sender`, our ids.
+    /// Why no flight may begin: another companion has `sender`, our ids.
     pub(crate) fn conflict(&self, now_ns: i64, sender: Sender) -> Option<Conflict> {
         let Other { message, steers, .. } = self.other(now_ns)?;
         Some(match steers {
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn our_own_packets_that_come_back_are_no_other_controllers() {
+    fn our_packets_that_a_router_returns_are_not_another_controllers() {
         let mut same = SameAddress::default();
         for i in 0..1000_i64 {
             let raw = match i % 20 {
@@ -139,26 +139,26 @@ mod tests {
     }
 
     #[test]
-    fn who_else_has_our_ids_is_said_to_steer_once_it_does() {
+    fn another_companion_with_our_ids_is_reported_to_steer_once_it_does() {
         let mut same = SameAddress::default();
         let heartbeat = encode(OURS, 7, &MavMessage::HEARTBEAT(compose::heartbeat()));
         same.sent(0, 7, &heartbeat);
         // Ours, much later.
         take(&mut same, 4000 * MS, &heartbeat);
-        let told =
+        let reason =
             |same: &SameAddress, ms: i64| same.conflict(ms * MS, OURS).map(|it| it.to_string());
-        let waits = told(&same, 4001).unwrap();
+        let waits = reason(&same, 4001).unwrap();
         let parts = ["(1 and 191)", "HEARTBEAT", "no setpoints so far", "`autopilot.component_id`"];
         assert!(parts.iter().all(|part| waits.contains(part)), "{waits}");
         // A setpoint with the number of one of ours, and another content.
         same.sent(5000 * MS, 9, &setpoint(9, 5000));
         take(&mut same, 5001 * MS, &setpoint(9, 4990));
         take(&mut same, 5002 * MS, &heartbeat);
-        let steers = told(&same, 5003).unwrap();
+        let steers = reason(&same, 5003).unwrap();
         assert!(
             steers.contains("SET_POSITION_TARGET_LOCAL_NED") && steers.contains("End that one"),
             "{steers}"
         );
-        assert_eq!(told(&same, 15_003), None, "it has gone");
+        assert_eq!(reason(&same, 15_003), None, "it has gone");
     }
 }

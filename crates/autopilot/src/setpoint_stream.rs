@@ -1,4 +1,4 @@
-//! The stream of setpoints that PX4's OFFBOARD needs, before it and while it lasts.
+//! The stream of setpoints that PX4's OFFBOARD needs, before it and during it.
 
 /// Time for which setpoints are sent before OFFBOARD is requested, in nanoseconds: PX4 enters it only after a
 /// second of setpoints at 2 Hz or more (<https://docs.px4.io/main/en/flight_modes/offboard.html>).
@@ -7,14 +7,14 @@ const PROOF_NS: i64 = 1_300_000_000;
 const MAX_GAP_NS: i64 = 300_000_000;
 /// Period of the zeros, in nanoseconds.
 const PERIOD_NS: i64 = 50_000_000;
-/// Time for which zeros go on without being asked for again, in nanoseconds: ticks are 25 ms apart.
+/// Time for which zeros continue without another request, in nanoseconds: ticks are 25 ms apart.
 const ZEROS_NS: i64 = 60_000_000;
 
 /// When setpoints were sent, and until when zeros are.
 #[derive(Copy, Clone, Debug, Default)]
 pub(crate) struct SetpointStream {
     /// Since when they have been sent without a gap, and when the last one was.
-    lasts: Option<(i64, i64)>,
+    span: Option<(i64, i64)>,
     zeros_until_ns: Option<i64>,
 }
 
@@ -22,7 +22,7 @@ impl SetpointStream {
     /// A setpoint is sent now.
     pub(crate) fn sent(&mut self, now_ns: i64) {
         let since_ns = self.since_ns(now_ns).unwrap_or(now_ns);
-        self.lasts = Some((since_ns, now_ns));
+        self.span = Some((since_ns, now_ns));
     }
 
     /// Zeros are sent until the next call, a tick later.
@@ -30,12 +30,12 @@ impl SetpointStream {
         self.zeros_until_ns = Some(now_ns.saturating_add(ZEROS_NS));
     }
 
-    /// True when a zero is to be sent, where `is_wanted` says that OFFBOARD is requested.
-    pub(crate) fn is_zero_due(&self, now_ns: i64, is_wanted: bool) -> bool {
+    /// True when a zero is to be sent, where `is_requested` states that OFFBOARD is requested.
+    pub(crate) fn is_zero_due(&self, now_ns: i64, is_requested: bool) -> bool {
         let is_asked_for = self.zeros_until_ns.is_some_and(|until_ns| now_ns < until_ns);
         let is_recent = |last_ns: i64| (0..PERIOD_NS).contains(&now_ns.saturating_sub(last_ns));
-        let is_due = self.lasts.is_none_or(|(_, last_ns)| !is_recent(last_ns));
-        (is_wanted || is_asked_for) && is_due
+        let is_due = self.span.is_none_or(|(_, last_ns)| !is_recent(last_ns));
+        (is_requested || is_asked_for) && is_due
     }
 
     /// For how long setpoints must still be sent before OFFBOARD is requested, in nanoseconds.
@@ -46,11 +46,11 @@ impl SetpointStream {
 
     /// When the last one was sent.
     pub(crate) fn last_ns(&self) -> Option<i64> {
-        self.lasts.map(|(_, last_ns)| last_ns)
+        self.span.map(|(_, last_ns)| last_ns)
     }
 
     fn since_ns(&self, now_ns: i64) -> Option<i64> {
         let is_gap = |last_ns: i64| !(0..=MAX_GAP_NS).contains(&now_ns.saturating_sub(last_ns));
-        self.lasts.filter(|(_, last_ns)| !is_gap(*last_ns)).map(|(since_ns, _)| since_ns)
+        self.span.filter(|(_, last_ns)| !is_gap(*last_ns)).map(|(since_ns, _)| since_ns)
     }
 }

@@ -1,10 +1,10 @@
-//! Signed packets of MAVLink 2 (<https://mavlink.io/en/guide/message_signing.html>): who has not the key can neither
-//! make a packet nor send an old one again, but those of the last minute before this side was started, which the standard allows.
+//! Signs and verifies packets of MAVLink 2 (<https://mavlink.io/en/guide/message_signing.html>). Without the key a sender can neither
+//! make a packet nor replay an old one, except those of the last minute before this side was started, which the standard allows.
 //!
 //! A signature is 13 bytes behind the checksum: a link id, a stamp of 48 bits in units of 10 µs since 2015, and the first
 //! 48 bits of SHA-256 over the key and the packet. Stamps only grow: a sender takes the later of its clock and the
-//! newest stamp that it has sent or accepted, so that one whose clock is wrong is still accepted by those with whom
-//! it speaks.
+//! newest stamp that it has sent or accepted, so that one whose clock is wrong is still accepted by its
+//! peers.
 
 use std::fmt;
 use std::str::FromStr;
@@ -32,7 +32,7 @@ const MAX_BEHIND: u64 = 60 * PER_S;
 const MAX_STAMP: u64 = (1 << 48) - 1;
 /// Maximum number of streams (link, system and component) of the holders of the key.
 const MAX_STREAMS: usize = 32;
-/// What a radio adds to the line by itself, without a key, and what nobody acts upon.
+/// Messages that a radio adds to the line on its own, without a key, and on which no receiver acts.
 const OF_RADIO: u32 = RADIO_STATUS_DATA::ID;
 
 /// The stamp of a time since 1970; 0 before 2015.
@@ -45,7 +45,7 @@ pub fn stamp(since_1970: Duration) -> u64 {
 #[derive(Clone)]
 pub struct Key([u8; KEY]);
 
-/// Why a text is no key.
+/// A text that is no key.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "neither 64 hexadecimal digits nor a passphrase of {} to {} characters in one line",
@@ -119,7 +119,7 @@ impl Refusal {
         }
     }
 
-    /// What can be done about it.
+    /// The remedy.
     pub fn advice(self) -> &'static str {
         match self {
             Self::Unsigned => "give the other side the same key, or take `signing_key` away here",
@@ -162,7 +162,7 @@ impl Refusals {
     }
 }
 
-/// One leg of the way: signs what is sent, and verifies what is received.
+/// One leg of the path: signs sent packets, and verifies received ones.
 #[derive(Debug)]
 pub struct Signing {
     key: Key,
@@ -170,7 +170,7 @@ pub struct Signing {
     /// The newest stamp sent or accepted.
     newest: u64,
     streams: Vec<Stream>,
-    /// Whose packets were signed here, which never come from the other side.
+    /// Senders whose packets were signed here. Their packets never come from the other side.
     signed: Vec<Sender>,
 }
 
@@ -193,7 +193,7 @@ impl Signing {
         self.newest
     }
 
-    /// The packet with our signature in place of any other; one of MAVLink 1 becomes one of MAVLink 2. `None` for what is no
+    /// The packet with our signature in place of any other; one of MAVLink 1 becomes one of MAVLink 2. `None` for bytes that are no
     /// packet. `now` is the clock's [`stamp`].
     pub fn sign(&mut self, now: u64, raw: &[u8]) -> Option<Vec<u8>> {
         let mut signed = reframe(raw, SIGNED)?;
@@ -206,7 +206,7 @@ impl Signing {
         Some(signed)
     }
 
-    /// Notes whose packet is signed here.
+    /// Notes the sender of a packet that is signed here.
     fn note_signed(&mut self, raw: &[u8]) {
         // As `reframe` makes it.
         let &[_, _, _, _, _, system, component, ..] = raw else { return };
@@ -228,7 +228,7 @@ impl Signing {
             return Err(Refusal::WrongKey);
         }
         let Stamped { link_id, stamp, .. } = stamped;
-        // Somebody sends us what we have sent.
+        // A packet of ours was sent back to us.
         if link_id == self.link_id && self.signed.contains(&packet.sender) {
             return Err(Refusal::Replayed);
         }
@@ -246,7 +246,7 @@ impl Signing {
     }
 }
 
-/// What a signature is over, without the key.
+/// The bytes that a signature covers, without the key.
 struct Stamped<'a> {
     all: &'a [u8],
     link_id: u8,
@@ -312,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_signed_is_verified_once() {
+    fn a_signed_packet_is_verified_once() {
         let mut here = Signing::new(key("correct horse"), 191, 0);
         let mut there = Signing::new(key("correct horse"), 0, 0);
         let raw = here.sign(NOW, &heartbeat(AUTOPILOT)).unwrap();
@@ -322,17 +322,17 @@ mod tests {
         assert_eq!(signed.without_signature(), packet(&heartbeat(AUTOPILOT)));
 
         assert_eq!(there.verify(NOW, &packet(&heartbeat(AUTOPILOT))), Err(Refusal::Unsigned));
-        let mut stranger = Signing::new(key("another horse"), 191, 0);
-        let forged = stranger.sign(NOW + 9, &heartbeat(AUTOPILOT)).unwrap();
+        let mut attacker = Signing::new(key("another horse"), 191, 0);
+        let forged = attacker.sign(NOW + 9, &heartbeat(AUTOPILOT)).unwrap();
         assert_eq!(there.verify(NOW, &packet(&forged)), Err(Refusal::WrongKey));
-        // What another leg has signed is signed anew.
+        // A packet that another leg has signed is signed again.
         let again = here.sign(NOW, &forged).unwrap();
         assert_eq!(again.len(), forged.len());
         assert_eq!(there.verify(NOW, &packet(&again)), Ok(()));
     }
 
     #[test]
-    fn our_own_packets_are_not_taken_from_others() {
+    fn our_packets_are_not_accepted_from_other_senders() {
         let mut here = Signing::new(key("correct horse"), 191, 0);
         let raw = here.sign(NOW, &heartbeat(AUTOPILOT)).unwrap();
         assert_eq!(here.verify(NOW, &packet(&raw)), Err(Refusal::Replayed));

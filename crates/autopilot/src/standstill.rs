@@ -1,26 +1,26 @@
-//! Whether the mode that is known is of after a standstill of this process.
+//! Decides whether the known mode was received after a standstill of this process.
 //!
-//! A process that was stopped, swapped out or starved goes on with what lies in its socket, oldest first: a pilot's switch may lie behind
-//! much of before. A request that is sent before that is read would take the vehicle from the pilot.
+//! A process that was stopped, swapped out or starved continues with the packets in its socket, oldest first: a pilot's switch may be
+//! behind many older packets. A request that is sent before that is read would take the vehicle from the pilot.
 
 /// Shortest pause between two ticks that is a standstill, in nanoseconds: they are 25 ms apart.
 const MIN_PAUSE_NS: i64 = 300_000_000;
-/// Time in which what lay in the socket is read, in nanoseconds.
+/// Time in which the packets that waited in the socket are read, in nanoseconds.
 const BACKLOG_NS: i64 = 300_000_000;
 /// Longest wait for the mode, in nanoseconds: heartbeats come each second, and one may be lost.
 const MAX_WAIT_NS: i64 = 2_500_000_000;
 
-/// The last standstill, until the mode of after it is known.
+/// The last standstill, until a mode received after it is known.
 #[derive(Copy, Clone, Debug, Default)]
 pub(crate) struct Standstill {
     ticked_ns: Option<i64>,
-    /// When the first one of those ended after which the mode is not known, and the last one.
+    /// When the first and the last standstill ended after which no mode is known.
     first_ns: Option<i64>,
     ended_ns: Option<i64>,
 }
 
 impl Standstill {
-    /// Time goes on.
+    /// Advances the time.
     pub(crate) fn tick(&mut self, now_ns: i64) {
         let before_ns = self.ticked_ns.unwrap_or(now_ns);
         self.ticked_ns = Some(before_ns.max(now_ns));
@@ -28,7 +28,7 @@ impl Standstill {
             self.ended_ns = Some(now_ns);
             self.first_ns.get_or_insert(now_ns);
         }
-        // A process that stands still again and again asks nevertheless.
+        // A process that is stopped again and again sends requests nevertheless.
         if self
             .first_ns
             .take_if(|first_ns| now_ns.saturating_sub(*first_ns) > MAX_WAIT_NS)
@@ -49,7 +49,7 @@ impl Standstill {
         }
     }
 
-    /// Whether the mode that is known may be of before.
+    /// Whether the known mode may be from before the standstill.
     pub(crate) fn is_mode_old(&self) -> bool {
         self.ended_ns.is_some()
     }
@@ -71,11 +71,11 @@ mod tests {
     }
 
     #[test]
-    fn after_a_standstill_the_mode_is_waited_for_behind_what_lay_in_the_socket() {
+    fn after_a_standstill_the_mode_is_awaited_behind_the_packets_in_the_socket() {
         let mut standstill = frozen();
         standstill.mode_shown(1100 * MS, None);
         standstill.mode_shown(1400 * MS, Some(990 * MS));
-        assert!(standstill.is_mode_old(), "at once, and behind measurements of before");
+        assert!(standstill.is_mode_old(), "at once, and behind earlier measurements");
         standstill.mode_shown(1400 * MS, Some(1390 * MS));
         assert!(!standstill.is_mode_old());
     }
@@ -91,7 +91,7 @@ mod tests {
         assert!(!standstill.is_mode_old());
     }
     #[test]
-    fn the_wait_is_bounded_for_a_process_that_stands_still_again_and_again() {
+    fn the_wait_is_bounded_for_a_process_that_is_stopped_again_and_again() {
         let mut standstill = frozen();
         for ms in (1500..3500).step_by(500) {
             standstill.tick(ms * MS);

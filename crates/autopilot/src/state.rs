@@ -1,5 +1,5 @@
 //! The vehicle's state from MAVLink messages: attitude, position, velocity and range with their stamps,
-//! battery, landed state, and readiness to arm with what is missing.
+//! battery, landed state, and readiness to arm with the missing conditions.
 //!
 //! A stamp is in nanoseconds of the caller's clock: the time of the measurement where the autopilot's clock
 //! is known ([`crate::clock`]), else that of its reception. `boot_ms` is the autopilot's own clock.
@@ -92,7 +92,7 @@ pub struct VehicleState {
     pub mode: FlightMode,
     /// Whether the motors are armed.
     pub armed: bool,
-    /// Contact with the ground, as far as its reports are believed: what contradicts a flight is not.
+    /// Contact with the ground, as far as its reports are believed: those that contradict a flight are not.
     pub landed: LandedState,
     /// Whether it can be armed and flown: pre-arm checks passed and a position known.
     pub ready: bool,
@@ -113,7 +113,7 @@ pub(crate) struct Readiness {
     has_position: bool,
     /// ArduPilot's last text about the pre-arm checks.
     complaint: Option<String>,
-    /// What PX4's checks tell of them. It stays while they pass: those of another mode may fail without a new report.
+    /// The reasons that PX4's checks give. They stay while the checks pass: those of another mode may fail without a new report.
     checks: Option<String>,
 }
 
@@ -186,8 +186,8 @@ impl Position {
         finite.then_some(Self { stamp_ns, boot_ms: message.time_boot_ms, position, velocity })
     }
 
-    /// True for the numbers of an `earlier` one to the last bit although they say that the vehicle moves: nothing new
-    /// was estimated. An estimator's numbers change always, also on the ground; only a simulated vehicle is still.
+    /// True for the numbers of an `earlier` one to the last bit although they show that the vehicle moves: there is no new
+    /// estimate. An estimator's numbers change always, also on the ground; only a simulated vehicle is stationary.
     pub(crate) fn repeats(&self, earlier: &Self) -> bool {
         self.position == earlier.position
             && self.velocity == earlier.velocity
@@ -217,7 +217,7 @@ impl Battery {
         }
     }
 
-    /// From BATTERY_STATUS, which may know the charge where SYS_STATUS does not.
+    /// From BATTERY_STATUS, which may contain the charge where SYS_STATUS does not.
     pub fn from_details(message: &BATTERY_STATUS_DATA) -> Self {
         Self {
             voltage_v: None,
@@ -226,7 +226,7 @@ impl Battery {
         }
     }
 
-    /// What both say together: neither forgets what the other knows, and of two charges the lower one counts.
+    /// Both combined: a value that only one of them contains is retained, and of two charges the lower one counts.
     pub fn joined_with(&self, details: &Self) -> Self {
         let lower = |a: f64, b: f64| if b < a { b } else { a };
         let remaining = match (self.remaining, details.remaining) {
@@ -291,7 +291,7 @@ impl Readiness {
         self.prearm != Some(false) && estimates && self.has_position
     }
 
-    /// What is missing, as texts; empty when it is ready.
+    /// The missing conditions, as texts; empty when it is ready.
     pub(crate) fn reasons(&self) -> Vec<String> {
         let mut reasons = Vec::new();
         if !self.has_position {
@@ -330,8 +330,8 @@ fn ekf_is_ready(flags: EkfStatusFlags) -> bool {
     flags.contains(needed) && flags.intersects(horizontal) && !flags.intersects(wrong)
 }
 
-/// The same of PX4's ESTIMATOR_STATUS. Its filter is in constant position mode whenever the vehicle stands
-/// still (since
+/// The same of PX4's ESTIMATOR_STATUS. Its filter is in constant position mode whenever the vehicle is
+/// stationary (since
 /// 1.15, `EKF/ekf_helper.cpp: get_ekf_soln_status`): that is a problem only without any position source.
 fn estimator_is_ready(flags: EstimatorStatusFlags) -> bool {
     let needed = EstimatorStatusFlags::ESTIMATOR_ATTITUDE
@@ -340,10 +340,10 @@ fn estimator_is_ready(flags: EstimatorStatusFlags) -> bool {
         | EstimatorStatusFlags::ESTIMATOR_POS_VERT_ABS;
     let horizontal = EstimatorStatusFlags::ESTIMATOR_POS_HORIZ_ABS
         | EstimatorStatusFlags::ESTIMATOR_POS_HORIZ_REL;
-    let is_told = EstimatorStatusFlags::ESTIMATOR_PRED_POS_HORIZ_ABS
+    let is_known = EstimatorStatusFlags::ESTIMATOR_PRED_POS_HORIZ_ABS
         | EstimatorStatusFlags::ESTIMATOR_PRED_POS_HORIZ_REL;
     let only_assumed = flags.contains(EstimatorStatusFlags::ESTIMATOR_CONST_POS_MODE)
-        && !flags.intersects(is_told);
+        && !flags.intersects(is_known);
     flags.contains(needed) && flags.intersects(horizontal) && !only_assumed
 }
 
@@ -362,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_ready_with_the_flags_of_a_ready_ardupilot_and_says_why_before() {
+    fn it_is_ready_with_the_flags_of_a_ready_ardupilot_and_gives_reasons_before() {
         let mut readiness = Readiness::default();
         let prearm = MavSysStatusSensor::MAV_SYS_STATUS_PREARM_CHECK;
         let mut status =
@@ -387,10 +387,10 @@ mod tests {
     }
 
     #[test]
-    fn a_px4_at_rest_is_ready_and_one_that_only_assumes_its_place_is_not() {
+    fn a_stationary_px4_is_ready_and_one_that_only_assumes_its_position_is_not() {
         let mut readiness = Readiness::default();
         readiness.take_position();
-        // What PX4 1.17 reports before takeoff, with and without a satellite fix.
+        // The flags that PX4 1.17 reports before takeoff, with and without a satellite fix.
         readiness.take_estimator(EstimatorStatusFlags::from_bits_retain(1023));
         assert!(readiness.is_ready(), "{:?}", readiness.reasons());
         readiness.take_estimator(EstimatorStatusFlags::from_bits_retain(1023 - 256 - 512));
@@ -410,7 +410,7 @@ mod tests {
     }
 
     #[test]
-    fn a_charge_that_only_one_message_knows_is_kept_and_of_two_the_lower_one() {
+    fn a_charge_that_only_one_message_contains_is_retained_and_of_two_the_lower_one() {
         let (unknown, low) = (
             Battery::default(),
             BATTERY_STATUS_DATA { battery_remaining: 8, ..Default::default() },

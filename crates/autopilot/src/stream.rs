@@ -1,4 +1,4 @@
-//! Message streams: requested, counted, and requested again when they stop.
+//! Requests message streams, measures their rates, and requests them again when they stop.
 //!
 //! An autopilot forgets requests when it restarts, another station may overwrite them, and some messages
 //! begin long after their acknowledgement; so only the measured rate counts.
@@ -43,11 +43,11 @@ pub struct Stream {
     pub message_id: u32,
     /// Requested rate, in Hz.
     pub rate_hz: f64,
-    /// What is expected of it.
+    /// Its expected behaviour.
     pub expected: Expected,
 }
 
-/// What is expected of a requested message.
+/// The expected behaviour of a requested message.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Expected {
     /// It comes at its rate; its absence is reported.
@@ -127,7 +127,7 @@ impl Streams {
             if watched.stream.message_id == message_id {
                 // It began during the count.
                 if !std::mem::replace(&mut watched.began, true) && watched.ask_at_ns.is_none() {
-                    watched.count_anew(now_ns);
+                    watched.restart_count(now_ns);
                 }
                 watched.count = watched.count.saturating_add(1);
             }
@@ -139,7 +139,7 @@ impl Streams {
         let Some((index, _)) = self.asking.take() else { return };
         let Some(watched) = self.list.get_mut(index) else { return };
         match result {
-            MavResult::MAV_RESULT_ACCEPTED => watched.count_anew(now_ns),
+            MavResult::MAV_RESULT_ACCEPTED => watched.restart_count(now_ns),
             MavResult::MAV_RESULT_TEMPORARILY_REJECTED | MavResult::MAV_RESULT_IN_PROGRESS => {
                 watched.ask_at_ns = Some(now_ns.saturating_add(SECOND_NS));
             }
@@ -175,7 +175,7 @@ impl Streams {
 }
 
 impl Watched {
-    fn count_anew(&mut self, now_ns: i64) {
+    fn restart_count(&mut self, now_ns: i64) {
         self.ask_at_ns = None;
         self.count = 0;
         self.since_ns = now_ns;
@@ -196,7 +196,7 @@ impl Watched {
             return None;
         }
         let measured_hz = f64::from(self.count) / (elapsed_ns as f64 / SECOND_NS as f64);
-        self.count_anew(now_ns);
+        self.restart_count(now_ns);
         if measured_hz >= min_hz {
             self.requests = 1;
             let restored = std::mem::take(&mut self.missing);
@@ -304,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn what_begins_late_is_no_alarm_and_what_never_begins_is_one() {
+    fn a_stream_that_begins_late_is_no_alarm_and_one_that_never_begins_is() {
         let mut streams = Streams::new(&[ATTITUDE]);
         let (notices, _) = run(&mut streams, 0, 40, OK, 0);
         assert!(notices.is_empty(), "{notices:?}");
@@ -325,7 +325,7 @@ mod tests {
     }
 
     #[test]
-    fn a_restart_asks_for_everything_anew() {
+    fn after_a_restart_everything_is_requested_again() {
         let mut streams = Streams::new(&[ATTITUDE, RANGE]);
         run(&mut streams, 0, 10, OK, 1);
         streams.restart();

@@ -17,11 +17,11 @@ use crate::state::{LandedState, VehicleState};
 const MAX_HEIGHT_ERROR_M: f64 = 0.5;
 /// Maximum vertical speed at the end of the climb, in m/s.
 const MAX_CLIMB_M_S: f64 = 0.3;
-/// How far below its height PX4 ends its climb by itself, in m, at most: it is there within 0.8 m (`NAV_MC_ALT_RAD`), and heights err.
+/// How far below its height PX4 ends its climb automatically, in m, at most: it is there within 0.8 m (`NAV_MC_ALT_RAD`), and heights err.
 const MAX_MISSING_M: f64 = 1.5;
 /// Pause between two attempts to arm.
 const ARM_RETRY: Duration = Duration::from_secs(2);
-/// Time within which a simulated vehicle says that it is one.
+/// Time within which a simulated vehicle reports that it is one.
 const SIMULATION_LIMIT: Duration = Duration::from_secs(10);
 
 /// Timeouts of the parts of a takeoff.
@@ -62,9 +62,9 @@ pub struct Takeoff {
     risen: bool,
     /// Its motors were armed before the first request.
     found_armed: bool,
-    /// It is asked only of a vehicle that says that it is a simulation.
+    /// Only a vehicle that reports that it is a simulation is flown.
     only_simulated: bool,
-    /// It would be armed, but another vehicle on the link might not have been heard yet.
+    /// It would be armed, but a heartbeat of another vehicle on the link may still be due.
     is_listening: bool,
     /// The timeout of that question.
     simulation_until_ns: Option<i64>,
@@ -91,7 +91,7 @@ pub enum TakeoffProgress {
     },
     /// It flies in GUIDED or OFFBOARD: setpoints may be sent.
     Done,
-    /// It ended; nothing more is sent.
+    /// It ended; no more is sent.
     Failed(TakeoffError),
 }
 
@@ -125,7 +125,7 @@ pub enum TakeoffError {
     NotReady {
         /// Time waited.
         after: Duration,
-        /// What is missing.
+        /// The missing conditions.
         reasons: Vec<String>,
     },
     /// A command failed.
@@ -168,7 +168,7 @@ struct Arming {
     /// The mode in which it began.
     mode: Option<FlightMode>,
     request: Option<CommandId>,
-    /// It was asked for, if not now: motors that run may be ours.
+    /// It was requested, if not now: motors that run may be ours.
     was_asked: bool,
     retry_ns: i64,
     refused: Option<CommandError>,
@@ -199,7 +199,7 @@ impl Takeoff {
         }
     }
 
-    /// The same, with or without real vehicles: without them one that does not say that it is a simulation is not
+    /// The same, with or without real vehicles: without them one that does not report that it is a simulation is not
     /// armed, moved or landed.
     #[must_use]
     pub fn of_real_vehicle(self, may_be_real: bool) -> Self {
@@ -219,8 +219,8 @@ impl Takeoff {
         self.progress(autopilot)
     }
 
-    /// Puts it off, instead of a step, while something else than the vehicle keeps it from beginning: its times stand still, and the motors
-    /// are not asked to start. False where it has begun, as the motors run, and where no vehicle is known: then it must be stepped.
+    /// Puts it off, instead of a step, while a reason other than the vehicle prevents its beginning: its timers are stopped, and the motors
+    /// are not requested to start. False where it has begun, as the motors run, and where no vehicle is known: then it must be stepped.
     pub fn put_off(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
         let Some(state) = autopilot.state() else { return false };
         // An arming that was withdrawn may be carried out all the same.
@@ -291,7 +291,7 @@ impl Takeoff {
             Part::Ready => state.armed,
             // PX4 is armed in the pilot's own mode.
             Part::Arm(arming) => {
-                // It leaves LAND by itself once it stands.
+                // It leaves LAND automatically once it stands.
                 let is_changed = arming.mode.is_some_and(|mode| {
                     let leaves_land = mode.is_landing() && state.mode == FlightMode::AUTO_HOLD;
                     mode != state.mode && !leaves_land
@@ -364,7 +364,7 @@ impl Takeoff {
         Ok(())
     }
 
-    /// Whether it may be flown as far as it is known: any vehicle, or one that says that it is a simulation.
+    /// Whether it may be flown as far as it is known: any vehicle, or one that reports that it is a simulation.
     fn may_be_flown(
         &mut self,
         now_ns: i64,
@@ -478,7 +478,7 @@ impl Takeoff {
         Ok(())
     }
 
-    /// Height above the place where it stood, in m; above the origin when it was not seen standing.
+    /// Height above the position where it stood, in m; above the origin when it was not seen standing.
     fn height(&self, state: &VehicleState) -> f64 {
         let z = state.position.map_or(0.0, |position| position.position.z());
         self.ground_z.unwrap_or(0.0) - z

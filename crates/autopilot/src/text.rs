@@ -1,4 +1,4 @@
-//! Texts of the autopilot, joined from several packets.
+//! Joins the autopilot's texts from several packets.
 
 use crate::dialect::{MavSeverity, STATUSTEXT_DATA};
 
@@ -25,7 +25,7 @@ struct Partial {
     since_ns: i64,
 }
 
-/// A whole text.
+/// A complete text.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Text {
     pub(crate) severity: MavSeverity,

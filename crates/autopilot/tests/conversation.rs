@@ -1,4 +1,4 @@
-//! The client against a scripted ArduPilot: streams and rates, lost and refused commands, restarts, silence,
+//! Tests the client against a scripted ArduPilot: streams and rates, lost and refused commands, restarts, silence,
 //! other senders on the link, setpoints and take-offs.
 
 #![allow(
@@ -28,7 +28,7 @@ const SECOND: i64 = 1_000_000_000;
 const STEP: i64 = SECOND / 50;
 const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
 
-/// A fake autopilot with ArduPilot's measured behaviour, and what a test sets.
+/// A fake autopilot with ArduPilot's measured behaviour, and the settings of a test.
 #[derive(Clone)]
 struct Fake {
     firmware: MavAutopilot,
@@ -53,12 +53,12 @@ struct Fake {
     has_no_heartbeat: bool,
     ignores_modes: bool,
     queue: Vec<MavMessage>,
-    /// Questions for the time, to be answered at the next step.
-    questions: Vec<i64>,
-    /// What it measures is sent so many steps later.
+    /// Requests for the time, to be answered at the next step.
+    time_requests: Vec<i64>,
+    /// Its measurements are sent so many steps later.
     late_steps: i64,
-    /// The speed to the north that it tells, in m/s; it stays where it is.
-    told_m_s: f32,
+    /// The speed to the north that it reports, in m/s; its position stays the same.
+    reported_m_s: f32,
     parser: Parser,
 }
 
@@ -83,9 +83,9 @@ impl Fake {
             has_no_heartbeat: false,
             ignores_modes: false,
             queue: Vec::new(),
-            questions: Vec::new(),
+            time_requests: Vec::new(),
             late_steps: 0,
-            told_m_s: 0.0,
+            reported_m_s: 0.0,
             parser: Parser::new(),
         }
     }
@@ -111,7 +111,7 @@ impl Fake {
                     assert_eq!(packet.sender, Sender { system: 1, component: 191 });
                 }
                 MavMessage::TIMESYNC(question) if question.tc1 == 0 => {
-                    self.questions.push(question.ts1);
+                    self.time_requests.push(question.ts1);
                 }
                 other => panic!("unexpected {other:?}"),
             }
@@ -199,7 +199,7 @@ impl Fake {
         let mut sent = std::mem::take(&mut self.queue);
         let tc1 = now - self.boot_ns;
         sent.extend(
-            self.questions
+            self.time_requests
                 .drain(..)
                 .map(|ts1| MavMessage::TIMESYNC(TIMESYNC_DATA { tc1, ts1, ..Default::default() })),
         );
@@ -226,7 +226,7 @@ impl Fake {
                 time_boot_ms,
                 // The origin lies 2 m below the ground.
                 z: (-2.0 - self.height) as f32,
-                vx: self.told_m_s,
+                vx: self.reported_m_s,
                 vz,
                 ..Default::default()
             }),
@@ -258,7 +258,7 @@ struct World {
     fake: Fake,
     events: Vec<Event>,
     sequence: u8,
-    /// After how many steps the client's packets come back to it; 0: never.
+    /// After how many steps the client's packets return to it; 0: never.
     echo_steps: usize,
     echoes: VecDeque<Vec<Vec<u8>>>,
 }
@@ -320,7 +320,7 @@ impl World {
         }
     }
 
-    /// A router sends what was sent back, some steps later.
+    /// A router sends the client's packets back, some steps later.
     fn echo(&mut self, sent: Vec<Vec<u8>>) {
         self.echoes.push_back(sent);
         if self.echo_steps == 0 || self.echoes.len() <= self.echo_steps {
@@ -391,8 +391,8 @@ fn a_position_that_stays_the_same_although_the_vehicle_moves_grows_old() {
         (world.now - position.stamp_ns) as f64 * 1e-9
     };
     world.run(3);
-    assert!(age_s(&world) < 0.1, "a simulated vehicle stands quite still");
-    world.fake.told_m_s = 0.3;
+    assert!(age_s(&world) < 0.1, "a simulated vehicle is stationary");
+    world.fake.reported_m_s = 0.3;
     world.run(3);
     assert!(age_s(&world) > 2.5, "{} s", age_s(&world));
     assert!(world.client.late_measurements() > 100, "they are counted");
@@ -460,14 +460,14 @@ fn a_second_controller_with_our_ids_is_reported_once() {
 }
 
 #[test]
-fn our_own_packets_that_a_router_sends_back_are_no_second_controller() {
-    // Each of them comes back 0.4 s later.
+fn our_packets_that_a_router_sends_back_are_no_second_controller() {
+    // Each of them returns 0.4 s later.
     let mut world = World { echo_steps: 20, ..World::new() };
     let mut takeoff = Takeoff::new(10.0);
     let (end, _) = world.take_off(&mut takeoff, 60);
     assert_eq!(end, TakeoffProgress::Done);
-    let is_told = |event: &Event| matches!(event, Event::SameAddress { .. });
-    assert_eq!(world.count(is_told), 0);
+    let is_reported = |event: &Event| matches!(event, Event::SameAddress { .. });
+    assert_eq!(world.count(is_reported), 0);
 }
 
 #[test]
@@ -743,8 +743,8 @@ fn velocities_are_sent_only_in_flight_in_guided() {
 }
 
 #[test]
-fn a_flying_vehicle_gets_setpoints_whatever_is_said_of_the_ground() {
-    let still = Vector::zero();
+fn a_flying_vehicle_gets_setpoints_despite_reports_of_the_ground() {
+    let stop = Vector::zero();
     let mut world = World::flying();
     for report in [
         MavLandedState::MAV_LANDED_STATE_UNDEFINED,
@@ -753,7 +753,7 @@ fn a_flying_vehicle_gets_setpoints_whatever_is_said_of_the_ground() {
     ] {
         world.fake.landed = report;
         world.run(6);
-        assert_eq!(world.client.set_velocity(world.now, still, 0.0), Ok(()), "{report:?}");
+        assert_eq!(world.client.set_velocity(world.now, stop, 0.0), Ok(()), "{report:?}");
     }
     world.fake.landed = MavLandedState::MAV_LANDED_STATE_IN_AIR;
     world.run(1);
@@ -769,7 +769,7 @@ fn a_flying_vehicle_gets_setpoints_whatever_is_said_of_the_ground() {
 }
 
 #[test]
-fn without_the_heartbeat_alone_setpoints_go_on_and_commands_do_not() {
+fn without_the_heartbeat_alone_setpoints_continue_and_commands_do_not() {
     let mut world = World::flying();
     world.fake.has_no_heartbeat = true;
     world.run(5);
@@ -799,13 +799,13 @@ fn a_measurement_of_another_time_is_neither_used_nor_a_restart() {
 }
 
 #[test]
-fn mode_motors_and_contact_are_told_after_every_heartbeat() {
+fn mode_motors_and_contact_are_reported_after_every_heartbeat() {
     let mut world = World::flying();
-    let told = |world: &World| world.count(|event| matches!(event, Event::Status(_)));
-    let before = told(&world);
+    let reports = |world: &World| world.count(|event| matches!(event, Event::Status(_)));
+    let before = reports(&world);
     // Of 3 heartbeats and 15 reports of the contact.
     world.run(3);
-    assert!(told(&world) >= before + 17, "{}", told(&world) - before);
+    assert!(reports(&world) >= before + 17, "{}", reports(&world) - before);
 }
 
 #[test]
@@ -820,7 +820,7 @@ fn unsupported_firmware_is_refused_by_name() {
 }
 
 #[test]
-fn measurements_carry_their_own_time_once_clocks_are_synchronised() {
+fn measurements_carry_their_measurement_time_once_clocks_are_synchronised() {
     let boot_ns = 63 * SECOND;
     let fake = Fake { boot_ns, late_steps: 15, ..Fake::new() };
     let age_ms = |world: &World| {
@@ -836,7 +836,7 @@ fn measurements_carry_their_own_time_once_clocks_are_synchronised() {
     without.run(10);
     assert!(without.client.round_trip(without.now).is_none());
     assert!(age_ms(&without) <= 20, "that of its reception");
-    // What comes seconds late, as out of a link's backlog, is none of now.
+    // A measurement that comes seconds late, as out of a link's backlog, is not used.
     let mut backlog =
         World::with(Fake { boot_ns, late_steps: 200, ..Fake::new() }, Config::default());
     backlog.run(10);
@@ -943,20 +943,20 @@ fn of_another_vehicle() -> MavMessage {
 fn of_two_vehicles_on_the_link_none_is_armed_while_none_is_pinned() {
     for mut world in [World::standing(), World::flying()] {
         world.receive(Sender { system: 2, component: 1 }, &of_another_vehicle());
-        // It is not forgotten: the right one cannot be told.
+        // It is not forgotten: the right one cannot be identified.
         world.run(60);
         let (end, _) = world.take_off(&mut Takeoff::new(10.0), 5);
         let conflict = Conflict::SeveralVehicles { system: 1, other: 2 };
         assert_eq!(end, TakeoffProgress::Failed(TakeoffError::Conflict(conflict)));
         let text = end.to_string();
-        let told = ["system ids 1 and 2", "autopilot.system_id"];
-        assert!(told.iter().all(|part| text.contains(part)), "{text}");
+        let parts = ["system ids 1 and 2", "autopilot.system_id"];
+        assert!(parts.iter().all(|part| text.contains(part)), "{text}");
         assert_eq!(world.commands(MavCmd::MAV_CMD_COMPONENT_ARM_DISARM), 0);
     }
 }
 
 #[test]
-fn a_pinned_vehicle_takes_off_beside_another_one() {
+fn a_pinned_vehicle_takes_off_with_another_one_on_the_link() {
     let config = Config { system_id: Some(1), ..Config::default() };
     let mut world = World::with(Fake::new(), config);
     world.run(1);
@@ -967,7 +967,7 @@ fn a_pinned_vehicle_takes_off_beside_another_one() {
 }
 
 #[test]
-fn a_vehicle_that_is_ready_at_once_is_armed_only_when_another_would_have_been_heard() {
+fn a_vehicle_that_is_ready_at_once_is_armed_only_when_a_heartbeat_of_another_would_have_come() {
     let mut world = World::new();
     let began = world.now;
     let mut takeoff = Takeoff::new(10.0);
@@ -1063,7 +1063,7 @@ fn after_a_standstill_the_pilots_switch_is_read_before_a_request_is_sent_again()
         world.fake.lose_commands = 1;
         let id = world.client.request(world.now, Command::SetMode(FlightMode::Land));
         world.step();
-        // This process stands still, and packets wait.
+        // This process is stopped, and packets wait.
         let mut waiting = Vec::new();
         for step in 0..3 * SECOND / STEP {
             world.now += STEP;
@@ -1072,7 +1072,7 @@ fn after_a_standstill_the_pilots_switch_is_read_before_a_request_is_sent_again()
             }
             waiting.extend(world.fake.step(world.now));
         }
-        // As it goes on, half of them are read before a tick.
+        // As it continues, half of them are read before a tick.
         for (number, message) in waiting.iter().enumerate() {
             world.receive(AUTOPILOT, message);
             if number == waiting.len() / 2 {

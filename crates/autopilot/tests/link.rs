@@ -1,4 +1,4 @@
-//! Links over UDP and TCP on the loopback and a serial pseudo-terminal: which sender is answered, packets cut in
+//! Tests links over UDP and TCP on the loopback and a serial pseudo-terminal: which sender is answered, packets cut in
 //! two, reconnection, signatures, and errors at once.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "helpers of tests may fail like tests")]
@@ -20,7 +20,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, UdpSocket};
 use tokio::time::{sleep, timeout};
 
-const PATIENCE: Duration = Duration::from_secs(30);
+const TIMEOUT: Duration = Duration::from_secs(30);
 const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
 
 fn heartbeat(autopilot: bool) -> Vec<u8> {
@@ -47,7 +47,7 @@ async fn open(address: String) -> Link {
 }
 
 async fn next(link: &mut Link) -> LinkEvent {
-    timeout(PATIENCE, link.recv()).await.expect("an event of the link")
+    timeout(TIMEOUT, link.recv()).await.expect("an event of the link")
 }
 
 async fn packet(link: &mut Link) -> Vec<u8> {
@@ -76,7 +76,7 @@ async fn lost(link: &mut Link) -> String {
 
 async fn datagram(socket: &UdpSocket) -> (Vec<u8>, SocketAddr) {
     let mut bytes = [0; 2048];
-    let (count, from) = timeout(PATIENCE, socket.recv_from(&mut bytes)).await.unwrap().unwrap();
+    let (count, from) = timeout(TIMEOUT, socket.recv_from(&mut bytes)).await.unwrap().unwrap();
     (bytes[..count].to_vec(), from)
 }
 
@@ -149,7 +149,7 @@ async fn a_packet_cut_over_datagrams_survives_another_sender_in_between() {
 }
 
 #[tokio::test]
-async fn another_vehicle_at_the_port_is_told_of_and_takes_nobodys_place() {
+async fn another_vehicle_at_the_port_is_reported_and_does_not_replace_the_autopilot() {
     let mut link = open("udpin:127.0.0.1:0".into()).await;
     let at = link.local_address().unwrap();
     let ours = UdpSocket::bind("127.0.0.1:0").await.unwrap();
@@ -167,10 +167,10 @@ async fn another_vehicle_at_the_port_is_told_of_and_takes_nobodys_place() {
         }),
     );
     other.send_to(&theirs, at).await.unwrap();
-    let LinkEvent::OtherAutopilot { packet: told, .. } = next(&mut link).await else {
-        panic!("it is not told of");
+    let LinkEvent::OtherAutopilot { packet: reported, .. } = next(&mut link).await else {
+        panic!("it is not reported");
     };
-    assert_eq!(told.raw, theirs);
+    assert_eq!(reported.raw, theirs);
     ours.send_to(&time(), at).await.unwrap();
     assert_eq!(packet(&mut link).await, time());
     link.send(&heartbeat(false)).unwrap();
@@ -178,7 +178,7 @@ async fn another_vehicle_at_the_port_is_told_of_and_takes_nobodys_place() {
 }
 
 #[tokio::test]
-async fn a_port_in_use_is_an_error_at_once_that_says_what_to_do() {
+async fn a_port_in_use_is_an_error_at_once_with_the_remedy() {
     let holder = UdpSocket::bind("127.0.0.1:0").await.unwrap();
     let port = holder.local_addr().unwrap().port();
     let address: Address = format!("udpin:127.0.0.1:{port}").parse().unwrap();
@@ -201,7 +201,7 @@ async fn listening_on_the_address_of_another_machine_is_explained() {
 }
 
 #[tokio::test]
-async fn udpout_sends_first_and_outlives_a_peer_that_is_away() {
+async fn udpout_sends_first_and_outlasts_an_absent_peer() {
     let reserved = UdpSocket::bind("127.0.0.1:0").await.unwrap();
     let at = reserved.local_addr().unwrap();
     drop(reserved);
@@ -222,12 +222,12 @@ async fn udpout_sends_first_and_outlives_a_peer_that_is_away() {
     assert_eq!(packet(&mut link).await, time());
 }
 
-/// Set where the test below runs in a network of its own.
+/// Set where the test below runs in a separate network.
 const OWN_NETWORK: &str = "ALIGHT_TEST_OWN_NETWORK";
 
 #[cfg(target_os = "linux")]
 #[test]
-fn udpout_goes_on_with_a_new_address_of_this_machine() {
+fn udpout_continues_with_a_new_address_of_this_machine() {
     use std::process::Command;
     let shell = |script: &str| Command::new("sh").args(["-ec", script]).output().unwrap();
     if std::env::var_os(OWN_NETWORK).is_some() {
@@ -247,7 +247,7 @@ fn udpout_goes_on_with_a_new_address_of_this_machine() {
             peer(&mut link).await;
         };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-        runtime.block_on(async { timeout(PATIENCE, sending).await }).unwrap();
+        runtime.block_on(async { timeout(TIMEOUT, sending).await }).unwrap();
         return;
     }
     const NETWORK: &str = "ip link set lo up
@@ -260,7 +260,7 @@ fn udpout_goes_on_with_a_new_address_of_this_machine() {
         testing::skip("namespaces", String::from_utf8_lossy(&tried.stderr).trim());
         return;
     }
-    let test = "udpout_goes_on_with_a_new_address_of_this_machine";
+    let test = "udpout_continues_with_a_new_address_of_this_machine";
     let run = Command::new("unshare")
         .args(["-rn", "sh", "-ec", &format!("{NETWORK}\nexec \"$@\"",), "sh"])
         .arg(std::env::current_exe().unwrap())
@@ -268,12 +268,12 @@ fn udpout_goes_on_with_a_new_address_of_this_machine() {
         .env(OWN_NETWORK, "1")
         .output()
         .unwrap();
-    let told = String::from_utf8_lossy(&run.stdout) + String::from_utf8_lossy(&run.stderr);
-    assert!(run.status.success() && told.contains("1 passed"), "{told}");
+    let output = String::from_utf8_lossy(&run.stdout) + String::from_utf8_lossy(&run.stderr);
+    assert!(run.status.success() && output.contains("1 passed"), "{output}");
 }
 
 #[tokio::test]
-async fn tcp_connects_again_and_sends_nothing_old() {
+async fn tcp_connects_again_and_sends_no_old_packet() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let at = listener.local_addr().unwrap();
     let mut link = open(format!("tcp:{at}")).await;
@@ -291,16 +291,16 @@ async fn tcp_connects_again_and_sends_nothing_old() {
     assert!(reason.contains("connection refused; is the autopilot"), "{reason}");
 
     let listener = TcpListener::bind(at).await.unwrap();
-    let (mut server, _) = timeout(PATIENCE, listener.accept()).await.unwrap().unwrap();
+    let (mut server, _) = timeout(TIMEOUT, listener.accept()).await.unwrap().unwrap();
     peer(&mut link).await;
     link.send(&heartbeat(false)).unwrap();
     let mut bytes = vec![0; heartbeat(false).len()];
-    timeout(PATIENCE, server.read_exact(&mut bytes)).await.unwrap().unwrap();
+    timeout(TIMEOUT, server.read_exact(&mut bytes)).await.unwrap().unwrap();
     assert_eq!(bytes, heartbeat(false));
 }
 
 #[tokio::test]
-async fn a_packet_that_comes_in_two_parts_over_tcp_is_none_less() {
+async fn a_packet_that_comes_in_two_parts_over_tcp_is_complete() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let mut link = open(format!("tcp:{}", listener.local_addr().unwrap())).await;
     let (mut server, _) = listener.accept().await.unwrap();
@@ -318,13 +318,13 @@ async fn tcpin_takes_one_client_after_the_other() {
     let at = link.local_address().unwrap();
     for _ in 0..2 {
         let mut client =
-            timeout(PATIENCE, tokio::net::TcpStream::connect(at)).await.unwrap().unwrap();
+            timeout(TIMEOUT, tokio::net::TcpStream::connect(at)).await.unwrap().unwrap();
         client.write_all(&heartbeat(true)).await.unwrap();
         peer(&mut link).await;
         assert_eq!(packet(&mut link).await, heartbeat(true));
         link.send(&time()).unwrap();
         let mut bytes = vec![0; time().len()];
-        timeout(PATIENCE, client.read_exact(&mut bytes)).await.unwrap().unwrap();
+        timeout(TIMEOUT, client.read_exact(&mut bytes)).await.unwrap().unwrap();
         assert_eq!(bytes, time());
         drop(client);
         lost(&mut link).await;
@@ -332,7 +332,7 @@ async fn tcpin_takes_one_client_after_the_other() {
 }
 
 #[tokio::test]
-async fn a_ground_station_that_is_away_is_called_one() {
+async fn an_absent_ground_station_is_named_as_one() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = format!("tcp:{}", listener.local_addr().unwrap());
     drop(listener);
@@ -365,7 +365,7 @@ async fn a_serial_line_carries_packets_both_ways_and_its_end_is_noticed() {
     assert_eq!(link.counters().bad_bytes, 17);
     link.send(&time()).unwrap();
     let mut bytes = vec![0; time().len()];
-    timeout(PATIENCE, autopilot.read_exact(&mut bytes)).await.unwrap().unwrap();
+    timeout(TIMEOUT, autopilot.read_exact(&mut bytes)).await.unwrap().unwrap();
     assert_eq!(bytes, time());
     drop((autopilot, end));
     let reason = lost(&mut link).await;
@@ -373,39 +373,39 @@ async fn a_serial_line_carries_packets_both_ways_and_its_end_is_noticed() {
 }
 
 #[tokio::test]
-async fn what_comes_instead_of_the_heartbeat_is_told() {
+async fn a_missing_heartbeat_is_explained() {
     let peering = Peering::Autopilot { system: Some(7) };
     let address = "udpin:127.0.0.1:0".parse().unwrap();
     let mut link = Link::open_for(address, peering, None).await.unwrap();
     let at = link.local_address().unwrap();
-    assert!(link.heard().instead(Some(7)).contains("nothing came: check"));
+    assert!(link.received().why_no_heartbeat(Some(7)).contains("no bytes received: check"));
     let autopilot = UdpSocket::bind("127.0.0.1:0").await.unwrap();
     autopilot.send_to(&heartbeat(true), at).await.unwrap();
     packet(&mut link).await;
-    let told = link.heard().instead(Some(7));
-    assert!(told.contains("no heartbeat of system 7 yet, but of 1"), "{told}");
+    let text = link.received().why_no_heartbeat(Some(7));
+    assert!(text.contains("no heartbeat of system 7 yet, but of 1"), "{text}");
 }
 
 #[cfg(unix)]
 #[tokio::test]
-async fn bytes_at_another_speed_are_told_as_such() {
+async fn bytes_at_another_speed_are_reported_as_such() {
     use tokio_serial::SerialPort;
     let (mut autopilot, end) = tokio_serial::SerialStream::pair().unwrap();
     let device = end.name().unwrap();
     let mut link = open(format!("serial:{device}:115200")).await;
     peer(&mut link).await;
     autopilot.write_all(&[0x55; 400]).await.unwrap();
-    let told = timeout(PATIENCE, async {
+    let explained = timeout(TIMEOUT, async {
         loop {
-            let told = link.heard().instead(None);
-            if told.contains("no MAVLink packet") {
-                return told;
+            let text = link.received().why_no_heartbeat(None);
+            if text.contains("no MAVLink packet") {
+                return text;
             }
             sleep(Duration::from_millis(10)).await;
         }
     });
-    let told = told.await.expect("the bytes are told of");
-    assert!(told.contains("speed (baud)"), "{told}");
+    let text = explained.await.expect("the bytes are reported");
+    assert!(text.contains("speed (baud)"), "{text}");
 }
 
 #[tokio::test]
@@ -450,29 +450,29 @@ async fn open_signed(address: String, signing: SigningConfig) -> Link {
 }
 
 #[tokio::test]
-async fn only_holders_of_the_key_are_heard_and_each_refusal_has_its_reason() {
+async fn only_packets_of_key_holders_are_received_and_each_refusal_has_its_reason() {
     let mut vehicle = open_signed("udpin:127.0.0.1:0".into(), signing("correct horse", 191)).await;
     let at = vehicle.local_address().unwrap();
     let to = format!("udpout:{at}");
-    // Who has no key does not become the peer, whatever it says it is.
-    let stranger = open(to.clone()).await;
-    let thief = open_signed(to.clone(), signing("another horse", 1)).await;
-    stranger.send_when_connected(&heartbeat(true)).await;
-    // A radio's own packets need no signature, and make nobody the peer either.
+    // A sender without the key does not become the peer, whatever kind it states.
+    let keyless = open(to.clone()).await;
+    let other_key = open_signed(to.clone(), signing("another horse", 1)).await;
+    keyless.send_when_connected(&heartbeat(true)).await;
+    // A radio's own packets need no signature, and make no sender the peer either.
     let radio = MavMessage::RADIO_STATUS(RADIO_STATUS_DATA::default());
-    stranger.send(&packet::encode(AUTOPILOT, 1, &radio)).unwrap();
-    stranger.send(&heartbeat(true)).unwrap();
-    thief.send_when_connected(&heartbeat(true)).await;
+    keyless.send(&packet::encode(AUTOPILOT, 1, &radio)).unwrap();
+    keyless.send(&heartbeat(true)).unwrap();
+    other_key.send_when_connected(&heartbeat(true)).await;
     let are_refused = async || {
         let refusals = vehicle.refusals();
         refusals.of(Refusal::WrongKey) > 0 && refusals.of(Refusal::Unsigned) >= 2
     };
-    until("both are refused", PATIENCE, are_refused).await.unwrap();
+    until("both are refused", TIMEOUT, are_refused).await.unwrap();
     assert_eq!(vehicle.try_recv(), None);
 
     let mut holder = open_signed(to, signing("correct horse", 1)).await;
     holder.send_when_connected(&heartbeat(true)).await;
-    // What is received has no signature any more, so it can go over another leg.
+    // A received packet has no signature any more, so it can go over another leg.
     assert_eq!(packet(&mut vehicle).await, heartbeat(true));
     vehicle.send(&time()).unwrap();
     assert_eq!(packet(&mut holder).await, time());
@@ -494,7 +494,7 @@ async fn a_peer_that_signs_is_noticed_without_a_key() {
         holder.send_when_connected(&heartbeat(true)).await;
         keyless.lacks_key()
     };
-    until("the signature is noticed", PATIENCE, is_noticed).await.unwrap();
+    until("the signature is noticed", TIMEOUT, is_noticed).await.unwrap();
 }
 
 /// `Link::send` as soon as there is a connection.
@@ -505,7 +505,7 @@ trait SendWhenConnected {
 impl SendWhenConnected for Link {
     async fn send_when_connected(&self, packet: &[u8]) {
         let is_sent = async || self.send(packet).is_ok();
-        until("there is a connection", PATIENCE, is_sent).await.unwrap();
+        until("there is a connection", TIMEOUT, is_sent).await.unwrap();
     }
 }
 
@@ -513,7 +513,7 @@ impl SendWhenConnected for Link {
 async fn after_five_starts_without_a_clock_it_is_still_believed() {
     let directory = tempfile::tempdir().unwrap();
     let stamp_file = directory.path().join("state/signing.stamp");
-    let kept =
+    let stored =
         || std::fs::read_to_string(&stamp_file).map_or(0, |text| text.trim().parse().unwrap());
     let mut vehicle = open_signed("tcpin:127.0.0.1:0".into(), signing("correct horse", 1)).await;
     let to = format!("tcp:{}", vehicle.local_address().unwrap());
@@ -526,7 +526,7 @@ async fn after_five_starts_without_a_clock_it_is_still_believed() {
         };
         let companion = open_signed(to.clone(), companion).await;
         companion.send_when_connected(&heartbeat(false)).await;
-        let heard = async {
+        let packet = async {
             loop {
                 if let Some(LinkEvent::Packet { .. }) = vehicle.try_recv() {
                     return;
@@ -535,23 +535,23 @@ async fn after_five_starts_without_a_clock_it_is_still_believed() {
                 if start == 0 {
                     vehicle.send_when_connected(&heartbeat(true)).await;
                 }
-                // Again: the first is lost where the vehicle has not noticed yet that the connection of before is gone.
+                // Again: the first is lost where the vehicle has not noticed yet that the earlier connection is gone.
                 companion.send_when_connected(&heartbeat(false)).await;
                 sleep(Duration::from_millis(5)).await;
             }
         };
-        timeout(PATIENCE, heard).await.unwrap_or_else(|_| panic!("start {start}"));
+        timeout(TIMEOUT, packet).await.unwrap_or_else(|_| panic!("start {start}"));
         let refusals = vehicle.refusals().of(Refusal::Old);
         if start == 0 {
             refused = refusals;
             let written = async {
-                while kept() < stamp(SystemTime::UNIX_EPOCH.elapsed().unwrap()) {
+                while stored() < stamp(SystemTime::UNIX_EPOCH.elapsed().unwrap()) {
                     // While the disk writes the first stamp, later ones are not written: only with a further packet.
                     vehicle.send_when_connected(&heartbeat(true)).await;
                     sleep(Duration::from_millis(5)).await;
                 }
             };
-            timeout(PATIENCE, written).await.expect("the stamp is kept");
+            timeout(TIMEOUT, written).await.expect("the stamp is stored");
         }
         // From the second start on the first packet is believed already.
         assert_eq!(refusals, refused, "start {start}");

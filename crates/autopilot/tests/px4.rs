@@ -1,4 +1,4 @@
-//! The client against a PX4 scripted by its documentation: EVENT messages and failing checks, take-off to an altitude over
+//! Tests the client against a PX4 scripted by its documentation: EVENT messages and failing checks, take-off to an altitude over
 //! the sea, modes, OFFBOARD only with a stream of setpoints.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests may fail like tests")]
@@ -32,7 +32,7 @@ struct Px4 {
     height_m: f64,
     climbs_to_m: Option<f64>,
     intervals: BTreeMap<u32, i64>,
-    /// It knows CURRENT_MODE; the mode that was sent last, and when.
+    /// It supports CURRENT_MODE; the mode that was sent last, and when.
     has_current_mode: bool,
     reported_mode: Option<(FlightMode, i64)>,
     /// Its heartbeats are lost on the way.
@@ -42,10 +42,10 @@ struct Px4 {
     setpoints: Vec<[f32; 3]>,
     mode_requests: usize,
     refuses: bool,
-    /// What it answers to the question for its checks, if anything, and how often it was asked.
+    /// Its answer to a request for its checks, if any, and the number of requests.
     answers_checks: Option<MavResult>,
     checks_requests: usize,
-    /// What it then reports.
+    /// Its report then.
     checks: Vec<MavMessage>,
     boot_ns: i64,
     landing_targets: Vec<(u8, [f32; 3])>,
@@ -83,7 +83,7 @@ impl Px4 {
         }
     }
 
-    /// What is acknowledged; `None` for a command whose acknowledgement is lost.
+    /// The acknowledgement; `None` for a command whose acknowledgement is lost.
     fn carry_out(&mut self, now: i64, command: &COMMAND_LONG_DATA) -> Option<MavResult> {
         if command.command == MavCmd::MAV_CMD_RUN_PREARM_CHECKS {
             self.checks_requests += 1;
@@ -129,7 +129,7 @@ impl Px4 {
                     return MavResult::MAV_RESULT_TEMPORARILY_REJECTED;
                 }
                 let here = [command.param4, command.param5, command.param6];
-                assert!(here.iter().all(|value| value.is_nan()), "at the present place");
+                assert!(here.iter().all(|value| value.is_nan()), "at the present position");
                 self.climbs_to_m = Some(f64::from(command.param7) - GROUND_AMSL_M);
                 self.mode = FlightMode::AUTO_TAKEOFF;
             }
@@ -229,7 +229,7 @@ impl World {
         Self::with(|_| {})
     }
 
-    /// With a PX4 that is different.
+    /// With a changed PX4.
     fn with(differs: impl FnOnce(&mut Px4)) -> Self {
         let mut px4 = Px4 {
             mode: FlightMode::AUTO_HOLD,
@@ -341,7 +341,7 @@ fn texts_of(events: &[Event]) -> Vec<String> {
 const NO_POSITION: &str = "Navigation error: No valid position estimate";
 
 #[test]
-fn why_it_does_not_arm_is_told_from_its_events() {
+fn the_reason_why_it_does_not_arm_comes_from_its_events() {
     let mut world = World::new();
     world.px4.queue.push(status_of_failing_checks());
     world.px4.queue.extend(report(1));
@@ -369,14 +369,14 @@ fn status_of_failing_checks() -> MavMessage {
 }
 
 #[test]
-fn who_comes_after_its_events_or_was_away_learns_why_it_does_not_arm() {
+fn a_client_that_connects_after_its_events_gets_the_reason_why_it_does_not_arm() {
     let mut world = World::with(|px4| px4.checks = report(40).to_vec());
     world.px4.queue.push(status_of_failing_checks());
     world.step();
     let why = [format!("prearm: {NO_POSITION}")];
     assert_eq!(world.client.not_ready_because(), why);
     assert_eq!(world.px4.checks_requests, 1);
-    // Nothing is heard of it for a while, and its checks stay as they are.
+    // No packet of it is received for a while, and its checks stay the same.
     world.now += 10 * SECOND;
     world.client.tick(world.now);
     assert!(!world.client.is_connected());
@@ -414,7 +414,7 @@ fn after_it_started_again_its_events_count_from_the_first_and_old_checks_are_for
     assert_eq!(world.client.not_ready_because(), [format!("prearm: {NO_POSITION}")]);
     assert_eq!(texts(&mut world.client), ["No manual control input", NO_POSITION]);
     world.px4.boot_ns = world.now;
-    // Asked, it reports only one of them, with a number that is not far behind those from before.
+    // Asked, it reports only one of them, with a number that is not far behind the earlier ones.
     let [begin, sticks, _, end] = report(1);
     world.px4.checks = vec![begin, sticks, end];
     world.run(2);
@@ -424,12 +424,12 @@ fn after_it_started_again_its_events_count_from_the_first_and_old_checks_are_for
     let restarts = events.iter().filter(|event| matches!(event, Event::Restarted { .. }));
     assert_eq!(restarts.count(), 1);
     assert_eq!(texts_of(&events), ["No manual control input"]);
-    let also = "prearm: checks not passed yet; PX4 also says: No manual control input";
+    let also = "prearm: checks not passed yet; PX4 also reports: No manual control input";
     assert_eq!(world.client.not_ready_because(), [also]);
 }
 
 #[test]
-fn a_question_for_its_checks_that_nobody_answers_or_that_is_refused_changes_nothing() {
+fn a_request_for_its_checks_without_an_answer_or_with_a_refusal_has_no_effect() {
     let refusals = [MavResult::MAV_RESULT_DENIED, MavResult::MAV_RESULT_UNSUPPORTED];
     for (answer, asked) in [(None, 3), (Some(refusals[0]), 1), (Some(refusals[1]), 1)] {
         let mut world = World::with(|px4| px4.answers_checks = answer);
@@ -439,7 +439,7 @@ fn a_question_for_its_checks_that_nobody_answers_or_that_is_refused_changes_noth
         assert_eq!(texts(&mut world.client), [""; 0]);
         world.request(Command::Arm).unwrap();
     }
-    // Accepted, and its report was lost on the way; or to come later.
+    // Accepted, and its report was lost on the way, or comes later.
     let later = [MavResult::MAV_RESULT_TEMPORARILY_REJECTED, MavResult::MAV_RESULT_IN_PROGRESS];
     for answer in [MavResult::MAV_RESULT_ACCEPTED].into_iter().chain(later) {
         let mut world = World::with(|px4| px4.answers_checks = Some(answer));
@@ -460,7 +460,7 @@ fn an_armed_one_is_asked_for_its_checks_once_it_is_disarmed() {
 }
 
 #[test]
-fn what_it_tells_again_is_told_once() {
+fn a_repeated_event_is_reported_once() {
     let mut world = World::new();
     world.px4.queue.extend(report(1));
     world.px4.queue.extend(report(5));
@@ -475,8 +475,9 @@ fn what_it_tells_again_is_told_once() {
     }
     world.step();
     let denied = "Arming denied: Resolve system health failures first";
-    let told = ["No manual control input", NO_POSITION, denied, "Its words differ", "Only a text"];
-    assert_eq!(texts(&mut world.client), told);
+    let reported =
+        ["No manual control input", NO_POSITION, denied, "Its words differ", "Only a text"];
+    assert_eq!(texts(&mut world.client), reported);
 }
 
 #[test]
@@ -505,7 +506,7 @@ fn checks_explain_why_it_does_not_arm_and_no_other_request() {
 }
 
 #[test]
-fn a_refusal_to_arm_has_the_checks_that_were_told_before() {
+fn a_refusal_to_arm_has_the_checks_that_were_reported_before() {
     let mut world = World::with(|px4| px4.checks = report(1).to_vec());
     world.px4.refuses = true;
     let denied = "Arming denied: Resolve system health failures first";
@@ -539,7 +540,7 @@ fn a_takeoff_arms_rises_to_an_altitude_and_ends_in_offboard() {
     assert_eq!(takeoff.step(world.now, &mut world.client), TakeoffProgress::Done);
     assert_eq!(world.px4.mode, FlightMode::OFFBOARD);
     assert!((world.px4.height_m - 10.0).abs() < 0.2, "{} m", world.px4.height_m);
-    assert!(world.px4.setpoints.iter().all(|v| *v == [0.0; 3]), "the proof of life stands still");
+    assert!(world.px4.setpoints.iter().all(|v| *v == [0.0; 3]), "the first setpoints are zero");
 }
 
 #[test]
@@ -589,10 +590,10 @@ fn a_change_of_mode_shows_at_once_where_it_sends_its_mode() {
             matches!(event, Event::ModeChanged { from: Some(FlightMode::AUTO_HOLD), to: POSITION })
         });
         assert_eq!(changes.count(), 1);
-        let told = events.iter().any(
+        let is_reported = events.iter().any(
             |event| matches!(event, Event::Status(state) if state.mode == POSITION && state.armed),
         );
-        assert!(told, "{events:?}");
+        assert!(is_reported, "{events:?}");
     }
 }
 
@@ -630,7 +631,7 @@ fn a_mode_that_is_shown_once_more_while_the_pilot_changes_it_lets_no_request_thr
         world.client.send_zeros(world.now);
         world.step();
     }
-    // Between two of its messages, the pilot requests POSITION as we request OFFBOARD: what comes first is the former mode.
+    // Between two of its messages, the pilot requests POSITION as we request OFFBOARD: the former mode comes first.
     while !(300..320).contains(&(world.now / 1_000_000 % 500)) {
         world.client.send_zeros(world.now);
         world.step();
@@ -649,7 +650,7 @@ fn a_mode_that_is_shown_once_more_while_the_pilot_changes_it_lets_no_request_thr
 
 #[test]
 fn on_the_ground_the_mode_changes_with_the_motors() {
-    // It says that it stands before its motors stop, or it does not.
+    // It reports the ground before its motors stop, or it does not.
     for height_m in [0.0, 0.3] {
         let mut world = World::with(|px4| {
             (px4.has_current_mode, px4.armed, px4.height_m) = (true, true, height_m);
@@ -705,7 +706,7 @@ fn a_mode_is_believed_of_a_connected_px4_only() {
 }
 
 #[test]
-fn zeros_go_on_while_only_the_heartbeat_is_missing() {
+fn zeros_continue_while_only_the_heartbeat_is_missing() {
     let mut world = World::flying(5.0);
     world.request(Command::SetMode(FlightMode::OFFBOARD)).unwrap();
     world.px4.loses_heartbeats = true;
@@ -718,7 +719,7 @@ fn zeros_go_on_while_only_the_heartbeat_is_missing() {
 }
 
 #[test]
-fn it_lands_in_its_own_mode_with_targets_in_its_own_frame() {
+fn it_lands_in_px4s_own_mode_with_targets_in_px4s_frame() {
     let mut world = World::flying(5.0);
     world.request(Command::SetMode(Firmware::Px4.land().unwrap())).unwrap();
     assert_eq!(world.px4.mode, FlightMode::AUTO_LAND);
@@ -747,10 +748,10 @@ fn the_pilots_mode_change_ends_the_takeoff() {
             break;
         }
     }
-    let TakeoffProgress::Failed(problem) = takeoff.step(world.now, &mut world.client) else {
-        panic!("it went on");
+    let TakeoffProgress::Failed(error) = takeoff.step(world.now, &mut world.client) else {
+        panic!("it continued");
     };
-    assert!(problem.to_string().contains("PX4 POSITION"), "{problem}");
+    assert!(error.to_string().contains("PX4 POSITION"), "{error}");
 }
 
 #[test]
@@ -764,10 +765,10 @@ fn hold_below_the_height_of_the_takeoff_is_the_pilots() {
             (world.px4.mode, world.px4.climbs_to_m) = (FlightMode::AUTO_HOLD, None);
         }
     }
-    let TakeoffProgress::Failed(problem) = takeoff.step(world.now, &mut world.client) else {
-        panic!("it goes on");
+    let TakeoffProgress::Failed(error) = takeoff.step(world.now, &mut world.client) else {
+        panic!("it continues");
     };
-    assert!(problem.to_string().contains("PX4 HOLD"), "{problem}");
+    assert!(error.to_string().contains("PX4 HOLD"), "{error}");
     assert_eq!((world.px4.mode_requests, world.px4.mode), (0, FlightMode::AUTO_HOLD));
 }
 
@@ -796,9 +797,9 @@ fn a_pilot_who_arms_or_changes_the_mode_while_arming_is_refused_ends_the_takeoff
             Some(mode) => world.px4.mode = mode,
         }
         let steps = (0..10 * SECOND / STEP).map(|_| step(&mut world)).last();
-        let Some(TakeoffProgress::Failed(problem)) = steps else { panic!("{mode}: {steps:?}") };
+        let Some(TakeoffProgress::Failed(error)) = steps else { panic!("{mode}: {steps:?}") };
         let name = chosen.unwrap_or(mode).to_string();
-        assert!(problem.to_string().contains(&name), "{problem}");
+        assert!(error.to_string().contains(&name), "{error}");
         assert_eq!(world.px4.climbs_to_m, None);
     }
 }

@@ -1,5 +1,5 @@
-//! Logs of real and simulated flights: every packet is found, and the client reports changes when they
-//! happen.
+//! Tests parser and client with logs of real and simulated flights: every packet is found, and the client reports changes when
+//! they happen.
 //!
 //! The recordings are not part of the repository; a short log of our own is.
 
@@ -67,7 +67,7 @@ fn every_packet_of_the_simulated_flights_is_found() {
 }
 
 #[test]
-fn the_real_logs_give_what_pymavlink_finds_in_them() {
+fn the_real_logs_give_the_packets_that_pymavlink_finds() {
     let Some(folder) = testing::recording("autopilot-logs") else { return };
     let summary = std::fs::read(folder.join("logs_summary.json")).unwrap();
     let summary: Value = serde_json::from_slice(&summary).unwrap();
@@ -109,7 +109,7 @@ fn changes_of_client(log: &[u8]) -> (Vec<(f64, Change)>, Autopilot) {
         client.tick(now_ns);
         while client.poll_outgoing().is_some() {}
         while let Some(event) = client.poll_event() {
-            let what = match event {
+            let change = match event {
                 Event::Found { system: 1, .. } => {
                     first_ns = Some(now_ns);
                     continue;
@@ -124,8 +124,8 @@ fn changes_of_client(log: &[u8]) -> (Vec<(f64, Change)>, Autopilot) {
                 }
                 _ => continue,
             };
-            let first_ns = first_ns.expect("the vehicle is found before it does anything");
-            changes.push(((now_ns - first_ns) as f64 * 1e-9, what));
+            let first_ns = first_ns.expect("the vehicle is found before its first change");
+            changes.push(((now_ns - first_ns) as f64 * 1e-9, change));
         }
     }
     (changes, client)
@@ -167,20 +167,20 @@ fn changes_of_events(events: &[Value]) -> Vec<(f64, Change)> {
     changes
 }
 
-/// Compares the changes that the client reports with the events of a log; how many they are.
+/// Compares the changes that the client reports with the events of a log; returns their number.
 fn compare_with_events(log: &Path, events: &[u8]) -> usize {
     let events: Vec<Value> = serde_json::from_slice(events).unwrap();
     let (changes, client) = changes_of_client(&std::fs::read(log).unwrap());
     let expected = changes_of_events(&events);
     assert_eq!(changes.len(), expected.len(), "{changes:?}\n{expected:?}");
-    for ((at, what), (expected_at, expected)) in changes.iter().zip(&expected) {
-        assert_eq!(what, expected, "at {at} s");
+    for ((at, change), (expected_at, expected)) in changes.iter().zip(&expected) {
+        assert_eq!(change, expected, "at {at} s");
         // The ground is believed after three reports.
-        let later_s = if *what == Change::Landed(LandedState::OnGround) { 0.65 } else { 0.1 };
+        let later_s = if *change == Change::Landed(LandedState::OnGround) { 0.65 } else { 0.1 };
         let is_in_time = (-0.1..later_s).contains(&(at - expected_at));
-        assert!(is_in_time, "{what:?} at {at} s, expected at {expected_at} s");
+        assert!(is_in_time, "{change:?} at {at} s, expected at {expected_at} s");
     }
-    assert!(expected.iter().any(|(_, what)| *what == Change::Mode(FlightMode::Land)));
+    assert!(expected.iter().any(|(_, change)| *change == Change::Mode(FlightMode::Land)));
     assert_eq!(client.refused_numbers(), 0);
     assert!(client.state().unwrap().position.is_some());
     expected.len()
@@ -217,7 +217,7 @@ fn a_precision_landing_is_followed_to_the_ground() {
         let (changes, client) = changes_of_client(&std::fs::read(&path).unwrap());
         let state = client.state().unwrap();
         assert!(!state.armed && state.landed == LandedState::OnGround, "{}", path.display());
-        assert!(changes.iter().any(|(_, what)| *what == Change::Landed(LandedState::InAir)));
+        assert!(changes.iter().any(|(_, change)| *change == Change::Landed(LandedState::InAir)));
         println!("{}: {} changes, {state:?}", path.display(), changes.len());
     }
 }

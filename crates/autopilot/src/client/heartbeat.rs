@@ -14,7 +14,7 @@ use crate::state::{Battery, LandedState, Readiness, VehicleState};
 use crate::stream::{self, Streams};
 use crate::text::Joiner;
 
-/// Time for which a heartbeat may come behind CURRENT_MODE, in nanoseconds, besides the link's delay up to as long.
+/// Time for which a heartbeat may come behind CURRENT_MODE, in nanoseconds, in addition to the link's delay up to as long.
 const OVERTAKEN_NS: i64 = 300_000_000;
 
 impl Autopilot {
@@ -63,7 +63,7 @@ impl Autopilot {
             mode_ns: now_ns,
             mode_since_ns: now_ns,
             mode_before: None,
-            heard_ns: now_ns,
+            received_ns: now_ns,
             boot: BootClock::default(),
             contact: Contact::default(),
             batteries: [Battery::default(); 2],
@@ -82,7 +82,7 @@ impl Autopilot {
         let armed = heartbeat.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
         vehicle.heartbeat_ns = now_ns;
         vehicle.simulation.take_mode(heartbeat.base_mode);
-        vehicle.heard_ns = now_ns;
+        vehicle.received_ns = now_ns;
         state.stamp_ns = now_ns;
         let returned = !std::mem::replace(&mut state.connected, true);
         vehicle.contact_ns = if returned { now_ns } else { vehicle.contact_ns };
@@ -102,9 +102,9 @@ impl Autopilot {
         self.report_contact(landed_before);
     }
 
-    /// Takes the mode that PX4 sends beside the heartbeat. When the motors stop after a landing PX4 goes back to OFFBOARD, which the
-    /// heartbeat shows together with the motors, so on the ground, and for that change, the heartbeat alone counts. Nor does anything
-    /// count of one that sends no heartbeat.
+    /// Takes the mode that PX4 sends in addition to the heartbeat. When the motors stop after a landing PX4 goes back to OFFBOARD, which the
+    /// heartbeat shows together with the motors, so on the ground, and for that change, the heartbeat alone counts. Without a
+    /// heartbeat the message does not count.
     pub(super) fn take_current_mode(&mut self, now_ns: i64, number: u32) {
         let Some(state) = self.state().filter(|state| state.connected) else { return };
         let to = FlightMode::of(Firmware::Px4, number);

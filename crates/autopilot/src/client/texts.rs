@@ -5,7 +5,7 @@ use crate::command::{Command, CommandError};
 use crate::dialect::{EVENT_DATA, MavSeverity};
 use crate::event::Event;
 use crate::mode::Firmware;
-use crate::px4_listener::{About, Heard};
+use crate::px4_listener::{About, EventText};
 use crate::text::Text;
 
 impl Autopilot {
@@ -23,14 +23,14 @@ impl Autopilot {
     }
 
     pub(super) fn take_statustext(&mut self, Text { severity, text, is_event }: Text) {
-        let is_told =
-            is_event && self.vehicle.as_mut().is_some_and(|it| it.listener.is_told(&text));
-        if !is_told {
+        let is_reported =
+            is_event && self.vehicle.as_mut().is_some_and(|it| it.listener.is_reported(&text));
+        if !is_reported {
             self.take_text(severity, text);
         }
     }
 
-    /// A disarmed PX4 that was found, returned or started again is asked which checks fail. ArduPilot repeats its reasons by itself.
+    /// A disarmed PX4 that was found, returned or started again is asked which checks fail. ArduPilot repeats its reasons on its own.
     pub(super) fn ask_for_checks(&mut self, now_ns: i64) {
         let is_px4 = |vehicle: &&mut super::Vehicle| vehicle.firmware == Firmware::Px4;
         let Some(vehicle) = self.vehicle.as_mut().filter(is_px4) else { return };
@@ -39,7 +39,7 @@ impl Autopilot {
         }
     }
 
-    /// A refusal to arm with the checks that prevent it: PX4 need not tell again what it told before.
+    /// A refusal to arm with the checks that prevent it: PX4 need not report a check again.
     pub(super) fn explained(&self, error: CommandError) -> CommandError {
         let (CommandError::Refused { command: Command::Arm, result, mut texts }, Some(vehicle)) =
             (error.clone(), &self.vehicle)
@@ -56,15 +56,15 @@ impl Autopilot {
 
     pub(super) fn take_px4_event(&mut self, event: &EVENT_DATA) {
         let Some(vehicle) = &mut self.vehicle else { return };
-        let heard = vehicle.listener.take(event);
+        let received = vehicle.listener.take(event);
         let why = vehicle.listener.why_not_armed();
-        // The old reason stands until the next report has one, or has ended.
+        // The old reason holds until the next report has one, or has ended.
         if why.is_some() || !vehicle.listener.in_report() {
             vehicle.readiness.take_checks(why);
         }
-        let Some(Heard { severity, text, about, is_told }) = heard else { return };
+        let Some(EventText { severity, text, about, is_reported }) = received else { return };
         let is_new = match about {
-            About::Else if is_told => return,
+            About::Else if is_reported => return,
             About::Else => return self.take_text(severity, text),
             About::Arming { is_new } => {
                 self.requests.iter_mut().for_each(|request| request.add_check(&text));
@@ -72,7 +72,7 @@ impl Autopilot {
             }
             About::Health { is_new } => is_new,
         };
-        if is_new && !is_told {
+        if is_new && !is_reported {
             self.push(Event::Text { severity, text });
         }
     }

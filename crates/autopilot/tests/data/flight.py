@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Writes `flight.tlog`, a short flight of a made-up copter, with pymavlink, and `flight.events.json`: what happens when.
+"""Writes `flight.tlog`, a short flight of a made-up copter, with pymavlink, and `flight.events.json`: its changes with their times.
 
     python3 flight.py       (needs pymavlink)
 
