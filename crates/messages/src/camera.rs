@@ -88,7 +88,7 @@ pub struct FrameHeader {
     pub parts: Vec<FramePart>,
 }
 
-/// A rectangle of a frame as a file of its own, at full or reduced resolution.
+/// A rectangle of a frame as a separate file, at full or reduced resolution.
 ///
 /// The part's pixel (u, v) is the mean of `scale` x `scale` pixels of the frame, the first of which is (`x` +
 /// `scale` u, `y` + `scale` v); so its centre is at `x` + `scale` u + (`scale` - 1) / 2 in the frame, and
@@ -127,7 +127,7 @@ pub struct FrameAck {
     pub bytes: u32,
 }
 
-/// A rigid transform on the wire, `to_from_from` as its field's name says.
+/// A rigid transform on the wire, `to_from_from` as in its field's name.
 #[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Transform3 {
     /// Origin of `from` as seen in `to`, in metres.
@@ -176,7 +176,7 @@ const MAX_MOUNT_M: f64 = 100.0;
 const MAX_DIFFERENCE: f64 = 1e-6;
 
 impl CameraInfo {
-    /// What no camera can have, as text; `None` for what may be one's calibration and mount.
+    /// The first value that no camera can have, as text; `None` for a plausible calibration and mount.
     pub fn problem(&self) -> Option<String> {
         let (width, height) = (self.width, self.height);
         if !(1..=MAX_PIXELS).contains(&width) || !(1..=MAX_PIXELS).contains(&height) {
@@ -248,7 +248,7 @@ impl CameraInfo {
     }
 }
 
-/// How a camera is exposed: with what a frame was taken, what is wanted for later ones, and why. It follows a frame: at once
+/// The exposure of a camera: the setting of a frame, the requested one for later frames, and why. It follows a frame: at once
 /// when `set_by`, `in_use`, `wanted`, `why` or `refused` changes, else once a second, or five times a second while a camera that
 /// is exposed for the marker sees one.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -261,30 +261,30 @@ pub struct CameraControl {
     pub stamp_ns: i64,
     /// Name of the stamp's clock.
     pub clock: String,
-    /// Who sets exposure and gain from now on.
+    /// The setter of exposure and gain from now on.
     pub set_by: ExposureSetter,
-    /// With what the frame was taken; none while that is not known: a camera that meters by itself does not tell, and while
+    /// The setting with which the frame was taken; none while that is not known: a camera with automatic metering does not report it, and while
     /// a change is under way a frame may be from before it.
     pub in_use: Option<ExposureSetting>,
-    /// What the marker wants for later frames; none where it does not set them.
+    /// The setting requested for the marker in later frames; none where the marker does not set it.
     pub wanted: Option<ExposureSetting>,
-    /// Why that is wanted, or why nothing is.
+    /// Why that is requested, or why no setting is.
     pub why: ExposureReason,
-    /// What the device answered when it refused to be set so; none where it did not. It is asked again after a second.
+    /// The device's answer when it refused the setting; none where it did not. The setting is sent again after a second.
     pub refused: Option<String>,
     /// The marker's levels in the frame; none where they were not measured.
     pub levels: Option<MarkerLevels>,
     /// How fast the marker moved lately in the image, in pixels per second; none without a marker.
     pub motion_px_s: Option<f64>,
-    /// What `wanted` is kept within; none where nothing follows the marker.
+    /// The limits of `wanted`; none where the exposure does not follow the marker.
     pub limits: Option<ExposureLimits>,
 }
 
-/// Who sets a camera's exposure and gain.
+/// The setter of a camera's exposure and gain.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ExposureSetter {
-    /// Nobody: they stay as the configuration, or the last order for the marker, has set them.
+    /// No setter: they stay as the configuration, or the last request for the marker, has set them.
     #[default]
     Fixed,
     /// The camera's own metering.
@@ -293,26 +293,26 @@ pub enum ExposureSetter {
     Marker,
 }
 
-/// Why an exposure is wanted for the marker, or why none is.
+/// Why an exposure is requested for the marker, or why none is.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ExposureReason {
     /// By its configuration the camera's exposure does not follow the marker.
     #[default]
     Configured,
-    /// No marker was seen for a while: the camera meters by itself.
+    /// No marker was seen for a while: the camera meters automatically.
     NoMarker,
-    /// A marker is seen, but was lost soon after the exposure followed it: for a while the camera goes on to meter by itself.
+    /// A marker is seen, but was lost soon after the exposure followed it: for a while the camera continues to meter automatically.
     LostSoon,
-    /// A marker is seen: exposure and gain are taken over as the camera's own metering has chosen them.
+    /// A marker is seen: exposure and gain are taken over as the camera's metering has chosen them.
     TakenOver,
-    /// A change may be under way: frames do not tell yet what came of it.
+    /// A change may be under way: frames do not show its effect yet.
     Settling,
-    /// The frame shows too little of the marker, or the marker may be elsewhere by now: nothing changes.
+    /// The frame shows too little of the marker, or the marker may be elsewhere by now: no change.
     NotInFrame,
-    /// Where the marker should be there is no white beside black: nothing changes.
+    /// Where the marker should be there is no white next to black: no change.
     NoContrast,
-    /// The marker's white is right, or as near to it as steps reach: nothing changes.
+    /// The marker's white is right, or as near to it as the steps allow: no change.
     Good,
     /// White is clipped: less light.
     Clipped,
@@ -348,7 +348,7 @@ pub struct MarkerLevels {
     pub black: f64,
 }
 
-/// What a camera's exposure and gain are kept within.
+/// The limits of a camera's exposure and gain.
 #[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ExposureLimits {
     /// Minimum exposure time in nanoseconds, that of the device.

@@ -1,4 +1,4 @@
-//! The two functions that write and read what is sent: [`encode`] and [`decode`].
+//! Encodes messages into payloads and decodes them: [`encode`] and [`decode`].
 //!
 //! A payload is the letter `A`, the message's type, its version, and the postcard encoding of its fields.
 //! Positional encodings break silently when a type changes; the version makes them break loudly.
@@ -74,7 +74,7 @@ pub enum DecodeError {
         len: usize,
         /// The message that was expected.
         expected: &'static str,
-        /// What was found in it, in words.
+        /// The invalid part, as text.
         cause: &'static str,
     },
     /// Bytes after the end of the message.
@@ -99,7 +99,7 @@ impl DecodeError {
         }
     }
 
-    /// Why a message of a recording cannot be read, after the word "it": there, no program is to be run in another version.
+    /// Why a message of a recording cannot be read, after the word "it": without the advice to run another version.
     pub fn in_recording(&self) -> String {
         match self {
             Self::Version { found, wanted, .. } => {
@@ -138,7 +138,7 @@ pub fn decode<M: Message>(bytes: &[u8]) -> Result<M, DecodeError> {
         return Err(DecodeError::Version { found: found_version, wanted: M::VERSION, expected });
     }
     let (message, rest) = M::read_body(body).map_err(|error| {
-        let cause = said(&error);
+        let cause = error_text(&error);
         DecodeError::Damaged { len: len.max(HEADER_LEN), expected, cause }
     })?;
     match rest.len() {
@@ -147,8 +147,8 @@ pub fn decode<M: Message>(bytes: &[u8]) -> Result<M, DecodeError> {
     }
 }
 
-/// Why postcard could not read a message, in words.
-fn said(error: &postcard::Error) -> &'static str {
+/// Why postcard could not read a message, as text.
+fn error_text(error: &postcard::Error) -> &'static str {
     use postcard::Error;
     match error {
         Error::DeserializeUnexpectedEnd => "it ends before its last field",

@@ -155,7 +155,7 @@ impl fmt::Display for Phase {
     }
 }
 
-/// What the controller does, and why.
+/// The state of the controller, with its reason.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ControllerStatus {
     /// Time in nanoseconds of the controller's clock.
@@ -174,7 +174,7 @@ pub struct ControllerStatus {
     pub active_detector: Option<String>,
     /// Why this one is active, as text.
     pub detector_why: String,
-    /// What the operator prefers: a detector's name, `onboard`, `ground` or nothing.
+    /// The operator's preference: a detector's name, `onboard`, `ground` or nothing.
     pub preference: String,
     /// Number of changes of the active detector.
     pub detector_changes: u64,
@@ -193,10 +193,10 @@ pub struct ControllerStatus {
     pub started_ns: Option<i64>,
     /// When the motors stopped after the landing, in nanoseconds of the controller's clock.
     pub disarmed_ns: Option<i64>,
-    /// True once nothing more happens without a command.
+    /// True once the controller does no more without a command.
     pub finished: bool,
-    /// True while a landing that began is held or aborted and goes on only by a command: whoever restarts a controller must not have it
-    /// taken up again.
+    /// True while a landing that began is held or aborted and continues only by a command: after a restart of the controller it must not be
+    /// resumed.
     pub waits_for_operator: bool,
     /// Detections of the marker that were used.
     pub detections_used: u64,
@@ -204,17 +204,17 @@ pub struct ControllerStatus {
     pub latency_ms: Option<[f64; 2]>,
     /// Time after which the autopilot stops when setpoints stop, in seconds; none while it is not known.
     pub setpoint_timeout_s: Option<f64>,
-    /// What the operator should know, as sentences: what is refused, and detectors that disagree.
+    /// Warnings for the operator, as sentences: refused inputs, and detectors that disagree.
     pub warnings: Vec<String>,
 }
 
 impl ControllerStatus {
-    /// The marker it lands on, unless that is no marker's name, as in a status that tells none.
+    /// The marker it lands on, unless that is no marker's name, as in a status without one.
     pub fn landing_marker(&self) -> Option<&str> {
         marker_name(&self.marker).is_ok().then_some(self.marker.as_str())
     }
 
-    /// The phase and its reason in words. A reason that begins with the phase's name stands alone, as "aborted: held too long" and
+    /// The phase and its reason as a sentence. A reason that begins with the phase's name stands alone, as "aborted: held too long" and
     /// "aborted by the operator" do.
     pub fn sentence(&self) -> String {
         let phase = self.phase.name();
@@ -235,7 +235,7 @@ impl ControllerStatus {
     }
 }
 
-/// What a text of a status is about: all but its numbers, which change with each second. Digits within backquotes stay, as
+/// The subject of a text of a status: all but its numbers, which change with each second. Digits within backquotes stay, as
 /// they are part of a name.
 pub fn matter(text: &str) -> String {
     let mut is_name = false;
@@ -273,7 +273,7 @@ pub enum ControllerCommand {
 pub struct CommandReply {
     /// Whether the command is carried out.
     pub accepted: bool,
-    /// Why not, or what happens next.
+    /// The reason of a refusal, or the next step.
     pub reason: String,
 }
 
@@ -282,21 +282,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn no_reason_doubles_the_word_of_its_phase() {
-        let told = |phase, why: &str| {
+    fn no_reason_repeats_the_name_of_its_phase() {
+        let sentence = |phase, why: &str| {
             ControllerStatus { phase, why: why.into(), ..ControllerStatus::default() }.sentence()
         };
-        assert_eq!(told(Phase::Aborted, "aborted by the operator"), "aborted by the operator");
-        assert_eq!(told(Phase::Aborted, "aborted: held too long"), "aborted: held too long");
-        assert_eq!(told(Phase::Aborted, "the battery is low"), "aborted: the battery is low");
-        assert_eq!(told(Phase::Aborted, ""), "aborted");
+        assert_eq!(sentence(Phase::Aborted, "aborted by the operator"), "aborted by the operator");
+        assert_eq!(sentence(Phase::Aborted, "aborted: held too long"), "aborted: held too long");
+        assert_eq!(sentence(Phase::Aborted, "the battery is low"), "aborted: the battery is low");
+        assert_eq!(sentence(Phase::Aborted, ""), "aborted");
     }
 
     #[test]
-    fn a_text_is_about_names_and_not_about_numbers() {
-        let text = "detector `ground1` is 1.2 m beside `air 2`";
-        assert_eq!(matter(text), "detector `ground1` is . m beside `air 2`");
-        assert_eq!(matter(text), matter("detector `ground1` is 30.45 m beside `air 2`"));
-        assert_ne!(matter(text), matter("detector `ground2` is 1.2 m beside `air 2`"));
+    fn the_subject_of_a_text_contains_names_and_no_numbers() {
+        let text = "detector `ground1` is 1.2 m from `air 2`";
+        assert_eq!(matter(text), "detector `ground1` is . m from `air 2`");
+        assert_eq!(matter(text), matter("detector `ground1` is 30.45 m from `air 2`"));
+        assert_ne!(matter(text), matter("detector `ground2` is 1.2 m from `air 2`"));
     }
 }

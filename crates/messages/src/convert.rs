@@ -18,7 +18,7 @@ impl<A: Frame, B: Frame> From<&Transform<A, B>> for Transform3 {
 }
 
 impl Transform3 {
-    /// The transform between the coordinate frames that the field's name says; `None` for a rotation without
+    /// The transform between the coordinate frames in the field's name; `None` for a rotation without
     /// a direction or numbers that are not finite.
     pub fn transform<A: Frame, B: Frame>(&self) -> Option<Transform<A, B>> {
         let [x, y, z] = self.translation_m;

@@ -30,7 +30,7 @@ pub struct Detections {
 /// Splits a marker's name, `FAMILY` or `FAMILY:ID`.
 ///
 /// # Errors
-/// Says which form a name has.
+/// States the form of a name.
 pub fn marker_name(name: &str) -> Result<(&str, Option<u32>), String> {
     let (family, id) = match name.split_once(':') {
         Some((family, id)) => (family, Some(id)),
@@ -40,7 +40,7 @@ pub fn marker_name(name: &str) -> Result<(&str, Option<u32>), String> {
     id.ok()
         .filter(|_| !family.is_empty())
         .map(|id| (family, id))
-        .ok_or_else(|| "it must be FAMILY or FAMILY:ID, with a whole number as ID".to_owned())
+        .ok_or_else(|| "it must be FAMILY or FAMILY:ID, with an integer as ID".to_owned())
 }
 
 /// The family of pads of several markers.
@@ -101,14 +101,14 @@ pub struct StageTime {
     pub micros: u32,
 }
 
-/// Candidates for markers that a detector refused in one frame; published only while somebody subscribes.
+/// Candidates for markers that a detector refused in one frame; published only while there is a subscriber.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Refusals {
     /// The detector's name.
     pub detector: String,
     /// The header of the frame, unchanged.
     pub header: FrameHeader,
-    /// How many it refused: of very many only some are kept.
+    /// How many it refused: of very many only some are listed.
     pub total: u32,
     /// The largest of them, largest first.
     pub refusals: Vec<Refusal>,
@@ -137,7 +137,7 @@ pub enum RefusedShape {
 pub struct EllipsePx {
     /// Its centre.
     pub centre_px: [f32; 2],
-    /// The whole lengths of its minor and its major axis.
+    /// The full lengths of its minor and its major axis.
     pub axes_px: [f32; 2],
     /// From the image's x axis to the minor axis, turning from x to y.
     pub angle_rad: f32,
@@ -176,11 +176,11 @@ pub struct DetectorInfo {
     pub pid: u32,
 }
 
-/// How a camera shows light, as a detector estimates it from the markers that it sees, or as it is configured.
+/// The response of a camera to light, as a detector estimates it from the markers that it sees, or as it is configured.
 ///
 /// Light from 0 (black ink) to 1 (white paper) has the level `(1 + curve) w / (1 + curve w)` between theirs; then
 /// `sharpening` times its difference from a copy blurred by a Gaussian of one pixel is added. Where it is neither configured nor
-/// told by a marker, nothing is known, and the other numbers are 0.
+/// estimated from a marker, the response is unknown, and the other numbers are 0.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CameraResponse {
     /// The detector's name.
@@ -189,7 +189,7 @@ pub struct CameraResponse {
     pub camera: String,
     /// Whether it is configured; else it is estimated.
     pub configured: bool,
-    /// Number of markers that told it.
+    /// Number of markers from which it is estimated.
     pub markers: u32,
     /// The tone curve: 0 is linear, 1.1 nearly sRGB.
     pub curve: f64,
@@ -249,10 +249,10 @@ impl Detection {
     }
 }
 
-/// Whether a detector that tells that it looks for these markers (`FAMILY:ID:SIZE_M`, `FAMILY:SIZE_M`, `pad:ID`) surely never reports the one
-/// that is wanted, `FAMILY` or `FAMILY:ID`. Of what is written otherwise nothing is known.
-pub fn looks_for_others(markers: &[String], wanted: &str) -> bool {
-    let Ok((family, id)) = marker_name(wanted) else { return false };
+/// Whether a detector that looks for these markers (`FAMILY:ID:SIZE_M`, `FAMILY:SIZE_M`, `pad:ID`) surely never reports the requested
+/// one, `FAMILY` or `FAMILY:ID`. Other forms of names are ignored.
+pub fn looks_for_others(markers: &[String], requested: &str) -> bool {
+    let Ok((family, id)) = marker_name(requested) else { return false };
     let is_other = |text: &String| {
         let parts: Vec<&str> = text.split(':').collect();
         let (of, number) = match parts[..] {
@@ -283,7 +283,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_wanted_marker_is_found_by_family_and_id() {
+    fn the_requested_marker_is_found_by_family_and_id() {
         let detection =
             |family: &str, id| Detection { family: family.into(), id, ..Detection::sample() };
         let detections = vec![
@@ -306,10 +306,10 @@ mod tests {
             |family: &str, id| Detection { family: family.into(), id, ..Detection::sample() };
         let (tag, rings) = (detection("aruco-4x4-50", Some(3)), detection("rings", None));
         assert_eq!((tag.name().as_str(), rings.name().as_str()), ("aruco-4x4-50:3", "rings"));
-        for (wanted, is_other) in
+        for (requested, is_other) in
             [("aruco-4x4-50:3", false), ("aruco-4x4-50", false), ("aruco-4x4-50:7", true)]
         {
-            assert_eq!(tag.is_other_than(wanted), is_other, "{wanted}");
+            assert_eq!(tag.is_other_than(requested), is_other, "{requested}");
         }
         assert!(rings.is_other_than("aruco-4x4-50:3") && !rings.is_other_than("pad:1"));
         assert!(detection("pad", Some(2)).is_other_than("pad:1"));
@@ -317,7 +317,7 @@ mod tests {
 
     #[test]
     fn another_marker_is_one_that_the_landing_never_takes() {
-        for (markers, wanted, is_other) in [
+        for (markers, requested, is_other) in [
             (&["rings:0.15"][..], "rings", false),
             (&["rings:0.15"], "aruco-4x4-50:7", true),
             (&["aruco-4x4-50:7:0.1"], "aruco-4x4-50", false),
@@ -328,14 +328,18 @@ mod tests {
             (&["pad:1"], "pad:1", false),
             (&["pad:1"], "pad:2", true),
             (&["rings:0.15"], "pad:1", true),
-            // What is on a pad, or a detector of another program calls its markers, is not known.
+            // The markers on a pad, and the names that a detector of another program uses, are not known.
             (&["pad:1"], "rings", false),
             (&["my marker"], "rings", false),
             (&["mine:big"], "rings", false),
             (&[], "rings", false),
         ] {
             let markers: Vec<String> = markers.iter().map(|it| (*it).to_owned()).collect();
-            assert_eq!(looks_for_others(&markers, wanted), is_other, "{markers:?} for {wanted}");
+            assert_eq!(
+                looks_for_others(&markers, requested),
+                is_other,
+                "{markers:?} for {requested}"
+            );
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Messages of the bridge: the ground stations heard, what of their packets is refused, and whether packets are signed.
+//! Messages of the bridge: the ground stations whose packets were received, their refused packets, and whether packets are signed.
 
 use std::fmt;
 
@@ -11,7 +11,7 @@ wire! {
     GcsStatus = 22 v 1;
 }
 
-/// Who is heard on the ground, what of it is refused, and whether packets are signed.
+/// The ground stations whose packets were received, their refused packets, and whether packets are signed.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GcsStatus {
     /// The bridge's name.
@@ -22,24 +22,24 @@ pub struct GcsStatus {
     pub system: Option<u8>,
     /// Address of the link to the ground, as it is configured.
     pub link: String,
-    /// The other side of that link, as text; none while the link is down, and where the bridge listens and nobody was heard.
+    /// The other side of that link, as text; none while the link is down, and where the bridge listens and no ground station was received.
     pub peer: Option<String>,
     /// Why the link is down, as a sentence.
     pub problem: Option<String>,
-    /// What a ground station may send to the autopilot: `everything`, `no-arming` or `monitor`.
+    /// The packets that a ground station may send to the autopilot: `everything`, `no-arming` or `monitor`.
     pub ground_may: String,
-    /// The ground stations that were heard since the start, silent ones included, in the order in which they were first heard.
+    /// The ground stations received since the start, silent ones included, in the order of their first packets.
     pub stations: Vec<GroundStation>,
     /// Packets of further ground stations since the start, which are not listed.
     pub unlisted: u64,
     /// Packets from the ground that were neither passed on nor answered as they ask, since the start, by reason; each once, and
-    /// the vehicle's own that come back left out.
+    /// without the vehicle's packets that come back.
     pub refused: Vec<Count>,
     /// Whether packets on the link to the ground are signed.
     pub signing: GcsSigning,
 }
 
-/// A ground station that was heard.
+/// A ground station whose packets were received.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GroundStation {
     /// Its MAVLink system id.
@@ -56,11 +56,11 @@ pub struct GroundStation {
     pub packets: u64,
     /// Those of them that were refused.
     pub refused: u64,
-    /// What is known of its last packet's signature.
+    /// The signature of its last packet.
     pub signature: PacketSignature,
 }
 
-/// What is known of a packet's signature.
+/// The signature of a packet, as far as it was checked.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PacketSignature {
@@ -77,7 +77,7 @@ pub enum PacketSignature {
 pub struct GcsSigning {
     /// Whether they are.
     pub state: SigningState,
-    /// Id of the link in the signatures of what the bridge sends; none without a key.
+    /// Id of the link in the signatures of the bridge's packets; none without a key.
     pub link_id: Option<u8>,
     /// When the last packet with a right signature came, in nanoseconds of the bridge's clock.
     pub verified_ns: Option<i64>,
@@ -90,12 +90,12 @@ pub enum SigningState {
     /// There is no key here, and no ground station signs.
     #[default]
     Off,
-    /// There is no key here, but a ground station signs, by the last packet of one that speaks or of the one that spoke last: its
-    /// packets are passed on unchecked, and it may refuse what comes from here.
+    /// There is no key here, but a ground station signs, by the last packet of one that sends or of the one that sent last: its
+    /// packets are passed on unchecked, and it may refuse packets from here.
     NoKey,
-    /// What is sent is signed and what is not signed is refused, but no packet with a right signature has come yet.
+    /// Sent packets are signed and unsigned ones are refused, but no packet with a right signature has come yet.
     Wanted,
-    /// What is sent is signed, what is not signed is refused, and packets with right signatures have come.
+    /// Sent packets are signed, unsigned ones are refused, and packets with right signatures have come.
     InForce,
 }
 

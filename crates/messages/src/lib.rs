@@ -1,12 +1,12 @@
-//! What crosses a process: types, the topic table, and the codec.
+//! The messages between processes: types, the topic table, and the codec.
 //!
-//! Wire types are plain data. They say nothing of what is done with them, and this crate knows no Zenoh, no
-//! clock and no algorithm. Units are in the fields' names; coordinate frames and pixel conventions are those
+//! Wire types are plain data. They do not define how they are used, and this crate does not depend on Zenoh, on
+//! a clock or on an algorithm. Units are in the fields' names; coordinate frames and pixel conventions are those
 //! of the `geometry` crate.
 //!
 //! Modules in reading order: [`topic`] is the table of everything that is published, [`codec`] turns it into
 //! bytes and back, [`convert`] into the types of `geometry` and `imaging` and back; [`sample`] has messages
-//! for tests, [`tape`] what a controller handled in order, and the others are the types by publisher.
+//! for tests, [`tape`] the events of a controller in order, and the others are the types by publisher.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
 

@@ -1,4 +1,4 @@
-//! Message of a recorder: file, messages kept, lost or never come by key, and its problem.
+//! Message of a recorder: its file, the number of messages stored, lost or never received by key, and its error.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,7 +8,7 @@ wire! {
     RecorderStatus = 18 v 2;
 }
 
-/// What a recorder has kept, and what not.
+/// The messages that a recorder has stored and lost.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RecorderStatus {
     /// The recorder's name.
@@ -24,12 +24,12 @@ pub struct RecorderStatus {
     /// Bytes that are free for the recorder on the disk of the file, as of the last time that something was written to it;
     /// `None` while there is no file, or where its file system has no bound.
     pub free_bytes: Option<u64>,
-    /// Messages that were kept since the start, by key; of at most [`Self::MAX_KEYS`] keys.
+    /// Messages that were stored since the start, by key; of at most [`Self::MAX_KEYS`] keys.
     pub kept: Vec<RecorderCount>,
     /// Messages that were lost since the start, by key; with [`NEVER_CAME`] after it, frames whose numbers are missing. Of at most
     /// [`Self::MAX_KEYS`] keys.
     pub dropped: Vec<RecorderCount>,
-    /// Why nothing is being kept, as a sentence.
+    /// Why no messages are stored, as a sentence.
     pub problem: Option<String>,
 }
 
@@ -37,10 +37,10 @@ pub struct RecorderStatus {
 pub const OTHER_KEYS: &str = "other keys";
 
 /// Follows the key of frames whose numbers are missing: the simulator left them out, or they were lost on their way to the
-/// recorder. What a real camera misses has no number, and stands in its own health.
+/// recorder. Frames that a real camera misses have no number, and are counted in its health.
 pub const NEVER_CAME: &str = "(never came)";
 
-/// Whether what is counted under this key are frames that never came; everything else came, and was lost by the recorder.
+/// Whether this key counts frames that never came; messages of all other keys came, and were lost by the recorder.
 pub fn has_never_come(key: &str) -> bool {
     key.ends_with(NEVER_CAME)
 }
@@ -49,7 +49,7 @@ impl RecorderStatus {
     /// Maximum number of keys that are counted, [`OTHER_KEYS`] among them.
     pub const MAX_KEYS: usize = 256;
 
-    /// How many messages were kept.
+    /// How many messages were stored.
     pub fn total_kept(&self) -> u64 {
         self.kept.iter().map(|kept| kept.count).sum()
     }
@@ -70,7 +70,7 @@ impl RecorderStatus {
     }
 }
 
-/// Messages of one key that a recorder kept or lost.
+/// Messages of one key that a recorder stored or lost.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RecorderCount {
     /// The key.
@@ -84,7 +84,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_never_came_is_no_loss_of_the_recorder() {
+    fn frames_that_never_came_are_no_loss_of_the_recorder() {
         let count = |key: &str, count| RecorderCount { key: key.into(), count };
         let dropped = vec![
             count("wind", 3),

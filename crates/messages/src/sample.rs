@@ -175,7 +175,7 @@ impl Health {
 }
 
 impl Truth {
-    /// A level vehicle at rest over the pad, on the ground, before any frame.
+    /// A level stationary vehicle on the pad, on the ground, before any frame.
     pub fn sample() -> Self {
         Self {
             stamp_ns: 0,

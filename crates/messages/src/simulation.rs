@@ -46,7 +46,7 @@ pub struct Touchdown {
 }
 
 impl Touchdown {
-    /// Horizontal distance beyond which a touchdown is beside the pad, in metres.
+    /// Horizontal distance beyond which a touchdown misses the pad, in metres.
     pub const MAX_ERROR_M: f64 = 0.3;
 }
 

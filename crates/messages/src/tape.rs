@@ -2,7 +2,7 @@
 //! packets out of them, and a running hash.
 //!
 //! A [`Tape`] holds some records. The hash of each is over its event, time and output and the hash before (XXH3 of 64 bits,
-//! seeded with that): a bit that was flipped, and a record that is missing, is found at once. What a tape says is enough to
+//! seeded with that): a bit that was flipped, and a record that is missing, is found at once. The content of a tape is enough to
 //! fly the same flight again.
 
 use std::borrow::Cow;
@@ -22,13 +22,13 @@ wire! {
 /// Length of the hash at the end of each record, in bytes.
 const HASH_LEN: usize = size_of::<u64>();
 /// Maximum size of the records that wait to be taken from a [`TapeWriter`], in bytes. Beyond it they are dropped, and the
-/// numbers of those after them tell.
+/// numbers of later records show it.
 const MAX_WAITING_BYTES: usize = 1 << 20;
 
 /// Some records of a controller's tape, in order.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Tape {
-    /// When the controller began its tape, in nanoseconds of its clock: it tells the tapes of two controllers apart.
+    /// When the controller began its tape, in nanoseconds of its clock: it distinguishes the tapes of two controllers.
     pub begun_ns: i64,
     /// Number of the first of these records; the first of all has 0.
     pub first: u64,
@@ -38,7 +38,7 @@ pub struct Tape {
     pub records: Vec<u8>,
 }
 
-/// What a controller handled.
+/// An event that a controller handled.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum TapeEvent<'a> {
     /// It started; always the first.
@@ -46,14 +46,14 @@ pub enum TapeEvent<'a> {
         /// The program with its version.
         #[serde(borrow)]
         program: Cow<'a, str>,
-        /// For what it was built.
+        /// The target of its build.
         #[serde(borrow)]
         build: Cow<'a, str>,
         /// Its effective configuration, as TOML.
         #[serde(borrow)]
         configuration: Cow<'a, str>,
     },
-    /// It took over what an earlier controller left to put back.
+    /// It took over a parameter that an earlier controller left to restore.
     TakeOver(TapeNote),
     /// A packet of the autopilot's link.
     Packet {
@@ -74,7 +74,7 @@ pub enum TapeEvent<'a> {
         /// The detector on whose key they came.
         #[serde(borrow)]
         publisher: Cow<'a, str>,
-        /// What came.
+        /// The message.
         message: Cow<'a, Detections>,
     },
     /// A camera's calibration and mount.
@@ -92,7 +92,7 @@ pub enum TapeEvent<'a> {
         /// The detector on whose key it came.
         #[serde(borrow)]
         publisher: Cow<'a, str>,
-        /// What came.
+        /// The message.
         info: Cow<'a, DetectorInfo>,
     },
     /// An operator's command.
@@ -101,23 +101,23 @@ pub enum TapeEvent<'a> {
     RefusedVersion,
     /// It ends.
     Shutdown,
-    /// Nothing was handled: this is its state, written now and then. It shows where the flight stood after a part that is
-    /// missing, and in a replay where what no decision shows yet became different.
+    /// No event was handled: this is its state, written from time to time. It shows the state of the flight after a missing
+    /// part, and in a replay the first difference before a decision shows it.
     State(Box<TapeState>),
-    /// It took over the place of the pad as an earlier controller knew it.
+    /// It took over the position of the pad that an earlier controller had estimated.
     TakeOverPad(TapePad),
 }
 
-/// What a controller says of itself.
+/// The state of a controller.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TapeState {
-    /// What it is doing; without latencies, which the health report counts.
+    /// Its status; without latencies, which the health report counts.
     pub status: ControllerStatus,
     /// The landing point.
     pub target: TargetEstimate,
 }
 
-/// A parameter of the autopilot that an earlier controller left to put back.
+/// A parameter of the autopilot that an earlier controller left to restore.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TapeNote {
     /// The link's address.
@@ -132,7 +132,7 @@ pub struct TapeNote {
     pub set_s: f64,
 }
 
-/// The place of the pad as an earlier controller knew it.
+/// The position of the pad that an earlier controller had estimated.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TapePad {
     /// The link's address.
@@ -147,7 +147,7 @@ pub struct TapePad {
     pub deviation_m: f64,
 }
 
-/// What the lander decided, with the detector in use.
+/// A decision of the lander, with the detector in use.
 #[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TapeDecision<'a> {
     /// The phase, by its short name.
@@ -211,7 +211,7 @@ pub struct TapeTarget {
     pub ambiguous: bool,
 }
 
-/// What came out of an event.
+/// The output of an event.
 #[derive(Copy, Clone, Debug, Default)]
 pub struct TapeOutput<'a> {
     /// The decision; `None` when it is the one before.
@@ -254,7 +254,7 @@ pub struct TapeRecord<'a> {
     pub number: u64,
     /// When it was handled, in nanoseconds of the controller's clock.
     pub now_ns: i64,
-    /// What was handled.
+    /// The event that was handled.
     pub event: TapeEvent<'a>,
     /// The packets for the autopilot that came out, one after the other.
     pub packets: Cow<'a, [u8]>,
@@ -264,7 +264,7 @@ pub struct TapeRecord<'a> {
     pub decision: Cow<'a, [u8]>,
     /// The running hash.
     pub hash: u64,
-    /// What the hash is of, beside the hash before.
+    /// The bytes that the hash covers, in addition to the hash before.
     bytes: &'a [u8],
 }
 
@@ -295,11 +295,11 @@ fn as_bytes<S: Serializer>(bytes: impl AsRef<[u8]>, serializer: S) -> Result<S::
     serializer.serialize_bytes(bytes.as_ref())
 }
 
-/// Bytes that grow, in memory that is kept: values are written where they stay, without a look at its size for each of
+/// Bytes that grow, in memory that is reused: values are written in place, without a check of its size for each of
 /// their parts.
 #[derive(Clone, Debug, Default)]
 struct Buffer {
-    /// What is in use, and zeros or older bytes behind it.
+    /// The bytes in use, and zeros or older bytes behind them.
     memory: Vec<u8>,
     len: usize,
 }
@@ -354,7 +354,7 @@ impl TapeWriter {
         }
     }
 
-    /// Adds an event that was handled at `now_ns`, and what came out of it.
+    /// Adds an event that was handled at `now_ns`, with its output.
     pub fn write(&mut self, now_ns: i64, event: &TapeEvent<'_>, output: &TapeOutput<'_>) {
         if self.records.len > MAX_WAITING_BYTES {
             self.records.clear();
@@ -453,7 +453,7 @@ impl<'a> TapeRecord<'a> {
     }
 }
 
-/// What follows in the bytes of a decision.
+/// The parts that follow in the bytes of a decision.
 #[derive(Copy, Clone, Default)]
 struct Contents(u8);
 
@@ -478,8 +478,8 @@ impl Contents {
 /// Appends numbers: all of them at once, as there is a decision for most events.
 fn write_numbers<const N: usize>(numbers: [f64; N], bytes: &mut Vec<u8>) {
     let mut all = [[0; 8]; N];
-    for (place, number) in all.iter_mut().zip(numbers) {
-        *place = number.to_le_bytes();
+    for (slot, number) in all.iter_mut().zip(numbers) {
+        *slot = number.to_le_bytes();
     }
     bytes.extend_from_slice(all.as_flattened());
 }
@@ -616,7 +616,7 @@ impl TapeTarget {
 }
 
 impl TapeEvent<'_> {
-    /// What it is, for people.
+    /// Its name for people.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Begin { .. } => "begin",
@@ -666,7 +666,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_was_decided_is_read_again_and_what_is_cut_is_no_decision() {
+    fn every_decision_is_read_again_and_cut_bytes_are_no_decision() {
         let target = TapeTarget {
             position_ned_m: [1.0, 2.0, 3.0],
             velocity_ned_m_s: [4.0, 5.0, -0.0],
@@ -727,7 +727,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_and_the_same_decision_is_kept_once() {
+    fn written_records_are_read_and_a_repeated_decision_is_stored_once() {
         let tape = written();
         assert_eq!((tape.begun_ns, tape.first, tape.count), (5, 0, 3));
         assert!(hashes_fit(&tape));
@@ -754,7 +754,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tape_that_nobody_takes_is_bounded_and_its_numbers_tell_what_is_missing() {
+    fn a_tape_that_is_not_taken_is_bounded_and_its_numbers_show_missing_records() {
         let mut writer = TapeWriter::new(0);
         let packet = TapeEvent::Packet { raw: Cow::Owned(vec![0; 1000]) };
         for now_ns in 0..2000 {

@@ -1,4 +1,4 @@
-//! The topic table: every key, its type, how it is delivered, who publishes it and who may subscribe to it.
+//! The topic table: every key with its type, its delivery, and the services that publish it and may subscribe to it.
 //!
 //! Keys carry no vehicle: that is the Zenoh namespace of the session.
 
@@ -26,7 +26,7 @@ pub enum Delivery {
     LastValue,
     /// A dialogue: every message in order, within the bounds of the queues.
     Reliable,
-    /// A record for later: as `Reliable`, behind all that is needed now.
+    /// A record for later: as `Reliable`, with lower priority than all traffic that is needed now.
     Record,
     /// A request with one reply.
     Query,
@@ -45,7 +45,7 @@ pub struct Row {
     pub delivery: Delivery,
     /// The services that may publish it, or, for a query, send it.
     pub publishers: &'static [&'static str],
-    /// The services that may subscribe to it, besides [`MONITORS`]; to a query's key nobody does.
+    /// The services that may subscribe to it, in addition to [`MONITORS`]; a query's key has no subscribers.
     pub subscribers: &'static [&'static str],
 }
 
@@ -97,11 +97,11 @@ impl<M: Message> Topic<M> {
         let pattern = self.row.key.rsplit('/');
         let mut chunks = key.rsplit('/');
         let mut first = None;
-        for wanted in pattern {
+        for expected in pattern {
             let chunk = chunks.next()?;
-            match wanted.starts_with('{') {
+            match expected.starts_with('{') {
                 true => first = Some(chunk),
-                false if wanted == chunk => {}
+                false if expected == chunk => {}
                 false => return None,
             }
         }
@@ -109,8 +109,8 @@ impl<M: Message> Topic<M> {
     }
 }
 
-/// Those that show or keep what the others do, and may subscribe to every topic; `observer` is whoever has a key to
-/// watch only.
+/// The services that show or record the others, and may subscribe to every topic; `observer` is a holder of a key that only
+/// allows subscriptions.
 pub const MONITORS: &[&str] = &["alight", "dashboard", "observer", "recorder"];
 
 const CAMERAS: &[&str] = &["camera-pub", "simulator"];
@@ -118,7 +118,7 @@ const DETECTOR: &[&str] = &["detector"];
 const CONTROLLER: &[&str] = &["controller"];
 const SIMULATOR: &[&str] = &["simulator"];
 const BRIDGE: &[&str] = &["gcs-bridge"];
-/// Who supervises them, `alight up`, has their keys.
+/// Their supervisor, `alight up`, has their keys.
 const SUPERVISED: &[&str] = &["controller", "detector"];
 /// Monitors only.
 const NO_OTHERS: &[&str] = &[];
@@ -129,14 +129,14 @@ pub const FRAME: Topic<FrameHeader> =
 /// JPEG files, of the whole frame or of parts of it; the message is the attachment.
 pub const JPEG: Topic<FrameHeader> =
     Topic::new("camera/{camera}/jpeg", Delivery::Latest, CAMERAS, DETECTOR);
-/// Grey pixels as the same camera would see them without distortion; made only while somebody subscribes. The message is the
+/// Grey pixels as the same camera would see them without distortion; made only while there is a subscriber. The message is the
 /// attachment.
 pub const RECT: Topic<FrameHeader> =
     Topic::new("camera/{camera}/rect", Delivery::Latest, &["camera-pub"], NO_OTHERS);
 /// A camera's calibration and mount.
 pub const CAMERA_INFO: Topic<CameraInfo> =
     Topic::new("camera/{camera}/info", Delivery::LastValue, CAMERAS, &["controller", "detector"]);
-/// How a camera is exposed, and why.
+/// The exposure of a camera, and why.
 pub const CAMERA_CONTROL: Topic<CameraControl> =
     Topic::new("camera/{camera}/control", Delivery::Latest, CAMERAS, NO_OTHERS);
 /// Markers found in a frame.
@@ -149,7 +149,7 @@ pub const DETECTIONS: Topic<Detections> = Topic::new(
 /// Acknowledges a frame of `camera/{camera}/jpeg`.
 pub const FRAME_ACK: Topic<FrameAck> =
     Topic::new("detector/{detector}/ack", Delivery::LatestPriority, DETECTOR, CAMERAS);
-/// Candidates that were refused in a frame; published only while somebody subscribes.
+/// Candidates that were refused in a frame; published only while there is a subscriber.
 pub const REFUSALS: Topic<Refusals> =
     Topic::new("detector/{detector}/refusals", Delivery::Latest, DETECTOR, NO_OTHERS);
 /// A JPEG overlay, one of `ellipses`, `rings`, `target`; the message is the attachment.
@@ -158,7 +158,7 @@ pub const DEBUG_IMAGE: Topic<FrameHeader> =
 /// A detector's identity and settings.
 pub const DETECTOR_INFO: Topic<DetectorInfo> =
     Topic::new("detector/{detector}/info", Delivery::LastValue, DETECTOR, SUPERVISED);
-/// How the camera shows light, as a detector has it.
+/// The camera's response to light, as a detector uses it.
 pub const CAMERA_RESPONSE: Topic<CameraResponse> =
     Topic::new("detector/{detector}/response", Delivery::LastValue, DETECTOR, NO_OTHERS);
 /// A command to a detector; answered with a [`CommandReply`].
@@ -186,7 +186,7 @@ pub const COMMAND: Topic<ControllerCommand> =
 /// The answer to a command; travels as the reply, on the command's key.
 pub const COMMAND_REPLY: Topic<CommandReply> =
     Topic::new("controller/command", Delivery::Query, CONTROLLER, NO_OTHERS);
-/// What the controller handled and what came out of it, in order; published only while somebody subscribes.
+/// The events that the controller handled with their output, in order; published only while there is a subscriber.
 pub const TAPE: Topic<Tape> =
     Topic::new("controller/tape", Delivery::Record, CONTROLLER, NO_OTHERS);
 /// The true wind.
@@ -207,10 +207,10 @@ pub const TO_AUTOPILOT: Topic<MavlinkBytes> = Topic::new(
     &["gcs-bridge", "simulator"],
     CONTROLLER,
 );
-/// What a recorder has kept, and what not.
+/// The messages that a recorder has stored and lost.
 pub const RECORDER_STATUS: Topic<RecorderStatus> =
     Topic::new("recorder/{recorder}/status", Delivery::LastValue, &["recorder"], BRIDGE);
-/// Ground stations that are heard, refused packets by reason, and signing.
+/// Ground stations whose packets are received, refused packets by reason, and signing.
 pub const GCS_STATUS: Topic<GcsStatus> =
     Topic::new("gcs/status", Delivery::LastValue, BRIDGE, NO_OTHERS);
 /// Health of a service.

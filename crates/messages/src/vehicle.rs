@@ -1,4 +1,4 @@
-//! The vehicle's state as the controller knows it, and the autopilot's packets.
+//! Messages of the vehicle: its state as estimated by the controller, and the autopilot's packets.
 
 use serde::{Deserialize, Serialize};
 

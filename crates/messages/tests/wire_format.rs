@@ -1,4 +1,4 @@
-//! The encoding of every message type against its golden bytes, which change only with a version and stand in
+//! Tests the encoding of every message type against its golden bytes, which change only with a version and are listed in
 //! the documentation; and decoding of arbitrary bytes.
 
 use std::borrow::Cow;
@@ -556,32 +556,32 @@ fn records_of_a_tape() {
     let camera_bytes: String = encode(&camera)[3..].iter().map(|b| format!("{b:02x}")).collect();
     let command = ControllerCommand::Start;
     let reply = CommandReply { accepted: true, reason: "r".into() };
-    let nothing = TapeOutput::default();
+    let no_output = TapeOutput::default();
     let begin = TapeEvent::Begin { program: text("a"), build: text("b"), configuration: text("c") };
-    assert_eq!(record(&begin, &nothing), "0200016101620163000000");
+    assert_eq!(record(&begin, &no_output), "0200016101620163000000");
     assert_eq!(
-        record(&TapeEvent::TakeOver(note), &nothing),
+        record(&TapeEvent::TakeOver(note), &no_output),
         "02010161010170000000000000e03f000000000000f03f000000"
     );
-    assert_eq!(record(&TapeEvent::Packet { raw: raw() }, &nothing), "020202fd07000000");
-    assert_eq!(record(&TapeEvent::GroundPacket { raw: raw() }, &nothing), "020302fd07000000");
-    let tick = TapeOutput { packets: b"ab", ..nothing };
+    assert_eq!(record(&TapeEvent::Packet { raw: raw() }, &no_output), "020202fd07000000");
+    assert_eq!(record(&TapeEvent::GroundPacket { raw: raw() }, &no_output), "020302fd07000000");
+    let tick = TapeOutput { packets: b"ab", ..no_output };
     assert_eq!(record(&TapeEvent::Tick, &tick), "02040002616200");
     let event = TapeEvent::Detections { publisher: text("m"), message: Cow::Owned(detections) };
     assert_eq!(
-        record(&event, &nothing),
+        record(&event, &no_output),
         "0205016d046d61696e04646f776eac0201016302900acc0700000000000000"
     );
     let event = TapeEvent::Camera(Cow::Owned(camera));
-    assert_eq!(record(&event, &nothing), format!("0206{camera_bytes}000000"));
+    assert_eq!(record(&event, &no_output), format!("0206{camera_bytes}000000"));
     let event = TapeEvent::Presence { detector: text("m"), alive: true };
-    assert_eq!(record(&event, &nothing), "0207016d01000000");
+    assert_eq!(record(&event, &no_output), "0207016d01000000");
     let event = TapeEvent::DetectorInfo { publisher: text("d"), info: Cow::Owned(info) };
-    assert_eq!(record(&event, &nothing), "020801640164016800016300017601000000");
-    let answered = TapeOutput { reply: Some(&reply), ..nothing };
+    assert_eq!(record(&event, &no_output), "020801640164016800016300017601000000");
+    let answered = TapeOutput { reply: Some(&reply), ..no_output };
     assert_eq!(record(&TapeEvent::Command(Cow::Owned(command)), &answered), "020900000001010172");
-    assert_eq!(record(&TapeEvent::RefusedVersion, &nothing), "020a000000");
-    assert_eq!(record(&TapeEvent::Shutdown, &nothing), "020b000000");
+    assert_eq!(record(&TapeEvent::RefusedVersion, &no_output), "020a000000");
+    assert_eq!(record(&TapeEvent::Shutdown, &no_output), "020b000000");
     let pad = TapePad {
         address: "a".into(),
         system: 1,
@@ -589,9 +589,9 @@ fn records_of_a_tape() {
         position_ned_m: [0.0, 0.0, 1.0],
         deviation_m: 0.5,
     };
-    let place = "00000000000000000000000000000000000000000000f03f000000000000e03f";
-    let taken_over = record(&TapeEvent::TakeOverPad(pad), &nothing);
-    assert_eq!(taken_over, format!("020d01610102{place}000000"));
+    let position = "00000000000000000000000000000000000000000000f03f000000000000e03f";
+    let taken_over = record(&TapeEvent::TakeOverPad(pad), &no_output);
+    assert_eq!(taken_over, format!("020d01610102{position}000000"));
     let status = ControllerStatus { phase: Phase::Hold, ..ControllerStatus::default() };
     let target = TargetEstimate {
         stamp_ns: 1,
@@ -610,7 +610,7 @@ fn records_of_a_tape() {
     };
     let state = TapeState { status, target };
     assert_eq!(
-        record(&TapeEvent::State(Box::new(state)), &nothing),
+        record(&TapeEvent::State(Box::new(state)), &no_output),
         "020c000800000000000000000000000000000000000000000002000001000000000000f03f000000000000000000000000"
     );
     let decision = TapeDecision {
@@ -633,7 +633,7 @@ fn records_of_a_tape() {
         rejected: None,
         detector: Some("m"),
     };
-    let decided = TapeOutput { decision: Some(decision), ..nothing };
+    let decided = TapeOutput { decision: Some(decision), ..no_output };
     assert_eq!(
         record(&TapeEvent::Tick, &decided),
         "02048f01a901007001007701006d000000000000f03f0000000000000000000000000000f0bf000000000000e03f000000000000f03f00000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000f03f0000000000000040000000000000e03f000000000000d03f000000000000000000000000000000402c010000000000"
@@ -646,7 +646,7 @@ fn records_of_a_tape() {
     ] {
         let decided = TapeOutput {
             decision: Some(TapeDecision { action, target: None, ..decision }),
-            ..nothing
+            ..no_output
         };
         assert_eq!(
             record(&TapeEvent::Tick, &decided),
@@ -887,7 +887,7 @@ fn the_documented_bytes_are_those_of_the_program() {
     let shown: Vec<(&str, Vec<u8>)> = blocks
         .map(|(name, rest)| {
             let lines = rest.split("```").next().unwrap_or_default().lines();
-            // The bytes take the first 48 columns, what they are follows.
+            // The bytes take the first 48 columns, their meaning follows.
             let bytes = lines.flat_map(|line| {
                 line.get(..line.len().min(48)).unwrap_or_default().split(' ').take_while(is_hex)
             });
