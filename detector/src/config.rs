@@ -7,7 +7,7 @@ use messages::Place;
 use node::{Check, Settings, read_text};
 use serde::{Deserialize, Serialize};
 
-/// The keys of `detector.toml`; meanings, units and ranges are told there.
+/// The keys of `detector.toml`; meanings, units and ranges are described there.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
@@ -23,7 +23,7 @@ pub struct Config {
     pub markers: Vec<String>,
     /// Pads whose markers are solved together.
     pub pads: Vec<String>,
-    /// Detections less sure than this are not published.
+    /// Detections with a lower confidence are not published.
     pub min_confidence: f64,
     /// Whether markers printed white on black are looked for as well.
     pub inverted: bool,
@@ -86,11 +86,11 @@ impl Config {
     /// A detector as configured.
     ///
     /// # Errors
-    /// Says which marker is wrong and why.
+    /// States which marker is wrong and why.
     pub fn detector(&self) -> Result<Detector, String> {
         let mut markers = self.listed_markers()?;
         for pad in self.parsed_pads()? {
-            pad.add_markers(&mut markers).map_err(|problem| problem.to_string())?;
+            pad.add_markers(&mut markers).map_err(|error| error.to_string())?;
         }
         if markers.is_empty() {
             return Err(
@@ -100,18 +100,18 @@ impl Config {
         let Self { thesis_threshold, inverted, thorough, .. } = *self;
         let response = self.response()?;
         let settings = fiducial::Settings { thesis_threshold, inverted, thorough, response };
-        Detector::new(&markers, settings).map_err(|problem| problem.to_string())
+        Detector::new(&markers, settings).map_err(|error| error.to_string())
     }
 
     /// How the camera shows light.
     ///
     /// # Errors
-    /// Says what a response looks like.
+    /// States the form of a response.
     pub fn response(&self) -> Result<ResponseSetting, String> {
         self.response.parse()
     }
 
-    /// How markers are followed; when they are not, the whole of each frame is searched.
+    /// How markers are tracked; when they are not, each frame is searched completely.
     pub fn tracking(&self) -> TrackingSettings {
         let TrackingConfig { enabled, full_search_period } = self.tracking;
         TrackingSettings { full_search_period: if enabled { full_search_period } else { 1 } }
@@ -120,11 +120,11 @@ impl Config {
     /// This configuration with one setting changed while the service runs.
     ///
     /// # Errors
-    /// Says why the setting is refused.
+    /// States why the setting is refused.
     pub fn with(&self, key: &str, value: &str) -> Result<Self, String> {
         let changed = node::changed(self, &format!("{key}={value}"));
-        let changed = changed.map_err(|problem| problem.to_string())?;
-        // The keys by which others know this detector, and its frames.
+        let changed = changed.map_err(|error| error.to_string())?;
+        // The keys by which other services identify this detector and its frames.
         for (name, before, after) in [
             ("id", self.id.as_str(), changed.id.as_str()),
             ("place", self.place.name(), changed.place.name()),
@@ -145,7 +145,7 @@ impl Config {
     /// The pads, read from their files.
     ///
     /// # Errors
-    /// Says which pad is wrong and why, or which file cannot be read.
+    /// States which pad is wrong and why, or which file cannot be read.
     pub fn parsed_pads(&self) -> Result<Vec<Pad>, String> {
         let read = |name: &String| Pad::named(name, |file| read_text(file));
         let pads: Vec<Pad> =
@@ -154,10 +154,10 @@ impl Config {
         Ok(pads)
     }
 
-    /// The markers of the list. Where that is the default one, it gives way to a pad with the same marker in its own size.
+    /// The markers of the list. Where that is the default one, it gives way to a pad with the same marker in the pad's size.
     ///
     /// # Errors
-    /// Says which marker or pad is wrong and why.
+    /// States which marker or pad is wrong and why.
     pub fn listed_markers(&self) -> Result<Vec<Marker>, String> {
         let mut markers = self.parsed_markers()?;
         if self.markers == DEFAULT_MARKERS {
@@ -170,7 +170,7 @@ impl Config {
         Ok(markers)
     }
 
-    /// What is looked for, by name: the markers of the list, then the pads.
+    /// The names of the searched markers: those of the list, then the pads.
     ///
     /// # Errors
     /// As [`Config::listed_markers`].
@@ -180,7 +180,7 @@ impl Config {
         Ok(names)
     }
 
-    /// What a person should know of the families that are looked for, in sentences.
+    /// Warnings about the searched families, in sentences.
     ///
     /// # Errors
     /// As [`Config::listed_markers`].
@@ -255,8 +255,11 @@ mod tests {
     fn a_family_for_comparison_is_cautioned_of_once() {
         let cautions = |set: &str| load(set).unwrap().cautions().unwrap();
         assert!(cautions("").is_empty());
-        let told = cautions("markers=[\"rings-thesis:0.15341\", \"rings:0.15341\"]");
-        assert!(matches!(told[..], [text] if text.contains("kept for comparison")), "{told:?}");
+        let warnings = cautions("markers=[\"rings-thesis:0.15341\", \"rings:0.15341\"]");
+        assert!(
+            matches!(warnings[..], [text] if text.contains("kept for comparison")),
+            "{warnings:?}"
+        );
     }
 
     #[test]

@@ -1,7 +1,7 @@
-//! Frames for the search: those of this machine as they come, those of the air link acknowledged at once.
+//! Receives frames for the search: those of this machine as they come, those of the air link with an acknowledgement at once.
 //!
-//! A camera sends its next frame over the air link when the last one is acknowledged, and measures the link by that. So frames
-//! are received by a task of their own, whatever the search does, of which the newest waits.
+//! A camera sends its next frame over the air link when the last one is acknowledged, and measures the link by that. So a
+//! separate task receives the frames, independently of the search, and the newest one waits.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -12,7 +12,7 @@ use node::{Frame, FrameSubscriber, HealthCounters, Publisher};
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
-/// Time without a newer frame after which one with an older stamp is searched: its camera began anew, or one stamp was wrong.
+/// Time without a newer frame after which one with an older stamp is searched: its camera was restarted, or one stamp was wrong.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
 /// Where frames come from.
@@ -130,7 +130,7 @@ impl Order {
     }
 }
 
-// What a thread that panicked has left is still one whole value.
+// The value that a thread left when it panicked is still complete.
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

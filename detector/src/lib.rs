@@ -1,11 +1,11 @@
-//! Frames in, marker detections out.
+//! Searches camera frames for markers and publishes the detections.
 //!
-//! The service takes the newest frame of its camera, searches it for its markers and publishes what it found, with
-//! the frame's header unchanged; also when it found nothing. It knows nothing of the vehicle and of control, and it
+//! The service takes the newest frame of its camera, searches it for its markers and publishes the detections with
+//! the frame's header unchanged; also when there are none. It does not depend on the vehicle and on control, and it
 //! runs as well on the drone as on the ground.
 //!
-//! Modules in reading order: [`config`] is what it is told, [`service`] joins the network (`inbox`) to the image work of
-//! [`search`], [`parts`] tells what was found in parts of a frame in the whole one's pixels, and [`wire`] turns the algorithm's
+//! Modules in reading order: [`config`] is its configuration, [`service`] joins the network (`inbox`) to the image work of
+//! [`search`], [`parts`] maps detections in parts of a frame to the whole frame's pixels, and [`wire`] turns the algorithm's
 //! types into messages and back.
 
 pub mod config;

@@ -1,4 +1,4 @@
-//! Markers found in parts of a frame, in pixels of the whole frame.
+//! Maps markers that were found in parts of a frame to pixels of the whole frame.
 
 use fiducial::Observation;
 use geometry::Roi;
@@ -32,7 +32,7 @@ mod tests {
     const PART: FramePart =
         FramePart { x: 160, y: 80, width: 120, height: 100, scale: 2, bytes: 0 };
 
-    /// A marker drawn at a place of a frame.
+    /// A marker drawn at a position in a frame.
     fn frame(centre: [f64; 2], size_px: f64) -> GrayImage {
         let marker = "aruco-4x4-50:7".parse().unwrap();
         let drawing = markers::Drawing::new(&marker, size_px).unwrap();

@@ -1,4 +1,4 @@
-//! The search of one frame, as configured: the same for frames that come over the network and for those of a recording.
+//! Searches one frame for the configured markers: the same for frames that come over the network and for those of a recording.
 
 use std::time::{Duration, Instant};
 
@@ -11,7 +11,7 @@ use messages::{Detection, FrameHeader, FramePart, StageTime};
 use crate::config::Config;
 use crate::{parts, wire};
 
-/// A detector with what it follows from frame to frame.
+/// A detector with the markers that it tracks from frame to frame.
 pub struct Search {
     detector: Detector,
     pads: Vec<Pad>,
@@ -33,7 +33,7 @@ impl Search {
     /// As configured.
     ///
     /// # Errors
-    /// Says which marker or pad is wrong and why.
+    /// States which marker or pad is wrong and why.
     pub fn new(config: &Config) -> Result<Self, String> {
         Ok(Self {
             detector: config.detector()?,
@@ -56,7 +56,7 @@ impl Search {
         self.searched = Searched::Whole;
         let time_s = header.stamp_ns as f64 * 1e-9;
         let found = self.tracker.detect(&mut self.detector, view, camera, time_s, clock);
-        told(found, &self.pads, camera, self.min_confidence)
+        published(found, &self.pads, camera, self.min_confidence)
     }
 
     /// The markers in parts of a frame, in the whole one's pixels; `camera` is that of the whole frame.
@@ -84,7 +84,7 @@ impl Search {
             self.parts_trace.add_roi(self.detector.trace(), &roi);
         }
         found.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
-        told(&found, &self.pads, camera, self.min_confidence)
+        published(&found, &self.pads, camera, self.min_confidence)
     }
 
     /// The candidates of the last frame, in the whole frame's pixels.
@@ -103,15 +103,15 @@ impl Search {
         }
     }
 
-    /// What is remembered of how the camera shows light.
+    /// The stored estimates of the camera's response to light.
     pub fn response(&self) -> &ResponseMemory {
         self.tracker.response()
     }
 }
 
-/// What is published of the markers that were found, in the whole frame's pixels: those that are sure enough, and the
-/// pads that these make up.
-fn told(
+/// The detections to publish, in the whole frame's pixels: markers with a sufficient confidence, and the
+/// pads of which these are parts.
+fn published(
     found: &[Observation],
     pads: &[Pad],
     camera: Option<&CameraModel>,

@@ -1,8 +1,8 @@
-//! The detector's service: the newest frame in; detections, refused candidates and debug images out; camera
+//! The detector's service: receives the newest frame and publishes detections, refused candidates and debug images. Camera
 //! information and changed parameters take effect between two frames.
 //!
-//! The image work runs on one thread of its own, named `detect`, so that no message ever waits for it. The thread
-//! takes a frame only when it is free, and its inbox keeps only the newest.
+//! The image work runs on a separate thread, named `detect`, so no message ever waits for it. The thread
+//! takes a frame only when it is free, and its inbox stores only the newest.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -31,11 +31,11 @@ use crate::wire;
 /// The debug images, as the topics name them: the thesis' three, and the squares.
 const DEBUG_IMAGES: [&str; 4] = ["ellipses", "rings", "squares", "target"];
 
-/// How often a detector tells about itself, for those whose link was cut.
+/// Period at which a detector publishes its information, for subscribers whose link was cut.
 const INFO_PERIOD: Duration = Duration::from_secs(1);
 /// Silence after which a camera's calibration may be replaced: cameras repeat it every second.
 const CAMERA_SILENT: Duration = Duration::from_millis(3500);
-/// Time for the answer to a last command to leave.
+/// Time for the answer to a last command to be sent.
 const FAREWELL: Duration = Duration::from_millis(100);
 
 /// Runs the service until it is asked to stop, by the system or by a command.
@@ -77,28 +77,28 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let (stopped, thread) = work.start()?;
     node.announce().await?;
     let follow_camera = async {
-        let mut heard = Instant::now();
+        let mut received = Instant::now();
         while let Some(info) = infos.next().await {
-            if accept(&node, lock(&camera).as_ref(), &info, heard.elapsed()) {
-                heard = Instant::now();
+            if accept(&node, lock(&camera).as_ref(), &info, received.elapsed()) {
+                received = Instant::now();
                 *lock(&camera) = Some(info);
             }
         }
     };
     let obey = async {
         let mut introduction = tokio::time::interval(INFO_PERIOD);
-        let mut told = None;
+        let mut published = None;
         loop {
             tokio::select! {
                 _ = introduction.tick() => {
                     infos_of_ours.publish(&live.info).await;
                     let now = lock(&response).clone();
-                    // What is no longer so would stay the last value for those that come late.
-                    let told_of_none = now.is_none().then(|| unknown_response(&live.config));
-                    if now != told && let Some(response) = now.as_ref().or(told_of_none.as_ref()) {
+                    // An outdated response would stay the last value for late subscribers.
+                    let unknown = now.is_none().then(|| unknown_response(&live.config));
+                    if now != published && let Some(response) = now.as_ref().or(unknown.as_ref()) {
                         responses.publish(response).await;
                     }
-                    told = now;
+                    published = now;
                 }
                 request = commands.next() => {
                     let Some(request) = request else { return };
@@ -126,17 +126,13 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     Ok(())
 }
 
-/// Whether a camera's information is used: not what no camera can have, and not another calibration while the
-/// present one is still repeated, which was heard `silence` ago. Who publishes it is not known here.
+/// Whether a camera's information is used. Implausible values are refused, and so is another calibration while the
+/// present one, received `silence` ago, is still repeated. The publisher is not known here.
 fn accept(node: &Node, known: Option<&CameraInfo>, info: &CameraInfo, silence: Duration) -> bool {
     let camera = &info.camera;
-    if let Some(problem) = info.problem() {
+    if let Some(error) = info.problem() {
         if node.health().failed("camera info that cannot be") {
-            tracing::warn!(
-                camera,
-                problem,
-                "Camera information refused (further ones are counted)"
-            );
+            tracing::warn!(camera, error, "Camera information refused (further ones are counted)");
         }
         return false;
     }
@@ -155,7 +151,7 @@ fn accept(node: &Node, known: Option<&CameraInfo>, info: &CameraInfo, silence: D
     false
 }
 
-/// What this detector says about itself.
+/// The information of this detector.
 fn info(config: &Config) -> Result<DetectorInfo, String> {
     Ok(DetectorInfo {
         detector: config.id.clone(),
@@ -176,7 +172,7 @@ fn configured_response(config: &Config) -> Option<CameraResponse> {
     }
 }
 
-/// Says that nothing is known of the camera's response.
+/// The message that the camera's response is unknown.
 fn unknown_response(config: &Config) -> CameraResponse {
     CameraResponse {
         detector: config.id.clone(),
@@ -203,16 +199,16 @@ fn camera_response(
     }
 }
 
-/// What the image thread shares with the service's task.
+/// The state that the image thread shares with the service's task.
 struct Shared {
     camera: Arc<Mutex<Option<CameraInfo>>>,
-    /// Locked before `response` by whoever locks both.
+    /// Locked before `response` where both are locked.
     change: Arc<Mutex<Option<Change>>>,
-    /// How the camera shows light, to be published.
+    /// The camera's response to light, to be published.
     response: Arc<Mutex<Option<CameraResponse>>>,
 }
 
-/// What the image thread changes to before its next frame.
+/// The changes that the image thread makes before its next frame.
 struct Change {
     config: Config,
     search: Search,
@@ -256,7 +252,7 @@ impl Live {
         new.for_each(|caution| tracing::warn!("{caution}"));
         let mut change = lock(&self.change);
         *change = Some(Change { config: config.clone(), search });
-        // What the search before knew is forgotten at once: of a camera that is gone there is no next frame.
+        // The estimate of the earlier search is dropped at once: a camera that is gone sends no next frame.
         *lock(&self.response) = configured_response(&config);
         self.config = config;
         Ok(())
@@ -311,7 +307,7 @@ impl Work {
         })
     }
 
-    /// Starts the image thread. The receiver hears when it ends.
+    /// Starts the image thread. The receiver is notified when it ends.
     fn start(mut self) -> anyhow::Result<(oneshot::Receiver<()>, std::thread::JoinHandle<()>)> {
         let runtime = Handle::current();
         let (running, stopped) = oneshot::channel();
@@ -345,7 +341,7 @@ impl Work {
             return;
         };
         let mut clock = StageClock::start();
-        // Taken out while the image it holds is looked at.
+        // Taken out while its image is processed.
         let mut converter = std::mem::take(&mut self.converter);
         match converter.convert(&bytes, width as usize, height as usize, format) {
             Ok(view) => {
@@ -381,9 +377,9 @@ impl Work {
                     self.publish_debug_images(view, &frame.header).await;
                 }
             }
-            Err(problem) => {
+            Err(error) => {
                 if self.node.health().failed("frame that cannot be decoded") {
-                    tracing::warn!(%problem, "A frame cannot be decoded; further ones are counted only");
+                    tracing::warn!(%error, "A frame cannot be decoded; further ones are counted only");
                 }
             }
         }
@@ -397,7 +393,7 @@ impl Work {
         }
     }
 
-    /// Has the response that was remembered of the camera published, unless a change is about to end that.
+    /// Stores the estimated response of the camera for publication, unless a change is about to replace it.
     fn keep_response(&self) {
         let change = lock(&self.shared.change);
         if change.is_some() {
@@ -445,7 +441,7 @@ impl Work {
         None
     }
 
-    /// What was refused in the frame that was searched last, for who asks.
+    /// Publishes the refused candidates of the last frame, for subscribers.
     async fn publish_refusals(&self, header: &FrameHeader) {
         if self.refusals.has_subscribers().await {
             let refusals = wire::refusals(&self.config.id, header, self.search.trace());

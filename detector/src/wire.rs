@@ -43,8 +43,8 @@ pub fn pad_detection(pad: &Pad, seen: &PadObservation) -> Detection {
     }
 }
 
-/// What was refused in a frame, as it is sent: the largest, as a marker that is looked for is larger than most of what
-/// resembles one.
+/// The refused candidates of a frame, as they are sent: the largest, as a marker is larger than most objects that
+/// resemble one.
 pub fn refusals(detector: &str, header: &FrameHeader, trace: &Trace) -> Refusals {
     let mut refused: Vec<_> = trace.refusals.iter().collect();
     refused.sort_by(|a, b| extent_px(&b.candidate).total_cmp(&extent_px(&a.candidate)));
@@ -60,7 +60,7 @@ pub fn refusals(detector: &str, header: &FrameHeader, trace: &Trace) -> Refusals
     }
 }
 
-/// The largest extent of a candidate, in pixels; that of one which is no number is nothing.
+/// The largest extent of a candidate, in pixels; 0 for one whose numbers are not finite.
 fn extent_px(candidate: &Candidate) -> f64 {
     let extent_px = match candidate {
         Candidate::Ring(edges) => edges.iter().map(|it| it.major).fold(0.0, f64::max),
@@ -114,16 +114,16 @@ mod tests {
         let edge = |major| Ellipse { centre: [5.0, 6.0], minor: 2.0, major, angle: 0.5 };
         let candidate = Candidate::Ring([edge(300.0), edge(400.0)]);
         trace.refusals.push(fiducial::Refusal { candidate, reason: Reason::Type });
-        let told = refusals("main", &FrameHeader::sample(), &trace);
-        assert_eq!((told.total, told.refusals.len()), (102, MAX_REFUSALS));
-        assert_eq!((told.detector.as_str(), &told.header), ("main", &FrameHeader::sample()));
+        let message = refusals("main", &FrameHeader::sample(), &trace);
+        assert_eq!((message.total, message.refusals.len()), (102, MAX_REFUSALS));
+        assert_eq!((message.detector.as_str(), &message.header), ("main", &FrameHeader::sample()));
         let axes_px = [2.0, 300.0];
         let inner = EllipsePx { centre_px: [5.0, 6.0], axes_px, angle_rad: 0.5 };
         let outer = EllipsePx { axes_px: [2.0, 400.0], ..inner };
         let ring = Refusal { reason: "type".into(), shape: RefusedShape::Ring([inner, outer]) };
-        assert_eq!(told.refusals[0], ring);
+        assert_eq!(message.refusals[0], ring);
         let corners = [[0.0, 0.0], [100.0, 0.0], [100.0, 100.0], [0.0, 100.0]];
         let shape = RefusedShape::Quad(corners);
-        assert_eq!(told.refusals[1], Refusal { reason: "border".into(), shape });
+        assert_eq!(message.refusals[1], Refusal { reason: "border".into(), shape });
     }
 }

@@ -1,4 +1,4 @@
-//! A running detector service with a camera and an operator made up here: markers of several families, changed parameters,
+//! Tests a running detector service with a simulated camera and operator: markers of several families, changed parameters,
 //! acknowledged frames of the air link, a camera in Python.
 
 use std::time::Duration;
@@ -19,7 +19,7 @@ use node::{
 use testing::{ports, python, python_passes};
 use tokio::time::timeout;
 
-const PATIENCE: Duration = Duration::from_secs(30);
+const TIMEOUT: Duration = Duration::from_secs(30);
 const MARKERS: [(&str, [f64; 2], f64); 3] = [
     ("rings", [170.0, 240.0], 180.0),
     ("apriltag-36h11:7", [430.0, 120.0], 100.0),
@@ -91,10 +91,10 @@ async fn film(frames: FramePublisher, format: PixelFormat, bytes: Vec<u8>) {
     }
 }
 
-/// Waits for detections of which something holds.
+/// Waits for detections that meet a condition.
 async fn until(
     detections: &Subscriber<Detections>,
-    what: &str,
+    condition: &str,
     holds: impl Fn(&Detections) -> bool,
 ) -> anyhow::Result<Detections> {
     let wait = async {
@@ -107,10 +107,10 @@ async fn until(
         }
         Err(last)
     };
-    match timeout(PATIENCE, wait).await {
+    match timeout(TIMEOUT, wait).await {
         Ok(Ok(message)) => Ok(message),
-        Ok(Err(last)) => Err(anyhow::anyhow!("{what}; last: {last:?}")),
-        Err(_) => Err(anyhow::anyhow!("waiting until {what}")),
+        Ok(Err(last)) => Err(anyhow::anyhow!("{condition}; last: {last:?}")),
+        Err(_) => Err(anyhow::anyhow!("waiting until {condition}")),
     }
 }
 
@@ -181,14 +181,14 @@ async fn check_live_changes(
     }
     until(detections, "only ArUco is still found", |m| names(m) == only).await?;
     accept(operator, "min_confidence", "1").await?;
-    until(detections, "nothing is sure enough", |m| m.detections.is_empty()).await?;
+    until(detections, "no confidence is sufficient", |m| m.detections.is_empty()).await?;
     accept(operator, "min_confidence", "0").await?;
     accept(operator, "markers", ALL).await?;
     until(detections, "all families are found again", |m| names(m) == all).await?;
     Ok(())
 }
 
-/// The response that was configured is published, and later that it is not known any more; whoever comes late gets it as well.
+/// The response that was configured is published, and later that it is not known any more; late subscribers get it as well.
 async fn check_response(operator: &Node) -> anyhow::Result<()> {
     let responses = operator.subscriber(topic::CAMERA_RESPONSE, &["main"]).await?;
     let configured = async {
@@ -196,21 +196,27 @@ async fn check_response(operator: &Node) -> anyhow::Result<()> {
         let late = operator.subscriber(topic::CAMERA_RESPONSE, &["main"]).await?;
         late.next().await.context("the last response")
     };
-    let told = timeout(PATIENCE, configured).await.context("waiting for the response")??;
-    ensure!((told.curve, told.sharpening) == (1.1, 0.5) && told.camera == "down", "{told:?}");
+    let received = timeout(TIMEOUT, configured).await.context("waiting for the response")??;
+    ensure!(
+        (received.curve, received.sharpening) == (1.1, 0.5) && received.camera == "down",
+        "{received:?}"
+    );
     accept(operator, "response", "\"auto\"").await?;
-    // No marker of these frames, whose camera is not calibrated, tells it.
+    // These frames, whose camera is not calibrated, give no estimate.
     let estimated = async {
         while responses.next().await.context("a response")?.configured {}
         let late = operator.subscriber(topic::CAMERA_RESPONSE, &["main"]).await?;
         late.next().await.context("the last response")
     };
-    let told = timeout(PATIENCE, estimated).await.context("waiting for another response")??;
-    ensure!((told.configured, told.markers, told.curve) == (false, 0, 0.0), "{told:?}");
+    let received = timeout(TIMEOUT, estimated).await.context("waiting for another response")??;
+    ensure!(
+        (received.configured, received.markers, received.curve) == (false, 0, 0.0),
+        "{received:?}"
+    );
     Ok(())
 }
 
-/// What a detector publishes as its configuration is what it was changed to last, also for those that come late.
+/// A detector publishes its configuration with the last change, also for late subscribers.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_changed_parameter_is_in_the_published_configuration() -> anyhow::Result<()> {
     let ([port], _, _) = ports::free()?;
@@ -218,13 +224,13 @@ async fn a_changed_parameter_is_in_the_published_configuration() -> anyhow::Resu
     let operator = open("alight", "test", port).await?;
     let layers = Layers { file: None, set: vec![format!("markers={ALL}")] };
     let config = layers.load::<Config>()?;
-    let (telling, toml) = (node.clone(), config.table.to_string());
-    let telling = tokio::spawn(async move { telling.publish_configuration(toml).await });
+    let (publishing, toml) = (node.clone(), config.table.to_string());
+    let publishing = tokio::spawn(async move { publishing.publish_configuration(toml).await });
     let service = tokio::spawn(detector::run(node, config.settings, Shutdown::on_signals()?));
-    let told = operator.subscriber(topic::CONFIGURATION, &["detector", "main"]).await?;
-    let next_with = async |told: &Subscriber<Configuration>, value: &str| {
+    let received = operator.subscriber(topic::CONFIGURATION, &["detector", "main"]).await?;
+    let next_with = async |received: &Subscriber<Configuration>, value: &str| {
         let wait = async {
-            while let Some(Configuration { toml, .. }) = told.next().await {
+            while let Some(Configuration { toml, .. }) = received.next().await {
                 // The others stay.
                 ensure!(toml.contains("aruco-4x4-50:3:0.1"), "{toml}");
                 if toml.lines().any(|line| line == format!("min_confidence = {value}")) {
@@ -233,15 +239,15 @@ async fn a_changed_parameter_is_in_the_published_configuration() -> anyhow::Resu
             }
             anyhow::bail!("the session is closed")
         };
-        timeout(PATIENCE, wait).await.with_context(|| format!("waiting for {value}"))?
+        timeout(TIMEOUT, wait).await.with_context(|| format!("waiting for {value}"))?
     };
-    next_with(&told, "0.0").await?;
+    next_with(&received, "0.0").await?;
     ensure!(!set(&operator, "min_confidence", "1.5").await?.accepted);
     accept(&operator, "min_confidence", "0.75").await?;
-    next_with(&told, "0.75").await?;
+    next_with(&received, "0.75").await?;
     let late = operator.subscriber(topic::CONFIGURATION, &["detector", "main"]).await?;
     next_with(&late, "0.75").await?;
-    telling.abort();
+    publishing.abort();
     service.abort();
     Ok(())
 }
@@ -332,7 +338,7 @@ async fn a_frame_of_the_air_link_is_acknowledged_while_another_is_searched() -> 
         while !jpegs.has_subscribers().await {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
-        // Where the search has not begun before the small frame comes, that one takes the large one's place: then once more.
+        // Where the search has not begun before the small frame comes, that one replaces the large one: then once more.
         for large in [1, 3, 5, 7, 9] {
             let small = large + 1;
             send_noise(&jpegs, large, 4000, 3000).await?;
@@ -364,7 +370,7 @@ async fn a_frame_of_the_air_link_is_acknowledged_while_another_is_searched() -> 
         }
         anyhow::bail!("the small frame always came before the search of the large one began")
     };
-    timeout(PATIENCE, watched).await.context("waiting for acknowledgements and detections")??;
+    timeout(TIMEOUT, watched).await.context("waiting for acknowledgements and detections")??;
     service.abort();
     Ok(())
 }
@@ -383,8 +389,8 @@ fn the_detector_in_python_acknowledges_a_frame_before_it_looks_at_it() -> anyhow
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_camera_in_python_is_searched_and_nobody_else_gives_its_calibration() -> anyhow::Result<()>
-{
+async fn a_camera_in_python_is_searched_and_no_other_client_gives_its_calibration()
+-> anyhow::Result<()> {
     let script = "camera-pub/examples/python/camera.py";
     let Some(probe) = python(script, &["--help"]) else { return Ok(()) };
     if !python_passes(&probe.wait_with_output()?)? {
@@ -392,7 +398,7 @@ async fn a_camera_in_python_is_searched_and_nobody_else_gives_its_calibration() 
     }
     let ([port], _, _) = ports::free()?;
     let node = open("detector", "main", port).await?;
-    let other = open("camera-pub", "stranger", port).await?;
+    let other = open("camera-pub", "other-client", port).await?;
     let layers = Layers { file: None, set: vec![format!("markers={ALL}")] };
     let service = tokio::spawn(detector::run(
         node,
@@ -415,13 +421,15 @@ async fn a_camera_in_python_is_searched_and_nobody_else_gives_its_calibration() 
         // 180 pixels of 0.2 m, seen with 1000 pixels.
         let distance_m = rings_m(&seen).context("a pose")?;
         ensure!((distance_m - 1.11).abs() < 0.06, "{distance_m} m");
-        let info = timeout(PATIENCE, infos.next()).await?.context("its calibration")?;
+        let info = timeout(TIMEOUT, infos.next()).await?.context("its calibration")?;
         ensure!(info.body_from_camera == CameraInfo::sample().body_from_camera, "{info:?}");
-        let lies = other.publisher(topic::CAMERA_INFO, &["down"]).await?;
+        let false_infos = other.publisher(topic::CAMERA_INFO, &["down"]).await?;
         for focal_px in [f64::NAN, 500.0, 2000.0].repeat(5) {
-            lies.publish(&CameraInfo { focal_px: Some([focal_px; 2]), ..info.clone() }).await;
+            false_infos
+                .publish(&CameraInfo { focal_px: Some([focal_px; 2]), ..info.clone() })
+                .await;
             for _ in 0..2 {
-                let seen = timeout(PATIENCE, detections.next()).await?.context("detections")?;
+                let seen = timeout(TIMEOUT, detections.next()).await?.context("detections")?;
                 ensure!(rings_m(&seen).is_none_or(|m| (m - 1.11).abs() < 0.06), "{seen:?}");
             }
         }

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """A detector in Python: OpenCV's ArUco and AprilTag on Alight's frames, a full member of the network.
 
-It takes the newest frame of a camera (pixels as they are, or JPEG), publishes what it found with the frame's header
-unchanged, tells about itself, declares its presence, and answers commands. docs/wire-format.md explains every byte.
+It takes the newest frame of a camera (pixels as they are, or JPEG), publishes its detections with the frame's header
+unchanged, sends its information, declares its presence, and answers commands. docs/wire-format.md explains every byte.
 
     python3 detector/examples/python/detector.py --id python --marker aruco-4x4-50:7:0.15
     alight detectors                         # it is listed, in shadow
@@ -134,7 +134,7 @@ def read_header(data):
         raise ValueError("neither Mono8 nor JPEG")
     names = ("x", "y", "width", "height", "scale", "bytes")
     header["parts"] = [{name: reader.unsigned() for name in names} for _ in range(reader.unsigned())]
-    # It goes back as it came.
+    # It is returned unchanged.
     header["encoded"] = data[3:]
     return header
 
@@ -154,7 +154,7 @@ def read_camera(data):
 
 
 def grey_parts(header, payload):
-    """The pictures in a frame's payload, finest first, each with what takes its pixels to the frame's."""
+    """The pictures in a frame's payload, finest first, each with the offset and scale of its pixels in the frame."""
     if header["format"] == 0:
         pixels = np.frombuffer(payload, np.uint8).reshape(header["height"], header["width"])
         yield pixels, 0.0, 0.0, 1.0
@@ -266,7 +266,7 @@ def write_detections(name, header, marker, corners, camera, stages):
 
 
 class Newest:
-    """A mailbox that keeps the newest only: an old frame is of no use."""
+    """A mailbox that stores only the newest value: an old frame is useless."""
 
     def __init__(self):
         self.changed, self.value = threading.Condition(), None
@@ -276,10 +276,10 @@ class Newest:
             self.value = value
             self.changed.notify()
 
-    def take(self, patience_s):
+    def take(self, timeout_s):
         with self.changed:
             if self.value is None:
-                self.changed.wait(patience_s)
+                self.changed.wait(timeout_s)
             value, self.value = self.value, None
             return value
 
@@ -289,7 +289,7 @@ class Detector:
         self.session, self.prefix, self.args = session, prefix, args
         self.frames, self.camera, self.stopped = Newest(), None, threading.Event()
         self.acks = None
-        self.problems = set()
+        self.reported = set()
 
     def key(self, rest):
         return self.prefix + rest
@@ -297,8 +297,8 @@ class Detector:
     def take_camera(self, sample):
         try:
             self.camera = read_camera(sample.payload.to_bytes())
-        except ValueError as problem:
-            self.complain("camera info", problem)
+        except ValueError as error:
+            self.warn("camera info", error)
 
     def take_frame(self, sample):
         """Acknowledges a JPEG frame as it arrives, on Zenoh's thread: a camera sends the next one over the air link then."""
@@ -308,18 +308,18 @@ class Detector:
                 ack = Writer(FRAME_ACK).text(header["camera"]).unsigned(header["sequence"])
                 ack.signed(header["stamp_ns"]).text(header["clock"]).unsigned(len(sample.payload.to_bytes()))
                 self.acks.put(ack.bytes())
-            except (ValueError, AttributeError) as problem:
-                self.complain("frame", problem)
+            except (ValueError, AttributeError) as error:
+                self.warn("frame", error)
         self.frames.put(sample)
 
-    def complain(self, what, problem):
-        """Once for each kind: a foreign message must not stop a detector, nor fill its log."""
-        if what not in self.problems:
-            self.problems.add(what)
-            print(f"{what}: {problem}; further ones are not told", file=sys.stderr, flush=True)
+    def warn(self, subject, error):
+        """Warns once for each kind: an invalid message must neither stop a detector nor fill its log."""
+        if subject not in self.reported:
+            self.reported.add(subject)
+            print(f"{subject}: {error}; further ones are not reported", file=sys.stderr, flush=True)
 
     def obey(self, query):
-        """Answers a command: whether it is accepted, and why not or what happens."""
+        """Answers a command: whether it is accepted, and why not or the next step."""
         accepted, reason = False, "no command of this version"
         try:
             reader = Reader(query.payload.to_bytes(), DETECTOR_COMMAND)
@@ -327,8 +327,8 @@ class Detector:
                 accepted, reason = True, f"detector `{self.args.id}` stops"
             else:
                 reason = f"`{reader.text()}` cannot be changed while this detector runs"
-        except (ValueError, AttributeError) as problem:
-            reason = str(problem)
+        except (ValueError, AttributeError) as error:
+            reason = str(error)
         reply = Writer(COMMAND_REPLY).byte(1 if accepted else 0).text(reason).bytes()
         query.reply(query.key_expr, reply)
         if accepted:
@@ -353,15 +353,15 @@ class Detector:
             self.session.declare_subscriber(self.key(f"camera/{camera}/info"), self.take_camera),
             self.session.declare_subscriber(self.key(f"camera/{camera}/{topic}"), self.take_frame),
         ]
-        # Ready means: able to tell where a marker is. The camera keeps its last word for those who come late.
+        # Ready means: able to locate a marker. The camera stores its last information for late subscribers.
         for reply in self.session.get(self.key(f"camera/{camera}/info"), timeout=2.0):
             if reply.ok is not None:
                 self.take_camera(reply.ok)
         kept.append(self.session.liveliness().declare_token(self.key(f"alive/detector/{name}")))
-        told_s = 0.0
+        published_s = 0.0
         while not self.stopped.is_set():
-            if time.monotonic() - told_s > 1.0:
-                told_s = time.monotonic()
+            if time.monotonic() - published_s > 1.0:
+                published_s = time.monotonic()
                 self.session.put(info_key, self.info())
             sample = self.frames.take(0.2)
             if sample is not None:
@@ -379,24 +379,24 @@ class Detector:
             detections.put(
                 write_detections(self.args.id, header, self.args.marker, corners, self.camera, stages)
             )
-        except (ValueError, AttributeError, cv2.error) as problem:
-            self.complain("frame", problem)
+        except (ValueError, AttributeError, cv2.error) as error:
+            self.warn("frame", error)
 
 
 def configuration(args):
-    """The session's configuration, and what keys begin with."""
+    """The session's configuration, and the prefix of keys."""
     if os.path.isfile(args.zenoh):
         # A file of the project: a peer like all others, whose keys get the vehicle's name from `namespace`.
         return zenoh.Config.from_file(args.zenoh), ""
     if args.zenoh not in ("", "local"):
-        # With the addresses and keys of the environment; what is wrong with them it says itself.
+        # With the addresses and keys of the environment; the program reports errors in them.
         ask = [args.alight, "config", "--session", f"detector.{args.id}", "--zenoh", args.zenoh]
         try:
             session = subprocess.run(ask, stdout=subprocess.PIPE, text=True, check=True)
-        except OSError as problem:
-            sys.exit(f"`--zenoh {args.zenoh}` needs the program `alight` (--alight PROGRAM): {problem}")
-        except subprocess.CalledProcessError as problem:
-            sys.exit(problem.returncode)
+        except OSError as error:
+            sys.exit(f"`--zenoh {args.zenoh}` needs the program `alight` (--alight PROGRAM): {error}")
+        except subprocess.CalledProcessError as error:
+            sys.exit(error.returncode)
         return zenoh.Config.from_json5(session.stdout), ""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
@@ -422,8 +422,8 @@ def main():
     config, prefix = configuration(args)
     try:
         session = zenoh.open(config)
-    except zenoh.ZError as problem:
-        sys.exit(f"no service of Alight is there: start one first, as `alight land` or `alight detector` ({problem})")
+    except zenoh.ZError as error:
+        sys.exit(f"no service of Alight is there: start one first, as `alight land` or `alight detector` ({error})")
     with session:
         detector = Detector(session, prefix, args)
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -1,4 +1,4 @@
-"""Whether the example detector acknowledges JPEG frames as they arrive, also while it searches one."""
+"""Tests whether the example detector acknowledges JPEG frames as they arrive, also while it searches one."""
 
 import pathlib
 import sys
@@ -24,7 +24,7 @@ def frame(sequence):
 
 
 class Session:
-    """Keeps the callback of the frames, and what is published by key."""
+    """Stores the callback of the frames, and the published messages by key."""
 
     def __init__(self):
         self.on_frame, self.published, self.ready = None, {}, threading.Event()
@@ -52,12 +52,12 @@ class Session:
         pass
 
 
-searching, goes_on = threading.Event(), threading.Event()
+searching, continues = threading.Event(), threading.Event()
 
 
 def find(header, payload):
     searching.set()
-    assert goes_on.wait(20)
+    assert continues.wait(20)
 
 
 session = Session()
@@ -74,10 +74,10 @@ for sequence in (2, 3):
 acks = session.published["detector/python/ack"]
 detections = session.published["detector/python/detections"]
 before = (len(acks), len(detections))
-goes_on.set()
+continues.set()
 under_test.stopped.set()
 running.join(20)
 assert before == (3, 0), f"acknowledgements and detections while the first frame is searched: {before}"
 reader = detector.Reader(acks[2], detector.FRAME_ACK)
-told = (reader.text(), reader.unsigned(), reader.signed(), reader.text(), reader.unsigned())
-assert told == ("down", 3, -3, "clock", 7), told
+received = (reader.text(), reader.unsigned(), reader.signed(), reader.text(), reader.unsigned())
+assert received == ("down", 3, -3, "clock", 7), received
