@@ -26,7 +26,7 @@ const ANSWER_BYTES: usize = 64;
 
 /// The first message of a Zenoh client that wants to connect (INIT), with its length before it. Its name, which may be any
 /// bytes, is two ends of a line: servers of lines of text, such as web servers, then answer at once.
-const GREETING: [u8; 9] = [7, 0, 0x01, 0x09, 0x32, b'\r', b'\n', b'\r', b'\n'];
+pub(crate) const GREETING: [u8; 9] = [7, 0, 0x01, 0x09, 0x32, b'\r', b'\n', b'\r', b'\n'];
 /// The answer that accepts: INIT with the flag A. The upper two bits show the optional parts.
 const INIT_ACK: u8 = 0x21;
 /// It is shorter than this: two letters, taken for its length, are more.

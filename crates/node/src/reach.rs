@@ -1,8 +1,8 @@
 //! Explains to a tool why it sees no process of the vehicle, by separate TCP and TLS connections: a name or address unknown,
-//! no program listening, its key refused. Zenoh retries an address for ever without a log message, and a relay sends nothing to a
+//! no program listening, no answer on an open connection, its key refused. Zenoh retries an address for ever without a log message, and a relay sends nothing to a
 //! client that it rejects.
 
-use std::io;
+use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -15,9 +15,10 @@ use tokio::sync::oneshot;
 use tokio::time::timeout;
 
 use crate::endpoint::{self, Endpoint};
+use crate::foreign::GREETING;
 use crate::key_pair;
 
-/// Maximum time for a connection, and for the exchange of certificates.
+/// Maximum time for a connection, and then for an answer on it, such as the exchange of certificates.
 const PATIENCE: Duration = Duration::from_secs(1);
 /// Maximum time for an address altogether: the system may look a name up for longer.
 const MAX_TIME: Duration = Duration::from_secs(4);
@@ -63,6 +64,8 @@ enum Finding {
     Unknown(io::Error),
     /// No program listens, or no answer arrives.
     Unreachable(io::Error),
+    /// The connection is open, and nothing answers on it.
+    Stalled,
     /// The exchange of certificates failed.
     Refused(io::Error),
     /// No result in time.
@@ -153,7 +156,7 @@ impl Reach {
         let own = own.unwrap_or_default();
         match finding {
             Finding::Unknown(cause) => {
-                format!("the address of `{host}` is not known here ({cause}); {CORRECT}")
+                format!("the address of `{host}` is not known here ({}); {CORRECT}", plain(cause))
             }
             Finding::Unreachable(cause) if cause.kind() == io::ErrorKind::ConnectionRefused => {
                 format!(
@@ -161,7 +164,13 @@ impl Reach {
                 )
             }
             Finding::Unreachable(cause) => format!(
-                "{at} cannot be reached ({cause}): is it switched on, and is this machine in its network? Else {CORRECT}"
+                "{at} cannot be reached ({}): is it switched on, and is this machine in its network? Else {CORRECT}",
+                plain(cause)
+            ),
+            Finding::Stalled => format!(
+                "the connection to {at} opens, but nothing answers on it within {} s: the link or the relay there is stalled. The drone continues \
+                 its landing on its own; to intervene, use the pilot's mode switch. If it persists, start the relay again, or {CORRECT}",
+                PATIENCE.as_secs()
             ),
             Finding::Slow => format!(
                 "{at} was not reached, or has not answered, within {} s: its name is resolved slowly, or it cannot be reached; {CORRECT}",
@@ -185,8 +194,9 @@ impl Reach {
                     format!("the relay at {at} has a certificate {problem}")
                 }
                 _ => format!(
-                    "the program that listens at {at} has not answered with a certificate ({cause}): another program, or a relay without keys \
-                     (`--keys`); else {CORRECT}"
+                    "the program that listens at {at} has not answered with a certificate ({}): another program, or a relay without keys \
+                     (`--keys`); else {CORRECT}",
+                    plain(cause)
                 ),
             },
             Finding::Accepted if place.is_encrypted && self.keys.is_none() => {
@@ -220,11 +230,25 @@ impl Place {
                 Ok(stream) if self.is_encrypted => {
                     return keys.map_or(Finding::Accepted, |keys| greet(stream, host, keys));
                 }
-                Ok(_) => return Finding::Accepted,
+                Ok(stream) => return answer(stream),
                 Err(cause) => last = cause,
             }
         }
         Finding::Unreachable(last)
+    }
+}
+
+/// Whether anything answers Zenoh's greeting on a connection without TLS.
+fn answer(mut stream: TcpStream) -> Finding {
+    let read = stream
+        .set_write_timeout(Some(PATIENCE))
+        .and_then(|()| stream.set_read_timeout(Some(PATIENCE)))
+        .and_then(|()| stream.write_all(&GREETING))
+        .and_then(|()| stream.read(&mut [0]));
+    match read {
+        Err(cause) if is_timeout(&cause) => Finding::Stalled,
+        // Another answer than Zenoh's was reported when the session was opened.
+        Ok(_) | Err(_) => Finding::Accepted,
     }
 }
 
@@ -241,6 +265,7 @@ fn greet(mut stream: TcpStream, host: &str, keys: &Keys) -> Finding {
     });
     match outcome {
         Ok(()) => Finding::Accepted,
+        Err(cause) if is_timeout(&cause) => Finding::Stalled,
         Err(cause) => Finding::Refused(cause),
     }
 }
@@ -328,6 +353,14 @@ fn connection(host: &str, keys: &Keys) -> anyhow::Result<ClientConnection> {
 
 fn is_timeout(cause: &io::Error) -> bool {
     matches!(cause.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut)
+}
+
+/// An error without the number that the operating system gives it.
+fn plain(cause: &io::Error) -> String {
+    match cause.raw_os_error() {
+        Some(_) => cause.kind().to_string(),
+        None => cause.to_string(),
+    }
 }
 
 fn rustls_error(cause: &io::Error) -> Option<&rustls::Error> {

@@ -194,6 +194,26 @@ async fn the_cause_of_a_missing_answer_is_reported_to_the_operator() -> anyhow::
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_stalled_relay_or_link_is_reported_as_such() -> anyhow::Result<()> {
+    let keys = tempfile::tempdir()?;
+    Authority::new()?.issue(keys.path(), "operator.anna@drone")?;
+    // The kernel accepts connections, as for a stopped relay.
+    let stopped = std::net::TcpListener::bind("127.0.0.1:0")?;
+    let site = Site { meet: 1, air: stopped.local_addr()?.to_string() };
+    let plain = Network { meet: None, ..site.network("ground") };
+    let encrypted = Network { keys: Some(keys.path().to_owned()), ..plain.clone() };
+    let (plain, encrypted) = tokio::join!(error_text(&plain), error_text(&encrypted));
+    for text in [plain?, encrypted?] {
+        let stalled = format!("the connection to {} opens, but nothing answers", site.air);
+        contains(&text, &[&stalled, "within 1 s", "stalled", "pilot's mode switch"])?;
+        for wrong in ["os error", "another program", "certificate"] {
+            ensure!(!text.contains(wrong), "`{wrong}` is in: {text}");
+        }
+    }
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_client_that_a_relay_rejects_gets_the_reason() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let keys_of = |name: &str| -> anyhow::Result<PathBuf> {
