@@ -19,7 +19,7 @@ use anyhow::bail;
 use clap::Args;
 use messages::{CameraInfo, ControllerStatus, DetectorState, FrameHeader, Health, Phase, topic};
 use node::version::release;
-use node::{INSECURE, Node, clock_name, stats};
+use node::{INSECURE, Node, RELAY, clock_name, stats};
 use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
 use tokio::time::timeout;
@@ -29,7 +29,7 @@ use self::keys::Checked;
 use crate::args::{Format, NetworkArgs, OPERATOR, WrongUse, whole_number};
 use crate::programs::{missing, missing_of_service};
 use crate::runtime::{block_on, tool_identity};
-use crate::services::{RELAY, Service};
+use crate::services::Service;
 use crate::site::{Job, Role, Site};
 use crate::terminal::print;
 

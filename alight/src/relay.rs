@@ -11,12 +11,12 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, ensure};
 use clap::Args;
 use node::access::{HOLDERS, Holders};
-use node::{HealthCounters, Identity, Network, Node, Shutdown, denied};
+use node::{HealthCounters, Identity, Network, Node, RELAY, Shutdown, denied};
 use tokio::time::MissedTickBehavior;
 
 use crate::args::{NetworkArgs, ParentArgs, source_of};
 use crate::runtime::block_on;
-use crate::services::{RELAY, warn_if_open};
+use crate::services::warn_if_open;
 
 /// Period at which the process checks that it is running.
 const BEAT: Duration = Duration::from_millis(100);

@@ -12,9 +12,6 @@ use node::{Effective, INSECURE, Identity, Layers, Network, Node, Settings, Shutd
 use crate::args::{ServiceArgs, source_of};
 use crate::runtime::block_on;
 
-/// The name of the relay as a service.
-pub(crate) const RELAY: &str = "relay";
-
 /// The services.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Service {

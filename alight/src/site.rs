@@ -9,11 +9,11 @@ use clap::ValueEnum;
 use messages::looks_for_others;
 use node::access::key_name;
 use node::network::{Address, NO_KEYS_OVER_IPV6};
-use node::{ConfigError, Layers, Network};
+use node::{ConfigError, Layers, Network, RELAY};
 use serde::Deserialize;
 
 use crate::args::{MEET_RULE, WrongUse, source_of};
-use crate::services::{RELAY, Service};
+use crate::services::Service;
 
 /// The role of a machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

@@ -54,7 +54,7 @@ pub use service::{
     Options, Shutdown, ignores_hangups, own_program, relaunch, relaunch_with_zenoh_threads, run,
     start_logging,
 };
-pub use session::{Announcement, Node, Presence, ZenohSource};
+pub use session::{Announcement, Node, Presence, RELAY, ZenohSource};
 pub use standstill::Standstill;
 pub use state::{STATE_VARIABLE, state_directory};
 pub use tap::{Tap, Tapped};

@@ -115,11 +115,7 @@ impl Reach {
 
     /// The reason why no process of the vehicle is seen, and a remedy.
     pub(crate) async fn explain(&self) -> String {
-        let mut reasons = Vec::new();
-        for place in &self.places {
-            let finding = self.finding(place).await;
-            reasons.push(self.reason(place, &finding));
-        }
+        let mut reasons = self.reasons().await;
         if let Some(port) = self.meet {
             reasons.push(format!(
                 "no process of the vehicle `{}` meets at port {port} of this machine: `alight land` prints the port of its processes (`--meet`, \
@@ -131,6 +127,21 @@ impl Reach {
             true => format!("is one running for the vehicle `{}`?", self.vehicle),
             false => reasons.join("; "),
         }
+    }
+
+    /// The same for the other machines only: why their processes are not seen.
+    pub(crate) async fn explain_others(&self) -> Option<String> {
+        let reasons = self.reasons().await;
+        (!reasons.is_empty()).then(|| reasons.join("; "))
+    }
+
+    async fn reasons(&self) -> Vec<String> {
+        let mut reasons = Vec::new();
+        for place in &self.places {
+            let finding = self.finding(place).await;
+            reasons.push(self.reason(place, &finding));
+        }
+        reasons
     }
 
     /// Connects in a separate thread, for which neither the runtime's workers nor the end of the process waits.

@@ -34,6 +34,9 @@ pub fn local_config(port: u16) -> String {
     LOCAL_CONFIG.replace(&format!(":{LOCAL_PORT}"), &format!(":{port}"))
 }
 
+/// The name of a relay as a service.
+pub const RELAY: &str = "relay";
+
 /// Presence changes that a mailbox keeps.
 const PRESENCE_DEPTH: usize = 256;
 
@@ -275,7 +278,15 @@ impl Node {
             let names = ready.iter().map(|(name, id)| format!("{name} `{id}`"));
             let names: Vec<_> = names.map(|name| sender::shown(&name)).collect();
             let vehicle = self.reach.vehicle();
-            format!("of the vehicle `{vehicle}` there is only {}", names.join(", "))
+            let only = format!("of the vehicle `{vehicle}` there is only {}", names.join(", "));
+            // Without a relay in sight, these are processes of this machine, which need none.
+            if ready.iter().any(|(name, _)| name == RELAY) {
+                return only;
+            }
+            match self.reach.explain_others().await {
+                Some(why) => format!("{only}; {why}"),
+                None => only,
+            }
         })
     }
 

@@ -264,6 +264,17 @@ async fn a_client_that_a_relay_rejects_gets_the_reason() -> anyhow::Result<()> {
     contains(&bob?, &["bob/operator.pem, but announces no process to it", "revoked"])?;
     contains(&eve?, &["of another authority"])?;
     contains(&named?, &["not valid for the address `localhost`", "--address"])?;
+    // Processes of the ground see each other without the relay, which still announces none to a revoked holder.
+    let own = issue(&authority, "dave", "operator.dave@drone")?;
+    common::list(&drone, "operator.dave@drone")?;
+    let identity = Identity { service: "detector", instance: "ground".into() };
+    let detector = Node::open(identity, &ground(&own).source("operator")?).await?;
+    detector.announce().await?;
+    contains(
+        &error_text(&to_bob).await?,
+        &["there is only detector `ground`; ", "bob/operator.pem, but announces no", "revoked"],
+    )?;
+    detector.close().await;
     controller.announce().await?;
     contains(
         &error_text(&ground(&mallory)).await?,
