@@ -351,6 +351,26 @@ fn bounds_are_named_min_and_max() -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Words that describe programs and values as persons, and the files that explain that.
+const PERSONAL: [&str; 4] = ["told", "tell", "tells", "heard"];
+const ABOUT_WORDS: [&str; 2] = ["CONTRIBUTING.md", "tests/architecture.rs"];
+
+#[test]
+fn programs_and_values_are_not_described_as_persons() -> anyhow::Result<()> {
+    let mut found = BTreeSet::new();
+    for ending in ["rs", "toml", "py", "js", "html", "md"] {
+        for path in tracked(ending)?.into_iter().filter(|it| !ABOUT_WORDS.contains(&it.as_str())) {
+            let content = text(root().join(&path))?.to_lowercase();
+            let words = content.split(|letter: char| !letter.is_alphabetic());
+            found.extend(
+                words.filter(|word| PERSONAL.contains(word)).map(|word| format!("{path}: {word}")),
+            );
+        }
+    }
+    ensure!(found.is_empty(), "CONTRIBUTING.md names words to use instead: {found:#?}");
+    Ok(())
+}
+
 #[test]
 fn parameters_are_no_tuples() -> anyhow::Result<()> {
     let mut found = Vec::new();
