@@ -138,7 +138,7 @@ export class Map2 {
       context.stroke();
       context.fillText(`${up < 1 && up > 0 ? up.toFixed(1) : up.toFixed(0)}`, 4 * ratio, y + 4 * ratio);
     }
-    const label = `m up; to ${far.toFixed(2)} m from the pad`;
+    const label = `m up; ${far.toFixed(2)} m across`;
     context.fillText(this.funnel ? `${label}; dashed: funnel` : label, 34 * ratio, height - 5 * ratio);
     if (this.funnel) {
       // Left of it the vehicle may descend.
