@@ -217,7 +217,7 @@ mod tests {
         assert!(load(twice).unwrap_err().contains("listed twice"));
         assert!(load("response=bright").unwrap_err().contains("srgb"));
         assert!(load("thesis_threshold=0").unwrap_err().contains("from 1 to 255"));
-        // A number that does not fit its type is refused too, whatever its range says.
+        // A number that does not fit its type is refused too, independently of its range.
         assert!(load("thesis_threshold=300").is_err());
     }
 

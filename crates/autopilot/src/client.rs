@@ -189,7 +189,7 @@ impl Autopilot {
         self.step_requests(now_ns, false);
     }
 
-    /// Lets time pass: to be called at 20 Hz or more, also when nothing is received.
+    /// Lets time pass: to be called at 20 Hz or more, also when no packet is received.
     pub fn tick(&mut self, now_ns: i64) {
         self.now_ns = now_ns;
         if self.config.heartbeat && now_ns >= self.heartbeat_due_ns {
@@ -479,7 +479,7 @@ impl Autopilot {
         if !state.mode.is_guided() {
             return Err(SetpointError::NotGuided(state.mode));
         }
-        // "Landing" lasts for a moment after LAND. During a takeoff a setpoint would end it.
+        // "Landing" persists for a moment after LAND. During a takeoff a setpoint would end it.
         if !state.armed || !matches!(state.landed, LandedState::InAir | LandedState::Landing) {
             return Err(SetpointError::NotFlying(state.landed));
         }

@@ -34,7 +34,7 @@ pub enum Conflict {
         /// The newest message of it.
         message: &'static str,
     },
-    /// Two autopilots are on the link, and the configuration does not say which one is flown.
+    /// Two autopilots are on the link, and the configuration does not state which one is flown.
     #[error(
         "two vehicles are on the autopilot's link, with the system ids {system} and {other}, and the configuration does not \
          state which one is to be flown. Set `autopilot.system_id` to its id, and start the controller again; in the air the autopilot's \

@@ -18,7 +18,7 @@ const COMPONENT: usize = 31;
 const HEADER: usize = 10;
 const CHECKSUM: usize = 2;
 
-/// A command in a packet, whether the dialect knows it or not.
+/// A command in a packet, whether the dialect contains it or not.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct GivenCommand {
     /// Its number.

@@ -2,7 +2,7 @@
 //! reconnection, signatures, and explained errors.
 //!
 //! A permanent problem (a port used by another program) is an error at once; a temporary one (no device yet,
-//! no reply, a cable pulled) is retried without end. Slow readers and slow lines block nothing: queues are
+//! no reply, a cable pulled) is retried without end. Slow readers and slow lines do not block: queues are
 //! bounded, the oldest received packet is dropped, and a packet that cannot be sent is refused, because a
 //! late command is a wrong one.
 

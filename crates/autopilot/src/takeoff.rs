@@ -110,7 +110,7 @@ pub enum TakeoffError {
     },
     /// The vehicle may be a real one, which was not allowed.
     #[error(
-        "no takeoff: within {} s the vehicle did not say that it is a simulation (no SIM_STATE, SIMSTATE or \
+        "no takeoff: within {} s the vehicle did not report that it is a simulation (no SIM_STATE, SIMSTATE or \
          HIL_STATE_QUATERNION, and no HIL flag in its heartbeat), so it may be a real one. Check the address of \
          the autopilot; `alight land --real-vehicle` (`takeoff_real_vehicle = true` of the controller) starts \
          the motors of any vehicle",
@@ -498,7 +498,7 @@ impl Takeoff {
             Part::Ready => {
                 let mut reasons = reasons(autopilot);
                 if self.only_simulated && autopilot.is_connected() && !autopilot.is_simulated() {
-                    reasons.insert(0, "waiting for it to say that it is a simulation".to_owned());
+                    reasons.insert(0, "waiting for its report that it is a simulation".to_owned());
                 }
                 if self.is_listening && autopilot.is_connected() {
                     reasons.push(LISTENING.to_owned());

@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lost_part_hides_nothing_else() {
+    fn a_lost_part_hides_no_other_text() {
         let mut joiner = Joiner::default();
         let long = "x".repeat(PART);
         joiner.push(0, &part(3, 0, &long));

@@ -125,7 +125,7 @@ pub enum Phase {
     Aborted,
     /// The pilot, or a failsafe of the autopilot, flies.
     PilotInCommand,
-    /// Ended by a failure; nothing is sent any more.
+    /// Ended by a failure; no setpoint or command is sent any more.
     Failed,
 }
 
@@ -219,11 +219,11 @@ impl ControllerStatus {
     pub fn sentence(&self) -> String {
         let phase = self.phase.name();
         let after = self.why.strip_prefix(phase);
-        let says_it =
+        let names_phase =
             after.is_some_and(|after| after.starts_with(": ") || after.starts_with(" by "));
         match self.why.as_str() {
             "" => phase.to_owned(),
-            why if says_it => why.to_owned(),
+            why if names_phase => why.to_owned(),
             why => format!("{phase}: {why}"),
         }
     }

@@ -178,7 +178,7 @@ class Marker:
         name = "DICT_" + family.removeprefix("aruco-").replace("-", "_").upper()
         dictionary = getattr(cv2.aruco, name, None)
         if dictionary is None:
-            raise argparse.ArgumentTypeError(f"OpenCV knows no family `{family}`")
+            raise argparse.ArgumentTypeError(f"OpenCV has no family `{family}`")
         self.text, self.family, self.id, self.size_m = text, family, int(number), float(size)
         # OpenCV turns AprilTags by half a turn against AprilTag 3, and begins with their bottom-right corner.
         self.first_corner = 2 if family.startswith("apriltag-") else 0
