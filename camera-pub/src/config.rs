@@ -922,6 +922,6 @@ mod tests {
             );
         }
         check(&["source.controls=['gain']"], "`name=value`");
-        check(&["source.controls=['gain=much']"], "no number");
+        check(&["source.controls=['gain=much']"], "not a number");
     }
 }

@@ -389,7 +389,7 @@ mod tests {
         // A tunnel has its end here as well.
         for endpoint in ["tcp/10.0.0.1:7448", "tcp/127.0.0.1:7448?prio=5-6"] {
             let there = problem_of(endpoint, Answer::Silence).unwrap();
-            for part in ["0.0.1:7448, where", "2 s", "on that machine", "--connect"] {
+            for part in ["0.0.1:7448, to which", "2 s", "on that machine", "--connect"] {
                 assert!(there.contains(part), "`{part}` is not in: {there}");
             }
             let keys = problem_of(endpoint, Answer::Encrypted).unwrap();
