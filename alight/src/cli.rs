@@ -169,6 +169,7 @@ fn is_wrong_use(problem: &anyhow::Error) -> bool {
     problem.is::<WrongUse>()
         || problem.is::<ConfigError>()
         || problem.is::<clap::Error>()
+        || problem.is::<controller::KeyFileError>()
         || problem.is::<fiducial::DetectorError>()
         || problem.is::<markers::PadError>()
         || problem.is::<markers::BoardError>()
@@ -194,6 +195,8 @@ fn print_config(args: ConfigArgs) -> anyhow::Result<ExitCode> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::Permissions;
+    use std::os::unix::fs::PermissionsExt;
     use std::path::Path;
 
     use super::*;
@@ -296,6 +299,31 @@ mod tests {
             for network in [["--zenoh", "nosuch.json5"], ["--vehicle", "a/b"]] {
                 let problem = performed(&[&[service.name()][..], &network].concat()).unwrap_err();
                 assert!(is_wrong_use(&problem), "{}, {network:?}: {problem:#}", service.name());
+            }
+        }
+    }
+
+    #[test]
+    fn a_signing_key_that_cannot_be_used_is_a_wrong_use_of_a_service() {
+        let folder = tempfile::tempdir().unwrap();
+        let (missing, open) = (folder.path().join("missing"), folder.path().join("open"));
+        std::fs::write(&open, "correct horse battery").unwrap();
+        std::fs::set_permissions(&open, Permissions::from_mode(0o644)).unwrap();
+        let udp = "udpin:127.0.0.1:0";
+        for (service, address, key) in [
+            ("gcs-bridge", "ground", "signing_key"),
+            ("controller", "autopilot.address", "autopilot.signing_key"),
+        ] {
+            for (file, reason) in [(&missing, "No such file"), (&open, "is open to other users")] {
+                let ([port], _, _) = testing::ports::free().unwrap();
+                let port = port.to_string();
+                let address = format!("{address}={udp}");
+                let key = format!("{key}={}", file.display());
+                let words = [service, "--meet", &port, "--set", &address, "--set", &key];
+                let problem = performed(&words).unwrap_err();
+                let text = format!("{problem:#}");
+                assert!(is_wrong_use(&problem), "{text}");
+                assert_eq!(text.matches(reason).count(), 1, "{text}");
             }
         }
     }

@@ -27,7 +27,7 @@ use tokio::time::timeout;
 use self::focus::Focus;
 use self::keys::Checked;
 use crate::args::{Format, NetworkArgs, OPERATOR, WrongUse, whole_number};
-use crate::programs::{missing, missing_of_service};
+use crate::programs::{missing, missing_of_service, unusable_key};
 use crate::runtime::{block_on, tool_identity};
 use crate::services::Service;
 use crate::site::{Job, Role, Site};
@@ -286,27 +286,13 @@ fn check_site(
     }
 }
 
-/// Why a service's key for signed MAVLink packets cannot be used, if it has one.
-fn problem_of_key(job: &Job, service: Service) -> Option<String> {
-    let problem = match service {
-        Service::Controller => {
-            job.layers.load::<controller::Config>().ok()?.settings.signing().err()?
-        }
-        Service::GcsBridge => {
-            job.layers.load::<gcs_bridge::Config>().ok()?.settings.signing().err()?
-        }
-        _ => return None,
-    };
-    Some(problem.to_string())
-}
-
 /// Checks the files and devices that a service needs.
 fn check_devices(findings: &mut Findings, job: &Job, service: Service, folder: &Path) {
     let Ok(config) = service.effective_config(&job.layers) else { return };
-    if let Some(problem) = problem_of_key(job, service) {
+    if let Some(problem) = unusable_key(job, folder) {
         findings.wrong(
             "signing",
-            problem,
+            problem.to_string(),
             "`alight keys signing` makes a key, for the user that runs `alight`",
         );
     }

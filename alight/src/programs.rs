@@ -1,8 +1,11 @@
 //! Finds the programs, devices and files that the processes of a site need and this machine does not have.
 
 use std::ffi::OsStr;
+use std::io::ErrorKind;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
+
+use controller::KeyFileError;
 
 use crate::services::Service;
 use crate::site::Job;
@@ -30,7 +33,7 @@ pub(crate) fn missing_of_service(job: &Job, folder: &Path, search: &OsStr) -> Op
 }
 
 /// The missing devices and files of a service, with the remedy: the autopilot's serial port, a camera, images, a calibration, a key for
-/// signed packets.
+/// signed packets, which may also be unusable.
 pub(crate) fn missing_devices(job: &Job, folder: &Path) -> Vec<String> {
     let Some(config) = job.service.and_then(|it| it.effective_config(&job.layers).ok()) else {
         return Vec::new();
@@ -73,7 +76,32 @@ pub(crate) fn missing_devices(job: &Job, folder: &Path) -> Vec<String> {
     wanted.retain(|(path, _, _)| std::fs::metadata(folder.join(path)).is_err());
     let message =
         |(path, what, advice)| format!("{}: there is no {what} {path}; {advice}", job.name);
-    wanted.into_iter().map(message).collect()
+    let missing = wanted.into_iter().map(message);
+    let is_missing = |it: &KeyFileError| matches!(it, KeyFileError::Read { cause, .. } if cause.kind() == ErrorKind::NotFound);
+    let key = unusable_key(job, folder).filter(|it| !is_missing(it));
+    missing.chain(key.map(|it| format!("{}: {it}", job.name))).collect()
+}
+
+/// Why a service's key for signed MAVLink packets cannot be used, if it has one.
+pub(crate) fn unusable_key(job: &Job, folder: &Path) -> Option<KeyFileError> {
+    let in_folder = |key: &mut String| {
+        if !key.is_empty() {
+            *key = folder.join(&key).to_string_lossy().into_owned();
+        }
+    };
+    match job.service {
+        Some(Service::Controller) => {
+            let mut settings = job.layers.load::<controller::Config>().ok()?.settings;
+            in_folder(&mut settings.autopilot.signing_key);
+            settings.signing().err()
+        }
+        Some(Service::GcsBridge) => {
+            let mut settings = job.layers.load::<gcs_bridge::Config>().ok()?.settings;
+            in_folder(&mut settings.signing_key);
+            settings.signing().err()
+        }
+        _ => None,
+    }
 }
 
 fn absent(program: &str, folder: &Path, search: &OsStr) -> Option<String> {
@@ -158,7 +186,12 @@ mod tests {
             line[0].contains("gcs-bridge: there is no file no-such.signing; make it"),
             "{line:?}"
         );
-        assert_eq!(missing(Service::GcsBridge, &["signing_key=there"]), Vec::<String>::new());
+        let line = missing(Service::GcsBridge, &["signing_key=there"]);
+        assert!(line[0].contains("there\" is open to other users (mode 755)"), "{line:?}");
+        let key = folder.path().join("key");
+        std::fs::write(&key, "correct horse battery").unwrap();
+        std::fs::set_permissions(&key, std::fs::Permissions::from_mode(0o600)).unwrap();
+        assert_eq!(missing(Service::GcsBridge, &["signing_key=key"]), Vec::<String>::new());
         let size = "source.size_px=[64, 48]";
         let camera = missing(
             Service::CameraPub,

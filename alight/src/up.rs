@@ -35,7 +35,8 @@ pub(crate) struct UpArgs {
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
     /// Print the processes without starting them. Missing items are named, with exit status 1: a program (also one that reads a
-    /// camera), the autopilot's serial port, a camera's device, images, a calibration, a detector that looks for the controller's marker.
+    /// camera), the autopilot's serial port, a camera's device, images, a calibration, a key for signed packets (also one that is open to
+    /// other users), a detector that looks for the controller's marker.
     #[arg(long)]
     dry_run: bool,
 }

@@ -44,5 +44,6 @@ pub mod unreadable;
 pub mod wind;
 pub mod wire;
 
+pub use autopilot::KeyFileError;
 pub use config::Config;
 pub use service::run;

@@ -31,12 +31,12 @@ pub struct SigningConfig {
 #[derive(Debug, thiserror::Error)]
 pub enum KeyFileError {
     /// It cannot be read.
-    #[error("reading the signing key {path:?}: {source}")]
+    #[error("reading the signing key {path:?}: {cause}")]
     Read {
         /// The file.
         path: PathBuf,
         /// The error of the operating system.
-        source: io::Error,
+        cause: io::Error,
     },
     /// Other users can read it.
     #[error(
@@ -50,12 +50,12 @@ pub enum KeyFileError {
         mode: u32,
     },
     /// It is no key.
-    #[error("the signing key {path:?} is {source}")]
+    #[error("the signing key {path:?} is {cause}")]
     NotAKey {
         /// The file.
         path: PathBuf,
         /// Why not.
-        source: crate::signing::NotAKey,
+        cause: crate::signing::NotAKey,
     },
 }
 
@@ -71,7 +71,7 @@ impl SigningConfig {
         state: Option<PathBuf>,
         name: &str,
     ) -> Result<Self, KeyFileError> {
-        let failed = |source| KeyFileError::Read { path: path.to_owned(), source };
+        let failed = |cause| KeyFileError::Read { path: path.to_owned(), cause };
         let about = std::fs::metadata(path).map_err(failed)?;
         let mode = about.permissions().mode() & 0o777;
         if mode & 0o077 != 0 {
@@ -81,9 +81,8 @@ impl SigningConfig {
             return Err(failed(io::Error::other(format!("it has more than {MAX_KEY_FILE} bytes"))));
         }
         let text = std::fs::read_to_string(path).map_err(failed)?;
-        let key = text
-            .parse()
-            .map_err(|source| KeyFileError::NotAKey { path: path.to_owned(), source })?;
+        let key =
+            text.parse().map_err(|cause| KeyFileError::NotAKey { path: path.to_owned(), cause })?;
         let stamp_file = state.map(|directory| directory.join(format!("signing-{name}.stamp")));
         Ok(Self { key, link_id, stamp_file, clock: SystemTime::now })
     }
