@@ -49,15 +49,6 @@ pub(crate) fn missing_devices(job: &Job, folder: &Path) -> Vec<String> {
             let device = settings.ok().and_then(|it| it.serial_device());
             let advice = "connect the autopilot, or correct `autopilot.address`";
             wanted.extend(device.map(|device| (device, "device", advice)));
-            let key = text("autopilot", "signing_key").map(str::to_owned);
-            let advice = "make it (`alight keys signing`), or correct `autopilot.signing_key`";
-            wanted.extend(key.map(|key| (key, "file", advice)));
-        }
-        Some(Service::GcsBridge) => {
-            let key = config.get("signing_key").and_then(toml::Value::as_str);
-            let key = key.filter(|key| !key.is_empty()).map(str::to_owned);
-            let advice = "make it (`alight keys signing`), or correct `signing_key`";
-            wanted.extend(key.map(|key| (key, "file", advice)));
         }
         Some(Service::CameraPub) => {
             let device = text("source", "device").map(str::to_owned);
@@ -77,8 +68,17 @@ pub(crate) fn missing_devices(job: &Job, folder: &Path) -> Vec<String> {
     let message =
         |(path, what, advice)| format!("{}: there is no {what} {path}; {advice}", job.name);
     let missing = wanted.into_iter().map(message);
-    let is_missing = |it: &KeyFileError| matches!(it, KeyFileError::Read { cause, .. } if cause.kind() == ErrorKind::NotFound);
-    let key = unusable_key(job, folder).filter(|it| !is_missing(it));
+    let key = unusable_key(job, folder).map(|error| match &error {
+        KeyFileError::Read { path, cause } if cause.kind() == ErrorKind::NotFound => {
+            let path = path.strip_prefix(folder).unwrap_or(path).display();
+            let name = match job.service {
+                Some(Service::Controller) => "autopilot.signing_key",
+                _ => "signing_key",
+            };
+            format!("there is no file {path}; make it (`alight keys signing`), or correct `{name}`")
+        }
+        _ => error.to_string(),
+    });
     missing.chain(key.map(|it| format!("{}: {it}", job.name))).collect()
 }
 
