@@ -209,8 +209,7 @@ impl Mission {
     /// When LAND was asked for last, where a PX4 may have taken it; now, where it shows it.
     fn land_sent_ns(&self, autopilot: &Autopilot, now_ns: i64) -> Option<i64> {
         let State::AskingForLand { request } = self.state else { return None };
-        let lands = autopilot.state().is_some_and(|state| state.mode == FlightMode::AUTO_LAND);
-        autopilot.sent_ns(request).or(lands.then_some(now_ns))
+        autopilot.sent_ns(request).or(autopilot.is_in_auto_land().then_some(now_ns))
     }
 
     /// Gives up a request for LAND, for this reason: a PX4 that may have taken it is taken back to HOLD. True while that continues.
@@ -228,8 +227,9 @@ impl Mission {
 
     /// A LAND that is called back continues, as the vehicle is too low to be held there.
     pub fn leave_in_land(&mut self, autopilot: &mut Autopilot) {
-        let lands = autopilot.state().is_some_and(|state| state.mode == FlightMode::AUTO_LAND);
-        if lands && let State::LeavingOffboard { .. } = self.state {
+        if autopilot.is_in_auto_land()
+            && let State::LeavingOffboard { .. } = self.state
+        {
             let why = "ended by the operator, too low for it: the LAND that the vehicle has taken continues; the pilot's mode switch stops it";
             self.fail(autopilot, why.to_owned());
         }
@@ -277,10 +277,10 @@ impl Mission {
             return true;
         }
         // In OFFBOARD still, the landing that was given up would begin automatically.
-        let mode = autopilot.state().filter(|state| state.armed).map(|state| state.mode);
+        let is_armed = autopilot.state().is_some_and(|state| state.armed);
         let is_out = !autopilot.is_in_offboard();
         let (mut why, awaits_takeoff) = (std::mem::take(why), *awaits_takeoff && is_out);
-        if mode == Some(FlightMode::AUTO_LAND) {
+        if is_armed && autopilot.is_in_auto_land() {
             why.push_str(", and it stays in LAND all the same: the pilot's mode switch stops it");
         }
         self.fail(autopilot, why);

@@ -22,7 +22,7 @@ use crate::command::{
 };
 use crate::compose;
 use crate::config::Config;
-use crate::conflict::Conflict;
+use crate::conflict::{Conflict, LISTENS_NS};
 use crate::contact::Contact;
 use crate::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, TIMESYNC_DATA};
 use crate::event::Event;
@@ -46,8 +46,6 @@ const MAX_OUTCOMES: usize = 32;
 const HEARTBEAT_NS: i64 = 1_000_000_000;
 /// The delay for which an unsteady link counts.
 const UNSTEADY: Duration = Duration::from_secs(1);
-/// Time within which a heartbeat of another vehicle on the link is received, in nanoseconds: two heartbeats, which come once a second, and a margin.
-const LISTENS_NS: i64 = 2_500_000_000;
 /// Time within which the clock's answers show how slow the link is, in nanoseconds: it is requested ten times a second.
 const LINK_DELAY_DUE_NS: i64 = 3_000_000_000;
 /// Time for which a delay counts that is not measured any more, in nanoseconds.
@@ -429,6 +427,11 @@ impl Autopilot {
     /// True while the vehicle shows OFFBOARD.
     pub fn is_in_offboard(&self) -> bool {
         self.state().is_some_and(|state| state.mode == FlightMode::OFFBOARD)
+    }
+
+    /// True while a PX4 shows LAND.
+    pub fn is_in_auto_land(&self) -> bool {
+        self.state().is_some_and(|state| state.mode == FlightMode::AUTO_LAND)
     }
 
     /// True while OFFBOARD is requested: the request may be carried out although it is withdrawn.

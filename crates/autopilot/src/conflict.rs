@@ -3,7 +3,9 @@
 
 use crate::packet::Sender;
 
-/// The reason that is shown while a heartbeat of another vehicle on the link may still be due.
+/// Time within which a heartbeat of another vehicle on the link is received, in nanoseconds: two heartbeats, which come once a second, and a margin.
+pub(crate) const LISTENS_NS: i64 = 2_500_000_000;
+/// The reason that is shown for this time, while a heartbeat of another vehicle on the link may still be due.
 pub const LISTENING: &str = "waiting 2.5 s for heartbeats of another vehicle on the link; there is no wait where `autopilot.system_id` is set";
 
 /// Why neither a take-off nor a landing may begin.

@@ -69,8 +69,8 @@ impl OffboardExit {
     }
 
     fn is_in_mode_to_leave(&self, autopilot: &Autopilot) -> bool {
-        let lands = autopilot.state().is_some_and(|state| state.mode == FlightMode::AUTO_LAND);
-        autopilot.is_in_offboard() || lands && self.land_sent_ns.is_some()
+        let lands = self.land_sent_ns.is_some() && autopilot.is_in_auto_land();
+        autopilot.is_in_offboard() || lands
     }
 
     fn request_hold(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
