@@ -14,6 +14,7 @@ use messages::{
 };
 use node::{BoxFuture, HealthCounters, Node, Shutdown, Tap, Tapped, now_ns};
 
+use crate::alone::Alone;
 use crate::config::{Config, Frames};
 use crate::frame::{Frame, Pictures, header, received};
 use crate::live::Live;
@@ -71,7 +72,9 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     node.announce().await?;
     let status = RecorderStatus { recorder: config.id.clone(), ..RecorderStatus::default() };
     let status = Arc::new(Mutex::new(status));
+    let alone = Arc::new(Alone::new(&node, &config.id));
     let recorder = Recorder {
+        alone: Some(Arc::clone(&alone)),
         live,
         health: node.shared_health(),
         status: Arc::clone(&status),
@@ -86,14 +89,18 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
         .context("starting the thread of the recorder")?;
     let mut due = tokio::time::interval(MIN_STATUS_PERIOD);
     let mut published = None;
+    let mut is_warned = false;
     loop {
         tokio::select! {
             _ = due.tick() => {
-                let now = {
-                    let now = status.lock().unwrap_or_else(PoisonError::into_inner);
-                    is_due(published.as_ref(), &now, now_ns()).then(|| now.clone())
-                };
-                if let Some(now) = now {
+                let missing = alone.problem();
+                if let Some(missing) = missing.as_ref().filter(|_| !is_warned) {
+                    tracing::warn!("{missing}");
+                }
+                is_warned |= missing.is_some();
+                let mut now = status.lock().unwrap_or_else(PoisonError::into_inner).clone();
+                now.problem = now.problem.or(missing);
+                if is_due(published.as_ref(), &now, now_ns()) {
                     let now = RecorderStatus { stamp_ns: now_ns(), ..now };
                     publisher.publish(&now).await;
                     published = Some(now);
@@ -105,6 +112,9 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     }
     is_over.store(true, Ordering::Relaxed);
     let ended = tokio::task::spawn_blocking(move || thread.join()).await?;
+    if let Some(missing) = alone.warning() {
+        tracing::warn!("{missing}");
+    }
     ended.unwrap_or_else(|_panic| bail!("the thread of the recorder panicked"))
 }
 
@@ -169,6 +179,7 @@ struct Recorder {
     /// Bytes that may wait for the disk; as many may wait before they are handled.
     max_waiting_bytes: usize,
     about: About,
+    alone: Option<Arc<Alone>>,
     health: Arc<HealthCounters>,
     status: Arc<Mutex<RecorderStatus>>,
     /// Time since 1970 less that of the clock of this host when it was looked at last, in nanoseconds.
@@ -254,6 +265,7 @@ impl Recorder {
             live: None,
             max_waiting_bytes,
             about,
+            alone: None,
             health: Arc::default(),
             status: Arc::default(),
             config,
@@ -327,6 +339,9 @@ impl Recorder {
 
     /// Records a message, or counts it as lost; offers it to the viewers.
     fn take(&mut self, message: Tapped) {
+        if let Some(alone) = &self.alone {
+            alone.take(&message.key);
+        }
         let header = self.take_number(&message);
         let before_bytes = self.ending_bytes();
         let waiting_bytes = self.recording.as_ref().map(|it| it.status().waiting_bytes);
