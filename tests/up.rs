@@ -12,7 +12,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, ensure};
-use messages::{DetectorCommand, VehicleState, topic};
+use messages::{ControllerStatus, DetectorCommand, VehicleState, topic};
 use node::{Identity, Network, Node, Subscriber};
 use rustix::process::{Pid, Signal, kill_process, test_kill_process};
 use testing::{ports, with_second_try};
@@ -48,6 +48,21 @@ set = ["autopilot.address=udpin:127.0.0.1:{autopilot}"]
 [[ground]]
 run = "detector"
 set = ["id=ground"]
+"#
+    );
+    std::fs::write(folder.join("site.toml"), site)?;
+    Ok(meet)
+}
+
+/// A site with a controller without an autopilot.
+fn write_lone_controller(folder: &Path) -> anyhow::Result<u16> {
+    let ([meet], _, autopilot) = ports::free()?;
+    let site = format!(
+        r#"
+meet = {meet}
+[[local]]
+run = "controller"
+set = ["autopilot.address=udpin:127.0.0.1:{autopilot}"]
 "#
     );
     std::fs::write(folder.join("site.toml"), site)?;
@@ -404,6 +419,67 @@ set = ["autopilot.address=udpin:127.0.0.1:{autopilot}", "start=takeoff"]
     let started = up.wait_for_line("controller:", "started as process").await?;
     ensure!(!started.contains("start ="), "{started}");
     ensure!(up.stop()? == Some(0));
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_process_that_runs_and_does_not_answer_is_reported() -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
+    let folder = tempfile::tempdir()?;
+    write_lone_controller(folder.path())?;
+    let mut up = Up::start(folder.path(), "local")?;
+    let controller = up.process("controller:").await?;
+    up.wait_for_line("controller:", "Ready").await?;
+    tokio::time::sleep(Duration::from_secs(3)).await;
+    kill_process(controller, Signal::STOP)?;
+    let number = controller.as_raw_nonzero();
+    let silent = format!("process {number} runs, but has not answered for 10 s");
+    let reported = up.wait_for_line("controller:", &silent).await;
+    let output = alight(folder.path(), &["doctor", "local", "--format", "json"]);
+    kill_process(controller, Signal::CONT)?;
+    reported?;
+    let output = output?;
+    let said = String::from_utf8_lossy(&output.stdout);
+    let running = format!("the controller runs here as process {number}, but does not answer");
+    ensure!(said.contains(&running), "{said}");
+    ensure!(!said.contains("alight up drone") && !said.contains("nothing can land"), "{said}");
+    up.wait_for_line("controller:", "answers again").await?;
+    ensure!(up.stop()? == Some(0));
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_end_during_a_landing_warns_of_the_vehicle_in_the_air() -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
+    let folder = tempfile::tempdir()?;
+    let meet = write_lone_controller(folder.path())?;
+    for is_landing in [false, true] {
+        let mut up = Up::start(folder.path(), "local")?;
+        up.wait_for_line("controller:", "started as process").await?;
+        if is_landing {
+            let identity = Identity { service: "tester", instance: "main".into() };
+            let network = Network { meet: Some(meet), ..Network::default() };
+            let node = Node::open(identity, &network.source("controller")?).await?;
+            let statuses = node.publisher(topic::STATUS, &[]).await?;
+            let landing = ControllerStatus { started_ns: Some(1), ..ControllerStatus::default() };
+            let note = || {
+                std::fs::read_dir(folder.path()).map(|files| {
+                    files
+                        .flatten()
+                        .any(|file| file.path().extension().is_some_and(|it| it == "landing"))
+                })
+            };
+            let began = Instant::now();
+            while !note()? && began.elapsed() < PATIENCE {
+                statuses.publish(&landing).await;
+                tokio::time::sleep(Duration::from_millis(50)).await;
+            }
+            node.close().await;
+        }
+        ensure!(up.stop()? == Some(0));
+        let warned = up.wait_for_line("The vehicle may be in the air", "the mode switch").await;
+        ensure!(warned.is_ok() == is_landing, "{warned:?}");
+    }
     Ok(())
 }
 

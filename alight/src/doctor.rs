@@ -7,6 +7,7 @@ mod cameras;
 mod focus;
 mod keys;
 mod ports;
+mod running;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -176,6 +177,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
             match timeout(OPEN_TIMEOUT, Node::open_tool(tool_identity("doctor"), &zenoh)).await {
                 Ok(Ok(node)) => {
                     let watched = Watched {
+                        role: args.role,
                         duration: Duration::from_secs(args.seconds),
                         // They do not fit an air link.
                         has_raw_frames: network.connect.is_none(),
@@ -343,6 +345,8 @@ fn report_unopened(findings: &mut Findings, device: &str, cause: &Error, has_con
 /// For how long and with which frames the network is watched.
 #[derive(Clone, Copy)]
 struct Watched {
+    /// The role of this machine.
+    role: Option<Role>,
     duration: Duration,
     has_raw_frames: bool,
 }
@@ -518,7 +522,33 @@ fn keep<T>(kept: &mut Vec<T>, new: T, same: impl Fn(&T, &T) -> bool) {
     }
 }
 
+/// Reports the services of this machine whose processes run without being ready; returns the others.
+fn check_silent<'a>(findings: &mut Findings, seen: &Seen, expected: &'a [Job]) -> Vec<&'a Job> {
+    let is_ready = |job: &Job| {
+        let names = job.service.map(Service::name).zip(job.instance.as_deref());
+        seen.peers.iter().any(|(service, instance)| names == Some((service, instance)))
+    };
+    let mut others = Vec::new();
+    for job in expected {
+        match running::process(job).filter(|_| job.instance.is_some() && !is_ready(job)) {
+            Some(pid) => findings.wrong(
+                "services",
+                format!("the {} runs here as process {pid}, but does not answer", job.name),
+                &format!(
+                    "it is stopped (`ps -o stat= -p {pid}` shows T), hangs or is starting; `kill -9 {pid}` ends it, and `alight up` restarts it"
+                ),
+            ),
+            None => others.push(job),
+        }
+    }
+    others
+}
+
 fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job], watched: Watched) {
+    let others = check_silent(findings, seen, expected);
+    if seen.peers.is_empty() && others.len() < expected.len() {
+        return;
+    }
     // Without a site, and on this machine, nothing need run yet.
     if seen.peers.is_empty() && expected.is_empty() && watched.has_raw_frames {
         findings.doubtful(
@@ -536,7 +566,7 @@ fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job], watche
         );
         return;
     }
-    for job in expected {
+    for job in others {
         let (Some(service), Some(instance)) = (job.service, &job.instance) else { continue };
         let ready = seen.peers.iter().filter(|(alive, _)| alive == service.name());
         let ready: Vec<&str> = ready.map(|(_, instance)| instance.as_str()).collect();
@@ -558,11 +588,17 @@ fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job], watche
             );
         }
     }
-    if !seen.has_controller() {
+    // One that this machine should run is reported above.
+    let is_expected = expected.iter().any(|job| job.service == Some(Service::Controller));
+    if !seen.has_controller() && !is_expected {
+        let remedy = match watched.role {
+            Some(Role::Local) => "list one in the site, and run `alight up local`",
+            _ => "run `alight up drone` on the drone",
+        };
         findings.doubtful(
             "services",
-            "no controller is running, so nothing can land".to_owned(),
-            "run `alight up drone` on the drone",
+            "no controller is ready, so nothing can land".to_owned(),
+            remedy,
         );
     }
 }
@@ -811,7 +847,8 @@ mod tests {
         let searched = Searched { frames: 30, found: 27 };
         let detectors = [("idle", Searched::default()), ("main", searched)];
         let detectors = detectors.map(|(name, searched)| (name.to_owned(), searched)).into();
-        let watched = Watched { duration: Duration::from_secs(3), has_raw_frames: true };
+        let watched =
+            Watched { role: None, duration: Duration::from_secs(3), has_raw_frames: true };
         let mut findings = Findings::default();
         check_detectors(&mut findings, &Seen { detectors, ..Seen::default() }, watched);
         let text = findings.text();
@@ -872,7 +909,8 @@ mod tests {
             let peers = ready.iter().map(|name| ("detector".to_owned(), (*name).to_owned()));
             let peers = [("controller".to_owned(), "main".to_owned())].into_iter().chain(peers);
             let seen = Seen { peers: peers.collect(), ..Seen::default() };
-            let watched = Watched { duration: Duration::from_secs(3), has_raw_frames: false };
+            let watched =
+                Watched { role: None, duration: Duration::from_secs(3), has_raw_frames: false };
             let mut findings = Findings::default();
             check_presence(&mut findings, &seen, &expected, watched);
             findings.text()

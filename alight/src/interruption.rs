@@ -21,6 +21,10 @@ const TERMINATE: u8 = 15;
 pub(crate) const FLIGHTS_END: &str =
     "the flights under way end, and those that were flown are kept";
 
+/// The warning after a landing that was interrupted in the air.
+pub(crate) const IN_THE_AIR: &str = "The vehicle may be in the air with its motors running, and Alight does not steer it any more: an ArduPilot hovers \
+                          in GUIDED, a PX4 in HOLD. Take over with the mode switch";
+
 /// Whether this process was interrupted.
 pub(crate) struct Interruption {
     signal: watch::Receiver<Option<u8>>,

@@ -22,6 +22,7 @@ use tokio::time::Instant;
 use crate::args::{Format, OPERATOR, WrongUse, address, meet_port, source_of, whole_number};
 use crate::children::{ChildEvent, Children, options_for_shell};
 use crate::ending::recording;
+use crate::interruption::IN_THE_AIR;
 use crate::outcome::{LandingSummary, OurRecorder};
 use crate::progress::Progress;
 use crate::record::file_setting;
@@ -402,10 +403,6 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     }
     Ok(landing)
 }
-
-/// The warning after a landing that was interrupted in the air.
-const IN_THE_AIR: &str = "The vehicle may be in the air with its motors running, and Alight does not steer it any more: an ArduPilot hovers \
-                          in GUIDED, a PX4 in HOLD. Take over with the mode switch";
 
 /// The error with which a service ended, where a line of its standard error is that.
 fn error_in(line: &str) -> Option<&str> {

@@ -2,10 +2,11 @@
 //! which detector has replaced one that exited.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 use std::time::Duration;
 
-use messages::{ControllerStatus, DetectorInfo, Place, topic};
-use node::{Network, Node};
+use messages::{ControllerStatus, DetectorInfo, Health, Place, topic};
+use node::{Network, Node, Subscriber};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
@@ -15,6 +16,8 @@ use crate::runtime::tool_identity;
 
 /// Maximum number of detectors that are followed; a network has far fewer.
 const MAX_DETECTORS: usize = 64;
+/// Maximum number of processes of this machine whose health is followed.
+const MAX_PROCESSES: usize = 256;
 /// Interval at which the note of a landing is written again.
 const REFRESH: Duration = Duration::from_secs(1);
 /// A note older than this is stale: its landing is not resumed.
@@ -45,9 +48,13 @@ pub(crate) struct Replacement {
 struct PeerTable {
     /// When a landing was under way the last time, unless it is over.
     under_way: Option<Instant>,
+    /// Whether a landing has begun and is not over, by the controller's last status.
+    is_in_the_air: bool,
     /// The controller's: a detector's name, a place, or nothing.
     preference: String,
     detectors: BTreeMap<String, KnownDetector>,
+    /// When the health of a process of this machine was received the last time, by its number.
+    healths: BTreeMap<u32, Instant>,
 }
 
 /// A detector that is there, or was a while ago.
@@ -76,6 +83,12 @@ impl Peers {
         let statuses = node.subscriber(topic::STATUS, &[]).await?;
         let infos = node.subscriber(topic::DETECTOR_INFO, &[]).await?;
         let presence = node.presence("detector").await?;
+        // A relay with keys sends the health to none of the keys that this session may have; on the vehicle there is no check.
+        let healths = match network.config.as_deref().is_none_or(|it| it == Path::new("local")) {
+            true => Some(node.subscriber(topic::HEALTH, &[]).await?),
+            false => None,
+        };
+        let host = node::host_name();
         let (sender, table) = watch::channel(PeerTable { under_way, ..PeerTable::default() });
         let task = tokio::spawn(async move {
             // The note of before is removed once its landing is over.
@@ -87,6 +100,7 @@ impl Peers {
                         // No task waits for this value: it is looked up when a controller is started.
                         sender.send_if_modified(|table| {
                             table.under_way = under_way;
+                            table.is_in_the_air = is_in_the_air(&status);
                             false
                         });
                         if sender.borrow().preference != status.preference {
@@ -98,6 +112,13 @@ impl Peers {
                         if sender.borrow().info(name) != Some(&info) {
                             sender.send_modify(|table| table.set_info(name, info));
                         }
+                    }
+                    Some(health) = next(healths.as_ref()) => {
+                        // No task waits for this value either.
+                        sender.send_if_modified(|table| {
+                            table.set_health(&health, &host, Instant::now());
+                            false
+                        });
                     }
                     Some((name, alive)) = presence.next() => {
                         sender.send_modify(|table| table.set_alive(&name, alive, Instant::now()));
@@ -121,6 +142,17 @@ impl Peers {
     /// Whether a landing is under way, or was a moment ago.
     pub(crate) fn landing(&self) -> bool {
         self.table.borrow().landing(Instant::now())
+    }
+
+    /// Whether the vehicle may be in the air during a landing, also one that is held or aborted.
+    pub(crate) fn may_be_in_the_air(&self) -> bool {
+        self.landing() || self.table.borrow().is_in_the_air
+    }
+
+    /// When the health of the process with this number was received the last time, if it was.
+    pub(crate) fn last_health(&self, pid: i32) -> Option<Instant> {
+        let pid = u32::try_from(pid).ok()?;
+        self.table.borrow().healths.get(&pid).copied()
     }
 
     /// The detector that replaces the one with this process number on this host, which has ended; `own` are the numbers of those that
@@ -162,6 +194,16 @@ impl PeerTable {
     fn set_info(&mut self, name: &str, info: DetectorInfo) {
         if let Some(detector) = self.detector(name) {
             detector.info = Some(info);
+        }
+    }
+
+    fn set_health(&mut self, health: &Health, host: &str, now: Instant) {
+        let has_room = self.healths.len() < MAX_PROCESSES || self.healths.contains_key(&health.pid);
+        if !has_room {
+            self.healths.retain(|_, last| now - *last < STALE_AFTER);
+        }
+        if health.host == host && (has_room || self.healths.len() < MAX_PROCESSES) {
+            self.healths.insert(health.pid, now);
         }
     }
 
@@ -214,6 +256,14 @@ impl PeerTable {
     }
 }
 
+/// The next health; none without a subscriber.
+async fn next(healths: Option<&Subscriber<Health>>) -> Option<Health> {
+    match healths {
+        Some(healths) => healths.next().await,
+        None => std::future::pending().await,
+    }
+}
+
 /// The one that came last, if it came after a time.
 fn newest_after(time: Instant, all: impl Iterator<Item = Replacement>) -> Option<Replacement> {
     all.filter(|it| it.joined > time).max_by_key(|it| it.joined)
@@ -221,6 +271,12 @@ fn newest_after(time: Instant, all: impl Iterator<Item = Replacement>) -> Option
 
 fn is_process(info: &DetectorInfo, host: &str, pid: i32) -> bool {
     info.host == host && u32::try_from(pid).is_ok_and(|pid| info.pid == pid)
+}
+
+/// Whether a landing has begun, and neither has it ended nor have the motors stopped.
+fn is_in_the_air(status: &ControllerStatus) -> bool {
+    let is_over = status.finished && !status.waits_for_operator;
+    status.started_ns.is_some() && status.disarmed_ns.is_none() && !is_over
 }
 
 /// Follows from the controller's status whether a landing is under way.
@@ -283,6 +339,18 @@ mod tests {
 
     fn name(replacement: Option<Replacement>) -> Option<String> {
         replacement.map(|it| it.name)
+    }
+
+    #[test]
+    fn a_landing_that_is_held_or_aborted_may_be_in_the_air_and_one_that_is_over_is_not() {
+        let flying = ControllerStatus { started_ns: Some(1), ..ControllerStatus::default() };
+        let held = ControllerStatus { waits_for_operator: true, ..flying.clone() };
+        let aborted = ControllerStatus { finished: true, ..held.clone() };
+        assert!([&flying, &held, &aborted].into_iter().all(is_in_the_air));
+        let landed = ControllerStatus { disarmed_ns: Some(2), ..flying.clone() };
+        let ended = ControllerStatus { finished: true, ..flying };
+        let waiting = ControllerStatus::default();
+        assert!(![&landed, &ended, &waiting].into_iter().any(is_in_the_air));
     }
 
     #[test]

@@ -14,9 +14,10 @@ use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use node::Shutdown;
 use tokio::process::Command;
-use tokio::time::Instant;
+use tokio::time::{Instant, MissedTickBehavior};
 
 use crate::children::{ChildEvent, Children, Exit, Reach, for_shell, without_network, word};
+use crate::interruption::IN_THE_AIR;
 use crate::notes::{Note, Notes};
 use crate::peers::{Peers, Replacement, STALE_AFTER};
 use crate::programs::{OWN_PROGRAM, missing, missing_devices, missing_of_service};
@@ -51,6 +52,10 @@ const PERIOD: Duration = Duration::from_secs(60);
 const LONG_PAUSE: Duration = Duration::from_secs(30);
 /// Interval at which the note is written again that this program runs.
 const RENEWAL: Duration = Duration::from_secs(60);
+/// Time without the health of a process that runs, which each service publishes once a second, after which that is reported.
+const SILENCE: Duration = Duration::from_secs(10);
+/// Period at which the health of the processes is looked at.
+const HEALTH_PERIOD: Duration = Duration::from_secs(1);
 /// The exit status for an invalid configuration, with which a restart is useless.
 const WRONG_USE: i32 = 2;
 
@@ -139,7 +144,7 @@ fn by_hand(job: &Job) -> String {
 }
 
 /// The program and its arguments.
-fn arguments(job: &Job) -> Vec<String> {
+pub(crate) fn arguments(job: &Job) -> Vec<String> {
     let mut arguments = job.command.clone();
     if let Some(file) = &job.layers.file {
         arguments.extend(["--config".to_owned(), file.display().to_string()]);
@@ -163,6 +168,8 @@ struct Supervised {
     /// Whether it has once run for [`PERIOD`], or led a landing under a supervisor that crashed: its configuration is valid then.
     has_run: bool,
     keeps_failing: bool,
+    /// Whether it is reported that its process does not answer.
+    is_silent: bool,
     state: State,
 }
 
@@ -187,8 +194,28 @@ impl Supervised {
             completions: 0,
             has_run: false,
             keeps_failing: false,
+            is_silent: false,
             state: State::Running,
         }
+    }
+
+    /// Takes when the health of its process was received the last time; returns the message to show. A process that published none since
+    /// its start is still starting.
+    fn on_health(&mut self, last: Option<Instant>, now: Instant) -> Option<String> {
+        let last = last.filter(|last| self.state == State::Running && *last >= self.started)?;
+        let is_silent = now.duration_since(last) >= SILENCE;
+        if is_silent == std::mem::replace(&mut self.is_silent, is_silent) {
+            return None;
+        }
+        let (name, pid) = (&self.job.name, self.pid);
+        Some(match is_silent {
+            true => format!(
+                "{name}: process {pid} runs, but has not answered for {} s: it hangs or is stopped (`ps -o stat= -p {pid}` shows T). End it by \
+                 `kill -9 {pid}`, and it is restarted",
+                SILENCE.as_secs()
+            ),
+            false => format!("{name}: process {pid} answers again"),
+        })
     }
 
     /// Whether it is a program that is none of ours: one may do its work once.
@@ -284,6 +311,8 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
     }
     let all_are_out =
         watch(&mut children, &mut supervised, &mut peers, &notes.running, site, &shutdown).await?;
+    let is_ours = supervised.iter().any(|it| it.job.service == Some(Service::Controller));
+    let may_be_in_the_air = is_ours && peers.may_be_in_the_air();
     say("stopping");
     // In reverse order: the controller stops while its peers can still receive its last messages.
     for (index, stopped) in supervised.iter().enumerate().rev() {
@@ -300,6 +329,9 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
         if !all_are_out {
             notes.running.remove();
         }
+    }
+    if may_be_in_the_air {
+        say(IN_THE_AIR);
     }
     Ok(ExitCode::from(u8::from(all_are_out)))
 }
@@ -405,6 +437,9 @@ async fn watch(
     shutdown: &Shutdown,
 ) -> anyhow::Result<bool> {
     let mut renewal = tokio::time::interval_at(Instant::now() + RENEWAL, RENEWAL);
+    let mut looked = Instant::now();
+    let mut look = tokio::time::interval(HEALTH_PERIOD);
+    look.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         if all_are_out(supervised) {
             say("no process runs, and none is likely to: ending with an error");
@@ -432,6 +467,15 @@ async fn watch(
             () = peers.changed() => restart_unreplaced(supervised, peers),
             // The first one may have found no room, or was removed; a failure is in the log.
             _ = renewal.tick() => { running.write(); }
+            _ = look.tick() => {
+                let now = Instant::now();
+                // After a pause of this process the healths of that time still wait.
+                let is_late = now.duration_since(std::mem::replace(&mut looked, now)) > 2 * HEALTH_PERIOD;
+                for process in supervised.iter_mut().filter(|_| !is_late) {
+                    let last = peers.last_health(process.pid);
+                    process.on_health(last, now).iter().for_each(|line| say(line));
+                }
+            }
             () = next_start => {
                 let Some((_, index)) = next else { continue };
                 let Some(again) = supervised.get_mut(index) else { continue };
@@ -502,6 +546,7 @@ fn start_or_retry(
     site: &Site,
 ) {
     process.started = Instant::now();
+    process.is_silent = false;
     match start(children, index, &process.job, start_as, site) {
         Ok(pid) => (process.pid, process.state) = (pid, State::Running),
         Err(problem) => {
@@ -709,6 +754,25 @@ mod tests {
             assert_eq!(process.state, State::Waiting(now + MIN_PAUSE));
             now += PERIOD + MIN_PAUSE;
         }
+    }
+
+    #[test]
+    fn a_process_that_does_not_answer_is_reported_once() {
+        let mut process = supervised();
+        let start = process.started;
+        let at = |seconds| start + Duration::from_secs(seconds);
+        assert_eq!(process.on_health(None, at(60)), None, "it is still starting");
+        assert_eq!(process.on_health(Some(at(60)), at(69)), None);
+        let silent = process.on_health(Some(at(60)), at(70)).unwrap();
+        assert!(silent.contains("detector: process 0 runs, but has not answered"), "{silent}");
+        assert_eq!(process.on_health(Some(at(60)), at(71)), None);
+        let again = process.on_health(Some(at(71)), at(72)).unwrap();
+        assert!(again.contains("answers again"), "{again}");
+        // The health of a process before this one, of the same number.
+        process.started = at(80);
+        assert_eq!(process.on_health(Some(at(72)), at(90)), None);
+        process.state = State::GivenUp;
+        assert_eq!(process.on_health(Some(at(81)), at(99)), None);
     }
 
     #[test]

@@ -339,7 +339,8 @@ mod tests {
         let mount = geometry::Transform::identity();
         let mut findings = Findings::default();
         let cameras = vec![CameraInfo::new("down", &model, &mount)];
-        let watched = Watched { duration: Duration::from_secs(1), has_raw_frames: true };
+        let watched =
+            Watched { role: None, duration: Duration::from_secs(1), has_raw_frames: true };
         let seen = Seen { cameras, healths, raw_frames: frames, ..Seen::default() };
         check(&mut findings, &seen, watched, false);
         findings.text()
@@ -413,7 +414,8 @@ mod tests {
         let info = CameraInfo::new("down", &model, &geometry::Transform::identity());
         let findings_text = |searched: &str| {
             let mut findings = Findings::default();
-            let watched = Watched { duration: Duration::from_secs(3), has_raw_frames: true };
+            let watched =
+                Watched { role: None, duration: Duration::from_secs(3), has_raw_frames: true };
             let seen = Seen {
                 cameras: vec![CameraInfo { focal_px: None, ..info.clone() }],
                 searched: [searched.to_owned()].into(),
@@ -436,7 +438,8 @@ mod tests {
         let findings_text =
             |phase, is_of_site, frames: Vec<ReceivedFrame>, cameras, ended_s: i64| {
                 let mut findings = Findings::default();
-                let watched = Watched { duration: Duration::from_secs(3), has_raw_frames: true };
+                let watched =
+                    Watched { role: None, duration: Duration::from_secs(3), has_raw_frames: true };
                 let seen = Seen {
                     peers: vec![("controller".into(), "main".into())],
                     status: Some(status(phase)),
