@@ -14,7 +14,7 @@ use node::Node;
 use serde::Serialize;
 
 use crate::args::{Format, NetworkArgs};
-use crate::command::send_to_controller;
+use crate::command::Sending;
 use crate::runtime::with_node;
 use crate::terminal::{aligned, print};
 
@@ -42,6 +42,9 @@ enum Action {
     Use {
         /// Its name.
         id: String,
+        /// Format of the reply: text, or one JSON object (`accepted`, `by`, `reason`).
+        #[arg(long, value_enum, default_value_t)]
+        format: Format,
         #[command(flatten)]
         network: NetworkArgs,
     },
@@ -50,6 +53,9 @@ enum Action {
         /// The place; `any` removes the preference.
         #[arg(value_enum)]
         place: Where,
+        /// Format of the reply: text, or one JSON object (`accepted`, `by`, `reason`).
+        #[arg(long, value_enum, default_value_t)]
+        format: Format,
         #[command(flatten)]
         network: NetworkArgs,
     },
@@ -68,19 +74,21 @@ enum Where {
 
 /// Lists the detectors, or has the controller choose one.
 pub(crate) fn run(args: DetectorsArgs) -> anyhow::Result<ExitCode> {
-    let (network, command) = match args.action {
+    let (network, format, command) = match args.action {
         None => return list(&args.network, args.format),
-        Some(Action::Use { id, network }) => (network, ControllerCommand::UseDetector(id)),
-        Some(Action::Prefer { place, network }) => {
+        Some(Action::Use { id, format, network }) => {
+            (network, format, ControllerCommand::UseDetector(id))
+        }
+        Some(Action::Prefer { place, format, network }) => {
             let command = match place {
                 Where::Onboard => ControllerCommand::PreferDetectors(Place::Onboard),
                 Where::Ground => ControllerCommand::PreferDetectors(Place::Ground),
                 Where::Any => ControllerCommand::PreferAnyDetector,
             };
-            (network, command)
+            (network, format, command)
         }
     };
-    send_to_controller(&network, "detectors", &command)
+    Sending { network: &network, tool: "detectors", format }.send_to_controller(&command)
 }
 
 fn list(network: &NetworkArgs, format: Format) -> anyhow::Result<ExitCode> {
@@ -89,7 +97,7 @@ fn list(network: &NetworkArgs, format: Format) -> anyhow::Result<ExitCode> {
         Format::Text => overview.table(),
         Format::Json => serde_json::to_string(&overview)?,
     })?;
-    Ok(ExitCode::SUCCESS)
+    Ok(ExitCode::from(u8::from(overview.is_empty())))
 }
 
 async fn listen(node: &Node) -> anyhow::Result<Overview> {
@@ -239,6 +247,11 @@ impl Overview {
             detectors,
             warnings,
         }
+    }
+
+    /// Whether neither a controller nor a detector was reached.
+    fn is_empty(&self) -> bool {
+        !self.controller && self.detectors.is_empty()
     }
 
     fn table(&self) -> String {
@@ -404,7 +417,10 @@ mod tests {
         // As its configuration is read, whose version is the same.
         let marker = Some("rings".to_owned());
         let unread = Overview::new(Controller::Unread, marker, &announced, &BTreeMap::new());
-        assert!(unread.controller && !unread.status_read);
+        assert!(unread.controller && !unread.status_read && !unread.is_empty());
+        let nothing = Controller::Absent("no program listens".to_owned());
+        let nothing = Overview::new(nothing, None, &BTreeMap::new(), &BTreeMap::new());
+        assert!(nothing.is_empty());
         let unread = unread.table();
         assert!(unread.starts_with("No detector is there: none is alive"), "{unread}");
         assert!(!unread.contains("LATENCY") && !without_status.contains("No detector is there"));

@@ -220,6 +220,10 @@ fn flights(files: &[PathBuf]) -> anyhow::Result<Vec<Flight>> {
         let mut reader = FlightReader::new(&name(file));
         add(&mut reader, file)?;
         ensure!(
+            !(reader.is_empty() && reader.is_cut()),
+            "{file:?} is cut: it has no end, and no message of a flight is left in it; copy it again from its origin"
+        );
+        ensure!(
             !reader.is_empty(),
             "nothing of a flight is in {file:?}; `alight land --record` and `alight record` write recordings"
         );
@@ -306,6 +310,8 @@ mod tests {
         let mut empty = Vec::new();
         flightlog::Writer::new(&mut empty, &about).unwrap().finish().unwrap();
         assert!(refusal(Some(&empty)).contains("nothing of a flight is in"));
+        let cut = refusal(empty.get(..100));
+        assert!(cut.contains("flight.mcap\" is cut: it has no end"), "{cut}");
     }
 
     /// Writes a recording of a part of a tape.

@@ -1,5 +1,5 @@
-//! Counts the denials of Zenoh: connections without a valid certificate or without any rights, and messages that access
-//! control rejects.
+//! Counts the denials of Zenoh: connections without a valid certificate or without any rights, those that ended before they showed
+//! one, and messages that access control rejects.
 //!
 //! Zenoh 1.10 has no counter for these. It only logs them, below the level that is shown; this module reads
 //! those log messages. `tests/denied.rs` fails when Zenoh words them differently.
@@ -93,8 +93,10 @@ fn reason(metadata: &Metadata<'_>, message: &str) -> Option<String> {
         }
         if is_precomputed(message) { None } else { denied_message(message) }
     } else {
-        is_denied_connection(message)
-            .then(|| "denied: a connection without a valid certificate".to_owned())
+        is_denied_connection(message).then(|| match is_broken(message) {
+            true => "denied: a connection that ended before it showed a valid certificate, as where a link breaks or a client gives up".to_owned(),
+            false => "denied: a connection without a valid certificate".to_owned(),
+        })
     }
 }
 
@@ -142,9 +144,35 @@ fn is_denied_connection(message: &str) -> bool {
     message.contains("Hint:") && !message.contains("Too many open files")
 }
 
+/// Whether a connection ended, or sent nothing more, before its certificate was checked.
+fn is_broken(message: &str) -> bool {
+    let causes = [
+        "handshake eof",
+        "Timeout during TLS handshake",
+        "Connection reset",
+        "Broken pipe",
+        "timed out",
+    ];
+    causes.iter().any(|cause| message.contains(cause))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_broken_connection_is_distinguished_from_one_without_a_certificate() {
+        let hint = "Hint: increase the system open file limit.";
+        for cause in
+            ["tls handshake eof", "Timeout during TLS handshake", "Connection reset by peer"]
+        {
+            let message = format!("{cause}. {hint}");
+            assert!(is_denied_connection(&message) && is_broken(&message), "{cause}");
+        }
+        for cause in ["invalid peer certificate: UnknownIssuer", "peer sent no certificates"] {
+            assert!(!is_broken(&format!("{cause}. {hint}")), "{cause}");
+        }
+    }
 
     #[test]
     fn a_connection_is_denied_for_its_certificate() {

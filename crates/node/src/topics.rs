@@ -463,15 +463,21 @@ fn reply_with_time(query: Query) -> BoxFuture<'static, ()> {
     })
 }
 
+/// A command for a log: its name, or JSON where it has a value.
+fn logged<M: Message>(command: &M) -> String {
+    let json = serde_json::to_string(command).unwrap_or_default();
+    let name = json.strip_prefix('"').and_then(|it| it.strip_suffix('"')).unwrap_or(&json);
+    name.chars().take(MAX_LOGGED).collect()
+}
+
 impl<M: Message> Request<M> {
     /// Answers the command, and logs its sender.
     pub async fn answer(self, reply: &messages::CommandReply) {
-        let command = serde_json::to_string(&self.message).unwrap_or_default();
-        let command: String = command.chars().take(MAX_LOGGED).collect();
+        let command = logged(&self.message);
         let (sender, reason) = (&self.sender, &reply.reason);
         match reply.accepted {
-            true => tracing::info!(command, sender, reason, "Command accepted"),
-            false => tracing::warn!(command, sender, reason, "Command refused"),
+            true => tracing::info!(%command, sender, reason, "Command accepted"),
+            false => tracing::warn!(%command, sender, reason, "Command refused"),
         }
         answer(self.query, encode(reply)).await;
     }
@@ -600,5 +606,17 @@ pub(crate) fn report_refused(
             %problem,
             "Payloads that cannot be read: the newest of those since the last such line (all are counted)"
         );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_command_is_logged_by_its_plain_name() {
+        use messages::ControllerCommand::{Hold, UseDetector};
+        assert_eq!(logged(&Hold), "Hold");
+        assert_eq!(logged(&UseDetector("a\nb".into())), r#"{"UseDetector":"a\nb"}"#);
     }
 }

@@ -66,9 +66,13 @@ async fn real_denials_are_counted() -> anyhow::Result<()> {
         ..Network::default()
     };
     let ground =
-        Network { config: Some("ground".into()), connect: Some(air), ..Network::default() };
+        Network { config: Some("ground".into()), connect: Some(air.clone()), ..Network::default() };
     let relay = open("relay", "drone", keys.path(), drone).await?;
     let _winds = relay.subscriber(topic::WIND, &[]).await?;
+
+    // A connection that ends before the exchange of certificates.
+    let broken = async || drop(tokio::net::TcpStream::connect(&air).await);
+    until_denied("ended before it showed a valid certificate", CONNECTION_TARGET, broken).await?;
 
     // A detector has no right to publish the wind.
     let detector = open("detector", "detector.main", keys.path(), ground.clone()).await?;

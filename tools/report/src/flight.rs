@@ -271,6 +271,11 @@ impl FlightReader {
         self.flight.messages == 0 && self.tapes.is_empty()
     }
 
+    /// True when a file lacks its end.
+    pub fn is_cut(&self) -> bool {
+        !self.flight.is_ended
+    }
+
     /// The begin of the first file: it gives the order of files.
     pub fn begin(&self) -> Begin {
         self.begin
