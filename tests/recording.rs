@@ -4,12 +4,17 @@
 mod disks;
 mod played;
 
-use std::process::Command;
+use std::io::{BufRead, BufReader, Read};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
 
 use anyhow::{Context, ensure};
-use testing::{node, node_passes, python, python_passes, with_second_try};
+use messages::{Wind, topic};
+use node::{Identity, Network, Node, now_ns};
+use rustix::process::{Pid, Signal, kill_process};
+use testing::{node as node_js, node_passes, ports, python, python_passes, with_second_try};
 
-use crate::flight::{ALIGHT, Landing, alone, beside_another, output_of, time_for};
+use crate::flight::{ALIGHT, Landing, PATIENCE, alone, beside_another, output_of, time_for};
 use crate::recorders::{self, Contents, kills};
 
 #[tokio::test(flavor = "multi_thread")]
@@ -111,7 +116,7 @@ async fn a_landing_is_followed_by_a_client_of_foxglove() -> anyhow::Result<()> {
         landing.descends_below(9.0).await?;
         let address = format!("ws://127.0.0.1:{port}");
         for subprotocol in flightlog::live::SUBPROTOCOLS {
-            let Some(client) = node("tests/recording/live.cjs", &[&address, subprotocol]) else {
+            let Some(client) = node_js("tests/recording/live.cjs", &[&address, subprotocol]) else {
                 return Ok(());
             };
             let output = tokio::task::block_in_place(|| client.wait_with_output())?;
@@ -153,6 +158,48 @@ fn follows(seen: &serde_json::Value) -> anyhow::Result<()> {
     // The first picture may have come before the client asked.
     ensure!(overlays >= 20 && paired + 2 >= overlays, "{seen}");
     ensure!(seen["newestMs"].as_f64().is_some_and(|age| age < 1000.0), "{seen}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recorder_of_a_vehicle_without_another_process_warns() -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
+    let folder = tempfile::tempdir()?;
+    let ([meet], _, _) = ports::free()?;
+    let record = |vehicle: &str| {
+        let file = folder.path().join(vehicle).with_extension("mcap");
+        let mut command = Command::new(ALIGHT);
+        command.arg("record").arg("-o").arg(file).args(["--meet", &meet.to_string()]);
+        command.args(["--vehicle", vehicle]).stderr(Stdio::piped()).spawn()
+    };
+    let (mut misnamed, mut named) = (record("rhed")?, record("red")?);
+    let network =
+        Network { meet: Some(meet), vehicle: Some("red".to_owned()), ..Network::default() };
+    let identity = Identity { service: "tester", instance: "main".into() };
+    let tester = Node::open(identity, &network.source("controller")?).await?;
+    let winds = tester.publisher(topic::WIND, &[]).await?;
+    let publish = async || loop {
+        winds.publish(&Wind { velocity_ned_m_s: [0.0; 3], stamp_ns: now_ns() }).await;
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    };
+    let warning = "no message of another process of the vehicle `rhed` has arrived";
+    let lines = BufReader::new(misnamed.stderr.take().context("standard error")?).lines();
+    let reading = tokio::task::spawn_blocking(move || {
+        lines.map_while(Result::ok).any(|line| line.contains(warning))
+    });
+    let is_warned = tokio::select! {
+        is_warned = tokio::time::timeout(PATIENCE, reading) => is_warned??,
+        () = publish() => false,
+    };
+    for child in [&misnamed, &named] {
+        kill_process(Pid::from_child(child), Signal::INT)?;
+    }
+    ensure!(is_warned, "no warning");
+    let mut text = String::new();
+    named.stderr.take().context("standard error")?.read_to_string(&mut text)?;
+    ensure!(!text.contains("another process"), "{text}");
+    let ends = [&mut misnamed, &mut named].map(Child::wait);
+    ensure!(ends.iter().all(|end| end.as_ref().is_ok_and(|end| end.success())), "{ends:?}");
     Ok(())
 }
 

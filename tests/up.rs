@@ -423,7 +423,7 @@ set = ["autopilot.address=udpin:127.0.0.1:{autopilot}", "start=takeoff"]
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_process_that_runs_and_does_not_answer_is_reported() -> anyhow::Result<()> {
+async fn a_process_that_hangs_is_reported_by_the_supervisor_and_the_doctor() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     let folder = tempfile::tempdir()?;
     write_lone_controller(folder.path())?;
@@ -433,7 +433,7 @@ async fn a_process_that_runs_and_does_not_answer_is_reported() -> anyhow::Result
     tokio::time::sleep(Duration::from_secs(3)).await;
     kill_process(controller, Signal::STOP)?;
     let number = controller.as_raw_nonzero();
-    let silent = format!("process {number} runs, but has not answered for 10 s");
+    let silent = format!("process {number} runs, but has published no health for 10 s");
     let reported = up.wait_for_line("controller:", &silent).await;
     let output = alight(folder.path(), &["doctor", "local", "--format", "json"]);
     kill_process(controller, Signal::CONT)?;
@@ -443,7 +443,42 @@ async fn a_process_that_runs_and_does_not_answer_is_reported() -> anyhow::Result
     let running = format!("the controller runs here as process {number}, but does not answer");
     ensure!(said.contains(&running), "{said}");
     ensure!(!said.contains("alight up drone") && !said.contains("nothing can land"), "{said}");
-    up.wait_for_line("controller:", "answers again").await?;
+    up.wait_for_line("controller:", "publishes its health again").await?;
+    ensure!(up.stop()? == Some(0));
+    Ok(())
+}
+
+/// The output of a tool as JSON, with its exit status.
+fn json_of(arguments: &[&str], meet: &str) -> anyhow::Result<(serde_json::Value, Option<i32>)> {
+    let json = ["--format", "json", "--meet", meet];
+    let output = output_of(Command::new(ALIGHT).args(arguments).args(json))?;
+    let parsed = serde_json::from_slice(&output.stdout);
+    Ok((parsed.with_context(|| format!("{output:?}"))?, output.status.code()))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn programs_read_the_reply_to_a_command_and_the_list_of_detectors() -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
+    let folder = tempfile::tempdir()?;
+    let meet = write_lone_controller(folder.path())?.to_string();
+    let (list, status) = json_of(&["detectors"], &meet)?;
+    ensure!(list["controller"] == false && status == Some(1), "{list}, {status:?}");
+    for arguments in [&["command", "hold"][..], &["detectors", "use", "main"]] {
+        let (reply, status) = json_of(arguments, &meet)?;
+        ensure!(reply["accepted"].is_null() && reply["by"].is_null(), "{reply}");
+        let is_named = reply["reason"].as_str().is_some_and(|reason| reason.contains("controller"));
+        ensure!(is_named && status == Some(1), "{reply}, {status:?}");
+    }
+    let mut up = Up::start(folder.path(), "local")?;
+    up.wait_for_line("controller:", "Ready").await?;
+    let (list, status) = json_of(&["detectors"], &meet)?;
+    ensure!(list["controller"] == true && status == Some(0), "{list}, {status:?}");
+    let (reply, status) = json_of(&["detectors", "prefer", "any"], &meet)?;
+    ensure!(reply["accepted"] == true && status == Some(0), "{reply}, {status:?}");
+    let (reply, status) = json_of(&["command", "resume"], &meet)?;
+    ensure!(reply["accepted"] == false && reply["by"] == "controller", "{reply}");
+    ensure!(status == Some(1), "{reply}, {status:?}");
+    up.wait_for_line("controller:", "command=Resume").await?;
     ensure!(up.stop()? == Some(0));
     Ok(())
 }

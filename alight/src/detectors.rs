@@ -23,9 +23,13 @@ const LISTENING: Duration = Duration::from_millis(1500);
 /// Further time for the controller's configuration, which is published every 3 s.
 const CONFIGURATION_TIMEOUT: Duration = Duration::from_secs(2);
 
+/// The meaning of the exit status.
+const EXIT_STATUS: &str = "Exit status: 0 done; 1 when the list has neither a controller nor a detector, or the controller did not accept the \
+                           choice; 2 wrong use.";
+
 /// The arguments of `alight detectors`.
 #[derive(Args)]
-#[command(args_conflicts_with_subcommands = true)]
+#[command(args_conflicts_with_subcommands = true, after_help = EXIT_STATUS)]
 pub(crate) struct DetectorsArgs {
     #[command(subcommand)]
     action: Option<Action>,
@@ -42,7 +46,7 @@ enum Action {
     Use {
         /// Its name.
         id: String,
-        /// Format of the reply: text, or one JSON object (`accepted`, `by`, `reason`).
+        /// Format of the reply: text, or one JSON object (`accepted`, `by`, `reason`; `accepted` is null without a reply).
         #[arg(long, value_enum, default_value_t)]
         format: Format,
         #[command(flatten)]
@@ -53,7 +57,7 @@ enum Action {
         /// The place; `any` removes the preference.
         #[arg(value_enum)]
         place: Where,
-        /// Format of the reply: text, or one JSON object (`accepted`, `by`, `reason`).
+        /// Format of the reply: text, or one JSON object (`accepted`, `by`, `reason`; `accepted` is null without a reply).
         #[arg(long, value_enum, default_value_t)]
         format: Format,
         #[command(flatten)]

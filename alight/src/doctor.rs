@@ -522,20 +522,23 @@ fn keep<T>(kept: &mut Vec<T>, new: T, same: impl Fn(&T, &T) -> bool) {
     }
 }
 
-/// Reports the services of this machine whose processes run without being ready; returns the others.
+/// Reports the services of this machine whose processes run without being ready; returns the other jobs.
 fn check_silent<'a>(findings: &mut Findings, seen: &Seen, expected: &'a [Job]) -> Vec<&'a Job> {
-    let is_ready = |job: &Job| {
-        let names = job.service.map(Service::name).zip(job.instance.as_deref());
-        seen.peers.iter().any(|(service, instance)| names == Some((service, instance)))
+    let silent_process = |job: &Job| {
+        let names = (job.service?.name(), job.instance.as_deref()?);
+        let mut ready = seen.peers.iter();
+        let is_ready = ready.any(|(service, instance)| (service.as_str(), &**instance) == names);
+        if is_ready { None } else { running::process(job) }
     };
     let mut others = Vec::new();
     for job in expected {
-        match running::process(job).filter(|_| job.instance.is_some() && !is_ready(job)) {
+        match silent_process(job) {
             Some(pid) => findings.wrong(
                 "services",
                 format!("the {} runs here as process {pid}, but does not answer", job.name),
                 &format!(
-                    "it is stopped (`ps -o stat= -p {pid}` shows T), hangs or is starting; `kill -9 {pid}` ends it, and `alight up` restarts it"
+                    "if it was not started just now, it hangs or is stopped (`ps -o stat= -p {pid}` shows T then): `kill -9 {pid}` ends it, and \
+                     `alight up` restarts it"
                 ),
             ),
             None => others.push(job),
@@ -546,11 +549,9 @@ fn check_silent<'a>(findings: &mut Findings, seen: &Seen, expected: &'a [Job]) -
 
 fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job], watched: Watched) {
     let others = check_silent(findings, seen, expected);
-    if seen.peers.is_empty() && others.len() < expected.len() {
-        return;
-    }
+    let is_any_here = !seen.peers.is_empty() || others.len() < expected.len();
     // Without a site, and on this machine, nothing need run yet.
-    if seen.peers.is_empty() && expected.is_empty() && watched.has_raw_frames {
+    if !is_any_here && expected.is_empty() && watched.has_raw_frames {
         findings.doubtful(
             "services",
             "no service runs on this machine".to_owned(),
@@ -558,7 +559,7 @@ fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job], watche
         );
         return;
     }
-    if seen.peers.is_empty() {
+    if !is_any_here {
         findings.wrong(
             "services",
             "no service found".to_owned(),

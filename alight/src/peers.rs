@@ -48,12 +48,12 @@ pub(crate) struct Replacement {
 struct PeerTable {
     /// When a landing was under way the last time, unless it is over.
     under_way: Option<Instant>,
-    /// Whether a landing has begun and is not over, by the controller's last status.
+    /// Whether the vehicle may be in the air during a landing, by the controller's last status.
     is_in_the_air: bool,
     /// The controller's: a detector's name, a place, or nothing.
     preference: String,
     detectors: BTreeMap<String, KnownDetector>,
-    /// When the health of a process of this machine was received the last time, by its number.
+    /// When the health of each process of this machine was received the last time, by its number.
     healths: BTreeMap<u32, Instant>,
 }
 
@@ -83,7 +83,7 @@ impl Peers {
         let statuses = node.subscriber(topic::STATUS, &[]).await?;
         let infos = node.subscriber(topic::DETECTOR_INFO, &[]).await?;
         let presence = node.presence("detector").await?;
-        // A relay with keys sends the health to none of the keys that this session may have; on the vehicle there is no check.
+        // Through a relay with keys this session may not receive it. On the drone every process may.
         let healths = match network.config.as_deref().is_none_or(|it| it == Path::new("local")) {
             true => Some(node.subscriber(topic::HEALTH, &[]).await?),
             false => None,
@@ -256,7 +256,7 @@ impl PeerTable {
     }
 }
 
-/// The next health; none without a subscriber.
+/// The next health; never one without a subscriber.
 async fn next(healths: Option<&Subscriber<Health>>) -> Option<Health> {
     match healths {
         Some(healths) => healths.next().await,

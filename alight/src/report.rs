@@ -221,7 +221,8 @@ fn flights(files: &[PathBuf]) -> anyhow::Result<Vec<Flight>> {
         add(&mut reader, file)?;
         ensure!(
             !(reader.is_empty() && reader.is_cut()),
-            "{file:?} is cut: it has no end, and no message of a flight is left in it; copy it again from its origin"
+            "{file:?} is cut off before the first message of a flight: copy it again (a recorder that was killed just after its start leaves such a \
+             file, too)"
         );
         ensure!(
             !reader.is_empty(),
@@ -311,7 +312,7 @@ mod tests {
         flightlog::Writer::new(&mut empty, &about).unwrap().finish().unwrap();
         assert!(refusal(Some(&empty)).contains("nothing of a flight is in"));
         let cut = refusal(empty.get(..100));
-        assert!(cut.contains("flight.mcap\" is cut: it has no end"), "{cut}");
+        assert!(cut.contains("flight.mcap\" is cut off before the first message"), "{cut}");
     }
 
     /// Writes a recording of a part of a tape.

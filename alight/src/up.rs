@@ -52,9 +52,9 @@ const PERIOD: Duration = Duration::from_secs(60);
 const LONG_PAUSE: Duration = Duration::from_secs(30);
 /// Interval at which the note is written again that this program runs.
 const RENEWAL: Duration = Duration::from_secs(60);
-/// Time without the health of a process that runs, which each service publishes once a second, after which that is reported.
+/// A running process that has published no health for this long is reported; each service publishes it once a second.
 const SILENCE: Duration = Duration::from_secs(10);
-/// Period at which the health of the processes is looked at.
+/// Period at which the health of the processes is checked.
 const HEALTH_PERIOD: Duration = Duration::from_secs(1);
 /// The exit status for an invalid configuration, with which a restart is useless.
 const WRONG_USE: i32 = 2;
@@ -168,7 +168,7 @@ struct Supervised {
     /// Whether it has once run for [`PERIOD`], or led a landing under a supervisor that crashed: its configuration is valid then.
     has_run: bool,
     keeps_failing: bool,
-    /// Whether it is reported that its process does not answer.
+    /// Whether it is reported that its process publishes no health.
     is_silent: bool,
     state: State,
 }
@@ -199,8 +199,8 @@ impl Supervised {
         }
     }
 
-    /// Takes when the health of its process was received the last time; returns the message to show. A process that published none since
-    /// its start is still starting.
+    /// Takes the time at which the health of its process was received last; returns the message to show. A process that has published none
+    /// since its start is still starting.
     fn on_health(&mut self, last: Option<Instant>, now: Instant) -> Option<String> {
         let last = last.filter(|last| self.state == State::Running && *last >= self.started)?;
         let is_silent = now.duration_since(last) >= SILENCE;
@@ -210,11 +210,11 @@ impl Supervised {
         let (name, pid) = (&self.job.name, self.pid);
         Some(match is_silent {
             true => format!(
-                "{name}: process {pid} runs, but has not answered for {} s: it hangs or is stopped (`ps -o stat= -p {pid}` shows T). End it by \
-                 `kill -9 {pid}`, and it is restarted",
+                "{name}: process {pid} runs, but has published no health for {} s: it hangs or is stopped (`ps -o stat= -p {pid}` shows T then). \
+                 `kill -9 {pid}` ends it, and it is restarted",
                 SILENCE.as_secs()
             ),
-            false => format!("{name}: process {pid} answers again"),
+            false => format!("{name}: process {pid} publishes its health again"),
         })
     }
 
@@ -311,8 +311,9 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
     }
     let all_are_out =
         watch(&mut children, &mut supervised, &mut peers, &notes.running, site, &shutdown).await?;
-    let is_ours = supervised.iter().any(|it| it.job.service == Some(Service::Controller));
-    let may_be_in_the_air = is_ours && peers.may_be_in_the_air();
+    let runs = |service| supervised.iter().any(|it| it.job.service == Some(service));
+    let may_be_in_the_air = runs(Service::Controller) && peers.may_be_in_the_air();
+    let is_simulated = runs(Service::Simulator);
     say("stopping");
     // In reverse order: the controller stops while its peers can still receive its last messages.
     for (index, stopped) in supervised.iter().enumerate().rev() {
@@ -330,8 +331,12 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
             notes.running.remove();
         }
     }
-    if may_be_in_the_air {
-        say(IN_THE_AIR);
+    match (may_be_in_the_air, is_simulated) {
+        (true, false) => say(IN_THE_AIR),
+        (true, true) => say(&format!(
+            "The simulated landing was not over. With a real vehicle this warning follows: {IN_THE_AIR}"
+        )),
+        (false, _) => {}
     }
     Ok(ExitCode::from(u8::from(all_are_out)))
 }
@@ -437,9 +442,9 @@ async fn watch(
     shutdown: &Shutdown,
 ) -> anyhow::Result<bool> {
     let mut renewal = tokio::time::interval_at(Instant::now() + RENEWAL, RENEWAL);
-    let mut looked = Instant::now();
-    let mut look = tokio::time::interval(HEALTH_PERIOD);
-    look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut last_check = Instant::now();
+    let mut check = tokio::time::interval(HEALTH_PERIOD);
+    check.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         if all_are_out(supervised) {
             say("no process runs, and none is likely to: ending with an error");
@@ -467,10 +472,10 @@ async fn watch(
             () = peers.changed() => restart_unreplaced(supervised, peers),
             // The first one may have found no room, or was removed; a failure is in the log.
             _ = renewal.tick() => { running.write(); }
-            _ = look.tick() => {
+            _ = check.tick() => {
                 let now = Instant::now();
-                // After a pause of this process the healths of that time still wait.
-                let is_late = now.duration_since(std::mem::replace(&mut looked, now)) > 2 * HEALTH_PERIOD;
+                // If this process was stopped, the healths of that time are still queued.
+                let is_late = now.duration_since(std::mem::replace(&mut last_check, now)) > 2 * HEALTH_PERIOD;
                 for process in supervised.iter_mut().filter(|_| !is_late) {
                     let last = peers.last_health(process.pid);
                     process.on_health(last, now).iter().for_each(|line| say(line));
@@ -757,17 +762,20 @@ mod tests {
     }
 
     #[test]
-    fn a_process_that_does_not_answer_is_reported_once() {
+    fn a_process_that_publishes_no_health_is_reported_once() {
         let mut process = supervised();
         let start = process.started;
         let at = |seconds| start + Duration::from_secs(seconds);
         assert_eq!(process.on_health(None, at(60)), None, "it is still starting");
         assert_eq!(process.on_health(Some(at(60)), at(69)), None);
         let silent = process.on_health(Some(at(60)), at(70)).unwrap();
-        assert!(silent.contains("detector: process 0 runs, but has not answered"), "{silent}");
+        assert!(
+            silent.contains("detector: process 0 runs, but has published no health"),
+            "{silent}"
+        );
         assert_eq!(process.on_health(Some(at(60)), at(71)), None);
         let again = process.on_health(Some(at(71)), at(72)).unwrap();
-        assert!(again.contains("answers again"), "{again}");
+        assert!(again.contains("publishes its health again"), "{again}");
         // The health of a process before this one, of the same number.
         process.started = at(80);
         assert_eq!(process.on_health(Some(at(72)), at(90)), None);

@@ -1,4 +1,4 @@
-//! Notices that no other process of the recorder's vehicle is present, as where the vehicle's name is wrong.
+//! Warns when no message of another process of the recorder's vehicle arrives, as with a wrong vehicle name.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 use messages::topic;
 use node::Node;
 
-/// Time after the start in which a process is expected: each publishes its health once a second.
-const TIMEOUT: Duration = Duration::from_secs(5);
+/// Time after the start within which a message is expected: each process publishes its health once a second.
+const TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Whether only this recorder's own messages were received.
+/// Whether only this recorder's own messages have arrived.
 pub(crate) struct Alone {
     vehicle: String,
     /// The keys of its own messages.
@@ -20,16 +20,16 @@ pub(crate) struct Alone {
 
 impl Alone {
     pub(crate) fn new(node: &Node, id: &str) -> Self {
-        Self::of(node.vehicle(), node.identity().service, &node.identity().instance, id)
+        let identity = node.identity();
+        Self::of(node.vehicle(), &[identity.service, &identity.instance], id)
     }
 
-    fn of(vehicle: &str, service: &str, instance: &str, id: &str) -> Self {
-        let names = [service, instance];
+    fn of(vehicle: &str, process: &[&str], id: &str) -> Self {
         Self {
             vehicle: vehicle.to_owned(),
             own: [
-                topic::HEALTH.key(&names),
-                topic::CONFIGURATION.key(&names),
+                topic::HEALTH.key(process),
+                topic::CONFIGURATION.key(process),
                 topic::RECORDER_STATUS.key(&[id]),
             ],
             begun: Instant::now(),
@@ -44,8 +44,8 @@ impl Alone {
         }
     }
 
-    /// The warning once the time of the other processes is over.
-    pub(crate) fn problem(&self) -> Option<String> {
+    /// The warning, once the time for a message of another process is over.
+    pub(crate) fn warning_in_time(&self) -> Option<String> {
         (self.begun.elapsed() >= TIMEOUT).then(|| self.warning()).flatten()
     }
 
@@ -53,8 +53,8 @@ impl Alone {
     pub(crate) fn warning(&self) -> Option<String> {
         (!self.has_others.load(Ordering::Relaxed)).then(|| {
             format!(
-                "no process of the vehicle `{}` is present: only this recorder's own messages are recorded. Name the vehicle with `--vehicle` \
-                 (ALIGHT_VEHICLE), and its network with `--meet`, or with `--zenoh` and `--connect`",
+                "no message of another process of the vehicle `{}` has arrived, so this recorder has only its own messages. Check the vehicle's \
+                 name (`--vehicle`, ALIGHT_VEHICLE) and the network (`--meet`, or `--zenoh` and `--connect`)",
                 self.vehicle
             )
         })
@@ -66,17 +66,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn own_messages_are_no_process_of_the_vehicle() {
-        let alone = Alone::of("rhed", "recorder", "main", "main");
-        assert_eq!(alone.problem(), None, "others may still start");
+    fn own_messages_are_not_those_of_another_process() {
+        let alone = Alone::of("rhed", &["recorder", "main"], "main");
+        assert_eq!(alone.warning_in_time(), None, "others may still start");
         for key in ["health/recorder/main", "config/recorder/main", "recorder/main/status"] {
             alone.take(key);
         }
         let warning = alone.warning().unwrap();
         assert!(warning.contains("`rhed`") && warning.contains("--vehicle"), "{warning}");
         let late = Alone { begun: Instant::now().checked_sub(TIMEOUT).unwrap(), ..alone };
-        assert_eq!(late.problem(), Some(warning));
+        assert_eq!(late.warning_in_time(), Some(warning));
         late.take("health/controller/main");
-        assert_eq!((late.problem(), late.warning()), (None, None));
+        assert_eq!((late.warning_in_time(), late.warning()), (None, None));
     }
 }

@@ -5,7 +5,7 @@
 //! and counts of recorded messages. A file whose writer is killed is read up to its last half second.
 //!
 //! Modules in reading order: [`config`]; [`service`] takes messages, `frame` makes pictures, `unseen` counts the frames
-//! that were never received, `alone` notices that no other process is present; `recording` is one
+//! that were never received, `alone` warns when no message of another process arrives; `recording` is one
 //! file as MCAP with its `name`, and `disk` the thread that writes it. `live` offers messages to viewers: `hub` has
 //! channels and clients, `outbox` and `window` bound the messages that wait for one and are on their way to it, `guard` decides which
 //! clients are allowed, and `server` answers them.

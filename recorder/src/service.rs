@@ -93,14 +93,15 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     loop {
         tokio::select! {
             _ = due.tick() => {
-                let missing = alone.problem();
-                if let Some(missing) = missing.as_ref().filter(|_| !is_warned) {
-                    tracing::warn!("{missing}");
+                if !is_warned && let Some(warning) = alone.warning_in_time() {
+                    tracing::warn!("{warning}");
+                    is_warned = true;
                 }
-                is_warned |= missing.is_some();
-                let mut now = status.lock().unwrap_or_else(PoisonError::into_inner).clone();
-                now.problem = now.problem.or(missing);
-                if is_due(published.as_ref(), &now, now_ns()) {
+                let now = {
+                    let now = status.lock().unwrap_or_else(PoisonError::into_inner);
+                    is_due(published.as_ref(), &now, now_ns()).then(|| now.clone())
+                };
+                if let Some(now) = now {
                     let now = RecorderStatus { stamp_ns: now_ns(), ..now };
                     publisher.publish(&now).await;
                     published = Some(now);
@@ -112,8 +113,8 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     }
     is_over.store(true, Ordering::Relaxed);
     let ended = tokio::task::spawn_blocking(move || thread.join()).await?;
-    if let Some(missing) = alone.warning() {
-        tracing::warn!("{missing}");
+    if let Some(warning) = alone.warning() {
+        tracing::warn!("{warning}");
     }
     ended.unwrap_or_else(|_panic| bail!("the thread of the recorder panicked"))
 }
@@ -179,6 +180,7 @@ struct Recorder {
     /// Bytes that may wait for the disk; as many may wait before they are handled.
     max_waiting_bytes: usize,
     about: About,
+    /// `None` in tests.
     alone: Option<Arc<Alone>>,
     health: Arc<HealthCounters>,
     status: Arc<Mutex<RecorderStatus>>,

@@ -40,31 +40,6 @@ fn winds(file: &Path) -> anyhow::Result<(Vec<u32>, bool)> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_recorder_whose_vehicle_has_no_process_reports_that() -> anyhow::Result<()> {
-    let folder = tempfile::tempdir()?;
-    let ([meet], _, _) = ports::free()?;
-    let set = vec![format!("file={:?}", folder.path().join("flight.mcap"))];
-    let config = Layers { file: None, set }.load::<Config>()?.settings;
-    let observer = open("alight", meet).await?;
-    let statuses = observer.subscriber(topic::RECORDER_STATUS, &[]).await?;
-    let node = open("recorder", meet).await?;
-    let task = tokio::spawn(recorder::run(node, config, Shutdown::on_signals()?));
-    let next_problem = async || statuses.next().await.and_then(|status| status.problem);
-    let is_absent = async || {
-        next_problem().await.is_some_and(|it| it.contains("no process of the vehicle `drone`"))
-    };
-    until("the recorder reports that no process is present", TIMEOUT, is_absent).await?;
-    let wind = observer.publisher(topic::WIND, &[]).await?;
-    let is_over = async || {
-        wind.publish(&Wind { velocity_ned_m_s: [0.0; 3], stamp_ns: now_ns() }).await;
-        next_problem().await.is_none()
-    };
-    until("the recorder reports no problem", TIMEOUT, is_over).await?;
-    task.abort();
-    Ok(())
-}
-
-#[tokio::test(flavor = "multi_thread")]
 async fn nothing_is_lost_when_a_full_file_is_followed_by_the_next() -> anyhow::Result<()> {
     with_second_try(is_complete).await
 }

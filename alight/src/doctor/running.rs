@@ -1,34 +1,42 @@
-//! Finds the process of a service that runs on this machine and does not answer, by its command line and its environment.
+//! Finds the running process of a service of this machine by its command line and its environment.
 
-use std::os::unix::ffi::OsStrExt;
+use std::collections::BTreeSet;
+
+use node::network::variable;
 
 use crate::site::Job;
 use crate::up::arguments;
 
-/// The number of the process that `alight up` started for a job, if this user may look at it.
+/// The number of the process that `alight up` started for a job; `None` also if this user may not read its environment.
 pub(super) fn process(job: &Job) -> Option<i32> {
-    let command: Vec<Vec<u8>> = arguments(job).into_iter().map(String::into_bytes).collect();
-    let environment: Vec<Vec<u8>> = job
-        .network
-        .environment()
-        .into_iter()
-        .map(|(name, value)| [name.as_bytes(), b"=", value.as_bytes()].concat())
+    let command = arguments(job);
+    let environment = job.network.environment().into_iter();
+    let network: BTreeSet<Vec<u8>> = environment
+        .map(|(name, value)| [name.as_bytes(), b"=", value.as_encoded_bytes()].concat())
         .collect();
     let entries = std::fs::read_dir("/proc").ok()?.flatten();
     let mut numbers = entries.filter_map(|entry| entry.file_name().to_str()?.parse::<i32>().ok());
     numbers.find(|number| {
-        // The program may have any path, and more arguments follow.
-        let arguments = parts(*number, "cmdline");
-        let is_command = arguments.len() >= command.len()
-            && arguments.iter().zip(&command).skip(1).all(|(one, other)| one == other);
-        is_command && {
-            let variables = parts(*number, "environ");
-            environment.iter().all(|wanted| variables.contains(wanted))
-        }
+        is_started_by(&parts(*number, "cmdline"), &command) && network_of(*number) == network
     })
 }
 
-/// The parts of a process's file, each of which ends in a zero byte; nothing of one that this user may not read.
+/// Whether a process has the arguments of a command. Its program may have any path, and more arguments follow.
+fn is_started_by(arguments: &[Vec<u8>], command: &[String]) -> bool {
+    arguments.len() >= command.len()
+        && arguments.iter().zip(command).skip(1).all(|(one, other)| one == other.as_bytes())
+}
+
+/// The variables of a process's environment that configure its network.
+fn network_of(number: i32) -> BTreeSet<Vec<u8>> {
+    let is_of_network = |part: &Vec<u8>| {
+        let name = part.split(|byte| *byte == b'=').next().unwrap_or_default();
+        variable::ALL.iter().any(|variable| variable.as_bytes() == name)
+    };
+    parts(number, "environ").into_iter().filter(is_of_network).collect()
+}
+
+/// The parts of a process's file, each of which ends in a zero byte; none of a file that this user may not read.
 fn parts(number: i32, file: &str) -> Vec<Vec<u8>> {
     let bytes = std::fs::read(format!("/proc/{number}/{file}")).unwrap_or_default();
     bytes.split(|byte| *byte == 0).map(<[u8]>::to_vec).collect()
@@ -63,9 +71,12 @@ mod tests {
             .unwrap();
         let found = process(&job);
         job.network.vehicle = Some("kestrel".to_owned());
-        let other = process(&job);
+        let of_another_vehicle = process(&job);
+        job.network = Network::default();
+        let without_a_network = process(&job);
         sleeping.kill().unwrap();
         sleeping.wait().unwrap();
-        assert_eq!((found, other), (i32::try_from(sleeping.id()).ok(), None));
+        assert_eq!(found, i32::try_from(sleeping.id()).ok());
+        assert_eq!((of_another_vehicle, without_a_network), (None, None));
     }
 }

@@ -1,5 +1,5 @@
-//! Counts the denials of Zenoh: connections without a valid certificate or without any rights, those that ended before they showed
-//! one, and messages that access control rejects.
+//! Counts the denials of Zenoh: connections without a valid certificate, which may have ended before they showed one, or without any
+//! rights, and messages that access control rejects.
 //!
 //! Zenoh 1.10 has no counter for these. It only logs them, below the level that is shown; this module reads
 //! those log messages. `tests/denied.rs` fails when Zenoh words them differently.
@@ -93,10 +93,11 @@ fn reason(metadata: &Metadata<'_>, message: &str) -> Option<String> {
         }
         if is_precomputed(message) { None } else { denied_message(message) }
     } else {
-        is_denied_connection(message).then(|| match is_broken(message) {
-            true => "denied: a connection that ended before it showed a valid certificate, as where a link breaks or a client gives up".to_owned(),
-            false => "denied: a connection without a valid certificate".to_owned(),
-        })
+        let reason = match is_broken(message) {
+            true => "denied: a connection that ended before it showed a valid certificate",
+            false => "denied: a connection without a valid certificate",
+        };
+        is_denied_connection(message).then(|| reason.to_owned())
     }
 }
 
@@ -144,7 +145,7 @@ fn is_denied_connection(message: &str) -> bool {
     message.contains("Hint:") && !message.contains("Too many open files")
 }
 
-/// Whether a connection ended, or sent nothing more, before its certificate was checked.
+/// Whether a denied connection ended, or the client sent nothing more, before its certificate was checked: the link may have broken.
 fn is_broken(message: &str) -> bool {
     let causes = [
         "handshake eof",

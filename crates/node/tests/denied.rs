@@ -83,5 +83,5 @@ async fn real_denials_are_counted() -> anyhow::Result<()> {
 
     // The session opens without a connection, and retries it.
     let _denied = open("detector", "detector.main", foreign_keys.path(), ground).await?;
-    until_denied("connection", CONNECTION_TARGET, async || {}).await
+    until_denied("a connection without a valid certificate", CONNECTION_TARGET, async || {}).await
 }
