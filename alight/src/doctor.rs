@@ -924,6 +924,26 @@ mod tests {
     }
 
     #[test]
+    fn a_missing_controller_is_reported_once_with_the_remedy_for_the_role() {
+        let site: Site = toml::from_str("local = [{ run = 'controller' }]").unwrap();
+        let expected = site.jobs(Role::Local).unwrap();
+        let findings_text = |role, expected: &[Job]| {
+            let peers = vec![("detector".to_owned(), "main".to_owned())];
+            let seen = Seen { peers, ..Seen::default() };
+            let watched = Watched { role, duration: Duration::from_secs(3), has_raw_frames: true };
+            let mut findings = Findings::default();
+            check_presence(&mut findings, &seen, expected, watched);
+            findings.text()
+        };
+        assert!(findings_text(None, &[]).contains("run `alight up drone` on the drone"));
+        let local = findings_text(Some(Role::Local), &[]);
+        assert!(local.contains("list one in the site") && !local.contains("drone"), "{local}");
+        let listed = findings_text(Some(Role::Local), &expected);
+        assert!(listed.contains("no controller is ready, but this machine should"), "{listed}");
+        assert!(listed.ends_with("1 wrong, 0 doubtful."), "{listed}");
+    }
+
+    #[test]
     fn a_serial_port_that_is_in_use_is_well_while_a_controller_runs() {
         let findings_text = |kind: ErrorKind, has_controller| {
             let mut findings = Findings::default();
