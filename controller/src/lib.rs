@@ -46,4 +46,5 @@ pub mod wire;
 
 pub use autopilot::KeyFileError;
 pub use config::Config;
+pub use landing::MAX_STANDSTILL_S;
 pub use service::run;

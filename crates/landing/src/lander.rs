@@ -73,7 +73,7 @@ const MIN_RESUMED_LOOK_S: f64 = 1.5;
 
 /// Maximum time between two events, which are 25 ms apart, after which a landing continues automatically, in seconds. A controller that
 /// is started again resumes one that is as old.
-const MAX_STANDSTILL_S: f64 = 15.0;
+pub const MAX_STANDSTILL_S: f64 = 15.0;
 
 /// Maximum age of the newest detection, in seconds, up to which heights are those over the target.
 const MAX_TARGET_AGE_S: f64 = 20.0;

@@ -58,7 +58,7 @@ pub use event::{
     Alarm, AutopilotLimits, Event, FrameObservation, Landed, MarkerInFrame, Mode, OperatorCommand,
     VehicleState, VehicleStatus,
 };
-pub use lander::Lander;
+pub use lander::{Lander, MAX_STANDSTILL_S};
 pub use limits::ConfigError;
 pub use mount_check::{Measured, MountFindings};
 pub use standing::{RememberedPad, SeenPad};
