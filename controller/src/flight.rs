@@ -527,6 +527,7 @@ impl Flight {
             may_recall,
             distrust: self.view().distrust(),
             is_flying: self.lander.is_flying(),
+            is_awaiting_state: self.lander.is_awaiting_state(),
         };
         if let Some(landing_target) = &mut self.landing_target
             && landing_target.step(now_ns, situation, &mut self.autopilot)

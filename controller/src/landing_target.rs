@@ -78,6 +78,8 @@ pub struct Situation {
     pub distrust: Option<Reason>,
     /// It is certainly in the air.
     pub is_flying: bool,
+    /// Its motors have just stopped, and its state is too old to show whether that was in the air.
+    pub is_awaiting_state: bool,
 }
 
 impl LandingTargetMode {
@@ -122,13 +124,14 @@ impl LandingTargetMode {
 
     /// Follows what the autopilot does; true when it has just begun to land, by any request.
     pub fn step(&mut self, now_ns: i64, situation: Situation, autopilot: &mut Autopilot) -> bool {
-        let Situation { may_recall, distrust, is_flying } = situation;
+        let Situation { may_recall, distrust, is_flying, is_awaiting_state } = situation;
         let Some(state) = autopilot.state().copied() else { return false };
         let lands = state.armed && state.mode.is_landing();
         match self.state.clone() {
             State::Landing if !state.armed && is_flying => {
                 self.state = State::Ended(Reason::StoppedInAir.to_string());
             }
+            State::Landing if !state.armed && is_awaiting_state => {}
             State::Landing if !state.armed => self.state = State::Landed,
             State::Landing if !lands => {
                 self.state = State::Ended(format!("the flight mode was changed to {}", state.mode));

@@ -8,9 +8,9 @@ mod packets;
 use std::sync::Arc;
 
 use autopilot::dialect::{
-    ATTITUDE_DATA, EKF_STATUS_REPORT_DATA, EkfStatusFlags, HEARTBEAT_DATA, MavAutopilot, MavCmd,
-    MavLandedState, MavMessage, MavSysStatusSensor, MavType, PARAM_VALUE_DATA, SYS_STATUS_DATA,
-    TIMESYNC_DATA,
+    ATTITUDE_DATA, EKF_STATUS_REPORT_DATA, EkfStatusFlags, HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA,
+    MavAutopilot, MavCmd, MavLandedState, MavMessage, MavSysStatusSensor, MavType,
+    PARAM_VALUE_DATA, SYS_STATUS_DATA, TIMESYNC_DATA,
 };
 use autopilot::{Parser, Sender};
 use controller::flight::Flight;
@@ -377,6 +377,8 @@ fn precision_landing_gets_the_target_and_no_setpoint() {
     assert!(stamps, "of one steady clock");
     hover(&mut flight, 6000, 7000, 9);
     assert_eq!(flight.status(7000 * MS).phase, Phase::Final);
+    receive(&mut flight, 7998 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+    pose_at(&mut flight, 7999 * MS, 0.0);
     receive(&mut flight, 8000 * MS, &heartbeat(9, false));
     flight.tick(8001 * MS);
     let status = flight.status(8001 * MS);
@@ -445,6 +447,31 @@ fn motors_that_stop_in_the_air_abort_a_precision_landing() {
     let status = flight.status(5001 * MS);
     assert_eq!(status.phase, Phase::Aborted);
     assert!(status.why.contains("stopped (disarmed) in the air"), "{}", status.why);
+}
+
+#[test]
+fn motors_that_stop_while_the_state_is_old_end_a_precision_landing_by_the_next_state() {
+    for (height_m, phase) in [(3.0, Phase::Aborted), (0.0, Phase::Landed)] {
+        let mut flight = landing_target("command");
+        parameter(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
+        parameter(&mut flight, 2 * MS, "PLND_TYPE", 1.0);
+        hover(&mut flight, 1000, 4000, 4);
+        hover(&mut flight, 4000, 5000, 9);
+        receive(&mut flight, 6500 * MS, &heartbeat(9, false));
+        receive(&mut flight, 6501 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+        flight.tick(6502 * MS);
+        assert_eq!(flight.status(6502 * MS).phase, Phase::Final);
+        receive(&mut flight, 6600 * MS, &attitude(6600 * MS));
+        let falls = LOCAL_POSITION_NED_DATA {
+            time_boot_ms: 6600,
+            z: -height_m,
+            vz: height_m,
+            ..Default::default()
+        };
+        receive(&mut flight, 6600 * MS + 1, &MavMessage::LOCAL_POSITION_NED(falls));
+        flight.tick(6603 * MS);
+        assert_eq!(flight.status(6603 * MS).phase, phase, "{height_m} m");
+    }
 }
 
 #[test]

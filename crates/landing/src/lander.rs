@@ -56,6 +56,12 @@ const MAX_CONTACT_M: f64 = 1.0;
 /// Maximum vertical speed at which that report is accepted, in m/s, in addition to the pad's heave.
 const MAX_CONTACT_M_S: f64 = 0.5;
 
+/// Maximum speed of an autopilot's LAND, in m/s: ArduPilot's LAND_SPEED_HIGH is at most 5 m/s, PX4's MPC_Z_V_AUTO_DN 4 m/s.
+const MAX_LAND_M_S: f64 = 5.0;
+
+/// Longest wait for a recent state after the motors have stopped, in seconds.
+const MAX_STATE_WAIT_S: f64 = 2.0;
+
 /// Maximum delay of the link to the autopilot, both ways together, in seconds, at which the vehicle is steered;
 /// and the one at which it is steered again.
 const MAX_LINK_DELAY_S: f64 = 0.7;
@@ -86,6 +92,8 @@ pub struct Lander {
     history: History,
     /// Mode, motors and contact with the ground, as they were reported last.
     status: Option<VehicleStatus>,
+    /// Since when the motors are reported as off.
+    disarmed: Option<Timestamp>,
     detectors_alive: bool,
     link_delay_s: f64,
     is_link_slow: bool,
@@ -138,6 +146,7 @@ impl Lander {
             now: None,
             history: History::new(config.target.max_extrapolation_s),
             status: None,
+            disarmed: None,
             detectors_alive: true,
             link_delay_s: 0.0,
             is_link_slow: false,
@@ -199,6 +208,8 @@ impl Lander {
             }
             Event::Operator(_) | Event::Alarm(_) | Event::Tick => Ok(()),
         };
+        let is_disarmed = self.status.is_some_and(|status| !status.armed);
+        self.disarmed = is_disarmed.then(|| self.disarmed.unwrap_or(now));
         let operator = if let Event::Operator(command) = event { Some(command) } else { None };
         let operator =
             operator.or_else(|| self.is_dispute_over().then_some(OperatorCommand::Resume));
@@ -389,24 +400,46 @@ impl Lander {
 
     /// Whether the vehicle is certainly in the air, although its motors are off: it falls, or, where its autopilot does not report the ground,
     /// sinks or is high over a target that was seen lately. A vehicle stands still for a second before its autopilot stops the motors.
+    /// From its last state, if that is old, it may have come down as fast as LAND does; if it was higher, it was in the air, also where the
+    /// ground is reported, as autopilots report it of each vehicle whose motors are off.
     fn flies(&self, now: Timestamp) -> bool {
         let (Some(vehicle), Some(status)) = (self.history.newest(), self.status) else {
             return false;
         };
-        let is_recent = now.seconds_since(vehicle.stamp) <= self.config.phases.stale_vehicle_s;
+        let age_s = now.seconds_since(vehicle.stamp);
+        let is_recent = age_s <= self.config.phases.stale_vehicle_s;
         let down_m_s = vehicle.velocity.z() - self.config.estimator.pad_heave_m_s;
         let standing_m = standing_height_m(&self.config);
+        let max_sunk_m = if is_recent { 0.0 } else { MAX_LAND_M_S * age_s };
         let is_high = self
             .recent_target(now)
-            .is_some_and(|target| target.height_m - standing_m > MAX_CONTACT_M);
+            .is_some_and(|target| target.height_m - standing_m - max_sunk_m > MAX_CONTACT_M);
         let sinks = down_m_s > MAX_STANDING_M_S;
         let falls = down_m_s > MAX_CONTACT_M_S;
-        is_recent && (falls || status.landed != Landed::OnGround && (sinks || is_high))
+        if is_recent {
+            falls || status.landed != Landed::OnGround && (sinks || is_high)
+        } else {
+            is_high
+        }
     }
 
     /// The same now.
     pub fn is_flying(&self) -> bool {
         self.now.is_some_and(|now| self.flies(now))
+    }
+
+    /// Whether the motors have just stopped, and the vehicle's state is too old to show whether that was in the air.
+    fn awaits_state(&self, now: Timestamp) -> bool {
+        let is_old = self.history.newest().is_none_or(|vehicle| {
+            now.seconds_since(vehicle.stamp) > self.config.phases.stale_vehicle_s
+        });
+        let waits = |since| now.seconds_since(since) < MAX_STATE_WAIT_S;
+        is_old && self.disarmed.is_some_and(waits)
+    }
+
+    /// The same now: a state that follows within seconds decides whether the vehicle has landed.
+    pub fn is_awaiting_state(&self) -> bool {
+        self.now.is_some_and(|now| self.awaits_state(now))
     }
 
     fn frame(&mut self, now: Timestamp, frame: &FrameObservation) -> Result<(), Rejection> {
@@ -474,6 +507,7 @@ impl Lander {
                 && state.velocity.z() > MAX_STANDING_M_S + self.config.estimator.pad_heave_m_s,
             land_m_s: self.limits.land_m_s,
             flies: self.flies(now),
+            awaits_state: self.awaits_state(now),
         })
     }
 

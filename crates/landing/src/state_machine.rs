@@ -40,7 +40,7 @@
 //! | the controller has stood still for long | Hold; not in Final, where LAND has been asked for |
 //! | a mode that is neither GUIDED nor the requested LAND; GUIDED again in LAND, `MAX_OVERTAKEN_S` after it began | PilotInCommand |
 //! | on the ground; still and low over the pad, where Search or Retry would follow, in Search, or where the link is slow | Final |
-//! | disarmed | Aborted in the air; else Landed on the ground or in LAND; else, half a second later, Aborted |
+//! | disarmed | Aborted in the air; else, while the state is old, a wait of 2 s for a recent one; Landed on the ground or in LAND; else, half a second later, Aborted |
 //! | an alarm | as configured for it |
 //!
 //! Idle, Landed, Aborted and PilotInCommand are terminal: only a new start leaves them, or the command to land here, which
@@ -139,6 +139,8 @@ pub struct VehicleInputs {
     pub land_m_s: f64,
     /// It is certainly in the air: it falls, or, not reported to stand, sinks or is high over the target.
     pub flies: bool,
+    /// Its motors have just stopped, and its state is too old to show whether that was in the air; a newer one may follow.
+    pub awaits_state: bool,
 }
 
 /// The state: a phase, since when, and the reason.
@@ -442,10 +444,11 @@ impl StateMachine {
         if let Some(vehicle) = inputs.vehicle {
             // PX4 leaves LAND as it stops the motors (seen with 1.17); that is not the pilot.
             if self.landing && !vehicle.armed {
-                return Some(match self.stopped_in_air {
-                    true => (Phase::Aborted, Reason::StoppedInAir),
-                    false => (Phase::Landed, Reason::TouchedDown),
-                });
+                return match self.stopped_in_air {
+                    true => Some((Phase::Aborted, Reason::StoppedInAir)),
+                    false if vehicle.awaits_state => None,
+                    false => Some((Phase::Landed, Reason::TouchedDown)),
+                };
             }
             let is_ours = match vehicle.mode {
                 Mode::Guided => !self.landing || self.elapsed_s(inputs.now) < MAX_OVERTAKEN_S,
@@ -540,6 +543,9 @@ impl StateMachine {
 
     /// The end of a landing whose motors are off.
     fn disarmed(&self, now: Timestamp, vehicle: VehicleInputs) -> Option<(Phase, Reason)> {
+        if vehicle.awaits_state && !self.stopped_in_air {
+            return None;
+        }
         if !vehicle.armed && vehicle.landed == Landed::OnGround && !self.stopped_in_air {
             return Some((Phase::Landed, Reason::TouchedDown));
         }

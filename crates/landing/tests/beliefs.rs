@@ -572,6 +572,56 @@ fn motors_that_are_stopped_in_the_air_end_no_landing_as_a_touchdown() {
     assert_eq!(flight.phase(), Phase::Landed);
 }
 
+/// A vehicle in LAND at this height, which sinks; its state is reported for the last time.
+fn in_land(height_m: f64) -> Harness {
+    let mut flight = Harness::started(Config::default(), 6.0);
+    flight.pad = Some(Point::origin());
+    while flight.position.z() < -height_m {
+        flight.fly(STEP_S);
+    }
+    flight.step(Event::Operator(OperatorCommand::LandHere));
+    flight.velocity = Vector::new(0.0, 0.0, 0.5);
+    flight.status.mode = Mode::Land;
+    flight.run(STEP_S, true);
+    flight.pad = None;
+    flight
+}
+
+/// An autopilot reports the ground as soon as the motors are off.
+#[test]
+fn motors_that_stop_while_the_state_is_old_end_no_landing_as_a_touchdown_in_the_air() {
+    let stopped = |height_m: f64, silent_s: f64| {
+        let mut flight = in_land(height_m);
+        flight.run(silent_s, false);
+        (flight.status.armed, flight.status.landed) = (false, Landed::OnGround);
+        flight.run(0.3, false);
+        flight
+    };
+    let end = |flight: &Harness| {
+        let decision = flight.decisions.last().unwrap().1;
+        (decision.phase, decision.why)
+    };
+    // So high that it cannot have come down.
+    assert_eq!(end(&stopped(5.0, 0.7)), (Phase::Aborted, Reason::StoppedInAir));
+    // The next state shows that it falls, or that it stands.
+    let mut falls = stopped(2.0, 0.7);
+    assert_eq!(falls.phase(), Phase::Final);
+    falls.velocity = Vector::new(0.0, 0.0, 4.0);
+    falls.run(0.1, true);
+    assert_eq!(end(&falls), (Phase::Aborted, Reason::StoppedInAir));
+    let mut stands = stopped(2.0, 5.0);
+    assert_eq!(stands.phase(), Phase::Final);
+    (stands.position, stands.velocity) = (Point::origin(), Vector::zero());
+    stands.run(0.1, true);
+    assert_eq!(end(&stands), (Phase::Landed, Reason::TouchedDown));
+    // The wait is bounded.
+    let mut silent = stopped(2.0, 5.0);
+    silent.run(1.6, false);
+    assert_eq!(silent.phase(), Phase::Final);
+    silent.run(0.2, false);
+    assert_eq!(end(&silent), (Phase::Landed, Reason::TouchedDown));
+}
+
 #[test]
 fn a_retry_stays_below_the_fence() {
     let mut config = Config::default();

@@ -15,6 +15,7 @@ const FLYING: VehicleInputs = VehicleInputs {
     sinks: false,
     land_m_s: 0.5,
     flies: false,
+    awaits_state: false,
 };
 
 fn at(seconds: f64) -> Inputs {
@@ -505,6 +506,14 @@ fn motors_that_stop_in_the_air_are_no_touchdown() {
     let [a, b, c, d] = finals;
     check(&[a, b, c, d, falls(9.5)], fell.0, fell.1);
     check(&[a, b, c, d, falls(9.5), flown(9.8, down)], fell.0, fell.1);
+    // While the state is old a newer one decides.
+    let is_open = |v: &mut VehicleInputs| {
+        (v.mode, v.armed, v.landed, v.awaits_state) = (Mode::Other, false, Landed::OnGround, true);
+    };
+    check(&[a, b, c, d, flown(9.5, is_open)], Phase::Final, Reason::AutopilotLands);
+    check(&[a, b, c, d, flown(9.5, is_open), falls(9.8)], fell.0, fell.1);
+    let stands = (Phase::Landed, Reason::TouchedDown);
+    check(&[a, b, c, d, flown(9.5, is_open), flown(9.8, down)], stands.0, stands.1);
     // Motors that run again were not off.
     check(&[start(), falls(1.0), at(1.2), flown(9.0, down)], Phase::Landed, Reason::TouchedDown);
 }

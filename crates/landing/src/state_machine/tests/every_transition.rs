@@ -78,6 +78,7 @@ fn vehicles() -> Vec<Option<VehicleInputs>> {
         change(|v| v.armed = false),
         change(|v| (v.armed, v.flies) = (false, true)),
         change(|v| (v.armed, v.landed) = (false, Landed::OnGround)),
+        change(|v| (v.age_s, v.armed, v.awaits_state) = (1.0, false, true)),
         change(|v| (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround)),
         change(|v| v.landed = Landed::OnGround),
         change(|v| (v.mode, v.landed) = (Mode::Land, Landed::OnGround)),
