@@ -1151,6 +1151,29 @@ fn no_landing_begins_automatically_before_packets_of_another_vehicle_would_arriv
 }
 
 #[test]
+fn no_command_begins_a_landing_before_packets_of_another_vehicle_would_arrive() {
+    for command in [ControllerCommand::Start, ControllerCommand::LandHere] {
+        for system_id in [0, 1] {
+            let pinned = format!("autopilot.system_id={system_id}");
+            let mut flight = in_flight_with("command", &[&pinned]);
+            flight.camera(0, CameraInfo::sample());
+            flight.presence(0, "main", true);
+            hover(&mut flight, 20, 2480, 4);
+            let early = flight.command(2480 * MS, &command);
+            assert_eq!(early.accepted, system_id == 1, "{early:?}");
+            if system_id == 1 {
+                continue;
+            }
+            assert!(early.reason.contains("waiting 2.5 s for heartbeats"), "{early:?}");
+            assert!(early.reason.ends_with("Give the command again"), "{early:?}");
+            assert_eq!(hover(&mut flight, 2500, 2600, 4).setpoints, 0);
+            let reply = flight.command(2600 * MS, &command);
+            assert!(reply.accepted, "{reply:?}");
+        }
+    }
+}
+
+#[test]
 fn a_landing_is_resumed_with_its_own_vehicle_although_another_one_is_present() {
     let [(other, of_other, text), _] = others();
     let on_ground = contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND);

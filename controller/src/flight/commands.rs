@@ -1,6 +1,6 @@
 //! The operator's commands to a flight: start, hold, resume, abort and land here, carried out or refused with the reason.
 
-use autopilot::Conflict;
+use autopilot::{Conflict, LISTENING};
 use landing::{Event as LanderEvent, OnAbort, OperatorCommand, Phase};
 
 use super::Flight;
@@ -36,6 +36,9 @@ impl Flight {
                     .to_owned(),
             );
         }
+        if self.is_listening(now_ns) {
+            return Err(format!("no landing was started: {LISTENING}. Give the command again"));
+        }
         if let Some(obstacle) = self.frames.start_obstacle(now_ns) {
             return Err(format!("no landing was started: {obstacle}"));
         }
@@ -66,6 +69,12 @@ impl Flight {
     fn is_ours(&self) -> bool {
         let is_armed = self.autopilot.state().is_some_and(|state| state.armed);
         self.mission.is_taking_off() || is_armed && self.mission.started_ns().is_some()
+    }
+
+    /// Whether this may be another vehicle than the one that is meant: a heartbeat of a second one on the link may still be due.
+    fn is_listening(&self, now_ns: i64) -> bool {
+        let is_found = self.autopilot.system().is_some();
+        is_found && !self.is_ours() && !self.autopilot.has_listened(now_ns)
     }
 
     /// Refuses while a PX4 is taken back to HOLD.
@@ -116,6 +125,9 @@ impl Flight {
         let conflict = self.autopilot.conflict(now_ns).filter(|_| !self.is_ours());
         if let Some(conflict) = conflict {
             return Err(format!("not landed here: {conflict}"));
+        }
+        if self.is_listening(now_ns) {
+            return Err(format!("not landed here: {LISTENING}. Give the command again"));
         }
         if is_holding_px4(&self.autopilot) {
             self.check_way_out()?;
