@@ -141,6 +141,9 @@ impl Limits {
             if is_landing {
                 self.active_ns = Some(now_ns);
                 self.shorten(name, timeout_s, autopilot);
+            } else if !autopilot.has_listened(now_ns) {
+                // A landing that is to be resumed begins only then, and this may be another vehicle.
+                self.active_ns = Some(now_ns);
             } else {
                 self.is_refused = false;
                 let since_ns = *self.active_ns.get_or_insert(now_ns);

@@ -173,6 +173,21 @@ fn the_parameter_of_a_killed_controller_is_put_back() {
     }
 }
 
+/// It waits for heartbeats of another vehicle before it resumes the landing.
+#[test]
+fn a_controller_that_resumes_with_any_vehicle_leaves_the_timeout_short() {
+    let mut killed = Conversation::new("airborne", 3.0);
+    killed.fly(3, GUIDED);
+    let note = killed.flight.note().cloned().unwrap();
+    let mut next = Conversation::with(&["start=resume", "autopilot.system_id=0"], 0.5);
+    next.flight.take_over(note);
+    next.fly(6, GUIDED);
+    assert!(next.flight.status(next.now_ns).started_ns.is_some());
+    assert_eq!((next.timeout_s, next.set_s.as_slice()), (0.5, [].as_slice()));
+    next.fly(4, LOITER);
+    assert_eq!((next.timeout_s, next.flight.note()), (3.0, None));
+}
+
 #[test]
 fn an_orderly_end_puts_it_back_at_once_and_sends_no_descent() {
     let mut it = Conversation::new("airborne", 3.0);
