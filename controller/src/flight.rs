@@ -13,7 +13,7 @@ use autopilot::dialect::{MavMessage, MavType};
 use autopilot::{Autopilot, Event, FlightMode, LISTENING, LandedState, Packet};
 use landing::{
     Action, Alarm, AlarmAction, Decision, Event as LanderEvent, FrameObservation, Lander,
-    OperatorCommand, Phase, Reason, Timestamp,
+    MAX_STANDSTILL_S, OperatorCommand, Phase, Reason, Timestamp,
 };
 use messages::{
     CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorInfo,
@@ -67,6 +67,8 @@ pub struct Flight {
     is_disputed: bool,
     /// Since when a take-off waits for a battery that is not empty.
     empty_since_ns: Option<i64>,
+    /// The time of the last tick.
+    ticked_ns: Option<i64>,
 }
 
 impl Flight {
@@ -113,6 +115,7 @@ impl Flight {
             is_ending: false,
             is_disputed: false,
             empty_since_ns: None,
+            ticked_ns: None,
             config,
         })
     }
@@ -156,6 +159,7 @@ impl Flight {
 
     /// Lets time pass; to be called at least 20 times a second.
     pub fn tick(&mut self, now_ns: i64) {
+        self.notice_standstill(now_ns);
         self.autopilot.tick(now_ns);
         self.handle_autopilot_events(now_ns);
         self.frames.tick(now_ns);
@@ -174,6 +178,19 @@ impl Flight {
         }
         self.decide(now_ns, LanderEvent::Tick);
         self.watch_offboard(now_ns);
+    }
+
+    /// After a standstill of this process for which a landing would be held, what was to begin waits for a command as well.
+    fn notice_standstill(&mut self, now_ns: i64) {
+        let before_ns = self.ticked_ns.replace(now_ns).unwrap_or(now_ns);
+        let stood_s = now_ns.saturating_sub(before_ns) as f64 * 1e-9;
+        if stood_s <= MAX_STANDSTILL_S {
+            return;
+        }
+        self.mission.stand_still(now_ns, &mut self.autopilot, stood_s);
+        if let Some(landing_target) = &mut self.landing_target {
+            landing_target.stand_still(stood_s, &mut self.autopilot);
+        }
     }
 
     /// Leads a PX4 out of OFFBOARD that is left there while nothing steers it.
@@ -553,13 +570,14 @@ impl Flight {
         // or that may be the wrong one; a vehicle that took off for us is ours.
         let begins_by_itself = self.mission.is_awaiting_takeoff();
         let conflict = self.autopilot.conflict(now_ns).filter(|_| begins_by_itself);
-        let obstacle = match conflict {
-            Some(conflict) => Some(conflict.to_string()),
-            None if begins_by_itself && !self.autopilot.has_listened(now_ns) => {
+        let obstacle = match (conflict, self.mission.held_because()) {
+            (Some(conflict), _) => Some(conflict.to_string()),
+            (None, Some(why)) => Some(why.to_owned()),
+            (None, None) if begins_by_itself && !self.autopilot.has_listened(now_ns) => {
                 Some(LISTENING.to_owned())
             }
-            None if is_fresh => self.frames.obstacle(now_ns),
-            None => Some("waiting for attitude and position".to_owned()),
+            (None, None) if is_fresh => self.frames.obstacle(now_ns),
+            (None, None) => Some("waiting for attitude and position".to_owned()),
         };
         let steers = self.landing_target.is_none();
         let obstacle = obstacle.as_deref();

@@ -216,6 +216,19 @@ impl LandingTargetMode {
         }
     }
 
+    /// The controller has not run for so long that nothing descends without a command: a landing that the autopilot has not begun ends. One that
+    /// it flies continues.
+    pub fn stand_still(&mut self, seconds: f64, autopilot: &mut Autopilot) {
+        if matches!(self.state, State::Stabilising(_) | State::Commanding(_)) {
+            autopilot.withdraw();
+            let why = format!(
+                "the controller did not run for {seconds:.0} s before the autopilot landed; hovering: `start` begins a landing"
+            );
+            tracing::warn!("{why}");
+            self.state = State::Ended(why);
+        }
+    }
+
     /// Aborts a landing: one that the autopilot flies already is taken back to the mode in which it hovers,
     /// unless it may not be recalled: it is lower than `no_return_m`.
     ///

@@ -24,6 +24,8 @@ pub struct Mission {
     goes_on_until_ns: Option<i64>,
     /// The landing that was to go on is over: the next one begins once the vehicle flies.
     awaits_next_flight: bool,
+    /// Why the landing that was to begin automatically waits for a command.
+    held_because: Option<String>,
 }
 
 /// The state of a mission.
@@ -110,6 +112,7 @@ impl Mission {
             disarmed_ns: None,
             goes_on_until_ns: None,
             awaits_next_flight: false,
+            held_because: None,
         }
     }
 
@@ -152,6 +155,41 @@ impl Mission {
             *why = reason;
         }
         is_put_off
+    }
+
+    /// This process has not run for so long that nothing begins without a command. A take-off without motors ends, as persons may be near
+    /// the vehicle by now, and so does a change to OFFBOARD; a landing that was to follow a take-off, or to be resumed, waits.
+    pub fn stand_still(&mut self, now_ns: i64, autopilot: &mut Autopilot, seconds: f64) {
+        let stood_still = format!("the controller did not run for {seconds:.0} s");
+        let is_armed = autopilot.state().is_some_and(|state| state.armed);
+        match self.state {
+            State::TakingOff { .. } if !is_armed => {
+                self.fail(autopilot, format!("no take-off: {stood_still}"));
+            }
+            State::AwaitingTakeoff if self.start != Start::Resume => return,
+            State::TakingOff { .. } | State::AwaitingTakeoff => {
+                self.held_because =
+                    Some(format!("{stood_still}: `resume` begins the landing that was to follow"));
+            }
+            State::TakingControl { .. } => {
+                self.leave_offboard(now_ns, autopilot, &stood_still);
+            }
+            _ => return,
+        }
+        tracing::warn!("Nothing begins without a command: {stood_still}");
+    }
+
+    /// Why the landing that was to begin automatically waits for a command; `None` if it does not.
+    pub fn held_because(&self) -> Option<&str> {
+        let is_ahead = matches!(self.state, State::TakingOff { .. } | State::AwaitingTakeoff);
+        self.held_because.as_deref().filter(|_| is_ahead)
+    }
+
+    /// The command for which such a landing waits; false where none does.
+    pub fn resume(&mut self) -> bool {
+        let is_held = self.held_because().is_some();
+        self.held_because = None;
+        is_held
     }
 
     /// Asks a PX4 that holds its place to follow setpoints. The landing begins once it does.
@@ -308,6 +346,7 @@ impl Mission {
     /// A landing begins: the lander's, or the autopilot's own.
     pub fn begin(&mut self, now_ns: i64, is_autopilots: bool) {
         self.started_ns = Some(now_ns);
+        self.held_because = None;
         self.disarmed_ns = None;
         self.goes_on_until_ns = None;
         self.awaits_next_flight = false;

@@ -142,6 +142,11 @@ impl View<'_> {
 
     /// The phase and the reason for it.
     pub fn phase(&self, now_ns: i64) -> (Phase, String) {
+        if let (State::AwaitingTakeoff, Some(why)) =
+            (self.mission.state(), self.mission.held_because())
+        {
+            return (Phase::Idle, why.to_owned());
+        }
         match (self.mission.state(), self.landing_target) {
             (
                 State::Idle | State::AwaitingTakeoff | State::SendingLandingTarget,

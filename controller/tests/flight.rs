@@ -1760,6 +1760,97 @@ fn a_pilot_ends_the_wait_of_a_vehicle_that_took_off_for_its_landing() {
 }
 
 #[test]
+fn after_a_standstill_of_more_than_15_s_a_takeoff_starts_no_motors() {
+    for (stood_ms, arms) in [(14_000, true), (20_000, false)] {
+        let mut flight = flight_with("takeoff", &[]);
+        flight.presence(0, "main", true);
+        for ms in (0..5000).step_by(20) {
+            stand(&mut flight, ms, 4, false);
+        }
+        sent(&mut flight);
+        let mut commands = Vec::new();
+        for ms in (5000 + stood_ms..10_000 + stood_ms).step_by(20) {
+            stand(&mut flight, ms, 4, true);
+            commands.extend(sent(&mut flight).1);
+        }
+        let status = flight.status((10_000 + stood_ms) * MS);
+        let arm = MavCmd::MAV_CMD_COMPONENT_ARM_DISARM;
+        assert_eq!(commands.contains(&arm), arms, "{stood_ms} ms: {status:?}");
+        assert_eq!(status.phase == Phase::Failed, !arms, "{status:?}");
+        assert_eq!(status.why.contains("did not run for 20 s"), !arms, "{status:?}");
+    }
+}
+
+#[test]
+fn after_a_standstill_of_more_than_15_s_a_landing_that_was_to_begin_waits_for_a_command() {
+    let commands = [ControllerCommand::Resume, ControllerCommand::Start];
+    for (start, command) in ["takeoff", "resume"]
+        .into_iter()
+        .flat_map(|start| commands.iter().map(move |command| (start, command)))
+    {
+        for (stood_ms, begins) in [(14_000, true), (20_000, false)] {
+            let mut flight = in_flight(start);
+            flight.camera(0, CameraInfo::sample());
+            flight.presence(0, "main", true);
+            // Attitude and position are missing.
+            for ms in (20..3000).step_by(20) {
+                if ms % 1000 == 0 {
+                    receive(&mut flight, ms * MS, &heartbeat(4, true));
+                }
+                flight.tick(ms * MS + 3);
+            }
+            // A resumed landing is stopped at once.
+            sent(&mut flight);
+            let end_ms = 3000 + stood_ms;
+            receive(&mut flight, end_ms * MS, &heartbeat(4, true));
+            let after = hover(&mut flight, end_ms, end_ms + 4000, 4);
+            let status = flight.status((end_ms + 4000) * MS);
+            assert_eq!(after.setpoints > 0, begins, "{start}: {status:?}");
+            if begins {
+                continue;
+            }
+            assert!(status.why.contains("did not run for 20 s: `resume` begins"), "{status:?}");
+            assert!(status.started_ns.is_none(), "{status:?}");
+            let reply = flight.command((end_ms + 4000) * MS, command);
+            assert!(reply.accepted, "{start}: {reply:?}");
+            let sent = hover(&mut flight, end_ms + 4020, end_ms + 6000, 4);
+            assert!(sent.setpoints > 10, "{start}: {:?}", flight.status((end_ms + 6000) * MS));
+        }
+    }
+}
+
+#[test]
+fn after_a_standstill_of_more_than_15_s_no_precision_landing_asks_for_land() {
+    for (stood_ms, asks) in [(14_000, true), (20_000, false)] {
+        let mut flight = landing_target("command");
+        parameter(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
+        parameter(&mut flight, 2 * MS, "PLND_TYPE", 1.0);
+        hover(&mut flight, 20, 1000, 4);
+        assert!(flight.command(1000 * MS, &ControllerCommand::Start).accepted);
+        hover(&mut flight, 1000, 1200, 4);
+        let end_ms = 1000 + stood_ms;
+        let sent = hover(&mut flight, end_ms, end_ms + 4000, 4);
+        let status = flight.status((end_ms + 4000) * MS);
+        assert_eq!(sent.modes.contains(&9.0), asks, "{status:?}");
+        if !asks {
+            assert_eq!(status.phase, Phase::Aborted);
+            assert!(status.why.contains("`start` begins a landing"), "{status:?}");
+            let reply = flight.command((end_ms + 4000) * MS, &ControllerCommand::Start);
+            assert!(reply.accepted, "{reply:?}");
+        }
+    }
+    // One that the autopilot flies continues.
+    let mut flight = landing_target("command");
+    parameter(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
+    parameter(&mut flight, 2 * MS, "PLND_TYPE", 1.0);
+    hover(&mut flight, 1000, 4000, 4);
+    hover(&mut flight, 4000, 5000, 9);
+    let sent = hover(&mut flight, 25_000, 27_000, 9);
+    assert_eq!(flight.status(27_000 * MS).phase, Phase::Final);
+    assert!(sent.targets.len() > 20 && sent.modes.is_empty(), "{sent:?}");
+}
+
+#[test]
 fn a_vehicle_that_waits_in_the_air_for_its_landing_lands_before_its_battery_is_empty() {
     for (set, lands) in [("", true), ("phases.on_battery_critical=hold", false)] {
         let set: Vec<&str> = [set].into_iter().filter(|it| !it.is_empty()).collect();

@@ -530,6 +530,17 @@ fn a_px4_that_leaves_land_as_its_motors_stop_has_landed() {
 }
 
 #[test]
+fn after_a_standstill_of_more_than_15_s_no_px4_is_asked_for_offboard() {
+    let mut flight = px4_asked_for_offboard("command");
+    // The change was carried out in the meantime.
+    receive(&mut flight, 25_000 * MS, &heartbeat(OFFBOARD, true));
+    hover(&mut flight, 25_000, 28_000, OFFBOARD);
+    let status = flight.status(28_000 * MS);
+    assert!(status.started_ns.is_none(), "{status:?}");
+    assert!(status.why.contains("did not run for 22 s"), "{status:?}");
+}
+
+#[test]
 fn a_heartbeat_that_current_mode_overtook_is_no_pilots_switch() {
     let mut flight = px4_asked_for_offboard("command");
     receive(&mut flight, 3110 * MS, &current_mode(OFFBOARD));

@@ -16,7 +16,9 @@ impl Flight {
             return Err(format!("a landing is active, in phase `{phase}`"));
         }
         if self.mission.is_taking_off() {
-            return Err("the vehicle is taking off; the landing begins automatically".to_owned());
+            let is_held = self.mission.resume();
+            let why = "the vehicle is taking off; the landing begins automatically".to_owned();
+            return if is_held { Ok(why) } else { Err(why) };
         }
         if self.mission.is_taking_control() {
             return Err(format!("a start is under way: {}", self.view().phase(now_ns).1));
@@ -156,6 +158,9 @@ impl Flight {
         now_ns: i64,
         command: OperatorCommand,
     ) -> Result<String, String> {
+        if command == OperatorCommand::Resume && self.mission.resume() {
+            return Ok("the landing begins as soon as nothing else prevents it".to_owned());
+        }
         if self.mission.is_taking_off() {
             if command == OperatorCommand::Resume {
                 return Err("the vehicle is taking off; there is nothing to resume".to_owned());
