@@ -152,7 +152,9 @@ impl Lander {
     }
 
     /// The height from which a vehicle flies although it is still. The autopilot's report that it flies is needed for the lower one, and
-    /// is no proof: it comes seconds late.
+    /// is no proof: the ground is reported seconds late, and not while a hover is requested, as the land detectors of ArduPilot
+    /// (`update_throttle_mix`) and PX4 (`MulticopterLandDetector`) need a requested descent. The thrust of a vehicle that stands may be
+    /// close to that of a hover, and a climb would distinguish the two only by lifting it.
     fn min_flying_m(&self) -> f64 {
         let standing_m = standing_height_m(&self.config);
         let is_in_air = self.status.is_some_and(|status| status.landed == Landed::InAir);
