@@ -443,12 +443,12 @@ impl StateMachine {
     fn interruption(&self, inputs: &Inputs) -> Option<(Phase, Reason)> {
         if let Some(vehicle) = inputs.vehicle {
             // PX4 leaves LAND as it stops the motors (seen with 1.17); that is not the pilot.
-            if self.landing && !vehicle.armed {
-                return match self.stopped_in_air {
-                    true => Some((Phase::Aborted, Reason::StoppedInAir)),
-                    false if vehicle.awaits_state => None,
-                    false => Some((Phase::Landed, Reason::TouchedDown)),
-                };
+            let is_at_end = self.landing && !vehicle.armed;
+            if is_at_end && self.stopped_in_air {
+                return Some((Phase::Aborted, Reason::StoppedInAir));
+            }
+            if is_at_end && !vehicle.awaits_state {
+                return Some((Phase::Landed, Reason::TouchedDown));
             }
             let is_ours = match vehicle.mode {
                 Mode::Guided => !self.landing || self.elapsed_s(inputs.now) < MAX_OVERTAKEN_S,
@@ -457,7 +457,7 @@ impl StateMachine {
                 // Undecided: no mode is requested, and the vehicle hovers.
                 Mode::Unknown => true,
             };
-            if !is_ours {
+            if !is_ours && !is_at_end {
                 return Some((Phase::PilotInCommand, Reason::PilotTookOver));
             }
             let disarmed = self.disarmed(inputs.now, vehicle);

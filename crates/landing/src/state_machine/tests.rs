@@ -512,6 +512,9 @@ fn motors_that_stop_in_the_air_are_no_touchdown() {
     };
     check(&[a, b, c, d, flown(9.5, is_open)], Phase::Final, Reason::AutopilotLands);
     check(&[a, b, c, d, flown(9.5, is_open), falls(9.8)], fell.0, fell.1);
+    // The report of the motors may be wrong: an abort is obeyed.
+    let aborted = Inputs { operator: Some(OperatorCommand::Abort), ..flown(9.8, is_open) };
+    check(&[a, b, c, d, flown(9.5, is_open), aborted], Phase::Aborted, Reason::OperatorAbort);
     let stands = (Phase::Landed, Reason::TouchedDown);
     check(&[a, b, c, d, flown(9.5, is_open), flown(9.8, down)], stands.0, stands.1);
     // Motors that run again were not off.
