@@ -1,0 +1,58 @@
+//! Decides whether a vehicle whose motors have stopped was in the air, also while its state is old.
+
+use super::{Lander, MAX_CONTACT_M, MAX_CONTACT_M_S};
+use crate::event::Landed;
+use crate::standing::{MAX_STANDING_M_S, standing_height_m};
+use crate::time::Timestamp;
+
+/// Maximum speed of an autopilot's LAND, in m/s: ArduPilot's LAND_SPEED_HIGH is at most 5 m/s, PX4's MPC_Z_V_AUTO_DN 4 m/s.
+const MAX_LAND_M_S: f64 = 5.0;
+
+/// Longest wait for a recent state after the motors have stopped, in seconds.
+const MAX_STATE_WAIT_S: f64 = 2.0;
+
+impl Lander {
+    /// Whether the vehicle is certainly in the air, although its motors are off: it falls, or, where its autopilot does not report the ground,
+    /// sinks or is high over a target that was seen lately. A vehicle stands still for a second before its autopilot stops the motors.
+    /// From its last state, if that is old, it may have come down as fast as LAND does; if it was higher, it was in the air, also where the
+    /// ground is reported, as autopilots report it of each vehicle whose motors are off.
+    pub(super) fn flies(&self, now: Timestamp) -> bool {
+        let (Some(vehicle), Some(status)) = (self.history.newest(), self.status) else {
+            return false;
+        };
+        let age_s = now.seconds_since(vehicle.stamp);
+        let is_recent = age_s <= self.config.phases.stale_vehicle_s;
+        let down_m_s = vehicle.velocity.z() - self.config.estimator.pad_heave_m_s;
+        let standing_m = standing_height_m(&self.config);
+        let max_sunk_m = if is_recent { 0.0 } else { MAX_LAND_M_S * age_s };
+        let is_high = self
+            .recent_target(now)
+            .is_some_and(|target| target.height_m - standing_m - max_sunk_m > MAX_CONTACT_M);
+        let sinks = down_m_s > MAX_STANDING_M_S;
+        let falls = down_m_s > MAX_CONTACT_M_S;
+        if is_recent {
+            falls || status.landed != Landed::OnGround && (sinks || is_high)
+        } else {
+            is_high
+        }
+    }
+
+    /// The same now.
+    pub fn is_flying(&self) -> bool {
+        self.now.is_some_and(|now| self.flies(now))
+    }
+
+    /// Whether the motors have just stopped, and the vehicle's state is too old to show whether that was in the air.
+    pub(super) fn awaits_state(&self, now: Timestamp) -> bool {
+        let is_old = self.history.newest().is_none_or(|vehicle| {
+            now.seconds_since(vehicle.stamp) > self.config.phases.stale_vehicle_s
+        });
+        let waits = |since| now.seconds_since(since) < MAX_STATE_WAIT_S;
+        is_old && self.disarmed.is_some_and(waits)
+    }
+
+    /// The same now: a state that follows within seconds decides whether the vehicle has landed.
+    pub fn is_awaiting_state(&self) -> bool {
+        self.now.is_some_and(|now| self.awaits_state(now))
+    }
+}
