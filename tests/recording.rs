@@ -6,6 +6,8 @@ mod played;
 
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
@@ -170,6 +172,7 @@ async fn a_recorder_of_a_vehicle_without_another_process_warns() -> anyhow::Resu
         let file = folder.path().join(vehicle).with_extension("mcap");
         let mut command = Command::new(ALIGHT);
         command.arg("record").arg("-o").arg(file).args(["--meet", &meet.to_string()]);
+        command.args(["--stop-with-parent", &std::process::id().to_string()]);
         command.args(["--vehicle", vehicle]).stderr(Stdio::piped()).spawn()
     };
     let (mut misnamed, mut named) = (record("rhed")?, record("red")?);
@@ -178,23 +181,28 @@ async fn a_recorder_of_a_vehicle_without_another_process_warns() -> anyhow::Resu
     let identity = Identity { service: "tester", instance: "main".into() };
     let tester = Node::open(identity, &network.source("controller")?).await?;
     let winds = tester.publisher(topic::WIND, &[]).await?;
-    let publish = async || loop {
-        winds.publish(&Wind { velocity_ned_m_s: [0.0; 3], stamp_ns: now_ns() }).await;
-        tokio::time::sleep(Duration::from_millis(200)).await;
-    };
     let warning = "no message of another process of the vehicle `rhed` has arrived";
     let lines = BufReader::new(misnamed.stderr.take().context("standard error")?).lines();
+    let is_warned = Arc::new(AtomicBool::new(false));
+    let noted = Arc::clone(&is_warned);
     let reading = tokio::task::spawn_blocking(move || {
-        lines.map_while(Result::ok).any(|line| line.contains(warning))
+        for line in lines.map_while(Result::ok).filter(|line| line.contains(warning)) {
+            println!("{line}");
+            noted.store(true, Ordering::Relaxed);
+        }
     });
-    let is_warned = tokio::select! {
-        is_warned = tokio::time::timeout(PATIENCE, reading) => is_warned??,
-        () = publish() => false,
+    let publish = async {
+        while !is_warned.load(Ordering::Relaxed) {
+            winds.publish(&Wind { velocity_ned_m_s: [0.0; 3], stamp_ns: now_ns() }).await;
+            tokio::time::sleep(Duration::from_millis(200)).await;
+        }
     };
+    let in_time = tokio::time::timeout(PATIENCE, publish).await;
     for child in [&misnamed, &named] {
         kill_process(Pid::from_child(child), Signal::INT)?;
     }
-    ensure!(is_warned, "no warning");
+    in_time.context("no warning")?;
+    reading.await?;
     let mut text = String::new();
     named.stderr.take().context("standard error")?.read_to_string(&mut text)?;
     ensure!(!text.contains("another process"), "{text}");

@@ -527,7 +527,8 @@ fn check_silent<'a>(findings: &mut Findings, seen: &Seen, expected: &'a [Job]) -
     let silent_process = |job: &Job| {
         let names = (job.service?.name(), job.instance.as_deref()?);
         let mut ready = seen.peers.iter();
-        let is_ready = ready.any(|(service, instance)| (service.as_str(), &**instance) == names);
+        let is_ready =
+            ready.any(|(service, instance)| (service.as_str(), instance.as_str()) == names);
         if is_ready { None } else { running::process(job) }
     };
     let mut others = Vec::new();
