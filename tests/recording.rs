@@ -5,9 +5,10 @@ mod disks;
 mod played;
 
 use std::io::{BufRead, BufReader, Read};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
@@ -109,7 +110,7 @@ async fn a_landing_is_followed_by_a_client_of_foxglove() -> anyhow::Result<()> {
     with_second_try(async || {
         let folder = tempfile::tempdir()?;
         let file = folder.path().join("flight.mcap");
-        let ([port], _, _) = testing::ports::free()?;
+        let ([port], _, _) = ports::free()?;
         let serve = format!("recorder.serve=\"127.0.0.1:{port}\"");
         let name = file.to_str().context("a path")?;
         let slowly = "controller.metric.max_descend_m_s=0.5";
@@ -207,7 +208,7 @@ async fn a_recorder_of_a_vehicle_without_another_process_warns() -> anyhow::Resu
     named.stderr.take().context("standard error")?.read_to_string(&mut text)?;
     ensure!(!text.contains("another process"), "{text}");
     let ends = [&mut misnamed, &mut named].map(Child::wait);
-    ensure!(ends.iter().all(|end| end.as_ref().is_ok_and(|end| end.success())), "{ends:?}");
+    ensure!(ends.iter().all(|end| end.as_ref().is_ok_and(ExitStatus::success)), "{ends:?}");
     Ok(())
 }
 
