@@ -134,3 +134,22 @@ fn the_printed_board_is_found_and_one_picture_of_it_is_refused() -> anyhow::Resu
     ensure!(!folder.path().join("camera.yaml").exists(), "a refused calibration was written");
     Ok(())
 }
+
+#[test]
+fn mirrored_images_are_refused_as_mirrored() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let print = ["calibrate", "board", "--print", "board.png", "--dpi", "100"];
+    let printed = alight(&print, folder.path())?;
+    ensure!(printed.status.success(), "{printed:?}");
+    let images = folder.path().join("images");
+    std::fs::create_dir(&images)?;
+    let board = image::open(folder.path().join("board.png"))?;
+    board.fliph().save(images.join("a.png"))?;
+    image::GrayImage::new(640, 480).save(images.join("b.png"))?;
+    let done = alight(&["calibrate", "board", "images", "--format", "json"], folder.path())?;
+    ensure!(done.status.code() == Some(1), "{done:?}");
+    let said: Value = serde_json::from_slice(&done.stdout)?;
+    let reason = said["refused"].as_str().context("a reason")?;
+    ensure!(reason.contains("a.png") && reason.contains("are mirrored"), "{said}");
+    Ok(())
+}

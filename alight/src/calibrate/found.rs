@@ -1,6 +1,8 @@
 //! Finds the tags of the calibration board in images and in frames of a camera, leaves out those in which it has not moved or
 //! is shaken, and looks again once the lens is known.
 
+use std::collections::VecDeque;
+
 use anyhow::{Context, ensure};
 use calibration::{ImageSize, Sighting, View};
 use fiducial::{Detector, Settings};
@@ -26,6 +28,8 @@ const MAX_SHAKE: f64 = 0.005;
 /// Corners whose standard deviation is larger are not used where the lens is known, in pixels: those at a fisheye's rim that
 /// could not be refined are a pixel off, and not by chance. Refined ones are known to some hundredths.
 const MAX_CORNER_PX: f64 = 0.15;
+/// Images that are searched mirrored where none shows the board.
+const MIRRORED_IMAGES: usize = 8;
 /// An image whose outlines are wider than this is blurred, in pixels.
 pub(super) const BLURRED_PX: f64 = 5.0;
 
@@ -42,6 +46,10 @@ pub(super) struct FoundImages {
     pub(super) images: usize,
     /// Those without the board.
     pub(super) empty: Vec<String>,
+    /// The last images without the board, as long as no image shows it.
+    last_empty: VecDeque<(String, GrayImage)>,
+    /// The name of an image that shows the board only when it is mirrored, where no image shows it.
+    pub(super) mirrored: Option<String>,
     /// Those that could not be read, with the reason.
     pub(super) unreadable: Vec<String>,
     /// Frames in which the board had not moved.
@@ -146,19 +154,34 @@ impl FoundImages {
         if view.points.is_empty() {
             // A stream without the board would fill the list with every frame.
             if origin == Origin::File {
-                self.empty.push(name);
+                self.empty.push(name.clone());
+            }
+            if self.views.is_empty() {
+                self.last_empty.truncate(MIRRORED_IMAGES - 1);
+                self.last_empty.push_front((name, image));
             }
         } else if origin == Origin::Live && !is_still(&view, before.as_ref(), edge_px) {
             self.shaken += 1;
         } else if origin != Origin::File && !has_moved(&view, &self.views) {
             self.unmoved += 1;
         } else {
+            self.last_empty.clear();
             self.views.push(view);
             self.kept.push(image);
             self.edges.extend(edge_px.map(|width_px| EdgeWidth { name, width_px }));
         }
         let pixels: usize = self.kept.iter().map(|image| image.width() * image.height()).sum();
         self.is_full = self.views.len() >= MAX_VIEWS || pixels >= MAX_KEPT_PIXELS;
+    }
+
+    /// Looks for the board in mirrored images, where no image showed it.
+    pub(super) fn look_mirrored(&mut self, finder: &mut Finder<'_>) {
+        let mut shows_board = |name: &str, image: &GrayImage| {
+            let seen = finder.look_at(&mirrored(image), name, None);
+            seen.is_ok_and(|seen| !seen.view.points.is_empty())
+        };
+        let mut empty = self.last_empty.drain(..);
+        self.mirrored = empty.find_map(|(name, image)| shows_board(&name, &image).then_some(name));
     }
 
     /// Looks at the same images again, with the lens as it was found from the first look: it bends the edges of near tags, and
@@ -232,6 +255,17 @@ fn add_item(found: &mut FoundImages, finder: &mut Finder<'_>, item: Item, args: 
             found.unreadable.push(problem);
         }
     }
+}
+
+/// The image with left and right exchanged.
+fn mirrored(image: &GrayImage) -> GrayImage {
+    let mut mirrored = GrayImage::filled(image.width(), image.height(), 0);
+    for (y, row) in image.pixels().chunks_exact(image.width().max(1)).enumerate() {
+        let target = mirrored.row_mut(y);
+        target.copy_from_slice(row);
+        target.reverse();
+    }
+    mirrored
 }
 
 /// Whether the board lies elsewhere than in the views so far.

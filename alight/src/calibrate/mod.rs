@@ -17,7 +17,7 @@ use std::process::ExitCode;
 use std::time::SystemTime;
 
 use anyhow::{Context, ensure};
-use calibration::{Calibration, Refusal, calibrate, calibrate_unjudged};
+use calibration::{Calibration, calibrate, calibrate_unjudged};
 use clap::{Args, Subcommand};
 use media::{CalibrationDetails, CalibrationNote, write_calibration};
 
@@ -110,6 +110,7 @@ fn board(args: &BoardArgs) -> anyhow::Result<ExitCode> {
         sensor.check([view.size.width, view.size.height])?;
     }
     let (lens, options) = (args.lens.model(), args.options());
+    found.look_mirrored(&mut finder);
     let mut first = calibrate_unjudged(&found.views, lens, &options).ok();
     for _ in 0..LOOKS {
         let Some(camera) = first.as_ref().map(|first| first.camera) else { break };
@@ -119,7 +120,9 @@ fn board(args: &BoardArgs) -> anyhow::Result<ExitCode> {
     let shown = Shown::new(&found, first.as_ref());
     match calibrate(&found.views, lens, &options) {
         Ok(calibration) => accept(args, &found, &shown, &calibration),
-        Err(refusal) => refuse(args, &found, &shown, &refusal),
+        Err(refusal) => {
+            refuse(args, &found, &shown, &report::refusal_text(&found, &refusal, &board, lens))
+        }
     }
 }
 
@@ -167,15 +170,15 @@ fn refuse(
     args: &BoardArgs,
     found: &FoundImages,
     shown: &Shown,
-    refusal: &Refusal,
+    reason: &str,
 ) -> anyhow::Result<ExitCode> {
     match args.format {
         Format::Text => {
             print(report::found_text(found, shown).trim_end())?;
             print(report::shown_text(shown).trim_end())?;
-            print(&format!("No calibration: {}.", report::refusal_text(found, refusal)))
+            print(&format!("No calibration: {reason}."))
         }
-        Format::Json => print(&report::json(found, shown, None, Some(refusal)).to_string()),
+        Format::Json => print(&report::json(found, shown, None, Some(reason)).to_string()),
     }
     .context("writing the result")?;
     Ok(ExitCode::FAILURE)

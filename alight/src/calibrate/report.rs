@@ -3,8 +3,9 @@
 
 use std::fmt::Write as _;
 
-use calibration::{Calibration, Refusal};
+use calibration::{Calibration, Lens, Refusal};
 use geometry::{CameraModel, Distortion};
+use markers::Board;
 use serde_json::{Value, json};
 
 use super::found::{BLURRED_PX, FoundImages};
@@ -17,14 +18,43 @@ const MAP: [usize; 2] = [6, 4];
 /// Names that are listed.
 const MAX_NAMES: usize = 5;
 
-/// Why there is no calibration; where no image shows the board, which board is meant.
-pub(super) fn refusal_text(found: &FoundImages, refusal: &Refusal) -> String {
+/// Why there is no calibration, with the values of the options `--tag`, `--gap` and `--lens` that may be right; where no image shows
+/// the board, which board is meant.
+pub(super) fn refusal_text(
+    found: &FoundImages,
+    refusal: &Refusal,
+    board: &Board,
+    lens: Lens,
+) -> String {
+    if let Some(name) = &found.mirrored {
+        return format!(
+            "no image shows the board, but the mirrored image of {name} does: the images are mirrored; switch the camera's mirroring \
+             off, or print the board again, not from its back"
+        );
+    }
     if found.views.is_empty() {
         return "no image shows the board, which is the grid of AprilTags that `alight calibrate board --print` writes; a chessboard \
                 or another board is not found: calibrate with OpenCV from those, and give its file wherever a calibration is taken"
             .to_owned();
     }
-    refusal.to_string()
+    match refusal {
+        Refusal::TagSize { percent, .. } => {
+            // The images show the size of the tags by their spacing only.
+            let tag_m = board.tag_m() * (1.0 + percent / 100.0);
+            let gap_m = board.tag_m() + board.gap_m() - tag_m;
+            format!(
+                "{refusal}. With the stated spacing, `--tag {tag_m:.5} --gap {gap_m:.5}` fit the images"
+            )
+        }
+        Refusal::WrongLens { .. } | Refusal::Diverged { .. } | Refusal::Inconsistent { .. }
+            if lens != Lens::KannalaBrandt =>
+        {
+            format!(
+                "{refusal}. For a fisheye or another wide-angle lens pass `--lens kannala-brandt`"
+            )
+        }
+        _ => refusal.to_string(),
+    }
 }
 
 /// Which images show the board, and where in the image it was.
@@ -198,7 +228,7 @@ pub(super) fn json(
     found: &FoundImages,
     shown: &Shown,
     calibration: Option<&Calibration>,
-    refusal: Option<&Refusal>,
+    refused: Option<&str>,
 ) -> Value {
     let edges: Vec<Value> = found
         .edges
@@ -215,7 +245,7 @@ pub(super) fn json(
         "edges": edges,
         "shaken": found.shaken,
         "shown": shown.json(),
-        "refused": refusal.map(|refusal| refusal_text(found, refusal)),
+        "refused": refused,
         "calibration": calibration.map(calibration_json),
     })
 }
@@ -278,11 +308,30 @@ mod tests {
     fn images_without_the_board_are_reported_with_the_board_that_is_meant() {
         let refusal = Refusal::TooFewViews { views: 0, min_views: 3, min_points: 12 };
         let mut found = FoundImages::default();
-        let text = refusal_text(&found, &refusal);
+        let reason =
+            |found: &FoundImages| refusal_text(found, &refusal, &Board::A4, Lens::BrownConrady5);
+        let text = reason(&found);
         assert!(text.contains("AprilTags") && text.contains("chessboard"), "{text}");
         assert!(text.contains("OpenCV") && !text.contains("more pictures"), "{text}");
         let size = ImageSize { width: 640, height: 480 };
         found.views.push(View { name: "a.png".to_owned(), size, points: Vec::new() });
-        assert_eq!(refusal_text(&found, &refusal), refusal.to_string());
+        assert_eq!(reason(&found), refusal.to_string());
+    }
+
+    #[test]
+    fn refusals_name_the_options_that_may_be_right() {
+        let size = ImageSize { width: 640, height: 480 };
+        let mut found = FoundImages::default();
+        found.views.push(View { name: "a.png".to_owned(), size, points: Vec::new() });
+        let board = Board::new(5, 7, 0.0281, 0.0083).unwrap();
+        let reason = |refusal, lens| refusal_text(&found, &refusal, &board, lens);
+        let size = Refusal::TagSize { percent: -0.35, max_percent: 0.3 };
+        let text = reason(size, Lens::BrownConrady5);
+        assert!(text.contains("`--tag 0.02800 --gap 0.00840` fit"), "{text}");
+        let (max_px, max_ratio) = (0.3, 4.0);
+        let halves = Refusal::Inconsistent { difference_px: 0.75, ratio: 5.7, max_px, max_ratio };
+        let text = reason(halves.clone(), Lens::BrownConrady5);
+        assert!(text.contains("`--lens kannala-brandt`"), "{text}");
+        assert_eq!(reason(halves.clone(), Lens::KannalaBrandt), halves.to_string());
     }
 }

@@ -56,8 +56,11 @@ impl Shown {
 
     /// A line for the person with the board.
     pub(super) fn line(&self) -> String {
-        let mut line =
-            format!("{} views, {:.0} % of the image", self.views, 100.0 * self.covered());
+        let mut line = format!(
+            "{}, {:.0} % of the image",
+            counted(self.views, "view"),
+            100.0 * self.covered()
+        );
         if let Some(tilt_deg) = self.tilt_deg {
             line.push_str(&format!(", tilt {tilt_deg:.0} degrees"));
         }
@@ -95,7 +98,7 @@ impl Shown {
             );
         }
         if self.views < GOOD_VIEWS {
-            next.push(format!("take {} more images", GOOD_VIEWS - self.views));
+            next.push(format!("take {}", counted(GOOD_VIEWS - self.views, "more image")));
         }
         next
     }
@@ -142,6 +145,12 @@ impl Shown {
             "next": self.next,
         })
     }
+}
+
+/// A number of things with their name, which is `noun` in the singular.
+fn counted(count: usize, noun: &str) -> String {
+    let plural = if count == 1 { "" } else { "s" };
+    format!("{count} {noun}{plural}")
 }
 
 fn point_counts(views: &[View]) -> [[usize; COLUMNS]; ROWS] {

@@ -9,8 +9,9 @@ use crate::view::ImageSize;
 pub enum Refusal {
     /// Not enough views with enough points.
     #[error(
-        "{views} views show {min_points} points of the board or more, at least {min_views} must: take more pictures in which \
-         the board is whole, sharp and near"
+        "{views} {} {min_points} points of the board or more, at least {min_views} must: take more pictures in which \
+         the board is whole, sharp and near",
+        if *views == 1 { "view shows" } else { "views show" }
     )]
     TooFewViews {
         /// Views that can be used.
@@ -129,11 +130,13 @@ pub enum Refusal {
     },
     /// The board is not as described: the size of the tags against their spacing.
     #[error(
-        "the tags are {percent:+.2} % larger than stated, against their spacing (limit {max_percent:.2} %): measure the side of \
-         a tag's black square and the gap between two, and state both"
+        "the tags are {} than stated, against their spacing (limit {max_percent:.2} %), which is finer than a ruler shows: measure \
+         the side of a tag's black square with a caliper, and the spacing across several tags (from the left edge of the first to \
+         that of the last, divided by the steps between them); the gap is the spacing minus the side",
+        compared(*percent)
     )]
     TagSize {
-        /// How much larger.
+        /// How much larger; negative where they are smaller.
         percent: f64,
         /// Its limit.
         max_percent: f64,
@@ -210,4 +213,10 @@ pub enum Refusal {
         /// Its limit.
         max_px: f64,
     },
+}
+
+/// A difference in percent, in words.
+fn compared(percent: f64) -> String {
+    let comparison = if percent < 0.0 { "smaller" } else { "larger" };
+    format!("{:.2} % {comparison}", percent.abs())
 }

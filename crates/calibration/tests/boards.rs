@@ -103,12 +103,17 @@ fn bad_sets_are_refused_with_their_reason() {
 #[test]
 fn a_refusal_states_the_value_the_limit_and_the_remedy() {
     let truth = lenses()[0];
-    let (views, lens) = Bad::TagSize.set(&truth, 502);
-    let refusal = calibrate(&views, lens, &Options::default()).unwrap_err();
-    let Refusal::TagSize { percent, .. } = refusal else { panic!("{refusal}") };
-    let text = refusal.to_string();
-    assert!(text.contains(&format!("{percent:+.2} %")) && text.contains("limit 0.30 %"), "{text}");
-    assert!(text.contains("measure the side"), "{text}");
+    for (seed, comparison) in [(502, "larger"), (501, "smaller")] {
+        let (views, lens) = Bad::TagSize.set(&truth, seed);
+        let refusal = calibrate(&views, lens, &Options::default()).unwrap_err();
+        let Refusal::TagSize { percent, .. } = refusal else { panic!("{refusal}") };
+        let text = refusal.to_string();
+        let difference = format!("are {:.2} % {comparison} than stated", percent.abs());
+        assert!(text.contains(&difference) && text.contains("limit 0.30 %"), "{text}");
+        for part in ["measure the side", "caliper", "across several tags"] {
+            assert!(text.contains(part), "`{part}` is not in: {text}");
+        }
+    }
 }
 
 #[test]
