@@ -86,6 +86,18 @@ impl Paper {
         let [width, height] = self.size_mm();
         (width - 2.0 * MARGIN_MM).min(height - 2.0 * BELOW_MM)
     }
+
+    /// Width and height of the largest pad that fits between the edges and above the ruler, in millimetres.
+    fn pad_room_mm(self) -> [f64; 2] {
+        let [width, height] = self.size_mm();
+        [width - 2.0 * MARGIN_MM, height - MARGIN_MM - BELOW_MM]
+    }
+
+    /// Whether a pad of this width and height fits, in millimetres.
+    fn has_room(self, needed_mm: [f64; 2]) -> bool {
+        let room_mm = self.pad_room_mm();
+        (0..2).all(|axis| needed_mm[axis] <= room_mm[axis] + ROUNDING_MM)
+    }
 }
 
 /// Why a sheet is impossible.
@@ -157,7 +169,15 @@ impl Mark {
     }
 }
 
-/// A sheet of paper with a marker at its centre.
+/// The part of the paper that a marker or pad covers, with its quiet zones.
+struct Frame {
+    /// The marker's centre or the pad's landing point, from the paper's top left corner, x right, y down, in millimetres.
+    origin_mm: [f64; 2],
+    /// Its least and its greatest coordinates from there, x right, y up, in millimetres.
+    bounds_mm: [[f64; 2]; 2],
+}
+
+/// A sheet of paper with a marker or pad.
 #[derive(Clone, Debug)]
 pub(crate) struct Sheet {
     pub(super) size_mm: [f64; 2],
@@ -171,24 +191,41 @@ impl Sheet {
         if 2.0 * half_mm > paper.room_mm() + ROUNDING_MM {
             return Err(too_large(marker, size_m, half_mm, paper));
         }
-        Ok(Self::from_drawing(&drawing, &[format!("{}, size {size_m} m", marker.name())], paper))
+        let [width, height] = paper.size_mm();
+        let frame = Frame {
+            origin_mm: [width / 2.0, height / 2.0],
+            bounds_mm: [[-half_mm; 2], [half_mm; 2]],
+        };
+        let titles = [format!("{}, size {size_m} m", marker.name())];
+        Ok(Self::from_drawing(&drawing, &frame, &titles, paper))
     }
 
-    /// A sheet with all markers of a pad, its landing point at the centre.
+    /// A sheet with all markers of a pad, its landing point at the centre, or as near to it as its markers fit on the paper.
     pub(super) fn with_pad(pad: &Pad, paper: Paper) -> Result<Self, SheetError> {
         let drawing = pad.drawing().ok_or(SheetError::NoId)?;
-        let needed_mm = 2e3 * drawing.half_extent_m;
-        if needed_mm > paper.room_mm() + ROUNDING_MM {
-            let instead = larger_paper(needed_mm)
+        let bounds_mm =
+            pad.bounds_m().ok_or(SheetError::NoId)?.map(|corner| corner.map(|m| 1e3 * m));
+        let [[left, bottom], [right, top]] = bounds_mm;
+        let needed_mm = [right - left, top - bottom];
+        if !paper.has_room(needed_mm) {
+            let mut papers = Paper::value_variants().iter();
+            let instead = papers
+                .find(|paper| paper.has_room(needed_mm))
                 .map_or(String::new(), |paper| format!("; it fits on {}", paper.name()));
+            let [room_width, room_height] = paper.pad_room_mm();
             let problem = format!(
-                "{} needs {needed_mm:.1} mm about its landing point; {} has {:.1} mm{instead}",
+                "{} needs {:.1} x {:.1} mm, its quiet zones included; {} has {room_width:.1} x {room_height:.1} mm{instead}",
                 pad.name(),
+                needed_mm[0],
+                needed_mm[1],
                 paper.name(),
-                paper.room_mm()
             );
             return Err(SheetError::TooLarge { problem });
         }
+        let [width, height] = paper.size_mm();
+        let across = (width / 2.0).max(MARGIN_MM - left).min(width - MARGIN_MM - right);
+        let down = (height / 2.0).max(MARGIN_MM + top).min(height - BELOW_MM + bottom);
+        let frame = Frame { origin_mm: [across, down], bounds_mm };
         let markers = pad.markers().iter().map(|placed| placed.marker);
         let name = pad.name();
         let counted = match pad.markers().len() {
@@ -196,7 +233,7 @@ impl Sheet {
             count => format!("{count} markers"),
         };
         let titles = [format!("{name}, {counted}"), in_one_line(&kinds(markers), paper)];
-        Ok(Self::from_drawing(&drawing, &titles, paper))
+        Ok(Self::from_drawing(&drawing, &frame, &titles, paper))
     }
 
     /// A sheet with a calibration board and its instructions.
@@ -240,10 +277,10 @@ impl Sheet {
         Ok(sheet)
     }
 
-    fn from_drawing(drawing: &Drawing, titles: &[String], paper: Paper) -> Self {
+    fn from_drawing(drawing: &Drawing, frame: &Frame, titles: &[String], paper: Paper) -> Self {
         let mut sheet = Self { size_mm: paper.size_mm(), marks: Vec::new() };
-        sheet.draw(drawing, sheet.centre());
-        sheet.draw_cut_marks(drawing.half_extent_m * 1e3);
+        sheet.draw(drawing, frame.origin_mm);
+        sheet.draw_cut_marks(frame);
         sheet.draw_ruler();
         let [width, height] = sheet.size_mm;
         let left = (width - RULER_MM) / 2.0;
@@ -255,10 +292,6 @@ impl Sheet {
         let advice = "Print at 100 %: the ruler must measure 100 mm.";
         sheet.write([left, advice_mm], advice.to_owned());
         sheet
-    }
-
-    fn centre(&self) -> [f64; 2] {
-        self.size_mm.map(|edge| edge / 2.0)
     }
 
     /// Draws it with its origin there.
@@ -277,19 +310,15 @@ impl Sheet {
     }
 
     /// Draws cut marks outside the quiet zone's corners.
-    fn draw_cut_marks(&mut self, half_mm: f64) {
-        let [x, y] = self.centre();
-        let near = half_mm + CUT_MARK_GAP_MM;
-        let far = near + CUT_MARK_LENGTH_MM;
-        for (right, down) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)] {
-            self.line(
-                [x + right * near, y + down * half_mm],
-                [x + right * far, y + down * half_mm],
-            );
-            self.line(
-                [x + right * half_mm, y + down * near],
-                [x + right * half_mm, y + down * far],
-            );
+    fn draw_cut_marks(&mut self, frame: &Frame) {
+        let [x, y] = frame.origin_mm;
+        let [[left, bottom], [right, top]] = frame.bounds_mm;
+        let (near, far) = (CUT_MARK_GAP_MM, CUT_MARK_GAP_MM + CUT_MARK_LENGTH_MM);
+        for (at_x, outwards) in [(x + left, -1.0), (x + right, 1.0)] {
+            for (at_y, downwards) in [(y - top, -1.0), (y - bottom, 1.0)] {
+                self.line([at_x + outwards * near, at_y], [at_x + outwards * far, at_y]);
+                self.line([at_x, at_y + downwards * near], [at_x, at_y + downwards * far]);
+            }
         }
     }
 
@@ -488,6 +517,35 @@ mod tests {
         assert!(row.contains(&"aruco-4x4-50:0-3 0.02 m".to_owned()), "{row:?}");
         let sizes = texts(&four(&|id| format!("0.01{id}")), Paper::A5);
         assert!(sizes.iter().any(|text| text.ends_with(", 3 more")), "{sizes:?}");
+    }
+
+    #[test]
+    fn a_pad_fits_by_its_width_and_height_wherever_its_landing_point_is() {
+        let pad = |y_m: f64, size_m: f64| -> Pad {
+            let far = format!("{{ marker = \"apriltag-36h11:7:0.1\", y_m = {y_m} }}");
+            let near = format!("{{ marker = \"aruco-4x4-50:1:{size_m}\", y_m = -0.03 }}");
+            format!("id = 1\nmarkers = [{far}, {near}]").parse().unwrap()
+        };
+        // Tall, and its landing point far below its centre: 125 x 240 mm.
+        let tall = Sheet::with_pad(&pad(0.1375, 0.0075), Paper::A4).unwrap();
+        assert!(Sheet::with_pad(&pad(0.1375, 0.0075), Paper::A5).is_err());
+        for mark in &tall.marks {
+            if let Mark::Rectangle { min_mm, max_mm, .. } = mark {
+                assert!(min_mm[0] >= 0.0 && min_mm[1] >= 0.0, "{mark:?}");
+                assert!(max_mm[0] <= 210.0 && max_mm[1] <= 297.0, "{mark:?}");
+            }
+        }
+        let lowest = |ink: Ink| {
+            let marks = tall.marks.iter().filter(|mark| mark.ink() == Some(ink));
+            let bottoms = marks.filter_map(|mark| match mark {
+                Mark::Rectangle { max_mm, .. } => Some(max_mm[1]),
+                _ => None,
+            });
+            bottoms.fold(0.0, f64::max)
+        };
+        assert!(lowest(Ink::White) <= 297.0 - BELOW_MM + ROUNDING_MM);
+        let refused = Sheet::with_pad(&pad(0.24, 0.0075), Paper::A4).unwrap_err().to_string();
+        assert!(refused.contains("a4 has 200.0 x 259.0 mm; it fits on a3"), "{refused}");
     }
 
     #[test]

@@ -216,6 +216,20 @@ impl Pad {
         Ok(())
     }
 
+    /// Its least and its greatest coordinates, markers with their quiet zones, in metres from the landing point (right and up); `None` for
+    /// an id that cannot be drawn.
+    pub fn bounds_m(&self) -> Option<[[f64; 2]; 2]> {
+        let mut bounds = [[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]];
+        for placed in &self.markers {
+            let [_, quiet_m] = placed.reaches_m()?;
+            for (axis, at_m) in placed.position_m.into_iter().enumerate() {
+                bounds[0][axis] = bounds[0][axis].min(at_m - quiet_m);
+                bounds[1][axis] = bounds[1][axis].max(at_m + quiet_m);
+            }
+        }
+        Some(bounds)
+    }
+
     /// All its markers, each on white paper of its quiet zone, later ones over earlier ones; `None` for an id that cannot
     /// be drawn.
     pub fn drawing(&self) -> Option<Drawing> {
@@ -514,6 +528,17 @@ mod tests {
             let pad = format!("id = 1\nmarkers = [{markers}]").parse::<Pad>();
             assert!(pad.is_ok(), "{pad:?}");
         }
+    }
+
+    #[test]
+    fn a_pad_is_as_large_as_its_markers_with_their_quiet_zones() {
+        let markers = "[{ marker = \"apriltag-36h11:7:0.08\", x_m = 0.01, y_m = 0.05 }, { marker = \"rings:0.05\", y_m = -0.06 }]";
+        let pad: Pad = format!("id = 1\nmarkers = {markers}").parse().unwrap();
+        // A tag of 8 cells has a quiet zone of one cell, rings one of a tenth.
+        let expected = [[-0.04, -0.09], [0.06, 0.1]];
+        let bounds = pad.bounds_m().unwrap();
+        let pairs = bounds.as_flattened().iter().zip(expected.as_flattened());
+        assert!(pairs.into_iter().all(|(a, b)| (a - b).abs() < 1e-9), "{bounds:?}");
     }
 
     #[test]
