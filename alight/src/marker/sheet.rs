@@ -361,6 +361,8 @@ struct Kind {
     full: String,
     /// With their number, where there is no room for the ids.
     short: String,
+    /// How many they are.
+    count: usize,
 }
 
 /// The markers of a pad by family and size.
@@ -379,11 +381,11 @@ fn kinds(markers: impl Iterator<Item = Marker>) -> Vec<Kind> {
         let size = size_m.map_or_else(String::new, |size_m| format!(" {size_m} m"));
         if ids.is_empty() {
             let name = format!("{family}{size}");
-            return Kind { full: name.clone(), short: name };
+            return Kind { full: name.clone(), short: name, count: 1 };
         }
         ids.sort_unstable();
         let full = format!("{family}:{}{size}", ranges(&ids).join(","));
-        Kind { full, short: format!("{family}: {} of{size}", ids.len()) }
+        Kind { full, short: format!("{family}: {} of{size}", ids.len()), count: ids.len() }
     });
     kinds.collect()
 }
@@ -405,7 +407,7 @@ fn in_one_line(kinds: &[Kind], paper: Paper) -> String {
     let room_mm = (width + RULER_MM) / 2.0 - MARGIN_MM;
     let max_letters = (room_mm / (LETTER * TEXT_MM)) as usize;
     let line = |shown: usize, name: fn(&Kind) -> &str| {
-        let more = match kinds.len() - shown {
+        let more = match kinds.iter().skip(shown).map(|kind| kind.count).sum::<usize>() {
             0 => None,
             rest => Some(format!("{rest} more")),
         };
@@ -558,6 +560,10 @@ mod tests {
         };
         assert_eq!(of((0..20).rev().collect()), "aruco-4x4-50:0-19 0.02 m");
         assert_eq!(of((0..25).map(|i| 2 * i).collect()), "aruco-4x4-50: 25 of 0.02 m");
+        // Of 16 markers of 8 families and sizes 2 are named.
+        let pairs =
+            (0..16).map(|id| format!("aruco-4x4-50:{id}:0.0{}", 15 + id % 8).parse().unwrap());
+        assert_eq!(in_one_line(&kinds(pairs), Paper::A5), "aruco-4x4-50:0,8 0.015 m, 14 more");
     }
 
     #[test]
