@@ -202,6 +202,15 @@ mod tests {
     }
 
     #[test]
+    fn one_view_is_named_in_the_singular() {
+        let line = |found: &FoundImages| Shown::new(found, None).line();
+        let mut found = seen_in(|_, _| true);
+        assert!(line(&found).starts_with("1 view, "), "{}", line(&found));
+        found.views.extend(found.views.clone());
+        assert!(line(&found).starts_with("2 views, "), "{}", line(&found));
+    }
+
+    #[test]
     fn points_at_the_edges_of_the_image_are_counted_in_its_last_parts() {
         let mut found = seen_in(|_, _| false);
         for (x, y) in [(-0.5, -0.5), (799.5, 599.5), (-30.0, 900.0)] {

@@ -38,16 +38,17 @@ pub(crate) struct DetectArgs {
     /// Track: search first where the markers of the last images are predicted; one image after the other.
     #[arg(long, conflicts_with = "threads")]
     pub(super) track: bool,
-    /// Folder for annotated images, IMAGE.drawn.png, in grey as they are searched and those narrower than 900 pixels two to four times as
+    /// Folder for annotated images, IMAGE.drawn.png (of a video VIDEO-000123.drawn.png, with the frame's number), in grey as they are searched and those narrower than 900 pixels two to four times as
     /// large: outlines (green) with the marker's own top-left corner (red circle), a circle around
     /// small ones (yellow), the axes of poses (x red, y green, z blue, towards the viewer; a red cross without a pose), and name, id,
     /// confidence and position in the camera frame (x, y, z). Earlier ones of that name are replaced, other files never, and none is
     /// searched as an image of its folder.
     #[arg(long, value_name = "DIR")]
     pub(super) draw: Option<PathBuf>,
-    /// Image files (PNG of 8 or 16 bits, JPEG), videos (Motion JPEG as AVI or stream, H.264 as MP4 or
-    /// stream), and folders of them, of which images of other formats are left out and named. An image is searched as it is stored, as the
-    /// sensor saw it: it is not turned by its Exif orientation; a note reports that.
+    /// Image files (PNG of 8 or 16 bits, JPEG; up to 100 megapixels), `-` for one image from standard input, videos
+    /// (Motion JPEG as AVI or stream, H.264 as MP4 or stream), and folders of them, of which images of other formats are
+    /// left out and named. An image is searched as it is stored, as the sensor saw it: it is not turned by its Exif
+    /// orientation; a note reports that.
     #[arg(required = true, value_name = "IMAGE")]
     pub(super) images: Vec<PathBuf>,
 }

@@ -1,12 +1,13 @@
 //! Iterates over the images of files, folders and videos, in order.
 
 use std::collections::HashMap;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use imaging::BayerPattern;
 use media::{
     DEFAULT_MAX_PIXELS, IMAGE_EXTENSIONS, OTHER_IMAGE_EXTENSIONS, StillImage, VIDEO_EXTENSIONS,
-    Video, VideoImage, files_in, is_video, read_image,
+    Video, VideoImage, files_in, is_video, max_file_bytes, read_image, read_image_bytes,
 };
 
 /// Assumed interval between image files, in seconds.
@@ -17,6 +18,9 @@ const MAX_NAMES: usize = 5;
 
 /// The ending of annotated images, which are none of a folder's images.
 pub(crate) const DRAWN_ENDING: &str = ".drawn.png";
+
+/// The names of standard input, from which one image is read.
+const STANDARD_INPUT: [&str; 2] = ["-", "/dev/stdin"];
 
 /// Iterates over files, folders and videos.
 pub(crate) struct Source {
@@ -112,7 +116,8 @@ impl Source {
                 Some(Ok(frame)) => {
                     let name = format!("{}#{}", path.display(), frame.index);
                     let content = Content::Frame(path.clone(), frame.image);
-                    let stem = format!("{}-{}", self.video_stem, frame.index);
+                    // With leading zeros the names are sorted like the frames.
+                    let stem = format!("{}-{:06}", self.video_stem, frame.index);
                     let time_s = frame.time_s;
                     return Some(Item { name, stem, time_s, is_frame: true, content });
                 }
@@ -162,6 +167,9 @@ impl Item {
     /// The grey image as it is stored, or the reason why there is none.
     pub(crate) fn into_image(self, bayer: Option<BayerPattern>) -> Result<StillImage, String> {
         let image = match self.content {
+            Content::File(path) if STANDARD_INPUT.iter().any(|name| path == Path::new(name)) => {
+                return image_of(std::io::stdin().lock(), &path, bayer);
+            }
             Content::File(path) => read_image(&path, DEFAULT_MAX_PIXELS, bayer),
             Content::Frame(path, image) => {
                 image.grey(&path, DEFAULT_MAX_PIXELS).map(StillImage::from)
@@ -172,9 +180,51 @@ impl Item {
     }
 }
 
+/// The image that a stream contains, up to its end.
+fn image_of(
+    stream: impl Read,
+    path: &Path,
+    bayer: Option<BayerPattern>,
+) -> Result<StillImage, String> {
+    let max_bytes = max_file_bytes(DEFAULT_MAX_PIXELS);
+    let mut bytes = Vec::new();
+    let read = stream.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes);
+    read.map_err(|cause| format!("standard input cannot be read: {cause}"))?;
+    if bytes.len() as u64 > max_bytes {
+        return Err(format!(
+            "standard input has more than the {max_bytes} bytes of the largest image"
+        ));
+    }
+    let image = read_image_bytes(path, &bytes, DEFAULT_MAX_PIXELS, bayer);
+    image.map_err(|problem| problem.to_string())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_image_is_read_from_a_stream() {
+        let mut png = std::io::Cursor::new(Vec::new());
+        let image = image::GrayImage::from_pixel(16, 8, image::Luma([77]));
+        image.write_to(&mut png, image::ImageFormat::Png).unwrap();
+        let read = image_of(png.get_ref().as_slice(), Path::new("-"), None).unwrap();
+        assert_eq!((read.grey.width(), read.grey.height()), (16, 8));
+        let error = image_of(&b""[..], Path::new("-"), None).unwrap_err();
+        assert!(error.contains("\"-\"") && error.contains("empty"), "{error}");
+    }
+
+    #[test]
+    fn the_names_of_a_videos_frames_are_sorted_like_the_frames() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("flight.mjpeg");
+        let mut frame = std::io::Cursor::new(Vec::new());
+        let image = image::GrayImage::new(16, 8);
+        image.write_to(&mut frame, image::ImageFormat::Jpeg).unwrap();
+        std::fs::write(&path, frame.into_inner().repeat(12)).unwrap();
+        let names = stems(&[path]);
+        assert!(names.is_sorted() && names[11].ends_with("flight.mjpeg-000011"), "{names:?}");
+    }
 
     fn stems(paths: &[PathBuf]) -> Vec<String> {
         let mut source = Source::new(paths);

@@ -113,8 +113,7 @@ pub(crate) fn run(args: &MarkerArgs) -> anyhow::Result<ExitCode> {
         (None, pad) => {
             let name = pad.as_deref().unwrap_or_default();
             let pad = Pad::named(name, |file| read_text(file))?;
-            let count = pad.markers().len();
-            (Sheet::with_pad(&pad, args.paper)?, format!("{}, {count} markers", pad.name()))
+            (Sheet::with_pad(&pad, args.paper)?, sheet::pad_title(&pad))
         }
     };
     args.output.write(&sheet, args.dpi)?;

@@ -227,12 +227,7 @@ impl Sheet {
         let down = (height / 2.0).max(MARGIN_MM + top).min(height - BELOW_MM + bottom);
         let frame = Frame { origin_mm: [across, down], bounds_mm };
         let markers = pad.markers().iter().map(|placed| placed.marker);
-        let name = pad.name();
-        let counted = match pad.markers().len() {
-            1 => "1 marker".to_owned(),
-            count => format!("{count} markers"),
-        };
-        let titles = [format!("{name}, {counted}"), in_one_line(&kinds(markers), paper)];
+        let titles = [pad_title(pad), in_one_line(&kinds(markers), paper)];
         Ok(Self::from_drawing(&drawing, &frame, &titles, paper))
     }
 
@@ -352,6 +347,15 @@ impl Sheet {
 
     fn write(&mut self, at_mm: [f64; 2], text: String) {
         self.marks.push(Mark::Text { at_mm, text });
+    }
+}
+
+/// The name of a pad and how many markers it has.
+pub(super) fn pad_title(pad: &Pad) -> String {
+    let name = pad.name();
+    match pad.markers().len() {
+        1 => format!("{name}, 1 marker"),
+        count => format!("{name}, {count} markers"),
     }
 }
 
@@ -508,6 +512,8 @@ mod tests {
         assert!(built_in.contains(&"pad:0, 2 markers".to_owned()), "{built_in:?}");
         let markers = "apriltag-custom48h12:0 0.099 m, aruco-4x4-50:0 0.024 m".to_owned();
         assert!(built_in.contains(&markers), "{built_in:?}");
+        let one: Pad = "id = 2\nmarkers = [{ marker = \"rings:0.1\" }]".parse().unwrap();
+        assert_eq!(pad_title(&one), "pad:2, 1 marker");
         let four = |size_m: &dyn Fn(u32) -> String| -> Pad {
             let placed = (0..4).map(|id| {
                 let (x_m, size_m) = (0.03 * f64::from(id) - 0.045, size_m(id));

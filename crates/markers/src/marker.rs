@@ -185,12 +185,14 @@ pub struct Marker {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum MarkerError {
     /// No such family.
-    #[error("marker `{text}`: there is no family `{family}`; known are {known}")]
+    #[error("marker `{text}`: there is no family `{family}`{suggestion}; known are {known}")]
     Family {
         /// The whole text.
         text: String,
         /// The family it names.
         family: String,
+        /// The marker that may be meant, as a question in parentheses; empty if none is similar.
+        suggestion: String,
         /// The families there are.
         known: String,
     },
@@ -241,6 +243,7 @@ impl FromStr for Marker {
         let family = Family::named(name).ok_or_else(|| MarkerError::Family {
             text: text.to_owned(),
             family: name.to_owned(),
+            suggestion: suggestion(text, name),
             known: Family::ALL.map(listed).join(", "),
         })?;
         let id = match family.id_count() {
@@ -256,6 +259,27 @@ impl FromStr for Marker {
             None => Ok(Self { family, id, size_m }),
         }
     }
+}
+
+/// The question whether another marker is meant by `text`, whose family is written in another way: with other letters between its
+/// parts, or with the name that AprilTag's or OpenCV's library has for it.
+fn suggestion(text: &str, name: &str) -> String {
+    let plain = |name: &str| -> String {
+        let letters = name.chars().filter(char::is_ascii_alphanumeric);
+        letters.map(|letter| letter.to_ascii_lowercase()).collect()
+    };
+    let given = plain(name);
+    let of_april_tag = format!("april{given}");
+    let of_open_cv = given.strip_prefix("dict").map(|rest| format!("aruco{rest}"));
+    let is_meant = |family: &Family| {
+        let known = plain(family.name());
+        known == given || known == of_april_tag || Some(&known) == of_open_cv.as_ref()
+    };
+    let meant = Family::ALL.into_iter().find(is_meant);
+    meant.map_or_else(String::new, |family| {
+        let rest = text.get(name.len()..).unwrap_or_default();
+        format!(" (did you mean `{family}{rest}`?)")
+    })
 }
 
 /// A family's name in a list of all.
@@ -334,6 +358,22 @@ mod tests {
         assert!(caution.contains("kept for comparison") && caution.contains("finds few"));
         let listed = "ring".parse::<Marker>().unwrap_err().to_string();
         assert!(listed.ends_with("rings, rings-thesis (for comparison only)"), "{listed}");
+    }
+
+    #[test]
+    fn a_family_that_is_written_in_another_way_is_suggested() {
+        for (text, meant) in [
+            ("tag36h11:7", "apriltag-36h11:7"),
+            ("AprilTag-36h11:7", "apriltag-36h11:7"),
+            ("tagStandard41h12:3:0.1", "apriltag-standard41h12:3:0.1"),
+            ("DICT_4X4_50:1", "aruco-4x4-50:1"),
+            ("Rings", "rings"),
+        ] {
+            let error = text.parse::<Marker>().unwrap_err().to_string();
+            assert!(error.contains(&format!("(did you mean `{meant}`?)")), "{error}");
+        }
+        let error = "chessboard".parse::<Marker>().unwrap_err().to_string();
+        assert!(!error.contains("did you mean"), "{error}");
     }
 
     #[test]

@@ -124,7 +124,7 @@ impl Pad {
     /// The name of the family under which pads are reported next to markers.
     pub const FAMILY: &'static str = "pad";
 
-    /// The built-in pad of this name, or the one that the file of this name describes; `read` reads files.
+    /// The built-in pad of this name in upper or lower case, or the one that the file of this name describes; `read` reads files.
     ///
     /// # Errors
     /// [`PadError`] with the name, when there is no such pad or its description is wrong.
@@ -132,7 +132,7 @@ impl Pad {
         name: &str,
         read: impl FnOnce(&str) -> Result<String, E>,
     ) -> Result<Self, PadError> {
-        let text = match BUILT_IN.iter().find(|(known, _)| *known == name) {
+        let text = match BUILT_IN.iter().find(|(known, _)| known.eq_ignore_ascii_case(name)) {
             Some((_, text)) => (*text).to_owned(),
             None => read(name).map_err(|problem| PadError::Unreadable {
                 name: name.to_owned(),
@@ -471,6 +471,8 @@ mod tests {
         let aside = format!("{}, x_m = 0.002", inside("0.024"));
         check(&pair(hollow, &aside), "out of its free centre by 0.0015 m");
         check(&pair(&inside("0.024"), hollow), "name that one after it");
+        let of_case = |name: &str| Pad::named(name, |_| Err("there is no such file")).unwrap();
+        assert_eq!(of_case("A4").name(), of_case("a4").name());
         let missing = Pad::named("no/such.toml", |_| Err("there is no such file"));
         let missing = missing.unwrap_err().to_string();
         assert!(missing.contains("no/such.toml") && missing.contains("a4"), "{missing}");

@@ -61,7 +61,8 @@ pub enum ImageError {
     },
     /// An image larger than the limit.
     #[error(
-        "{path:?} has {width} x {height} pixels; the limit is {max_pixels} pixels, and {edge} for an edge; make it smaller",
+        "{path:?} has {width} x {height} pixels; the limit is {max_pixels} pixels ({megapixels} megapixels), and {edge} for an edge; make it smaller",
+        megapixels = *max_pixels as f64 * 1e-6,
         edge = GrayView::MAX_EDGE_PX
     )]
     TooLarge {
@@ -199,7 +200,20 @@ pub fn read_image(
     max_pixels: u64,
     bayer: Option<BayerPattern>,
 ) -> Result<StillImage, ImageError> {
-    let decoded = DecodedImage::read(path, max_pixels)?;
+    read_image_bytes(path, &file_bytes(path, max_pixels)?, max_pixels, bayer)
+}
+
+/// As [`read_image`], from the bytes of a file; errors name `path`.
+///
+/// # Errors
+/// As [`read_image`].
+pub fn read_image_bytes(
+    path: &Path,
+    bytes: &[u8],
+    max_pixels: u64,
+    bayer: Option<BayerPattern>,
+) -> Result<StillImage, ImageError> {
+    let decoded = DecodedImage::decode(path, bytes, max_pixels)?;
     if bayer.is_some() && decoded.raw_bits().is_none() {
         return Err(ImageError::NotRaw { path: path.to_owned() });
     }
@@ -407,10 +421,15 @@ fn file_bytes(path: &Path, max_pixels: u64) -> Result<Vec<u8>, ImageError> {
     if !metadata.is_file() {
         return Err(ImageError::NotAFile { path: path.to_owned() });
     }
-    if metadata.len() > max_pixels.saturating_mul(8).saturating_add(MAX_METADATA_BYTES) {
+    if metadata.len() > max_file_bytes(max_pixels) {
         return Err(ImageError::TooLong { path: path.to_owned(), len: metadata.len() });
     }
     std::fs::read(path).map_err(unreadable)
+}
+
+/// Maximum bytes of the file of an image of at most so many pixels.
+pub fn max_file_bytes(max_pixels: u64) -> u64 {
+    max_pixels.saturating_mul(8).saturating_add(MAX_METADATA_BYTES)
 }
 
 /// A decoder of an image whose size is within the limit.
@@ -583,6 +602,13 @@ mod tests {
         assert_eq!(problem(65_535, 1, DEFAULT_MAX_PIXELS), Ok(65_535));
         assert!(problem(65_536, 1, DEFAULT_MAX_PIXELS).unwrap_err().contains("65536 x 1 pixels"));
         assert!(problem(11, 10, 100).unwrap_err().contains("the limit is 100 pixels"));
+        let large = ImageError::TooLarge {
+            path: PathBuf::from("a.png"),
+            width: 20_000,
+            height: 10_000,
+            max_pixels: DEFAULT_MAX_PIXELS,
+        };
+        assert!(large.to_string().contains("(100 megapixels)"), "{large}");
         // The header of a PNG of 65535 x 65535 pixels, without pixels.
         let small = bytes_of(&photo(), ImageFormat::Png);
         let header = png_of_size(&small, 65_535, 65_535);

@@ -29,7 +29,8 @@ pub use calibration::{
 pub use h264::{H264Error, LiveH264};
 pub use image::{
     DEFAULT_MAX_PIXELS, DecodedImage, IMAGE_EXTENSIONS, ImageError, OTHER_IMAGE_EXTENSIONS,
-    StillImage, decode_image, files_in, frame_bytes, images_in, read_image, samples_to_grey,
+    StillImage, decode_image, files_in, frame_bytes, images_in, max_file_bytes, read_image,
+    read_image_bytes, samples_to_grey,
 };
 pub use jpeg::JpegScanner;
 pub use rectify::Rectifier;

@@ -55,6 +55,12 @@ pub enum VideoError {
         /// Its kind.
         kind: String,
     },
+    /// A file without a byte.
+    #[error("{path:?} is empty; copy or record it again")]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
     /// Bytes that are not a valid video.
     #[error("{path:?} is damaged or cut short: {cause}")]
     Damaged {
@@ -136,6 +142,7 @@ impl Video {
         file.by_ref().take(12).read_to_end(&mut start).map_err(|e| problems.unreadable(e))?;
         file.rewind().map_err(|e| problems.unreadable(e))?;
         let (stream, period_s) = match start.as_slice() {
+            [] => return Err(VideoError::Empty { path: path.to_owned() }),
             [b'R', b'I', b'F', b'F', _, _, _, _, b'A', b'V', b'I', b' '] => {
                 let (reader, period_s) = AviReader::open(file, &problems)?;
                 (Stream::Avi(reader), period_s)
@@ -689,12 +696,14 @@ mod tests {
         for (name, bytes) in [
             ("a.avi", avi(b"XVID", &[])),
             ("a.mkv", b"\x1a\x45\xdf\xa3 and more".to_vec()),
-            ("a.mp4", vec![]),
+            ("a.mp4", b"neither MP4 nor AVI".to_vec()),
         ] {
             let problem = levels(name, &bytes).unwrap_err();
             assert!(problem.contains("ffmpeg -i") && problem.contains(name), "{problem}");
         }
         assert!(levels("a.avi", &avi(b"XVID", &[])).unwrap_err().contains("\"XVID\""));
+        let empty = levels("a.mp4", &[]).unwrap_err();
+        assert!(empty.contains("a.mp4") && empty.contains("is empty"), "{empty}");
         assert!(Video::open(Path::new("no/such.avi"), MAX_PIXELS).is_err());
         assert!(is_video(Path::new("a.MP4")) && !is_video(Path::new("a.png")));
     }
