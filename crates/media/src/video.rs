@@ -115,6 +115,7 @@ pub struct Video {
     stream: Stream,
     period_s: f64,
     next: u64,
+    is_turned: bool,
 }
 
 enum Stream {
@@ -141,6 +142,7 @@ impl Video {
         let mut start = Vec::new();
         file.by_ref().take(12).read_to_end(&mut start).map_err(|e| problems.unreadable(e))?;
         file.rewind().map_err(|e| problems.unreadable(e))?;
+        let mut is_turned = false;
         let (stream, period_s) = match start.as_slice() {
             [] => return Err(VideoError::Empty { path: path.to_owned() }),
             [b'R', b'I', b'F', b'F', _, _, _, _, b'A', b'V', b'I', b' '] => {
@@ -153,6 +155,7 @@ impl Video {
             }
             [_, _, _, _, b'f', b't', b'y', b'p', ..] => {
                 let (decoder, period_s) = H264::from_mp4(file, &problems, max_pixels)?;
+                is_turned = decoder.is_turned();
                 (Stream::H264(Box::new(decoder)), period_s)
             }
             [0, 0, 1, ..] | [0, 0, 0, 1, ..] if has_extension(path, &["h264", "264"]) => {
@@ -162,7 +165,13 @@ impl Video {
             _ => return Err(problems.unsupported("in an unknown container")),
         };
         let path = path.to_owned();
-        Ok(Self { path, stream, period_s, next: 0 })
+        Ok(Self { path, stream, period_s, next: 0, is_turned })
+    }
+
+    /// Whether the file asks viewers to turn or to mirror its frames, as the videos of telephones do. The frames are those of the
+    /// sensor all the same.
+    pub fn is_turned(&self) -> bool {
+        self.is_turned
     }
 
     /// The next frame; `None` after the last. After an error there are no more.
@@ -507,6 +516,15 @@ impl H264 {
         Self { decoder, limits, source, ready, times, is_over: false }
     }
 
+    /// Whether the track's header has a rotation for viewers (ISO/IEC 14496-12, 8.3.2): a matrix other than a scale.
+    fn is_turned(&self) -> bool {
+        let Source::Mp4 { reader, track, .. } = &self.source else { return false };
+        reader.tracks().get(track).is_some_and(|track| {
+            let matrix = &track.trak.tkhd.matrix;
+            matrix.a < 0 || matrix.d < 0 || matrix.b != 0 || matrix.c != 0
+        })
+    }
+
     /// The next picture, and its time where the file gives it.
     fn next(
         &mut self,
@@ -689,6 +707,30 @@ mod tests {
         }
         let expected: Vec<u32> = (0..20).filter(kept).map(|n| n - 1).collect();
         assert_eq!(times, expected);
+    }
+
+    #[test]
+    fn an_mp4_file_that_viewers_turn_is_recognised() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.mp4");
+        let opened = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).unwrap();
+            Video::open(&path, MAX_PIXELS).unwrap().is_turned()
+        };
+        let mut bytes = include_bytes!("../../../fuzz/corpus/mp4/baseline.mp4").to_vec();
+        assert!(!opened(&bytes));
+        // The matrix of the track's header begins 40 bytes behind the name of its box, which has four bytes.
+        let at = 44 + bytes.windows(4).position(|name| name == b"tkhd").unwrap();
+        let (one, right) = (0x1_0000_i32, 0x4000_0000_i32);
+        for (matrix, is_turned) in [
+            ([0, one, 0, -one, 0, 0, 0, 0, right], true),
+            ([-one, 0, 0, 0, -one, 0, 0, 0, right], true),
+            ([-one, 0, 0, 0, one, 0, 0, 0, right], true),
+            ([2 * one, 0, 0, 0, one, 0, 0, 0, right], false),
+        ] {
+            bytes[at..at + 36].copy_from_slice(matrix.map(i32::to_be_bytes).as_flattened());
+            assert_eq!(opened(&bytes), is_turned, "{matrix:?}");
+        }
     }
 
     #[test]
