@@ -48,7 +48,7 @@ pub(crate) struct DetectArgs {
     /// Image files (PNG of 8 or 16 bits, JPEG; up to 100 megapixels), `-` for one image from standard input, videos
     /// (Motion JPEG as AVI or stream, H.264 as MP4 or stream), and folders of them, of which images of other formats are
     /// left out and named. An image is searched as it is stored, as the sensor saw it: it is not turned by its Exif
-    /// orientation; a note reports that.
+    /// orientation, nor a video by the rotation in its header; a note reports that.
     #[arg(required = true, value_name = "IMAGE")]
     pub(super) images: Vec<PathBuf>,
 }

@@ -173,6 +173,11 @@ impl Examiner {
     fn examine(&self, item: Item, worker: &mut Worker) -> Line {
         let (name, stem) = (item.name.clone(), item.stem.clone());
         let (time_s, is_frame) = (item.time_s, item.is_frame);
+        if item.is_turned
+            && let Some(note) = self.note_of_turn("rotation in the video's header", &name)
+        {
+            write_error(&note);
+        }
         let error = |error: String| Line::Error { image: name.clone(), error };
         // A panic in one image must not affect the others, which wait for its line.
         let examined = catch_unwind(AssertUnwindSafe(|| {
@@ -203,7 +208,9 @@ impl Examiner {
         let Some(view) = image.view() else {
             return Err("the image has no pixels".to_owned());
         };
-        if let Some(note) = self.note_of_turn(still, name) {
+        if let Some(orientation) = exif_orientation
+            && let Some(note) = self.note_of_turn(&format!("Exif orientation {orientation}"), name)
+        {
             write_error(&note);
         }
         let (camera, no_poses) = match self.camera(still, name) {
@@ -279,14 +286,13 @@ impl Examiner {
         }
     }
 
-    /// The note on the first image that a viewer would turn: it is searched as it is stored.
-    fn note_of_turn(&self, still: &StillImage, name: &str) -> Option<String> {
-        let orientation = still.exif_orientation?;
+    /// The note on the first image that a viewer would turn, by the entry of its file that is `cause`: it is searched as it is stored.
+    fn note_of_turn(&self, cause: &str, name: &str) -> Option<String> {
         if self.turn_was_reported.swap(true, Ordering::Relaxed) {
             return None;
         }
         Some(format!(
-            "note: viewers turn {name} (Exif orientation {orientation}); it is searched as it is stored, which is as the sensor saw it \
+            "note: viewers turn {name} ({cause}); it is searched as it is stored, which is as the sensor saw it \
              and as the images of `alight calibrate board` are read: pixels, poses and drawings are of that, here and in others like it"
         ))
     }
@@ -536,16 +542,33 @@ mod tests {
             let grey = imaging::GrayImage::filled(320, 240, 0);
             StillImage { grey, exif_orientation }
         };
-        assert_eq!(examiner.note_of_turn(&still(None), "a.jpg"), None);
-        let note = examiner.note_of_turn(&still(Some(3)), "b.jpg").unwrap();
+        let mut worker = examiner.worker().unwrap();
+        examiner.detect(&still(None), ["a.jpg"; 2], 0.0, &mut worker).unwrap();
+        assert!(!examiner.turn_was_reported.load(Ordering::Relaxed));
+        let note = examiner.note_of_turn("Exif orientation 3", "b.jpg").unwrap();
         assert!(note.contains("b.jpg") && note.contains("Exif orientation 3"), "{note}");
-        assert_eq!(examiner.note_of_turn(&still(Some(3)), "c.jpg"), None);
+        assert_eq!(examiner.note_of_turn("Exif orientation 3", "c.jpg"), None);
         let upright = CameraModel::pinhole(240, 320, 300.0);
         let warning = warning_of_size(&upright, &still(Some(6)), "a.jpg");
         assert!(warning.contains("320 x 240") && warning.contains("Exif"), "{warning}");
         assert!(!warning_of_size(&upright, &still(None), "a.jpg").contains("Exif"));
         let larger = CameraModel::pinhole(640, 480, 300.0);
         assert!(!warning_of_size(&larger, &still(Some(6)), "a.jpg").contains("Exif"));
+    }
+
+    #[test]
+    fn a_video_that_viewers_would_turn_is_reported() {
+        let examiner =
+            Examiner::new(&args(&["--marker", "rings", "a.mp4"]).unwrap(), Lens::Unknown).unwrap();
+        let folder = folder();
+        let reported = |is_turned: bool| {
+            let mut item = Source::new(&[folder.path().join("0.png")]).next().unwrap();
+            (item.is_frame, item.is_turned) = (true, is_turned);
+            examiner.examine(item, &mut examiner.worker().unwrap());
+            examiner.turn_was_reported.load(Ordering::Relaxed)
+        };
+        assert!(!reported(false));
+        assert!(reported(true));
     }
 
     #[test]

@@ -43,6 +43,8 @@ pub(crate) struct Item {
     pub(crate) time_s: f64,
     /// Whether it is a frame of a video.
     pub(crate) is_frame: bool,
+    /// Whether it is a frame that viewers turn, by the header of its video.
+    pub(crate) is_turned: bool,
     content: Content,
 }
 
@@ -119,7 +121,8 @@ impl Source {
                     // With leading zeros the names are sorted like the frames.
                     let stem = format!("{}-{:06}", self.video_stem, frame.index);
                     let time_s = frame.time_s;
-                    return Some(Item { name, stem, time_s, is_frame: true, content });
+                    let is_turned = video.is_turned();
+                    return Some(Item { name, stem, time_s, is_frame: true, is_turned, content });
                 }
                 Some(Err(problem)) => return Some(Item::unreadable(path, problem.to_string())),
                 None => self.video = None,
@@ -143,7 +146,8 @@ impl Source {
         self.images = self.images.saturating_add(1);
         let name = path.display().to_string();
         let stem = self.stem(&path);
-        Some(Item { name, stem, time_s, is_frame: false, content: Content::File(path) })
+        let content = Content::File(path);
+        Some(Item { name, stem, time_s, is_frame: false, is_turned: false, content })
     }
 }
 
@@ -161,7 +165,8 @@ impl Item {
     fn unreadable(path: &Path, problem: String) -> Self {
         let name = path.display().to_string();
         let content = Content::Unreadable(problem);
-        Self { stem: stem(&name), name, time_s: 0.0, is_frame: false, content }
+        let stem = stem(&name);
+        Self { stem, name, time_s: 0.0, is_frame: false, is_turned: false, content }
     }
 
     /// The grey image as it is stored, or the reason why there is none.
