@@ -28,7 +28,7 @@ const MAX_SHAKE: f64 = 0.005;
 /// Corners whose standard deviation is larger are not used where the lens is known, in pixels: those at a fisheye's rim that
 /// could not be refined are a pixel off, and not by chance. Refined ones are known to some hundredths.
 const MAX_CORNER_PX: f64 = 0.15;
-/// Images that are searched mirrored where none shows the board.
+/// Maximum number of images that are searched again mirrored, if none shows the board.
 const MIRRORED_IMAGES: usize = 8;
 /// An image whose outlines are wider than this is blurred, in pixels.
 pub(super) const BLURRED_PX: f64 = 5.0;
@@ -46,9 +46,9 @@ pub(super) struct FoundImages {
     pub(super) images: usize,
     /// Those without the board.
     pub(super) empty: Vec<String>,
-    /// The last images without the board, as long as no image shows it.
+    /// The last images, the newest first, as long as no image shows the board.
     last_empty: VecDeque<(String, GrayImage)>,
-    /// The name of an image that shows the board only when it is mirrored, where no image shows it.
+    /// An image that shows the board after it is mirrored, if no image shows it as it is.
     pub(super) mirrored: Option<String>,
     /// Those that could not be read, with the reason.
     pub(super) unreadable: Vec<String>,
@@ -174,7 +174,7 @@ impl FoundImages {
         self.is_full = self.views.len() >= MAX_VIEWS || pixels >= MAX_KEPT_PIXELS;
     }
 
-    /// Looks for the board in mirrored images, where no image showed it.
+    /// Looks for the board in mirrored images, if no image shows it as it is: the code of a mirrored tag is not valid.
     pub(super) fn look_mirrored(&mut self, finder: &mut Finder<'_>) {
         let mut shows_board = |name: &str, image: &GrayImage| {
             let seen = finder.look_at(&mirrored(image), name, None);

@@ -18,8 +18,8 @@ const MAP: [usize; 2] = [6, 4];
 /// Names that are listed.
 const MAX_NAMES: usize = 5;
 
-/// Why there is no calibration, with the values of the options `--tag`, `--gap` and `--lens` that may be right; where no image shows
-/// the board, which board is meant.
+/// Why there is no calibration, with the values of the options `--tag`, `--gap` and `--lens` that may fit the images. Where no image
+/// shows the board, the text says which board is meant, or that the images are mirrored.
 pub(super) fn refusal_text(
     found: &FoundImages,
     refusal: &Refusal,
@@ -39,19 +39,26 @@ pub(super) fn refusal_text(
     }
     match refusal {
         Refusal::TagSize { percent, .. } => {
-            // The images show the size of the tags by their spacing only.
+            // Images show only the ratio of the tags' side to their spacing.
             let tag_m = board.tag_m() * (1.0 + percent / 100.0);
             let gap_m = board.tag_m() + board.gap_m() - tag_m;
+            if Board::new(board.columns(), board.rows(), tag_m, gap_m).is_err() {
+                return refusal.to_string();
+            }
             format!(
-                "{refusal}. With the stated spacing, `--tag {tag_m:.5} --gap {gap_m:.5}` fit the images"
+                "{refusal}. If the stated spacing is right, the images show `--tag {tag_m:.5} --gap {gap_m:.5}`"
             )
         }
-        Refusal::WrongLens { .. } | Refusal::Diverged { .. } | Refusal::Inconsistent { .. }
-            if lens != Lens::KannalaBrandt =>
-        {
-            format!(
-                "{refusal}. For a fisheye or another wide-angle lens pass `--lens kannala-brandt`"
-            )
+        Refusal::WrongLens { .. } | Refusal::Diverged { .. } | Refusal::Inconsistent { .. } => {
+            match lens {
+                Lens::BrownConrady4 | Lens::BrownConrady5 => format!(
+                    "{refusal}. Other lenses: `--lens brown-conrady-8` for a wide-angle lens, `--lens kannala-brandt` for a fisheye"
+                ),
+                Lens::BrownConrady8 => {
+                    format!("{refusal}. For a fisheye: `--lens kannala-brandt`")
+                }
+                Lens::KannalaBrandt => refusal.to_string(),
+            }
         }
         _ => refusal.to_string(),
     }
@@ -327,11 +334,18 @@ mod tests {
         let reason = |refusal, lens| refusal_text(&found, &refusal, &board, lens);
         let size = Refusal::TagSize { percent: -0.35, max_percent: 0.3 };
         let text = reason(size, Lens::BrownConrady5);
-        assert!(text.contains("`--tag 0.02800 --gap 0.00840` fit"), "{text}");
+        assert!(text.contains("the images show `--tag 0.02800 --gap 0.00840`"), "{text}");
+        // A gap that no board has is not named.
+        let size = Refusal::TagSize { percent: 20.0, max_percent: 0.3 };
+        let text = reason(size.clone(), Lens::BrownConrady5);
+        assert_eq!(text, size.to_string());
         let (max_px, max_ratio) = (0.3, 4.0);
         let halves = Refusal::Inconsistent { difference_px: 0.75, ratio: 5.7, max_px, max_ratio };
-        let text = reason(halves.clone(), Lens::BrownConrady5);
-        assert!(text.contains("`--lens kannala-brandt`"), "{text}");
+        for lens in [Lens::BrownConrady5, Lens::BrownConrady8] {
+            let text = reason(halves.clone(), lens);
+            assert!(text.contains("`--lens kannala-brandt`"), "{text}");
+            assert_eq!(text.contains("`--lens brown-conrady-8`"), lens == Lens::BrownConrady5);
+        }
         assert_eq!(reason(halves.clone(), Lens::KannalaBrandt), halves.to_string());
     }
 }
