@@ -56,6 +56,30 @@ fn markers_without_a_size_are_reported_once() -> anyhow::Result<()> {
     Ok(())
 }
 
+#[test]
+fn an_image_is_read_from_standard_input() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let made = ["marker", "rings", "--size", "0.1", "--dpi", "60", "-o", "a.png"];
+    ensure!(alight(&made, folder.path())?.status.success(), "no picture");
+    let of = |file: &str| {
+        let args = ["detect", "--marker", "rings", "--format", "jsonl", "--draw", "seen", "-"];
+        let image = std::fs::File::open(folder.path().join(file))?;
+        let mut command = Command::new(env!("CARGO_BIN_EXE_alight"));
+        let output = command.args(args).current_dir(folder.path()).stdin(image).output()?;
+        let line: Value = std::str::from_utf8(&output.stdout)?.trim().parse()?;
+        anyhow::Ok((output, line))
+    };
+    let (output, line) = of("a.png")?;
+    ensure!(output.status.success() && line["image"] == "-", "{output:?}");
+    ensure!(line["detections"][0]["family"] == "rings", "{line}");
+    ensure!(folder.path().join("seen/stdin.drawn.png").is_file(), "no drawing of standard input");
+    std::fs::write(folder.path().join("video.avi"), "RIFF, and no image")?;
+    let (output, line) = of("video.avi")?;
+    let error = line["error"].as_str().context("an error")?;
+    ensure!(output.status.code() == Some(1) && error.contains("standard input"), "{output:?}");
+    Ok(())
+}
+
 /// A library that turns markers otherwise would turn a vehicle that follows their heading, and nothing else would show it.
 #[test]
 fn the_detector_in_python_begins_with_the_same_corner() -> anyhow::Result<()> {

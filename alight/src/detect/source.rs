@@ -19,7 +19,7 @@ const MAX_NAMES: usize = 5;
 /// The ending of annotated images, which are none of a folder's images.
 pub(crate) const DRAWN_ENDING: &str = ".drawn.png";
 
-/// The names of standard input, from which one image is read.
+/// The paths of standard input, from which one image is read.
 const STANDARD_INPUT: [&str; 2] = ["-", "/dev/stdin"];
 
 /// Iterates over files, folders and videos.
@@ -118,7 +118,7 @@ impl Source {
                 Some(Ok(frame)) => {
                     let name = format!("{}#{}", path.display(), frame.index);
                     let content = Content::Frame(path.clone(), frame.image);
-                    // With leading zeros the names are sorted like the frames.
+                    // With leading zeros the order of the names is that of the frames.
                     let stem = format!("{}-{:06}", self.video_stem, frame.index);
                     let time_s = frame.time_s;
                     let is_turned = video.is_turned();
@@ -151,12 +151,19 @@ impl Source {
     }
 }
 
+fn is_standard_input(path: &Path) -> bool {
+    STANDARD_INPUT.iter().any(|name| path == Path::new(name))
+}
+
 fn is_drawn(file: &Path) -> bool {
     file.to_string_lossy().ends_with(DRAWN_ENDING)
 }
 
 /// A path as one name, of which folders become parts.
 pub(crate) fn stem(path: &str) -> String {
+    if is_standard_input(Path::new(path)) {
+        return "stdin".to_owned();
+    }
     let parts = path.split(['/', '\\']).filter(|part| !matches!(*part, "" | "." | ".."));
     parts.collect::<Vec<_>>().join("_").replace(['#', ':'], "-")
 }
@@ -172,8 +179,8 @@ impl Item {
     /// The grey image as it is stored, or the reason why there is none.
     pub(crate) fn into_image(self, bayer: Option<BayerPattern>) -> Result<StillImage, String> {
         let image = match self.content {
-            Content::File(path) if STANDARD_INPUT.iter().any(|name| path == Path::new(name)) => {
-                return image_of(std::io::stdin().lock(), &path, bayer);
+            Content::File(path) if is_standard_input(&path) => {
+                return image_of(std::io::stdin().lock(), bayer);
             }
             Content::File(path) => read_image(&path, DEFAULT_MAX_PIXELS, bayer),
             Content::Frame(path, image) => {
@@ -185,12 +192,8 @@ impl Item {
     }
 }
 
-/// The image that a stream contains, up to its end.
-fn image_of(
-    stream: impl Read,
-    path: &Path,
-    bayer: Option<BayerPattern>,
-) -> Result<StillImage, String> {
+/// The image that standard input contains, up to its end.
+fn image_of(stream: impl Read, bayer: Option<BayerPattern>) -> Result<StillImage, String> {
     let max_bytes = max_file_bytes(DEFAULT_MAX_PIXELS);
     let mut bytes = Vec::new();
     let read = stream.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes);
@@ -200,7 +203,7 @@ fn image_of(
             "standard input has more than the {max_bytes} bytes of the largest image"
         ));
     }
-    let image = read_image_bytes(path, &bytes, DEFAULT_MAX_PIXELS, bayer);
+    let image = read_image_bytes(Path::new("standard input"), &bytes, DEFAULT_MAX_PIXELS, bayer);
     image.map_err(|problem| problem.to_string())
 }
 
@@ -213,10 +216,11 @@ mod tests {
         let mut png = std::io::Cursor::new(Vec::new());
         let image = image::GrayImage::from_pixel(16, 8, image::Luma([77]));
         image.write_to(&mut png, image::ImageFormat::Png).unwrap();
-        let read = image_of(png.get_ref().as_slice(), Path::new("-"), None).unwrap();
+        let read = image_of(png.get_ref().as_slice(), None).unwrap();
         assert_eq!((read.grey.width(), read.grey.height()), (16, 8));
-        let error = image_of(&b""[..], Path::new("-"), None).unwrap_err();
-        assert!(error.contains("\"-\"") && error.contains("empty"), "{error}");
+        let error = image_of(&b""[..], None).unwrap_err();
+        assert!(error.contains("standard input") && error.contains("empty"), "{error}");
+        assert_eq!(stems(&[PathBuf::from("-")]), ["stdin"]);
     }
 
     #[test]
