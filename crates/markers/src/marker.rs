@@ -191,7 +191,7 @@ pub enum MarkerError {
         text: String,
         /// The family it names.
         family: String,
-        /// The marker that may be meant, as a question in parentheses; empty if none is similar.
+        /// The marker that may be meant, as a question in parentheses; empty if no name is similar.
         suggestion: String,
         /// The families there are.
         known: String,
@@ -261,20 +261,17 @@ impl FromStr for Marker {
     }
 }
 
-/// The question whether another marker is meant by `text`, whose family is written in another way: with other letters between its
-/// parts, or with the name that AprilTag's or OpenCV's library has for it.
+/// The question whether another marker is meant by `text`: one whose family differs in case and separators only, or has this name
+/// in AprilTag's or OpenCV's library (`tag36h11`, `DICT_4X4_50`).
 fn suggestion(text: &str, name: &str) -> String {
     let plain = |name: &str| -> String {
         let letters = name.chars().filter(char::is_ascii_alphanumeric);
         letters.map(|letter| letter.to_ascii_lowercase()).collect()
     };
     let given = plain(name);
-    let of_april_tag = format!("april{given}");
-    let of_open_cv = given.strip_prefix("dict").map(|rest| format!("aruco{rest}"));
-    let is_meant = |family: &Family| {
-        let known = plain(family.name());
-        known == given || known == of_april_tag || Some(&known) == of_open_cv.as_ref()
-    };
+    let given = given.strip_prefix("dict").unwrap_or(&given);
+    let meant = ["", "april", "aruco"].map(|prefix| format!("{prefix}{given}"));
+    let is_meant = |family: &Family| meant.contains(&plain(family.name()));
     let meant = Family::ALL.into_iter().find(is_meant);
     meant.map_or_else(String::new, |family| {
         let rest = text.get(name.len()..).unwrap_or_default();
@@ -367,6 +364,8 @@ mod tests {
             ("AprilTag-36h11:7", "apriltag-36h11:7"),
             ("tagStandard41h12:3:0.1", "apriltag-standard41h12:3:0.1"),
             ("DICT_4X4_50:1", "aruco-4x4-50:1"),
+            ("DICT_APRILTAG_36h11:*:0.1", "apriltag-36h11:*:0.1"),
+            ("DICT_ARUCO_MIP_36h12:1", "aruco-mip-36h12:1"),
             ("Rings", "rings"),
         ] {
             let error = text.parse::<Marker>().unwrap_err().to_string();

@@ -216,8 +216,8 @@ impl Pad {
         Ok(())
     }
 
-    /// Its least and its greatest coordinates, markers with their quiet zones, in metres from the landing point (right and up); `None` for
-    /// an id that cannot be drawn.
+    /// The minimum and maximum coordinates of its markers with their quiet zones, in metres from the landing point (right, up);
+    /// `None` for an id that cannot be drawn.
     pub fn bounds_m(&self) -> Option<[[f64; 2]; 2]> {
         let mut bounds = [[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]];
         for placed in &self.markers {
