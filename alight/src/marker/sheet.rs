@@ -173,7 +173,7 @@ impl Mark {
 struct Frame {
     /// The marker's centre or the pad's landing point, from the paper's top left corner, x right, y down, in millimetres.
     origin_mm: [f64; 2],
-    /// Its least and its greatest coordinates from there, x right, y up, in millimetres.
+    /// Its minimum and maximum coordinates from there, x right, y up, in millimetres.
     bounds_mm: [[f64; 2]; 2],
 }
 
@@ -350,7 +350,7 @@ impl Sheet {
     }
 }
 
-/// The name of a pad and how many markers it has.
+/// The name of a pad and its number of markers.
 pub(super) fn pad_title(pad: &Pad) -> String {
     let name = pad.name();
     match pad.markers().len() {
@@ -365,7 +365,7 @@ struct Kind {
     full: String,
     /// With their number, where there is no room for the ids.
     short: String,
-    /// How many they are.
+    /// Number of markers.
     count: usize,
 }
 

@@ -62,7 +62,7 @@ pub enum ImageError {
     /// An image larger than the limit.
     #[error(
         "{path:?} has {width} x {height} pixels; the limit is {max_pixels} pixels ({megapixels} megapixels), and {edge} for an edge; make it smaller",
-        megapixels = *max_pixels as f64 * 1e-6,
+        megapixels = *max_pixels as f64 / 1e6,
         edge = GrayView::MAX_EDGE_PX
     )]
     TooLarge {

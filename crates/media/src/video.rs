@@ -55,7 +55,7 @@ pub enum VideoError {
         /// Its kind.
         kind: String,
     },
-    /// A file without a byte.
+    /// A file of no bytes.
     #[error("{path:?} is empty; copy or record it again")]
     Empty {
         /// The file.
