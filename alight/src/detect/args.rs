@@ -38,8 +38,8 @@ pub(crate) struct DetectArgs {
     /// Track: search first where the markers of the last images are predicted; one image after the other.
     #[arg(long, conflicts_with = "threads")]
     pub(super) track: bool,
-    /// Folder for annotated images, IMAGE.drawn.png (of a video VIDEO-000123.drawn.png, with the frame's number), in grey as they are searched and those narrower than 900 pixels two to four times as
-    /// large: outlines (green) with the marker's own top-left corner (red circle), a circle around
+    /// Folder for annotated images, IMAGE.drawn.png (of a video VIDEO-000123.drawn.png, with the frame's number), in grey as
+    /// they are searched and those narrower than 900 pixels two to four times as large: outlines (green) with the marker's own top-left corner (red circle), a circle around
     /// small ones (yellow), the axes of poses (x red, y green, z blue, towards the viewer; a red cross without a pose), and name, id,
     /// confidence and position in the camera frame (x, y, z). Earlier ones of that name are replaced, other files never, and none is
     /// searched as an image of its folder.
