@@ -1,6 +1,6 @@
 //! Measures the accuracy of calibrations from rendered images of boards through known lenses, and of OpenCV's from the same corners.
 
-use calibration::{Calibration, Lens, Options, Refusal, calibrate};
+use calibration::{Calibration, Lens, Options, Refusal, View, calibrate};
 use geometry::{Body, CameraModel, Ned, Pixel, Point, Rotation, Transform};
 use imaging::GrayImage;
 use markers::Board;
@@ -11,6 +11,8 @@ use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
 
 use super::LOOKS;
 use super::found::{Finder, FoundImages, Origin, Picture};
+use super::report;
+use super::shown::Shown;
 
 #[path = "../../../crates/calibration/tests/opencv/mod.rs"]
 mod opencv;
@@ -86,6 +88,26 @@ fn errors(truth: &CameraModel, camera: &CameraModel) -> [f64; 4] {
     let focal = (camera.fx / truth.fx - 1.0).abs().max((camera.fy / truth.fy - 1.0).abs());
     let principal = (camera.cx - truth.cx).hypot(camera.cy - truth.cy);
     [100.0 * focal, principal, map_error_px(truth, camera), turned_map_error_px(truth, camera)]
+}
+
+#[test]
+fn images_that_were_turned_are_reported_by_name() {
+    let Truth { lens, camera: truth, .. } = lenses()[0];
+    let mut views = synthetic::views(&truth, &synthetic::Taking::default(), 1);
+    let report = |views: &[View]| {
+        let calibration = calibrate(views, lens, &Options::default()).unwrap();
+        let found = FoundImages::default();
+        let json = report::json(&found, &Shown::new(&found, None), Some(&calibration), None);
+        (report::worth_text(&calibration), json["calibration"]["turned"].to_string())
+    };
+    let (text, turned) = report(&views);
+    assert!(!text.contains("turn by 180 degrees") && turned == "[]", "{text}");
+    for point in &mut views[2].points {
+        point.seen = Pixel::new(1279.0 - point.seen.x, 959.0 - point.seen.y);
+    }
+    let (text, turned) = report(&views);
+    assert!(text.contains("1 image fits better after a turn by 180 degrees: 002.png;"), "{text}");
+    assert_eq!(turned, "[\"002.png\"]");
 }
 
 #[test]

@@ -90,10 +90,7 @@ pub(super) fn found_text(found: &FoundImages, shown: &Shown) -> String {
     ] {
         let names: Vec<&str> = names;
         if !names.is_empty() {
-            let rest = names.len().saturating_sub(MAX_NAMES);
-            let more = if rest > 0 { format!(" and {rest} more") } else { String::new() };
-            let listed = names[..names.len().min(MAX_NAMES)].join(", ");
-            let _ = writeln!(text, "{what}: {listed}{more}");
+            let _ = writeln!(text, "{what}: {}", listed(&names));
         }
     }
     if found.views.is_empty() {
@@ -137,7 +134,7 @@ pub(super) fn shown_text(shown: &Shown) -> String {
 pub(super) fn worth_text(calibration: &Calibration) -> String {
     let CameraModel { width, height, fx, fy, cx, cy, .. } = calibration.camera;
     let sigma = |i: usize| calibration.covariance[(i, i)].max(0.0).sqrt();
-    let mut text = String::new();
+    let mut text = turned_text(calibration).unwrap_or_default();
     // Writing to a string cannot fail.
     let _ = writeln!(text, "{}, {width} x {height} pixels", calibration.lens);
     let _ = writeln!(
@@ -189,6 +186,32 @@ pub(super) fn worth_text(calibration: &Calibration) -> String {
         two_digits(100.0 * error.range_m)
     );
     text
+}
+
+/// The warning of images that were turned after they were taken, so that their principal point is elsewhere; `None` if there are none.
+fn turned_text(calibration: &Calibration) -> Option<String> {
+    let turned: Vec<&str> = turned(calibration).collect();
+    let count = match turned.len() {
+        0 => return None,
+        1 => "1 image fits".to_owned(),
+        count => format!("{count} images fit"),
+    };
+    Some(format!(
+        "warning: {count} better after a turn by 180 degrees: {}; if another program turned them, turn them back or leave them out, and \
+         calibrate again\n",
+        listed(&turned)
+    ))
+}
+
+fn turned(calibration: &Calibration) -> impl Iterator<Item = &str> {
+    calibration.views.iter().filter(|view| view.is_turned).map(|view| view.name.as_str())
+}
+
+/// The first names, and how many more there are.
+fn listed(names: &[&str]) -> String {
+    let rest = names.len().saturating_sub(MAX_NAMES);
+    let more = if rest > 0 { format!(" and {rest} more") } else { String::new() };
+    format!("{}{more}", names[..names.len().min(MAX_NAMES)].join(", "))
 }
 
 /// Maps of the residuals of the points and of the uncertainty of the projection.
@@ -302,6 +325,7 @@ fn calibration_json(calibration: &Calibration) -> Value {
         "error_at_5_m": { "lateral_m": error.lateral_m, "range_m": error.range_m },
         "residuals_by_place": residuals,
         "uncertainty_by_place": uncertainty,
+        "turned": turned(calibration).collect::<Vec<_>>(),
         "views": views,
     })
 }

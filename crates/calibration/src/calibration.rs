@@ -10,6 +10,7 @@ use crate::evidence::Evidence;
 use crate::halves::CrossValidation;
 use crate::lens::{INTRINSICS, Lens};
 use crate::stages::Solved;
+use crate::turned::is_turned;
 use crate::view::{ImageSize, View};
 
 /// The options of a calibration.
@@ -61,6 +62,8 @@ pub struct SolvedView {
     pub camera_from_board: Transform<Camera, Board>,
     /// Root mean square of its residuals' lengths, in pixels.
     pub rms_px: f64,
+    /// Whether the camera explains it better after a turn by 180 degrees.
+    pub is_turned: bool,
     /// The residual of each point.
     pub residuals: Vec<Residual>,
 }
@@ -142,6 +145,7 @@ impl Calibration {
                 name: views.get(*i)?.name.clone(),
                 camera_from_board: Transform::from_isometry(camera_from_board),
                 rms_px: rms_px(residuals.iter()),
+                is_turned: is_turned(solved, points, pose),
                 residuals,
             });
         }

@@ -22,8 +22,8 @@
 //! Modules in reading order: [`view`] is the input, [`lens`] the camera model that is estimated; `board` predicts a board's
 //! point with its derivatives, `equations` and `solve` find a minimum, `start` computes the first guess, `stages` leads from
 //! it to the result, `covariance` gives the uncertainty;
-//! [`evidence`] measures the residuals of the fit, [`halves`] compares two halves of the views; [`calibration`] is the result,
-//! `judge` refuses by [`refusal`]. [`flight`] is another method, without a board: [`calibrate_flight`] compares the pad's
+//! [`evidence`] measures the residuals of the fit, `turned` finds views that were turned by 180 degrees, [`halves`] compares two
+//! halves of the views; [`calibration`] is the result, `judge` refuses by [`refusal`]. [`flight`] is another method, without a board: [`calibrate_flight`] compares the pad's
 //! detections in flight with the vehicle's pose that the autopilot reports.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
@@ -41,6 +41,7 @@ pub mod refusal;
 mod solve;
 mod stages;
 mod start;
+mod turned;
 pub mod view;
 
 pub use calibration::{

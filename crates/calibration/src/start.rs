@@ -193,7 +193,7 @@ pub(crate) fn poses(bundle: &Bundle<'_>, shared: &Shared) -> Vec<Option<Isometry
 }
 
 /// A view's pose, refined separately.
-fn refined(
+pub(crate) fn refined(
     bundle: &Bundle<'_>,
     points: &Vec<BoardPoint>,
     shared: &Shared,

@@ -81,8 +81,27 @@ fn tags_that_are_found_elsewhere_do_not_move_the_camera() {
 fn good_sets_of_many_kinds_are_accepted() {
     for (truth, seed) in lenses().into_iter().cycle().zip(400..412) {
         let views = views(&truth.camera, &Taking::good(seed), seed);
-        let refusal = calibrate(&views, truth.lens, &Options::default()).err();
-        assert_eq!(refusal, None, "{} {seed}", truth.name);
+        let found = calibrate(&views, truth.lens, &Options::default());
+        let found = found.unwrap_or_else(|refusal| panic!("{} {seed}: {refusal}", truth.name));
+        assert!(found.views.iter().all(|view| !view.is_turned), "{} {seed}", truth.name);
+    }
+}
+
+#[test]
+fn views_that_were_turned_by_180_degrees_are_recognised() {
+    for truth in lenses() {
+        let mut views = views(&truth.camera, &Taking::default(), 602);
+        for point in views.iter_mut().step_by(6).flat_map(|view| &mut view.points) {
+            let right_px = f64::from(synthetic::SIZE.width) - 1.0 - point.seen.x;
+            let down_px = f64::from(synthetic::SIZE.height) - 1.0 - point.seen.y;
+            point.seen = Pixel::new(right_px, down_px);
+        }
+        let found = calibrate(&views, truth.lens, &Options::default());
+        let found = found.unwrap_or_else(|refusal| panic!("{}: {refusal}", truth.name));
+        let turned = found.views.iter().filter(|view| view.is_turned);
+        let turned: Vec<&str> = turned.map(|view| view.name.as_str()).collect();
+        let expected: Vec<&str> = views.iter().step_by(6).map(|view| view.name.as_str()).collect();
+        assert_eq!(turned, expected, "{}", truth.name);
     }
 }
 
