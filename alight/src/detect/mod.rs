@@ -173,8 +173,9 @@ impl Examiner {
     fn examine(&self, item: Item, worker: &mut Worker) -> Line {
         let (name, stem) = (item.name.clone(), item.stem.clone());
         let (time_s, is_frame) = (item.time_s, item.is_frame);
+        let video = name.rsplit_once('#').map_or(name.as_str(), |(video, _)| video);
         if item.is_turned
-            && let Some(note) = self.note_of_turn("rotation in the video's header", &name)
+            && let Some(note) = self.note_of_turn("rotation in the video's header", video)
         {
             write_error(&note);
         }

@@ -198,6 +198,9 @@ fn image_of(stream: impl Read, bayer: Option<BayerPattern>) -> Result<StillImage
     let mut bytes = Vec::new();
     let read = stream.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes);
     read.map_err(|cause| format!("standard input cannot be read: {cause}"))?;
+    if bytes.is_empty() {
+        return Err("standard input is empty: no program wrote an image to it".to_owned());
+    }
     if bytes.len() as u64 > max_bytes {
         return Err(format!(
             "standard input has more than the {max_bytes} bytes of the largest image"
