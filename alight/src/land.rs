@@ -101,6 +101,9 @@ const EXIT_STATUS: &str = "Exit status of a landing: 0 when it landed on the pad
                            when it landed and the recording of `--record` failed or lost messages (the result contains `landed`, the recording's `problem` and the number `dropped`), \
                            and 2 for a wrong command line or setting.";
 
+/// How a landing that ended in the air is continued: its detector and its simulated camera have ended with it.
+const CONTINUE: &str = "To continue the landing of an ArduPilot that hovers in GUIDED, run this `alight land` again; land a PX4 in Land or Return, or by hand";
+
 /// The loopback interface.
 pub(crate) const LOOPBACK: &str = "127.0.0.1";
 
@@ -394,7 +397,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         && !settings.is_simulated()
     {
         progress.say(IN_THE_AIR);
-        progress.say(&format!("To continue the landing: {resume}"));
+        progress.say(CONTINUE);
     }
     node.close().await;
     let mut landing = watched?;

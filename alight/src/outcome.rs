@@ -10,6 +10,7 @@ use node::health::LATENCIES_KEPT;
 use serde::Serialize;
 
 use crate::children::Exit;
+use crate::peers::is_in_the_air;
 
 /// The thesis' one simulated flight (section 4.4.3).
 const THESIS_TIME_S: f64 = 55.0;
@@ -252,13 +253,12 @@ impl LandingSummary {
         healths
     }
 
-    /// Whether a landing that was interrupted may have left its vehicle in the air.
+    /// Whether a landing that was interrupted or aborted may have left its vehicle in the air.
     pub(crate) fn may_be_in_the_air(&self) -> bool {
         let is_down = self.last_truth.as_ref().is_some_and(|truth| truth.on_ground);
-        self.interrupted.is_some()
-            && self.started_ns.is_some()
-            && self.disarmed_ns.is_none()
-            && !is_down
+        let is_interrupted =
+            self.interrupted.is_some() && self.started_ns.is_some() && self.disarmed_ns.is_none();
+        (is_interrupted || self.last_status.as_ref().is_some_and(is_in_the_air)) && !is_down
     }
 
     /// True while no landing has begun.
@@ -711,9 +711,20 @@ mod tests {
     }
 
     #[test]
-    fn only_a_landing_that_was_interrupted_may_leave_its_vehicle_in_the_air() {
+    fn only_a_landing_that_was_interrupted_or_aborted_may_leave_its_vehicle_in_the_air() {
         let mut landing = LandingSummary { started_ns: Some(1), ..LandingSummary::default() };
         assert!(!landing.may_be_in_the_air(), "it was not interrupted");
+        let aborted = ControllerStatus {
+            started_ns: Some(1),
+            waits_for_operator: true,
+            finished: true,
+            ..status(Phase::Aborted)
+        };
+        landing.last_status = Some(aborted.clone());
+        assert!(landing.may_be_in_the_air(), "it was aborted");
+        landing.last_status = Some(ControllerStatus { disarmed_ns: Some(2), ..aborted });
+        assert!(!landing.may_be_in_the_air(), "its motors are off");
+        landing.last_status = None;
         landing.interrupted("interrupted");
         assert!(landing.may_be_in_the_air());
         landing.last_truth = Some(Truth { on_ground: true, ..truth(None) });

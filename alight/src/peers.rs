@@ -273,8 +273,8 @@ fn is_process(info: &DetectorInfo, host: &str, pid: i32) -> bool {
     info.host == host && u32::try_from(pid).is_ok_and(|pid| info.pid == pid)
 }
 
-/// Whether a landing has begun, and neither has it ended nor have the motors stopped.
-fn is_in_the_air(status: &ControllerStatus) -> bool {
+/// Whether a landing has begun, and neither has it ended nor have the motors stopped. An aborted one has not ended.
+pub(crate) fn is_in_the_air(status: &ControllerStatus) -> bool {
     let is_over = status.finished && !status.waits_for_operator;
     status.started_ns.is_some() && status.disarmed_ns.is_none() && !is_over
 }

@@ -62,6 +62,9 @@ const TRUTH_INTERVAL_US: f32 = 10_000.0;
 const IN_AIR_M: f64 = 0.3;
 /// Height above which the legs do not touch the ground, in metres.
 const CLEAR_M: f64 = 0.04;
+/// Height up to which a vehicle that has touched the ground may bounce, in metres. ArduPilot's simulated one, dropped from
+/// 4 m, bounced by 0.1 m.
+const BOUNCE_M: f64 = 1.0;
 
 /// Runs the service until a shutdown is requested.
 ///
@@ -175,8 +178,11 @@ impl Simulation {
 #[derive(Default)]
 struct TouchdownMonitor {
     was_in_air: bool,
-    /// The last state clear of the ground, or the fastest one down since: contact brakes the vehicle faster than the ticks resolve.
+    /// The last state clear of the ground, or the fastest one down since: contact brakes the vehicle faster than the ticks resolve, and a
+    /// hard one throws it up again.
     before_contact: Option<VehicleTruth>,
+    /// The vehicle was as low as its legs since it was last high.
+    has_been_low: bool,
     touchdown: Option<Touchdown>,
     max_tilt_rad: f64,
     frames: u64,
@@ -204,7 +210,10 @@ impl TouchdownMonitor {
             });
         }
         let is_faster = |than: VehicleTruth| truth.velocity.z() > than.velocity.z();
-        if truth.height_m > CLEAR_M || self.before_contact.is_some_and(is_faster) {
+        self.has_been_low =
+            truth.height_m <= BOUNCE_M && (self.has_been_low || truth.height_m <= CLEAR_M);
+        let is_clear = truth.height_m > CLEAR_M && !self.has_been_low;
+        if is_clear || self.before_contact.is_some_and(is_faster) {
             self.before_contact = Some(*truth);
         }
     }
@@ -674,6 +683,13 @@ mod tests {
         assert!((touchdown.error_m - 0.1).abs() < 1e-9 && touchdown.stamp_ns == 5);
         assert!((touchdown.vertical_speed_m_s - 0.7).abs() < 1e-9);
         assert!((touchdown.lateral_speed_m_s - 0.1).abs() < 1e-9);
+        // The first contact of a vehicle that falls and bounces counts, not its last one.
+        monitor.update(&at(3.0, 4.0, false), &pad, 6);
+        for (height_m, fall) in [(0.05, 7.2), (-0.01, 6.0), (0.08, -0.5), (0.06, 0.4)] {
+            monitor.update(&at(height_m, fall, false), &pad, 7);
+        }
+        monitor.update(&at(0.0, 0.0, true), &pad, 8);
+        assert!((monitor.touchdown.unwrap().vertical_speed_m_s - 7.2).abs() < 1e-9);
     }
 
     #[test]
