@@ -21,7 +21,8 @@ const MAX_PROCESSES: usize = 256;
 /// Interval at which the note of a landing is written again.
 const REFRESH: Duration = Duration::from_secs(1);
 /// A note older than this is stale: its landing is not resumed, as a controller that stood still for as long does not continue it.
-pub(crate) const STALE_AFTER: Duration = Duration::from_millis((controller::MAX_STANDSTILL_S * 1e3) as u64);
+pub(crate) const STALE_AFTER: Duration =
+    Duration::from_millis((controller::MAX_STANDSTILL_S * 1e3) as u64);
 
 /// The peers, as received so far.
 pub(crate) struct Peers {
