@@ -544,6 +544,47 @@ fn a_tag_that_contains_a_round_tag_is_one_marker() {
     }
 }
 
+/// The same with the round tag alone listed: each of these contains one, some with a wrong bit.
+#[test]
+fn a_part_of_a_larger_tag_is_not_a_round_tag() {
+    for (family, id) in [
+        (Family::AprilTagStandard41h12, 704),
+        (Family::AprilTagStandard41h12, 542),
+        (Family::AprilTagCircle49h12, 19158),
+        (Family::AprilTagCircle49h12, 28117),
+    ] {
+        for size_px in [16.0, 24.0, 40.0, 80.0, 200.0] {
+            let image = sheet(family, id, size_px);
+            assert_eq!(
+                names(&find(&image, &[family.name()])),
+                [(family, Some(id))],
+                "{size_px} px"
+            );
+            let listed = [ROUND[0].name()];
+            assert_eq!(names(&find(&image, &listed)), [], "{family}:{id}, {size_px} px");
+        }
+    }
+}
+
+#[test]
+fn every_round_tag_is_found_on_any_ground() {
+    let family = Family::AprilTagCircle21h7;
+    for (id, ground) in (0..38).flat_map(|id| [20, 250].map(|ground| (id, ground))) {
+        let mut image = sheet(family, id, 40.0);
+        let middle = image.width() as f64 / 2.0;
+        for y in 0..image.height() {
+            for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+                let [right, down] = [x, y].map(|at| at as f64 - middle);
+                if right.hypot(down) > f64::hypot(0.7, 0.7) * 40.0 + 2.0 {
+                    *pixel = ground;
+                }
+            }
+        }
+        let found = find(&image, &[family.name()]);
+        assert_eq!(names(&found), [(family, Some(id))], "ground of {ground}");
+    }
+}
+
 #[test]
 fn a_round_tag_may_be_cut_out_along_its_outline() {
     let size_px = 80.0;

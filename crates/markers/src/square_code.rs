@@ -58,6 +58,23 @@ impl SquareCode {
         codeword.is_some_and(|word| self.rotated(self.rotated(*word)) == *word)
     }
 
+    /// The codes whose markers have the same square, all bits of this one and at least so many more: a part of such a marker may be
+    /// one of this code. They are prepared at the first call.
+    pub fn containing(&self, min_more_bits: usize) -> impl Iterator<Item = &'static Self> {
+        let has_same_square = move |family: &Family| {
+            layout(*family).is_some_and(|other| {
+                (other.cells, other.reversed_border) == (self.cells, self.reversed_border)
+            })
+        };
+        let has_all_bits = move |family: &Family| {
+            let bits = tables::cells(*family);
+            bits.len() >= self.bits.len() + min_more_bits
+                && self.bits.iter().all(|bit| bits.contains(bit))
+        };
+        let families = Family::ALL.into_iter().filter(has_same_square).filter(has_all_bits);
+        families.filter_map(Self::for_family)
+    }
+
     /// Cells across the square in its middle that has no bits, and is left free for a smaller marker; 0 if there is none.
     pub fn free_cells(&self) -> u8 {
         let cells = self.cells as i8;
@@ -181,6 +198,20 @@ mod tests {
         let free = codes().filter(|code| code.free_cells() > 0);
         let free: Vec<_> = free.map(|code| (code.family, code.free_cells())).collect();
         assert_eq!(free, [(Family::AprilTagCustom48h12, 2)]);
+    }
+
+    #[test]
+    fn the_bits_of_two_families_are_among_those_of_others() {
+        let pairs = codes().flat_map(|code| code.containing(1).map(|it| (code.family, it.family)));
+        let round = Family::AprilTagCircle21h7;
+        let expected = [
+            (round, Family::AprilTagCircle49h12),
+            (round, Family::AprilTagStandard41h12),
+            (Family::AprilTagCustom48h12, Family::AprilTagStandard52h13),
+        ];
+        assert_eq!(pairs.collect::<Vec<_>>(), expected);
+        let custom = SquareCode::for_family(Family::AprilTagCustom48h12).unwrap();
+        assert_eq!(custom.containing(5).count(), 0);
     }
 
     #[test]

@@ -5,6 +5,7 @@
 //! breaks.
 
 mod grid;
+mod larger;
 
 use geometry::Pixel;
 use imaging::GrayView;
@@ -23,6 +24,7 @@ use crate::decode::occluded::{Occluded, OccludedQuery, SquareReading};
 use crate::decode::steps::Steps;
 use crate::families::family::{FamilyDetector, FrameInput, Output, Prediction};
 use crate::families::query::{ExpectedMarker, FamilyQuery, ImageInput, segment_corner_px};
+use crate::families::square::larger::LargerCode;
 use crate::observation::Observation;
 use crate::refine::corners::refine;
 use crate::refine::fit::{CornerGuess, Refined, Scratch};
@@ -106,6 +108,8 @@ struct SquareQuery {
     code: &'static SquareCode,
     /// Indices of its layouts: with the code's border, and with one that is a cell wider.
     layouts: [Option<usize>; 2],
+    /// The codes whose tags may contain one of these.
+    larger: Vec<LargerCode>,
     /// The ids that a fallback looks for.
     missing: Vec<u32>,
     is_missing: bool,
@@ -181,11 +185,12 @@ impl SquareTagDetector {
             }
             if layouts[0].is_some() {
                 let query = FamilyQuery::new(*marker);
-                let missing = Vec::new();
+                let (larger, missing) = (LargerCode::all_of(code), Vec::new());
                 detector.queries.push(SquareQuery {
                     query,
                     code,
                     layouts,
+                    larger,
                     missing,
                     is_missing: false,
                 });
@@ -267,6 +272,9 @@ impl SquareTagDetector {
         let found = found.filter(|found| (found.id, found.rotation) == (expected.id, 0))?;
         let decoded = self.check(&quad, index, 0, found).ok()?;
         let refined = decoded.refined(query, input, true, &mut self.scratch)?;
+        if query.larger.iter().any(|it| it.is_shown(&mut self.cells, input, &refined.corners)) {
+            return None;
+        }
         decoded.observation(query, refined, input)
     }
 
@@ -391,7 +399,7 @@ impl SquareTagDetector {
         self.found.push(found);
     }
 
-    /// Adds the observations decoded from the index `from` on, the most confident first.
+    /// Adds the observations decoded from the index `from` on, the most confident first; not those of parts of a larger tag.
     fn observe_all(&mut self, input: ImageInput<'_>, from: usize, found: &mut Vec<Observation>) {
         let first = found.len();
         let mut index = from;
@@ -400,7 +408,9 @@ impl SquareTagDetector {
             let refined = marker.refined(query, input, false, &mut self.scratch);
             let refined =
                 refined.unwrap_or_else(|| Refined::unrefined(&marker.corners, marker.corner_px));
-            match marker.observation(query, refined, input) {
+            let cells = &mut self.cells;
+            let is_part = query.larger.iter().any(|it| it.is_shown(cells, input, &refined.corners));
+            match marker.observation(query, refined, input).filter(|_| !is_part) {
                 Some(seen) => {
                     found.push(seen);
                     index += 1;
