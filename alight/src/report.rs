@@ -22,8 +22,9 @@ const EXIT_STATUS: &str = "Exit status 1 also when there is a page and something
 #[derive(Args)]
 #[command(after_help = EXIT_STATUS)]
 pub(crate) struct ReportArgs {
-    /// The recording of a flight (MCAP), or those of two to compare. Files that share a controller's tape and the recorder's clock are
-    /// one flight, in any order of their names, as a recorder begins a new file when one is large.
+    /// The recording of a flight (MCAP), or those of two to compare. Files of one run of the recorder are one flight, in any order of
+    /// their names, as a recorder begins a new file when one is large; so are files that share a controller's tape and the recorder's
+    /// clock.
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Which landing of each recording, from 1 on, where it has several [default: the last].
@@ -353,6 +354,43 @@ mod tests {
         assert_eq!(names(&[&two, &other, &second, &one])[2], "one.mcap");
         // Of the same flight, by another recorder.
         assert_eq!(names(&[&second, &ground, &one]), ["one.mcap", "ground.mcap"]);
+    }
+
+    #[test]
+    fn files_of_one_run_of_the_recorder_are_one_flight_also_without_a_tape() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, run: &str, key: &str, received_ns: i64| {
+            let facts = [("clock", "drone"), ("run", run)];
+            let facts = facts.map(|(name, value)| (name.to_owned(), value.to_owned())).into();
+            let about = flightlog::About { facts, ..flightlog::About::default() };
+            let tape = messages::Tape { begun_ns: 3, ..messages::Tape::default() };
+            let mut recording = Vec::new();
+            let mut writer = flightlog::Writer::new(&mut recording, &about).unwrap();
+            let payload = messages::encode(&tape);
+            let message =
+                flightlog::Received { key, payload: &payload, attachment: b"", received_ns };
+            writer.receive(message).unwrap();
+            writer.finish().unwrap();
+            let file = folder.path().join(name);
+            std::fs::write(&file, recording).unwrap();
+            file
+        };
+        let tape = messages::topic::TAPE.key(&[]);
+        // The controller starts after the first file and ends before the third; then another recorder continues its tape.
+        let before = write("s.mcap", "7-1", "wind", 1);
+        let during = write("s-2.mcap", "7-1", &tape, 2);
+        let after = write("s-3.mcap", "7-1", "wind", 3);
+        let later = write("t.mcap", "8-1", &tape, 4);
+        let later_after = write("t-2.mcap", "8-1", "wind", 5);
+        let other = write("other.mcap", "9-1", "wind", 6);
+        let names = |files: &[&PathBuf]| -> Vec<String> {
+            let files: Vec<PathBuf> = files.iter().map(|it| (*it).clone()).collect();
+            flights(&files).unwrap().into_iter().map(|it| it.name).collect()
+        };
+        assert_eq!(names(&[&after, &during, &before]), ["s.mcap"]);
+        assert_eq!(names(&[&after, &before]), ["s.mcap"]);
+        assert_eq!(names(&[&before, &during, &after, &later, &later_after]), ["s.mcap"]);
+        assert_eq!(names(&[&before, &other]), ["s.mcap", "other.mcap"]);
     }
 
     /// A recorded landing of its own.

@@ -214,7 +214,7 @@ pub struct FlightReader {
     boot_of_tape: BTreeMap<i64, usize>,
     meter: Meter,
     begin: Begin,
-    /// Messages that a recorder lost since its start, by its run and their key.
+    /// Messages that a recorder lost since its start, by its run and their key; each run of the files that were added is in it.
     lost_by_run: BTreeMap<String, BTreeMap<String, u64>>,
 }
 
@@ -281,11 +281,13 @@ impl FlightReader {
         self.begin
     }
 
-    /// True when another is of the same recording: a tape continues in it, and its times are of the same clock. The ground's of the
-    /// same flight is another.
+    /// True when another is of the same recording: one run of a recorder wrote both, or a tape continues in it, as after a restart of the
+    /// recorder; and its times are of the same clock. The ground's of the same flight is another.
     pub fn goes_on_in(&self, other: &Self) -> bool {
         let clock = |reader: &Self| reader.flight.facts.get("clock").cloned();
-        self.tapes.shares_tape_with(&other.tapes) && clock(self) == clock(other)
+        let mut runs = self.lost_by_run.keys().filter(|run| !run.is_empty());
+        let is_of_one_run = runs.any(|run| other.lost_by_run.contains_key(run));
+        (is_of_one_run || self.tapes.shares_tape_with(&other.tapes)) && clock(self) == clock(other)
     }
 
     /// The flight; of several starts of the vehicle's computer that with the last landing, or the last.
