@@ -37,8 +37,8 @@ pub(crate) struct RecordArgs {
     /// Only serve, and write no file: short for `--set file=`.
     #[arg(long, requires = "serve", conflicts_with = "output")]
     no_file: bool,
-    /// End a recording properly whose recorder was killed, or save the readable part of a damaged one, as a copy. Exit status 0 when it was
-    /// complete, 1 when something is missing.
+    /// End a recording properly whose recorder was killed, or save the readable part of a damaged one, as a copy, which states what is
+    /// lost. Exit status 0 when it was complete, 1 when something is missing, also from before an earlier repair.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["config", "set", "serve"])]
     repair: Option<PathBuf>,
     #[command(flatten)]
@@ -73,8 +73,17 @@ fn repair(file: &Path, output: Option<&Path>) -> anyhow::Result<ExitCode> {
     let recording = std::fs::read(file).with_context(|| format!("reading {file:?}"))?;
     let found = flightlog::repair(&recording, std::io::sink())
         .with_context(|| format!("{file:?} is no recording (MCAP file) that could be repaired"))?;
+    let name = file.display();
+    for damage in &found.earlier {
+        print(&format!("{name}: {damage}"))?;
+    }
+    if found.damage.is_empty() && !found.earlier.is_empty() {
+        let messages = found.messages;
+        print(&format!("{name} is a repaired copy, and no more is lost: {messages} messages"))?;
+        return Ok(ExitCode::FAILURE);
+    }
     if found.damage.is_empty() {
-        print(&format!("{} is whole: {} messages", file.display(), found.messages))?;
+        print(&format!("{name} is whole: {} messages", found.messages))?;
         return Ok(ExitCode::SUCCESS);
     }
     let stem = file.file_stem().unwrap_or_default().to_string_lossy();
@@ -84,7 +93,7 @@ fn repair(file: &Path, output: Option<&Path>) -> anyhow::Result<ExitCode> {
     ensure!(!output.exists(), "{output:?} is there already; name another file with `-o`");
     let found = write_repaired(&recording, output).with_context(doing)?;
     for damage in &found.damage {
-        print(&format!("{}: {damage}", file.display()))?;
+        print(&format!("{name}: {damage}"))?;
     }
     print(&format!(
         "{}: {} messages in {} chunks",
@@ -113,6 +122,23 @@ fn write_repaired(recording: &[u8], output: &Path) -> anyhow::Result<flightlog::
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_repaired_copy_is_not_called_whole() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("flight.mcap");
+        let mut recording = Vec::new();
+        let about = flightlog::About::default();
+        flightlog::Writer::new(&mut recording, &about).unwrap().finish().unwrap();
+        std::fs::write(&file, &recording).unwrap();
+        let status = |file: &Path| format!("{:?}", repair(file, None).unwrap());
+        let [success, failure] = [ExitCode::SUCCESS, ExitCode::FAILURE].map(|it| format!("{it:?}"));
+        assert_eq!(status(&file), success);
+        std::fs::write(&file, &recording[..recording.len() / 3]).unwrap();
+        assert_eq!(status(&file), failure);
+        assert_eq!(status(&folder.path().join("flight-repaired.mcap")), failure);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2, "a copy of the copy");
+    }
 
     #[test]
     fn an_incomplete_copy_is_not_left() {

@@ -8,9 +8,10 @@
 //! [`channel`] defines records and has messages as they were received and as JSON, [`display`] as Foxglove shows them, with the packets of
 //! the vehicle's [`own_autopilot`] alone; [`live`] offers the latter to programs that follow a flight; [`writer`] writes both into a file;
 //! `records` iterates over one, [`mod@repair`] ends a file properly whose writer was killed, [`reader`] reads one as far as it is valid,
-//! and [`tape`] the controllers' tapes.
+//! [`damage`] describes the rest, and [`tape`] the controllers' tapes.
 
 pub mod channel;
+pub mod damage;
 pub mod display;
 pub mod foxglove;
 pub mod live;
@@ -23,6 +24,7 @@ pub mod tape;
 pub mod writer;
 
 pub use channel::{Received, Record, Schema, is_state};
+pub use damage::Lost;
 pub use display::{Picture, VehicleClock};
 pub use live::Live;
 pub use own_autopilot::OwnAutopilot;

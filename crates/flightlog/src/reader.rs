@@ -4,11 +4,12 @@
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
-use mcap::records::{MessageHeader, Record};
+use mcap::records::{MessageHeader, Record, op};
 use mcap::{Channel, Summary};
 use messages::{FrameHeader, PixelFormat, decode, topic};
 
 use crate::channel::{RAW_PREFIX, Received, is_state, split_raw};
+use crate::damage::{Before, Counter, Lost, REPAIRED};
 use crate::display::picture_channel;
 use crate::foxglove::{self, Image};
 use crate::records::{Records, check_begin, contained, records_of};
@@ -40,12 +41,17 @@ pub enum Entry<'a> {
 /// How much of a recording was read.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Reading {
-    /// Whether it has its end: without, its recorder was killed, or the rest is missing.
+    /// Whether it has its end: without, its recorder was killed, or the rest is missing. A repaired copy has an end, and counts as
+    /// the recording that it was made of.
     pub is_ended: bool,
+    /// Whether it is the repaired copy of a recording of which a part is lost.
+    pub is_repaired: bool,
     /// Messages that were read as they were received.
     pub messages: u64,
-    /// The parts that could not be read, as sentences.
+    /// The parts that could not be read, as sentences; also before a repair.
     pub damage: Vec<String>,
+    /// The chunks that could not be read, also before a repair.
+    pub lost: Lost,
 }
 
 /// Reads a recording; `each` receives its entries, in order.
@@ -65,6 +71,8 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Er
         each,
     };
     let mut chunks = 0;
+    let mut counter = Counter::default();
+    let (mut was_cut_off, mut earlier) = (false, 0);
     let mut records = Records::new(recording);
     for (opcode, record) in &mut records {
         match record {
@@ -75,11 +83,24 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Er
                 let ahead_ns = metadata.metadata.get("ahead_ns").and_then(|it| it.parse().ok());
                 ahead_ns.into_iter().for_each(|ahead_ns| (found.each)(Entry::TimeSet(ahead_ns)));
             }
+            Ok(Record::Metadata(metadata)) if metadata.name == REPAIRED => {
+                let mut before = Before::of(&metadata.metadata);
+                found.reading.is_repaired = true;
+                earlier += before.damage.len();
+                found.reading.damage.append(&mut before.damage);
+                was_cut_off |= before.is_cut_off;
+                counter.add(before);
+            }
             Ok(Record::Chunk { header, data }) => {
                 chunks += 1;
+                let times_ns = header.message_start_time..header.message_end_time;
                 match records_of(header, &data) {
-                    Ok(records) => records.iter().for_each(|record| found.record(record)),
+                    Ok(records) => {
+                        counter.read(times_ns);
+                        records.iter().for_each(|record| found.record(record));
+                    }
                     Err(error) => {
+                        counter.lose(Some(times_ns));
                         let text = format!("chunk {chunks} is damaged: {error}");
                         found.reading.damage.push(text);
                     }
@@ -97,12 +118,16 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Er
                 found.reading.damage.push(text);
             }
             Err(error) => {
+                if opcode == op::CHUNK {
+                    counter.lose(None);
+                }
                 let text = format!("a record after {chunks} chunks is damaged: {error}");
                 found.reading.damage.push(text);
             }
         }
     }
-    found.reading.is_ended = records.is_ended();
+    found.reading.is_ended = records.is_ended() && !was_cut_off;
+    found.reading.lost = counter.finish(found.utc_offset_ns);
     if found.lost > 0 {
         let text = format!(
             "{} messages are lost: the description of their channel is damaged",
@@ -110,7 +135,7 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Er
         );
         found.reading.damage.push(text);
     }
-    if records.differs() && found.reading.damage.is_empty() {
+    if records.differs() && found.reading.damage.len() == earlier {
         found.reading.damage.push(DIFFERS.to_owned());
     }
     Ok(found.reading)

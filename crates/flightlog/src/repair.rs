@@ -4,10 +4,11 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io::Write;
 use std::sync::Arc;
 
-use mcap::records::Record;
+use mcap::records::{Metadata, Record, op};
 use mcap::write::{NoSeek, WriteOptions};
 use mcap::{Attachment, Channel, McapError, Summary};
 
+use crate::damage::{Before, Counter, REPAIRED};
 use crate::records::{Records, check_begin, contained, records_of};
 use crate::writer::Error;
 
@@ -24,9 +25,12 @@ pub struct Repaired {
     pub chunks: u64,
     /// The damaged and missing parts; empty for a complete file.
     pub damage: Vec<String>,
+    /// The parts that were damaged or missing before an earlier repair, of which the recording is a copy.
+    pub earlier: Vec<String>,
 }
 
-/// Copies every complete chunk of a recording into `output`, and ends it.
+/// Copies every complete chunk of a recording into `output`, and ends it. If a part is lost, the copy has metadata about it
+/// ([`REPAIRED`]): it is not a complete recording.
 ///
 /// A channel is described once, in the first chunk that has messages of it, and again in the index of a recording that
 /// was ended. Where both are damaged or missing, the messages of the channel are lost, and counted.
@@ -36,7 +40,8 @@ pub struct Repaired {
 pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Error> {
     check_begin(recording)?;
     let index = contained(|| Summary::read(recording)).ok().flatten();
-    let options = WriteOptions::new().compression(None).disable_seeking(true);
+    // Chunks are copied one by one, whatever their size.
+    let options = WriteOptions::new().compression(None).chunk_size(None).disable_seeking(true);
     let mut copy = Copy {
         mcap: options.create(NoSeek::new(output))?,
         in_index: index.as_ref().map(|it| &it.channels),
@@ -44,18 +49,32 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Error> 
         lost: BTreeMap::new(),
         found: Repaired::default(),
     };
+    let mut counter = Counter::default();
     let mut records = Records::new(recording);
     for (opcode, record) in &mut records {
         let chunks = copy.found.chunks;
         match record {
-            Ok(Record::Chunk { header, data }) => match records_of(header, &data) {
-                Ok(records) => copy.chunk(records)?,
-                Err(error) => copy
-                    .found
-                    .damage
-                    .push(format!("the chunk after {chunks} complete ones is damaged: {error}")),
-            },
-            Ok(Record::Metadata(metadata)) => copy.mcap.write_metadata(&metadata)?,
+            Ok(Record::Chunk { header, data }) => {
+                let times_ns = header.message_start_time..header.message_end_time;
+                match records_of(header, &data) {
+                    Ok(records) => {
+                        counter.read(times_ns);
+                        copy.chunk(records)?;
+                    }
+                    Err(error) => {
+                        counter.lose(Some(times_ns));
+                        let text =
+                            format!("the chunk after {chunks} complete ones is damaged: {error}");
+                        copy.found.damage.push(text);
+                    }
+                }
+            }
+            Ok(Record::Metadata(metadata)) => {
+                if metadata.name == REPAIRED {
+                    copy.found.earlier.extend(earlier(&metadata));
+                }
+                copy.mcap.write_metadata(&metadata)?;
+            }
             Ok(Record::Attachment { header, data, .. }) => copy.mcap.attach(&Attachment {
                 log_time: header.log_time,
                 create_time: header.create_time,
@@ -72,6 +91,9 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Error> 
                 copy.found.damage.push(text);
             }
             Err(error) => {
+                if opcode == op::CHUNK {
+                    counter.lose(None);
+                }
                 let text = format!("a record after {chunks} complete chunks is damaged: {error}");
                 copy.found.damage.push(text);
             }
@@ -83,19 +105,32 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Error> 
             "{messages} messages of channel {channel} are lost: the description of it is damaged"
         )
     }));
-    if !records.is_ended() {
+    if records.differs() && found.damage.is_empty() {
+        found.damage.push(DIFFERS.to_owned());
+    }
+    let is_cut_off = !records.is_ended();
+    if is_cut_off || !found.damage.is_empty() {
+        let metadata = counter.metadata(&found.damage, is_cut_off);
+        mcap.write_metadata(&Metadata { name: REPAIRED.to_owned(), metadata })?;
+    }
+    if is_cut_off {
         let chunks = found.chunks;
         found.damage.push(format!(
-            "not ended: the messages after {chunks} complete chunks are missing; of a recorder that was killed these are half a second"
+            "not ended: the messages after {chunks} complete chunks are missing; a recorder that was killed loses the last half second, \
+             and of a file that was cut off more may be missing"
         ));
     } else if index.is_none() {
         found.damage.push("its index is damaged or missing".to_owned());
     }
-    if records.differs() && found.damage.is_empty() {
-        found.damage.push(DIFFERS.to_owned());
-    }
     mcap.finish()?;
     Ok(found)
+}
+
+/// The damage before an earlier repair, as sentences.
+fn earlier(metadata: &Metadata) -> Vec<String> {
+    let Before { mut damage, is_cut_off, .. } = Before::of(&metadata.metadata);
+    damage.extend(is_cut_off.then(|| "before its repair: not ended".to_owned()));
+    damage
 }
 
 /// A copy that is being made.

@@ -28,9 +28,12 @@ pub const TIME_SET: &str = "alight-time-set";
 /// Why a recording cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The file could not be written, or is not an MCAP file.
-    #[error("{0}")]
-    Mcap(#[from] mcap::McapError),
+    /// The file could not be written or read.
+    #[error(transparent)]
+    Io(std::io::Error),
+    /// It is not a valid MCAP file.
+    #[error(transparent)]
+    Mcap(mcap::McapError),
     /// The file is empty.
     #[error("it is empty; was its recorder killed at once, or the disk full?")]
     Empty,
@@ -40,6 +43,16 @@ pub enum Error {
     /// Its reader panicked.
     #[error("its bytes make no sense to the reader")]
     Senseless,
+}
+
+impl From<mcap::McapError> for Error {
+    fn from(error: mcap::McapError) -> Self {
+        match error {
+            // Its text is that of reading compressed data as well.
+            mcap::McapError::Io(error) => Self::Io(error),
+            error => Self::Mcap(error),
+        }
+    }
 }
 
 /// The source of a recording.

@@ -86,10 +86,69 @@ fn flushed_messages_survive_a_kill_and_are_ended_by_a_repair() {
     assert_eq!(numbers(&repaired), (0..MESSAGES).collect::<Vec<_>>());
     assert_eq!(found.messages, 2 * MESSAGES as u64);
     assert!(found.damage[0].contains("not ended"), "{found:?}");
-    // A second repair finds no damage.
+    // A second repair finds no other damage.
     let mut again = Vec::new();
-    assert_eq!(repair(&repaired, &mut again).unwrap().damage, Vec::<String>::new());
+    let found = repair(&repaired, &mut again).unwrap();
+    assert_eq!((found.damage, found.earlier.len()), (Vec::<String>::new(), 1));
     assert_eq!(numbers(&again).len(), MESSAGES);
+}
+
+#[test]
+fn a_repaired_copy_states_what_was_lost() {
+    let complete = recording(false);
+    let chunks = chunks(&complete);
+    let mut damaged = complete.clone();
+    // In messages of the second and third chunk; their lengths stay.
+    for chunk in &chunks[1..3] {
+        damaged[chunk.end - 4] ^= 1;
+    }
+    let read = |file: &[u8]| flightlog::read(file, |_| ()).unwrap();
+    let of_damaged = read(&damaged);
+    assert_eq!((of_damaged.lost.chunks, of_damaged.lost.of), (2, 6));
+    assert_eq!(of_damaged.lost.gaps_ns, [9..30]);
+    let mut copy = Vec::new();
+    repair(&damaged, &mut copy).unwrap();
+    let of_copy = read(&copy);
+    assert!(of_copy.is_repaired && of_copy.is_ended && !of_damaged.is_repaired);
+    assert_eq!(of_copy.lost, of_damaged.lost);
+    assert_eq!(of_copy.damage.len(), 2, "{of_copy:?}");
+    assert!(of_copy.damage[0].starts_with("before its repair: the chunk after 1 complete"));
+    // The copy of a damaged copy states both.
+    let at = copy.len() / 2;
+    copy[at] ^= 1;
+    let mut again = Vec::new();
+    let found = repair(&copy, &mut again).unwrap();
+    assert_eq!((found.damage.len(), found.earlier.len()), (1, 2), "{found:?}");
+    let of_again = read(&again);
+    assert_eq!((of_again.lost.chunks, of_again.lost.of, of_again.damage.len()), (3, 6, 3));
+    // One that was cut off counts as such afterwards; one whose index alone is missing is complete again.
+    for (length, is_ended) in [(chunks[4].end, false), (complete.len() - 60, true)] {
+        let mut copy = Vec::new();
+        repair(&complete[..length], &mut copy).unwrap();
+        assert_eq!((read(&copy).is_ended, read(&copy).damage.len()), (is_ended, 0), "{length}");
+    }
+}
+
+#[test]
+fn a_full_disk_is_named_once() {
+    struct Full;
+    impl std::io::Write for Full {
+        fn write(&mut self, _: &[u8]) -> std::io::Result<usize> {
+            Err(std::io::Error::from_raw_os_error(28))
+        }
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+    let error = repair(&recording(true), Full).unwrap_err();
+    let mut texts = vec![error.to_string()];
+    let mut cause = std::error::Error::source(&error);
+    while let Some(next) = cause {
+        texts.push(next.to_string());
+        cause = next.source();
+    }
+    assert_eq!(texts.len(), 1, "{texts:?}");
+    assert!(texts[0].contains("No space left"), "{texts:?}");
 }
 
 #[test]

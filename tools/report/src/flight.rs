@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-use flightlog::{Begin, Entry, Reading, Received, RecordedTape, TapeReader};
+use flightlog::{Begin, Entry, Lost, Reading, Received, RecordedTape, TapeReader};
 use messages::{
     CameraInfo, Configuration, ControllerStatus, Detections, DetectorInfo, FrameHeader, GcsStatus,
     Health, MavlinkBytes, Message, RecorderStatus, TapeEvent, TargetEstimate, Topic, Truth,
@@ -137,14 +137,18 @@ pub struct Flight {
     pub name: String,
     /// Facts about the recording: program, host, clock.
     pub facts: BTreeMap<String, String>,
-    /// Whether its files have their end.
+    /// Whether its files have their end, and had it before a repair.
     pub is_ended: bool,
+    /// Whether a file is the repaired copy of a recording of which a part is lost.
+    pub is_repaired: bool,
     /// Messages that were read.
     pub messages: u64,
     /// How far the clock of UTC was set ahead of a file's own times while it was open, each time, in seconds.
     pub time_set_s: Vec<f64>,
     /// The parts of its files that could not be read, as sentences.
     pub damage: Vec<String>,
+    /// The chunks of its files that could not be read.
+    pub lost_chunks: Lost,
     /// Messages that could not be read, by key.
     pub unreadable: BTreeMap<String, Unreadable>,
     /// Messages that the recorders lost since their start, by key.
@@ -235,7 +239,7 @@ impl FlightReader {
         let mut lost = BTreeMap::new();
         let mut run = String::new();
         let mut set_s = Vec::new();
-        let Reading { is_ended, messages, damage } =
+        let Reading { is_ended, is_repaired, messages, damage, lost: lost_chunks } =
             flightlog::read(recording, |entry| match entry {
                 Entry::About(facts) => {
                     run = facts.get("run").cloned().unwrap_or_default();
@@ -261,8 +265,10 @@ impl FlightReader {
             *max = count.max(*max);
         }
         flight.is_ended &= is_ended;
+        flight.is_repaired |= is_repaired;
         flight.messages += messages;
         flight.damage.extend(damage);
+        flight.lost_chunks.extend(lost_chunks);
         Ok(())
     }
 
@@ -578,7 +584,9 @@ impl Flight {
         (self.is_ended, self.messages) = (other.is_ended, other.messages);
         self.facts.clone_from(&other.facts);
         self.time_set_s.clone_from(&other.time_set_s);
+        self.is_repaired = other.is_repaired;
         self.damage.clone_from(&other.damage);
+        self.lost_chunks.clone_from(&other.lost_chunks);
         self.unreadable.clone_from(&other.unreadable);
         self.lost.clone_from(&other.lost);
         self.recorder.clone_from(&other.recorder);

@@ -17,6 +17,15 @@ pub fn begins(flight: &Flight) -> Vec<i64> {
 }
 
 impl Flight {
+    /// The time of the landing as far as it is known, in nanoseconds of the vehicle's clock: from its begin to the status that it is
+    /// finished, or else to the last status. `None` without a landing.
+    pub fn landing_ns(&self) -> Option<Range<i64>> {
+        let begun_ns = self.statuses.iter().find_map(|it| it.started_ns)?;
+        let mut of_landing = self.statuses.iter().filter(|it| it.stamp_ns >= begun_ns);
+        let finished = of_landing.find(|status| status.finished).or(self.statuses.last());
+        Some(begun_ns..finished.map_or(begun_ns, |it| it.stamp_ns).max(begun_ns))
+    }
+
     /// Keeps one of several landings, by its number from 1 on, or the last; of a recording with one everything stays, but for other
     /// starts of the vehicle's computer.
     ///

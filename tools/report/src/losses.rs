@@ -2,9 +2,13 @@
 
 use std::collections::BTreeMap;
 
+use flightlog::Lost;
 use messages::has_never_come;
 
 use crate::flight::{Boot, Flight};
+
+/// Number of damaged parts beyond which only the first is named among the gaps.
+const MAX_PARTS: usize = 3;
 
 /// Something of which a part was lost.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -141,10 +145,43 @@ pub fn tape(flight: &Flight) -> Vec<Loss> {
     losses
 }
 
+/// The lost chunks of the recording, with the time that they covered, as a sentence.
+fn lost_chunks(flight: &Flight) -> Option<String> {
+    let Lost { chunks, of, gaps_ns } = &flight.lost_chunks;
+    if *chunks == 0 {
+        return None;
+    }
+    let mut text = format!("{chunks} of {of} chunks of the recording are lost");
+    let sum_s = |lengths_ns: &mut dyn Iterator<Item = i64>| {
+        lengths_ns.map(|it| it.max(0) as f64 * 1e-9).sum::<f64>()
+    };
+    let all_s = sum_s(&mut gaps_ns.iter().map(|gap| gap.end.saturating_sub(gap.start)));
+    if all_s > 0.0 {
+        text.push_str(&format!(", with the messages of {all_s:.1} s"));
+        if let Some(landing_ns) = flight.landing_ns() {
+            let landing_s = sum_s(&mut gaps_ns.iter().map(|gap| {
+                let [from, to] = [gap.start, gap.end].map(|it| flight.vehicle_ns(it));
+                to.min(landing_ns.end).saturating_sub(from.max(landing_ns.start))
+            }));
+            text.push_str(&format!(", of these {landing_s:.1} s in the landing"));
+        }
+    }
+    Some(text)
+}
+
 /// The gaps of the recording, as sentences.
 pub fn recording(flight: &Flight) -> Vec<String> {
-    let mut lines = flight.damage.clone();
-    if !flight.is_ended {
+    let mut lines = lost_chunks(flight).into_iter().collect::<Vec<_>>();
+    match flight.damage.as_slice() {
+        [first, others @ ..] if others.len() >= MAX_PARTS => lines.push(format!(
+            "{first}; {} further parts are damaged, which the last section lists",
+            others.len()
+        )),
+        all => lines.extend_from_slice(all),
+    }
+    if !flight.is_ended && flight.is_repaired {
+        lines.push("the recording had no end before its repair: its recorder was killed, or the rest was cut off".to_owned());
+    } else if !flight.is_ended {
         lines.push("the recording has no end: its recorder was killed, or the rest is cut off; `alight record --repair` writes a copy with an end".to_owned());
     }
     let Boot { number, of } = flight.boot;

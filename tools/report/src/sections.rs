@@ -536,6 +536,10 @@ fn recording(view: &View<'_>) -> Section {
     for problem in &view.summary.problems {
         section.before.push(Block::Warning(problem.clone()));
     }
+    if flight.damage.len() > view.summary.problems.len() {
+        let title = format!("The {} damaged parts", flight.damage.len());
+        section.after.push(details(&title, Block::Lines(flight.damage.join("\n"))));
+    }
     let mut rows = vec![vec![text("file"), text(&flight.name)]];
     rows.push(vec![text("messages"), text(flight.messages.to_string())]);
     let tape = match &flight.replayed {

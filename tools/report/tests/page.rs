@@ -449,6 +449,38 @@ fn damaged_recordings_give_their_remaining_messages() {
 }
 
 #[test]
+fn a_repaired_copy_reports_the_damage_of_the_recording_in_time_and_a_few_lines() {
+    let recording = &landing().recording;
+    let mut damaged = recording.clone();
+    for twentieth in 4..10 {
+        damaged[twentieth * recording.len() / 20] ^= 1;
+    }
+    let mut copy = Vec::new();
+    let found = flightlog::repair(&damaged, &mut copy).unwrap();
+    assert_eq!(found.damage.len(), 6, "{found:?}");
+    let (complete, of_damaged, of_copy) = (read(recording), read(&damaged), read(&copy));
+    assert!(complete.is_complete() && !of_copy.is_complete());
+    assert_eq!(of_copy.lost_chunks, of_damaged.lost_chunks);
+    let gaps_s = of_copy.lost_chunks.gaps_ns.iter().map(|gap| (gap.end - gap.start) as f64 * 1e-9);
+    let lost_s: f64 = gaps_s.sum();
+    assert!(lost_s > 1.0, "{lost_s}");
+    let problems = summary(&of_copy).problems;
+    let first = format!("chunks of the recording are lost, with the messages of {lost_s:.1} s");
+    assert!(problems[0].starts_with("6 of ") && problems[0].contains(&first), "{problems:?}");
+    assert!(problems[0].ends_with(" s in the landing"), "{problems:?}");
+    assert!(problems[1].contains("5 further parts are damaged"), "{problems:?}");
+    assert_eq!(problems.len(), 2, "{problems:?}");
+    assert!(page(&of_copy).unwrap().contains("<summary>The 6 damaged parts</summary>"));
+    // One that was cut off has an end after its repair, and is still not complete.
+    let mut copy = Vec::new();
+    flightlog::repair(&recording[..recording.len() / 2], &mut copy).unwrap();
+    let of_copy = read(&copy);
+    assert!(!of_copy.is_complete());
+    let problems = summary(&of_copy).problems;
+    assert!(problems[0].starts_with("the recording had no end before its repair"), "{problems:?}");
+}
+
+#[test]
 fn of_a_recording_with_two_landings_each_has_its_own_numbers() {
     const LATER_NS: i64 = 100_000_000_000;
     let one = read(&without(&landing().recording, &["controller/tape"]));
