@@ -8,7 +8,7 @@ use messages::has_never_come;
 use crate::flight::{Boot, Flight};
 
 /// Number of damaged parts beyond which only the first is named among the gaps.
-const MAX_PARTS: usize = 3;
+pub const MAX_PARTS: usize = 3;
 
 /// Something of which a part was lost.
 #[derive(Clone, Debug, PartialEq, Eq)]

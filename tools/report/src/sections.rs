@@ -536,7 +536,7 @@ fn recording(view: &View<'_>) -> Section {
     for problem in &view.summary.problems {
         section.before.push(Block::Warning(problem.clone()));
     }
-    if flight.damage.len() > view.summary.problems.len() {
+    if flight.damage.len() > losses::MAX_PARTS {
         let title = format!("The {} damaged parts", flight.damage.len());
         section.after.push(details(&title, Block::Lines(flight.damage.join("\n"))));
     }
