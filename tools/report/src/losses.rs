@@ -10,6 +10,9 @@ use crate::flight::{Boot, Flight};
 /// Number of damaged parts beyond which only the first is named among the gaps.
 pub const MAX_PARTS: usize = 3;
 
+/// How long after the begin of a landing its recording may begin without a note, in seconds: states are published five times a second.
+const MAX_LATE_BEGIN_S: f64 = 0.5;
+
 /// Something of which a part was lost.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Loss {
@@ -169,6 +172,25 @@ fn lost_chunks(flight: &Flight) -> Option<String> {
     Some(text)
 }
 
+/// A recording that begins in the middle of the landing, as a sentence.
+fn late_begin(flight: &Flight) -> Option<String> {
+    // A status that was computed again from the tape may be of before the recording.
+    let landing_ns = flight.landing_ns().filter(|_| !flight.is_rebuilt)?;
+    let firsts = [
+        flight.statuses.first().map(|it| it.stamp_ns),
+        flight.vehicle.first().map(|it| it.stamp_ns),
+        flight.found.first().map(|it| it.message.header.stamp_ns),
+    ];
+    let first_ns = firsts.into_iter().flatten().min()?;
+    let late_s = first_ns.saturating_sub(landing_ns.start) as f64 * 1e-9;
+    (late_s > MAX_LATE_BEGIN_S).then(|| {
+        format!(
+            "the recording begins {late_s:.1} s after the landing began: its numbers are of the rest of the landing, with frames and latency of as \
+             much as the tape has; if it has earlier files, give all of them"
+        )
+    })
+}
+
 /// The gaps of the recording, as sentences.
 pub fn recording(flight: &Flight) -> Vec<String> {
     let mut lines = lost_chunks(flight).into_iter().collect::<Vec<_>>();
@@ -184,6 +206,7 @@ pub fn recording(flight: &Flight) -> Vec<String> {
     } else if !flight.is_ended {
         lines.push("the recording has no end: its recorder was killed, or the rest is cut off; `alight record --repair` writes a copy with an end".to_owned());
     }
+    lines.extend(late_begin(flight));
     let Boot { number, of } = flight.boot;
     if of > 1 {
         lines.push(format!(

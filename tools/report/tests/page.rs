@@ -481,6 +481,33 @@ fn a_repaired_copy_reports_the_damage_of_the_recording_in_time_and_a_few_lines()
 }
 
 #[test]
+fn a_recording_that_begins_in_the_middle_of_the_landing_is_reported() {
+    let recording = &landing().recording;
+    let begun_ns = read(recording).landing_ns().unwrap().start;
+    let from = |late_s: f64| {
+        let about = About { program: "test".to_owned(), facts: BTreeMap::new(), utc_offset_ns: 0 };
+        let mut copy = Vec::new();
+        let mut writer = Writer::new(&mut copy, &about).unwrap();
+        let from_ns = begun_ns + (late_s * 1e9) as i64;
+        flightlog::read(recording, |entry| {
+            if let Entry::Message(message) = entry
+                && message.received_ns >= from_ns
+            {
+                writer.receive(message).unwrap();
+            }
+        })
+        .unwrap();
+        writer.finish().unwrap();
+        summary(&read(&copy)).problems
+    };
+    let late = from(4.0);
+    let number = |text: &str| text.split(' ').nth(3).and_then(|it| it.parse::<f64>().ok());
+    assert!(late[0].starts_with("the recording begins "), "{late:?}");
+    near(number(&late[0]), Some(4.0), 0.3);
+    assert_eq!([from(0.0), summary(&read(recording)).problems], [Vec::<String>::new(), Vec::new()]);
+}
+
+#[test]
 fn of_a_recording_with_two_landings_each_has_its_own_numbers() {
     const LATER_NS: i64 = 100_000_000_000;
     let one = read(&without(&landing().recording, &["controller/tape"]));
