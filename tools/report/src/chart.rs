@@ -389,9 +389,11 @@ fn draw_layer<Backend: DrawingBackend<ErrorType: 'static>>(
             }
         }
         Shape::Area => {
-            let outline: Vec<(f64, f64)> = finite().map(|it| (it.x, it.y)).collect();
-            if outline.len() > 2 {
-                chart.draw_series([Polygon::new(outline, ink.mix(0.2).filled())])?;
+            for run in layer.points.split(|it| !(it.x.is_finite() && it.y.is_finite())) {
+                let outline: Vec<(f64, f64)> = run.iter().map(|it| (it.x, it.y)).collect();
+                if outline.len() > 2 {
+                    chart.draw_series([Polygon::new(outline, ink.mix(0.2).filled())])?;
+                }
             }
         }
         Shape::Dots | Shape::LargeDots => {
@@ -476,6 +478,30 @@ mod tests {
         let kept = thinned(&points, [0.1, 1.0]);
         assert!(kept.len() < 80, "{}", kept.len());
         assert!(kept.contains(&(500.0, 100.0)) && kept.contains(&(999.0, 0.0)));
+    }
+
+    #[test]
+    fn an_area_with_a_gap_is_two_areas() {
+        let piece = |from: f64| [at(from, 0.0), at(from, 1.0), at(from + 2.0, 1.0)];
+        let points: Vec<At> =
+            piece(0.0).into_iter().chain([at(2.0, f64::NAN)]).chain(piece(7.0)).collect();
+        let axes = Axes {
+            x_name: "s".to_owned(),
+            y_name: "m".to_owned(),
+            x: 0.0..9.0,
+            y: 0.0..1.0,
+            is_equal: false,
+        };
+        let chart = Chart {
+            title: "area".to_owned(),
+            axes,
+            bands: Vec::new(),
+            layers: vec![layer("area", Ink::Blue, Shape::Area, points)],
+            rows: Vec::new(),
+            height: 270,
+            note: String::new(),
+        };
+        assert_eq!(chart.svg().unwrap().matches("<polygon").count(), 2);
     }
 
     #[test]

@@ -10,7 +10,7 @@ use crate::flight::Light;
 use crate::frames::Fate;
 use crate::latency::between_ms;
 use crate::track::TrackPoint;
-use crate::view::{View, component, unbridged};
+use crate::view::{View, component, pieces, unbridged};
 
 /// Height of a chart over time, as shown, in pixels.
 const HEIGHT: u32 = 270;
@@ -93,10 +93,16 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
         let x_m = along(it) + sign * SIGMAS * it.deviation_m;
         at(x_m.clamp(x.start, x.end), it.height_m)
     };
-    let left = with_deviation().map(|it| edge(it, -1.0));
-    let right = with_deviation().rev().map(|it| edge(it, 1.0));
+    let with_deviation: Vec<&TrackPoint> = with_deviation().collect();
+    // Each piece is an area of its own.
+    let around = pieces(&with_deviation, |it| it.time_s).into_iter().flat_map(|piece| {
+        let left = piece.iter().map(|it| edge(it, -1.0));
+        let right = piece.iter().rev().map(|it| edge(it, 1.0));
+        left.chain(right).chain([at(f64::NAN, f64::NAN)])
+    });
+    let areas: Vec<At> = around.collect();
     let layers = vec![
-        layer("2 standard deviations", Ink::Blue, Shape::Area, left.chain(right)),
+        layer("2 standard deviations", Ink::Blue, Shape::Area, areas),
         layer("truth", Ink::Orange, Shape::Wide, from_the_side(&truth)),
         layer("estimate", Ink::Blue, Shape::Line, from_the_side(&estimated)),
         layer("pad", Ink::Text, Shape::Crosses, [at(0.0, 0.0)]),
@@ -163,18 +169,15 @@ pub fn height(view: &View<'_>) -> Vec<Chart> {
         layer("truth", Ink::Orange, Shape::Wide, truth(distance)),
         layer("estimate", Ink::Blue, Shape::Line, target(|it| it.lateral_error_m)),
     ];
-    let mut deviation = target(|it| it.deviation_m);
-    if let (Some(first), Some(last)) = (deviation.first().copied(), deviation.last().copied()) {
-        deviation.insert(0, at(first.x, 0.0));
-        deviation.push(at(last.x, 0.0));
-    }
+    let mut deviation = down_to_zero(&target(|it| it.deviation_m));
     let error = view.curve(&view.errors, |it| Some(at(it.time_s, it.horizontal_m)));
     // The large first deviations of the estimate would flatten the rest.
     let max = span(error.iter().map(|it| it.y), 0.0..0.05).end;
     let max = if error.is_empty() { f64::INFINITY } else { 2.0 * max };
     let is_cut = deviation.iter().any(|point| point.y > max);
-    for point in &mut deviation {
-        point.y = point.y.min(max);
+    // A point that is not a number stays one: it is a gap.
+    for point in deviation.iter_mut().filter(|point| point.y > max) {
+        point.y = max;
     }
     let errors = vec![
         layer("claimed standard deviation", Ink::Blue, Shape::Area, deviation),
@@ -193,6 +196,18 @@ pub fn height(view: &View<'_>) -> Vec<Chart> {
         }
     }
     charts
+}
+
+/// The areas between a curve and zero, one for each piece of it.
+fn down_to_zero(curve: &[At]) -> Vec<At> {
+    let mut areas = Vec::with_capacity(curve.len());
+    for piece in curve.split(|it| !it.y.is_finite()) {
+        let (Some(first), Some(last)) = (piece.first(), piece.last()) else { continue };
+        areas.push(at(first.x, 0.0));
+        areas.extend_from_slice(piece);
+        areas.extend([at(last.x, 0.0), at(last.x, f64::NAN)]);
+    }
+    areas
 }
 
 /// Setpoints against the vehicle's response.

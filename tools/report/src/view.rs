@@ -96,22 +96,23 @@ impl<'a> View<'a> {
 
 /// The points of samples, with one that is not a number where samples are missing: no line is drawn there.
 pub fn unbridged<T>(samples: &[T], time_s: impl Fn(&T) -> f64, of: impl Fn(&T) -> At) -> Vec<At> {
-    let between: Vec<f64> = samples
-        .iter()
-        .zip(samples.iter().skip(1))
-        .map(|(it, next)| time_s(next) - time_s(it))
-        .collect();
-    let usual_s = node::stats::quantile(&between, 0.5).unwrap_or(0.0);
-    let max_s = (MAX_GAP_PERIODS * usual_s).max(MIN_GAP_S);
-    let mut drawn = Vec::with_capacity(samples.len());
-    for (index, sample) in samples.iter().enumerate() {
-        let point = of(sample);
-        drawn.push(point);
-        if between.get(index).is_some_and(|gap_s| *gap_s > max_s) {
-            drawn.push(at(point.x, f64::NAN));
-        }
+    let mut drawn: Vec<At> = Vec::with_capacity(samples.len());
+    for piece in pieces(samples, time_s) {
+        drawn.extend(drawn.last().map(|last| at(last.x, f64::NAN)));
+        drawn.extend(piece.iter().map(&of));
     }
     drawn
+}
+
+/// Samples in pieces in which none are missing.
+pub fn pieces<T>(samples: &[T], time_s: impl Fn(&T) -> f64) -> Vec<&[T]> {
+    let between = || {
+        let pairs = samples.iter().zip(samples.iter().skip(1));
+        pairs.map(|(it, next)| time_s(next) - time_s(it))
+    };
+    let usual_s = node::stats::quantile(&between().collect::<Vec<_>>(), 0.5).unwrap_or(0.0);
+    let max_s = (MAX_GAP_PERIODS * usual_s).max(MIN_GAP_S);
+    samples.chunk_by(|it, next| time_s(next) - time_s(it) <= max_s).collect()
 }
 
 /// A component of a vector.

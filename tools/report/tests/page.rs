@@ -257,6 +257,29 @@ fn circles_of_the_deviation_are_whole_and_the_large_ones_are_left_out_aloud() {
 }
 
 #[test]
+fn a_gap_of_the_recording_is_a_gap_of_the_claimed_deviation() {
+    let mut flight = read(&landing().recording);
+    let gap_s = 3.0..6.0;
+    let zero_ns = flight.zero_ns;
+    flight.targets.retain(|it| !gap_s.contains(&((it.stamp_ns - zero_ns) as f64 * 1e-9)));
+    let view = View::new(&flight);
+    let chart = plots::height(&view).pop().unwrap();
+    let claimed = &chart.layers[0];
+    assert_eq!((claimed.name.as_str(), claimed.shape), ("claimed standard deviation", Shape::Area));
+    let pieces = claimed.points.split(|it| !it.y.is_finite()).filter(|it| !it.is_empty());
+    let pieces: Vec<_> = pieces.collect();
+    assert!(pieces.len() >= 2, "{}", pieces.len());
+    for piece in pieces {
+        let [from, to] = [piece[0], piece[piece.len() - 1]];
+        assert!(from.y == 0.0 && to.y == 0.0 && piece.len() > 2, "{from:?} {to:?}");
+        assert!(to.x <= gap_s.start + 0.1 || from.x >= gap_s.end - 0.1, "{from:?} {to:?}");
+    }
+    let from_the_side = plots::landing(&view).pop().unwrap();
+    let areas = &from_the_side.layers[0].points;
+    assert!(areas.split(|it| !it.y.is_finite()).filter(|it| !it.is_empty()).count() >= 2);
+}
+
+#[test]
 fn a_legend_shows_crosses_as_crosses_and_no_dots_hide_others() {
     let flight = read(&landing().recording);
     let html = page(&flight).unwrap();
