@@ -113,6 +113,13 @@ pub struct Handled {
     pub setpoint_ns: Option<i64>,
 }
 
+impl Handled {
+    /// Whether the detector in use searched it during the landing, before the vehicle stood.
+    pub fn is_of_landing(&self) -> bool {
+        !matches!(self.fate, Fate::Standby | Fate::NotNeeded | Fate::OnGround)
+    }
+}
+
 /// All frames that detectors searched.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Frames {
@@ -151,9 +158,7 @@ impl Frames {
 
     /// How many the detector in use searched during the landing, until the vehicle stood.
     pub fn of_landing(&self) -> usize {
-        let is_needed =
-            |fate: &Fate| !matches!(fate, Fate::Standby | Fate::NotNeeded | Fate::OnGround);
-        self.all.iter().filter(|frame| is_needed(&frame.fate)).count()
+        self.all.iter().filter(|frame| frame.is_of_landing()).count()
     }
 
     /// The outcomes of frames, the best first.

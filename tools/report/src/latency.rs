@@ -36,12 +36,12 @@ pub fn between_ms(from_ns: i64, to_ns: i64) -> f64 {
     to_ns.saturating_sub(from_ns) as f64 * 1e-6
 }
 
-/// The budget of the frames whose detector was in use.
+/// The budget of the frames of the landing whose detector was in use.
 pub fn budget(frames: &Frames) -> Vec<Stage> {
     let in_use: Vec<&Handled> = frames
         .all
         .iter()
-        .filter(|it| !matches!(it.fate, Fate::Standby))
+        .filter(|it| it.is_of_landing())
         // A stamp of another clock has no age.
         .filter(|it| (0.0..60_000.0).contains(&between_ms(it.exposed_ns, it.handled_ns)))
         .collect();

@@ -112,7 +112,7 @@ fn height(view: &View<'_>) -> Section {
         section.before.push(missing("truth, so the estimate's error is not known"));
     } else {
         let rows = vec![vec![
-            text("horizontal error of the estimate"),
+            text("horizontal error of the estimate, from the begin of the landing to the touchdown"),
             number(summary.estimate_error_p50_m, 3, "m"),
             number(summary.estimate_error_p95_m, 3, "m"),
         ]];
@@ -209,14 +209,17 @@ fn latency(view: &View<'_>) -> Section {
     let mut section = section(
         "latency",
         "Latency budget",
-        "From mid-exposure of a frame to the setpoint that uses it, stage by stage.",
+        "From mid-exposure of a frame to the setpoint that uses it, stage by stage. The table is of the frames of the landing.",
     );
     let stages = &view.summary.latency;
-    if stages.is_empty() {
+    if view.frames.all.is_empty() {
         section.before.push(missing("detections, so no latency is known"));
         return section;
     }
     section.charts = plots::latency(view);
+    if stages.is_empty() {
+        section.before.push(paragraph("No frame was searched during a landing."));
+    }
     if !view.frames.is_from_tape {
         section.before.push(paragraph(
             "Without the controller's tape the times are those at which the recorder had the detections; setpoints cannot be distinguished.",

@@ -44,7 +44,8 @@ pub struct Summary {
     pub touchdown_lateral_speed_m_s: Option<f64>,
     /// Largest tilt, in degrees: the true one, or that which the autopilot reports.
     pub max_tilt_deg: Option<f64>,
-    /// Median error of the estimated horizontal distance against truth, in metres.
+    /// Median error of the estimated horizontal position against truth from the begin of the landing to the touchdown, in metres;
+    /// without a landing that of the whole recording.
     pub estimate_error_p50_m: Option<f64>,
     /// Its 95th percentile, in metres.
     pub estimate_error_p95_m: Option<f64>,
@@ -101,8 +102,19 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
     let standing = of_landing.skip_while(|it| it.landed != LandedState::InAir);
     let standing_ns =
         standing.skip_while(|it| it.landed != LandedState::OnGround).map(|it| it.stamp_ns).next();
-    let errors_m: Vec<f64> =
-        track::estimate_errors(flight).iter().map(|error| error.horizontal_m).collect();
+    // Neither the climb before the landing nor the time on the ground counts.
+    let in_landing_ns = flight.landing_ns().map(|it| {
+        let down_ns = touchdown.map(|it| it.stamp_ns).or(standing_ns).unwrap_or(it.end);
+        it.start..down_ns.min(it.end)
+    });
+    let is_in_landing = |time_s: f64| {
+        in_landing_ns
+            .as_ref()
+            .is_none_or(|it| (flight.at_s(it.start)..=flight.at_s(it.end)).contains(&time_s))
+    };
+    let errors = track::estimate_errors(flight);
+    let in_landing = errors.iter().filter(|error| is_in_landing(error.time_s));
+    let errors_m: Vec<f64> = in_landing.map(|error| error.horizontal_m).collect();
     let winds: Vec<f64> = flight.wind.iter().map(|wind| norm(wind.velocity_ned_m_s)).collect();
     let phases = phases::of(flight);
     let to_setpoint = latency.iter().find(|stage| stage.name == TO_SETPOINT);

@@ -316,13 +316,17 @@ fn the_numbers_are_those_of_the_flight_itself() {
     assert_eq!(after.filter(unused).count(), 0);
     assert_eq!(found.frames + outside, flight.found.len());
     // Latency: each frame's detections came a modelled time after its exposure.
+    let of_landing: Vec<i64> =
+        frames.all.iter().filter(|it| it.is_of_landing()).map(|it| it.exposed_ns).collect();
     let times: Vec<f64> = flight
         .found
         .iter()
+        .filter(|it| of_landing.contains(&it.message.header.stamp_ns))
         .map(|it| (it.received_ns - it.message.header.stamp_ns) as f64 * 1e-6)
         .collect();
     let stage = found.latency.iter().find(|it| it.name == report::latency::TO_CONTROLLER).unwrap();
     near(Some(stage.p50_ms), node::stats::quantile(&times, 0.5), 1e-6);
+    assert_eq!(stage.frames, found.frames);
     // The controller's own percentiles are of its last 512 frames.
     let published = flight.statuses.iter().rev().find_map(|status| status.latency_ms).unwrap();
     near(found.latency_p50_ms, Some(published[0]), 30.0);
@@ -528,6 +532,28 @@ fn a_recording_that_begins_in_the_middle_of_the_landing_is_reported() {
     assert!(late[0].starts_with("the recording begins "), "{late:?}");
     near(number(&late[0]), Some(4.0), 0.3);
     assert_eq!([from(0.0), summary(&read(recording)).problems], [Vec::<String>::new(), Vec::new()]);
+}
+
+#[test]
+fn errors_of_the_estimate_before_and_after_the_landing_do_not_count() {
+    let flight = read(&landing().recording);
+    let touchdown_ns = flight.truth.iter().find_map(|it| it.touchdown).unwrap().stamp_ns;
+    let landing_ns = flight.landing_ns().unwrap().start..touchdown_ns;
+    let mut wrong = flight.clone();
+    let outside = wrong.targets.iter_mut().filter(|it| !landing_ns.contains(&it.stamp_ns));
+    for target in outside {
+        target.position_ned_m = target.position_ned_m.map(|[north, east, down]| {
+            [north + 50.0, east, down]
+        });
+    }
+    let worst = |flight: &Flight| {
+        report::track::estimate_errors(flight).iter().map(|it| it.horizontal_m).fold(0.0, f64::max)
+    };
+    assert!(worst(&wrong) > 40.0, "no estimate is outside of the landing");
+    let [before, after] = [&flight, &wrong].map(|it| summary(it));
+    assert!(before.estimate_error_p50_m.is_some());
+    assert_eq!(after.estimate_error_p50_m, before.estimate_error_p50_m);
+    assert_eq!(after.estimate_error_p95_m, before.estimate_error_p95_m);
 }
 
 #[test]
