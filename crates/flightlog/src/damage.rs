@@ -89,9 +89,8 @@ impl Counter {
     /// The lost chunks, by the recorder's clock, which is behind the file's times by `utc_offset_ns`.
     pub(crate) fn finish(mut self, utc_offset_ns: i64) -> Lost {
         self.end();
-        let own_ns = |file_ns: u64| {
-            i64::try_from(file_ns).unwrap_or(i64::MAX).saturating_sub(utc_offset_ns)
-        };
+        let own_ns =
+            |file_ns: u64| i64::try_from(file_ns).unwrap_or(i64::MAX).saturating_sub(utc_offset_ns);
         let gaps_ns = self.gaps_ns.into_iter().map(|gap| own_ns(gap.start)..own_ns(gap.end));
         Lost { chunks: self.chunks, of: self.of, gaps_ns: gaps_ns.collect() }
     }
@@ -107,8 +106,7 @@ impl Counter {
         if let Some(more) = damage.len().checked_sub(described.len()).filter(|more| *more > 0) {
             described.push(format!("{more} further parts are damaged"));
         }
-        let gaps_ns: Vec<[u64; 2]> =
-            self.gaps_ns.iter().map(|gap| [gap.start, gap.end]).collect();
+        let gaps_ns: Vec<[u64; 2]> = self.gaps_ns.iter().map(|gap| [gap.start, gap.end]).collect();
         let facts = [
             ("damage", serde_json::to_string(&described).unwrap_or_default()),
             ("lost_chunks", self.chunks.to_string()),

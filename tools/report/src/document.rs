@@ -140,6 +140,7 @@ impl Writer {
 
     fn head(&mut self, letter: &str, summary: &Summary) {
         self.line(&format!("{letter}{}", summary.name), TITLE);
+        self.line(&summary.origin(), SMALL);
         let rgb = match (summary.landed, summary.phase.as_deref()) {
             (Some(true), _) if summary.is_on_the_pad() => GREEN,
             (_, None) => QUIET,

@@ -13,6 +13,7 @@ use messages::{
 
 use replay::{Brightness, Meter};
 
+use crate::origin::Origin;
 use crate::packets::Packets;
 use crate::settings::{self, Difference};
 
@@ -137,6 +138,8 @@ pub struct Flight {
     pub name: String,
     /// Facts about the recording: program, host, clock.
     pub facts: BTreeMap<String, String>,
+    /// When it was recorded, and the size of its files.
+    pub origin: Origin,
     /// Whether its files have their end, and had it before a repair.
     pub is_ended: bool,
     /// Whether a file is the repaired copy of a recording of which a part is lost.
@@ -239,24 +242,34 @@ impl FlightReader {
         let mut lost = BTreeMap::new();
         let mut run = String::new();
         let mut set_s = Vec::new();
+        let mut file_offset_ns: Option<i64> = None;
         let Reading { is_ended, is_repaired, messages, damage, lost: lost_chunks } =
             flightlog::read(recording, |entry| match entry {
                 Entry::About(facts) => {
                     run = facts.get("run").cloned().unwrap_or_default();
+                    let offset_ns = facts.get("utc_offset_ns").and_then(|it| it.parse().ok());
+                    flight.origin.utc_offset_ns = offset_ns.or(flight.origin.utc_offset_ns);
+                    file_offset_ns = offset_ns;
                     flight.facts.extend(facts);
                 }
                 Entry::Dropped(counts) => lost = counts,
                 Entry::Message(message) => {
                     begin.take(message);
+                    flight.origin.take(message);
                     if message.key != tape_key {
                         flight.take(message);
                     } else if let Some(begun_ns) = tapes.take(message.payload) {
                         boot_of_tape.insert(begun_ns, flight.other_boots.len());
                     }
                 }
-                Entry::TimeSet(ahead_ns) => set_s.push(ahead_ns as f64 * 1e-9),
+                Entry::TimeSet(ahead_ns) => {
+                    set_s.push(ahead_ns as f64 * 1e-9);
+                    let set_ns = file_offset_ns.map(|it| it.saturating_add(ahead_ns));
+                    flight.origin.utc_offset_ns = set_ns.or(flight.origin.utc_offset_ns);
+                }
                 Entry::Picture { header, bytes, .. } => flight.see(meter, &header, bytes),
             })?;
+        flight.origin.bytes += recording.len() as u64;
         flight.time_set_s.extend(set_s);
         // Counted since the recorder's start: of its files the last has those before it.
         let so_far = lost_by_run.entry(run).or_default();
@@ -585,6 +598,7 @@ impl Flight {
         self.facts.clone_from(&other.facts);
         self.time_set_s.clone_from(&other.time_set_s);
         self.is_repaired = other.is_repaired;
+        self.origin.clone_from(&other.origin);
         self.damage.clone_from(&other.damage);
         self.lost_chunks.clone_from(&other.lost_chunks);
         self.unreadable.clone_from(&other.unreadable);

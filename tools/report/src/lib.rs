@@ -5,7 +5,7 @@
 //!
 //! Modules in reading order: [`flight`] has the messages of a recording, with the autopilot's [`packets`], and [`landings`] keeps
 //! one landing of it; [`frames`] shows
-//! the outcome of each frame, [`latency`] how long it took, [`light`] how bright the pictures were, [`track`] where the vehicle was,
+//! the outcome of each frame, [`latency`] how long it took, [`light`] how bright the pictures were, [`origin`] when it was recorded, [`track`] where the vehicle was,
 //! [`phases`] and [`journal`] the events and their reasons, [`losses`] the lost messages, [`tape`] whether the tape gives the same again,
 //! and [`mod@summary`] all of it in numbers. [`difference`], over [`settings`], compares configurations. [`view`] joins these for the page:
 //! [`plots`] are its charts, drawn by [`chart`], [`sections`] its parts, in pieces of [`html`], and [`mod@page`] the whole,
@@ -23,6 +23,7 @@ pub mod landings;
 pub mod latency;
 pub mod light;
 pub mod losses;
+pub mod origin;
 pub mod packets;
 pub mod page;
 pub mod pdf;

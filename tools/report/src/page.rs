@@ -87,8 +87,9 @@ fn head(views: &[&View<'_>]) -> String {
         // Writing to a string cannot fail.
         let _ = write!(
             html,
-            "<div class=\"head\"><h2>{letter}{}</h2><p class=\"outcome {mood}\">{}</p>",
+            "<div class=\"head\"><h2>{letter}{}</h2><p class=\"label\">{}</p><p class=\"outcome {mood}\">{}</p>",
             escaped(&summary.name),
+            escaped(&summary.origin()),
             escaped(&summary.outcome())
         );
         html.push_str(&cards(summary));

@@ -32,7 +32,10 @@ fn over_time(view: &View<'_>, title: &str, unit: &str, layers: Vec<Layer>) -> Ch
     Chart {
         title: title.to_owned(),
         axes: Axes {
-            x_name: "time since the landing began, s".to_owned(),
+            x_name: match view.summary.has_landing {
+                true => "time since the landing began, s".to_owned(),
+                false => "time since the recording began, s".to_owned(),
+            },
             y_name: unit.to_owned(),
             x: view.time.clone(),
             y,

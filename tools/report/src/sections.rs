@@ -73,7 +73,14 @@ fn phases(view: &View<'_>) -> Section {
     let mut section = section(
         "phases",
         "Phases and reasons",
-        "The controller's phases, with their reasons. Times count from the begin of the landing.",
+        match view.summary.has_landing {
+            true => {
+                "The controller's phases, with their reasons. Times count from the begin of the landing."
+            }
+            false => {
+                "The controller's phases, with their reasons. Times count from the begin of the recording."
+            }
+        },
     );
     let mut rows = Vec::new();
     for phase in &view.summary.phases {
@@ -112,7 +119,9 @@ fn height(view: &View<'_>) -> Section {
         section.before.push(missing("truth, so the estimate's error is not known"));
     } else {
         let rows = vec![vec![
-            text("horizontal error of the estimate, from the begin of the landing to the touchdown"),
+            text(
+                "horizontal error of the estimate, from the begin of the landing to the touchdown",
+            ),
             number(summary.estimate_error_p50_m, 3, "m"),
             number(summary.estimate_error_p95_m, 3, "m"),
         ]];

@@ -8,6 +8,7 @@ use serde::Serialize;
 use crate::flight::{Flight, Landing};
 use crate::frames::{Fate, Frames};
 use crate::latency::{Stage, TO_SETPOINT, budget};
+use crate::origin::size;
 use crate::{light, losses, phases, track};
 
 /// A flight in numbers. Values that were not recorded are `None`.
@@ -15,6 +16,14 @@ use crate::{light, losses, phases, track};
 pub struct Summary {
     /// The name of its file.
     pub name: String,
+    /// When the landing began, or else the recording, as date and time of UTC.
+    pub begun_utc: Option<String>,
+    /// The time that the recording covers, in seconds.
+    pub recording_s: Option<f64>,
+    /// The size of its files, in bytes.
+    pub recording_bytes: u64,
+    /// Whether the recording has a landing, from whose begin all times count; else they count from the recording's.
+    pub has_landing: bool,
     /// The program that flew it, with its version.
     pub program: Option<String>,
     /// The guidance law.
@@ -126,6 +135,10 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
             }
             None => flight.name.clone(),
         },
+        begun_utc: flight.begun_utc(),
+        recording_s: flight.origin.length_s(),
+        recording_bytes: flight.origin.bytes,
+        has_landing: flight.landing_ns().is_some(),
         program: flight.facts.get("program").cloned(),
         guidance: last.map(|status| status.guidance.clone()),
         phase: last.map(|status| status.phase.name().to_owned()),
@@ -211,6 +224,18 @@ impl Summary {
     /// How far from the pad's centre it touched down, if that is beside the pad.
     fn beside_m(&self) -> Option<f64> {
         self.touchdown_error_m.filter(|error_m| *error_m > Touchdown::MAX_ERROR_M)
+    }
+
+    /// Date, duration and size of the recording, in a line.
+    pub fn origin(&self) -> String {
+        let event = if self.has_landing { "landing" } else { "recording" };
+        let begun = self.begun_utc.as_ref().map(|utc| {
+            let time = utc.replace('T', " ").replace('Z', " UTC");
+            format!("{event} began {time}")
+        });
+        let length = self.recording_s.map(|length_s| format!("{length_s:.0} s recorded"));
+        let size = (self.recording_bytes > 0).then(|| size(self.recording_bytes));
+        [begun, length, size].into_iter().flatten().collect::<Vec<_>>().join(", ")
     }
 
     /// How it ended, in a few words.
