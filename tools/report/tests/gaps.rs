@@ -134,7 +134,7 @@ fn errors_of_the_estimate_before_and_after_the_landing_do_not_count() {
         report::track::estimate_errors(flight).iter().map(|it| it.horizontal_m).fold(0.0, f64::max)
     };
     assert!(worst(&wrong) > 40.0, "no estimate is outside of the landing");
-    let [before, after] = [&flight, &wrong].map(|it| summary(it));
+    let [before, after] = [&flight, &wrong].map(summary);
     assert!(before.estimate_error_p50_m.is_some());
     assert_eq!(after.estimate_error_p50_m, before.estimate_error_p50_m);
     assert_eq!(after.estimate_error_p95_m, before.estimate_error_p95_m);
