@@ -196,7 +196,7 @@ pub fn recording(flight: &Flight) -> Vec<String> {
     let mut lines = lost_chunks(flight).into_iter().collect::<Vec<_>>();
     match flight.damage.as_slice() {
         [first, others @ ..] if others.len() >= MAX_PARTS => lines.push(format!(
-            "{first}; {} further parts are damaged, which the last section lists",
+            "{first}; {} further parts are damaged, listed in the last section of the report",
             others.len()
         )),
         all => lines.extend_from_slice(all),
