@@ -185,8 +185,8 @@ fn late_begin(flight: &Flight) -> Option<String> {
     let late_s = first_ns.saturating_sub(landing_ns.start) as f64 * 1e-9;
     (late_s > MAX_LATE_BEGIN_S).then(|| {
         format!(
-            "the recording begins {late_s:.1} s after the landing began: its numbers are of the rest of the landing, with frames and latency of as \
-             much as the tape has; if it has earlier files, give all of them"
+            "the recording begins {late_s:.1} s after the landing began: the numbers lack earlier data that the tape does not have; if there are \
+             earlier files of it, give all of them"
         )
     })
 }
