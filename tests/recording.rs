@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
-use messages::{Wind, topic};
+use messages::{Phase, Wind, topic};
 use node::{Identity, Network, Node, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
 use testing::{node as node_js, node_passes, ports, python, python_passes, with_second_try};
@@ -215,6 +215,39 @@ async fn a_recorder_of_a_vehicle_without_another_process_warns() -> anyhow::Resu
 async fn a_recorder_that_is_killed_leaves_a_file_and_the_landing_continues() -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     with_second_try(|| kills(3, &[])).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recorder_that_starts_late_gets_the_tape_from_its_beginning() -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
+    with_second_try(late_recorder).await
+}
+
+async fn late_recorder() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let [first, late] = ["first.mcap", "late.mcap"].map(|name| folder.path().join(name));
+    let name = first.to_str().context("a path")?;
+    let mut landing = Landing::start(&["--seed", "5", "--record", name]).await?;
+    landing.descends_below(8.0).await?;
+    let pid = landing.start_by_hand("recorder", &["id=late", &format!("file={late:?}")])?;
+    landing.status("it has landed", |s| s.phase == Phase::Landed).await?;
+    kill_process(pid, Signal::INT)?;
+    let mut recorder = landing.by_hand.pop().context("the late recorder")?;
+    let end = tokio::task::spawn_blocking(move || recorder.wait()).await??;
+    ensure!(end.success(), "the late recorder: {end}");
+    landing.lands().await?;
+    let replay = output_of(Command::new(ALIGHT).arg("replay").arg(&late).arg("--verify"))?;
+    let text = String::from_utf8_lossy(&replay.stdout).into_owned();
+    println!("{text}");
+    ensure!(replay.status.success() && text.contains("verified"), "{text}");
+    // The first recorder does not get what the late one requests.
+    let bytes = std::fs::read(&first)?;
+    let mut reader = flightlog::TapeReader::default();
+    reader.read(&bytes)?;
+    let parts: usize = reader.tapes().iter().map(|tape| tape.parts.len()).sum();
+    let messages = Contents::read(&first)?.channels.get("raw/controller/tape").copied();
+    ensure!(messages == Some(parts as u64), "{messages:?} messages of {parts} parts");
+    Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread")]

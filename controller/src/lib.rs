@@ -40,6 +40,7 @@ pub mod setpoints;
 pub mod stamps;
 pub mod status;
 pub mod tape;
+mod tape_publisher;
 pub mod unreadable;
 pub mod wind;
 pub mod wire;

@@ -1,7 +1,6 @@
 //! The controller's service: joins topics and the autopilot's link to the flight, hands it detections, commands and packets,
 //! and publishes status, target, vehicle state, tape and the autopilot's packets.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
@@ -10,17 +9,17 @@ use autopilot::packet::{MAX_PACKET, is_setpoint};
 use autopilot::signing::Refusals;
 use autopilot::{Address, GivenCommand, Link, LinkEvent, Packet, Parser, Peering, Permission};
 use messages::{
-    CommandReply, ControllerCommand, ControllerStatus, MavlinkBytes, Tape, VehicleState, topic,
+    CommandReply, ControllerCommand, ControllerStatus, MavlinkBytes, VehicleState, topic,
 };
 use node::{BoxFuture, HealthCounters, Node, Publisher, Request, Shutdown, Standstill, now_ns};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
-use tokio::task::JoinHandle;
+use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
 use crate::config::{Config, TICK};
 use crate::flight::Flight;
 use crate::note_file::{LandingFile, NoteFile, PadFile, remove_useless_pads};
 use crate::tape::TapedFlight;
+use crate::tape_publisher::Tapes;
 use crate::unreadable::UnreadableDetections;
 
 /// Longest wait at shutdown for the autopilot to confirm that its parameter is put back, and for the heartbeats, one a second, after
@@ -35,22 +34,8 @@ const VEHICLE_PERIOD_NS: i64 = 18_000_000;
 /// Maximum number of the autopilot's packets that wait for the network; more are dropped, as the flight never
 /// waits.
 const MAX_WAITING_PACKETS: usize = 512;
-/// Period in which the tape is handed over, in nanoseconds; it is earlier when this much of it waits, in bytes.
-const TAPE_PERIOD_NS: i64 = 100_000_000;
-const TAPE_BYTES: usize = 16_000;
-/// Maximum size and number of the parts of the tape that wait for a subscriber, as a recorder may start after the
-/// controller: about ten minutes.
-const MAX_WAITING_TAPE_BYTES: usize = 16 << 20;
-const MAX_WAITING_TAPES: usize = 8192;
-/// Pause before the next check for a subscriber of the tape.
-const SUBSCRIBER_POLL: Duration = Duration::from_millis(100);
-/// Pause between two parts of the tape while further ones wait: sent all at once, some would be dropped, and a recorder
-/// beyond an air link would take the room of its frames.
-const TAPE_PAUSE: Duration = Duration::from_millis(8);
 /// Time for the last packet to be put on the wire.
 const LAST_PACKET: Duration = Duration::from_millis(100);
-/// Time for the waiting parts of the tape at the end.
-const TAPE_END: Duration = Duration::from_millis(200);
 
 /// Runs the service until shutdown.
 ///
@@ -321,77 +306,6 @@ fn send(node: &Node, link: &Link, flight: &mut TapedFlight) {
 fn has_more_other_versions(health: &HealthCounters, so_far: &mut u64) -> bool {
     let refused = health.failures("payload: wrong version");
     std::mem::replace(so_far, refused) < refused
-}
-
-/// Publishes the tape, once there is a subscriber.
-struct Tapes {
-    /// Each part with its share of the room.
-    waiting: mpsc::Sender<(Tape, OwnedSemaphorePermit)>,
-    /// Room for the waiting parts, in bytes.
-    room: Arc<Semaphore>,
-    publishing: JoinHandle<()>,
-    passed_on_ns: i64,
-    /// Whether a part found no room.
-    is_cut: bool,
-    health: Arc<HealthCounters>,
-}
-
-impl Tapes {
-    async fn new(node: &Node) -> anyhow::Result<Self> {
-        let (waiting, mut tapes) = mpsc::channel::<(Tape, _)>(MAX_WAITING_TAPES);
-        let publisher = node.publisher(topic::TAPE, &[]).await?;
-        let publishing = tokio::spawn(async move {
-            while let Some((tape, _share)) = tapes.recv().await {
-                while !publisher.has_subscribers().await {
-                    sleep(SUBSCRIBER_POLL).await;
-                }
-                publisher.publish(&tape).await;
-                if !tapes.is_empty() {
-                    sleep(TAPE_PAUSE).await;
-                }
-            }
-        });
-        let health = node.shared_health();
-        let room = Arc::new(Semaphore::new(MAX_WAITING_TAPE_BYTES));
-        Ok(Self { waiting, room, publishing, passed_on_ns: now_ns(), is_cut: false, health })
-    }
-
-    /// Hands the tape over at its period. Parts without room are missing, which the numbers of later parts show.
-    fn pass_on(&mut self, flight: &mut TapedFlight) {
-        let now = now_ns();
-        let is_due = now.saturating_sub(self.passed_on_ns) >= TAPE_PERIOD_NS;
-        if !is_due && flight.waiting_bytes() < TAPE_BYTES {
-            return;
-        }
-        self.passed_on_ns = now;
-        let Some(tape) = flight.take_tape() else { return };
-        if !self.has_kept(tape) {
-            self.health.dropped("parts of the tape");
-            if !std::mem::replace(&mut self.is_cut, true) {
-                tracing::info!(
-                    "No recorder, or one that is too slow: a recording from now on cannot be replayed from the start"
-                );
-            }
-        }
-    }
-
-    /// Keeps a part until it is published; false when there is no room.
-    fn has_kept(&self, tape: Tape) -> bool {
-        let bytes = u32::try_from(tape.records.len()).unwrap_or(u32::MAX);
-        let share = Arc::clone(&self.room).try_acquire_many_owned(bytes);
-        share.is_ok_and(|share| self.waiting.try_send((tape, share)).is_ok())
-    }
-
-    /// Publishes the waiting parts, if there is a subscriber.
-    async fn end(mut self, flight: &mut TapedFlight) {
-        self.passed_on_ns = i64::MIN;
-        self.pass_on(flight);
-        drop(self.waiting);
-        let publishing = self.publishing.abort_handle();
-        if timeout(TAPE_END, self.publishing).await.is_err() {
-            publishing.abort();
-        }
-    }
 }
 
 /// Publishes status, vehicle state and the autopilot's packets.

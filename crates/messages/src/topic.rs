@@ -26,7 +26,8 @@ pub enum Delivery {
     LastValue,
     /// A dialogue: every message in order, within the bounds of the queues.
     Reliable,
-    /// A record for later: as `Reliable`, with lower priority than all traffic that is needed now.
+    /// A record for later: as `Reliable`, with lower priority than all traffic that is needed now; a late recorder gets the earlier
+    /// messages as well.
     Record,
     /// A request with one reply.
     Query,

@@ -7,7 +7,8 @@
 //! service from start to shutdown; [`network`] configures the network, its `endpoint`s and, from [`access`], the rights of
 //! others by their [`certificate`]s and the `cipher` of links, and [`session`] joins it under an [`identity`], for a tool
 //! unless `foreign` programs answer there (`reach` finds why no process does), with shared memory where `memory` allows it;
-//! [`topics`] has typed messages and commands, with their `sender`, [`frames`] pixels, and [`tap`] all messages as bytes;
+//! [`topics`] has typed messages and commands, with their `sender`, [`frames`] pixels, and [`tap`] all messages as bytes, to which
+//! `earlier` sends those from before it;
 //! [`health`] counts, with [`stats`]; [`denied`] counts denials of access control; [`clock`] is the host's clock,
 //! [`standstill`] detects that a process was frozen, [`state`] is the folder of data that survive a reboot, and
 //! [`version`](mod@version) the version of the program.
@@ -20,6 +21,7 @@ mod cipher;
 pub mod clock;
 pub mod config;
 pub mod denied;
+mod earlier;
 mod endpoint;
 mod foreign;
 pub mod frames;
@@ -46,6 +48,7 @@ pub use config::{
     Check, ConfigError, Effective, Layers, Settings, changed, from_toml, named, read_text, to_toml,
     without_credentials,
 };
+pub use earlier::{EarlierRequest, EarlierRequests};
 pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
 pub use health::HealthCounters;
 pub use identity::Identity;

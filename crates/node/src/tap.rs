@@ -7,18 +7,22 @@ use std::time::Duration;
 
 use anyhow::anyhow;
 use messages::{Delivery, Row};
+use tokio::task::JoinSet;
+use zenoh::query::Querier;
 use zenoh::sample::Sample;
 
 use crate::boxed::BoxFuture;
 use crate::clock::now_ns;
 use crate::health::HealthCounters;
 use crate::session::Node;
-use crate::topics::{REPLY_TIMEOUT, with_query_qos};
+use crate::topics::{REPLY_TIMEOUT, with_query_qos, with_record_qos};
 
 /// Maximum number of messages that wait.
 const MAX_WAITING: usize = 16_384;
 /// Maximum number of keys whose losses are counted one by one.
 const MAX_KEYS: usize = 1024;
+/// Longest time in which the earlier messages of a record are received: a controller sends those of ten minutes in one.
+const EARLIER_TIMEOUT: Duration = Duration::from_secs(180);
 /// The name under which the losses of further keys are counted.
 const OTHER_KEYS: &str = "other keys";
 
@@ -41,6 +45,8 @@ pub struct Tapped {
 pub struct Tap {
     shared: Arc<Shared>,
     _subscribers: Vec<zenoh::pubsub::Subscriber<()>>,
+    /// Those that receive the earlier messages of records.
+    _earlier: JoinSet<()>,
 }
 
 struct Shared {
@@ -66,7 +72,9 @@ impl Tapped {
 
 impl Node {
     /// Receives all messages of some topics, of which up to `max_bytes` may wait. Frames are copied as they arrive,
-    /// so that none of the shared memory is held.
+    /// so that none of the shared memory is held. Of a state the last value is received first; of a record the earlier
+    /// messages as well, as far as its publisher has them, next to the new ones. One that is published at that moment may be
+    /// received twice.
     ///
     /// # Errors
     /// When the session is closed.
@@ -78,6 +86,7 @@ impl Node {
         Box::pin(async move {
             let shared = Arc::new(Shared::new(max_bytes, self.shared_health()));
             let mut subscribers = Vec::new();
+            let mut earlier = JoinSet::new();
             for row in topics {
                 let key = pattern(row.key);
                 let is_state = row.delivery == Delivery::LastValue;
@@ -100,9 +109,31 @@ impl Node {
                     let query = with_query_qos(self.session.get(&key)).timeout(REPLY_TIMEOUT);
                     drop(query.callback(reply).await);
                 }
+                if row.delivery == Delivery::Record {
+                    let querier = with_record_qos(self.session.declare_querier(key.clone()));
+                    let querier = querier.timeout(EARLIER_TIMEOUT).await;
+                    let querier = querier.map_err(|cause| anyhow!("querying {key}: {cause}"))?;
+                    earlier.spawn(take_earlier(querier, Arc::clone(&shared)));
+                }
             }
-            Ok(Tap { shared, _subscribers: subscribers })
+            Ok(Tap { shared, _subscribers: subscribers, _earlier: earlier })
         })
+    }
+}
+
+/// Takes the earlier messages of a record once, as soon as its publisher is there: later it is of no use, as all are received.
+async fn take_earlier(querier: Querier<'static>, shared: Arc<Shared>) {
+    let Ok(changes) = querier.matching_listener().await else { return };
+    while !querier.matching_status().await.is_ok_and(|status| status.matching()) {
+        if changes.recv_async().await.is_err() {
+            return;
+        }
+    }
+    let Ok(replies) = querier.get().await else { return };
+    while let Ok(reply) = replies.recv_async().await {
+        if let Ok(sample) = reply.result() {
+            shared.take(sample, false);
+        }
     }
 }
 
@@ -198,7 +229,11 @@ mod tests {
 
     #[test]
     fn a_read_message_makes_room() {
-        let tap = Tap { shared: Arc::new(Shared::new(8, Arc::default())), _subscribers: vec![] };
+        let tap = Tap {
+            shared: Arc::new(Shared::new(8, Arc::default())),
+            _subscribers: vec![],
+            _earlier: JoinSet::new(),
+        };
         let message = Tapped { key: "wind".into(), payload: vec![1; 4], ..Tapped::default() };
         for _ in 0..3 {
             assert!(tap.shared.reserve("wind", message.bytes()));

@@ -16,7 +16,7 @@ use messages::{DecodeError, Delivery, Message, Row, Topic, decode, encode};
 use zenoh::bytes::ZBytes;
 use zenoh::handlers::{RingChannel, RingChannelHandler};
 use zenoh::qos::{CongestionControl, Priority};
-use zenoh::query::{Query, Queryable};
+use zenoh::query::{ConsolidationMode, QuerierBuilder, Query, Queryable};
 use zenoh::sample::Sample;
 use zenoh::session::SessionGetBuilder;
 
@@ -40,7 +40,7 @@ const ASKS_TIME: &[u8] = b"time?";
 /// A mailbox of messages that are published on the keys that match.
 pub(crate) type SampleMailbox = zenoh::pubsub::Subscriber<RingChannelHandler<Sample>>;
 /// A mailbox of queries on a key.
-type QueryMailbox = Queryable<RingChannelHandler<Query>>;
+pub(crate) type QueryMailbox = Queryable<RingChannelHandler<Query>>;
 
 /// Publishes messages of one type on one key.
 pub struct Publisher<M> {
@@ -253,7 +253,11 @@ impl Node {
         Ok(Commands { queryable, health: self.shared_health(), message: PhantomData })
     }
 
-    fn queryable(&self, key: String, depth: usize) -> BoxFuture<'_, anyhow::Result<QueryMailbox>> {
+    pub(crate) fn queryable(
+        &self,
+        key: String,
+        depth: usize,
+    ) -> BoxFuture<'_, anyhow::Result<QueryMailbox>> {
         Box::pin(async move {
             self.session
                 .declare_queryable(key.clone())
@@ -359,6 +363,14 @@ fn unconfirmed(key: &str, waited: Duration) -> anyhow::Error {
          give it again",
         recipient(key)
     )
+}
+
+/// Queries for earlier messages of a record, each of which is a reply, with the quality of service of the record.
+pub(crate) fn with_record_qos<'a, 'b>(querier: QuerierBuilder<'a, 'b>) -> QuerierBuilder<'a, 'b> {
+    let Qos { priority, congestion, .. } = qos(Delivery::Record);
+    let querier = querier.priority(priority).congestion_control(congestion);
+    // Otherwise only the last reply on a key arrives.
+    querier.consolidation(ConsolidationMode::None)
 }
 
 fn nanoseconds(ns: i64) -> Duration {

@@ -110,15 +110,12 @@ fn the_access_rules_allow_exactly_the_rights_of_the_topic_table() -> anyhow::Res
             let messages: &[&str] = match row.delivery {
                 Delivery::Query if is_reply(row) => &["declare_queryable", "reply"],
                 Delivery::Query => &["query"],
-                Delivery::LastValue => &["put", "declare_queryable", "reply"],
-                Delivery::Latest
-                | Delivery::LatestPriority
-                | Delivery::Reliable
-                | Delivery::Record => &["put"],
+                Delivery::LastValue | Delivery::Record => &["put", "declare_queryable", "reply"],
+                Delivery::Latest | Delivery::LatestPriority | Delivery::Reliable => &["put"],
             };
-            // A subscriber queries the last value.
+            // A subscriber queries the last value, and the earlier messages of a record.
             let receiving: &[&str] = match row.delivery {
-                Delivery::LastValue => &["declare_subscriber", "query"],
+                Delivery::LastValue | Delivery::Record => &["declare_subscriber", "query"],
                 _ => &["declare_subscriber"],
             };
             let sending = messages.iter().map(|message| (message, stated));
@@ -147,7 +144,9 @@ fn every_access_rule_has_a_row_in_the_topic_table() -> anyhow::Result<()> {
                 .iter()
                 .filter(|row| match message.as_str() {
                     "declare_subscriber" => subscribes(row, service),
-                    "query" if row.delivery == Delivery::LastValue => subscribes(row, service),
+                    "query" if matches!(row.delivery, Delivery::LastValue | Delivery::Record) => {
+                        subscribes(row, service)
+                    }
                     _ => row.publishers.contains(&service),
                 })
                 .map(|row| key_on_the_wire(row, service))

@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use anyhow::{Context, anyhow};
 use messages::{
-    CommandReply, ControllerCommand, FrameHeader, MavlinkBytes, Wind, decode, encode, topic,
+    CommandReply, ControllerCommand, FrameHeader, MavlinkBytes, TOPICS, Tape, Wind, decode, encode,
+    topic,
 };
 use node::{FramePublisher, FrameSubscriber, Identity, Node, ZenohSource, clock_name, now_ns};
 use testing::ports;
@@ -417,4 +418,32 @@ impl Foreign {
     async fn put(&self, key: &str, bytes: &[u8]) -> anyhow::Result<()> {
         self.session.put(key, bytes).await.map_err(|cause| anyhow!("{cause}"))
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_tap_gets_each_earlier_message_of_a_record_once_its_publisher_is_there()
+-> anyhow::Result<()> {
+    let port = free_port()?;
+    let recorder = open("recorder", "late", port).await?;
+    let rows: Vec<_> = TOPICS.iter().copied().filter(|row| row.key == "controller/tape").collect();
+    let tap = recorder.tap(&rows, 1_000_000).await?;
+    let controller = open("controller", "main", port).await?;
+    let requests = controller.earlier_requests(topic::TAPE).await?;
+    let request = timeout(PATIENCE, requests.next()).await?.context("a request")?;
+    for first in 0..600 {
+        request.send(&Tape { first, ..Tape::default() }).await?;
+        // As the controller pauses: sent all at once, some are dropped.
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    let mut firsts = Vec::new();
+    while firsts.len() < 600 {
+        let message = tokio::task::block_in_place(|| tap.next(PATIENCE)).context("a message")?;
+        assert_eq!(message.key, "controller/tape");
+        firsts.push(decode::<Tape>(&message.payload)?.first);
+    }
+    assert_eq!(firsts, Vec::from_iter(0..600));
+    // A second request would double the messages.
+    drop(request);
+    assert!(timeout(Duration::from_millis(300), requests.next()).await.is_err());
+    Ok(())
 }
