@@ -36,6 +36,9 @@ async fn others_read_a_landing() -> anyhow::Result<()> {
     println!("{}", result["recording"]);
     println!("{}", result["processes"]);
     let contents = Contents::read(&file)?;
+    let as_received = contents.channels.iter().filter(|(name, _)| name.starts_with("raw/"));
+    let as_received: u64 = as_received.map(|(_, count)| *count).sum();
+    ensure!(result["recording"]["kept"] == as_received, "{as_received} of {}", result["recording"]);
     for channel in [
         "camera/down/frame",
         "camera/down/picture",

@@ -17,7 +17,7 @@ use node::{Layers, Network, Node, Shutdown, read_text};
 use rustix::io::Errno;
 use rustix::process::{Pid, test_kill_process};
 use tempfile::TempDir;
-use tokio::time::Instant;
+use tokio::time::{Instant, timeout_at};
 
 use crate::args::{Format, OPERATOR, WrongUse, address, meet_port, source_of, whole_number};
 use crate::children::{ChildEvent, Children, options_for_shell};
@@ -118,6 +118,11 @@ const INFO_TIMEOUT: Duration = Duration::from_millis(1500);
 
 /// Time after the landing for the last messages of the services.
 const AFTER_LANDING: Duration = Duration::from_millis(1200);
+
+/// Longest time between two statuses of a recorder that has ended, which are received after that.
+const LAST_STATUS: Duration = Duration::from_millis(200);
+/// Longest time for all of them.
+const LAST_STATUSES: Duration = Duration::from_secs(1);
 
 /// Lands, and prints the result.
 pub(crate) fn run(args: &LandArgs) -> anyhow::Result<ExitCode> {
@@ -363,7 +368,7 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     }
     let deadline = Instant::now() + Duration::from_secs_f64(args.timeout_s);
     let limits = Limits { shutdown, deadline };
-    let watched = watch(&node, settings, &mut children, &resume, &mut progress, limits).await;
+    let mut watched = watch(&node, settings, &mut children, &resume, &mut progress, limits).await;
     progress.finish();
     let mut recorders_end = None;
     let mut recorders_word = None;
@@ -379,7 +384,20 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     // The controller stops while the autopilot and the recorder still take its last messages, and the recorder last.
     children.stop_one(&Service::Controller, &mut note_end).await;
     children.stop_all_but(&Service::Recorder, &mut note_end).await;
+    let recorders = node.subscriber(topic::RECORDER_STATUS, &[]).await;
     children.stop(note_end).await;
+    if let Ok(landing) = &mut watched
+        && let Ok(recorders) = recorders
+        && settings.recorder().is_ok_and(|it| it.is_some())
+    {
+        // The last one has the final numbers and the last file.
+        let until = Instant::now() + LAST_STATUSES;
+        while let Ok(Some(status)) =
+            timeout_at(until.min(Instant::now() + LAST_STATUS), recorders.next()).await
+        {
+            landing.recorder(status);
+        }
+    }
     // In a user's own network, and in parallel to another landing, detectors may be meant to continue.
     if args.zenoh.is_none()
         && rendezvous.unusual_port.is_none()
@@ -476,6 +494,9 @@ async fn watch(
                     };
                     progress.say(&format!("{} exited: {exit}{consequence}", service.name()));
                     if service == Service::Recorder {
+                        while let Some(recorder) = recorders.waiting() {
+                            landing.recorder(recorder);
+                        }
                         landing.recording_ended_early(&exit);
                     }
                     if service == Service::Controller {

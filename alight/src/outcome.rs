@@ -32,6 +32,8 @@ pub(crate) struct LandingSummary {
     /// Detections used by earlier controllers.
     detections_before: u64,
     recorder: Option<RecorderStatus>,
+    /// The last file that has taken bytes.
+    recorded_file: String,
     /// How the recorder exited before it was to, or with an error.
     recorders_exit: Option<Exit>,
     /// The error with which it exited at the end, from its standard error.
@@ -186,11 +188,15 @@ impl LandingSummary {
         if self.recorded_by.as_ref().is_some_and(|ours| !ours.published(&recorder)) {
             return;
         }
-        // A recorder that fails continues without a file; its recorded messages are in the last one.
+        if recorder.bytes > 0 {
+            self.recorded_file.clone_from(&recorder.file);
+        }
         let before = self.recorder.replace(recorder).map(|before| before.file);
         if let (Some(now), Some(before)) = (&mut self.recorder, before) {
             if now.file.is_empty() {
-                now.file = before;
+                // A recorder that fails continues without a file; its recorded messages are in the last one that has taken any. One
+                // that has not, as on a full disk, is removed.
+                now.file.clone_from(&self.recorded_file);
             } else if !before.is_empty() && now.file != before {
                 // Another one has taken its place.
                 self.recorders_exit = None;
@@ -682,6 +688,25 @@ mod tests {
         let mut beside = landed(LandingSummary::default());
         beside.recorder(losing("wind"));
         assert!(is_done(&beside), "it is another's recording");
+    }
+
+    #[test]
+    fn a_file_that_a_full_disk_does_not_take_is_not_the_recording() {
+        let ours = OurRecorder { name: "main".into(), file: "f.mcap".into() };
+        let mut landing = LandingSummary::recorded_by(ours);
+        let reported = |file: &str, bytes: u64| RecorderStatus {
+            recorder: "main".into(),
+            file: file.into(),
+            bytes,
+            problem: file.is_empty().then(|| "No space left".to_owned()),
+            ..RecorderStatus::default()
+        };
+        for status in [reported("f.mcap", 900), reported("", 0), reported("f-2.mcap", 0)] {
+            landing.recorder(status);
+        }
+        landing.recorder(reported("", 0));
+        let table = landing.outcome().table();
+        assert!(table.contains(": f.mcap; No space left"), "{table}");
     }
 
     #[test]

@@ -113,6 +113,9 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     }
     is_over.store(true, Ordering::Relaxed);
     let ended = tokio::task::spawn_blocking(move || thread.join()).await?;
+    // With the last messages and the end of the file.
+    let last = status.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    publisher.publish(&RecorderStatus { stamp_ns: now_ns(), ..last }).await;
     if let Some(warning) = alone.warning() {
         tracing::warn!("{warning}");
     }
@@ -522,9 +525,30 @@ impl Recorder {
         status.free_bytes = None;
     }
 
-    /// Ends the file, and waits for the disk until then.
-    fn end(self, until: Instant) -> anyhow::Result<()> {
-        let last = match self.recording {
+    /// Ends the file, waits for the disk until then, and states the result in the status.
+    fn end(mut self, until: Instant) -> anyhow::Result<()> {
+        let ended = self.end_files(until);
+        let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
+        (status.kept, status.dropped) = (self.kept.list(), self.lost.list());
+        let earlier = status.problem.take();
+        status.problem = ended.as_ref().err().map(|error| earlier.unwrap_or(format!("{error:#}")));
+        drop(status);
+        ended?;
+        // Without a file only viewers missed them, to which they were reported.
+        let is_lost = |(key, _): &(&String, &u64)| self.config.has_file() && !has_never_come(key);
+        let lost: Vec<_> = self.lost.0.iter().filter(is_lost).collect();
+        let keys: Vec<_> = lost.iter().map(|(key, count)| format!("{count} of {key}")).collect();
+        let count: u64 = lost.iter().map(|(_, count)| **count).sum();
+        ensure!(
+            count == 0,
+            "{count} messages came and are in no file, as the recording counts them: {}",
+            keys.join(", ")
+        );
+        Ok(())
+    }
+
+    fn end_files(&mut self, until: Instant) -> anyhow::Result<()> {
+        let last = match self.recording.take() {
             Some(mut recording) => {
                 recording.writer.dropped(now_ns(), &self.lost.0)?;
                 Some(recording.end()?)
@@ -532,10 +556,16 @@ impl Recorder {
             None => None,
         };
         let is_missing = self.config.has_file() && last.is_none() && self.ending.is_none();
-        for ending in self.ending.into_iter().chain(last) {
+        for ending in self.ending.take().into_iter().chain(last) {
             let disk = ending.wait(until.saturating_duration_since(Instant::now()));
+            let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
+            status.file =
+                disk.path.as_ref().map_or_else(String::new, |it| it.display().to_string());
+            (status.bytes, status.waiting_bytes) = (disk.bytes, disk.waiting_bytes as u64);
+            drop(status);
             let name = disk.path.as_ref().unwrap_or(&self.config.file);
             if let Some(problem) = disk.problem {
+                self.count_unsynced(ending.unsynced());
                 bail!(
                     "the end of the recording is missing: {problem}; `alight record --repair` ends its file"
                 );
@@ -547,19 +577,9 @@ impl Recorder {
             tracing::info!(file = %name.display(), bytes = disk.bytes, messages = self.kept.total(), "Recorded");
         }
         ensure!(!is_missing, "nothing could be recorded at the end; see the log above");
-        if let Some(problem) = self.end_problem {
+        if let Some(problem) = &self.end_problem {
             bail!("{problem}");
         }
-        // Without a file only viewers missed them, to which they were reported.
-        let is_lost = |(key, _): &(&String, &u64)| self.config.has_file() && !has_never_come(key);
-        let lost: Vec<_> = self.lost.0.iter().filter(is_lost).collect();
-        let keys: Vec<_> = lost.iter().map(|(key, count)| format!("{count} of {key}")).collect();
-        let count: u64 = lost.iter().map(|(_, count)| **count).sum();
-        ensure!(
-            count == 0,
-            "{count} messages came and are in no file, as the recording counts them: {}",
-            keys.join(", ")
-        );
         Ok(())
     }
 }
@@ -615,6 +635,25 @@ mod tests {
             it.config.file = std::path::PathBuf::new();
         })
         .unwrap();
+    }
+
+    #[test]
+    fn the_last_status_has_every_message_and_the_file_that_was_ended() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut recorder = recorder(&folder);
+        let status = Arc::clone(&recorder.status);
+        recorder.look_after_file();
+        for _ in 0..3 {
+            recorder.take(Tapped { key: "wind".to_owned(), ..Tapped::default() });
+        }
+        recorder.lost.add("truth", 2);
+        drop(recorder.end(Instant::now() + Duration::from_secs(20)));
+        let status = status.lock().unwrap();
+        let file = folder.path().join("flight.mcap");
+        assert_eq!((status.total_kept(), status.lost()), (3, 2));
+        assert_eq!(status.file, file.display().to_string());
+        assert_eq!((status.bytes, status.waiting_bytes), (file.metadata().unwrap().len(), 0));
+        assert_eq!(status.problem, None);
     }
 
     #[test]
