@@ -281,13 +281,13 @@ fn change_text(change: &Change) -> String {
         return match change.other_outputs {
             0 => "no decision is another one".to_owned(),
             count => format!(
-                "no decision is another one; packets for the autopilot or replies are, after {count} of {} events",
+                "no decision is another one; packets for the autopilot or replies are, at {count} of {} events",
                 change.end.events
             ),
         };
     };
     format!(
-        "other decisions after {} of {} events, the first at {first_s:.3} s; another phase after {}\n\
+        "other decisions at {} of {} events, the first at {first_s:.3} s; another phase at {} events\n\
          velocity setpoints differ by {:.3} m/s at most, {:.3} m/s root mean square; the estimated landing point by {:.3} m at most",
         change.different,
         change.end.events,
@@ -316,6 +316,15 @@ mod tests {
         for marker in ["rings", "stag-hd23:4"] {
             assert!(!compared(&searched(marker)).contains("looks for"), "{marker}");
         }
+    }
+
+    #[test]
+    fn other_decisions_are_counted_by_the_events_at_which_they_are() {
+        let change =
+            Change { different: 3, first_s: Some(1.5), other_phase: 2, ..Change::default() };
+        let text = change_text(&change);
+        assert!(text.contains("other decisions at 3 of 0 events"), "{text}");
+        assert!(text.contains("another phase at 2 events"), "{text}");
     }
 
     #[test]

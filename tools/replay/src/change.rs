@@ -29,13 +29,13 @@ pub struct Change {
     pub end: End,
     /// The phases of the replay with their reasons.
     pub phases: Vec<Begun>,
-    /// Events after which the decision is another one.
+    /// Events at which the decision is another one.
     pub different: u64,
     /// When the first of them was, since the begin, in seconds.
     pub first_s: Option<f64>,
-    /// Events after which the packets for the autopilot or the reply are other ones, and the decision is the same.
+    /// Events at which the packets for the autopilot or the reply are other ones, and the decision is the same.
     pub other_outputs: u64,
-    /// Events after which the phase is another one.
+    /// Events at which the phase is another one.
     pub other_phase: u64,
     /// Greatest difference of the velocity setpoints, where there are both, in m/s.
     pub max_velocity_m_s: f64,
