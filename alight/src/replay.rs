@@ -184,10 +184,17 @@ fn compared(searched: &Searched) -> String {
         value.map_or("-".to_owned(), |it| format!("{it:.digits$} {unit}"))
     };
     let mut rows = vec![["".into(), "then".into(), "now".into()]];
+    let looked_for = |markers: &[String]| match markers {
+        [] => "-".to_owned(),
+        markers => markers.join(", "),
+    };
+    let [looked_for_then, looked_for_now] =
+        [&searched.looked_for_then, &searched.looked_for].map(|it| looked_for(it));
+    rows.push(["markers that were searched".into(), looked_for_then, looked_for_now]);
     let mut row = |name: &str, of: &dyn Fn(&replay::frames::Found) -> String| {
         rows.push([name.into(), of(then), of(now)]);
     };
-    row("marker", &|it| it.marker.clone());
+    row("marker of the landing", &|it| it.marker.clone());
     row("found", &|it| fraction(it.frames, searched.searched));
     if let Some(showing) = searched.showing_the_pad {
         row("found in flight, pad in the picture", &|it| fraction(it.visible, showing));
@@ -316,6 +323,21 @@ mod tests {
         for marker in ["rings", "stag-hd23:4"] {
             assert!(!compared(&searched(marker)).contains("looks for"), "{marker}");
         }
+    }
+
+    #[test]
+    fn the_markers_that_were_searched_are_shown_next_to_that_of_the_landing() {
+        let found = || replay::frames::Found { marker: "rings".to_owned(), ..Default::default() };
+        let text = compared(&Searched {
+            looked_for_then: vec!["rings:0.15341".to_owned()],
+            looked_for: vec!["apriltag-36h11:7:0.15".to_owned()],
+            then: found(),
+            now: found(),
+            ..Searched::default()
+        });
+        let row = text.lines().find(|line| line.starts_with("markers that were searched"));
+        let words: Vec<_> = row.unwrap_or_default().split_whitespace().skip(4).collect();
+        assert_eq!(words, ["rings:0.15341", "apriltag-36h11:7:0.15"], "{text}");
     }
 
     #[test]

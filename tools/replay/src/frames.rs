@@ -65,6 +65,8 @@ pub struct Searched {
     pub detector: String,
     /// Its camera.
     pub camera: String,
+    /// The markers and pads that were looked for then, by the recorded configuration.
+    pub looked_for_then: Vec<String>,
     /// The markers and pads that are looked for now.
     pub looked_for: Vec<String>,
     /// Whether the pictures lost something when they were recorded (JPEG).
@@ -194,6 +196,8 @@ pub fn search(
     ensure!(!then.is_empty(), "the recording has no detections of the detector `{name}`");
     let info = facts.cameras.get(&config.camera).cloned();
     let looked_for = config.looked_for().map_err(anyhow::Error::msg)?;
+    let recorded = Again { detector: again.detector.clone(), ..Again::default() };
+    let looked_for_then = facts.detector(&recorded)?.looked_for().map_err(anyhow::Error::msg)?;
     let mut frames = Frames {
         camera: config.camera.clone(),
         search: Search::new(&config).map_err(anyhow::Error::msg)?,
@@ -206,6 +210,7 @@ pub fn search(
         searched: Searched {
             detector: name.clone(),
             camera: config.camera,
+            looked_for_then,
             looked_for,
             then: Found { marker: facts.marker(tapes, &[])?, ..Found::default() },
             now: Found { marker: facts.marker(tapes, &again.of_controller)?, ..Found::default() },

@@ -213,6 +213,7 @@ fn a_pad_that_is_looked_for_is_named_as_the_controller_names_it() {
     let searched =
         again(recording(pixels), &Again { of_detector: set.to_vec(), ..Again::default() }).unwrap();
     assert_eq!(searched.looked_for, ["rings:0.15341", "pad:0"]);
+    assert_eq!(searched.looked_for_then, [format!("aruco-4x4-50:7:{SIZE_M}")]);
 }
 
 #[test]
