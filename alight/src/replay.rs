@@ -3,7 +3,7 @@
 
 mod live;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Instant;
@@ -103,9 +103,17 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     args.check()?;
     let mut reader = TapeReader::default();
     let mut recordings = Vec::new();
+    let mut files_of = BTreeMap::<i64, Vec<String>>::new();
     for file in &args.files {
         let recording = std::fs::read(file).with_context(|| format!("reading {file:?}"))?;
         reader.read(&recording).with_context(|| format!("{file:?} is no recording (MCAP file)"))?;
+        if args.files.len() > 1 {
+            let mut only = TapeReader::default();
+            only.read(&recording)?;
+            for tape in only.tapes() {
+                files_of.entry(tape.begun_ns).or_default().push(file.display().to_string());
+            }
+        }
         if args.live || args.from == From::Frames {
             recordings.push(recording);
         }
@@ -136,7 +144,10 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
         "there is no tape of a controller in {:?}; `alight land --record` and `alight record` keep it",
         args.files
     );
-    for tape in &tapes {
+    for (index, tape) in tapes.iter().enumerate() {
+        if tapes.len() > 1 {
+            print(&heading(index + 1, tapes.len(), files_of.get(&tape.begun_ns)))?;
+        }
         is_complete &= one(tape, args, &again.of_controller)?;
     }
     Ok(if is_complete { ExitCode::SUCCESS } else { ExitCode::FAILURE })
@@ -228,6 +239,12 @@ fn compared(searched: &Searched) -> String {
         ));
     }
     text
+}
+
+/// The heading of one of several tapes, with the files that have parts of it, if there are several files.
+fn heading(number: usize, count: usize, files: Option<&Vec<String>>) -> String {
+    let files = files.map_or_else(String::new, |files| format!(", in {}", files.join(" and ")));
+    format!("Tape {number} of {count}{files}:")
 }
 
 /// Replays one controller's tape; true when nothing is wrong with it.
@@ -347,6 +364,13 @@ mod tests {
         let text = change_text(&change);
         assert!(text.contains("other decisions at 3 of 0 events"), "{text}");
         assert!(text.contains("another phase at 2 events"), "{text}");
+    }
+
+    #[test]
+    fn each_of_several_tapes_has_a_heading_with_its_files() {
+        let files = vec!["a.mcap".to_owned(), "a-2.mcap".to_owned()];
+        assert_eq!(heading(1, 2, Some(&files)), "Tape 1 of 2, in a.mcap and a-2.mcap:");
+        assert_eq!(heading(2, 2, None), "Tape 2 of 2:");
     }
 
     #[test]
