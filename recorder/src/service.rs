@@ -333,6 +333,13 @@ impl Recorder {
             self.health.dropped_times("frames that never came", count);
             self.lost.add(&key, count);
         }
+        for key in self.unseen.doubled() {
+            self.health.failed("frames of two publishers with one camera name");
+            tracing::warn!(
+                %key,
+                "The numbers of the frames alternate between two sequences: two publishers use this camera name. Give each camera its own name (`id`)"
+            );
+        }
     }
 
     /// The header of a frame, whose number is looked at; `None` for any other message.

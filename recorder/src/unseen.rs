@@ -1,5 +1,5 @@
 //! Counts frames that were never received, by their numbers: a recorder that had no processor for a while does not see which were lost on
-//! the way to it.
+//! the way to it. Detects two publishers with the name of one camera, whose numbers alternate.
 
 use std::collections::BTreeMap;
 
@@ -12,6 +12,8 @@ const MAX_GAP: u64 = 100_000;
 /// By so many numbers a frame may be late, as one that a link delayed; one that is further behind is of a camera that
 /// restarted.
 const MAX_LATE: u64 = 64;
+/// So many returns to the numbers of another sequence show two publishers; one that restarts does not return.
+const MIN_RETURNS: u64 = 3;
 
 /// The numbers of each camera's frames.
 #[derive(Debug, Default)]
@@ -29,6 +31,60 @@ struct Numbers {
     dropped: u64,
     /// Frames that have been returned as unseen.
     counted: u64,
+    /// The last number before the latest jump, after which another publisher may continue.
+    before_jump: Option<u64>,
+    /// Numbers that the latest jump left out; they are missing unless the next frame returns to those before it.
+    jumped: u64,
+    /// How often a frame returned to the numbers before a jump.
+    returns: u64,
+    /// Whether two publishers were reported.
+    is_reported: bool,
+}
+
+impl Numbers {
+    fn take(&mut self, sequence: u64) {
+        let step = sequence.saturating_sub(self.last);
+        let late = self.last.saturating_sub(sequence);
+        if step > MAX_LATE || late > MAX_LATE {
+            self.jump(sequence);
+            return;
+        }
+        if step > 0 {
+            self.missing += step - 1 + std::mem::take(&mut self.jumped);
+        } else if late > 0 && sequence > 0 {
+            // Its number counted as missing. A frame that is received twice counts as two, so that the reported gap may be too small.
+            self.missing = self.missing.saturating_sub(1);
+            return;
+        } else if late > 0 {
+            self.restarted();
+        }
+        self.last = sequence;
+    }
+
+    /// Takes a number far from the last one: the camera restarted, many frames are missing, or another publisher has the same key.
+    fn jump(&mut self, sequence: u64) {
+        let jumped = std::mem::take(&mut self.jumped);
+        let before = self.before_jump.replace(self.last);
+        let return_step = before.map_or(0, |before| sequence.saturating_sub(before));
+        let step = sequence.saturating_sub(self.last);
+        if (1..=MAX_LATE).contains(&return_step) {
+            self.returns += 1;
+            self.missing += return_step - 1;
+        } else {
+            self.missing += jumped;
+            if (1..=MAX_GAP).contains(&step) {
+                self.jumped = step - 1;
+            } else {
+                self.restarted();
+            }
+        }
+        self.last = sequence;
+    }
+
+    fn restarted(&mut self) {
+        // Those that were dropped before the new numbers leave no gap in them.
+        self.missing = self.missing.max(self.dropped);
+    }
 }
 
 impl Unseen {
@@ -41,19 +97,20 @@ impl Unseen {
             }
             return;
         };
-        let step = sequence.saturating_sub(numbers.last);
-        let late = numbers.last.saturating_sub(sequence);
-        if (1..=MAX_GAP).contains(&step) {
-            numbers.missing += step - 1;
-        } else if (1..=MAX_LATE).contains(&late) && sequence > 0 {
-            // Its number counted as missing. A frame that is received twice counts as two, so that the reported gap may be too small.
-            numbers.missing = numbers.missing.saturating_sub(1);
-            return;
-        } else if step != 0 || late != 0 {
-            // Those that were dropped before the new numbers leave no gap in them.
-            numbers.missing = numbers.missing.max(numbers.dropped);
-        }
-        numbers.last = sequence;
+        numbers.take(sequence);
+    }
+
+    /// The keys on which two publishers were detected since the last call.
+    pub(crate) fn doubled(&mut self) -> Vec<String> {
+        let new = self
+            .cameras
+            .iter_mut()
+            .filter(|(_, numbers)| numbers.returns >= MIN_RETURNS && !numbers.is_reported);
+        new.map(|(key, numbers)| {
+            numbers.is_reported = true;
+            key.clone()
+        })
+        .collect()
     }
 
     /// Takes how many messages of a key were dropped before they were looked at.
@@ -98,6 +155,41 @@ mod tests {
         assert_eq!(unseen.more(), []);
         unseen.take(KEY, 18);
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 1)]);
+    }
+
+    #[test]
+    fn two_publishers_of_one_key_are_detected_and_leave_no_gaps() {
+        let mut unseen = Unseen::default();
+        for number in 0..20 {
+            unseen.take(KEY, 100 + number);
+            unseen.take(KEY, 5000 + number);
+            // Whenever the losses are looked at.
+            assert_eq!(unseen.more(), [], "{number}");
+            if number % 3 == 0 {
+                unseen.take(KEY, 5000 + number);
+            }
+        }
+        assert_eq!(unseen.doubled(), [KEY]);
+        assert_eq!(unseen.doubled(), [""; 0]);
+        // One of them misses a frame.
+        unseen.take(KEY, 121);
+        assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 1)]);
+    }
+
+    #[test]
+    fn a_long_gap_counts_with_the_frame_after_it_and_a_restart_is_no_second_publisher() {
+        let mut unseen = Unseen::default();
+        unseen.take(KEY, 10);
+        unseen.take(KEY, 1011);
+        assert_eq!(unseen.more(), []);
+        unseen.take(KEY, 1012);
+        assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 1000)]);
+        for _ in 0..5 {
+            for sequence in [0, 1, 2, 900] {
+                unseen.take(KEY, sequence);
+            }
+        }
+        assert_eq!(unseen.doubled(), [""; 0]);
     }
 
     #[test]
