@@ -6,6 +6,8 @@ use std::path::PathBuf;
 
 use serde::Deserialize;
 
+use crate::name::check_placeholders;
+
 /// Maximum number of origins.
 const MAX_ORIGINS: usize = 16;
 
@@ -74,6 +76,7 @@ impl node::Settings for Config {
         check.range("max_file_mb", self.max_file_mb, 1..=1_000_000);
         check.range("max_file_minutes", self.max_file_minutes, 1.0..=100_000.0);
         check.parses("file", check_purpose(self.has_file(), &self.serve));
+        check.parses("file", check_placeholders(&self.file));
         check.parses("serve", check_address(&self.serve, self.insecure));
         check.parses("origins", check_origins(&self.origins));
         check.range("max_clients", self.max_clients, 1..=16);
@@ -138,6 +141,7 @@ mod tests {
             ("max_file_minutes=nan", "max_file_minutes"),
             ("id=a/b", "letters, digits"),
             ("file=", "give `serve` an address"),
+            ("file=\"{foo}.mcap\"", "`{foo}` is not a placeholder"),
             ("serve=localhost:8765", "IP:PORT"),
             ("serve=0.0.0.0:8765", "`insecure = true`"),
             ("origins=[\"app.example\"]", "is not an origin"),

@@ -11,9 +11,34 @@ pub(crate) fn named(pattern: &Path, utc_ns: i64) -> PathBuf {
     PathBuf::from(pattern.to_string_lossy().replace("{time}", &time.replace(['-', ':'], "")))
 }
 
+/// Refuses a pattern with another word in braces than those that are replaced.
+///
+/// # Errors
+/// As a sentence that names the word and the known ones.
+pub(crate) fn check_placeholders(pattern: &Path) -> Result<(), String> {
+    let text = pattern.to_string_lossy();
+    let words = text.split('{').skip(1).filter_map(|rest| Some(rest.split_once('}')?.0));
+    match words.into_iter().find(|word| *word != "time") {
+        None => Ok(()),
+        Some(word) => Err(format!(
+            "`{{{word}}}` is not a placeholder; the only one is `{{time}}`, the time at which the file begins (UTC)"
+        )),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn unknown_placeholders_are_refused_by_name() {
+        let check = |pattern: &str| check_placeholders(Path::new(pattern));
+        for known in ["a/b.mcap", "{time}.mcap", "f {time} {time}", "a{b", "a}b{"] {
+            assert_eq!(check(known), Ok(()), "{known}");
+        }
+        let error = check("f {time} {foo}.mcap").unwrap_err();
+        assert!(error.contains("`{foo}`") && error.contains("`{time}`"), "{error}");
+    }
 
     #[test]
     fn the_time_in_a_name_is_utc() {
