@@ -1,4 +1,4 @@
-//! Warns when no message of another process of the recorder's vehicle arrives, as with a wrong vehicle name.
+//! Warns when no message of another process of the recorder's vehicle arrives, as with a wrong vehicle name, or none of a controller.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -9,13 +9,14 @@ use node::Node;
 /// Time after the start within which a message is expected: each process publishes its health once a second.
 const TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Whether only this recorder's own messages have arrived.
+/// Whether only this recorder's own messages have arrived, and whether one of a controller has.
 pub(crate) struct Alone {
     vehicle: String,
     /// The keys of its own messages.
     own: [String; 3],
     begun: Instant,
     has_others: AtomicBool,
+    has_controller: AtomicBool,
 }
 
 impl Alone {
@@ -34,6 +35,7 @@ impl Alone {
             ],
             begun: Instant::now(),
             has_others: AtomicBool::new(false),
+            has_controller: AtomicBool::new(false),
         }
     }
 
@@ -42,11 +44,24 @@ impl Alone {
         if !self.has_others.load(Ordering::Relaxed) && self.own.iter().all(|own| own != key) {
             self.has_others.store(true, Ordering::Relaxed);
         }
+        if !self.has_controller.load(Ordering::Relaxed) && is_of_controller(key) {
+            self.has_controller.store(true, Ordering::Relaxed);
+        }
     }
 
     /// The warning, once the time for a message of another process is over.
     pub(crate) fn warning_in_time(&self) -> Option<String> {
-        (self.begun.elapsed() >= TIMEOUT).then(|| self.warning()).flatten()
+        if self.begun.elapsed() < TIMEOUT {
+            return None;
+        }
+        self.warning().or_else(|| {
+            (!self.has_controller.load(Ordering::Relaxed)).then(|| {
+                format!(
+                    "no message of a controller of the vehicle `{}` has arrived: the recording contains no decisions until a controller starts",
+                    self.vehicle
+                )
+            })
+        })
     }
 
     /// The warning, at any time.
@@ -59,6 +74,12 @@ impl Alone {
             )
         })
     }
+}
+
+/// Whether it is the key of a message that a controller publishes.
+fn is_of_controller(key: &str) -> bool {
+    topic::HEALTH.first_name(key) == Some("controller")
+        || [topic::STATUS.key(&[]), topic::TAPE.key(&[])].iter().any(|of_it| of_it == key)
 }
 
 #[cfg(test)]
@@ -76,6 +97,10 @@ mod tests {
         assert!(warning.contains("`rhed`") && warning.contains("--vehicle"), "{warning}");
         let late = Alone { begun: Instant::now().checked_sub(TIMEOUT).unwrap(), ..alone };
         assert_eq!(late.warning_in_time(), Some(warning));
+        late.take("health/detector/main");
+        let warning = late.warning_in_time().unwrap();
+        assert!(warning.contains("controller of the vehicle `rhed`"), "{warning}");
+        assert_eq!(late.warning(), None, "at its end the file shows it");
         late.take("health/controller/main");
         assert_eq!((late.warning_in_time(), late.warning()), (None, None));
     }

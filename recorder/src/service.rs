@@ -496,6 +496,9 @@ impl Recorder {
         if stalls && status.problem.is_none() && self.health.failed("the disk takes nothing") {
             tracing::error!(file = %shown, "The disk takes nothing; waiting for it");
         }
+        if !shown.is_empty() && status.file != shown {
+            tracing::info!(file = %shown, "Recording to this file");
+        }
         status.file = shown;
         status.bytes = disk.bytes;
         status.waiting_bytes = (disk.waiting_bytes + before_bytes) as u64;
