@@ -135,8 +135,8 @@ fn is_due(last: Option<&RecorderStatus>, now: &RecorderStatus, now_ns: i64) -> b
 }
 
 /// Whether a topic is subscribed to. JPEG and rectified frames, a detector's refusals and its debug images are made only while
-/// a client subscribes, and would cost their publishers time. The tape, which a controller stores for the first client, is of use in a file
-/// only.
+/// a client subscribes, and would cost their publishers time. The tape, of which a controller sends each new client the last ten minutes,
+/// is of use in a file only.
 fn is_wanted(row: &Row, frames: Frames, has_file: bool) -> bool {
     let is_tape = row.key == topic::TAPE.key(&[]);
     let is_frame = row.key == topic::FRAME.key(&["{camera}"]);
