@@ -6,6 +6,7 @@
 //! no other is left.
 
 mod comparison;
+mod joined;
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -17,7 +18,7 @@ use anyhow::{Context, bail, ensure};
 use clap::Args;
 use messages::{
     Candidate, CommandReply, Configuration, ControllerCommand, ControllerStatus, Detections,
-    DetectorCommand, DetectorState, Place, topic,
+    DetectorCommand, DetectorInfo, DetectorState, Place, topic,
 };
 use node::{Layers, Node, Presence, Shutdown, Subscriber};
 use rustix::process::{Pid, Signal, kill_process_group};
@@ -27,6 +28,7 @@ use tokio::process::{Child, Command};
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
 use self::comparison::Comparison;
+use self::joined::Joined;
 use crate::args::{Format, NetworkArgs, WrongUse, whole_number};
 use crate::runtime::with_node;
 use crate::terminal::{print, write_error};
@@ -55,8 +57,9 @@ pub(crate) struct SwapArgs {
     /// shell and gets the network's options in its environment (ALIGHT_ZENOH, ALIGHT_CONNECT, ...).
     #[arg(long, value_name = "FILE|COMMAND")]
     to: String,
-    /// Name of the new detector when a configuration is given [default: that of the file, with a number if it
-    /// is taken].
+    /// Name of the new detector. Of a configuration [default: that of the file, with a number if it is taken].
+    /// Of a command, the name under which it joins [default: that of the detector that joins as a process of the
+    /// command]; give it if the command starts the detector in a container or on another host.
     #[arg(long, value_name = "ID")]
     id: Option<String>,
     /// Number of frames to compare with the active detector, from 1 to 30.
@@ -121,6 +124,7 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
     let configurations = node.subscriber(topic::CONFIGURATION, &["controller", "*"]).await?;
+    let infos = node.subscriber(topic::DETECTOR_INFO, &[]).await?;
     let presence = node.presence("detector").await?;
     let first = timeout(CONTROLLER_TIMEOUT, statuses.next()).await.ok().flatten();
     let Some(first) = first else {
@@ -141,6 +145,8 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
     };
     let (child, log) = new_detector.start(args)?;
     (report.pid, report.log) = (child.id(), log);
+    let joined =
+        Joined::new(new_detector.id, existing, report.pid.context("the new detector has exited")?);
     let mut swap = Swap {
         args,
         node,
@@ -151,8 +157,9 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
         comparison: Comparison::default(),
         preference: first.preference.clone(),
         latest: first,
+        infos,
         presence,
-        existing,
+        joined,
         child,
         is_asked: false,
         began: Instant::now(),
@@ -289,8 +296,9 @@ struct Swap<'a> {
     /// The operator's preference before: a detector's name, a place or nothing.
     preference: String,
     latest: ControllerStatus,
+    infos: Subscriber<DetectorInfo>,
     presence: Presence,
-    existing: BTreeSet<String>,
+    joined: Joined,
     child: Child,
     /// Whether the controller was asked for the new one, and did not refuse it.
     is_asked: bool,
@@ -301,13 +309,14 @@ struct Swap<'a> {
 /// An event during a swap.
 enum Event {
     Status(Box<ControllerStatus>),
-    Joined(String),
+    /// A detector has joined, or has published its information.
+    Joined,
     Left(String),
 }
 
 impl Swap<'_> {
     async fn carry_out(&mut self, report: &mut Report) -> anyhow::Result<()> {
-        let new = self.until_ready(report.to.clone()).await?;
+        let new = self.until_ready().await?;
         report.to = Some(new.clone());
         report.ready_s = Some(self.elapsed_s());
         self.show(&format!("{new} is ready and runs in shadow"));
@@ -353,7 +362,13 @@ impl Swap<'_> {
                     Ok(Event::Status(Box::new(status)))
                 }
                 Some((name, alive)) = self.presence.next() => {
-                    Ok(if alive { Event::Joined(name) } else { Event::Left(name) })
+                    self.joined.set_ready(&name, alive);
+                    Ok(if alive { Event::Joined } else { Event::Left(name) })
+                }
+                Some((key, info)) = self.infos.next_with_key() => {
+                    let name = topic::DETECTOR_INFO.first_name(&key).unwrap_or_default();
+                    self.joined.set_info(name, &info);
+                    Ok(Event::Joined)
                 }
                 Some(found) = self.detections.next() => {
                     self.comparison.found(&found);
@@ -373,22 +388,15 @@ impl Swap<'_> {
         }
     }
 
-    async fn until_ready(&mut self, expected: Option<String>) -> anyhow::Result<String> {
+    /// Waits until the started detector is ready; returns its name.
+    async fn until_ready(&mut self) -> anyhow::Result<String> {
         let deadline = Instant::now() + Duration::from_secs(self.args.ready_s);
-        let taken: Vec<&str> = self.existing.iter().map(String::as_str).collect();
-        let waiting_for = match taken.is_empty() {
-            true => "the new detector is ready".to_owned(),
-            false => {
-                format!("the new detector is ready, with another name than {}", taken.join(", "))
-            }
-        };
         loop {
-            if let Event::Joined(name) = self.next_event(deadline, &waiting_for).await? {
-                let is_new = expected.as_ref().is_none_or(|expected| *expected == name);
-                if is_new && !self.existing.contains(&name) {
-                    return Ok(name);
-                }
+            if let Some(name) = self.joined.started() {
+                return Ok(name);
             }
+            let waiting_for = self.joined.waiting_for();
+            self.next_event(deadline, &waiting_for).await?;
         }
     }
 
@@ -428,7 +436,7 @@ impl Swap<'_> {
                         None => {}
                     }
                 }
-                Event::Joined(_) | Event::Left(_) => {}
+                Event::Joined | Event::Left(_) => {}
             }
         }
     }
@@ -497,7 +505,7 @@ impl Swap<'_> {
         loop {
             match self.next_event(deadline, "the old detector has stopped").await? {
                 Event::Left(name) if name == old => return Ok(()),
-                Event::Left(_) | Event::Joined(_) | Event::Status(_) => {}
+                Event::Left(_) | Event::Joined | Event::Status(_) => {}
             }
         }
     }
@@ -678,7 +686,17 @@ fn last_lines(log: &Path) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser;
+    use node::{Identity, ZenohSource};
+
     use super::*;
+    use crate::land::free_port;
+
+    #[derive(Parser)]
+    struct Tool {
+        #[command(flatten)]
+        swap: SwapArgs,
+    }
 
     fn shadow(compared: u32, agreed: u32) -> Candidate {
         Candidate {
@@ -774,6 +792,85 @@ mod tests {
         assert_eq!(preferring("ground", &with(false)), place(Place::Ground));
         assert_eq!(preferring("spare", &none), named("spare"));
         assert_eq!(preferring("", &none), ControllerCommand::PreferAnyDetector);
+    }
+
+    /// Swaps to a command while another detector joins, and a detector `mine` with the process that the command writes to a file.
+    async fn swapped_to(command: &str) -> anyhow::Result<Report> {
+        let (port, _lock) = free_port()?;
+        let zenoh = ZenohSource::Text(node::session::local_config(port));
+        let open = async |service: &'static str, instance: &str| {
+            Node::open(Identity { service, instance: instance.to_owned() }, &zenoh).await
+        };
+        let operator = open("alight", "swap").await?;
+        let (third, mine) = (open("detector", "third").await?, open("detector", "mine").await?);
+        let statuses = operator.publisher(topic::STATUS, &[]).await?;
+        let folder = tempfile::tempdir()?;
+        let file = folder.path().join("pid");
+        let command = command.replace("FILE", &file.display().to_string());
+        let log = folder.path().join("log").display().to_string();
+        let args = ["swap", "--to", &command, "--ready-s", "3", "--agree-s", "0", "--log", &log];
+        let args = Tool::try_parse_from(args)?.swap;
+        let introduce = async |node: &Node, name: &str, pid: u32| {
+            let info = DetectorInfo {
+                detector: name.into(),
+                host: node::host_name(),
+                place: Place::Onboard,
+                camera: "down".into(),
+                markers: Vec::new(),
+                version: String::new(),
+                pid,
+            };
+            let infos = node.publisher(topic::DETECTOR_INFO, &[name]).await?;
+            infos.publish(&info).await;
+            node.announce().await?;
+            anyhow::Ok(infos)
+        };
+        let others = async {
+            let written = async || {
+                loop {
+                    statuses.publish(&ControllerStatus::default()).await;
+                    let text = std::fs::read_to_string(&file).unwrap_or_default();
+                    if let Ok(pid) = text.trim().parse::<u32>() {
+                        return pid;
+                    }
+                    sleep(Duration::from_millis(20)).await;
+                }
+            };
+            let pid = written().await;
+            let _third = introduce(&third, "third", std::process::id()).await?;
+            sleep(Duration::from_millis(500)).await;
+            let _mine = match pid {
+                0 => None,
+                pid => Some(introduce(&mine, "mine", pid).await?),
+            };
+            loop {
+                statuses.publish(&ControllerStatus::default()).await;
+                sleep(Duration::from_millis(100)).await;
+            }
+            #[expect(unreachable_code, reason = "it gives the type of the errors")]
+            anyhow::Ok(())
+        };
+        let shutdown = Shutdown::on_signals()?;
+        let report = tokio::select! {
+            report = swap(&args, &operator, &shutdown) => report?,
+            ended = others => bail!("the other detectors: {ended:?}"),
+        };
+        for node in [operator, third, mine] {
+            node.close().await;
+        }
+        Ok(report)
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn only_a_process_of_its_command_is_switched_to() -> anyhow::Result<()> {
+        let report = swapped_to("sh -c 'sleep 30 & echo $! > FILE; wait'").await?;
+        assert_eq!(report.to.as_deref(), Some("mine"), "{}", report.why);
+        let report = swapped_to("sh -c 'echo 0 > FILE; exec sleep 30'").await?;
+        assert_eq!(report.to, None, "{}", report.why);
+        let why = "`third` joined, and is not used: it is process";
+        assert!(report.why.contains(why) && report.why.contains("`--id third`"), "{}", report.why);
+        assert!(!report.swapped && report.ready_s.is_none(), "{}", report.why);
+        Ok(())
     }
 
     #[test]
