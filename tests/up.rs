@@ -553,7 +553,16 @@ fn a_dry_run_prints_the_commands_and_an_error_is_named() -> anyhow::Result<()> {
         text.contains("no device /dev/no-such") && text.contains("no device /dev/no-video");
     ensure!(output.status.code() == Some(1) && are_named, "{output:?}");
     ensure!(String::from_utf8_lossy(&output.stdout).lines().count() == 2, "{output:?}");
-    std::fs::write(folder.path().join("site.toml"), "[[drone]]\nrun = 'detectr'\n")?;
+    let site = folder.path().join("site.toml");
+    std::fs::write(&site, "[[local]]\nrun = 'detector'\n")?;
+    let mut dry_run = Command::new(ALIGHT);
+    dry_run.args(["up", "local", "--dry-run", "--config"]).arg(&site).env("ALIGHT_MEET", "7555");
+    let output = output_of(&mut dry_run)?;
+    let text = String::from_utf8_lossy(&output.stdout);
+    let is_commented = text.starts_with("# the processes of this machine meet at port 7555");
+    ensure!(output.status.success() && is_commented, "{output:?}");
+    ensure!(text.contains("ALIGHT_MEET=7555"), "{text}");
+    std::fs::write(&site, "[[drone]]\nrun = 'detectr'\n")?;
     let output = alight(folder.path(), &["up", "drone", "--dry-run"])?;
     let text = String::from_utf8_lossy(&output.stderr);
     ensure!(output.status.code() == Some(2) && text.contains("detectr"), "{output:?}");

@@ -2,17 +2,19 @@
 //! detectors with one id.
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use clap::ValueEnum;
 use messages::looks_for_others;
 use node::access::key_name;
-use node::network::{Address, NO_KEYS_OVER_IPV6};
+use node::network::{Address, NO_KEYS_OVER_IPV6, variable};
+use node::session::LOCAL_PORT;
 use node::{ConfigError, Layers, Network, RELAY};
 use serde::Deserialize;
 
-use crate::args::{MEET_RULE, WrongUse, source_of};
+use crate::args::{MEET_RULE, WrongUse, meet_port, source_of};
 use crate::services::Service;
 
 /// The role of a machine.
@@ -63,6 +65,9 @@ pub(crate) struct Site {
     /// The folder of the file; all paths in it are relative to it.
     #[serde(skip)]
     pub(crate) folder: PathBuf,
+    /// Which of `meet` and the environment sets the rendezvous port, where the environment contains one.
+    #[serde(skip)]
+    pub(crate) meet_note: Option<String>,
 }
 
 /// A process in the file, and its position there as a text.
@@ -116,11 +121,16 @@ impl Job {
 }
 
 impl Site {
-    /// Reads a file.
+    /// Reads a file. Without `meet` in it, the environment sets the rendezvous port, as for every other command.
     ///
     /// # Errors
     /// Names the file and the problem.
     pub(crate) fn read(path: &Path) -> Result<Self, ConfigError> {
+        Self::read_in(path, std::env::var_os(variable::MEET))
+    }
+
+    /// The same, with the rendezvous port of an environment.
+    fn read_in(path: &Path, meet: Option<OsString>) -> Result<Self, ConfigError> {
         let text = node::read_text(path)?;
         let mut site: Self = toml::from_str(&text).map_err(|cause| ConfigError::Syntax {
             source_name: path.display().to_string(),
@@ -134,9 +144,37 @@ impl Site {
                 limit: MEET_RULE.to_owned(),
             });
         }
+        site.take_meet(meet)?;
         let folder = media::folder_of(path);
         site.folder = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
         Ok(site)
+    }
+
+    /// Takes the rendezvous port of the environment unless the site has its own, which is the same wherever it is started.
+    fn take_meet(&mut self, environment: Option<OsString>) -> Result<(), ConfigError> {
+        let Some(text) = environment.filter(|text| !text.is_empty()) else { return Ok(()) };
+        let (text, name) = (text.to_string_lossy(), variable::MEET);
+        let note = match self.meet {
+            Some(own) if own.to_string() == text => return Ok(()),
+            Some(own) => {
+                format!(
+                    "port {own}, by `meet` of the site, and not at {text}, by {name} in the environment"
+                )
+            }
+            None => {
+                let refused = |limit| ConfigError::Refused {
+                    source_name: "the environment".to_owned(),
+                    key: name.to_owned(),
+                    value: text.to_string(),
+                    limit,
+                };
+                let port = meet_port(&text).map_err(refused)?;
+                self.meet = Some(port);
+                format!("port {port}, by {name} in the environment, as the site has no `meet`")
+            }
+        };
+        self.meet_note = Some(format!("the processes of this machine meet at {note}"));
+        Ok(())
     }
 
     /// The network of the processes of a role, but of its relay.
@@ -179,7 +217,7 @@ impl Site {
     /// A name for the supervisor of a role, unique on its machine.
     pub(crate) fn instance(&self, role: Role) -> String {
         let vehicle = self.vehicle.as_deref().unwrap_or("drone");
-        let meet = self.meet.unwrap_or(node::session::LOCAL_PORT);
+        let meet = self.meet.unwrap_or(LOCAL_PORT);
         format!("{}-{vehicle}-{meet}", role.name())
     }
 
@@ -609,6 +647,32 @@ mod tests {
         assert!(error.contains("`meet` = 0 is invalid") && error.contains("1 to 65535"), "{error}");
         std::fs::write(&path, "meet = 9000").unwrap();
         assert_eq!(Site::read(&path).unwrap().meet, Some(9000));
+    }
+
+    #[test]
+    fn the_port_of_the_environment_is_used_unless_the_site_has_one() {
+        let home = tempfile::tempdir().unwrap();
+        let path = home.path().join("site.toml");
+        let read = |text: &str, environment: Option<&str>| {
+            std::fs::write(&path, format!("{text}\nlocal = [{{ run = 'detector' }}]")).unwrap();
+            Site::read_in(&path, environment.map(Into::into))
+        };
+        let other = read("", Some("7555")).unwrap();
+        let environment = other.jobs(Role::Local).unwrap()[0].network.environment();
+        assert!(environment.contains(&("ALIGHT_MEET", "7555".into())), "{environment:?}");
+        assert_eq!(other.instance(Role::Local), "local-drone-7555");
+        let note = other.meet_note.unwrap();
+        assert!(note.contains("meet at port 7555, by ALIGHT_MEET in the environment"), "{note}");
+        let own = read("meet = 9000", Some("7555")).unwrap();
+        assert_eq!(own.network(Role::Local).meet, Some(9000));
+        let note = own.meet_note.unwrap();
+        assert!(note.contains("port 9000, by `meet` of the site, and not at 7555"), "{note}");
+        for (text, environment) in [("meet = 9000", "9000"), ("", "")] {
+            assert_eq!(read(text, Some(environment)).unwrap().meet_note, None);
+        }
+        assert_eq!(read("", None).unwrap().network(Role::Local).meet, None);
+        let error = read("", Some("0")).unwrap_err().to_string();
+        assert!(error.contains("`ALIGHT_MEET` = 0 is invalid"), "{error}");
     }
 
     #[test]

@@ -63,6 +63,10 @@ const WRONG_USE: i32 = 2;
 pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
     let site = Site::read(&args.config)?;
     let jobs = site.jobs(args.role)?;
+    if let Some(note) = &site.meet_note {
+        // A shell to which the commands of a dry run are given takes it as a comment.
+        say(&format!("{}{note}", if args.dry_run { "# " } else { "" }));
+    }
     if args.dry_run {
         // Paths in a site are relative to its folder.
         let is_here = std::env::current_dir().is_ok_and(|here| here == site.folder);

@@ -103,6 +103,14 @@ impl Reach {
         reach
     }
 
+    /// The vehicle and the rendezvous port, as a text.
+    pub(crate) fn network(&self) -> String {
+        match self.meet {
+            Some(port) => format!("vehicle `{}`, port {port} of this machine", self.vehicle),
+            None => format!("vehicle `{}`", self.vehicle),
+        }
+    }
+
     /// The vehicle's name.
     pub(crate) fn vehicle(&self) -> &str {
         &self.vehicle

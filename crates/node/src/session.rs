@@ -192,7 +192,9 @@ impl Node {
                         "another {service} (`{other}`) is running for this vehicle; stop it first, or set another vehicle (`namespace` in the Zenoh configuration)"
                     ),
                     Some(other) => bail!(
-                        "another {service} has the name `{other}` already; choose another with `--set id=...`"
+                        "another {service} has the name `{other}` already ({}); choose another with `--set id=...`, or join another network \
+                         (`--meet`, `--vehicle`, or ALIGHT_MEET and ALIGHT_VEHICLE)",
+                        self.reach.network()
                     ),
                 }
                 let claims = self.tokens(&topic::claim_key(service, matches, "*")).await?;

@@ -131,7 +131,8 @@ async fn a_second_instance_of_the_same_name_is_rejected() -> anyhow::Result<()> 
     let second = open("detector", "main", port).await?;
     let refusal =
         second.claim_unique_name("main").await.err().context("two of one name")?.to_string();
-    assert!(refusal.contains("`main` already") && refusal.contains("--set id="), "{refusal}");
+    let named = format!("`main` already (vehicle `drone`, port {port} of this machine)");
+    assert!(refusal.contains(&named) && refusal.contains("--set id="), "{refusal}");
     let spare = open("detector", "spare", port).await?;
     spare.claim_unique_name("spare").await
 }
