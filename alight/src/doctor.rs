@@ -8,6 +8,7 @@ mod focus;
 mod keys;
 mod ports;
 mod running;
+mod unusable;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -18,15 +19,16 @@ use std::time::Duration;
 
 use anyhow::bail;
 use clap::Args;
-use messages::{CameraInfo, ControllerStatus, DetectorState, FrameHeader, Health, Phase, topic};
+use messages::{CameraInfo, ControllerStatus, DetectorState, Health, Phase, topic};
 use node::version::release;
 use node::{INSECURE, Node, RELAY, clock_name, stats};
 use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
 use tokio::time::timeout;
 
-use self::focus::Focus;
+use self::focus::{Focus, ReceivedFrame};
 use self::keys::Checked;
+use self::unusable::{INFOS, Unusable};
 use crate::args::{Format, NetworkArgs, OPERATOR, WrongUse, whole_number};
 use crate::programs::{missing, missing_of_service, unusable_key};
 use crate::runtime::{block_on, tool_identity};
@@ -367,6 +369,10 @@ struct Seen {
     /// As JPEG.
     frames: Vec<ReceivedFrame>,
     raw_frames: Vec<ReceivedFrame>,
+    /// The cameras' messages that no detector uses.
+    unusable: Unusable,
+    /// The controller's `detectors.max_age_s`, if its configuration was received.
+    max_age_s: Option<f64>,
 }
 
 impl Seen {
@@ -429,14 +435,6 @@ struct Searched {
     found: u32,
 }
 
-struct ReceivedFrame {
-    header: FrameHeader,
-    bytes: usize,
-    received_ns: i64,
-    /// The width of edges in it, if that was measured.
-    edge_width_px: Option<f64>,
-}
-
 /// Checks the messages on the network, and returns them.
 async fn check_network(
     findings: &mut Findings,
@@ -462,12 +460,13 @@ async fn check_network(
 
 async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result<()> {
     seen.peers = node.list_peers().await?;
-    let (healths, cameras, statuses, infos, detections) = tokio::try_join!(
+    let (healths, cameras, statuses, infos, detections, configurations) = tokio::try_join!(
         node.subscriber(topic::HEALTH, &[]),
         node.subscriber(topic::CAMERA_INFO, &[]),
         node.subscriber(topic::STATUS, &[]),
         node.subscriber(topic::DETECTOR_INFO, &[]),
         node.subscriber(topic::DETECTIONS, &[]),
+        node.subscriber(topic::CONFIGURATION, &["controller"]),
     )?;
     // JPEG frames fit every link; our cameras make them while there is a subscriber, others may not.
     let frames = node.frame_subscriber(topic::JPEG, &[]).await?;
@@ -486,8 +485,14 @@ async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result
                 Some(health) = healths.next() => keep(&mut seen.healths, health, |a, b| {
                     (&a.service, &a.instance) == (&b.service, &b.instance)
                 }),
-                Some(camera) = cameras.next() => {
-                    keep(&mut seen.cameras, camera, |a, b| a.camera == b.camera);
+                Some((key, info)) = cameras.next_with_key() => {
+                    let key = topic::CAMERA_INFO.first_name(&key).unwrap_or_default();
+                    if seen.unusable.names_its_key(INFOS, key, &info.camera) {
+                        keep(&mut seen.cameras, info, |a, b| a.camera == b.camera);
+                    }
+                }
+                Some(configuration) = configurations.next() => {
+                    seen.max_age_s = cameras::max_age_s(&configuration).or(seen.max_age_s);
                 }
                 Some(status) = statuses.next() => seen.status = Some(status),
                 Some(info) = infos.next() => {
@@ -500,13 +505,22 @@ async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result
                     searched.frames += 1;
                     searched.found += u32::from(!found.detections.is_empty());
                 }
-                Some(frame) = frames.next() => seen.frames.push(focus.received(frame)),
-                Some(frame) = next_raw() => seen.raw_frames.push(focus.received(frame)),
+                Some(frame) = frames.next() => {
+                    if seen.unusable.accepts(topic::JPEG, &frame) {
+                        seen.frames.push(focus.received(frame));
+                    }
+                }
+                Some(frame) = next_raw() => {
+                    if seen.unusable.accepts(topic::FRAME, &frame) {
+                        seen.raw_frames.push(focus.received(frame));
+                    }
+                }
             }
         }
     };
     let _: Result<(), _> = timeout(watched.duration, watching).await;
     seen.ended_ns = node::now_ns();
+    seen.unusable.take_unreadable(node.health());
     // Peers that joined meanwhile.
     seen.peers.extend(node.list_peers().await?);
     seen.peers.sort();

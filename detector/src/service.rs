@@ -25,6 +25,7 @@ use tokio::sync::oneshot;
 
 use crate::config::{Config, Input};
 use crate::inbox::{AirInbox, Inbox, lock};
+use crate::publishers::{Misplaced, Publishers};
 use crate::search::{Search, StageClock};
 use crate::wire;
 
@@ -54,6 +55,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     node.claim_unique_name(&config.id).await?;
     let camera = Arc::new(Mutex::new(None));
     let infos = node.subscriber(topic::CAMERA_INFO, &[&config.camera]).await?;
+    let camera_name = config.camera.clone();
     let commands = node.commands(topic::DETECTOR_COMMAND, &[&config.id]).await?;
     let change = Arc::default();
     let response = Arc::new(Mutex::new(configured_response(&config)));
@@ -79,7 +81,8 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let follow_camera = async {
         let mut received = Instant::now();
         while let Some(info) = infos.next().await {
-            if accept(&node, lock(&camera).as_ref(), &info, received.elapsed()) {
+            let is_named = is_named(&node, "camera info", &camera_name, &info.camera);
+            if is_named && accept(&node, lock(&camera).as_ref(), &info, received.elapsed()) {
                 received = Instant::now();
                 *lock(&camera) = Some(info);
             }
@@ -126,12 +129,25 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     Ok(())
 }
 
+/// Whether a message names the camera of its key. Others are refused: the controller would take them for another camera's.
+fn is_named(node: &Node, kind: &str, key: &str, camera: &str) -> bool {
+    if key != camera
+        && node.health().failed(&format!("{kind} that names another camera than its key"))
+    {
+        tracing::warn!(
+            "A {kind} is refused: `{key}` gives it the name of `{camera}`; the camera that publishes it must give the name in its key as \
+             `camera` (docs/wire-format.md; further ones are counted)"
+        );
+    }
+    key == camera
+}
+
 /// Whether a camera's information is used. Implausible values are refused, and so is another calibration while the
 /// present one, received `silence` ago, is still repeated. The publisher is not known here.
 fn accept(node: &Node, known: Option<&CameraInfo>, info: &CameraInfo, silence: Duration) -> bool {
     let camera = &info.camera;
     if let Some(error) = info.problem() {
-        if node.health().failed("camera info that cannot be") {
+        if node.health().failed("camera info with values that no camera can have") {
             tracing::warn!(camera, error, "Camera information refused (further ones are counted)");
         }
         return false;
@@ -271,6 +287,7 @@ struct Work {
     converter: Converter,
     unpacker: Unpacker,
     search: Search,
+    publishers: Publishers,
     overlay: RgbImageBuf,
 }
 
@@ -303,6 +320,7 @@ impl Work {
             converter: Converter::default(),
             unpacker: Unpacker::default(),
             search,
+            publishers: Publishers::default(),
             overlay: RgbImageBuf::default(),
         })
     }
@@ -327,6 +345,10 @@ impl Work {
         self.take_change();
         let health = self.node.shared_health();
         let is_jpeg = frame.header.format == PixelFormat::Jpeg;
+        if !is_named(&self.node, "frame", &self.config.camera, &frame.header.camera) {
+            return;
+        }
+        self.check_order(&frame.header);
         health.count("frames");
         if frame.header.clock == clock_name() {
             health.latency("stamp to frame", age(&frame.header));
@@ -384,6 +406,26 @@ impl Work {
             }
         }
         self.unpacker = unpacker;
+    }
+
+    /// Counts a frame that does not follow the frame before. It is searched nevertheless: the controller checks the stamps.
+    fn check_order(&mut self, header: &FrameHeader) {
+        let Misplaced { by_stamp, by_sequence, as_of_two } = self.publishers.on_frame(header);
+        let (health, camera) = (self.node.health(), &header.camera);
+        if by_stamp {
+            health.failed("frame whose stamp is not later than that of the frame before");
+        }
+        if by_sequence {
+            health
+                .failed("frame whose sequence number is not greater than that of the frame before");
+        }
+        if as_of_two && health.failed(&format!("two publishers of camera `{camera}`")) {
+            tracing::warn!(
+                camera,
+                "Two publishers of one camera, by the sequence numbers or clocks of its frames: end one of them, or give it another name \
+                 (further frames are counted)"
+            );
+        }
     }
 
     fn take_change(&mut self) {

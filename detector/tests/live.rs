@@ -398,6 +398,7 @@ async fn a_camera_in_python_is_searched_and_no_other_client_gives_its_calibratio
     }
     let ([port], _, _) = ports::free()?;
     let node = open("detector", "main", port).await?;
+    let health = node.shared_health();
     let other = open("camera-pub", "other-client", port).await?;
     let layers = Layers { file: None, set: vec![format!("markers={ALL}")] };
     let service = tokio::spawn(detector::run(
@@ -433,6 +434,20 @@ async fn a_camera_in_python_is_searched_and_no_other_client_gives_its_calibratio
                 ensure!(rings_m(&seen).is_none_or(|m| (m - 1.11).abs() < 0.06), "{seen:?}");
             }
         }
+        let misnamed = CameraInfo { camera: "front".into(), ..info.clone() };
+        false_infos.publish(&misnamed).await;
+        let publisher = other.frame_publisher(topic::FRAME, &["down"], 0).await?;
+        let header = FrameHeader { camera: "front".into(), width: 1, height: 1, ..seen.header };
+        let is_counted = |kind: &str| {
+            health.failures(&format!("{kind} that names another camera than its key")) > 0
+        };
+        let counted = timeout(TIMEOUT, async {
+            while !(is_counted("camera info") && is_counted("frame")) {
+                publisher.publish(&header, publisher.loan(1)).await;
+                tokio::time::sleep(Duration::from_millis(7)).await;
+            }
+        });
+        counted.await.context("messages of another camera are counted")?;
         anyhow::Ok(())
     };
     let watched = watched.await;

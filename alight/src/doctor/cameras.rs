@@ -3,10 +3,11 @@
 
 use std::fmt::Write;
 
-use messages::{CameraInfo, Health, PixelFormat};
-use node::{clock_name, stats};
+use messages::{CameraInfo, Configuration, FrameHeader, Health, PixelFormat};
+use node::{Layers, clock_name, stats};
 
-use super::{Findings, ReceivedFrame, Seen, Watched};
+use super::focus::ReceivedFrame;
+use super::{Findings, Seen, Watched};
 
 /// Maximum age of a frame on arrival, in milliseconds; a larger one means a wrong clock or an unusable link.
 const MAX_AGE_MS: f64 = 1000.0;
@@ -17,6 +18,8 @@ const MAX_BLUR_PX: f64 = 3.0;
 /// Width of edges from which on a picture is blurred, in pixels: one in focus has 2 to 3, and a blur of two pixels' deviation 4
 /// to 5, on photographs of markers, streets, rooms and fields.
 const MAX_EDGE_WIDTH_PX: f64 = 4.0;
+/// Number of steps back of the sequence number from which on two programs publish one camera: a restarted camera steps back once.
+const MAX_STEPS_BACK: usize = 3;
 /// Part of the frames that a camera may drop.
 const MAX_DROPPED: f64 = 0.02;
 
@@ -29,6 +32,14 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_
     let seconds = watched.duration.as_secs();
     for info in &seen.cameras {
         let camera = &info.camera;
+        if let Some(problem) = info.problem() {
+            findings.wrong(
+                "calibration",
+                format!("camera `{camera}`: its information is refused by detectors: {problem}"),
+                "correct `[calibration]` and `[mount]` of camera-pub, or the CameraInfo of a camera of your own (docs/wire-format.md)",
+            );
+            continue;
+        }
         let Some([fx, fy]) = info.focal_px else {
             let text = format!("camera `{camera}` is not calibrated, so distances are unknown");
             let advice =
@@ -69,7 +80,8 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_
     for camera in names {
         let frames: Vec<&ReceivedFrame> =
             all.iter().copied().filter(|frame| frame.header.camera == camera).collect();
-        findings.good("camera", describe_frames(camera, &frames, seconds));
+        check_age(findings, describe_frames(camera, &frames, seconds), &frames, seen.max_age_s);
+        check_publishers(findings, camera, &seen.raw_frames);
         check_stamps(findings, camera, &frames);
         check_exposure(findings, camera, &frames, focal_px(seen, camera));
         check_focus(findings, camera, &frames);
@@ -87,13 +99,18 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_
                 "run camera and controller on one machine; a camera of your own must use that clock's name",
             );
         }
-        if !seen.cameras.iter().any(|info| info.camera == camera) {
+        let is_calibrated = seen.cameras.iter().any(|info| info.camera == camera);
+        if !is_calibrated && !seen.unusable.has_info(camera) {
             findings.wrong(
                 "calibration",
                 format!("camera `{camera}` sends frames, but not its calibration and mount"),
                 "publish them on `camera/CAMERA/info` every second",
             );
         }
+    }
+    seen.unusable.report(findings);
+    if all.is_empty() && seen.unusable.has_frames() {
+        return;
     }
     let is_needed = has_camera || seen.lands();
     let are_silent = is_needed && report_silent(findings, seen, watched);
@@ -173,6 +190,59 @@ fn describe_frames(camera: &str, frames: &[&ReceivedFrame], seconds: u64) -> Str
         None => text.push_str(", of unknown age, as their clock is that of another machine"),
     }
     text
+}
+
+/// The maximum age of a detector's frames in a controller's configuration, in seconds.
+pub(super) fn max_age_s(controller: &Configuration) -> Option<f64> {
+    let table: toml::Table = controller.toml.parse().ok()?;
+    table.get("detectors")?.get("max_age_s")?.as_float()
+}
+
+/// Adds the description of a camera's frames: doubtful where they are older on arrival than the controller allows a detector's frames.
+fn check_age(
+    findings: &mut Findings,
+    text: String,
+    frames: &[&ReceivedFrame],
+    max_age_s: Option<f64>,
+) {
+    let by_default = || Layers::default().load::<controller::Config>().ok();
+    let limit_s =
+        max_age_s.or_else(|| by_default().map(|config| config.settings.detectors.max_age_s));
+    let age_s = stats::quantile(&ages_ms(frames), 0.5).map(|age_ms| age_ms * 1e-3);
+    match age_s.zip(limit_s) {
+        Some((age_s, limit_s)) if age_s > limit_s => findings.doubtful(
+            "camera",
+            format!(
+                "{text}; the controller takes a detector for late whose detections come more than {:.0} ms after the exposure \
+                 (`detectors.max_age_s`)",
+                limit_s * 1e3
+            ),
+            "measure `source.delay_ms` (docs/camera.md), take a faster camera or link, or increase `detectors.max_age_s` of the controller",
+        ),
+        _ => findings.good("camera", text),
+    }
+}
+
+/// Reports a camera that two programs publish: the sequence numbers of raw frames step back, or the clock changes, again and again. Frames of
+/// the air link arrive over two connections, in any order.
+fn check_publishers(findings: &mut Findings, camera: &str, raw: &[ReceivedFrame]) {
+    let raw: Vec<&FrameHeader> =
+        raw.iter().map(|frame| &frame.header).filter(|header| header.camera == camera).collect();
+    let steps_back = raw.windows(2).filter(|pair| {
+        let [before, next] = pair else { return false };
+        next.sequence < before.sequence || next.clock != before.clock
+    });
+    let steps_back = steps_back.count();
+    if steps_back >= MAX_STEPS_BACK {
+        findings.wrong(
+            "camera",
+            format!(
+                "two publishers of camera `{camera}`: sequence numbers step back, or the clock changes, {steps_back} times in {} frames",
+                raw.len()
+            ),
+            "end one of them, or give it another name; for a camera-pub, set `id`",
+        );
+    }
 }
 
 /// The longer focal length of a camera, if it is calibrated.
@@ -315,7 +385,8 @@ mod tests {
     use super::*;
     use std::time::Duration;
 
-    use messages::{ControllerStatus, Count, FrameHeader, Phase, Rate};
+    use super::super::unusable::{FRAMES, Unusable};
+    use messages::{ControllerStatus, Count, Phase, Rate};
 
     fn frame(age_ms: i64, exposure_ns: u32) -> ReceivedFrame {
         let header = FrameHeader {
@@ -397,6 +468,78 @@ mod tests {
         assert!(soft.contains("edges are 5.5 pixels wide; 2 to 3 are sharp"), "{soft}");
         assert!(soft.contains("focus the lens"), "{soft}");
         assert!(of([None; 3]).contains("not judged"));
+    }
+
+    #[test]
+    fn frames_that_are_older_than_the_controller_allows_are_doubtful() {
+        let of = |age_ms: i64, max_age_s: Option<f64>| {
+            let mut findings = Findings::default();
+            let watched =
+                Watched { role: None, duration: Duration::from_secs(1), has_raw_frames: true };
+            let seen = Seen { raw_frames: vec![frame(age_ms, 1)], max_age_s, ..Seen::default() };
+            check(&mut findings, &seen, watched, false);
+            findings.text()
+        };
+        let late = "more than 200 ms after the exposure (`detectors.max_age_s`)";
+        for max_age_s in [None, Some(0.2)] {
+            let text = of(399, max_age_s);
+            assert!(text.contains("?      camera") && text.contains(late), "{text}");
+            assert!(!of(199, max_age_s).contains("max_age_s"));
+        }
+        assert!(!of(399, Some(0.5)).contains("max_age_s"));
+    }
+
+    #[test]
+    fn two_publishers_of_one_camera_are_wrong_and_a_restart_is_not() {
+        let of = |sequences: &[u64]| {
+            let frames = sequences.iter().map(|sequence| {
+                let mut frame = frame(30, 1);
+                frame.header.sequence = *sequence;
+                frame
+            });
+            text(frames.collect(), 640, Vec::new())
+        };
+        let two = of(&[1, 501, 2, 502, 3, 503, 4]);
+        assert!(
+            two.contains("two publishers of camera `down`") && two.contains("3 times"),
+            "{two}"
+        );
+        assert!(!of(&[100, 101, 102, 0, 1, 2]).contains("two publishers"));
+    }
+
+    #[test]
+    fn frames_that_cannot_be_used_are_no_missing_frames() {
+        let findings_text = |unusable: Unusable, has_camera| {
+            let mut findings = Findings::default();
+            let watched =
+                Watched { role: None, duration: Duration::from_secs(3), has_raw_frames: true };
+            let peers = vec![("detector".into(), "main".into())];
+            let ended_ns = 3_000_000_000;
+            let seen = Seen { peers, unusable, ended_ns, ..Seen::default() };
+            check(&mut findings, &seen, watched, has_camera);
+            findings.text()
+        };
+        assert!(findings_text(Unusable::default(), false).contains("no frame arrived within 3 s"));
+        for has_camera in [false, true] {
+            let mut unusable = Unusable::default();
+            unusable.names_its_key(FRAMES, "down", "front");
+            let text = findings_text(unusable, has_camera);
+            assert!(text.contains("frames are refused") && !text.contains("no frame"), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_mount_that_detectors_refuse_is_wrong() {
+        let model = geometry::CameraModel::pinhole(640, 480, 1800.0);
+        let mut info = CameraInfo::new("down", &model, &geometry::Transform::identity());
+        info.body_from_camera.rotation_wxyz = [0.0; 4];
+        let mut findings = Findings::default();
+        let watched =
+            Watched { role: None, duration: Duration::from_secs(1), has_raw_frames: true };
+        check(&mut findings, &Seen { cameras: vec![info], ..Seen::default() }, watched, false);
+        let text = findings.text();
+        assert!(text.contains("WRONG  calibration") && text.contains("a mount of the"), "{text}");
+        assert!(!text.contains("ok     calibration"), "{text}");
     }
 
     #[test]

@@ -3,14 +3,22 @@
 use std::collections::BTreeMap;
 
 use imaging::{Converter, GrayImage, edge_width_px};
+use messages::FrameHeader;
 use node::{Frame, now_ns};
-
-use super::ReceivedFrame;
 
 /// Time from one picture of a camera that is looked at to the next, in nanoseconds.
 const PERIOD_NS: i64 = 500_000_000;
 /// Maximum number of cameras that are looked at.
 const MAX_CAMERAS: usize = 16;
+
+/// A received frame.
+pub(super) struct ReceivedFrame {
+    pub(super) header: FrameHeader,
+    pub(super) bytes: usize,
+    pub(super) received_ns: i64,
+    /// The width of edges in it, if that was measured.
+    pub(super) edge_width_px: Option<f64>,
+}
 
 /// Looks at two pictures a second of each camera.
 #[derive(Default)]

@@ -16,6 +16,7 @@ use rustix::process::{Resource, getrlimit};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::handlers::RingChannel;
+use zenoh::key_expr::KeyExpr;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::sample::Sample;
 use zenoh::shm::{
@@ -39,6 +40,9 @@ const POOL_EXHAUSTED_TIMEOUT: Duration = Duration::from_secs(1);
 const MIN_FAILED_ALLOCATIONS: u32 = 4;
 /// Maximum number of replacement pools of a publisher, as readers keep the old ones mapped.
 const MAX_NEW_POOLS: u32 = 3;
+
+/// The error of frames whose length is not that of their header.
+pub const WRONG_LENGTH: &str = "frame of the wrong length";
 
 /// On the air link each priority has a separate connection (`zenoh-config/README.md`); frames use these
 /// two.
@@ -78,6 +82,7 @@ pub enum Loan {
 pub struct Frame {
     /// Its header.
     pub header: FrameHeader,
+    key: KeyExpr<'static>,
     payload: ZBytes,
 }
 
@@ -280,6 +285,11 @@ impl DerefMut for Loan {
 }
 
 impl Frame {
+    /// The key on which it was published.
+    pub fn key(&self) -> &str {
+        self.key.as_str()
+    }
+
     /// The payload's bytes, without a copy.
     pub fn bytes(&self) -> Cow<'_, [u8]> {
         self.payload.to_bytes()
@@ -315,7 +325,7 @@ impl FrameSubscriber {
                 None
             }
             Ok(header) if !has_length(&header, sample.payload().len()) => {
-                if self.health.failed("frame of the wrong length") {
+                if self.health.failed(WRONG_LENGTH) {
                     tracing::warn!(
                         ?header,
                         len = sample.payload().len(),
@@ -324,7 +334,10 @@ impl FrameSubscriber {
                 }
                 None
             }
-            Ok(header) => Some(Frame { header, payload: sample.payload().clone() }),
+            Ok(header) => {
+                let (key, payload) = (sample.key_expr().clone(), sample.payload().clone());
+                Some(Frame { header, key, payload })
+            }
         }
     }
 }
