@@ -22,6 +22,7 @@ mod exposure;
 mod genicam;
 mod marker;
 mod metadata;
+mod no_frame;
 mod pairing;
 mod program;
 mod rect;

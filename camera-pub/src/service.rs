@@ -25,6 +25,7 @@ use crate::exposure::Exposure;
 #[cfg(feature = "genicam")]
 use crate::genicam;
 use crate::marker::MarkerExposure;
+use crate::no_frame::{NoFrame, other_size};
 use crate::program::Program;
 use crate::rect::RectPublisher;
 use crate::repeated::{Picture, Pictures};
@@ -241,15 +242,6 @@ impl Pace {
     }
 }
 
-/// Why a picture gives no frame.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
-enum NoFrame {
-    /// It cannot be read.
-    Damaged,
-    /// It has another size.
-    OtherSize(FrameSize),
-}
-
 /// The result of reading a device.
 struct Read {
     frame: Result<Prepared, NoFrame>,
@@ -322,6 +314,7 @@ impl Stream {
         let bayer = self.config.source.bayer_pattern()?;
         let mut program = Program::start(config)?;
         let mut last_published = Instant::now();
+        let mut last_of_size = Instant::now();
         loop {
             let arrival = program.wait().await?;
             let began = Instant::now();
@@ -359,7 +352,21 @@ impl Stream {
                 FrameFormat::Samples { .. } => {
                     Some(self.prepare_samples(pixels, config.size, config.bits, bayer))
                 }
-                FrameFormat::Jpeg { .. } => self.prepare_jpeg(&jpeg).ok(),
+                FrameFormat::Jpeg { .. } => {
+                    let frame = self.prepare_jpeg(&jpeg);
+                    match frame {
+                        Err(NoFrame::OtherSize(size)) => {
+                            let waited = last_of_size.elapsed();
+                            ensure!(
+                                waited < config.timeout,
+                                "the camera program of `source.command`: {}",
+                                other_size(size, self.size)
+                            );
+                        }
+                        Ok(_) | Err(NoFrame::Damaged) => last_of_size = Instant::now(),
+                    }
+                    frame.ok()
+                }
             };
             self.health.latency("read", began.elapsed());
             if let Some(frame) = frame {
@@ -502,7 +509,8 @@ impl Stream {
             return Ok(());
         }
         if self.health.failed("image of another size") {
-            tracing::warn!(width, height, "Dropped a frame whose size is not `source.size_px`");
+            let error = other_size(size, self.size);
+            tracing::warn!(%error, "Dropped a frame whose size is not `source.size_px`");
         }
         Err(NoFrame::OtherSize(size))
     }
@@ -752,19 +760,6 @@ impl Stream {
         }
         self.frames.publish(&header, frame.pixels).await;
         self.sequence += 1;
-    }
-}
-
-impl NoFrame {
-    /// Why a camera is given up that has sent nothing else for so long, where frames of this size are wanted.
-    fn as_loss(self, wanted: FrameSize, for_ns: i64) -> Lost {
-        match self {
-            Self::Damaged => Lost::Unreadable(Duration::from_nanos(for_ns.unsigned_abs())),
-            Self::OtherSize(FrameSize { width, height }) => Lost::FormatChanged(format!(
-                "its frames have {width} x {height} pixels, {} x {} are wanted (`source.size_px`)",
-                wanted.width, wanted.height
-            )),
-        }
     }
 }
 

@@ -90,7 +90,7 @@ mod tests {
     /// The picture of a program that is run by a shell and writes JPEG files of 8 x 8 pixels.
     fn of_script(script: &str, limit: Duration) -> anyhow::Result<GrayImage> {
         let command = format!("source.command=[\"sh\", \"-c\", {script:?}]");
-        let set = [&*command, "source.pixels=mjpeg", "source.size_px=[8, 8]"];
+        let set = [&*command, "source.pixels=mjpeg", "source.size_px=[8, 8]", "source.timeout_s=5"];
         let layers = node::Layers { file: None, set: set.map(str::to_owned).into() };
         published_within(layers.load::<Config>()?.settings, limit)
     }
@@ -101,6 +101,16 @@ mod tests {
         let problem = of_script(damaged, Duration::from_secs(2)).unwrap_err().to_string();
         let said = "camera `down` gave no picture within 2 s: unreadable image (";
         assert!(problem.starts_with(said), "{problem}");
+    }
+
+    #[test]
+    fn frames_of_another_size_are_reported_with_both_sizes_within_the_timeout_of_the_source() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("seen.jpg");
+        image::save_buffer(&file, &[200; 256], 16, 16, image::ExtendedColorType::L8).unwrap();
+        let script = format!("while cat '{}'; do sleep 0.05; done", file.display());
+        let problem = of_script(&script, Duration::from_secs(60)).unwrap_err().to_string();
+        assert!(problem.contains("its frames have 16 x 16 pixels, 8 x 8 are wanted"), "{problem}");
     }
 
     #[test]
