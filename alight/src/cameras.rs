@@ -37,6 +37,9 @@ const RTSP_HINT: &str = if cfg!(feature = "rtsp") {
 } else {
     "# needs a program that was built with `--features rtsp`\n"
 };
+/// The optional features that concern cameras, and whether this program was built with each.
+const FEATURES: [(&str, bool); 2] =
+    [("rtsp", cfg!(feature = "rtsp")), ("genicam", cfg!(feature = "genicam"))];
 /// Maximum number of sizes of a format that are listed for people.
 const MAX_SIZES: usize = 6;
 
@@ -76,6 +79,8 @@ struct Listing {
     mavlink: Option<Announced>,
     /// Programs that are on this machine.
     programs: Vec<&'static str>,
+    /// Optional features with which this program was built.
+    features: Vec<&'static str>,
 }
 
 /// A device, and how to configure it.
@@ -134,7 +139,12 @@ fn listing(folder: &Path, only: Option<&Path>) -> Listing {
         genicam: Vec::new(),
         mavlink: None,
         programs: programs.collect(),
+        features: built_in(),
     }
+}
+
+fn built_in() -> Vec<&'static str> {
+    FEATURES.iter().filter(|(_, is_built_in)| *is_built_in).map(|(name, _)| *name).collect()
 }
 
 /// The error that a device is not one of those in a folder, which it lists.
@@ -207,7 +217,13 @@ fn text(listing: &Listing) -> String {
         let state = if listing.programs.contains(name) { "installed" } else { "not installed" };
         [format!("  {name}"), state.to_owned(), (*purpose).to_owned()]
     };
-    text + &aligned(&PROGRAMS.each_ref().map(row))
+    text += &aligned(&PROGRAMS.each_ref().map(row));
+    let row = |(name, is_built_in): &(&str, bool)| {
+        let state = if *is_built_in { "built in" } else { "not built in" };
+        [format!("  {name}"), state.to_owned()]
+    };
+    text + "\nOptional features of this program (`source.rtsp`, `source.genicam`):\n"
+        + &aligned(&FEATURES.each_ref().map(row))
 }
 
 /// A camera that is announced over MAVLink, with the tables of its streams.
@@ -360,6 +376,7 @@ mod tests {
             genicam: Vec::new(),
             mavlink: None,
             programs: vec!["ffmpeg"],
+            features: built_in(),
         };
         let text = text(&listing);
         assert!(text.contains("/dev/video0: PTZ Pro Camera (uvcvideo)"), "{text}");
@@ -369,6 +386,14 @@ mod tests {
         assert_eq!(json["devices"][0]["path"], "/dev/video0");
         assert_eq!(json["devices"][0]["description"]["formats"][1]["is_readable"], false);
         assert_eq!(json["programs"][0], "ffmpeg");
+        for (name, is_built_in) in FEATURES {
+            let state = if is_built_in { "built in" } else { "not built in" };
+            let rows =
+                text.lines().map(|line| line.split_whitespace().collect::<Vec<_>>().join(" "));
+            assert!(rows.clone().any(|row| row == format!("{name} {state}")), "{text}");
+            let listed = json["features"].as_array().unwrap().iter().any(|it| it == name);
+            assert_eq!(listed, is_built_in, "{name}");
+        }
     }
 
     #[test]
@@ -402,6 +427,7 @@ mod tests {
                 genicam: Vec::new(),
                 mavlink: None,
                 programs: Vec::new(),
+                features: Vec::new(),
             };
             let text = text(&listing);
             assert!(text.contains("gives no frames") || text.contains("none of these"), "{text}");
