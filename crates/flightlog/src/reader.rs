@@ -432,9 +432,9 @@ mod tests {
         let mut tried = 0;
         while at < end {
             let length = u64::from_le_bytes(file[at + 1..at + 9].try_into().unwrap()) as usize;
-            if file[at] == mcap::records::op::MESSAGE_INDEX {
+            if file[at] == op::MESSAGE_INDEX {
                 let mut flipped = file.clone();
-                flipped[at] = mcap::records::op::DATA_END;
+                flipped[at] = op::DATA_END;
                 let reading = read(&flipped, |_| {}).unwrap();
                 assert_eq!((reading.messages, reading.damage.len()), (whole.messages, 1));
                 tried += 1;

@@ -105,7 +105,8 @@ fn a_repaired_copy_states_what_was_lost() {
     let read = |file: &[u8]| flightlog::read(file, |_| ()).unwrap();
     let of_damaged = read(&damaged);
     assert_eq!((of_damaged.lost.chunks, of_damaged.lost.of), (2, 6));
-    assert_eq!(of_damaged.lost.gaps_ns, [9..30]);
+    assert_eq!(of_damaged.lost.gaps_ns.len(), 1);
+    assert_eq!(of_damaged.lost.gaps_ns.first(), Some(&(9..30)));
     let mut copy = Vec::new();
     repair(&damaged, &mut copy).unwrap();
     let of_copy = read(&copy);

@@ -26,6 +26,15 @@ impl Flight {
         Some(begun_ns..finished.map_or(begun_ns, |it| it.stamp_ns).max(begun_ns))
     }
 
+    /// When the landing began, or else the recording, as date and time of UTC by the recorder's machine.
+    pub fn begun_utc(&self) -> Option<String> {
+        let begun_ns = match self.landing_ns() {
+            Some(landing_ns) => landing_ns.start.saturating_add(self.shift_ns),
+            None => self.origin.received_ns.as_ref()?.start,
+        };
+        self.origin.utc(begun_ns)
+    }
+
     /// Keeps one of several landings, by its number from 1 on, or the last; of a recording with one everything stays, but for other
     /// starts of the vehicle's computer.
     ///

@@ -5,8 +5,6 @@ use std::time::{Duration, SystemTime};
 
 use flightlog::{Received, is_state};
 
-use crate::flight::Flight;
-
 /// The first date that a clock can show which was ever set, in nanoseconds since 1970: in lock-step clocks begin at 0.
 const MIN_UTC_NS: u64 = 1_000_000_000_000_000_000;
 
@@ -41,22 +39,11 @@ impl Origin {
     }
 
     /// A time of the recorder's clock as date and time of UTC, `2026-11-30T15:39:12Z`.
-    fn utc(&self, at_ns: i64) -> Option<String> {
+    pub fn utc(&self, at_ns: i64) -> Option<String> {
         let since_1970_ns = u64::try_from(at_ns.checked_add(self.utc_offset_ns?)?).ok()?;
         let since_1970 = Duration::from_nanos(Some(since_1970_ns).filter(|ns| *ns >= MIN_UTC_NS)?);
         let at = SystemTime::UNIX_EPOCH + since_1970;
         Some(humantime::format_rfc3339_seconds(at).to_string())
-    }
-}
-
-impl Flight {
-    /// When the landing began, or else the recording, as date and time of UTC; by the recorder's machine.
-    pub fn begun_utc(&self) -> Option<String> {
-        let begun_ns = match self.landing_ns() {
-            Some(landing_ns) => landing_ns.start.saturating_add(self.shift_ns),
-            None => self.origin.received_ns.as_ref()?.start,
-        };
-        self.origin.utc(begun_ns)
     }
 }
 
