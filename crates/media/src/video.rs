@@ -47,7 +47,7 @@ pub enum VideoError {
     /// A container or codec that is not supported.
     #[error(
         "{path:?} is {kind}; supported are Motion JPEG (.avi, .mjpeg) and 8-bit H.264 (.mp4, .mov, .h264). \
-         Convert it with: ffmpeg -i {path:?} -c:v mjpeg -q:v 2 -an video.avi"
+         Convert it with: ffmpeg -noautorotate -i {path:?} -c:v mjpeg -q:v 2 -an video.avi"
     )]
     Unsupported {
         /// The file.
@@ -709,6 +709,61 @@ mod tests {
         assert_eq!(times, expected);
     }
 
+    /// A video of ffmpeg's test pictures of 64 x 48 pixels, at 25 Hz.
+    fn encode(seconds: &str, options: &[&str], path: &Path) {
+        let source = format!("testsrc=size=64x48:rate=25:duration={seconds}");
+        let made = std::process::Command::new("ffmpeg")
+            .args(["-v", "error", "-f", "lavfi", "-i", &source])
+            .args(["-c:v", "libx264", "-pix_fmt", "yuv420p"])
+            .args(options)
+            .arg(path)
+            .status();
+        assert!(made.unwrap().success());
+    }
+
+    fn frames(path: &Path) -> Vec<GrayImage> {
+        let mut video = Video::open(path, MAX_PIXELS).unwrap();
+        let frames = std::iter::from_fn(|| video.next_frame());
+        frames.map(|frame| frame.unwrap().image.grey(path, MAX_PIXELS).unwrap()).collect()
+    }
+
+    #[test]
+    fn frames_are_as_the_sensor_saw_them_also_after_the_conversion_that_is_advised() {
+        if !testing::has_x264() {
+            return;
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let upright = folder.path().join("upright.mp4");
+        encode("0.2", &[], &upright);
+        assert!(!Video::open(&upright, MAX_PIXELS).unwrap().is_turned());
+        // A quarter of a turn, in the matrix of the track's header: 40 bytes behind the name of its box.
+        let mut bytes = std::fs::read(&upright).unwrap();
+        let at = 44 + bytes.windows(4).position(|name| name == b"tkhd").unwrap();
+        let matrix = [0, 0x1_0000, 0, -0x1_0000, 0, 0, 0, 0, 0x4000_0000_i32];
+        let matrix = matrix.map(i32::to_be_bytes);
+        bytes[at..at + 36].copy_from_slice(matrix.as_flattened());
+        let turned = folder.path().join("turned video.mp4");
+        std::fs::write(&turned, bytes).unwrap();
+        assert!(Video::open(&turned, MAX_PIXELS).unwrap().is_turned());
+        let stored = frames(&turned);
+        let advice = Problems { path: &turned }.unsupported("of a test").to_string();
+        let (_, command) = advice.split_once("Convert it with: ").unwrap();
+        let shell = std::process::Command::new("sh")
+            .args(["-c", &command.replacen("ffmpeg", "ffmpeg -v error", 1)])
+            .current_dir(folder.path())
+            .status();
+        assert!(shell.unwrap().success(), "{command}");
+        let converted = frames(&folder.path().join("video.avi"));
+        assert_eq!((stored.len(), converted.len()), (5, 5));
+        for (stored, converted) in stored.iter().zip(&converted) {
+            assert_eq!((converted.width(), converted.height()), (64, 48));
+            let pixels = stored.pixels().iter().zip(converted.pixels());
+            let off: u32 = pixels.map(|(a, b)| u32::from(a.abs_diff(*b))).sum();
+            // Video has a narrower range of luma than JPEG: 16 to 235.
+            assert!(off < 20 * 64 * 48, "{off}");
+        }
+    }
+
     #[test]
     fn an_mp4_file_that_viewers_turn_is_recognised() {
         let folder = tempfile::tempdir().unwrap();
@@ -741,7 +796,10 @@ mod tests {
             ("a.mp4", b"neither MP4 nor AVI".to_vec()),
         ] {
             let problem = levels(name, &bytes).unwrap_err();
-            assert!(problem.contains("ffmpeg -i") && problem.contains(name), "{problem}");
+            assert!(
+                problem.contains("ffmpeg -noautorotate -i") && problem.contains(name),
+                "{problem}"
+            );
         }
         assert!(levels("a.avi", &avi(b"XVID", &[])).unwrap_err().contains("\"XVID\""));
         let empty = levels("a.mp4", &[]).unwrap_err();
