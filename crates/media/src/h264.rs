@@ -82,7 +82,7 @@ impl LiveH264 {
 }
 
 /// The luma of a picture, as 8 bits.
-fn luma(frame: &Frame) -> Result<GrayImage, H264Error> {
+pub(crate) fn luma(frame: &Frame) -> Result<GrayImage, H264Error> {
     let format = SampleFormat { bits: u32::from(frame.bit_depth), bayer: None };
     let (width, height) = (frame.width as usize, frame.height as usize);
     let mut converter = Converter::default();
@@ -135,6 +135,11 @@ impl Limits {
     /// For pictures of at most so many pixels.
     pub(crate) fn new(max_pixels: u64) -> Self {
         Self { max_pixels, sequences: BTreeMap::new(), pictures: BTreeMap::new() }
+    }
+
+    /// The largest number of pixels of a picture.
+    pub(crate) fn max_pixels(&self) -> u64 {
+        self.max_pixels
     }
 
     /// The value of a unit that exceeds a limit, if any. A damaged unit is left to the decoder.

@@ -4,14 +4,16 @@
 //!
 //! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, `huffman` adds the tables that a camera leaves
 //! out, `scan` checks whether their data are complete, [`image`] reads image files, [`video`] reads videos frame by frame,
-//! [`h264`] decodes a camera's stream, [`calibration`] reads and writes the calibration files of other programs, [`rectify`]
-//! removes a lens's distortion from images, [`atomic`] replaces a file by a complete one.
+//! `cut` recognises a bare stream whose last picture is cut, [`h264`] decodes a camera's stream, [`calibration`] reads and
+//! writes the calibration files of other programs, [`rectify`] removes a lens's distortion from images, [`atomic`] replaces a
+//! file by a complete one.
 
 pub mod atomic;
 mod boxes;
 mod budget;
 pub mod calibration;
 mod contained;
+mod cut;
 pub mod h264;
 mod huffman;
 pub mod image;

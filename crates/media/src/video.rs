@@ -7,14 +7,15 @@ use std::fs::File;
 use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use imaging::{Converter, GrayImage, SampleFormat};
-use rust_h264::decoder::OrderedDecoder;
+use imaging::GrayImage;
+use rust_h264::decoder::{Frame, OrderedDecoder};
 use rust_h264::nal::{NalUnit, parse_annex_b, parse_avcc};
 
 use crate::boxes;
 use crate::budget::{Budget, BudgetReader};
 use crate::contained::contained;
-use crate::h264::Limits;
+use crate::cut::cut_picture;
+use crate::h264::{Limits, luma};
 use crate::image::{ImageError, decode_image, has_extension};
 use crate::jpeg::next_jpeg;
 
@@ -427,6 +428,8 @@ struct H264 {
     ready: VecDeque<GrayImage>,
     times: Times,
     is_over: bool,
+    /// Why the stream ended early, which is reported after its pictures.
+    failure: Option<VideoError>,
 }
 
 /// When the pictures of an MP4 file are shown.
@@ -506,14 +509,17 @@ impl H264 {
         let track = track.track_id();
         let source = Source::Mp4 { reader: Box::new(reader), track, next: 1, length_bytes };
         let ready = VecDeque::new();
-        Ok((Self { decoder, limits, source, ready, times, is_over: false }, period_s))
+        Ok((
+            Self { decoder, limits, source, ready, times, is_over: false, failure: None },
+            period_s,
+        ))
     }
 
     fn from_stream(bytes: Vec<u8>, max_pixels: u64) -> Self {
         let source = Source::Stream { bytes, at: 0 };
         let (decoder, limits) = (OrderedDecoder::new(), Limits::new(max_pixels));
         let (ready, times) = (VecDeque::new(), Times::default());
-        Self { decoder, limits, source, ready, times, is_over: false }
+        Self { decoder, limits, source, ready, times, is_over: false, failure: None }
     }
 
     /// Whether the track's header has a rotation for viewers (ISO/IEC 14496-12, 8.3.2): a matrix other than a scale.
@@ -531,18 +537,49 @@ impl H264 {
         problems: &Problems<'_>,
     ) -> Option<Result<(VideoImage, Option<f64>), VideoError>> {
         while self.ready.is_empty() && !self.is_over {
-            if let Err(problem) = self.decode_more(problems) {
-                self.is_over = true;
-                return Some(Err(problem));
-            }
+            self.decode_more(problems);
         }
-        let image = self.ready.pop_front()?;
-        Some(Ok((VideoImage::Grey(image), self.times.next_s())))
+        match self.ready.pop_front() {
+            Some(image) => Some(Ok((VideoImage::Grey(image), self.times.next_s()))),
+            None => self.failure.take().map(Err),
+        }
     }
 
-    fn decode_more(&mut self, problems: &Problems<'_>) -> Result<(), VideoError> {
+    fn decode_more(&mut self, problems: &Problems<'_>) {
         let mut frames = Vec::new();
-        let mut decode = |unit: &NalUnit<'_>| {
+        if let Err(failure) = self.decode_sample(&mut frames, problems) {
+            self.is_over = true;
+            self.failure = Some(failure);
+        }
+        if self.is_over {
+            let mut last = self.decoder.flush();
+            if let (Source::Stream { bytes, .. }, None) = (&self.source, &self.failure)
+                && let Some(cut) = cut_picture(bytes, &last, self.limits.max_pixels())
+            {
+                last.remove(cut);
+                self.failure = Some(problems.damaged("bytes are missing in its last picture"));
+            }
+            frames.extend(last);
+        }
+        for frame in frames {
+            match luma(&frame) {
+                Ok(image) => self.ready.push_back(image),
+                Err(failure) => {
+                    self.is_over = true;
+                    self.failure = Some(problems.damaged(failure));
+                    break;
+                }
+            }
+        }
+    }
+
+    /// Decodes the next picture's units; adds the pictures that are complete then to `frames`.
+    fn decode_sample(
+        &mut self,
+        frames: &mut Vec<Frame>,
+        problems: &Problems<'_>,
+    ) -> Result<(), VideoError> {
+        let decode = |unit: &NalUnit<'_>| {
             check(&mut self.limits, unit, problems)?;
             frames.extend(self.decoder.decode_nal(unit).map_err(|e| problems.damaged(e))?);
             Ok(())
@@ -553,32 +590,16 @@ impl H264 {
                 *next += 1;
                 match sample {
                     Some(sample) => {
+                        parse_avcc(&sample.bytes, *length_bytes).iter().try_for_each(decode)?;
                         self.times.add(&sample);
-                        parse_avcc(&sample.bytes, *length_bytes)
-                            .iter()
-                            .try_for_each(&mut decode)?;
                     }
                     None => self.is_over = true,
                 }
             }
             Source::Stream { bytes, at } => match next_unit(bytes, at) {
-                Some(unit) => parse_annex_b(unit).iter().try_for_each(&mut decode)?,
+                Some(unit) => parse_annex_b(unit).iter().try_for_each(decode)?,
                 None => self.is_over = true,
             },
-        }
-        if self.is_over {
-            frames.extend(self.decoder.flush());
-        }
-        for frame in frames {
-            let bits = SampleFormat { bits: u32::from(frame.bit_depth), bayer: None };
-            let (width, height) = (frame.width as usize, frame.height as usize);
-            let mut converter = Converter::default();
-            let view = converter
-                .convert(&frame.y, width, height, bits)
-                .map_err(|e| problems.damaged(e))?;
-            let mut image = GrayImage::filled(width, height, 0);
-            (0..height).for_each(|y| image.row_mut(y).copy_from_slice(view.row(y)));
-            self.ready.push_back(image);
         }
         Ok(())
     }
@@ -806,6 +827,49 @@ mod tests {
         assert!(empty.contains("a.mp4") && empty.contains("is empty"), "{empty}");
         assert!(Video::open(Path::new("no/such.avi"), MAX_PIXELS).is_err());
         assert!(is_video(Path::new("a.MP4")) && !is_video(Path::new("a.png")));
+    }
+
+    #[test]
+    fn a_bare_stream_that_is_cut_gives_its_complete_pictures_and_an_error() {
+        if !testing::has_x264() {
+            return;
+        }
+        let folder = tempfile::tempdir().unwrap();
+        for options in [
+            &["-bf", "2"][..],
+            &["-profile:v", "baseline"],
+            &["-g", "1"],
+            &["-slices", "3"],
+            &["-flags", "+ilme+ildct", "-x264opts", "tff=1"],
+        ] {
+            let path = folder.path().join("a.h264");
+            encode(
+                "0.4",
+                &[&["-vf", "noise=alls=60:allf=t", "-qp", "20", "-y"], options].concat(),
+                &path,
+            );
+            let whole = std::fs::read(&path).unwrap();
+            let read = || {
+                let mut video = Video::open(&path, MAX_PIXELS).unwrap();
+                let frames: Vec<_> = std::iter::from_fn(|| video.next_frame()).collect();
+                let errors: Vec<_> = frames.iter().filter_map(|it| it.as_ref().err()).collect();
+                let reported = errors.first().map_or(String::new(), ToString::to_string);
+                (frames.len() - errors.len(), reported)
+            };
+            assert_eq!(read(), (10, String::new()), "{options:?}");
+            std::fs::write(&path, [&whole[..], &[0; 3]].concat()).unwrap();
+            assert_eq!(read(), (10, String::new()), "{options:?}");
+            for missing in [8, 60] {
+                std::fs::write(&path, &whole[..whole.len() - missing]).unwrap();
+                let (count, reported) = read();
+                // With a slice that it refuses, the decoder drops the picture before it as well.
+                let is_known = (8..=9).contains(&count);
+                assert!(
+                    is_known && reported.contains("cut short"),
+                    "{options:?}: {count} {reported}"
+                );
+            }
+        }
     }
 
     #[test]
