@@ -23,26 +23,38 @@ pub(crate) fn is_jpeg(bytes: &[u8]) -> bool {
 
 /// Length of the JPEG file at the start of `bytes`, to its EOI marker; `None` when there is none.
 pub(crate) fn jpeg_len(bytes: &[u8]) -> Option<usize> {
-    end_of_image(bytes, &mut SOI.len())
+    match end_of_image(bytes, &mut SOI.len())? {
+        End::Complete(len) => Some(len),
+        End::Cut(_) => None,
+    }
 }
 
 /// The next JPEG file in `bytes`, at or after `at`, which moves behind it. A file whose segments do not lead
-/// to an EOI marker ends where EOI and SOI follow each other, or with the stream.
+/// to an EOI marker ends at the SOI marker of the next one, where EOI and SOI follow each other, or with the stream.
 pub(crate) fn next_jpeg<'a>(bytes: &'a [u8], at: &mut usize) -> Option<&'a [u8]> {
     let rest = bytes.get(*at..)?;
     let start = rest.windows(3).position(|w| w == [SOI[0], SOI[1], 0xff])?;
     let file = rest.get(start..)?;
     let boundary = [EOI, SOI].concat();
-    let len = jpeg_len(file)
+    let len = end_of_image(file, &mut SOI.len())
+        .map(|(End::Complete(len) | End::Cut(len))| len)
         .or_else(|| Some(file.windows(4).position(|w| w == boundary)? + EOI.len()))
         .unwrap_or(file.len());
     *at += start + len;
     file.get(..len)
 }
 
-/// Follows the segments from `at`, a place between segments or in coded data, to the end of the EOI marker.
+/// Where a file ends.
+enum End {
+    /// Behind its EOI marker.
+    Complete(usize),
+    /// Before the SOI marker of the next file: the rest of this one is missing.
+    Cut(usize),
+}
+
+/// Follows the segments from `at`, a place between segments or in coded data, to the end of the file.
 /// Where bytes are missing, `at` is the position to continue from once there are more.
-fn end_of_image(bytes: &[u8], at: &mut usize) -> Option<usize> {
+fn end_of_image(bytes: &[u8], at: &mut usize) -> Option<End> {
     loop {
         let ahead = bytes.get(*at..)?;
         let Some(next) = ahead.iter().position(|byte| *byte == 0xff) else {
@@ -54,9 +66,11 @@ fn end_of_image(bytes: &[u8], at: &mut usize) -> Option<usize> {
         match bytes.get(code)? {
             // A fill byte may be the first byte of a marker itself.
             0xff => *at = code,
+            // No file has a second SOI marker here, except that some repeat their first one.
+            0xd8 if *at > SOI.len() => return Some(End::Cut(*at)),
             // A stuffed byte, TEM, RST0 to RST7 and SOI have no length.
             0x00 | 0x01 | 0xd0..=0xd8 => *at = code + 1,
-            0xd9 => return Some(code + 1),
+            0xd9 => return Some(End::Complete(code + 1)),
             _ => {
                 let &[high, low] = bytes.get(code + 1..code + 3)? else { return None };
                 *at = code + 1 + usize::from(u16::from_be_bytes([high, low])).max(2);
@@ -113,11 +127,14 @@ pub struct JpegScanner {
     /// Where to look for the next marker.
     at: usize,
     is_complete: bool,
+    /// Whether the first byte of the next file's SOI marker was taken.
+    has_next_begun: bool,
 }
 
 impl JpegScanner {
-    /// Takes bytes up to the next event, which is the end of an SOI marker or of an EOI marker, and returns
-    /// how many it took. After an EOI marker it takes nothing until [`Self::take`].
+    /// Takes bytes up to the next event, which is the end of an SOI marker or of a file, and returns
+    /// how many it took. A file ends with its EOI marker or, where that is missing, before the SOI marker of the next file. After its
+    /// end the scanner takes nothing until [`Self::take`].
     pub fn push(&mut self, bytes: &[u8]) -> usize {
         if self.is_complete {
             return 0;
@@ -125,7 +142,14 @@ impl JpegScanner {
         if self.has_started() {
             let before = self.file.len();
             self.file.extend_from_slice(bytes);
-            let Some(end) = end_of_image(&self.file, &mut self.at) else { return bytes.len() };
+            let end = match end_of_image(&self.file, &mut self.at) {
+                Some(End::Complete(end)) => end,
+                Some(End::Cut(end)) => {
+                    self.has_next_begun = end < before;
+                    end
+                }
+                None => return bytes.len(),
+            };
             self.is_complete = true;
             self.file.truncate(end);
             return end.saturating_sub(before);
@@ -149,7 +173,7 @@ impl JpegScanner {
         self.file.len() >= SOI.len()
     }
 
-    /// True once the file has its EOI marker.
+    /// True once the file has its EOI marker, or the next one has begun.
     pub fn is_complete(&self) -> bool {
         self.is_complete
     }
@@ -161,7 +185,11 @@ impl JpegScanner {
 
     /// The file, as far as it has come; the scanner begins again.
     pub fn take(&mut self) -> Vec<u8> {
-        std::mem::take(self).file
+        let Self { file, has_next_begun, .. } = std::mem::take(self);
+        if has_next_begun {
+            self.file.push(SOI[0]);
+        }
+        file
     }
 }
 
@@ -213,6 +241,36 @@ mod tests {
             }
             assert_eq!((files, scanner.has_started()), (3, false), "pieces of {size}");
         }
+    }
+
+    #[test]
+    fn the_file_after_one_that_is_cut_in_its_coded_data_is_complete() {
+        // In the coded data, behind the first byte of a marker, and within the scan.
+        for len in [16, 17, FILE.len() - 3] {
+            let cut = &FILE[..len];
+            let stream = [cut, FILE, cut, FILE].concat();
+            for size in 1..stream.len() {
+                let mut scanner = JpegScanner::default();
+                let mut files = Vec::new();
+                for mut piece in stream.chunks(size) {
+                    while !piece.is_empty() {
+                        let taken = scanner.push(piece);
+                        piece = &piece[taken..];
+                        if scanner.is_complete() {
+                            files.push(scanner.take());
+                        }
+                    }
+                }
+                assert_eq!(files, [cut, FILE, cut, FILE], "cut to {len} bytes, pieces of {size}");
+            }
+            let mut at = 0;
+            assert_eq!(next_jpeg(&stream, &mut at), Some(cut));
+            assert_eq!(next_jpeg(&stream, &mut at), Some(FILE));
+            assert_eq!(jpeg_len(&stream), None, "cut to {len} bytes");
+        }
+        // A repeated SOI marker belongs to its file.
+        let repeated = [&SOI, FILE].concat();
+        assert_eq!(jpeg_len(&repeated), Some(repeated.len()));
     }
 
     #[test]
