@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 use imaging::GrayImage;
 use rust_h264::decoder::{Frame, OrderedDecoder};
+use rust_h264::error::DecodeError;
 use rust_h264::nal::{NalUnit, parse_annex_b, parse_avcc};
 
 use crate::boxes;
@@ -47,7 +48,7 @@ pub enum VideoError {
     },
     /// A container or codec that is not supported.
     #[error(
-        "{path:?} is {kind}; supported are Motion JPEG (.avi, .mjpeg) and 8-bit H.264 (.mp4, .mov, .h264). \
+        "{path:?} is {kind}; supported are Motion JPEG (.avi, .mjpeg) and H.264 of 8 or 10 bits (.mp4, .mov, .h264). \
          Convert it with: ffmpeg -noautorotate -i {path:?} -c:v mjpeg -q:v 2 -an video.avi"
     )]
     Unsupported {
@@ -223,6 +224,13 @@ impl Problems<'_> {
 
     fn unsupported(&self, kind: &str) -> VideoError {
         VideoError::Unsupported { path: self.path.to_owned(), kind: kind.to_owned() }
+    }
+
+    fn undecoded(&self, cause: &DecodeError) -> VideoError {
+        match cause {
+            DecodeError::Unsupported(kind) => self.unsupported(&format!("H.264 with {kind}")),
+            _ => self.damaged(cause),
+        }
     }
 
     fn damaged(&self, cause: impl std::fmt::Display) -> VideoError {
@@ -485,12 +493,26 @@ impl H264 {
         let is_video = |track: &&mp4::Mp4Track| {
             track.track_type().is_ok_and(|kind| kind == mp4::TrackType::Video)
         };
+        let container = match &reader.major_brand().value {
+            b"qt  " => "a QuickTime file",
+            _ => "an MP4 file",
+        };
         let Some(track) = reader.tracks().values().find(is_video) else {
-            return Err(problems.unsupported("an MP4 file without a known video track"));
+            return Err(problems.unsupported(&format!("{container} without a known video track")));
         };
-        let Some(avc1) = &track.trak.mdia.minf.stbl.stsd.avc1 else {
-            return Err(problems.unsupported("an MP4 file whose video is not H.264"));
+        let entry = &track.trak.mdia.minf.stbl.stsd;
+        let Some(avc1) = &entry.avc1 else {
+            let coding = match (&entry.hev1, &entry.vp09) {
+                (Some(_), _) => "is H.265",
+                (_, Some(_)) => "is VP9",
+                _ => "is not H.264",
+            };
+            return Err(problems.unsupported(&format!("{container} whose video {coding}")));
         };
+        // The parser reads every picture of a fragment at the beginning of that.
+        if !track.trafs.is_empty() {
+            return Err(problems.unsupported(&format!("{container} in fragments")));
+        }
         let (mut decoder, mut limits) = (OrderedDecoder::new(), Limits::new(max_pixels));
         let parameters =
             avc1.avcc.sequence_parameter_sets.iter().chain(&avc1.avcc.picture_parameter_sets);
@@ -498,7 +520,7 @@ impl H264 {
             let bytes = [&[0, 0, 1], parameter.bytes.as_slice()].concat();
             for unit in parse_annex_b(&bytes) {
                 check(&mut limits, &unit, problems)?;
-                decoder.decode_nal(&unit).map_err(|e| problems.damaged(e))?;
+                decoder.decode_nal(&unit).map_err(|e| problems.undecoded(&e))?;
             }
         }
         let ticks_per_s = f64::from(track.timescale().max(1));
@@ -581,7 +603,7 @@ impl H264 {
     ) -> Result<(), VideoError> {
         let decode = |unit: &NalUnit<'_>| {
             check(&mut self.limits, unit, problems)?;
-            frames.extend(self.decoder.decode_nal(unit).map_err(|e| problems.damaged(e))?);
+            frames.extend(self.decoder.decode_nal(unit).map_err(|e| problems.undecoded(&e))?);
             Ok(())
         };
         match &mut self.source {
@@ -827,6 +849,48 @@ mod tests {
         assert!(empty.contains("a.mp4") && empty.contains("is empty"), "{empty}");
         assert!(Video::open(Path::new("no/such.avi"), MAX_PIXELS).is_err());
         assert!(is_video(Path::new("a.MP4")) && !is_video(Path::new("a.png")));
+    }
+
+    #[test]
+    fn intact_videos_that_are_not_decoded_are_refused_with_the_reason_and_advice() {
+        if !testing::has_x264() {
+            return;
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let error = |name: &str, options: &[&str]| {
+            let path = folder.path().join(name);
+            let made = std::process::Command::new("ffmpeg")
+                .args(["-v", "error", "-f", "lavfi", "-i", "testsrc=size=64x48:rate=25:duration=1"])
+                .args(["-pix_fmt", "yuv420p", "-g", "5"])
+                .args(options)
+                .arg(&path)
+                .status();
+            assert!(made.unwrap().success(), "{options:?}");
+            let opened = Video::open(&path, MAX_PIXELS);
+            opened
+                .and_then(|mut video| video.next_frame().unwrap())
+                .map_err(|e| e.to_string())
+                .err()
+        };
+        let x264 = ["-c:v", "libx264"];
+        let ten_bits = [&x264[..], &["-pix_fmt", "yuv420p10le"]].concat();
+        assert_eq!(error("ten.mp4", &ten_bits), None);
+        let fragments =
+            ["frag_keyframe+empty_moov", "frag_keyframe", "frag_keyframe+default_base_moof"];
+        let fragments = fragments.map(|flags| [&x264[..], &["-movflags", flags]].concat());
+        let [empty, first, default] = fragments;
+        let yuv444 = [&x264[..], &["-pix_fmt", "yuv444p"]].concat();
+        for (name, options, reason) in [
+            ("empty.mp4", &*empty, "is an MP4 file in fragments;"),
+            ("first.mp4", &*first, "is an MP4 file in fragments;"),
+            ("default.mp4", &*default, "is an MP4 file in fragments;"),
+            ("colours.mp4", &*yuv444, "is H.264 with 4:4:4 chroma;"),
+            ("jpeg.mov", &["-c:v", "mjpeg"], "is a QuickTime file whose video is not H.264;"),
+        ] {
+            let error = error(name, options).unwrap();
+            assert!(error.contains(reason) && error.contains("ffmpeg -noautorotate -i"), "{error}");
+            assert!(error.contains("H.264 of 8 or 10 bits"), "{error}");
+        }
     }
 
     #[test]
