@@ -7,12 +7,12 @@ use std::future::poll_fn;
 use std::io::ErrorKind;
 use std::pin::pin;
 use std::process::Stdio;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail};
 use media::JpegScanner;
 use node::now_ns;
-use tokio::io::{AsyncBufRead, AsyncBufReadExt, AsyncReadExt, BufReader};
+use tokio::io::{AsyncBufRead, AsyncBufReadExt, BufReader};
 use tokio::process::{Child, ChildStdout, Command};
 use tokio::time::timeout;
 
@@ -61,7 +61,7 @@ impl Program {
             })?;
         let output = child.stdout.take().with_context(|| format!("`{name}` has no output"))?;
         let input = BufReader::with_capacity(BUFFER_BYTES, output);
-        let frames = FrameReader::new(input, config.format, period);
+        let frames = FrameReader::new(input, config.format, period, config.timeout);
         let (timeout, delay_ns) = (config.timeout, config.delay_ns);
         Ok(Self { name, timeout, child, frames, delay_ns, metadata })
     }
@@ -100,19 +100,19 @@ impl Program {
     /// JPEG file is returned.
     ///
     /// # Errors
-    /// As [`Self::wait`].
+    /// When the program writes nothing within the timeout, exits, or writes something else.
     pub(crate) async fn read(&mut self, samples: &mut [u8]) -> anyhow::Result<Vec<u8>> {
         let name = &self.name;
-        match timeout(self.timeout, self.frames.read(samples)).await {
-            Ok(Ok(jpeg)) => Ok(jpeg),
-            Ok(Err(cause)) if cause.kind() == ErrorKind::UnexpectedEof => {
+        match self.frames.read(samples).await {
+            Ok(jpeg) => Ok(jpeg),
+            Err(cause) if cause.kind() == ErrorKind::UnexpectedEof => {
                 Err(self.exit_error().await.context("its last frame is incomplete"))
             }
-            Ok(Err(cause)) => Err(anyhow!("reading a frame from `{name}`: {cause}")),
-            Err(_elapsed) => bail!(
+            Err(cause) if cause.kind() == ErrorKind::TimedOut => bail!(
                 "`{name}` stopped in the middle of a frame for {:.1} s (`source.timeout_s`)",
                 self.timeout.as_secs_f64()
             ),
+            Err(cause) => Err(anyhow!("reading a frame from `{name}`: {cause}")),
         }
     }
 
@@ -172,13 +172,15 @@ struct FrameReader<R> {
     format: FrameFormat,
     scanner: JpegScanner,
     queue: Queue,
+    /// Maximum time without a byte within a frame, and in which a JPEG file must end.
+    timeout: Duration,
     count: u64,
 }
 
 impl<R: AsyncBufRead + Unpin> FrameReader<R> {
-    fn new(input: R, format: FrameFormat, period: Duration) -> Self {
+    fn new(input: R, format: FrameFormat, period: Duration, timeout: Duration) -> Self {
         let queue = Queue::of(period);
-        Self { input, format, scanner: JpegScanner::default(), queue, count: 0 }
+        Self { input, format, scanner: JpegScanner::default(), queue, timeout, count: 0 }
     }
 
     /// Waits for the first byte of a frame; `None` at the end of the input.
@@ -224,7 +226,7 @@ impl<R: AsyncBufRead + Unpin> FrameReader<R> {
         let jpeg = match self.format {
             FrameFormat::Samples { row_bytes, stride_bytes, rows: _, chroma_bytes } => {
                 for row in samples.chunks_exact_mut(row_bytes.max(1)) {
-                    self.input.read_exact(row).await?;
+                    self.read_exact(row).await?;
                     self.skip(stride_bytes - row_bytes).await?;
                 }
                 self.skip(chroma_bytes).await?;
@@ -236,34 +238,46 @@ impl<R: AsyncBufRead + Unpin> FrameReader<R> {
         Ok(jpeg)
     }
 
+    async fn read_exact(&mut self, mut to: &mut [u8]) -> std::io::Result<()> {
+        while !to.is_empty() {
+            let taken =
+                std::io::Write::write(&mut to, ahead(&mut self.input, self.timeout).await?)?;
+            self.input.consume(taken);
+        }
+        Ok(())
+    }
+
     async fn skip(&mut self, bytes: usize) -> std::io::Result<()> {
         let mut left = bytes;
         while left > 0 {
-            let ahead = self.input.fill_buf().await?.len();
-            if ahead == 0 {
-                return Err(ErrorKind::UnexpectedEof.into());
-            }
-            let taken = ahead.min(left);
+            let taken = ahead(&mut self.input, self.timeout).await?.len().min(left);
             self.input.consume(taken);
             left -= taken;
         }
         Ok(())
     }
 
-    /// Reads from the SOI marker to the EOI marker.
+    /// Reads from the SOI marker to the end of the file.
     async fn read_jpeg(&mut self, max_bytes: usize) -> std::io::Result<Vec<u8>> {
+        let began = Instant::now();
         while !self.scanner.is_complete() {
-            if self.scanner.file_len() > max_bytes {
-                return Err(no_jpeg("end", max_bytes));
-            }
-            let ahead = self.input.fill_buf().await?;
-            if ahead.is_empty() {
-                return Err(ErrorKind::UnexpectedEof.into());
-            }
-            let taken = self.scanner.push(ahead);
+            let taken = self.scanner.push(ahead(&mut self.input, self.timeout).await?);
             self.input.consume(taken);
+            let is_late = began.elapsed() > self.timeout;
+            if !self.scanner.is_complete() && (self.scanner.file_len() > max_bytes || is_late) {
+                return Err(no_jpeg("end", self.scanner.file_len()));
+            }
         }
         Ok(self.scanner.take())
+    }
+}
+
+/// The next bytes of a frame; an error when none come within the time limit, or the input ends.
+async fn ahead<R: AsyncBufRead + Unpin>(input: &mut R, limit: Duration) -> std::io::Result<&[u8]> {
+    match timeout(limit, input.fill_buf()).await {
+        Ok(Ok([])) => Err(ErrorKind::UnexpectedEof.into()),
+        Ok(bytes) => bytes,
+        Err(_elapsed) => Err(ErrorKind::TimedOut.into()),
     }
 }
 
@@ -348,9 +362,9 @@ impl Queue {
     }
 }
 
-fn no_jpeg(event: &str, max_bytes: usize) -> std::io::Error {
+fn no_jpeg(event: &str, bytes: usize) -> std::io::Error {
     std::io::Error::other(format!(
-        "no JPEG {event} within {max_bytes} bytes; is `source.pixels` the format it writes?"
+        "no JPEG {event} within {bytes} bytes; is `source.pixels` the format it writes?"
     ))
 }
 
@@ -359,12 +373,14 @@ mod tests {
     use super::*;
     use ::image::{GrayImage, ImageFormat, Luma};
     use std::io::Cursor;
+
     const PERIOD: Duration = Duration::from_millis(40);
+    const TIMEOUT: Duration = Duration::from_secs(5);
 
     async fn all(format: FrameFormat, bytes: &[u8]) -> Result<Vec<Vec<u8>>, String> {
         // A buffer of a few bytes cuts every frame into many pieces.
         let input = BufReader::with_capacity(7, bytes);
-        let mut frames = FrameReader::new(input, format, PERIOD);
+        let mut frames = FrameReader::new(input, format, PERIOD, TIMEOUT);
         let mut read = Vec::new();
         while frames.wait().await.map_err(|e| e.to_string())?.is_some() {
             let mut samples = vec![0; format.frame_bytes()];
@@ -401,6 +417,77 @@ mod tests {
         assert!(all(format, &one[..one.len() - 2]).await.is_err(), "a cut frame");
         let problem = all(FrameFormat::Jpeg { max_bytes: 64 }, &[7; 500]).await.unwrap_err();
         assert!(problem.contains("`source.pixels`"), "{problem}");
+    }
+
+    /// The error of a frame of which a program writes 16 bytes in every period, so many times, and then nothing.
+    async fn slowly(format: FrameFormat, bytes: [u8; 16], times: u32) -> Option<String> {
+        let (mut program, output) = tokio::io::duplex(1 << 16);
+        let writing = async move {
+            for _ in 0..times {
+                tokio::io::AsyncWriteExt::write_all(&mut program, &bytes).await.unwrap();
+                tokio::time::sleep(PERIOD).await;
+            }
+            std::future::pending::<()>().await;
+        };
+        let reading = async {
+            let mut frames = FrameReader::new(BufReader::new(output), format, PERIOD, 5 * PERIOD);
+            frames.wait().await.unwrap().unwrap();
+            frames.read(&mut vec![0; format.frame_bytes()]).await.err().map(|e| e.to_string())
+        };
+        tokio::select! {
+            // Also on a machine that is busy, bytes are written before the time limit is checked.
+            biased;
+            () = writing => None,
+            error = reading => error,
+        }
+    }
+
+    #[tokio::test]
+    async fn a_frame_times_out_only_when_nothing_arrives() {
+        let samples = |stride_bytes| FrameFormat::Samples {
+            row_bytes: 32,
+            stride_bytes,
+            rows: 5,
+            chroma_bytes: 0,
+        };
+        let silent = std::io::Error::from(ErrorKind::TimedOut).to_string();
+        for stride_bytes in [32, 64] {
+            assert_eq!(slowly(samples(stride_bytes), [7; 16], 20).await, None, "all arrive");
+            let error = slowly(samples(stride_bytes), [7; 16], 9).await;
+            assert_eq!(error.as_ref(), Some(&silent), "half of it arrives");
+        }
+        // Coded data of a JPEG file that has no end, and of one that stops.
+        let jpeg = FrameFormat::Jpeg { max_bytes: 100_000 };
+        let mut endless = [7; 16];
+        (endless[14], endless[15]) = (0xff, 0xd8);
+        let error = slowly(jpeg, endless, 1).await;
+        assert_eq!(error.as_ref(), Some(&silent));
+    }
+
+    #[tokio::test]
+    async fn a_stream_that_has_no_jpeg_end_in_time_is_reported_as_another_format() {
+        let (mut program, output) = tokio::io::duplex(1 << 16);
+        let writing = async move {
+            let mut bytes: &[u8] = &[0xff, 0xd8, 7, 7];
+            while tokio::io::AsyncWriteExt::write_all(&mut program, bytes).await.is_ok() {
+                bytes = &[7; 64];
+                tokio::time::sleep(PERIOD).await;
+            }
+        };
+        let reading = async {
+            let format = FrameFormat::Jpeg { max_bytes: 1 << 20 };
+            let mut frames = FrameReader::new(BufReader::new(output), format, PERIOD, 5 * PERIOD);
+            frames.wait().await.unwrap().unwrap();
+            frames.read(&mut []).await.unwrap_err().to_string()
+        };
+        let error = tokio::select! {
+            () = writing => panic!("the reader has ended"),
+            error = reading => error,
+        };
+        assert!(
+            error.contains("no JPEG end within") && error.contains("`source.pixels`"),
+            "{error}"
+        );
     }
 
     #[test]
@@ -469,7 +556,7 @@ mod tests {
         };
         let reading = async {
             let input = BufReader::with_capacity(BUFFER_BYTES, output);
-            let mut frames = FrameReader::new(input, format, PERIOD);
+            let mut frames = FrameReader::new(input, format, PERIOD, TIMEOUT);
             let mut queued = 0;
             for _ in 0..20 {
                 queued += u32::from(frames.wait().await.unwrap().unwrap().was_queued);
