@@ -31,6 +31,7 @@ mod repeated;
 mod rtsp;
 pub mod service;
 mod side_channel;
+mod thread;
 mod v4l2;
 
 pub use announced::{Announced, AnnouncedCamera, AnnouncedStream, announced_cameras};

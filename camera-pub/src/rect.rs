@@ -53,7 +53,7 @@ impl RectPublisher {
         let runtime = Handle::current();
         std::thread::Builder::new()
             .name("rect".to_owned())
-            .spawn(move || node::block_on(&runtime, work.run()))
+            .spawn(move || work.run(&runtime))
             .context("starting the thread that rectifies frames")?;
         Ok(Self { is_wanted, newest })
     }
@@ -84,30 +84,26 @@ struct Work {
 }
 
 impl Work {
-    async fn run(mut self) {
-        let mut ticks = tokio::time::interval(TICK);
-        ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    /// Runs until the publisher is dropped, which may be after the runtime's end.
+    fn run(mut self, runtime: &Handle) {
         let mut checked = Instant::now();
         loop {
-            tokio::select! {
-                // The end of the service first: the runtime's clock ends after it, and must not be used after that.
-                biased;
-                changed = self.offers.changed() => {
-                    if changed.is_err() {
-                        return;
-                    }
+            let left = TICK.saturating_sub(checked.elapsed());
+            match node::block_on_for(runtime, left, self.offers.changed()) {
+                Some(Err(_dropped)) => return,
+                Some(Ok(())) => {
                     let offer = self.offers.borrow_and_update().clone();
                     if let Some(offer) = offer {
-                        self.publish(&offer).await;
+                        node::block_on(runtime, self.publish(&offer));
                     }
                     // Frames may come faster than they are rectified.
                     if checked.elapsed() < TICK {
                         continue;
                     }
                 }
-                _ = ticks.tick() => {}
+                None => {}
             }
-            let is_wanted = self.frames.has_subscribers().await;
+            let is_wanted = node::block_on(runtime, self.frames.has_subscribers());
             self.is_wanted.store(is_wanted, Ordering::Relaxed);
             checked = Instant::now();
         }
@@ -135,5 +131,33 @@ impl Work {
         self.health.latency("rectify", began.elapsed());
         let header = FrameHeader { format: PixelFormat::Mono8, ..offer.header.clone() };
         self.frames.publish(&header, pixels).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use node::{Identity, ZenohSource};
+
+    const TIME_LIMIT: Duration = Duration::from_secs(20);
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn the_thread_that_rectifies_frames_outlives_its_runtime_without_a_panic() {
+        let text = include_str!("../../zenoh-config/local.json5");
+        let ([port], _, _) = testing::ports::free().unwrap();
+        let local = ZenohSource::Text(text.replace(":7447", &format!(":{port}")));
+        let identity = Identity { service: "camera-pub", instance: "down".into() };
+        let node = Node::open(identity, &local).await.unwrap();
+        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
+        let start = RectPublisher::start(&node, "down", None);
+        let rect = node::block_on(runtime.handle(), start).unwrap();
+        runtime.shutdown_background();
+        tokio::time::sleep(3 * TICK).await;
+        // A thread that has panicked would not see a subscriber.
+        let subscriber = node.frame_subscriber(topic::RECT, &["down"]).await.unwrap();
+        let is_wanted = async || rect.is_wanted();
+        testing::until("the subscriber is seen", TIME_LIMIT, is_wanted).await.unwrap();
+        drop((rect, subscriber));
+        node.close().await;
     }
 }

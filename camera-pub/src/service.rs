@@ -15,7 +15,6 @@ use messages::{BayerPattern, CameraControl, CameraInfo, FrameHeader, PixelFormat
 use node::{
     BoxFuture, FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns,
 };
-use tokio::sync::oneshot;
 
 use crate::config::{
     Config, DeviceConfig, FrameFormat, FrameSize, GenicamConfig, ProgramConfig, RtspConfig,
@@ -31,6 +30,7 @@ use crate::rect::RectPublisher;
 use crate::repeated::{Picture, Pictures};
 #[cfg(feature = "rtsp")]
 use crate::rtsp::{self, feed::Image};
+use crate::thread::on_own_thread;
 use crate::v4l2::capture::{Lost, Taken};
 use crate::v4l2::kernel::DevicePath;
 use crate::v4l2::pixels::Pixels;
@@ -70,14 +70,15 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let info = camera_info(&config, found.size)?;
     let infos = node.publisher(topic::CAMERA_INFO, &[config.instance()]).await?;
     infos.publish(&info).await;
-    let stream = Stream::new(&node, &config, &found).await?;
+    let mut stream = Stream::new(&node, &config, &found).await?;
     // Images were found and can be read. A camera may be away yet, or not have begun.
     match found.source {
         Source::Images(_) => node.announce().await?,
         _ => node.announce_as("Present, waiting for the first frame").await?,
     }
+    let publish = async move || stream.run(found.source).await;
     tokio::select! {
-        result = on_own_thread(stream, found.source, shutdown) => result,
+        result = on_own_thread(publish, shutdown) => result,
         never = republish(&infos, &info) => match never {},
     }
 }
@@ -88,32 +89,6 @@ async fn republish(infos: &Publisher<CameraInfo>, info: &CameraInfo) -> Infallib
         second.tick().await;
         infos.publish(info).await;
     }
-}
-
-/// Runs the stream on a thread of its own, so that decoding does not block other tasks.
-async fn on_own_thread(
-    mut stream: Stream,
-    source: Source,
-    shutdown: Shutdown,
-) -> anyhow::Result<()> {
-    let runtime = tokio::runtime::Handle::current();
-    let (mut done, ended) = oneshot::channel();
-    let work = move || {
-        let result = node::block_on(&runtime, async {
-            tokio::select! {
-                result = stream.run(source) => result,
-                () = shutdown.requested() => Ok(()),
-                // The service is gone: no task waits for the result.
-                () = done.closed() => Ok(()),
-            }
-        });
-        drop(done.send(result));
-    };
-    std::thread::Builder::new()
-        .name("camera".to_owned())
-        .spawn(work)
-        .context("starting the camera's thread")?;
-    ended.await.context("the camera's thread ended without a result")?
 }
 
 /// Where frames come from.

@@ -14,7 +14,6 @@ use messages::{ControllerStatus, Detections, FrameAck, FrameHeader, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Subscriber, now_ns};
 use tokio::runtime::Handle;
 use tokio::sync::Notify;
-use tokio::time::MissedTickBehavior;
 
 use crate::config::{AirConfig, Mode};
 use crate::payload::Packer;
@@ -78,7 +77,7 @@ impl AirSender {
         let runtime = Handle::current();
         std::thread::Builder::new()
             .name("air".to_owned())
-            .spawn(move || node::block_on(&runtime, work.run()))
+            .spawn(move || work.run(&runtime))
             .context("starting the air link's thread")?;
         Ok(Self { offers })
     }
@@ -145,25 +144,13 @@ enum Event {
 }
 
 impl Work {
-    async fn run(&mut self) {
-        let mut ticks = tokio::time::interval(TICK);
-        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    /// Runs until the sender is dropped, which may be after the runtime's end.
+    fn run(&mut self, runtime: &Handle) {
+        let mut ticked = Instant::now();
         while !self.offers.is_over.load(Ordering::Relaxed) {
-            let event = tokio::select! {
-                biased;
-                ack = self.acks.next_with_key() => {
-                    ack.map_or(Event::Closed, |(key, ack)| Event::Ack(key, ack))
-                }
-                message = next_of(self.detections.as_ref()) => {
-                    message.map_or(Event::Closed, |message| Event::Detections(Box::new(message)))
-                }
-                message = self.status.next() => {
-                    message.map_or(Event::Closed, |message| Event::Status(Box::new(message)))
-                }
-                () = self.offers.arrived.notified() => Event::Frame,
-                _ = ticks.tick() => Event::Tick,
-            };
-            match event {
+            let left = TICK.saturating_sub(ticked.elapsed());
+            let event = node::block_on_for(runtime, left, self.next_event());
+            match event.unwrap_or(Event::Tick) {
                 Event::Ack(key, ack) => self.ack(&key, &ack),
                 Event::Detections(message) if message.header.camera == self.camera => {
                     self.predictor.update(&message);
@@ -174,12 +161,32 @@ impl Work {
                     self.window.use_receiver(status.active_detector.as_ref().map(key));
                     self.predictor.follow(&status);
                 }
-                Event::Frame => self.send().await,
-                Event::Tick => self.has_subscribers = self.jpegs.has_subscribers().await,
+                Event::Frame => node::block_on(runtime, self.send()),
+                Event::Tick => {
+                    self.has_subscribers = node::block_on(runtime, self.jpegs.has_subscribers());
+                    ticked = Instant::now();
+                }
                 Event::Closed => return,
             }
             let is_wanted = self.is_open() && self.has_subscribers;
             self.offers.is_wanted.store(is_wanted, Ordering::Relaxed);
+        }
+    }
+
+    /// The next message or frame.
+    async fn next_event(&self) -> Event {
+        tokio::select! {
+            biased;
+            ack = self.acks.next_with_key() => {
+                ack.map_or(Event::Closed, |(key, ack)| Event::Ack(key, ack))
+            }
+            message = next_of(self.detections.as_ref()) => {
+                message.map_or(Event::Closed, |message| Event::Detections(Box::new(message)))
+            }
+            message = self.status.next() => {
+                message.map_or(Event::Closed, |message| Event::Status(Box::new(message)))
+            }
+            () = self.offers.arrived.notified() => Event::Frame,
         }
     }
 
@@ -244,5 +251,44 @@ async fn next_of(detections: Option<&Subscriber<Detections>>) -> Option<Detectio
     match detections {
         Some(detections) => detections.next().await,
         None => std::future::pending().await,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use node::{Identity, ZenohSource};
+
+    const TIME_LIMIT: Duration = Duration::from_secs(20);
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn the_thread_of_the_air_link_outlives_its_runtime_without_a_panic() {
+        let text = include_str!("../../../zenoh-config/local.json5");
+        let ([port], _, _) = testing::ports::free().unwrap();
+        let local = ZenohSource::Text(text.replace(":7447", &format!(":{port}")));
+        let identity = Identity { service: "camera-pub", instance: "down".into() };
+        let node = Node::open(identity, &local).await.unwrap();
+        let jpegs = node.frame_publisher(topic::JPEG, &["down"], 0).await.unwrap();
+        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
+        let config = AirConfig {
+            mode: Mode::Full,
+            quality: 95,
+            min_quality: 65,
+            max_kb: 150.0,
+            min_kb: 5.0,
+            round_trip_ms: 80.0,
+            window: 2,
+            timeout_ms: 300.0,
+        };
+        let start = AirSender::start(&node, "down", jpegs, &config);
+        let air = node::block_on(runtime.handle(), start).unwrap();
+        runtime.shutdown_background();
+        tokio::time::sleep(10 * TICK).await;
+        // A thread that has panicked would not see a subscriber.
+        let subscriber = node.frame_subscriber(topic::JPEG, &["down"]).await.unwrap();
+        let is_wanted = async || air.is_wanted();
+        testing::until("the subscriber is seen", TIME_LIMIT, is_wanted).await.unwrap();
+        drop((air, subscriber));
+        node.close().await;
     }
 }

@@ -1,4 +1,4 @@
-//! Waits for a future on the current thread.
+//! Waits for a future on the current thread, without or with a time limit.
 
 use std::future::Future;
 use std::pin::pin;
@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::{Context, Poll, Wake, Waker};
 use std::thread::Thread;
+use std::time::{Duration, Instant};
 
 use tokio::runtime::Handle;
 
@@ -18,7 +19,7 @@ pub fn block_on<F: Future>(runtime: &Handle, future: F) -> F::Output {
     // Entered first, so that the future is dropped inside the runtime.
     let _entered = runtime.enter();
     let mut future = pin!(future);
-    let flag = Arc::new(Flag { thread: std::thread::current(), is_woken: AtomicBool::new(false) });
+    let flag = Flag::of_this_thread();
     let waker = Waker::from(Arc::clone(&flag));
     let mut context = Context::from_waker(&waker);
     loop {
@@ -26,8 +27,30 @@ pub fn block_on<F: Future>(runtime: &Handle, future: F) -> F::Output {
             return output;
         }
         // Parking ends also for other reasons, and others that park on this thread may take its token; the flag stays.
-        while !flag.is_woken.swap(false, Ordering::Acquire) {
+        while !flag.take() {
             std::thread::park();
+        }
+    }
+}
+
+/// Runs a future as [`block_on`] does, for at most `limit`; `None` when it has not ended by then, and is dropped.
+///
+/// The time is that of this thread. A thread that may outlive its runtime must use this instead of Tokio's timers: they panic once
+/// the runtime is shut down.
+pub fn block_on_for<F: Future>(runtime: &Handle, limit: Duration, future: F) -> Option<F::Output> {
+    let began = Instant::now();
+    let _entered = runtime.enter();
+    let mut future = pin!(future);
+    let flag = Flag::of_this_thread();
+    let waker = Waker::from(Arc::clone(&flag));
+    let mut context = Context::from_waker(&waker);
+    loop {
+        if let Poll::Ready(output) = future.as_mut().poll(&mut context) {
+            return Some(output);
+        }
+        while !flag.take() {
+            let left = limit.checked_sub(began.elapsed()).filter(|left| !left.is_zero())?;
+            std::thread::park_timeout(left);
         }
     }
 }
@@ -36,6 +59,17 @@ pub fn block_on<F: Future>(runtime: &Handle, future: F) -> F::Output {
 struct Flag {
     thread: Thread,
     is_woken: AtomicBool,
+}
+
+impl Flag {
+    fn of_this_thread() -> Arc<Self> {
+        Arc::new(Self { thread: std::thread::current(), is_woken: AtomicBool::new(false) })
+    }
+
+    /// Whether its future was woken since the last call.
+    fn take(&self) -> bool {
+        self.is_woken.swap(false, Ordering::Acquire)
+    }
 }
 
 impl Wake for Flag {

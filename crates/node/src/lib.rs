@@ -41,7 +41,7 @@ pub mod tap;
 pub mod topics;
 pub mod version;
 
-pub use block_on::block_on;
+pub use block_on::{block_on, block_on_for};
 pub use boxed::BoxFuture;
 pub use clock::{boot_ahead_ns, clock_name, host_name, now_ns};
 pub use config::{
