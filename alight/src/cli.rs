@@ -44,7 +44,7 @@ enum Command {
     Land(land::LandArgs),
     /// Start the processes of this machine, and restart them when they end, until Ctrl-C.
     Up(up::UpArgs),
-    /// Publish frames of a camera: a device, a program, a stream, image files or videos.
+    /// Publish frames of a camera: a device, a program, a stream or image files.
     CameraPub(ServiceArgs),
     /// Find markers in frames.
     Detector(ServiceArgs),

@@ -15,7 +15,7 @@ use crate::runtime::block_on;
 /// The services.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Service {
-    /// A camera (a device, a program, a stream, image files or videos) to frames.
+    /// A camera (a device, a program, a stream or image files) to frames.
     CameraPub,
     /// Frames to detections.
     Detector,

@@ -10,7 +10,7 @@ use airlink::AirSender;
 use anyhow::{Context, bail, ensure};
 use geometry::CameraModel;
 use imaging::{GrayImage, GrayView, SampleFormat};
-use media::{DecodedImage, ImageError, frame_bytes, images_in, samples_to_grey};
+use media::{DecodedImage, ImageError, frame_bytes, images_in, is_video, samples_to_grey};
 use messages::{BayerPattern, CameraControl, CameraInfo, FrameHeader, PixelFormat, topic};
 use node::{
     BoxFuture, FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns,
@@ -148,6 +148,12 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
     );
     for path in &config.source.paths {
         ensure!(path.exists(), "{path:?} of `source.paths` does not exist");
+        ensure!(
+            !is_video(path),
+            "{path:?} of `source.paths` is a video; to publish its frames, remove `source.paths` and set `source.command` to \
+             [\"ffmpeg\", \"-v\", \"error\", \"-re\", \"-i\", {path:?}, \"-an\", \"-pix_fmt\", \"gray\", \"-f\", \"rawvideo\", \"-\"], \
+             and `source.size_px` and `source.rate_hz` to those of the video"
+        );
         images.extend(images_in(path)?);
     }
     let max_pixels = config.max_pixels();
@@ -1071,6 +1077,17 @@ mod tests {
         assert_eq!((opened, health.failures("unreadable image")), (2, 2));
         assert_eq!(health.failures("camera unplugged"), 1);
         assert_eq!(health.failures("camera's frames unreadable"), 0);
+    }
+
+    #[test]
+    fn a_video_among_the_image_files_is_refused_with_the_command_that_plays_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("flight.mp4");
+        std::fs::write(&path, "a video").unwrap();
+        let set = vec![format!("source.paths=[{path:?}]")];
+        let config = Layers { file: None, set }.load::<Config>().unwrap().settings;
+        let error = find(&config).err().unwrap().to_string();
+        assert!(error.contains("is a video") && error.contains("\"ffmpeg\""), "{error}");
     }
 
     /// Grey levels that differ everywhere, so that no two places of a frame can be taken for each other.
