@@ -35,6 +35,7 @@ pub(crate) struct Program {
     frames: FrameReader<BufReader<ChildStdout>>,
     delay_ns: i64,
     metadata: Option<SideChannel>,
+    rate: Rate,
 }
 
 impl Program {
@@ -63,7 +64,8 @@ impl Program {
         let input = BufReader::with_capacity(BUFFER_BYTES, output);
         let frames = FrameReader::new(input, config.format, period, config.timeout);
         let (timeout, delay_ns) = (config.timeout, config.delay_ns);
-        Ok(Self { name, timeout, child, frames, delay_ns, metadata })
+        let rate = Rate::of(config.rate_hz);
+        Ok(Self { name, timeout, child, frames, delay_ns, metadata, rate })
     }
 
     /// Waits for the first byte of the next frame.
@@ -114,6 +116,12 @@ impl Program {
             ),
             Err(cause) => Err(anyhow!("reading a frame from `{name}`: {cause}")),
         }
+    }
+
+    /// The rate of the program's frames, in hertz, once when it is twice the configured one for two seconds: the size or the pixel format
+    /// may be another one.
+    pub(crate) fn excessive_rate_hz(&mut self) -> Option<f64> {
+        self.rate.add(Instant::now())
     }
 
     /// When the frame that was read was exposed: by its metadata, or by its arrival. `None` when it was queued.
@@ -186,6 +194,9 @@ impl<R: AsyncBufRead + Unpin> FrameReader<R> {
     /// Waits for the first byte of a frame; `None` at the end of the input.
     async fn wait(&mut self) -> std::io::Result<Option<Arrival>> {
         let read_ns = now_ns();
+        if self.count == 0 {
+            check_format(self.input.fill_buf().await?, self.format)?;
+        }
         let has_begun = match self.format {
             FrameFormat::Samples { .. } => !self.input.fill_buf().await?.is_empty(),
             FrameFormat::Jpeg { max_bytes } => self.find_jpeg(max_bytes).await?,
@@ -272,6 +283,23 @@ impl<R: AsyncBufRead + Unpin> FrameReader<R> {
     }
 }
 
+/// Refuses a stream whose first bytes show that it is in another format than the configured one.
+fn check_format(first: &[u8], format: FrameFormat) -> std::io::Result<()> {
+    let found = match (first, format) {
+        // An SOI marker, and the first byte of the next marker.
+        ([0xff, 0xd8, 0xff, ..], FrameFormat::Samples { .. }) => {
+            "it writes JPEG files; set `source.pixels` to \"mjpeg\", or let it write raw frames"
+        }
+        // A start code, a sequence parameter set, and one of the profiles (ITU-T H.264, 7.4.2.1.1).
+        ([0, 0, 0, 1, 0x27 | 0x67, 66 | 77 | 88 | 100 | 110 | 122 | 244, ..], _) => {
+            "it writes H.264; let it write the raw frames of `source.pixels` (ffmpeg: -pix_fmt gray -f rawvideo), or \
+             Motion JPEG for `source.pixels` = \"mjpeg\""
+        }
+        _ => return Ok(()),
+    };
+    Err(std::io::Error::other(found))
+}
+
 /// The next bytes of a frame; an error when none come within the time limit, or the input ends.
 async fn ahead<R: AsyncBufRead + Unpin>(input: &mut R, limit: Duration) -> std::io::Result<&[u8]> {
     match timeout(limit, input.fill_buf()).await {
@@ -307,6 +335,37 @@ async fn waiting_of<T>(work: impl Future<Output = T>) -> (T, Waiting) {
     })
     .await;
     (result, waiting)
+}
+
+/// Measures the rate of frames.
+struct Rate {
+    expected_hz: f64,
+    since: Option<Instant>,
+    frames: u32,
+    /// Seconds in which it was excessive, one after the other.
+    seconds: u32,
+}
+
+impl Rate {
+    fn of(expected_hz: f64) -> Self {
+        Self { expected_hz, since: None, frames: 0, seconds: 0 }
+    }
+
+    /// Counts a frame; the rate in hertz, once when it is about twice the expected one or more for two seconds. A burst of frames
+    /// that were queued takes less.
+    fn add(&mut self, now: Instant) -> Option<f64> {
+        let since = *self.since.get_or_insert(now);
+        self.frames += u32::from(now > since);
+        let elapsed_s = now.saturating_duration_since(since).as_secs_f64();
+        if elapsed_s < 1.0 {
+            return None;
+        }
+        let rate_hz = f64::from(self.frames) / elapsed_s;
+        let is_excessive = rate_hz > 1.8 * self.expected_hz;
+        self.seconds = if is_excessive { self.seconds.saturating_add(1) } else { 0 };
+        (self.since, self.frames) = (Some(now), 0);
+        (self.seconds == 2).then_some(rate_hz)
+    }
 }
 
 /// Detects frames that were queued on their way.
@@ -488,6 +547,37 @@ mod tests {
             error.contains("no JPEG end within") && error.contains("`source.pixels`"),
             "{error}"
         );
+    }
+
+    #[tokio::test]
+    async fn a_stream_in_another_format_is_refused_by_its_first_bytes() {
+        let samples =
+            FrameFormat::Samples { row_bytes: 4, stride_bytes: 4, rows: 2, chroma_bytes: 0 };
+        let jpeg = FrameFormat::Jpeg { max_bytes: 1000 };
+        let h264 = [0, 0, 0, 1, 0x67, 0x64, 0, 0x1f];
+        for (format, bytes, found) in [
+            (samples, [0xff, 0xd8, 0xff, 0xe0, 0, 16, b'J', b'F'], "it writes JPEG files"),
+            (samples, h264, "it writes H.264"),
+            (jpeg, h264, "it writes H.264"),
+        ] {
+            let mut frames = FrameReader::new(&bytes[..], format, PERIOD, TIMEOUT);
+            let error = frames.wait().await.unwrap_err().to_string();
+            assert!(error.contains(found) && error.contains("`source.pixels`"), "{error}");
+        }
+        let dark = [0, 0, 0, 1, 0, 0, 0, 1];
+        assert_eq!(all(samples, &dark).await.unwrap(), [dark]);
+    }
+
+    #[test]
+    fn frames_at_twice_the_configured_rate_are_noticed_once() {
+        let noticed = |rate_hz: u32, burst: u32| {
+            let (began, mut rate) = (Instant::now(), Rate::of(30.0));
+            let at = |number: u32| began + Duration::from_secs(1) * number / rate_hz;
+            let early = (0..burst).filter_map(|_| rate.add(began)).count();
+            early + (0..rate_hz * 5).filter_map(|number| rate.add(at(number))).count()
+        };
+        assert_eq!([30, 45, 60, 90].map(|rate_hz| noticed(rate_hz, 0)), [0, 0, 1, 1]);
+        assert_eq!(noticed(30, 1000), 0, "a burst");
     }
 
     #[test]

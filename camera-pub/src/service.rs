@@ -308,6 +308,16 @@ impl Stream {
                 FrameFormat::Jpeg { .. } => Loan::Private(Vec::new()),
             };
             let jpeg = program.read(&mut pixels).await?;
+            if let Some(measured_hz) = program.excessive_rate_hz() {
+                self.health.failed("frames far faster than configured");
+                let FrameSize { width, height } = config.size;
+                tracing::warn!(
+                    "The program writes {measured_hz:.0} frames of {width} x {height} pixels a second, and `source.rate_hz` is {}. Set that \
+                     to its rate. Where its frames are larger, or in another format, the pictures are pieces of frames: correct \
+                     `source.size_px` and `source.pixels`",
+                    config.rate_hz
+                );
+            }
             let Some(exposure) = program.exposure(arrival).await? else {
                 self.health.dropped("frames that were queued");
                 ensure!(
