@@ -105,6 +105,16 @@ impl History {
         self.states.back()
     }
 
+    /// The largest speed down of the states within so many seconds before the newest, in m/s; negative where all climb.
+    pub fn max_down_m_s(&self, seconds: f64) -> f64 {
+        let Some(newest) = self.newest() else { return f64::NEG_INFINITY };
+        self.states
+            .iter()
+            .rev()
+            .take_while(|state| newest.stamp.seconds_since(state.stamp) <= seconds)
+            .fold(f64::NEG_INFINITY, |max_m_s, state| libm::fmax(max_m_s, state.velocity.z()))
+    }
+
     /// From the odometry frame, as it now lies, to NED.
     pub fn ned_from_odometry(&self) -> Transform<Ned, Odometry> {
         Transform::new(Rotation::identity(), Point::origin() + self.odom_origin())

@@ -602,8 +602,11 @@ impl Lander {
         if self.state_machine.phase() != Phase::Search {
             self.square = None;
         }
+        // Nothing is requested of a vehicle whose motors are off: it stands, or falls.
+        let is_disarmed = self.disarmed.is_some();
         match self.state_machine.phase() {
             Phase::Idle | Phase::Landed | Phase::PilotInCommand => (Action::None, why),
+            phase if is_disarmed && phase != Phase::Aborted => (Action::None, why),
             Phase::Search if why == Reason::TakingOff => (Action::None, why),
             Phase::Search => (self.search(now), why),
             Phase::Approach | Phase::Descend => self.guided(now),

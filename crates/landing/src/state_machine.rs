@@ -139,7 +139,7 @@ pub struct VehicleInputs {
     pub land_m_s: f64,
     /// It is certainly in the air: it falls, or, not reported to stand, sinks or is high over the target.
     pub flies: bool,
-    /// Its motors have just stopped, and its state is too old to show whether that was in the air; a newer one may follow.
+    /// Its motors have just stopped, and its state does not show yet whether that was in the air; a newer one may follow.
     pub awaits_state: bool,
 }
 
@@ -303,7 +303,12 @@ impl StateMachine {
         self.disarmed = is_disarmed.then(|| self.disarmed.unwrap_or(inputs.now));
         let flies = inputs.vehicle.is_some_and(|vehicle| vehicle.flies);
         self.stopped_in_air = is_disarmed && (self.stopped_in_air || flies);
-        if let Some((phase, reason)) = self.interruption(inputs).or_else(|| self.next(inputs)) {
+        // With the motors off nothing advances: it is only decided where they stopped.
+        let next = match self.interruption(inputs) {
+            None if !is_disarmed => self.next(inputs),
+            interruption => interruption,
+        };
+        if let Some((phase, reason)) = next {
             // Search and retry climb, and so does a low hold over a slow link. An autopilot reports the ground seconds late:
             // ArduPilot 7 s after the touchdown.
             let climbs = matches!(
@@ -468,7 +473,7 @@ impl StateMachine {
         if inputs.operator == Some(OperatorCommand::Abort) && self.can_abort(inputs) {
             return Some((Phase::Aborted, Reason::OperatorAbort));
         }
-        if self.landing {
+        if self.landing || self.disarmed.is_some() {
             return None;
         }
         if inputs.operator == Some(OperatorCommand::LandHere) && self.phase != Phase::Final {
@@ -516,7 +521,7 @@ impl StateMachine {
             return Some((Phase::Hold, reason));
         }
         let on_ground = inputs.vehicle.is_some_and(|vehicle| vehicle.landed == Landed::OnGround);
-        if on_ground && self.phase != Phase::Final && self.disarmed.is_none() {
+        if on_ground && self.phase != Phase::Final {
             return Some((Phase::Final, Reason::TouchedEarly));
         }
         None

@@ -572,6 +572,93 @@ fn motors_that_are_stopped_in_the_air_end_no_landing_as_a_touchdown() {
     assert_eq!(flight.phase(), Phase::Landed);
 }
 
+/// The heartbeat that reports the motors is sent once a second, so the vehicle may lie still on the ground when it is received.
+#[test]
+fn a_fall_is_recognised_when_the_heartbeat_with_the_motors_off_comes_late() {
+    for (mode, height_m) in [
+        (Mode::Guided, 0.43),
+        (Mode::Guided, 1.0),
+        (Mode::Guided, 3.0),
+        (Mode::Land, 0.43),
+        (Mode::Land, 2.0),
+    ] {
+        for late_s in [0.0, 0.05, 0.3, 0.6, 0.9, 1.1, 2.0] {
+            let mut flight = Harness::started(Config::default(), 5.0);
+            flight.pad = Some(Point::origin());
+            while flight.position.z() < -height_m {
+                flight.fly(STEP_S);
+            }
+            if mode == Mode::Land {
+                flight.step(Event::Operator(OperatorCommand::LandHere));
+                flight.velocity = Vector::new(0.0, 0.0, 0.3);
+                flight.status.mode = mode;
+                flight.run(STEP_S, true);
+            } else {
+                flight.velocity = Vector::zero();
+            }
+            let mut seconds = 0.0;
+            let mut fall = |flight: &mut Harness| {
+                seconds += STEP_S;
+                // A PX4 reports the ground soon after its motors are off.
+                if seconds > 0.1 {
+                    flight.status.landed = Landed::OnGround;
+                }
+                if flight.position.z() < 0.0 {
+                    flight.velocity = flight.velocity + Vector::new(0.0, 0.0, 9.8 * STEP_S);
+                    flight.position = flight.position + flight.velocity * STEP_S;
+                } else {
+                    flight.velocity = Vector::zero();
+                }
+                flight.run(STEP_S, true);
+            };
+            for _ in 0..(late_s / STEP_S).round() as u32 {
+                fall(&mut flight);
+            }
+            flight.status.armed = false;
+            let before = flight.decisions.len();
+            for _ in 0..40 {
+                fall(&mut flight);
+            }
+            let decision = flight.decisions.last().unwrap().1;
+            let end = (decision.phase, decision.why);
+            let expected = (Phase::Aborted, Reason::StoppedInAir);
+            assert_eq!(end, expected, "{mode:?}, {height_m} m, {late_s} s");
+            for (_, decision) in &flight.decisions[before..] {
+                assert_eq!(decision.action, Action::None, "{mode:?}, {height_m} m, {late_s} s");
+                let is_new = decision.why == Reason::Aligning || decision.why == Reason::MayStand;
+                assert!(!is_new, "{mode:?}, {height_m} m, {late_s} s: {decision:?}");
+            }
+        }
+    }
+}
+
+/// A vehicle stands still for a second before its autopilot stops the motors, also on a deck that heaves.
+#[test]
+fn a_landing_is_one_whenever_the_heartbeat_with_the_motors_off_comes() {
+    for (down_m_s, heave_m_s) in [(0.3, 0.0), (0.8, 0.0), (1.3, 0.0), (0.8, 0.5)] {
+        for late_s in [0.0, 0.5, 1.1, 2.0] {
+            let mut config = Config::default();
+            config.estimator.pad_heave_m_s = heave_m_s;
+            let mut flight = Harness::started(config, 1.5);
+            flight.pad = Some(Point::origin());
+            flight.run(1.0, true);
+            flight.step(Event::Operator(OperatorCommand::LandHere));
+            (flight.velocity, flight.status.mode) = (Vector::new(0.0, 0.0, down_m_s), Mode::Land);
+            while flight.position.z() < 0.0 {
+                flight.position = flight.position + flight.velocity * STEP_S;
+                flight.run(STEP_S, true);
+            }
+            flight.velocity = Vector::new(0.0, 0.0, heave_m_s);
+            flight.status.landed = Landed::OnGround;
+            flight.run(1.0 + late_s, true);
+            flight.status.armed = false;
+            flight.run(0.1, true);
+            let phase = flight.phase();
+            assert_eq!(phase, Phase::Landed, "{down_m_s} m/s, {heave_m_s} m/s, {late_s} s");
+        }
+    }
+}
+
 /// A vehicle in LAND at this height, which sinks; its state is reported for the last time.
 fn in_land(height_m: f64) -> Harness {
     let mut flight = Harness::started(Config::default(), 6.0);

@@ -11,9 +11,22 @@ const MAX_LAND_M_S: f64 = 5.0;
 /// Longest wait for a recent state after the motors have stopped, in seconds.
 const MAX_STATE_WAIT_S: f64 = 2.0;
 
+/// Wait until a vehicle that was high when its motors stopped falls visibly, in seconds: by then it sinks at more than 2 m/s.
+const MAX_FALL_WAIT_S: f64 = 0.3;
+
+/// Time before the newest state in which a fall is searched for, in seconds: only the heartbeat reports that the motors are off. It is
+/// sent once a second, and one may be lost. A fall from 3 m lasts 0.8 s: then the vehicle is still on the ground when it is received.
+const MAX_REPORT_S: f64 = 2.3;
+
+/// Minimum speed down of a vehicle that falls, in m/s, and as a multiple of the autopilot's speed of landing. A vehicle touches down at
+/// 0.8 m/s at most, and stands still for a second before its autopilot stops the motors. In a fall from 0.2 m it reaches 2 m/s.
+const MIN_FALL_M_S: f64 = 1.5;
+const MIN_FALL_FACTOR: f64 = 1.5;
+
 impl Lander {
     /// Whether the vehicle is certainly in the air, although its motors are off: it falls, or, where its autopilot does not report the ground,
     /// sinks or is high over a target that was seen lately. A vehicle stands still for a second before its autopilot stops the motors.
+    /// One that fell within the last seconds was in the air, although it is still now: the report of the motors is late.
     /// From its last state, if that is old, it may have come down as fast as LAND does; if it was higher, it was in the air, also where the
     /// ground is reported, as autopilots report it of each vehicle whose motors are off.
     pub(super) fn flies(&self, now: Timestamp) -> bool {
@@ -31,10 +44,17 @@ impl Lander {
         let sinks = down_m_s > MAX_STANDING_M_S;
         let falls = down_m_s > MAX_CONTACT_M_S;
         if is_recent {
-            falls || status.landed != Landed::OnGround && (sinks || is_high)
+            falls || self.fell() || status.landed != Landed::OnGround && (sinks || is_high)
         } else {
             is_high
         }
+    }
+
+    /// Whether the vehicle has fallen since the last heartbeat could be sent that its motors run.
+    fn fell(&self) -> bool {
+        let landing_m_s = MIN_FALL_FACTOR * self.limits.land_m_s;
+        let min_m_s = libm::fmax(MIN_FALL_M_S, landing_m_s) + self.config.estimator.pad_heave_m_s;
+        self.history.max_down_m_s(MAX_REPORT_S) > min_m_s
     }
 
     /// The same now.
@@ -42,13 +62,19 @@ impl Lander {
         self.now.is_some_and(|now| self.flies(now))
     }
 
-    /// Whether the motors have just stopped, and the vehicle's state is too old to show whether that was in the air.
+    /// Whether the motors have just stopped, and the vehicle's state does not show yet whether that was in the air: it is old, or shows a
+    /// vehicle that is high and may be about to fall.
     pub(super) fn awaits_state(&self, now: Timestamp) -> bool {
         let is_old = self.history.newest().is_none_or(|vehicle| {
             now.seconds_since(vehicle.stamp) > self.config.phases.stale_vehicle_s
         });
-        let waits = |since| now.seconds_since(since) < MAX_STATE_WAIT_S;
-        is_old && self.disarmed.is_some_and(waits)
+        let is_high = self.known_height_m(now).is_some_and(|height_m| height_m > MAX_CONTACT_M);
+        let max_wait_s = match (is_old, is_high) {
+            (true, _) => MAX_STATE_WAIT_S,
+            (false, true) => MAX_FALL_WAIT_S,
+            (false, false) => return false,
+        };
+        self.disarmed.is_some_and(|since| now.seconds_since(since) < max_wait_s)
     }
 
     /// The same now: a state that follows within seconds decides whether the vehicle has landed.
