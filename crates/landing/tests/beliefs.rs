@@ -436,6 +436,39 @@ fn a_landing_aborted_low_hovers_where_a_drift_does_not_touch_the_ground() {
     assert_eq!(harness.decisions.last().unwrap().1.action, Action::None);
 }
 
+/// A vehicle that sinks at 1.7 m/s loses more than a metre while it brakes.
+#[test]
+fn a_landing_aborted_in_a_quick_descent_climbs_back_over_the_height_at_which_it_hovers() {
+    for aborted_m in [2.9, 2.6, 3.8] {
+        let mut harness = Harness::started(Config::default(), 8.0);
+        harness.pad = Some(Point::origin());
+        while harness.position.z() < -aborted_m {
+            harness.fly(STEP_S);
+        }
+        harness.velocity = Vector::new(0.0, 0.0, 1.7);
+        harness.run(STEP_S, true);
+        harness.step(Event::Operator(OperatorCommand::Abort));
+        let mut lowest_m = f64::MAX;
+        for _ in 0..480 {
+            harness.run(STEP_S, true);
+            let last = harness.decisions.last().unwrap().1;
+            let commanded_m_s = match last.action {
+                Action::Velocity { velocity, .. } => velocity.z(),
+                _ => 0.0,
+            };
+            let change_m_s =
+                (commanded_m_s - harness.velocity.z()).clamp(-1.25 * STEP_S, 1.25 * STEP_S);
+            harness.velocity = Vector::new(0.0, 0.0, harness.velocity.z() + change_m_s);
+            harness.position = harness.position + harness.velocity * STEP_S;
+            lowest_m = lowest_m.min(-harness.position.z());
+        }
+        let height_m = -harness.position.z();
+        assert!(lowest_m < aborted_m - 0.8, "{aborted_m} m: {lowest_m} m");
+        assert!(height_m > 2.3 && height_m < aborted_m, "{aborted_m} m: {height_m} m");
+        assert_eq!(harness.decisions.last().unwrap().1.action, Action::None, "{aborted_m} m");
+    }
+}
+
 #[test]
 fn a_vehicle_that_may_stand_is_not_lifted_by_an_abort() {
     for height_m in [0.0, 0.2, 0.45] {

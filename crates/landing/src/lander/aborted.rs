@@ -2,7 +2,7 @@
 
 use geometry::Vector;
 
-use super::Lander;
+use super::{Lander, MAX_HOVER_M_S};
 use crate::config::OnAbort;
 use crate::decision::{Action, Reason};
 use crate::event::{Landed, Mode};
@@ -22,7 +22,7 @@ const HOVER_TOLERANCE_M: f64 = 0.1;
 /// How an aborted landing changes its height.
 #[derive(Copy, Clone, Debug, Default, PartialEq)]
 pub(super) enum AbortClimb {
-    /// It has just been aborted.
+    /// It has just been aborted, and may still sink.
     #[default]
     Undecided,
     /// It climbs.
@@ -105,7 +105,8 @@ impl Lander {
     }
 
     /// Hovers for `release_after_s`, at `abort_hover_m` or higher: where the autopilot's velocity errs, a vehicle that hovers low
-    /// drifts onto the ground. One that may stand is not lifted, until it moves.
+    /// drifts onto the ground. One that may stand is not lifted, until it moves. One that sinks hovers only once it has stopped: it loses
+    /// height while it brakes.
     fn hover_aborted(&mut self, now: Timestamp) -> Action {
         let missing_m = self.missing_after_abort(now);
         let is_late = self.received_s(now) > CLIMB_AWAY_S;
@@ -126,6 +127,7 @@ impl Lander {
             AbortClimb::Undecided | AbortClimb::Climbs if missing_m.is_some() && !is_late => {
                 AbortClimb::Climbs
             }
+            AbortClimb::Undecided if self.sinks_fast() && !is_late => AbortClimb::Undecided,
             AbortClimb::Undecided | AbortClimb::Climbs => {
                 AbortClimb::Hovers { since: now, may_climb: false }
             }
@@ -136,6 +138,11 @@ impl Lander {
             AbortClimb::Climbs => self.climb(self.climb_speed(missing_m.unwrap_or(0.0))),
             AbortClimb::Undecided | AbortClimb::Hovers { .. } => Action::hover(),
         }
+    }
+
+    /// Whether the vehicle still goes down faster than one that hovers.
+    fn sinks_fast(&self) -> bool {
+        self.history.newest().is_some_and(|vehicle| vehicle.velocity.z() > MAX_HOVER_M_S)
     }
 
     /// Whether the vehicle may stand: it is still over the pad, and so low as heights err, or at a height that is not known, or LAND was
