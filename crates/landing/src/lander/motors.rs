@@ -11,9 +11,6 @@ const MAX_LAND_M_S: f64 = 5.0;
 /// Longest wait for a recent state after the motors have stopped, in seconds.
 const MAX_STATE_WAIT_S: f64 = 2.0;
 
-/// Wait until a vehicle that was high when its motors stopped falls visibly, in seconds: by then it sinks at more than 2 m/s.
-const MAX_FALL_WAIT_S: f64 = 0.3;
-
 /// Time before the newest state in which a fall is searched for, in seconds: only the heartbeat reports that the motors are off. It is
 /// sent once a second, and one may be lost. A fall from 3 m lasts 0.8 s: then the vehicle is still on the ground when it is received.
 const MAX_REPORT_S: f64 = 2.3;
@@ -62,19 +59,13 @@ impl Lander {
         self.now.is_some_and(|now| self.flies(now))
     }
 
-    /// Whether the motors have just stopped, and the vehicle's state does not show yet whether that was in the air: it is old, or shows a
-    /// vehicle that is high and may be about to fall.
+    /// Whether the motors have just stopped, and the vehicle's state is too old to show whether that was in the air.
     pub(super) fn awaits_state(&self, now: Timestamp) -> bool {
         let is_old = self.history.newest().is_none_or(|vehicle| {
             now.seconds_since(vehicle.stamp) > self.config.phases.stale_vehicle_s
         });
-        let is_high = self.known_height_m(now).is_some_and(|height_m| height_m > MAX_CONTACT_M);
-        let max_wait_s = match (is_old, is_high) {
-            (true, _) => MAX_STATE_WAIT_S,
-            (false, true) => MAX_FALL_WAIT_S,
-            (false, false) => return false,
-        };
-        self.disarmed.is_some_and(|since| now.seconds_since(since) < max_wait_s)
+        let waits = |since| now.seconds_since(since) < MAX_STATE_WAIT_S;
+        is_old && self.disarmed.is_some_and(waits)
     }
 
     /// The same now: a state that follows within seconds decides whether the vehicle has landed.
