@@ -502,8 +502,8 @@ async fn watch(
                     if service == Service::Controller {
                         controllers_exit = Some(exit.to_string());
                         if !landing.never_flew() {
-                            progress.say(&format!("To resume the landing of an ArduPilot that is still in GUIDED: {resume}"));
-                            progress.say("A PX4 leaves OFFBOARD on its own when the setpoints stop: land it in Land or Return, or by hand");
+                            progress.say(&format!("To resume the landing of a vehicle whose mode no pilot has changed: {resume}"));
+                            progress.say("A PX4 holds its place (COM_OBL_RC_ACT 5) and follows a resumed controller again; or land it in Land or Return, or by hand");
                         }
                     }
                     // The landing needs no ground station, recording or page.

@@ -1,8 +1,8 @@
 //! Taking control of a PX4 that holds its place.
 //!
 //! PX4 enters OFFBOARD only while setpoints come, so it cannot be chosen by hand before a landing begins, and no landing begins
-//! outside of it. A start from HOLD therefore sends setpoints of zero velocity, which every other mode ignores, and asks for
-//! OFFBOARD. A start that is given up is followed by an [`autopilot::OffboardExit`].
+//! outside of it. A start from HOLD therefore sends setpoints of zero velocity, which a mode that was chosen ignores, and asks for
+//! OFFBOARD. (A HOLD that is the failsafe of OFFBOARD ends with them.) A start that is given up is followed by an [`autopilot::OffboardExit`].
 
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode};
 

@@ -129,7 +129,8 @@ impl Flight {
     }
 
     /// Stops a vehicle whose landing is to be resumed, from the first packet of its autopilot on: the heartbeat with
-    /// the rest may be a second away.
+    /// the rest may be a second away. A PX4 that holds its place as the setpoints of the earlier controller ended follows again; one that a
+    /// pilot has switched ignores it.
     fn stop_before_resuming(&mut self, now_ns: i64, packet: &Packet) {
         let pinned = self.config.autopilot.system_id;
         let is_vehicle = packet.sender.component == autopilot::packet::AUTOPILOT
@@ -646,7 +647,8 @@ impl Flight {
             match event {
                 Event::State(state) => {
                     self.alarms.autopilot_active(now_ns);
-                    if let Some(vehicle) = wire::vehicle(&state) {
+                    if let Some(mut vehicle) = wire::vehicle(&state) {
+                        vehicle.mode = self.known_mode(now_ns, vehicle.mode);
                         if state.landed == LandedState::InAir {
                             self.wind.update(&vehicle);
                         }
@@ -655,7 +657,8 @@ impl Flight {
                 }
                 Event::Found { .. } => self.limits.found(&mut self.autopilot),
                 Event::Status(state) => {
-                    let status = wire::vehicle_status(&state);
+                    let mut status = wire::vehicle_status(&state);
+                    status.mode = self.known_mode(now_ns, status.mode);
                     self.decide(now_ns, LanderEvent::Status(status));
                 }
                 Event::ModeChanged { to, .. } => self.withdraw_from(to),
@@ -678,6 +681,14 @@ impl Flight {
                 }
                 _ => {}
             }
+        }
+    }
+
+    /// The mode for the lander: unknown while a PX4 that shows HOLD may return to OFFBOARD automatically.
+    fn known_mode(&self, now_ns: i64, mode: landing::Mode) -> landing::Mode {
+        match self.autopilot.may_return_to_offboard(now_ns) {
+            true => landing::Mode::Unknown,
+            false => mode,
         }
     }
 

@@ -24,7 +24,7 @@ const LAND_SPEED_HIGH: [Scaled; 2] =
     [scaled("LAND_SPEED_HIGH", 0.01), scaled("LAND_SPD_HIGH_MS", 1.0)];
 /// PX4's speed of LAND near the ground, in m/s.
 const MPC_LAND_SPEED: [Scaled; 1] = [scaled("MPC_LAND_SPEED", 1.0)];
-/// PX4's time without setpoints until it leaves OFFBOARD, in s.
+/// PX4's time without setpoints until it holds its place, in s.
 const COM_OF_LOSS_T: &str = "COM_OF_LOSS_T";
 
 /// PX4's reaction when setpoints stop, and its value for holding the place. By the default, position mode, a vehicle without a remote

@@ -13,6 +13,10 @@ use crate::control::{ControlProgress, TakingControl, hover_in_offboard, is_holdi
 /// not ended: the autopilot's heartbeat may have been wrong. One that stands has landed.
 const MAX_REARMED_NS: i64 = 10_000_000_000;
 
+/// Time within which a landing that is to be resumed must begin, in nanoseconds: until then a PX4 is kept in OFFBOARD, where it drifts with
+/// the error of its velocity.
+const MAX_RESUMING_NS: i64 = 15_000_000_000;
+
 /// The mission of a flight.
 #[derive(Clone, Debug)]
 pub struct Mission {
@@ -24,6 +28,8 @@ pub struct Mission {
     goes_on_until_ns: Option<i64>,
     /// The landing that was to go on is over: the next one begins once the vehicle flies.
     awaits_next_flight: bool,
+    /// Since when the vehicle whose landing is to be resumed is known.
+    found_ns: Option<i64>,
     /// Why the landing that was to begin automatically waits for a command.
     held_because: Option<String>,
 }
@@ -112,6 +118,7 @@ impl Mission {
             disarmed_ns: None,
             goes_on_until_ns: None,
             awaits_next_flight: false,
+            found_ns: None,
             held_because: None,
         }
     }
@@ -421,8 +428,8 @@ impl Mission {
                 if is_flying {
                     return Some(Trigger::InFlight);
                 }
-                if self.start == Start::Resume && has_no_landing(autopilot) {
-                    self.state = State::Idle;
+                if self.start == Start::Resume {
+                    self.await_landing(now_ns, autopilot);
                 }
                 None
             }
@@ -472,6 +479,24 @@ impl Mission {
             State::Idle | State::Landing | State::SendingLandingTarget | State::Failed { .. } => {
                 None
             }
+        }
+    }
+
+    /// Ends the wait for a landing to resume where there is none. A PX4 gets zeros for a while: it has stopped in HOLD as the earlier
+    /// controller ended, returns to OFFBOARD with them, and stays in it until the landing begins.
+    fn await_landing(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
+        if autopilot.state().is_none() {
+            return;
+        }
+        let found_ns = *self.found_ns.get_or_insert(now_ns);
+        let may_return = autopilot.may_return_to_offboard(now_ns);
+        if now_ns.saturating_sub(found_ns) <= MAX_RESUMING_NS
+            && (may_return || autopilot.is_in_offboard())
+        {
+            autopilot.send_zeros(now_ns);
+        }
+        if has_no_landing(autopilot) && !may_return {
+            self.state = State::Idle;
         }
     }
 

@@ -145,7 +145,7 @@ impl Setpoints {
         is_followed && !lands && autopilot.firmware() == Some(Firmware::Px4)
     }
 
-    /// Stops a vehicle of which only the system id is known.
+    /// Stops a vehicle of which only the system id is known, if it is in the mode that follows setpoints, or returns to it with them.
     pub fn stop_unknown(&mut self, now_ns: i64, system: u8, autopilot: &mut Autopilot) {
         if now_ns.saturating_sub(self.sent_ns) >= self.period_ns {
             self.sent_ns = now_ns;

@@ -244,7 +244,7 @@ impl View<'_> {
             return left_low;
         }
         match self.autopilot.state() {
-            // It may as well be the autopilot's failsafe: when PX4 misses setpoints it leaves OFFBOARD.
+            // It may as well be the autopilot's failsafe: when PX4 misses setpoints it holds.
             Some(state) if self.lander.phase() == landing::Phase::PilotInCommand => {
                 format!("{why} (or the autopilot's failsafe), in {}", state.mode)
             }

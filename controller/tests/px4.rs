@@ -540,6 +540,110 @@ fn after_a_standstill_of_more_than_15_s_no_px4_is_asked_for_offboard() {
     assert!(status.why.contains("did not run for 22 s"), "{status:?}");
 }
 
+/// A PX4 that is landing in OFFBOARD, at 2 s.
+fn px4_landing() -> Flight {
+    let mut flight = flight("airborne");
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(OFFBOARD, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    assert!(hover(&mut flight, 20, 2000, OFFBOARD).setpoints > 20);
+    assert!(is_steered(&flight, 2000), "{:?}", flight.status(2000 * MS));
+    flight
+}
+
+fn is_steered(flight: &Flight, ms: i64) -> bool {
+    matches!(flight.status(ms * MS).phase, Phase::Approach | Phase::Descend)
+}
+
+/// PX4 holds while setpoints are missing, and returns to OFFBOARD with the next one. Packets of the time without setpoints are read after it.
+#[test]
+fn a_hold_for_missing_setpoints_ends_with_them_in_whatever_order_packets_are_read() {
+    let backlogs: [&[u32]; 4] = [&[], &[HOLD], &[OFFBOARD, HOLD], &[HOLD, OFFBOARD, HOLD]];
+    for is_frozen in [true, false] {
+        for backlog in backlogs {
+            let mut flight = px4_landing();
+            if !is_frozen {
+                // No packet arrives for 5 s.
+                for ms in (2000..7000).step_by(20) {
+                    flight.tick(ms * MS);
+                }
+            }
+            for mode in backlog {
+                receive(&mut flight, 7000 * MS, &heartbeat(*mode, true));
+            }
+            let mut sent = Sent::default();
+            sent.take(&mut flight);
+            // It shows HOLD until its next heartbeat.
+            let sent = hover(&mut flight, 7020, 7980, OFFBOARD);
+            let status = flight.status(7980 * MS);
+            assert!(sent.setpoints > 20, "{is_frozen} {backlog:x?}: {sent:?} {status:?}");
+            assert_ne!(status.phase, Phase::PilotInCommand, "{is_frozen} {backlog:x?}");
+            hover(&mut flight, 8000, 10_000, OFFBOARD);
+            let status = flight.status(10_000 * MS);
+            assert!(is_steered(&flight, 10_000), "{is_frozen} {backlog:x?}: {status:?}");
+            // Long after that HOLD is a pilot's choice.
+            receive(&mut flight, 10_010 * MS, &heartbeat(HOLD, true));
+            flight.tick(10_020 * MS);
+            assert_eq!(flight.status(10_020 * MS).phase, Phase::PilotInCommand);
+        }
+    }
+}
+
+#[test]
+fn a_mode_that_was_chosen_while_setpoints_were_missing_is_kept() {
+    // HOLD stays although setpoints are sent.
+    let mut flight = px4_landing();
+    receive(&mut flight, 7000 * MS, &heartbeat(HOLD, true));
+    let sent = hover(&mut flight, 7020, 8980, HOLD);
+    assert_eq!(flight.status(8980 * MS).phase, Phase::Hold, "{sent:?}");
+    assert!(sent.modes.is_empty(), "{sent:?}");
+    let sent = hover(&mut flight, 9000, 12_000, HOLD);
+    assert!(sent.setpoints < 40 && sent.modes.is_empty(), "{sent:?}");
+    assert_eq!(flight.status(12_000 * MS).phase, Phase::PilotInCommand);
+    // Another mode is a pilot's at once.
+    let mut flight = px4_landing();
+    receive(&mut flight, 7000 * MS, &heartbeat(HOLD, true));
+    receive(&mut flight, 7001 * MS, &heartbeat(POSITION, true));
+    assert_eq!(flight.status(7001 * MS).phase, Phase::PilotInCommand);
+    Sent::default().take(&mut flight);
+    assert_eq!(hover(&mut flight, 7020, 9000, POSITION).setpoints, 0);
+}
+
+#[test]
+fn a_px4_is_held_until_resume_after_a_standstill_of_more_than_15_s() {
+    let mut flight = px4_landing();
+    receive(&mut flight, 25_000 * MS, &heartbeat(HOLD, true));
+    let sent = hover(&mut flight, 25_020, 30_000, OFFBOARD);
+    let status = flight.status(30_000 * MS);
+    assert!(status.phase == Phase::Hold && sent.setpoints > 100, "{status:?} {sent:?}");
+    assert!(status.why.contains("for more than 15 s"), "{status:?}");
+    assert!(flight.command(30_000 * MS, &ControllerCommand::Resume).accepted);
+    hover(&mut flight, 30_020, 32_000, OFFBOARD);
+    assert!(is_steered(&flight, 32_000), "{:?}", flight.status(32_000 * MS));
+}
+
+#[test]
+fn the_landing_of_a_px4_that_holds_for_missing_setpoints_is_resumed_whatever_mode_it_shows_first() {
+    for (first, then, resumes) in
+        [(HOLD, OFFBOARD, true), (OFFBOARD, OFFBOARD, true), (HOLD, HOLD, false)]
+    {
+        let mut flight = flight("resume");
+        flight.camera(0, CameraInfo::sample());
+        flight.presence(0, "main", true);
+        receive(&mut flight, 0, &heartbeat(first, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        let zeros = hover(&mut flight, 20, 980, first).setpoints;
+        assert!(zeros > 10, "{first:x} {zeros}");
+        hover(&mut flight, 1000, 4000, then);
+        let status = flight.status(4000 * MS);
+        assert_eq!(is_steered(&flight, 4000), resumes, "{first:x} {then:x}: {status:?}");
+        let sent = hover(&mut flight, 4000, 6000, then);
+        assert_eq!(sent.setpoints > 20, resumes, "{first:x} {then:x}: {sent:?}");
+        assert!(sent.modes.is_empty(), "{sent:?}");
+    }
+}
+
 #[test]
 fn a_heartbeat_that_current_mode_overtook_is_no_pilots_switch() {
     let mut flight = px4_asked_for_offboard("command");

@@ -27,6 +27,7 @@ use crate::contact::Contact;
 use crate::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, TIMESYNC_DATA};
 use crate::event::Event;
 use crate::mode::{Firmware, FlightMode};
+use crate::offboard_return::OffboardReturn;
 use crate::packet::{self, AUTOPILOT, Packet, Sender};
 use crate::parameter::{Parameter, Parameters};
 use crate::px4_listener::Listener;
@@ -62,6 +63,9 @@ pub struct Autopilot {
     parameters: Parameters,
     setpoints: SetpointStream,
     offboard_sent_ns: Option<i64>,
+    offboard_return: OffboardReturn,
+    /// The system to which stops were sent before it was found.
+    stopped_system: Option<u8>,
     streams: Streams,
     requests: Vec<Request>,
     standstill: Standstill,
@@ -122,6 +126,8 @@ impl Autopilot {
             parameters: Parameters::new(&config.parameters),
             setpoints: SetpointStream::default(),
             offboard_sent_ns: None,
+            offboard_return: OffboardReturn::default(),
+            stopped_system: None,
             config,
             vehicle: None,
             requests: Vec::new(),
@@ -294,8 +300,10 @@ impl Autopilot {
     }
 
     /// Sends a velocity of zero to a vehicle of which only the system id is known, before its heartbeat
-    /// arrives: outside of GUIDED or OFFBOARD an autopilot ignores it.
+    /// arrives. In a mode that a pilot has chosen an autopilot ignores it. A PX4 that holds its place only because setpoints were missing
+    /// in OFFBOARD, its failsafe, follows setpoints again.
     pub fn send_stop(&mut self, now_ns: i64, system: u8) {
+        self.stopped_system = Some(system);
         let target = Sender { system, component: AUTOPILOT };
         self.send(&compose::velocity((now_ns / 1_000_000) as u32, Vector::zero(), 0.0, target));
     }
@@ -439,6 +447,12 @@ impl Autopilot {
         self.requests.iter().any(|request| request.command.is_offboard())
     }
 
+    /// True while a PX4 shows HOLD, and that may be its failsafe, as our setpoints were interrupted just before: it returns to OFFBOARD as they
+    /// are sent again. For 2.5 s at most; if HOLD still shows then, it was chosen.
+    pub fn may_return_to_offboard(&self, now_ns: i64) -> bool {
+        self.offboard_return.is_expected(now_ns)
+    }
+
     /// When a setpoint was sent last, a zero or another.
     pub fn setpoint_sent_ns(&self) -> Option<i64> {
         self.setpoints.last_ns()
@@ -450,7 +464,7 @@ impl Autopilot {
     }
 
     /// Sends setpoints of zero velocity until the next call, a tick later: before OFFBOARD, and until it shows whether a PX4 has
-    /// changed to it. All other modes ignore them.
+    /// changed to it. Modes that were chosen ignore them; a HOLD that is the failsafe of OFFBOARD ends with them.
     pub fn send_zeros(&mut self, now_ns: i64) {
         self.setpoints.ask_for_zeros(now_ns);
     }
@@ -458,8 +472,9 @@ impl Autopilot {
     /// Sends a velocity in m/s, with a yaw rate in rad/s (0 holds the heading): at least twice a second,
     /// because the autopilot flies on with the last one for 3 s. Zeros stop the vehicle.
     ///
-    /// Also sent while only the heartbeat is missing and other packets arrive: in another mode than ours the
-    /// autopilot takes no setpoint, and without any it would fly on with the last one, downwards maybe.
+    /// Also sent while only the heartbeat is missing and other packets arrive: in a mode that a pilot has chosen the
+    /// autopilot takes no setpoint, and without any it would fly on with the last one, downwards maybe. And in HOLD, while
+    /// [`Autopilot::may_return_to_offboard`].
     pub fn set_velocity(
         &mut self,
         now_ns: i64,
@@ -479,7 +494,7 @@ impl Autopilot {
         if vehicle.firmware.guided().is_none() {
             return Err(SetpointError::Unsupported(vehicle.firmware));
         }
-        if !state.mode.is_guided() {
+        if !state.mode.is_guided() && !self.may_return_to_offboard(now_ns) {
             return Err(SetpointError::NotGuided(state.mode));
         }
         // "Landing" persists for a moment after LAND. During a takeoff a setpoint would end it.
@@ -489,7 +504,7 @@ impl Autopilot {
         let time_ms = (now_ns / 1_000_000) as u32;
         let target = Sender { system: vehicle.system, component: AUTOPILOT };
         self.send(&compose::velocity(time_ms, velocity, yaw_rate, target));
-        self.setpoints.sent(now_ns);
+        self.setpoint_sent(now_ns);
         Ok(())
     }
 
@@ -561,10 +576,17 @@ impl Autopilot {
         let limit_ns = now_ns.saturating_sub(ns(self.config.heartbeat_timeout));
         let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.received_ns >= limit_ns);
         let Some(system) = vehicle.map(|vehicle| vehicle.system) else { return };
-        self.setpoints.sent(now_ns);
+        self.setpoint_sent(now_ns);
         let time_ms = (now_ns / 1_000_000) as u32;
         let target = Sender { system, component: AUTOPILOT };
         self.send(&compose::velocity(time_ms, Vector::zero(), 0.0, target));
+    }
+
+    fn setpoint_sent(&mut self, now_ns: i64) {
+        self.setpoints.sent(now_ns);
+        if let Some(vehicle) = &self.vehicle {
+            self.offboard_return.sent(now_ns, vehicle.state.mode, vehicle.received_ns);
+        }
     }
 
     fn take_time(&mut self, now_ns: i64, from: Sender, message: &TIMESYNC_DATA) {

@@ -15,7 +15,7 @@
 //! [`state`] and [`parameter`] are the vehicle's reports, [`clock`] converts its time stamps, `boot` and
 //! `contact` decide which of its reports are believed, `standstill` whether its mode was received after a pause of this process, `simulation` asks whether it is simulated, [`client`] is the
 //! conversation with it with the settings of [`config`], [`event`] its events, [`command`] has the commands that can be requested
-//! and why they may fail, [`conflict`] has the reasons why neither a take-off nor a landing may begin, of which `same_address` finds one, [`takeoff`] arms the vehicle and takes off, [`offboard_exit`] ends PX4's OFFBOARD, which needs the `setpoint_stream`, [`permission`] restricts the packets of a ground station,
+//! and why they may fail, [`conflict`] has the reasons why neither a take-off nor a landing may begin, of which `same_address` finds one, [`takeoff`] arms the vehicle and takes off, [`offboard_exit`] ends PX4's OFFBOARD, which needs the `setpoint_stream`, `offboard_return` distinguishes its failsafe from a pilot's HOLD, [`permission`] restricts the packets of a ground station,
 //! [`compose`] makes the messages that a companion sends, and `given` the answer to a command that is not carried out.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
@@ -38,6 +38,7 @@ pub mod link;
 pub mod mode;
 mod newest;
 pub mod offboard_exit;
+mod offboard_return;
 pub mod packet;
 pub mod parameter;
 pub mod peers;

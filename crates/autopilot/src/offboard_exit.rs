@@ -1,7 +1,7 @@
 //! The way out of PX4's OFFBOARD, and of a LAND that is called back.
 //!
 //! PX4 takes silence in OFFBOARD for a failure of its companion, and without a remote control it then descends and drifts with
-//! the wind (`COM_OBL_RC_ACT`). Setpoints of zero velocity, which every other mode ignores, therefore continue until it shows HOLD.
+//! the wind (`COM_OBL_RC_ACT`). Setpoints of zero velocity, which a mode that was chosen ignores, therefore continue until it shows HOLD.
 //! HOLD is requested only just after a message that shows OFFBOARD, because a later request could undo a pilot's switch; and a
 //! request for OFFBOARD that was sent before may still be carried out. The same holds for LAND, where it was requested and is called back.
 

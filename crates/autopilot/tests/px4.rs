@@ -37,6 +37,8 @@ struct Px4 {
     reported_mode: Option<(FlightMode, i64)>,
     /// Its heartbeats are lost on the way.
     loses_heartbeats: bool,
+    /// It holds as setpoints are missing, and OFFBOARD is the mode that was chosen.
+    is_failsafe: bool,
     /// Since when setpoints have come at 2 Hz or more, and when the last one came.
     streaming: Option<(i64, i64)>,
     setpoints: Vec<[f32; 3]>,
@@ -72,6 +74,9 @@ impl Px4 {
                         _ => now,
                     };
                     self.streaming = Some((since, now));
+                    if std::mem::take(&mut self.is_failsafe) && self.mode == FlightMode::AUTO_HOLD {
+                        self.mode = FlightMode::OFFBOARD;
+                    }
                     self.setpoints.push([setpoint.vx, setpoint.vy, setpoint.vz]);
                 }
                 MavMessage::LANDING_TARGET(target) => {
@@ -121,7 +126,7 @@ impl Px4 {
                 if self.intervals.contains_key(&CURRENT_MODE) {
                     self.queue.push(current_mode(self.mode));
                 }
-                self.mode = mode;
+                (self.mode, self.is_failsafe) = (mode, false);
             }
             MavCmd::MAV_CMD_COMPONENT_ARM_DISARM => self.armed = command.param1 == 1.0,
             MavCmd::MAV_CMD_NAV_TAKEOFF => {
@@ -148,7 +153,7 @@ impl Px4 {
         }
         let silent = self.streaming.is_none_or(|(_, last)| now - last > OFFBOARD_LOSS_NS);
         if self.mode == FlightMode::OFFBOARD && silent && self.armed {
-            self.mode = FlightMode::AUTO_HOLD;
+            (self.mode, self.is_failsafe) = (FlightMode::AUTO_HOLD, true);
         }
         let mut sent = std::mem::take(&mut self.queue);
         if now % SECOND == 0 && !self.loses_heartbeats {
@@ -239,6 +244,7 @@ impl World {
             intervals: BTreeMap::new(),
             has_current_mode: false,
             reported_mode: None,
+            is_failsafe: false,
             loses_heartbeats: false,
             streaming: None,
             setpoints: Vec::new(),
@@ -552,8 +558,20 @@ fn offboard_is_entered_with_a_stream_and_lost_without_one() {
         world.step();
     }
     assert_eq!(world.px4.mode, FlightMode::OFFBOARD);
-    world.run(4);
+    world.run(3);
     assert_eq!(world.px4.mode, FlightMode::AUTO_HOLD, "its failsafe");
+    assert!(world.client.may_return_to_offboard(world.now));
+    for _ in 0..200 {
+        world.client.set_velocity(world.now, Vector::zero(), 0.0).unwrap();
+        world.step();
+    }
+    assert_eq!(world.px4.mode, FlightMode::OFFBOARD, "the mode that was chosen");
+    // A HOLD that is chosen gets no setpoint.
+    world.px4.mode = FlightMode::AUTO_HOLD;
+    while world.client.state().unwrap().mode == FlightMode::OFFBOARD {
+        world.client.set_velocity(world.now, Vector::zero(), 0.0).unwrap();
+        world.step();
+    }
     let refused = world.client.set_velocity(world.now, Vector::zero(), 0.0);
     assert!(refused.unwrap_err().to_string().contains("PX4 HOLD"));
 }

@@ -220,12 +220,12 @@ named! {
         VehicleAging = "vehicle-aging", "no vehicle state just now, descent stopped";
         /// The autopilot's reports stopped.
         VehicleStale = "vehicle-stale", "no recent vehicle state, holding";
-        /// The autopilot's heartbeat, and with it the mode, is missing.
-        ModeUnknown = "mode-unknown", "no heartbeat of the autopilot for seconds, so its mode is not known, holding";
+        /// The autopilot's heartbeat, and with it the mode, is missing, or a mode may be the autopilot's reaction to missing setpoints.
+        ModeUnknown = "mode-unknown", "the autopilot's mode is not known (no heartbeat for seconds, or setpoints were missing just before), holding";
         /// Over the link to the autopilot setpoints arrive too late to steer by.
         LinkSlow = "link-slow", "the link to the autopilot takes more than 0.7 s both ways, too slow to steer, holding";
-        /// The controller did not run for a time after which no landing continues automatically.
-        Standstill = "standstill", "the controller did not run for more than 15 s, holding: `resume` continues the landing, `abort` ends it";
+        /// The controller did not run, or its link was lost, for a time after which no landing continues automatically.
+        Standstill = "standstill", "the controller did not run, or had no link to the autopilot, for more than 15 s, holding: `resume` continues the landing, `abort` ends it";
         /// No detector is alive.
         NoDetector = "no-detector", "no detector is alive, nothing descends";
         /// No progress in the time allowed.

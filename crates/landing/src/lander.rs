@@ -32,7 +32,7 @@ use crate::standing::{
     MAX_STANDING_M_S, RememberedPad, Resumed, SeenPad, StandingHeight, may_stand,
     standing_height_m, to_remember,
 };
-use crate::state_machine::{Inputs, StateMachine, VehicleInputs, reaction};
+use crate::state_machine::{Inputs, MAX_STANDSTILL_S, StateMachine, VehicleInputs, reaction};
 use crate::target_filter::{Sightings, TargetFilter};
 use crate::time::Timestamp;
 
@@ -71,10 +71,6 @@ const MAX_HOVER_M_S: f64 = 0.3;
 
 /// Minimum time of a search by a lander that takes over before it climbs, in seconds: the vehicle may stand.
 const MIN_RESUMED_LOOK_S: f64 = 1.5;
-
-/// Maximum time between two events, which are 25 ms apart, after which a landing continues automatically, in seconds. A controller that
-/// is started again resumes one that is as old.
-pub const MAX_STANDSTILL_S: f64 = 15.0;
 
 /// Maximum age of the newest detection, in seconds, up to which heights are those over the target.
 const MAX_TARGET_AGE_S: f64 = 20.0;

@@ -58,8 +58,9 @@ pub use event::{
     Alarm, AutopilotLimits, Event, FrameObservation, Landed, MarkerInFrame, Mode, OperatorCommand,
     VehicleState, VehicleStatus,
 };
-pub use lander::{Lander, MAX_STANDSTILL_S};
+pub use lander::Lander;
 pub use limits::ConfigError;
 pub use mount_check::{Measured, MountFindings};
 pub use standing::{RememberedPad, SeenPad};
+pub use state_machine::MAX_STANDSTILL_S;
 pub use time::Timestamp;

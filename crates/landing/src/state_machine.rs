@@ -37,7 +37,7 @@
 //! | the axes of camera and autopilot, or the marker's size, are not as configured | Hold |
 //! | the vehicle's state is stale, or its mode not known | Hold; Final waits |
 //! | the link to the autopilot is slow | Hold |
-//! | the controller has stood still for long | Hold; not in Final, where LAND has been asked for |
+//! | the controller has stood still, or had no state of the vehicle, for long | Hold; not in Final, where LAND has been asked for |
 //! | a mode that is neither GUIDED nor the requested LAND; GUIDED again in LAND, `MAX_OVERTAKEN_S` after it began | PilotInCommand |
 //! | on the ground; still and low over the pad, where Search or Retry would follow, in Search, or where the link is slow | Final |
 //! | disarmed | Aborted in the air; else, while the state is old, a wait of 2 s for a recent one; Landed on the ground or in LAND; else, half a second later, Aborted |
@@ -82,6 +82,10 @@ const MAX_SINKING_S: f64 = 600.0;
 
 /// Wait for the report of the ground after the motors have stopped, in seconds: it may be later.
 const MAX_CONTACT_WAIT_S: f64 = 0.5;
+
+/// Maximum time between two events, which are 25 ms apart, and without a state of the vehicle, after which a landing continues
+/// automatically, in seconds. A controller that is started again resumes one that is as old.
+pub const MAX_STANDSTILL_S: f64 = 15.0;
 
 /// The inputs of one step.
 #[derive(Copy, Clone, Debug)]
@@ -139,7 +143,7 @@ pub struct VehicleInputs {
     pub land_m_s: f64,
     /// It is certainly in the air: it falls, or, not reported to stand, sinks or is high over the target.
     pub flies: bool,
-    /// Its motors have just stopped, and its state does not show yet whether that was in the air; a newer one may follow.
+    /// Its motors have just stopped, and its state is too old to show whether that was in the air; a newer one may follow.
     pub awaits_state: bool,
 }
 
@@ -704,6 +708,12 @@ impl StateMachine {
         };
         if self.timed_out(inputs, timeout_s) {
             return Some((Phase::Aborted, Reason::HeldTooLong));
+        }
+        // As after a standstill as long.
+        let was_lost = matches!(self.reason, Reason::VehicleStale | Reason::AutopilotLost)
+            && self.timed_out(inputs, MAX_STANDSTILL_S);
+        if was_lost && !is_stale {
+            return Some((Phase::Hold, Reason::Standstill));
         }
         let may_end_on_pad = matches!(self.reason, Reason::LinkSlow | Reason::Standstill);
         if may_end_on_pad && inputs.may_stand && !is_stale {

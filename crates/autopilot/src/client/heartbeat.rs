@@ -71,6 +71,9 @@ impl Autopilot {
             joiner: Joiner::default(),
             listener: Listener::default(),
         });
+        if self.stopped_system == Some(system) {
+            self.offboard_return.taken_over(now_ns, mode);
+        }
         self.streams = Streams::new(&stream::of_firmware(firmware, &self.config.streams));
         self.push(Event::Found { system, firmware });
         self.push(Event::ModeChanged { from: None, to: mode });
@@ -146,6 +149,7 @@ impl Autopilot {
             vehicle.mode_since_ns = now_ns;
         }
         if from != to {
+            self.offboard_return.mode_changed(now_ns, from, to);
             self.push(Event::ModeChanged { from: Some(from), to });
         }
         from != to

@@ -600,6 +600,21 @@ fn after_a_long_standstill_of_the_controller_the_operator_decides() {
 }
 
 #[test]
+fn a_landing_continues_by_itself_only_where_the_link_is_back_within_15_s() {
+    let lost = |seconds| flown(seconds, |v| v.age_s = seconds - 2.0);
+    let descending = [start(), seen(1.0, Progress::Unchanged), seen(2.0, Progress::Descending)];
+    let [a, b, c] = descending;
+    check(&[a, b, c, lost(3.0), lost(17.0), at(17.5)], Phase::Search, Reason::Searching);
+    let alarm = Inputs { alarm: Some((AlarmAction::Hold, Reason::AutopilotLost)), ..lost(4.0) };
+    check(&[a, b, c, lost(3.0), alarm, lost(18.0), at(18.5)], Phase::Search, Reason::Searching);
+    let long = [a, b, c, lost(3.0), alarm, lost(18.0), at(19.5)];
+    check(&long, Phase::Hold, Reason::Standstill);
+    let resumed = Inputs { operator: Some(OperatorCommand::Resume), ..at(60.0) };
+    check(&[a, b, c, lost(3.0), alarm, at(19.5), resumed], Phase::Search, Reason::Searching);
+    check(&[a, b, c, lost(3.0), lost(62.5), lost(64.0)], Phase::Aborted, Reason::HeldTooLong);
+}
+
+#[test]
 fn a_running_axis_check_also_delays_a_descent_without_the_marker() {
     let blind = Inputs { may_descend: false, ..seen(2.0, Progress::Blind) };
     check(&[start(), seen(1.0, Progress::Unchanged), blind], Phase::Approach, Reason::Aligning);

@@ -275,7 +275,9 @@ impl SimulatedAutopilot {
 
     /// Accepts velocities in the frames that ArduPilot supports; any other setpoint is a stop.
     fn take_setpoint(&mut self, now_s: f64, target: &SET_POSITION_TARGET_LOCAL_NED_DATA) {
-        self.px4.on_setpoint(now_s);
+        if self.px4.on_setpoint(now_s) {
+            self.flight.follow_setpoints(now_s, &self.estimate);
+        }
         if self.is_px4() && !self.px4.is_offboard() {
             return;
         }

@@ -10,7 +10,7 @@ pub enum Parameter {
     DisarmDelay,
     /// Seconds without a setpoint until the vehicle brakes.
     GuidedTimeout,
-    /// PX4's seconds without a setpoint until it leaves OFFBOARD.
+    /// PX4's seconds without a setpoint until it holds its place.
     OffboardLoss,
     /// Height below which LAND descends slowly, in cm.
     LandAltLow,

@@ -2,7 +2,8 @@
 //! OFFBOARD only with a stream of setpoints before and during
 //! (<https://docs.px4.io/main/en/flight_modes/offboard.html>), a takeoff to an altitude over the sea, a heartbeat with the mode
 //! once a second, and events with the checks before arming that fail: after a change and on request. Measured with 1.17 in its
-//! own simulation: CURRENT_MODE, if it is requested, with each change and twice a second, the former mode once more after an
+//! own simulation: HOLD as the failsafe for missing setpoints, and OFFBOARD again with the next one, as long as no other mode is
+//! chosen; CURRENT_MODE, if it is requested, with each change and twice a second, the former mode once more after an
 //! accepted request, and OFFBOARD again when the motors stop after a landing.
 
 use autopilot::FlightMode;
@@ -36,7 +37,10 @@ const CAN_ARM_AT: usize = 9;
 pub(super) struct Px4 {
     /// Since when setpoints have come, and when the last one did.
     stream: Option<(f64, f64)>,
+    /// OFFBOARD is the mode that was chosen.
     offboard: bool,
+    /// It holds its place as setpoints are missing.
+    is_failsafe: bool,
     /// It was in OFFBOARD before it landed.
     landed_from_offboard: bool,
     pub(super) precision: bool,
@@ -72,9 +76,11 @@ impl Px4 {
         MavMessage::EVENT(event)
     }
 
-    pub(super) fn on_setpoint(&mut self, now_s: f64) {
+    /// A setpoint; true when it ends the failsafe, and OFFBOARD continues.
+    pub(super) fn on_setpoint(&mut self, now_s: f64) -> bool {
         let continuing = self.stream.filter(|(_, last_s)| now_s - last_s <= STREAM_GAP_S);
         self.stream = Some((continuing.map_or(now_s, |(since_s, _)| since_s), now_s));
+        std::mem::take(&mut self.is_failsafe)
     }
 
     /// The requested mode in ArduPilot's terms; `None` when it is refused.
@@ -91,7 +97,7 @@ impl Px4 {
         };
         self.landed_from_offboard =
             mode == Mode::Land && (self.offboard || self.landed_from_offboard);
-        self.offboard = mode == Mode::Guided;
+        (self.offboard, self.is_failsafe) = (mode == Mode::Guided, false);
         self.precision = (main, sub) == (4, 9);
         Some(mode)
     }
@@ -107,18 +113,19 @@ impl Px4 {
     }
 
     pub(super) fn on_takeoff(&mut self) {
-        self.offboard = false;
+        (self.offboard, self.is_failsafe) = (false, false);
     }
 
+    /// True while it follows setpoints.
     pub(super) fn is_offboard(&self) -> bool {
-        self.offboard
+        self.offboard && !self.is_failsafe
     }
 
     /// True when the setpoints of OFFBOARD have just been missed for longer than `timeout_s`.
     pub(super) fn has_lost_setpoints(&mut self, now_s: f64, timeout_s: f64) -> bool {
         let lost =
-            self.offboard && self.stream.is_none_or(|(_, last_s)| now_s - last_s > timeout_s);
-        self.offboard &= !lost;
+            self.is_offboard() && self.stream.is_none_or(|(_, last_s)| now_s - last_s > timeout_s);
+        self.is_failsafe |= lost;
         lost
     }
 
@@ -131,7 +138,7 @@ impl Px4 {
     /// The mode that the heartbeat reports.
     pub(super) fn shown(&self, mode: Mode, landed: Landed) -> FlightMode {
         match mode {
-            Mode::Guided if self.offboard => FlightMode::OFFBOARD,
+            Mode::Guided if self.is_offboard() => FlightMode::OFFBOARD,
             Mode::Guided if landed == Landed::TakingOff => FlightMode::AUTO_TAKEOFF,
             Mode::Guided | Mode::Loiter | Mode::Brake => FlightMode::AUTO_HOLD,
             Mode::Land if self.precision => FlightMode::AUTO_PRECLAND,
@@ -173,8 +180,12 @@ mod tests {
         assert!(!px4.has_lost_setpoints(2.0, 1.0));
         assert!(px4.has_lost_setpoints(2.2, 1.0), "its failsafe");
         assert_eq!(px4.shown(Mode::Loiter, Landed::InAir), FlightMode::AUTO_HOLD);
-        px4.on_setpoint(5.0);
-        assert_eq!(px4.request(5.1, 6, 0), None, "a gap begins the stream again");
+        assert!(px4.on_setpoint(5.0), "the mode that was chosen is OFFBOARD still");
+        assert_eq!(px4.shown(Mode::Guided, Landed::InAir), FlightMode::OFFBOARD);
+        assert!(px4.has_lost_setpoints(6.1, 1.0));
+        assert_eq!(px4.request(6.2, 4, 3), Some(Mode::Loiter));
+        assert!(!px4.on_setpoint(7.0), "HOLD was chosen");
+        assert_eq!(px4.request(7.1, 6, 0), None, "a gap begins the stream again");
     }
 
     #[test]
