@@ -53,7 +53,9 @@ impl Drop for Waiting {
         // Without a receiver the thread ends.
         drop(self.ended.take());
         // The result has reported a panic.
-        self.thread.take().map(JoinHandle::join).map(drop);
+        if let Some(thread) = self.thread.take() {
+            drop(thread.join());
+        }
     }
 }
 
