@@ -795,7 +795,7 @@ mod tests {
     }
 
     /// Swaps to a command while another detector joins, and a detector `mine` with the process that the command writes to a file.
-    async fn swapped_to(command: &str) -> anyhow::Result<Report> {
+    async fn swapped_to(command: &str, ready_s: &str) -> anyhow::Result<Report> {
         let (port, _lock) = free_port()?;
         let zenoh = ZenohSource::Text(node::session::local_config(port));
         let open = async |service: &'static str, instance: &str| {
@@ -808,7 +808,8 @@ mod tests {
         let file = folder.path().join("pid");
         let command = command.replace("FILE", &file.display().to_string());
         let log = folder.path().join("log").display().to_string();
-        let args = ["swap", "--to", &command, "--ready-s", "3", "--agree-s", "0", "--log", &log];
+        let args =
+            ["swap", "--to", &command, "--ready-s", ready_s, "--agree-s", "0", "--log", &log];
         let args = Tool::try_parse_from(args)?.swap;
         let introduce = async |node: &Node, name: &str, pid: u32| {
             let info = DetectorInfo {
@@ -863,9 +864,9 @@ mod tests {
 
     #[tokio::test(flavor = "multi_thread")]
     async fn only_a_process_of_its_command_is_switched_to() -> anyhow::Result<()> {
-        let report = swapped_to("sh -c 'sleep 30 & echo $! > FILE; wait'").await?;
+        let report = swapped_to("sh -c 'sleep 60 & echo $! > FILE; wait'", "30").await?;
         assert_eq!(report.to.as_deref(), Some("mine"), "{}", report.why);
-        let report = swapped_to("sh -c 'echo 0 > FILE; exec sleep 30'").await?;
+        let report = swapped_to("sh -c 'echo 0 > FILE; exec sleep 60'", "6").await?;
         assert_eq!(report.to, None, "{}", report.why);
         let why = "`third` joined, and is not used: it is process";
         assert!(report.why.contains(why) && report.why.contains("`--id third`"), "{}", report.why);
