@@ -62,6 +62,15 @@ impl CameraWatch {
         camera.clone_into(&mut last.camera);
     }
 
+    /// This process has not run for so long: frames of that time were not missing.
+    pub fn stood_still(&mut self, now_ns: i64, stood_ns: i64) {
+        for last in self.detectors.values_mut() {
+            for at_ns in [&mut last.at_ns, &mut last.received_ns] {
+                *at_ns = at_ns.saturating_add(stood_ns).min(now_ns);
+            }
+        }
+    }
+
     /// A detector has ended: without it nothing shows whether the camera has frames.
     pub fn ended(&mut self, detector: &str) {
         self.detectors.remove(detector);
@@ -157,6 +166,17 @@ mod tests {
         watch.announced(14 * S, "other", "wide");
         assert_eq!(warnings(&watch, 14 * S).len(), 1);
         assert_eq!(watch.no_frame(14 * S), None, "the other camera has frames");
+    }
+
+    #[test]
+    fn frames_are_not_missing_while_this_process_does_not_run() {
+        let mut watch = CameraWatch::default();
+        watch.searched(0, "main", "down");
+        watch.stood_still(20 * S, 20 * S);
+        watch.announced(20 * S, "main", "down");
+        assert!(warnings(&watch, 20 * S).is_empty() && watch.no_frame(20 * S).is_none());
+        watch.announced(23 * S, "main", "down");
+        assert_eq!(warnings(&watch, 23 * S).len(), 1);
     }
 
     #[test]

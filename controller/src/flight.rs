@@ -38,6 +38,9 @@ use crate::status::{Used, View};
 use crate::wind::WindEstimate;
 use crate::wire;
 
+/// Shortest pause between two ticks, which are 25 ms apart, that is a standstill of this process, in nanoseconds.
+const MIN_STANDSTILL_NS: i64 = 300_000_000;
+
 /// A flight.
 pub struct Flight {
     config: Config,
@@ -69,6 +72,8 @@ pub struct Flight {
     empty_since_ns: Option<i64>,
     /// The time of the last tick.
     ticked_ns: Option<i64>,
+    /// The mode that ended the last landing as the pilot's.
+    pilots_mode: Option<FlightMode>,
 }
 
 impl Flight {
@@ -116,6 +121,7 @@ impl Flight {
             is_disputed: false,
             empty_since_ns: None,
             ticked_ns: None,
+            pilots_mode: None,
             config,
         })
     }
@@ -184,7 +190,11 @@ impl Flight {
     /// After a standstill of this process for which a landing would be held, what was to begin waits for a command as well.
     fn notice_standstill(&mut self, now_ns: i64) {
         let before_ns = self.ticked_ns.replace(now_ns).unwrap_or(now_ns);
-        let stood_s = now_ns.saturating_sub(before_ns) as f64 * 1e-9;
+        let stood_ns = now_ns.saturating_sub(before_ns);
+        if stood_ns > MIN_STANDSTILL_NS {
+            self.frames.camera_watch.stood_still(now_ns, stood_ns);
+        }
+        let stood_s = stood_ns as f64 * 1e-9;
         if stood_s <= MAX_STANDSTILL_S {
             return;
         }
@@ -516,6 +526,7 @@ impl Flight {
             frames: &self.frames,
             journal: &self.journal,
             setpoint: self.setpoints.last(),
+            pilots_mode: self.pilots_mode,
             used: self.used,
             wind_ned_m_s: self.wind.velocity_m_s(self.config.autopilot.drag()),
         }
@@ -720,6 +731,9 @@ impl Flight {
         let decision = self.lander.step(Timestamp::from_nanos(now_ns), event);
         if decision.phase != before {
             self.journal.phase_changed(before, &decision);
+            if decision.phase == Phase::PilotInCommand {
+                self.pilots_mode = self.autopilot.state().map(|state| state.mode);
+            }
         }
         // A LAND that was lost on the way must not be repeated after the pilot took over, nor GUIDED on the ground.
         if decision.phase != before || was_recalling && !self.lander.is_recalling() {

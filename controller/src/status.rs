@@ -1,7 +1,7 @@
 //! Builds the status and the target estimate that the controller publishes: phase and its reason in words, warnings, detector in
 //! use, height, link and ages.
 
-use autopilot::{Autopilot, LISTENING, LandedState};
+use autopilot::{Autopilot, FlightMode, LISTENING, LandedState};
 use landing::{Action, Decision, Lander, Reason};
 use messages::{ControllerStatus, Phase, Setpoint, TargetEstimate};
 
@@ -39,6 +39,8 @@ pub struct View<'a> {
     pub journal: &'a Journal,
     /// The last setpoint.
     pub setpoint: Option<Setpoint>,
+    /// The mode that ended the landing as the pilot's; the vehicle may show another one since.
+    pub pilots_mode: Option<FlightMode>,
     /// The detections that were used.
     pub used: Used,
     /// Wind velocity to the north and east, in m/s.
@@ -243,10 +245,10 @@ impl View<'_> {
         if let Some(left_low) = self.left_low() {
             return left_low;
         }
-        match self.autopilot.state() {
+        match self.pilots_mode {
             // It may as well be the autopilot's failsafe: when PX4 misses setpoints it holds.
-            Some(state) if self.lander.phase() == landing::Phase::PilotInCommand => {
-                format!("{why} (or the autopilot's failsafe), in {}", state.mode)
+            Some(mode) if self.lander.phase() == landing::Phase::PilotInCommand => {
+                format!("{why} (or the autopilot's failsafe), in {mode}")
             }
             _ => why,
         }

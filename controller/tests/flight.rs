@@ -994,6 +994,38 @@ fn the_last_known_delay_is_assumed_for_a_while() {
     }
 }
 
+/// While the controller does not run nobody measures the delay, and no frame is missing.
+#[test]
+fn a_standstill_of_the_controller_is_neither_a_link_without_answers_nor_a_camera_without_frames() {
+    let mut flight = flight("airborne");
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    for ms in (20..5000).chain(25_000..25_400).step_by(20) {
+        let now_ns = ms * MS;
+        if ms % 1000 == 0 {
+            receive(&mut flight, now_ns, &heartbeat(4, true));
+        }
+        pose(&mut flight, now_ns);
+        if ms % 60 == 0 && ms < 5000 {
+            flight.detections(now_ns + 2, "main", &seen(now_ns));
+        }
+        flight.tick(now_ns + 3);
+        let warnings = flight.status(now_ns + 4).warnings;
+        let is_expected = |text: &String| !text.contains("TIMESYNC") && !text.contains("no frame");
+        assert!(warnings.iter().all(is_expected), "after {ms} ms: {warnings:?}");
+        while let Some(packet) = flight.poll_outgoing() {
+            for packet in Parser::new().push(&packet) {
+                if let Some(MavMessage::TIMESYNC(question)) = packet.message {
+                    let answer = TIMESYNC_DATA { tc1: now_ns, ..question };
+                    receive(&mut flight, now_ns + 4, &MavMessage::TIMESYNC(answer));
+                }
+            }
+        }
+    }
+}
+
 #[test]
 fn a_link_that_was_unsteady_is_not_taken_for_a_slow_one_permanently() {
     let mut flight = flight("airborne");

@@ -5,6 +5,7 @@
 
 mod packets;
 
+use autopilot::FlightMode;
 use autopilot::dialect::{
     CURRENT_MODE_DATA, ESTIMATOR_STATUS_DATA, EstimatorStatusFlags, GLOBAL_POSITION_INT_DATA,
     MavCmd, MavLandedState, MavMessage,
@@ -608,6 +609,11 @@ fn a_mode_that_was_chosen_while_setpoints_were_missing_is_kept() {
     assert_eq!(flight.status(7001 * MS).phase, Phase::PilotInCommand);
     Sent::default().take(&mut flight);
     assert_eq!(hover(&mut flight, 7020, 9000, POSITION).setpoints, 0);
+    // The status names that mode, also where another one follows.
+    receive(&mut flight, 9010 * MS, &heartbeat(OFFBOARD, true));
+    let why = flight.status(9020 * MS).why;
+    assert!(why.contains(&FlightMode::Px4(POSITION).to_string()), "{why}");
+    assert!(!why.contains("OFFBOARD"), "{why}");
 }
 
 #[test]

@@ -223,7 +223,12 @@ impl Autopilot {
         if self.clock.link_delay_ns(now_ns).is_some() {
             self.link_delay_ns = Some(now_ns);
         }
-        self.standstill.tick(now_ns);
+        // While this process did not run nothing was measured, and nothing was missing.
+        if let (Some(stood_ns), Some(at_ns)) =
+            (self.standstill.tick(now_ns), &mut self.link_delay_ns)
+        {
+            *at_ns = at_ns.saturating_add(stood_ns).min(now_ns);
+        }
         self.step_requests(now_ns, !self.standstill.is_mode_old());
     }
 

@@ -20,11 +20,13 @@ pub(crate) struct Standstill {
 }
 
 impl Standstill {
-    /// Advances the time.
-    pub(crate) fn tick(&mut self, now_ns: i64) {
+    /// Advances the time; the length of the standstill, in nanoseconds, if one has just ended.
+    pub(crate) fn tick(&mut self, now_ns: i64) -> Option<i64> {
         let before_ns = self.ticked_ns.unwrap_or(now_ns);
         self.ticked_ns = Some(before_ns.max(now_ns));
-        if now_ns.saturating_sub(before_ns) > MIN_PAUSE_NS {
+        let pause_ns = now_ns.saturating_sub(before_ns);
+        let stood_ns = (pause_ns > MIN_PAUSE_NS).then_some(pause_ns);
+        if stood_ns.is_some() {
             self.ended_ns = Some(now_ns);
             self.first_ns.get_or_insert(now_ns);
         }
@@ -36,6 +38,7 @@ impl Standstill {
         {
             self.ended_ns = None;
         }
+        stood_ns
     }
 
     /// The vehicle's mode was received; `measured_ns` is when the newest measurement before it was made, if there is one.
@@ -66,7 +69,7 @@ mod tests {
         standstill.tick(0);
         standstill.tick(25 * MS);
         assert!(!standstill.is_mode_old());
-        standstill.tick(1000 * MS);
+        assert_eq!(standstill.tick(1000 * MS), Some(975 * MS));
         standstill
     }
 
