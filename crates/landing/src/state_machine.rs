@@ -477,11 +477,14 @@ impl StateMachine {
         if inputs.operator == Some(OperatorCommand::Abort) && self.can_abort(inputs) {
             return Some((Phase::Aborted, Reason::OperatorAbort));
         }
-        if self.landing || self.disarmed.is_some() {
+        if self.landing {
             return None;
         }
         if inputs.operator == Some(OperatorCommand::LandHere) && self.phase != Phase::Final {
             return Some((Phase::Final, Reason::OperatorLand));
+        }
+        if self.disarmed.is_some() {
+            return None;
         }
         if let Some((action, reason)) = inputs.alarm
             && self.phase != Phase::Final
