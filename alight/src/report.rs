@@ -312,7 +312,8 @@ mod tests {
         let mut empty = Vec::new();
         flightlog::Writer::new(&mut empty, &about).unwrap().finish().unwrap();
         assert!(refusal(Some(&empty)).contains("nothing of a flight is in"));
-        let cut = refusal(empty.get(..100));
+        // Within the first record, the header.
+        let cut = refusal(empty.get(..20));
         assert!(cut.contains("flight.mcap\" is cut off before the first message"), "{cut}");
     }
 
