@@ -583,8 +583,8 @@ fn a_topic_is_subscribed_to_by_the_services_that_its_row_names() -> anyhow::Resu
                 match package.name.as_str() {
                     // The sender of the air link is a part of the publisher of frames.
                     "airlink" => found.extend(["camera-pub", "simulator"]),
-                    // `alight up` watches with the key of the service that it supervises.
-                    "alight" if path.ends_with("peers.rs") => {
+                    // `alight up` watches with the key of the service that it supervises. Healths are read only where that key may read them.
+                    "alight" if path.ends_with("peers.rs") && name != "HEALTH" => {
                         found.extend(["controller", "detector"]);
                     }
                     other => drop(found.insert(other)),

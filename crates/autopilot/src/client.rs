@@ -7,6 +7,7 @@
 //! the mode since.
 
 mod heartbeat;
+mod link_delay;
 mod texts;
 
 use std::collections::VecDeque;
@@ -45,12 +46,6 @@ const MAX_QUEUED: usize = 1024;
 const MAX_OUTCOMES: usize = 32;
 /// Period of our heartbeat, in nanoseconds.
 const HEARTBEAT_NS: i64 = 1_000_000_000;
-/// The delay for which an unsteady link counts.
-const UNSTEADY: Duration = Duration::from_secs(1);
-/// Time within which the clock's answers show how slow the link is, in nanoseconds: it is requested ten times a second.
-const LINK_DELAY_DUE_NS: i64 = 3_000_000_000;
-/// Time for which a delay counts that is not measured any more, in nanoseconds.
-const MAX_LINK_DELAY_AGE_NS: i64 = 10_000_000_000;
 /// Maximum age of a position whose vertical speed shows whether the vehicle stands, in nanoseconds.
 const MAX_SPEED_AGE_NS: i64 = 500_000_000;
 
@@ -220,15 +215,8 @@ impl Autopilot {
             self.ask_for_checks(now_ns);
         }
         self.prove_setpoints(now_ns);
-        if self.clock.link_delay_ns(now_ns).is_some() {
-            self.link_delay_ns = Some(now_ns);
-        }
-        // While this process did not run nothing was measured, and nothing was missing.
-        if let (Some(stood_ns), Some(at_ns)) =
-            (self.standstill.tick(now_ns), &mut self.link_delay_ns)
-        {
-            *at_ns = at_ns.saturating_add(stood_ns).min(now_ns);
-        }
+        let stood_ns = self.standstill.tick(now_ns);
+        self.note_link_delay(now_ns, stood_ns);
         self.step_requests(now_ns, !self.standstill.is_mode_old());
     }
 
@@ -311,31 +299,6 @@ impl Autopilot {
         self.stopped_system = Some(system);
         let target = Sender { system, component: AUTOPILOT };
         self.send(&compose::velocity((now_ns / 1_000_000) as u32, Vector::zero(), 0.0, target));
-    }
-
-    /// The shortest round trip to the autopilot; `None` while its clock is not known and measurements are
-    /// stamped with the time of their reception.
-    pub fn round_trip(&self, now_ns: i64) -> Option<Duration> {
-        self.clock.round_trip_ns(now_ns).map(|ns| Duration::from_nanos(ns.max(0).unsigned_abs()))
-    }
-
-    /// How slow the link is now, both ways together; `None` while it is not known. A link that delays most packets
-    /// by a varying time is as slow as its late packets.
-    pub fn link_delay(&self, now_ns: i64) -> Option<Duration> {
-        if self.vehicle.as_ref().is_some_and(|vehicle| vehicle.boot.is_unsteady()) {
-            return Some(UNSTEADY);
-        }
-        self.clock.link_delay_ns(now_ns).map(|ns| Duration::from_nanos(ns.max(0).unsigned_abs()))
-    }
-
-    /// Whether the link's delay is unknown after 3 s of connection, or has not been measured for 10 s. Then the clock is not
-    /// requested ([`Config::timesync`]), or the link does not pass the requests or the answers.
-    pub fn lacks_link_delay(&self, now_ns: i64) -> bool {
-        let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.state.connected);
-        let Some(vehicle) = vehicle else { return false };
-        let has_passed = |since_ns: i64, limit_ns: i64| now_ns.saturating_sub(since_ns) >= limit_ns;
-        has_passed(vehicle.contact_ns, LINK_DELAY_DUE_NS)
-            && self.link_delay_ns.is_none_or(|at_ns| has_passed(at_ns, MAX_LINK_DELAY_AGE_NS))
     }
 
     /// Why neither a take-off nor a landing may begin now: another companion with our ids, or, where [`Config::system_id`] pins none, a
