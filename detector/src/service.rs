@@ -19,13 +19,13 @@ use messages::{
     CameraInfo, CameraResponse, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo,
     FrameHeader, PixelFormat, Refusals, topic,
 };
+use node::frame_order::{FrameOrder, Misplaced};
 use node::{BoxFuture, Frame, FramePublisher, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 
 use crate::config::{Config, Input};
 use crate::inbox::{AirInbox, Inbox, lock};
-use crate::publishers::{Misplaced, Publishers};
 use crate::search::{Search, StageClock};
 use crate::wire;
 
@@ -287,7 +287,7 @@ struct Work {
     converter: Converter,
     unpacker: Unpacker,
     search: Search,
-    publishers: Publishers,
+    order: FrameOrder,
     overlay: RgbImageBuf,
 }
 
@@ -320,7 +320,7 @@ impl Work {
             converter: Converter::default(),
             unpacker: Unpacker::default(),
             search,
-            publishers: Publishers::default(),
+            order: FrameOrder::default(),
             overlay: RgbImageBuf::default(),
         })
     }
@@ -410,7 +410,7 @@ impl Work {
 
     /// Counts a frame that does not follow the frame before. It is searched nevertheless: the controller checks the stamps.
     fn check_order(&mut self, header: &FrameHeader) {
-        let Misplaced { by_stamp, by_sequence, as_of_two } = self.publishers.on_frame(header);
+        let Misplaced { by_stamp, by_sequence, as_of_two } = self.order.on_frame(header);
         let (health, camera) = (self.node.health(), &header.camera);
         if by_stamp {
             health.failed("frame whose stamp is not later than that of the frame before");

@@ -20,9 +20,11 @@ pub(crate) struct Alone {
 }
 
 impl Alone {
-    pub(crate) fn new(node: &Node, id: &str) -> Self {
+    /// A recorder without a file, which only serves viewers, needs no controller.
+    pub(crate) fn new(node: &Node, id: &str, has_file: bool) -> Self {
         let identity = node.identity();
-        Self::of(node.vehicle(), &[identity.service, &identity.instance], id)
+        let alone = Self::of(node.vehicle(), &[identity.service, &identity.instance], id);
+        Self { has_controller: AtomicBool::new(!has_file), ..alone }
     }
 
     fn of(vehicle: &str, process: &[&str], id: &str) -> Self {
@@ -57,7 +59,8 @@ impl Alone {
         self.warning().or_else(|| {
             (!self.has_controller.load(Ordering::Relaxed)).then(|| {
                 format!(
-                    "no message of a controller of the vehicle `{}` has arrived: the recording contains no decisions until a controller starts",
+                    "no message of a controller of the vehicle `{}` has arrived: the recording contains no decisions until a controller starts. \
+                     Start one, unless only the camera is to be recorded",
                     self.vehicle
                 )
             })

@@ -72,7 +72,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     node.announce().await?;
     let status = RecorderStatus { recorder: config.id.clone(), ..RecorderStatus::default() };
     let status = Arc::new(Mutex::new(status));
-    let alone = Arc::new(Alone::new(&node, &config.id));
+    let alone = Arc::new(Alone::new(&node, &config.id, has_file));
     let recorder = Recorder {
         alone: Some(Arc::clone(&alone)),
         live,
@@ -333,19 +333,21 @@ impl Recorder {
             self.health.dropped_times("frames that never came", count);
             self.lost.add(&key, count);
         }
-        for key in self.unseen.doubled() {
-            self.health.failed("frames of two publishers with one camera name");
-            tracing::warn!(
-                %key,
-                "The numbers of the frames alternate between two sequences: two publishers use this camera name. Give each camera its own name (`id`)"
-            );
-        }
     }
 
     /// The header of a frame, whose number is looked at; `None` for any other message.
     fn take_number(&mut self, message: &Tapped) -> Option<FrameHeader> {
         let header = header(message)?;
-        self.unseen.take(&message.key, header.sequence);
+        let camera = &header.camera;
+        if self.unseen.take(&message.key, &header)
+            && self.health.failed(&format!("two publishers of camera `{camera}`"))
+        {
+            tracing::warn!(
+                key = message.key,
+                "Two publishers of one camera, by the sequence numbers or clocks of its frames: end one of them, or give each camera its \
+                 own name (`id`)"
+            );
+        }
         Some(header)
     }
 

@@ -1,9 +1,10 @@
 //! Counts frames that were never received, by their numbers: a recorder that had no processor for a while does not see which were lost on
-//! the way to it. Detects two publishers with the name of one camera, whose numbers alternate.
+//! the way to it. Two publishers with the name of one camera, whose numbers alternate, leave no gaps.
 
 use std::collections::BTreeMap;
 
-use messages::NEVER_CAME;
+use messages::{FrameHeader, NEVER_CAME};
+use node::frame_order::FrameOrder;
 
 /// Maximum number of cameras whose frames are counted.
 const MAX_CAMERAS: usize = 1024;
@@ -12,8 +13,6 @@ const MAX_GAP: u64 = 100_000;
 /// By so many numbers a frame may be late, as one that a link delayed; one that is further behind is of a camera that
 /// restarted.
 const MAX_LATE: u64 = 64;
-/// So many returns to the numbers of another sequence show two publishers; one that restarts does not return.
-const MIN_RETURNS: u64 = 3;
 
 /// The numbers of each camera's frames.
 #[derive(Debug, Default)]
@@ -35,10 +34,7 @@ struct Numbers {
     before_jump: Option<u64>,
     /// Numbers that the latest jump left out; they are missing unless the next frame returns to those before it.
     jumped: u64,
-    /// How often a frame returned to the numbers before a jump.
-    returns: u64,
-    /// Whether two publishers were reported.
-    is_reported: bool,
+    order: FrameOrder,
 }
 
 impl Numbers {
@@ -68,7 +64,6 @@ impl Numbers {
         let return_step = before.map_or(0, |before| sequence.saturating_sub(before));
         let step = sequence.saturating_sub(self.last);
         if (1..=MAX_LATE).contains(&return_step) {
-            self.returns += 1;
             self.missing += return_step - 1;
         } else {
             self.missing += jumped;
@@ -88,29 +83,18 @@ impl Numbers {
 }
 
 impl Unseen {
-    /// Takes the number of a frame, by its key.
-    pub(crate) fn take(&mut self, key: &str, sequence: u64) {
+    /// Takes the header of a frame, by its key; true where it shows that two publishers use that key.
+    pub(crate) fn take(&mut self, key: &str, header: &FrameHeader) -> bool {
         let Some(numbers) = self.cameras.get_mut(key) else {
             if self.cameras.len() < MAX_CAMERAS {
-                let first = Numbers { last: sequence, ..Numbers::default() };
+                let mut first = Numbers { last: header.sequence, ..Numbers::default() };
+                first.order.on_frame(header);
                 self.cameras.insert(key.to_owned(), first);
             }
-            return;
+            return false;
         };
-        numbers.take(sequence);
-    }
-
-    /// The keys on which two publishers were detected since the last call.
-    pub(crate) fn doubled(&mut self) -> Vec<String> {
-        let new = self
-            .cameras
-            .iter_mut()
-            .filter(|(_, numbers)| numbers.returns >= MIN_RETURNS && !numbers.is_reported);
-        new.map(|(key, numbers)| {
-            numbers.is_reported = true;
-            key.clone()
-        })
-        .collect()
+        numbers.take(header.sequence);
+        numbers.order.on_frame(header).as_of_two
     }
 
     /// Takes how many messages of a key were dropped before they were looked at.
@@ -140,63 +124,64 @@ mod tests {
     const KEY: &str = "camera/down/frame";
     const UNSEEN: &str = "camera/down/frame (never came)";
 
+    fn take(unseen: &mut Unseen, sequence: u64) -> bool {
+        unseen.take(KEY, &FrameHeader { sequence, ..FrameHeader::sample() })
+    }
+
     #[test]
     fn missing_numbers_are_frames_that_were_never_received() {
         let mut unseen = Unseen::default();
         for sequence in [7, 8, 12, 13] {
-            unseen.take(KEY, sequence);
+            take(&mut unseen, sequence);
         }
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 3)]);
         assert_eq!(unseen.more(), []);
         // The next two are dropped before they are looked at, and counted where they were dropped.
         unseen.dropped(KEY, 2);
         assert_eq!(unseen.more(), []);
-        unseen.take(KEY, 16);
+        take(&mut unseen, 16);
         assert_eq!(unseen.more(), []);
-        unseen.take(KEY, 18);
+        take(&mut unseen, 18);
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 1)]);
     }
 
     #[test]
     fn two_publishers_of_one_key_are_detected_and_leave_no_gaps() {
         let mut unseen = Unseen::default();
+        let mut are_two = false;
         for number in 0..20 {
-            unseen.take(KEY, 100 + number);
-            unseen.take(KEY, 5000 + number);
+            are_two |= take(&mut unseen, 100 + number);
+            are_two |= take(&mut unseen, 5000 + number);
             // Whenever the losses are looked at.
             assert_eq!(unseen.more(), [], "{number}");
             if number % 3 == 0 {
-                unseen.take(KEY, 5000 + number);
+                take(&mut unseen, 5000 + number);
             }
         }
-        assert_eq!(unseen.doubled(), [KEY]);
-        assert_eq!(unseen.doubled(), [""; 0]);
+        assert!(are_two);
         // One of them misses a frame.
-        unseen.take(KEY, 121);
+        take(&mut unseen, 121);
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 1)]);
     }
 
     #[test]
     fn a_long_gap_counts_with_the_frame_after_it_and_a_restart_is_no_second_publisher() {
         let mut unseen = Unseen::default();
-        unseen.take(KEY, 10);
-        unseen.take(KEY, 1011);
+        take(&mut unseen, 10);
+        take(&mut unseen, 1011);
         assert_eq!(unseen.more(), []);
-        unseen.take(KEY, 1012);
+        take(&mut unseen, 1012);
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 1000)]);
-        for _ in 0..5 {
-            for sequence in [0, 1, 2, 900] {
-                unseen.take(KEY, sequence);
-            }
+        for sequence in [0, 1, 2, 900] {
+            assert!(!take(&mut unseen, sequence));
         }
-        assert_eq!(unseen.doubled(), [""; 0]);
     }
 
     #[test]
     fn a_frame_that_comes_late_is_not_missing() {
         let mut unseen = Unseen::default();
         for sequence in [10, 12, 11, 13] {
-            unseen.take(KEY, sequence);
+            take(&mut unseen, sequence);
         }
         assert_eq!(unseen.more(), []);
     }
@@ -204,10 +189,10 @@ mod tests {
     #[test]
     fn drops_before_a_restart_of_a_camera_hide_no_gap_after_it() {
         let mut unseen = Unseen::default();
-        unseen.take(KEY, 900);
+        take(&mut unseen, 900);
         unseen.dropped(KEY, 3);
-        unseen.take(KEY, 0);
-        unseen.take(KEY, 3);
+        take(&mut unseen, 0);
+        take(&mut unseen, 3);
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 2)]);
     }
 
@@ -215,7 +200,7 @@ mod tests {
     fn a_camera_that_restarts_has_no_gap() {
         let mut unseen = Unseen::default();
         for sequence in [900, 0, 1, u64::MAX, 0, 5, 5] {
-            unseen.take(KEY, sequence);
+            take(&mut unseen, sequence);
         }
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 4)]);
     }

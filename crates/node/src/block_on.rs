@@ -48,8 +48,12 @@ pub fn block_on_for<F: Future>(runtime: &Handle, limit: Duration, future: F) -> 
         if let Poll::Ready(output) = future.as_mut().poll(&mut context) {
             return Some(output);
         }
-        while !flag.take() {
+        // Also of a future that is woken again and again.
+        loop {
             let left = limit.checked_sub(began.elapsed()).filter(|left| !left.is_zero())?;
+            if flag.take() {
+                break;
+            }
             std::thread::park_timeout(left);
         }
     }

@@ -7,7 +7,7 @@
 //! service from start to shutdown; [`network`] configures the network, its `endpoint`s and, from [`access`], the rights of
 //! others by their [`certificate`]s and the `cipher` of links, and [`session`] joins it under an [`identity`], for a tool
 //! unless `foreign` programs answer there (`reach` finds why no process does), with shared memory where `memory` allows it;
-//! [`topics`] has typed messages and commands, with their `sender`, [`frames`] pixels, and [`tap`] all messages as bytes, to which
+//! [`topics`] has typed messages and commands, with their `sender`, [`frames`] pixels in their [`frame_order`], and [`tap`] all messages as bytes, to which
 //! `earlier` sends those from before it;
 //! [`health`] counts, with [`stats`]; [`denied`] counts denials of access control; [`clock`] is the host's clock,
 //! [`standstill`] detects that a process was frozen, [`state`] is the folder of data that survive a reboot, and
@@ -24,6 +24,7 @@ pub mod denied;
 mod earlier;
 mod endpoint;
 mod foreign;
+pub mod frame_order;
 pub mod frames;
 pub mod health;
 pub mod identity;
