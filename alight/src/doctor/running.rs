@@ -21,10 +21,25 @@ pub(super) fn process(job: &Job) -> Option<i32> {
     })
 }
 
-/// Whether a process has the arguments of a command. Its program may have any path, and more arguments follow.
+/// Whether a process has the arguments of a command, and no others than those that `alight up` adds. Its program may have any path.
 fn is_started_by(arguments: &[Vec<u8>], command: &[String]) -> bool {
-    arguments.len() >= command.len()
-        && arguments.iter().zip(command).skip(1).all(|(one, other)| one == other.as_bytes())
+    let (Some(own), Some(added)) =
+        (arguments.get(1..command.len()), arguments.get(command.len()..))
+    else {
+        return false;
+    };
+    let mut added = added.iter().filter(|argument| !argument.is_empty());
+    let is_own = own.iter().zip(command.iter().skip(1)).all(|(one, other)| one == other.as_bytes());
+    let mut is_added = true;
+    while let Some(option) = added.next() {
+        let value = added.next().map_or(&[][..], Vec::as_slice);
+        is_added &= match option.as_slice() {
+            b"--set" => value.starts_with(b"start="),
+            b"--stop-with-parent" => true,
+            _ => false,
+        };
+    }
+    is_own && is_added
 }
 
 /// The variables of a process's environment that configure its network.
@@ -51,6 +66,23 @@ mod tests {
 
     use super::*;
     use crate::services::Service;
+
+    #[test]
+    fn a_process_with_further_settings_is_of_another_job() {
+        let words = |line: &str| line.split(' ').map(str::to_owned).collect::<Vec<_>>();
+        let arguments = |line: &str| {
+            let parts = line.split(' ').chain([""]);
+            parts.map(|part| part.as_bytes().to_vec()).collect::<Vec<_>>()
+        };
+        let job = words("alight detector --config d.toml");
+        let is_of = |line: &str| is_started_by(&arguments(line), &job);
+        assert!(is_of("/usr/bin/alight detector --config d.toml"));
+        assert!(is_of(
+            "alight detector --config d.toml --set start=\"resume\" --stop-with-parent 7"
+        ));
+        assert!(!is_of("alight detector --config d.toml --set id=\"spare\" --stop-with-parent 7"));
+        assert!(!is_of("alight detector --config e.toml") && !is_of("alight detector"));
+    }
 
     #[test]
     fn a_process_is_found_by_its_arguments_and_its_network() {
