@@ -1,4 +1,4 @@
-//! Describes why a picture gives no frame, with the size that it has and the one that is wanted.
+//! Describes why a picture gives no frame, with the size that it has and the one that is configured.
 
 use std::time::Duration;
 
@@ -15,7 +15,7 @@ pub(crate) enum NoFrame {
 }
 
 impl NoFrame {
-    /// Why a camera is given up that has sent nothing else for so long, where frames of this size are wanted.
+    /// Why a camera that has sent nothing else for so long counts as lost, where frames of this size are configured.
     pub(crate) fn as_loss(self, wanted: FrameSize, for_ns: i64) -> Lost {
         match self {
             Self::Damaged => Lost::Unreadable(Duration::from_nanos(for_ns.unsigned_abs())),
@@ -28,7 +28,7 @@ impl NoFrame {
 pub(crate) fn other_size(size: FrameSize, wanted: FrameSize) -> String {
     let FrameSize { width, height } = size;
     format!(
-        "its frames have {width} x {height} pixels, {} x {} are wanted (`source.size_px`)",
+        "its frames have {width} x {height} pixels, {} x {} are configured: correct `source.size_px`, or the size at the source",
         wanted.width, wanted.height
     )
 }

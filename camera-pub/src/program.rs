@@ -286,10 +286,12 @@ impl<R: AsyncBufRead + Unpin> FrameReader<R> {
 /// Refuses a stream whose first bytes show that it is in another format than the configured one.
 fn check_format(first: &[u8], format: FrameFormat) -> std::io::Result<()> {
     let found = match (first, format) {
-        // An SOI marker, and the first byte of the next marker.
-        ([0xff, 0xd8, 0xff, ..], FrameFormat::Samples { .. }) => {
-            "it writes JPEG files; set `source.pixels` to \"mjpeg\", or let it write raw frames"
-        }
+        // An SOI marker, and one that may follow it (tables, frame header, application data, comment): a row of a Bayer pattern may begin with
+        // the same three bytes.
+        (
+            [0xff, 0xd8, 0xff, 0xc0..=0xcf | 0xdb | 0xdd | 0xe0..=0xef | 0xfe, ..],
+            FrameFormat::Samples { .. },
+        ) => "it writes JPEG files; set `source.pixels` to \"mjpeg\", or let it write raw frames",
         // A start code, a sequence parameter set, and one of the profiles (ITU-T H.264, 7.4.2.1.1).
         ([0, 0, 0, 1, 0x27 | 0x67, 66 | 77 | 88 | 100 | 110 | 122 | 244, ..], _) => {
             "it writes H.264; let it write the raw frames of `source.pixels` (ffmpeg: -pix_fmt gray -f rawvideo), or \
@@ -351,7 +353,7 @@ impl Rate {
         Self { expected_hz, since: None, frames: 0, seconds: 0 }
     }
 
-    /// Counts a frame; the rate in hertz, once when it is about twice the expected one or more for two seconds. A burst of frames
+    /// Counts a frame; the rate in hertz, once for each time that it is about twice the expected one or more for two seconds. A burst of frames
     /// that were queued takes less.
     fn add(&mut self, now: Instant) -> Option<f64> {
         let since = *self.since.get_or_insert(now);

@@ -149,9 +149,9 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
     for path in &config.source.paths {
         ensure!(path.exists(), "{path:?} of `source.paths` does not exist");
         ensure!(
-            !is_video(path),
+            !(path.is_file() && is_video(path)),
             "{path:?} of `source.paths` is a video; to publish its frames, remove `source.paths` and set `source.command` to \
-             [\"ffmpeg\", \"-v\", \"error\", \"-re\", \"-i\", {path:?}, \"-an\", \"-pix_fmt\", \"gray\", \"-f\", \"rawvideo\", \"-\"], \
+             [\"ffmpeg\", \"-v\", \"error\", \"-re\", \"-noautorotate\", \"-i\", {path:?}, \"-an\", \"-pix_fmt\", \"gray\", \"-f\", \"rawvideo\", \"-\"], \
              and `source.size_px` and `source.rate_hz` to those of the video"
         );
         images.extend(images_in(path)?);
@@ -308,13 +308,20 @@ impl Stream {
                 FrameFormat::Jpeg { .. } => Loan::Private(Vec::new()),
             };
             let jpeg = program.read(&mut pixels).await?;
-            if let Some(measured_hz) = program.excessive_rate_hz() {
-                self.health.failed("frames far faster than configured");
+            if let Some(measured_hz) = program.excessive_rate_hz()
+                && self.health.failed("frames far faster than configured")
+            {
                 let FrameSize { width, height } = config.size;
+                let pieces = match config.format {
+                    FrameFormat::Samples { .. } => {
+                        ". Where its frames are larger, or in another format, the pictures are pieces of frames: correct `source.size_px` and \
+                         `source.pixels`"
+                    }
+                    FrameFormat::Jpeg { .. } => "",
+                };
                 tracing::warn!(
                     "The program writes {measured_hz:.0} frames of {width} x {height} pixels a second, and `source.rate_hz` is {}. Set that \
-                     to its rate. Where its frames are larger, or in another format, the pictures are pieces of frames: correct \
-                     `source.size_px` and `source.pixels`",
+                     to its rate{pieces} (further seconds are counted)",
                     config.rate_hz
                 );
             }
@@ -1097,7 +1104,10 @@ mod tests {
         let set = vec![format!("source.paths=[{path:?}]")];
         let config = Layers { file: None, set }.load::<Config>().unwrap().settings;
         let error = find(&config).err().unwrap().to_string();
-        assert!(error.contains("is a video") && error.contains("\"ffmpeg\""), "{error}");
+        assert!(
+            error.contains("is a video") && error.contains("\"-noautorotate\", \"-i\""),
+            "{error}"
+        );
     }
 
     /// Grey levels that differ everywhere, so that no two places of a frame can be taken for each other.
