@@ -17,7 +17,7 @@ use crate::terminal::{print, write_error};
 
 /// The meaning of the exit status of a report.
 const EXIT_STATUS: &str = "Exit status 1 also when there is a page and something of a recording could not be read: a damaged part, its end, \
-                           messages of another version; of a repaired copy also what was lost before the repair. The page says what.";
+                           messages of another version; of a repaired copy also what was lost before the repair. The page lists it.";
 
 #[derive(Args)]
 #[command(after_help = EXIT_STATUS)]

@@ -59,7 +59,8 @@ pub(crate) struct SwapArgs {
     to: String,
     /// Name of the new detector. Of a configuration [default: that of the file, with a number if it is taken].
     /// Of a command, the name under which it joins [default: that of the detector that joins as a process of the
-    /// command]; give it if the command starts the detector in a container or on another host.
+    /// command]; give it if the command starts the detector as a service (systemd), in a container or on
+    /// another host.
     #[arg(long, value_name = "ID")]
     id: Option<String>,
     /// Number of frames to compare with the active detector, from 1 to 30.
@@ -239,6 +240,12 @@ impl NewDetector {
         let mut words = words
             .ok_or_else(|| WrongUse(format!("`{}` is not a command: a quote is missing", args.to)))?
             .into_iter();
+        if let Some(id) = args.id.as_ref().filter(|id| existing.contains(*id)) {
+            let text = format!(
+                "`--id {id}`: a detector of that name runs already; choose another name for the new one"
+            );
+            return Err(WrongUse(text).into());
+        }
         let program = words.next().unwrap_or_default().into();
         Ok(Self { program, args: words.collect(), id: args.id.clone() })
     }

@@ -994,7 +994,7 @@ fn the_last_known_delay_is_assumed_for_a_while() {
     }
 }
 
-/// While the controller does not run nobody measures the delay, and no frame is missing.
+/// While the controller does not run the delay is not measured, and no frame is missing.
 #[test]
 fn a_standstill_of_the_controller_is_neither_a_link_without_answers_nor_a_camera_without_frames() {
     let mut flight = flight("airborne");

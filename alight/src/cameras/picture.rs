@@ -110,7 +110,10 @@ mod tests {
         image::save_buffer(&file, &[200; 256], 16, 16, image::ExtendedColorType::L8).unwrap();
         let script = format!("while cat '{}'; do sleep 0.05; done", file.display());
         let problem = of_script(&script, Duration::from_secs(60)).unwrap_err().to_string();
-        assert!(problem.contains("its frames have 16 x 16 pixels, 8 x 8 are wanted"), "{problem}");
+        assert!(
+            problem.contains("its frames have 16 x 16 pixels, 8 x 8 are configured"),
+            "{problem}"
+        );
     }
 
     #[test]

@@ -74,7 +74,7 @@ impl Unusable {
         for ((kind, key, camera), count) in &self.misnamed {
             findings.wrong(
                 "camera",
-                format!("{kind} are refused ({count} times): `{key}` gives them the name of `{camera}`"),
+                format!("{kind} are refused ({count} so far): `{key}` gives them the name of `{camera}`"),
                 "the camera that publishes them must give the name in its key as `camera` (docs/wire-format.md)",
             );
         }
@@ -111,7 +111,7 @@ mod tests {
         let text = findings.text();
         let named = "frames are refused (2 times): `down` gives them the name of `front`";
         assert!(
-            text.contains(named) && text.contains("camera infos are refused (1 times)"),
+            text.contains(named) && text.contains("camera infos are refused (1 so far)"),
             "{text}"
         );
         assert!(text.ends_with("2 wrong, 0 doubtful."), "{text}");

@@ -11,7 +11,7 @@ const APPENDED: [u8; 64] = [0xff; 64];
 /// The number of the stream's last picture among `shown`, the last pictures that its decoder gave, if that picture is cut.
 ///
 /// A decoder does not read beyond the end of a complete picture. It reads zeros where bytes are missing, without an error. The last picture is
-/// therefore decoded again with other bytes behind it, from the last picture on which no later one depends.
+/// therefore decoded again with other bytes behind it, from the last IDR picture, before which no later picture refers.
 pub(crate) fn cut_picture(stream: &[u8], shown: &[Frame], max_pixels: u64) -> Option<usize> {
     let units = parse_annex_b(stream);
     let number_of =

@@ -212,7 +212,8 @@ impl TouchdownMonitor {
         let is_faster = |than: VehicleTruth| truth.velocity.z() > than.velocity.z();
         self.has_been_low =
             truth.height_m <= BOUNCE_M && (self.has_been_low || truth.height_m <= CLEAR_M);
-        let is_clear = truth.height_m > CLEAR_M && !self.has_been_low;
+        let is_clear =
+            truth.height_m > CLEAR_M && (!self.has_been_low || self.before_contact.is_none());
         if is_clear || self.before_contact.is_some_and(is_faster) {
             self.before_contact = Some(*truth);
         }
