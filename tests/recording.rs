@@ -226,6 +226,9 @@ async fn a_recorder_that_starts_late_gets_the_tape_from_its_beginning() -> anyho
     with_second_try(late_recorder).await
 }
 
+/// Maximum number of parts of a tape that a recorder receives twice at its start.
+const MAX_TWICE: u64 = 5;
+
 async fn late_recorder() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let [first, late] = ["first.mcap", "late.mcap"].map(|name| folder.path().join(name));
@@ -249,7 +252,10 @@ async fn late_recorder() -> anyhow::Result<()> {
     reader.read(&bytes)?;
     let parts: usize = reader.tapes().iter().map(|tape| tape.parts.len()).sum();
     let messages = Contents::read(&first)?.channels.get("raw/controller/tape").copied();
-    ensure!(messages == Some(parts as u64), "{messages:?} messages of {parts} parts");
+    let messages = messages.context("no tape")?;
+    // Parts that are published while it makes its own request may arrive twice.
+    let of_one_request = parts as u64..=parts as u64 + MAX_TWICE;
+    ensure!(of_one_request.contains(&messages), "{messages} messages of {parts} parts");
     Ok(())
 }
 

@@ -109,7 +109,7 @@ mod tests {
         let mut findings = Findings::default();
         unusable.report(&mut findings);
         let text = findings.text();
-        let named = "frames are refused (2 times): `down` gives them the name of `front`";
+        let named = "frames are refused (2 so far): `down` gives them the name of `front`";
         assert!(
             text.contains(named) && text.contains("camera infos are refused (1 so far)"),
             "{text}"
