@@ -3,7 +3,7 @@
 
 use std::fmt::Write;
 
-use messages::{CameraInfo, Configuration, FrameHeader, Health, PixelFormat};
+use messages::{CameraInfo, Configuration, Health, PixelFormat};
 use node::frame_order::FrameOrder;
 use node::{Layers, clock_name, stats};
 
