@@ -171,8 +171,10 @@ impl Lander {
     /// The decision after `event`. A `now` earlier than the last one counts as the last one.
     pub fn step(&mut self, now: Timestamp, event: Event) -> Decision {
         let now = self.now.map_or(now, |last| last.max(now));
-        let has_stood_still =
-            self.now.is_some_and(|last| now.seconds_since(last) > MAX_STANDSTILL_S);
+        let is_long =
+            |last: Timestamp, next: Timestamp| next.seconds_since(last) > MAX_STANDSTILL_S;
+        let did_not_run = self.now.is_some_and(|last| is_long(last, now));
+        let last_state = self.newest_stamp();
         self.now = Some(now);
         let result = match event {
             Event::Vehicle(state) => self.vehicle(now, state),
@@ -199,6 +201,9 @@ impl Lander {
             }
             Event::Operator(_) | Event::Alarm(_) | Event::Tick => Ok(()),
         };
+        // After a silence of the autopilot as long as such a standstill the landing waits for a command, whatever it was held for.
+        let was_silent =
+            last_state.zip(self.newest_stamp()).is_some_and(|(last, newest)| is_long(last, newest));
         let is_disarmed = self.status.is_some_and(|status| !status.armed);
         self.disarmed = is_disarmed.then(|| self.disarmed.unwrap_or(now));
         let operator = if let Event::Operator(command) = event { Some(command) } else { None };
@@ -224,7 +229,7 @@ impl Lander {
             may_descend: self.is_axis_check_done(now),
             is_link_slow: self.is_link_slow,
             may_stand: self.may_stand(now),
-            has_stood_still,
+            has_stood_still: did_not_run || was_silent,
         };
         let was_active = !self.phase().is_terminal();
         let has_started = self.state_machine.advance(&inputs);
@@ -330,6 +335,11 @@ impl Lander {
             self.standing_height.observe(is_of_landing.then(|| self.target(now)).flatten());
         }
         Ok(())
+    }
+
+    /// The time of the vehicle's newest state.
+    fn newest_stamp(&self) -> Option<Timestamp> {
+        self.history.newest().map(|vehicle| vehicle.stamp)
     }
 
     /// Where the vehicle is, apart from the jumps of the autopilot's position.

@@ -83,7 +83,7 @@ const MAX_SINKING_S: f64 = 600.0;
 /// Wait for the report of the ground after the motors have stopped, in seconds: it may be later.
 const MAX_CONTACT_WAIT_S: f64 = 0.5;
 
-/// Maximum time between two events, which are 25 ms apart, and without a state of the vehicle, after which a landing continues
+/// Maximum time between two events, which are 25 ms apart, and between two states of the vehicle, after which a landing continues
 /// automatically, in seconds. A controller that is started again resumes one that is as old.
 pub const MAX_STANDSTILL_S: f64 = 15.0;
 
@@ -118,7 +118,7 @@ pub struct Inputs {
     pub is_link_slow: bool,
     /// The vehicle is still, and so low over the pad that it may stand on it.
     pub may_stand: bool,
-    /// The controller has just not run for so long that no landing continues automatically.
+    /// The controller has just not run, or has had no state of the vehicle, for so long that no landing continues automatically.
     pub has_stood_still: bool,
 }
 
@@ -711,12 +711,6 @@ impl StateMachine {
         };
         if self.timed_out(inputs, timeout_s) {
             return Some((Phase::Aborted, Reason::HeldTooLong));
-        }
-        // As after a standstill as long.
-        let was_lost = matches!(self.reason, Reason::VehicleStale | Reason::AutopilotLost)
-            && self.timed_out(inputs, MAX_STANDSTILL_S);
-        if was_lost && !is_stale {
-            return Some((Phase::Hold, Reason::Standstill));
         }
         let may_end_on_pad = matches!(self.reason, Reason::LinkSlow | Reason::Standstill);
         if may_end_on_pad && inputs.may_stand && !is_stale {

@@ -4,6 +4,7 @@
 
 mod scene;
 
+use landing::{Action, Alarm, Event, Phase, Reason};
 use scene::{Flight, MAX_SINK_M_S, MAX_SLIDE_M_S, Sample, Scene, Silence, Then};
 
 /// Heights over the pad at which the silence begins, in metres.
@@ -58,7 +59,7 @@ fn after_a_long_silence_no_landing_is_asked_for_high_up() {
         for seed in 0..4 {
             let silence = Silence { below_m, for_s, then: Then::Continues };
             let flight = silent(seed, 0.0, silence).fly();
-            let lands = |it: &&Sample| it.decision.phase == landing::Phase::Final;
+            let lands = |it: &&Sample| it.decision.phase == Phase::Final;
             let from_m = flight.samples.iter().find(lands).map(height_m);
             println!(
                 "silent below {below_m} m for {for_s} s, seed {seed}: lands from {from_m:?} m"
@@ -76,17 +77,48 @@ fn after_a_silence_of_more_than_15_s_nothing_descends_without_a_command() {
         let mut pairs = flight.samples.windows(2);
         let end = pairs.find(|pair| pair[1].seconds - pair[0].seconds > 0.5 * for_s);
         let end_s = end.map_or(f64::INFINITY, |pair| pair[1].seconds);
-        let after: Vec<&Sample> = flight.samples.iter().filter(|it| it.seconds >= end_s).collect();
-        assert!(after.len() > 100, "{} samples", after.len());
-        for sample in after {
-            let decision = sample.decision;
-            let found = (decision.phase, decision.why);
-            assert_eq!(found, (landing::Phase::Hold, landing::Reason::Standstill), "{below_m} m");
-            let landing::Action::Velocity { velocity, .. } = decision.action else {
-                panic!("{decision:?}")
-            };
-            assert!(velocity.z() <= 0.0, "{decision:?}");
-        }
+        check_waits(&flight, end_s);
+    }
+    // The autopilot alone is silent, in a hold that ends on its own otherwise.
+    let lost_s = 6.0;
+    let slow = |seconds: f64, delay_s: f64| (seconds, Event::LinkDelay(delay_s));
+    let alarm = |seconds: f64| (seconds, Event::Alarm(Alarm::AutopilotLost));
+    for (for_s, held_for, events) in [
+        (40.0, Reason::LinkSlow, vec![slow(5.0, 1.0), alarm(7.0), slow(20.0, 0.1)]),
+        (40.0, Reason::LinkSlow, vec![slow(5.0, 1.0), alarm(7.0), slow(46.5, 0.1)]),
+        (40.0, Reason::TargetNotFound, vec![alarm(7.0)]),
+        // The alarm comes later than usual.
+        (24.0, Reason::AutopilotLost, vec![alarm(lost_s + 20.0)]),
+        (16.0, Reason::VehicleStale, vec![]),
+    ] {
+        let flight = Scene::new(0)
+            .with(|scene| {
+                scene.world.link_lost_s = Some((lost_s, for_s));
+                scene.events = events;
+                scene.limit_s = lost_s + for_s + 30.0;
+                if held_for == Reason::TargetNotFound {
+                    scene.config.phases.search_timeout_s = 2.0;
+                    scene.camera.outage_s = Some((0.0, lost_s + for_s - 5.0));
+                }
+            })
+            .fly();
+        let held = flight.at(lost_s + for_s - 0.5).map(|it| it.decision);
+        let found = held.map(|it| (it.phase, it.why));
+        assert_eq!(found, Some((Phase::Hold, held_for)), "{for_s} s");
+        check_waits(&flight, lost_s + for_s + 0.1);
+    }
+}
+
+/// Fails where the vehicle does not hold until a command from this time on.
+fn check_waits(flight: &Flight, from_s: f64) {
+    let after: Vec<&Sample> = flight.samples.iter().filter(|it| it.seconds >= from_s).collect();
+    assert!(after.len() > 100, "{} samples", after.len());
+    for sample in after {
+        let decision = sample.decision;
+        let found = (decision.phase, decision.why);
+        assert_eq!(found, (Phase::Hold, Reason::Standstill), "after {} s", sample.seconds);
+        let Action::Velocity { velocity, .. } = decision.action else { panic!("{decision:?}") };
+        assert!(velocity.z() <= 0.0, "{decision:?}");
     }
 }
 
@@ -127,7 +159,7 @@ fn height_m(sample: &Sample) -> f64 {
 
 /// True where the lander has the vehicle climb.
 fn climbs(sample: &Sample) -> bool {
-    matches!(sample.decision.action, landing::Action::Velocity { velocity, .. } if velocity.z() < 0.0)
+    matches!(sample.decision.action, Action::Velocity { velocity, .. } if velocity.z() < 0.0)
 }
 
 /// Flights whose lander is silent below this height: vehicles that stand at its end must stay on the ground. One that hovers so
@@ -155,7 +187,7 @@ fn check_stays_down(below_m: f64, then: Then, seeds: std::ops::Range<u64>) -> u3
                 }
                 let hop_m = after.map(height_m).fold(0.0, f64::max);
                 stood += 1;
-                is_safe &= hop_m <= MAX_HOP_M && flight.phase == landing::Phase::Landed;
+                is_safe &= hop_m <= MAX_HOP_M && flight.phase == Phase::Landed;
                 table += &format!(
                     "\nwind {wind_m_s} m/s, silent below {below_m} m for {for_s} s, seed {seed}: {hop_m:.2} m, {:?}, {:.3} m off",
                     flight.phase, flight.error_m

@@ -580,6 +580,11 @@ fn after_a_long_standstill_of_the_controller_the_operator_decides() {
     check(&[a, b, c, slow, stopped(30.0), on[0]], Phase::Hold, Reason::Standstill);
     let lost = Inputs { alarm: Some((AlarmAction::Hold, Reason::AutopilotLost)), ..stopped(30.0) };
     check(&[a, b, c, lost, on[0]], Phase::Hold, Reason::Standstill);
+    let unknown = flown(3.0, |v| v.mode = Mode::Unknown);
+    let stale = flown(3.0, |v| v.age_s = 0.6);
+    for held in [unknown, stale, Inputs { target_age_s: 2.5, ..at(3.0) }] {
+        check(&[a, b, c, held, stopped(30.0), on[0], on[1]], Phase::Hold, Reason::Standstill);
+    }
     // Commands, alarms that end the landing, and the ground come first.
     let held = commanded(3.0, OperatorCommand::Hold);
     check(&[a, b, c, held, stopped(30.0)], Phase::Hold, Reason::OperatorHold);
@@ -607,10 +612,12 @@ fn a_landing_continues_by_itself_only_where_the_link_is_back_within_15_s() {
     check(&[a, b, c, lost(3.0), lost(17.0), at(17.5)], Phase::Search, Reason::Searching);
     let alarm = Inputs { alarm: Some((AlarmAction::Hold, Reason::AutopilotLost)), ..lost(4.0) };
     check(&[a, b, c, lost(3.0), alarm, lost(18.0), at(18.5)], Phase::Search, Reason::Searching);
-    let long = [a, b, c, lost(3.0), alarm, lost(18.0), at(19.5)];
+    // The lander states that the link was lost for longer.
+    let back = Inputs { has_stood_still: true, ..at(19.5) };
+    let long = [a, b, c, lost(3.0), alarm, lost(18.0), back, at(20.0)];
     check(&long, Phase::Hold, Reason::Standstill);
     let resumed = Inputs { operator: Some(OperatorCommand::Resume), ..at(60.0) };
-    check(&[a, b, c, lost(3.0), alarm, at(19.5), resumed], Phase::Search, Reason::Searching);
+    check(&[a, b, c, lost(3.0), alarm, back, resumed], Phase::Search, Reason::Searching);
     check(&[a, b, c, lost(3.0), lost(62.5), lost(64.0)], Phase::Aborted, Reason::HeldTooLong);
 }
 

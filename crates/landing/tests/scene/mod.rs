@@ -64,6 +64,8 @@ pub(crate) struct Scene {
     pub(crate) focal_ratio: f64,
     /// The operator's commands, by time.
     pub(crate) commands: Vec<(f64, OperatorCommand)>,
+    /// Further events that the lander receives, by time.
+    pub(crate) events: Vec<(f64, Event)>,
     /// The autopilot ignores the request to land.
     pub(crate) refuses_land: bool,
     /// The pilot takes over at this time.
@@ -180,6 +182,7 @@ impl Scene {
             standing_m: 0.0,
             focal_ratio: 1.0,
             commands: vec![(0.0, OperatorCommand::Start)],
+            events: Vec::new(),
             refuses_land: false,
             pilot_s: None,
             disputed_below_m: f64::NEG_INFINITY,
@@ -351,6 +354,7 @@ struct Run<'a> {
     start_s: f64,
     eyes: Eyes,
     commands: VecDeque<(f64, OperatorCommand)>,
+    others: VecDeque<(f64, Event)>,
     sent_s: f64,
     is_disputed: bool,
     /// When the silence began.
@@ -370,6 +374,7 @@ impl<'a> Run<'a> {
             start_s: world.now_s(),
             eyes: Eyes::new(scene),
             commands: scene.commands.iter().copied().collect(),
+            others: scene.events.iter().copied().collect(),
             sent_s: f64::NEG_INFINITY,
             is_disputed: false,
             silent_s: None,
@@ -426,6 +431,9 @@ impl<'a> Run<'a> {
         }
         if self.commands.front().is_some_and(|(at, _)| *at <= now_s) {
             events.extend(self.commands.pop_front().map(|(_, command)| Event::Operator(command)));
+        }
+        if self.others.front().is_some_and(|(at, _)| *at <= now_s) {
+            events.extend(self.others.pop_front().map(|(_, event)| event));
         }
         if self.resume_s.take_if(|at| *at <= now_s).is_some() {
             events.push(Event::Operator(OperatorCommand::Start));
