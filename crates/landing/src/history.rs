@@ -8,7 +8,7 @@ use geometry::{Body, Ned, Odometry, Point, Rotation, Transform, Vector};
 use crate::event::VehicleState;
 use crate::time::Timestamp;
 
-/// Number of stored states: five seconds at 50 Hz.
+/// Number of stored states: 2.6 s at 50 Hz, as attitude and position each give one.
 const CAPACITY: usize = 256;
 
 /// Longest interval between two states over which motion is interpolated, in seconds.
@@ -103,16 +103,6 @@ impl History {
     /// The newest state.
     pub fn newest(&self) -> Option<&VehicleState> {
         self.states.back()
-    }
-
-    /// The largest speed down of the states within so many seconds before the newest, in m/s; negative where all climb.
-    pub fn max_down_m_s(&self, seconds: f64) -> f64 {
-        let Some(newest) = self.newest() else { return f64::NEG_INFINITY };
-        self.states
-            .iter()
-            .rev()
-            .take_while(|state| newest.stamp.seconds_since(state.stamp) <= seconds)
-            .fold(f64::NEG_INFINITY, |max_m_s, state| libm::fmax(max_m_s, state.velocity.z()))
     }
 
     /// From the odometry frame, as it now lies, to NED.

@@ -10,6 +10,7 @@ mod motors;
 
 use aborted::AbortClimb;
 use geometry::{Ned, Odometry, Point, Vector};
+use motors::LastFall;
 
 use crate::axis_check::AxisConsistencyCheck;
 use crate::config::{AlarmAction, Config};
@@ -85,6 +86,7 @@ pub struct Lander {
     status: Option<VehicleStatus>,
     /// Since when the motors are reported as off.
     disarmed: Option<Timestamp>,
+    last_fall: LastFall,
     detectors_alive: bool,
     link_delay_s: f64,
     is_link_slow: bool,
@@ -138,6 +140,7 @@ impl Lander {
             history: History::new(config.target.max_extrapolation_s),
             status: None,
             disarmed: None,
+            last_fall: LastFall::default(),
             detectors_alive: true,
             link_delay_s: 0.0,
             is_link_slow: false,
@@ -241,6 +244,7 @@ impl Lander {
             self.guidance = ActiveGuidance::new(self.config.guidance);
             self.standing_height = StandingHeight::default();
             self.begin_checks();
+            self.last_fall.begin();
             self.start = self.position().unwrap_or(Point::origin());
         }
         let (action, why) = self.act(now);
@@ -317,9 +321,11 @@ impl Lander {
         }
         self.check_stamp(now, state.stamp, self.config.phases.stale_vehicle_s)?;
         let silence = self.pad_before_silence(state.stamp);
+        let before = self.history.newest().copied();
         if !self.history.push(state) {
             return Err(Rejection::OutOfOrder);
         }
+        self.watch_fall(before.as_ref(), &state);
         if silence.is_some() {
             self.resumed = Some(Resumed::new(silence));
         }

@@ -665,6 +665,103 @@ fn a_fall_is_recognised_when_the_heartbeat_with_the_motors_off_comes_late() {
     }
 }
 
+/// A vehicle that descends or is in LAND at 5 m; its motors stop, and it falls on the pad. Its states arrive 100 times a second,
+/// except for this time from the stop on, in seconds.
+fn falls(mode: Mode, height_m: f64, silent_s: f64) -> Harness {
+    const PERIOD_S: f64 = 0.01;
+    let mut flight = Harness::started(Config::default(), height_m + 1.0);
+    flight.pad = Some(Point::origin());
+    while flight.position.z() < -height_m {
+        flight.fly(STEP_S);
+    }
+    flight.velocity = Vector::zero();
+    if mode == Mode::Land {
+        flight.step(Event::Operator(OperatorCommand::LandHere));
+        flight.status.mode = mode;
+        flight.run(STEP_S, true);
+        assert_eq!(flight.phase(), Phase::Final);
+    }
+    let mut seconds = 0.0;
+    while flight.position.z() < 0.0 || seconds < silent_s {
+        seconds += PERIOD_S;
+        flight.seconds += PERIOD_S;
+        flight.velocity = flight.velocity + Vector::new(0.0, 0.0, 9.8 * PERIOD_S);
+        let z_m = (flight.position.z() + flight.velocity.z() * PERIOD_S).min(0.0);
+        flight.position = Point::new(flight.position.x(), flight.position.y(), z_m);
+        if z_m == 0.0 {
+            flight.velocity = Vector::zero();
+        }
+        if seconds > silent_s {
+            flight.step(Event::Vehicle(flight.state()));
+        }
+        flight.step(Event::Tick);
+    }
+    flight.velocity = Vector::zero();
+    flight.status.landed = Landed::OnGround;
+    flight
+}
+
+/// It stands 100 times a second for so long, and is disarmed; the end.
+fn end_disarmed(flight: &mut Harness, late_s: f64) -> (Phase, Reason) {
+    for i in 0..((late_s + 1.0) / 0.01).round() as u32 {
+        flight.seconds += 0.01;
+        flight.status.armed = f64::from(i) * 0.01 < late_s;
+        flight.step(Event::Vehicle(flight.state()));
+        // The autopilot obeys.
+        if flight.step(Event::Tick).action == Action::Land {
+            flight.status.mode = Mode::Land;
+        }
+    }
+    let decision = flight.decisions.last().unwrap().1;
+    (decision.phase, decision.why)
+}
+
+/// PX4's kill switch stops the motors and disarms 5 s later, ArduPilot's crash check 2 s after the rest.
+#[test]
+fn a_fall_is_recognised_when_the_vehicle_is_disarmed_seconds_after_the_impact() {
+    let stopped = (Phase::Aborted, Reason::StoppedInAir);
+    for mode in [Mode::Guided, Mode::Land] {
+        for late_s in [0.5, 2.5, 5.0, 6.0] {
+            let end = end_disarmed(&mut falls(mode, 5.0, 0.0), late_s);
+            assert_eq!(end, stopped, "{mode:?}, {late_s} s");
+        }
+        // A low fall is as fast as a landing, and a report of it comes soon.
+        assert_eq!(end_disarmed(&mut falls(mode, 0.43, 0.0), 2.0), stopped, "{mode:?}");
+        // The states of the fall are missing.
+        assert_eq!(end_disarmed(&mut falls(mode, 3.0, 0.8), 5.0), stopped, "{mode:?}");
+    }
+}
+
+/// A gap in the states, in which a vehicle in LAND sinks as fast as LAND does, or its autopilot's position jumps.
+#[test]
+fn neither_a_gap_nor_a_jump_of_the_position_makes_a_landing_a_fall() {
+    for (down_m_s, gap_s, jump_m) in [
+        (0.5, 0.8, 0.0),
+        (1.5, 1.4, 0.0),
+        (0.5, STEP_S, 4.0),
+        (0.5, 0.2, 4.0),
+        (0.5, 0.4, 4.0),
+        (0.5, 0.8, 8.0),
+        (0.5, 2.0, 12.0),
+    ] {
+        let mut flight = in_land(4.0);
+        flight.velocity = Vector::new(0.0, 0.0, down_m_s);
+        flight.run(0.5, true);
+        flight.run(gap_s - STEP_S, false);
+        let to_m = flight.position.z() + down_m_s * (0.5 + gap_s) + jump_m;
+        flight.position = Point::new(flight.position.x(), flight.position.y(), to_m);
+        flight.velocity = Vector::new(0.0, 0.0, 0.5);
+        for _ in 0..80 {
+            flight.run(STEP_S, true);
+            flight.position = flight.position + flight.velocity * STEP_S;
+        }
+        flight.velocity = Vector::zero();
+        flight.status.landed = Landed::OnGround;
+        let end = end_disarmed(&mut flight, 2.5);
+        assert_eq!(end, (Phase::Landed, Reason::TouchedDown), "{down_m_s} {gap_s} {jump_m}");
+    }
+}
+
 /// A vehicle stands still for a second before its autopilot stops the motors, also on a deck that heaves.
 #[test]
 fn a_landing_is_one_whenever_the_heartbeat_with_the_motors_off_comes() {

@@ -1,7 +1,9 @@
 //! Decides whether a vehicle whose motors have stopped was in the air, also while its state is old.
 
+use std::ops::RangeInclusive;
+
 use super::{Lander, MAX_CONTACT_M, MAX_CONTACT_M_S};
-use crate::event::Landed;
+use crate::event::{Landed, VehicleState};
 use crate::standing::{MAX_STANDING_M_S, standing_height_m};
 use crate::time::Timestamp;
 
@@ -11,16 +13,68 @@ const MAX_LAND_M_S: f64 = 5.0;
 /// Longest wait for a recent state after the motors have stopped, in seconds.
 const MAX_STATE_WAIT_S: f64 = 2.0;
 
-/// Time before the newest state in which a fall is searched for, in seconds: only the heartbeat reports that the motors are off. It is
+/// Time before the newest state in which the vehicle fell, in seconds: only the heartbeat reports that the motors are off. It is
 /// sent once a second, and one may be lost. A fall from 3 m lasts 0.8 s: then the vehicle is still on the ground when it is received.
 const MAX_REPORT_S: f64 = 2.3;
+
+/// The same for a vehicle that was faster than any landing, in seconds. Its autopilot may disarm late: PX4 5 s after its kill switch
+/// (COM_KILL_DISARM), ArduPilot 2 s after its crash check has found it at rest.
+const MAX_LATE_REPORT_S: f64 = 10.0;
+
+/// Interval between two states, in seconds, within which the positions show a fall that no velocity shows.
+const FALL_GAP_S: RangeInclusive<f64> = 0.3..=1.5;
+
+/// Acceleration of a fall, in m/s², and by how many metres positions at its ends may err. A larger difference is a jump of the
+/// autopilot's position.
+const GRAVITY_M_S2: f64 = 9.81;
+const MAX_POSITION_ERROR_M: f64 = 0.3;
 
 /// Minimum speed down of a vehicle that falls, in m/s, and as a multiple of the autopilot's speed of landing. A vehicle touches down at
 /// 0.8 m/s at most, and stands still for a second before its autopilot stops the motors. In a fall from 0.2 m it reaches 2 m/s.
 const MIN_FALL_M_S: f64 = 1.5;
 const MIN_FALL_FACTOR: f64 = 1.5;
 
+/// When the vehicle fell last. The states of that time may be forgotten when its motors are reported as off.
+#[derive(Copy, Clone, Debug, Default)]
+pub(super) struct LastFall {
+    /// When it sank faster than a vehicle that touches down.
+    sank_at: Option<Timestamp>,
+    /// When it sank faster than any LAND.
+    fast_at: Option<Timestamp>,
+}
+
+impl LastFall {
+    /// A landing begins: a pilot's dive before it is no fall.
+    pub(super) fn begin(&mut self) {
+        self.fast_at = None;
+    }
+}
+
+/// The speed down after an interval without states, in m/s, of a vehicle that accelerated evenly in it; `None` where the interval is
+/// too short or too long, and where not even a fall explains the positions.
+fn fallen_m_s(before: &VehicleState, state: &VehicleState) -> Option<f64> {
+    let gap_s = state.stamp.seconds_since(before.stamp);
+    let before_m_s = before.velocity.z();
+    let sunk_m = state.position.z() - before.position.z();
+    let max_m = before_m_s * gap_s + 0.5 * GRAVITY_M_S2 * gap_s * gap_s + MAX_POSITION_ERROR_M;
+    (FALL_GAP_S.contains(&gap_s) && sunk_m <= max_m).then(|| 2.0 * sunk_m / gap_s - before_m_s)
+}
+
 impl Lander {
+    /// Notes whether the vehicle falls, by its newest state and the one before.
+    pub(super) fn watch_fall(&mut self, before: Option<&VehicleState>, state: &VehicleState) {
+        let down_m_s = state.velocity.z();
+        let heave_m_s = self.config.estimator.pad_heave_m_s;
+        let landing_m_s = MIN_FALL_FACTOR * self.limits.land_m_s;
+        if down_m_s > libm::fmax(MIN_FALL_M_S, landing_m_s) + heave_m_s {
+            self.last_fall.sank_at = Some(state.stamp);
+        }
+        let fallen_m_s = before.and_then(|before| fallen_m_s(before, state)).unwrap_or(down_m_s);
+        if libm::fmax(down_m_s, fallen_m_s) > MAX_LAND_M_S + heave_m_s {
+            self.last_fall.fast_at = Some(state.stamp);
+        }
+    }
+
     /// Whether the vehicle is certainly in the air, although its motors are off: it falls, or, where its autopilot does not report the ground,
     /// sinks or is high over a target that was seen lately. A vehicle stands still for a second before its autopilot stops the motors.
     /// One that fell within the last seconds was in the air, although it is still now: the report of the motors is late.
@@ -41,17 +95,21 @@ impl Lander {
         let sinks = down_m_s > MAX_STANDING_M_S;
         let falls = down_m_s > MAX_CONTACT_M_S;
         if is_recent {
-            falls || self.fell() || status.landed != Landed::OnGround && (sinks || is_high)
+            falls
+                || self.fell(vehicle.stamp)
+                || status.landed != Landed::OnGround && (sinks || is_high)
         } else {
             is_high
         }
     }
 
     /// Whether the vehicle has fallen since the last heartbeat could be sent that its motors run.
-    fn fell(&self) -> bool {
-        let landing_m_s = MIN_FALL_FACTOR * self.limits.land_m_s;
-        let min_m_s = libm::fmax(MIN_FALL_M_S, landing_m_s) + self.config.estimator.pad_heave_m_s;
-        self.history.max_down_m_s(MAX_REPORT_S) > min_m_s
+    fn fell(&self, newest: Timestamp) -> bool {
+        let within = |at: Option<Timestamp>, max_s: f64| {
+            at.is_some_and(|at| newest.seconds_since(at) <= max_s)
+        };
+        within(self.last_fall.sank_at, MAX_REPORT_S)
+            || within(self.last_fall.fast_at, MAX_LATE_REPORT_S)
     }
 
     /// The same now.
