@@ -49,6 +49,19 @@ impl Alarms {
         self.raised.retain(|alarm| *alarm != Alarm::AutopilotLost);
     }
 
+    /// This process has not run for so long: operator, autopilot and battery were not observed in that time.
+    pub fn stood_still(&mut self, now_ns: i64, stood_ns: i64) {
+        let times = [
+            &mut self.low_since_ns,
+            &mut self.critical_since_ns,
+            &mut self.operator_ns,
+            &mut self.autopilot_ns,
+        ];
+        for at_ns in times.into_iter().flatten() {
+            *at_ns = at_ns.saturating_add(stood_ns).min(now_ns);
+        }
+    }
+
     /// The most severe alarm that is to be raised now.
     pub fn tick(&mut self, now_ns: i64, battery: Option<&Battery>) -> Option<Alarm> {
         let s = &self.settings;
@@ -183,6 +196,24 @@ mod tests {
             assert_eq!(alarms.tick(lost_s * SECOND, None), Some(Alarm::AutopilotLost));
             assert_eq!(alarms.tick((lost_s + 1) * SECOND, None), None, "once");
         }
+    }
+
+    #[test]
+    fn a_standstill_of_this_process_does_not_count() {
+        let mut alarms = alarms();
+        let low = battery(0.15, 12.0);
+        alarms.operator_active(100 * SECOND);
+        alarms.autopilot_active(103 * SECOND);
+        assert_eq!(alarms.tick(103 * SECOND, Some(&low)), None);
+        alarms.stood_still(109 * SECOND, 6 * SECOND);
+        assert_eq!(alarms.tick(109 * SECOND, Some(&low)), None);
+        assert_eq!(alarms.tick(110 * SECOND, Some(&low)), Some(Alarm::AutopilotLost));
+        assert_eq!(alarms.tick(111 * SECOND, Some(&low)), Some(Alarm::OperatorLost));
+        assert_eq!(alarms.tick(112 * SECOND, Some(&low)), Some(Alarm::BatteryLow));
+        // A message that was read before the standstill is noticed.
+        alarms.operator_active(120 * SECOND);
+        alarms.stood_still(120 * SECOND, 6 * SECOND);
+        assert_eq!(alarms.tick(125 * SECOND, None), Some(Alarm::OperatorLost));
     }
 
     #[test]

@@ -193,6 +193,7 @@ impl Flight {
         let stood_ns = now_ns.saturating_sub(before_ns);
         if stood_ns > MIN_STANDSTILL_NS {
             self.frames.camera_watch.stood_still(now_ns, stood_ns);
+            self.alarms.stood_still(now_ns, stood_ns);
         }
         let stood_s = stood_ns as f64 * 1e-9;
         if stood_s <= MAX_STANDSTILL_S {

@@ -377,6 +377,10 @@ fn precision_landing_gets_the_target_and_no_setpoint() {
     assert!(stamps, "of one steady clock");
     hover(&mut flight, 6000, 7000, 9);
     assert_eq!(flight.status(7000 * MS).phase, Phase::Final);
+    // Without these states it would have fallen by 5 m in a second.
+    for ms in (7000..7980).step_by(20) {
+        pose_at(&mut flight, ms * MS, 5.0 - 0.005 * (ms - 7000) as f32);
+    }
     receive(&mut flight, 7998 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
     pose_at(&mut flight, 7999 * MS, 0.0);
     receive(&mut flight, 8000 * MS, &heartbeat(9, false));
@@ -1083,6 +1087,28 @@ fn an_operator_is_lost_while_a_program_on_the_vehicle_says_that_it_is_a_ground_s
         let status = flight.status(6000 * MS);
         assert_eq!(status.why.contains("operator"), is_lost, "{system}: {status:?}");
     }
+}
+
+#[test]
+fn an_operator_is_not_lost_while_the_controller_does_not_run() {
+    let set = ["alarms.operator_lost_s=5", "phases.on_operator_lost=\"hold\""];
+    let mut flight = flight_with("airborne", &set);
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    let operator = Sender { system: 255, component: 190 };
+    receive_from(&mut flight, 2 * MS, operator, &of_ground_station());
+    hover(&mut flight, 20, 1000, 4);
+    let is_lost = |flight: &Flight, ms: i64| {
+        let status = flight.status(ms * MS);
+        status.why.contains("operator")
+    };
+    // It does not run for 6 s.
+    receive(&mut flight, 7000 * MS, &heartbeat(4, true));
+    hover(&mut flight, 7020, 9000, 4);
+    assert!(!is_lost(&flight, 9000), "{:?}", flight.status(9000 * MS));
+    receive(&mut flight, 9000 * MS, &heartbeat(4, true));
+    hover(&mut flight, 9020, 11_500, 4);
+    assert!(is_lost(&flight, 11_500), "{:?}", flight.status(11_500 * MS));
 }
 
 /// The heartbeats of a vehicle with another system id, and of a companion with our ids.
