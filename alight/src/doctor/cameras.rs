@@ -380,7 +380,7 @@ mod tests {
     use std::time::Duration;
 
     use super::super::unusable::{FRAMES, Unusable};
-    use messages::{ControllerStatus, Count, Phase, Rate};
+    use messages::{ControllerStatus, Count, FrameHeader, Phase, Rate};
 
     fn frame(age_ms: i64, exposure_ns: u32) -> ReceivedFrame {
         let header = FrameHeader {
