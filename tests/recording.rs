@@ -108,7 +108,8 @@ async fn others_read_a_landing() -> anyhow::Result<()> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_landing_is_followed_by_a_client_of_foxglove() -> anyhow::Result<()> {
-    let _flight = beside_another().await?;
+    // A machine without time left drops pictures on their way to the viewer.
+    let _flight = alone().await?;
     with_second_try(async || {
         let folder = tempfile::tempdir()?;
         let file = folder.path().join("flight.mcap");
