@@ -28,7 +28,7 @@ impl Autopilot {
     }
 
     /// Whether the link's delay is unknown after 3 s of connection, or has not been measured for 10 s. Then the clock is not
-    /// requested ([`Config::timesync`]), or the link does not pass the requests or the answers.
+    /// requested ([`Config::timesync`](crate::config::Config::timesync)), or the link does not pass the requests or the answers.
     pub fn lacks_link_delay(&self, now_ns: i64) -> bool {
         let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.state.connected);
         let Some(vehicle) = vehicle else { return false };
