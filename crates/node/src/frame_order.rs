@@ -14,6 +14,8 @@ const PERIOD_FRAMES: u64 = 60;
 #[derive(Debug, Default)]
 pub struct FrameOrder {
     before: Option<Frame>,
+    /// Whether the camera numbers its frames: a number was greater than the one before.
+    has_numbers: bool,
     frames: u64,
     /// The latest steps back, by the number of frames until then.
     steps_back: VecDeque<u64>,
@@ -31,7 +33,7 @@ struct Frame {
 pub struct Misplaced {
     /// Its stamp is that of the frame before, or earlier.
     pub by_stamp: bool,
-    /// Its sequence number is that of the frame before, or smaller.
+    /// Its sequence number is smaller than that of the frame before, or the same although the camera numbers its frames.
     pub by_sequence: bool,
     /// Sequence numbers or clocks have changed back as often as with two publishers.
     pub as_of_two: bool,
@@ -40,15 +42,17 @@ pub struct Misplaced {
 impl FrameOrder {
     /// Takes the next frame.
     pub fn on_frame(&mut self, header: &FrameHeader) -> Misplaced {
-        let FrameHeader { clock, stamp_ns, sequence, .. } = header.clone();
-        let frame = Frame { clock, stamp_ns, sequence };
+        let FrameHeader { ref clock, stamp_ns, sequence, .. } = *header;
+        let frame = Frame { clock: clock.clone(), stamp_ns, sequence };
         self.frames += 1;
         let Some(before) = self.before.replace(frame) else { return Misplaced::default() };
         // Stamps of two clocks cannot be compared.
-        let by_stamp = before.clock == header.clock && stamp_ns <= before.stamp_ns;
-        let by_sequence = sequence <= before.sequence;
-        // Stamps of one camera may step back, and one that does not count its frames repeats the number.
-        let is_step = sequence < before.sequence || before.clock != header.clock;
+        let by_stamp = before.clock == *clock && stamp_ns <= before.stamp_ns;
+        self.has_numbers |= sequence > before.sequence;
+        // Stamps of one camera may step back, and one that does not number its frames repeats the number.
+        let by_sequence =
+            sequence < before.sequence || (sequence == before.sequence && self.has_numbers);
+        let is_step = sequence < before.sequence || before.clock != *clock;
         if is_step {
             self.steps_back.push_back(self.frames);
         }
@@ -104,6 +108,14 @@ mod tests {
                 let found = order.on_frame(&header(stamp_ms, sequence as u64));
                 assert!(!found.as_of_two, "{start} {sequence}");
             }
+        }
+    }
+
+    #[test]
+    fn a_camera_that_does_not_number_its_frames_has_no_wrong_order() {
+        let mut order = FrameOrder::default();
+        for stamp_ms in 0..100 {
+            assert_eq!(order.on_frame(&header(stamp_ms, 0)), Misplaced::default(), "{stamp_ms}");
         }
     }
 
