@@ -1,7 +1,7 @@
 //! Computes a velocity from the target: either by [`thesis`] or by [`metric`].
 
 pub mod metric;
-mod observer;
+pub(crate) mod observer;
 mod path;
 pub mod situation;
 pub mod thesis;

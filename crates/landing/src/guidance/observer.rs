@@ -15,7 +15,7 @@ use crate::time::Timestamp;
 const ACCELERATION_S: f64 = 0.05;
 
 /// Acceleration of gravity, in m/s^2.
-const GRAVITY: f64 = 9.81;
+pub(crate) const GRAVITY_M_S2: f64 = 9.81;
 
 /// Time constant of the filter over the tilt against the wind, in seconds.
 const TILT_S: f64 = 1.0;
@@ -78,7 +78,7 @@ impl Observer {
         }
         self.path.advance(step_s, self.setpoint, &situation.limits);
         // The tilt that does not accelerate the vehicle along its path holds it against the wind.
-        let against_wind = tilt(situation) + self.path.acceleration() * (1.0 / GRAVITY);
+        let against_wind = tilt(situation) + self.path.acceleration() * (1.0 / GRAVITY_M_S2);
         self.tilt = self.tilt + (against_wind - self.tilt) * fmin(step_s / TILT_S, 1.0);
         self
     }

@@ -4,6 +4,7 @@ use std::ops::RangeInclusive;
 
 use super::{Lander, MAX_CONTACT_M, MAX_CONTACT_M_S};
 use crate::event::{Landed, VehicleState};
+use crate::guidance::observer::GRAVITY_M_S2;
 use crate::standing::{MAX_STANDING_M_S, standing_height_m};
 use crate::time::Timestamp;
 
@@ -24,9 +25,7 @@ const MAX_LATE_REPORT_S: f64 = 10.0;
 /// Interval between two states, in seconds, within which the positions show a fall that no velocity shows.
 const FALL_GAP_S: RangeInclusive<f64> = 0.3..=1.5;
 
-/// Acceleration of a fall, in m/s², and by how many metres positions at its ends may err. A larger difference is a jump of the
-/// autopilot's position.
-const GRAVITY_M_S2: f64 = 9.81;
+/// Maximum error of the positions at the ends of a fall, in metres. A larger difference is a jump of the autopilot's position.
 const MAX_POSITION_ERROR_M: f64 = 0.3;
 
 /// Minimum speed down of a vehicle that falls, in m/s, and as a multiple of the autopilot's speed of landing. A vehicle touches down at
