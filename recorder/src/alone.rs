@@ -14,6 +14,8 @@ pub(crate) struct Alone {
     vehicle: String,
     /// The keys of its own messages.
     own: [String; 3],
+    /// The keys that only a controller publishes, except its health.
+    of_controller: [String; 2],
     begun: Instant,
     has_others: AtomicBool,
     has_controller: AtomicBool,
@@ -35,6 +37,7 @@ impl Alone {
                 topic::CONFIGURATION.key(process),
                 topic::RECORDER_STATUS.key(&[id]),
             ],
+            of_controller: [topic::STATUS.key(&[]), topic::TAPE.key(&[])],
             begun: Instant::now(),
             has_others: AtomicBool::new(false),
             has_controller: AtomicBool::new(false),
@@ -46,9 +49,15 @@ impl Alone {
         if !self.has_others.load(Ordering::Relaxed) && self.own.iter().all(|own| own != key) {
             self.has_others.store(true, Ordering::Relaxed);
         }
-        if !self.has_controller.load(Ordering::Relaxed) && is_of_controller(key) {
+        if !self.has_controller.load(Ordering::Relaxed) && self.is_of_controller(key) {
             self.has_controller.store(true, Ordering::Relaxed);
         }
+    }
+
+    /// Whether it is the key of a message that a controller publishes.
+    fn is_of_controller(&self, key: &str) -> bool {
+        topic::HEALTH.first_name(key) == Some("controller")
+            || self.of_controller.iter().any(|of_it| of_it == key)
     }
 
     /// The warning, once the time for a message of another process is over.
@@ -77,12 +86,6 @@ impl Alone {
             )
         })
     }
-}
-
-/// Whether it is the key of a message that a controller publishes.
-fn is_of_controller(key: &str) -> bool {
-    topic::HEALTH.first_name(key) == Some("controller")
-        || [topic::STATUS.key(&[]), topic::TAPE.key(&[])].iter().any(|of_it| of_it == key)
 }
 
 #[cfg(test)]
