@@ -28,8 +28,9 @@ const MAX_SHAKE: f64 = 0.005;
 /// Corners whose standard deviation is larger are not used where the lens is known, in pixels: those at a fisheye's rim that
 /// could not be refined are a pixel off, and not by chance. Refined ones are known to some hundredths.
 const MAX_CORNER_PX: f64 = 0.15;
-/// Maximum number of images that are searched again mirrored, if none shows the board.
+/// Maximum number of images that are searched again mirrored, if none shows the board, and the maximum of their pixels.
 const MIRRORED_IMAGES: usize = 8;
+const MAX_MIRRORED_PIXELS: usize = 1 << 27;
 /// An image whose outlines are wider than this is blurred, in pixels.
 pub(super) const BLURRED_PX: f64 = 5.0;
 
@@ -159,6 +160,12 @@ impl FoundImages {
             if self.views.is_empty() {
                 self.last_empty.truncate(MIRRORED_IMAGES - 1);
                 self.last_empty.push_front((name, image));
+                let pixels = |(_, image): &(String, GrayImage)| image.width() * image.height();
+                while self.last_empty.len() > 1
+                    && self.last_empty.iter().map(pixels).sum::<usize>() > MAX_MIRRORED_PIXELS
+                {
+                    self.last_empty.pop_back();
+                }
             }
         } else if origin == Origin::Live && !is_still(&view, before.as_ref(), edge_px) {
             self.shaken += 1;
@@ -304,6 +311,22 @@ mod tests {
             name: String::new(),
             size: ImageSize { width: 1000, height: 800 },
             points: vec![Sighting { tag: 1, place_m: [0.0; 2], seen }],
+        }
+    }
+
+    #[test]
+    fn images_without_the_board_that_are_kept_are_few_and_small() {
+        let board = Board::A4;
+        let mut finder = Finder::new(&board).unwrap();
+        for (size, kept) in [([64, 48], MIRRORED_IMAGES), ([10_000, 6_000], 2)] {
+            let mut found = FoundImages::default();
+            for index in 0..MIRRORED_IMAGES + 2 {
+                let image = GrayImage::filled(size[0], size[1], 200);
+                let name = index.to_string();
+                found.add(&mut finder, Picture { name, image, origin: Origin::File });
+            }
+            assert_eq!(found.last_empty.len(), kept, "{size:?}");
+            assert_eq!(found.last_empty[0].0, (MIRRORED_IMAGES + 1).to_string());
         }
     }
 
