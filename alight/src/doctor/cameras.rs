@@ -79,7 +79,16 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_
     for camera in names {
         let frames: Vec<&ReceivedFrame> =
             all.iter().copied().filter(|frame| frame.header.camera == camera).collect();
-        check_age(findings, describe_frames(camera, &frames, seconds), &frames, seen.max_age_s);
+        let raw = seen.raw_frames.iter().filter(|frame| frame.header.camera == camera);
+        let raw: Vec<&ReceivedFrame> = raw.collect();
+        // A detector here takes raw frames where there are some.
+        let searched = if raw.is_empty() { &frames } else { &raw };
+        let mut text = describe_frames(camera, &frames, seconds);
+        if let Some(age_ms) = stats::quantile(&ages_ms(&raw), 0.5).filter(|_| is_jpeg(&frames)) {
+            // Writing to a string cannot fail.
+            let _ = write!(text, "; its raw frames are {age_ms:.0} ms old");
+        }
+        check_age(findings, text, searched, seen.max_age_s);
         check_publishers(findings, camera, &seen.raw_frames);
         check_stamps(findings, camera, &frames);
         check_exposure(findings, camera, &frames, focal_px(seen, camera));
@@ -171,14 +180,17 @@ fn implausible(info: &CameraInfo, focal_px: [f64; 2]) -> Option<String> {
     })
 }
 
+fn is_jpeg(frames: &[&ReceivedFrame]) -> bool {
+    frames.iter().all(|frame| frame.header.format == PixelFormat::Jpeg)
+}
+
 fn describe_frames(camera: &str, frames: &[&ReceivedFrame], seconds: u64) -> String {
     let rate_hz = frames.len() as f64 / seconds as f64;
-    let is_raw = frames.iter().any(|frame| frame.header.format != PixelFormat::Jpeg);
     let bytes: usize = frames.iter().map(|frame| frame.bytes).sum();
     let megabits_s = bytes as f64 * 8e-6 / seconds as f64;
-    let kind = if is_raw { "raw frames" } else { "JPEG frames" };
+    let kind = if is_jpeg(frames) { "JPEG frames" } else { "raw frames" };
     let mut text = format!("camera `{camera}`: {rate_hz:.1} {kind}/s, {megabits_s:.2} Mbit/s");
-    if !is_raw {
+    if is_jpeg(frames) {
         text.push_str(" (it takes more: they are few where no detector acknowledges them)");
     }
     match stats::quantile(&ages_ms(frames), 0.5) {
@@ -481,6 +493,17 @@ mod tests {
             assert!(!of(199, max_age_s).contains("max_age_s"));
         }
         assert!(!of(399, Some(0.5)).contains("max_age_s"));
+        // JPEG frames of the air link may be early, and raw ones late.
+        let mut jpeg = frame(20, 1);
+        jpeg.header.format = PixelFormat::Jpeg;
+        let mut findings = Findings::default();
+        let watched =
+            Watched { role: None, duration: Duration::from_secs(1), has_raw_frames: true };
+        let (frames, raw_frames) = (vec![jpeg], vec![frame(399, 1)]);
+        check(&mut findings, &Seen { frames, raw_frames, ..Seen::default() }, watched, false);
+        let text = findings.text();
+        assert!(text.contains("20 ms old on arrival; its raw frames are 399 ms old; "), "{text}");
+        assert!(text.contains(late), "{text}");
     }
 
     #[test]
