@@ -118,7 +118,7 @@ impl SimulatedAutopilot {
                 let custom = (first as i64) & 1 == 1;
                 if self.is_px4() {
                     let [_, main, sub, ..] = values;
-                    let before = self.shown_mode();
+                    let before = self.reported_mode();
                     let result = self.set_px4_mode(now_s, main as u8, sub as u8);
                     self.acknowledge(command as u16, result, from);
                     if result == ACCEPTED && self.schedule.has(CURRENT_MODE) {

@@ -21,12 +21,12 @@ mod telemetry;
 
 use std::collections::VecDeque;
 
+use autopilot::Sender;
 use autopilot::dialect::{
     HEARTBEAT_DATA, MavAutopilot, MavMessage, MavModeFlag, MavSeverity, MavState, MavType,
     TIMESYNC_DATA,
 };
 use autopilot::packet::encode;
-use autopilot::{FlightMode, Sender};
 use geometry::{Ned, Vector};
 
 pub use direct::ReportedMotion;
@@ -40,7 +40,7 @@ use crate::vehicle::{Demand, VehicleTruth};
 use estimate::{Estimate, Estimator};
 use flight::{Flight, FlightEvent, Setpoint};
 use parameters::Parameters;
-use px4::{CURRENT_MODE, Px4};
+use px4::{CURRENT_MODE, Px4, Reported};
 use telemetry::{Readiness, Schedule, Telemetry};
 
 /// The simulated autopilot's settings.
@@ -225,9 +225,9 @@ impl SimulatedAutopilot {
         self.outgoing.drain(..)
     }
 
-    /// The mode that PX4 shows.
-    fn shown_mode(&self) -> FlightMode {
-        self.px4.shown(self.flight.mode(), self.flight.landed())
+    /// What PX4 reports of its mode.
+    fn reported_mode(&self) -> Reported {
+        self.px4.report(self.flight.mode(), self.flight.landed())
     }
 
     fn is_px4(&self) -> bool {
@@ -303,7 +303,7 @@ impl SimulatedAutopilot {
             self.send(&MavMessage::TIMESYNC(request));
         }
         for id in self.schedule.due(self.now_s) {
-            let mode = self.shown_mode();
+            let mode = self.reported_mode();
             if id != CURRENT_MODE || self.px4.reports_mode(self.now_s, mode) {
                 self.send_message(id);
             }
@@ -323,7 +323,7 @@ impl SimulatedAutopilot {
             target_velocity: self.flight.target_velocity(),
             rangefinder: self.config.rangefinder,
             says_simulated: self.config.says_simulated,
-            px4: self.is_px4().then(|| self.shown_mode()),
+            px4: self.is_px4().then(|| self.reported_mode()),
         }
     }
 

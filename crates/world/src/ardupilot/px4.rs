@@ -4,7 +4,10 @@
 //! once a second, and events with the checks before arming that fail: after a change and on request. Measured with 1.17 in its
 //! own simulation: HOLD as the failsafe for missing setpoints, and OFFBOARD again with the next one, as long as no other mode is
 //! chosen; CURRENT_MODE, if it is requested, with each change and twice a second, the former mode once more after an
-//! accepted request, and OFFBOARD again when the motors stop after a landing.
+//! accepted request, and OFFBOARD again when the motors stop after a landing. From its sources (since 1.15): the mode that the user chose
+//! last stays OFFBOARD in that failsafe (`Failsafe::checkModeFallback` changes a copy of it, `Commander::handleModeIntentionAndFailsafe`
+//! stores both), CURRENT_MODE states both modes (`streams/CURRENT_MODE.hpp`), and the heartbeat states that a failsafe is active
+//! (`streams/HEARTBEAT.hpp`: MAV_STATE_CRITICAL).
 
 use autopilot::FlightMode;
 use autopilot::dialect::{
@@ -47,7 +50,18 @@ pub(super) struct Px4 {
     /// Number of its events so far.
     events: u16,
     /// The mode that CURRENT_MODE reported last, and when.
-    reported: Option<(FlightMode, f64)>,
+    reported: Option<(Reported, f64)>,
+}
+
+/// What a PX4 reports of its mode.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(super) struct Reported {
+    /// The mode in which it flies.
+    pub(super) mode: FlightMode,
+    /// The mode that its user chose last.
+    pub(super) chosen: FlightMode,
+    /// A failsafe has changed the mode.
+    pub(super) is_failsafe: bool,
 }
 
 impl Px4 {
@@ -103,7 +117,7 @@ impl Px4 {
     }
 
     /// True when CURRENT_MODE is to be sent.
-    pub(super) fn reports_mode(&mut self, now_s: f64, mode: FlightMode) -> bool {
+    pub(super) fn reports_mode(&mut self, now_s: f64, mode: Reported) -> bool {
         let is_due =
             self.reported.is_none_or(|(last, at_s)| last != mode || now_s - at_s >= CURRENT_MODE_S);
         if is_due {
@@ -135,8 +149,15 @@ impl Px4 {
         std::mem::take(&mut self.landed_from_offboard)
     }
 
+    /// What is reported of the mode.
+    pub(super) fn report(&self, mode: Mode, landed: Landed) -> Reported {
+        let mode = self.shown(mode, landed);
+        let chosen = if self.is_failsafe { FlightMode::OFFBOARD } else { mode };
+        Reported { mode, chosen, is_failsafe: self.is_failsafe }
+    }
+
     /// The mode that the heartbeat reports.
-    pub(super) fn shown(&self, mode: Mode, landed: Landed) -> FlightMode {
+    fn shown(&self, mode: Mode, landed: Landed) -> FlightMode {
         match mode {
             Mode::Guided if self.is_offboard() => FlightMode::OFFBOARD,
             Mode::Guided if landed == Landed::TakingOff => FlightMode::AUTO_TAKEOFF,
@@ -149,9 +170,12 @@ impl Px4 {
 }
 
 /// PX4's report of its mode.
-pub(super) fn current_mode(mode: FlightMode) -> MavMessage {
-    let custom_mode = mode.custom_mode();
-    MavMessage::CURRENT_MODE(CURRENT_MODE_DATA { custom_mode, ..CURRENT_MODE_DATA::default() })
+pub(super) fn current_mode(reported: Reported) -> MavMessage {
+    MavMessage::CURRENT_MODE(CURRENT_MODE_DATA {
+        custom_mode: reported.mode.custom_mode(),
+        intended_custom_mode: reported.chosen.custom_mode(),
+        ..CURRENT_MODE_DATA::default()
+    })
 }
 
 /// PX4's report of its estimator.
@@ -179,11 +203,18 @@ mod tests {
         assert_eq!(px4.shown(Mode::Guided, Landed::InAir), FlightMode::OFFBOARD);
         assert!(!px4.has_lost_setpoints(2.0, 1.0));
         assert!(px4.has_lost_setpoints(2.2, 1.0), "its failsafe");
-        assert_eq!(px4.shown(Mode::Loiter, Landed::InAir), FlightMode::AUTO_HOLD);
+        let failsafe = px4.report(Mode::Loiter, Landed::InAir);
+        let (mode, chosen) = (FlightMode::AUTO_HOLD, FlightMode::OFFBOARD);
+        assert_eq!(failsafe, Reported { mode, chosen, is_failsafe: true });
+        assert!(px4.reports_mode(2.2, failsafe) && !px4.reports_mode(2.3, failsafe));
         assert!(px4.on_setpoint(5.0), "the mode that was chosen is OFFBOARD still");
         assert_eq!(px4.shown(Mode::Guided, Landed::InAir), FlightMode::OFFBOARD);
         assert!(px4.has_lost_setpoints(6.1, 1.0));
         assert_eq!(px4.request(6.2, 4, 3), Some(Mode::Loiter));
+        // The same mode, chosen now, is reported at once.
+        let held = px4.report(Mode::Loiter, Landed::InAir);
+        assert_eq!(held, Reported { mode, chosen: mode, is_failsafe: false });
+        assert!(px4.reports_mode(2.3, held));
         assert!(!px4.on_setpoint(7.0), "HOLD was chosen");
         assert_eq!(px4.request(7.1, 6, 0), None, "a gap begins the stream again");
     }

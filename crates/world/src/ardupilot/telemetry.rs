@@ -1,7 +1,6 @@
 //! Composes the simulated autopilot's MAVLink messages (attitude, positions, battery, estimator status, true state), each
 //! composed when it is due at its requested interval.
 
-use autopilot::FlightMode;
 use autopilot::dialect::{
     ATTITUDE_DATA, ATTITUDE_QUATERNION_DATA, AUTOPILOT_VERSION_DATA, BATTERY_STATUS_DATA,
     DISTANCE_SENSOR_DATA, EKF_STATUS_REPORT_DATA, EXTENDED_SYS_STATE_DATA, EkfStatusFlags,
@@ -16,7 +15,7 @@ use geometry::{Body, Ned, Vector};
 
 use super::estimate::Estimate;
 use super::flight::{Landed, Mode};
-use super::px4::CURRENT_MODE;
+use super::px4::{CURRENT_MODE, Reported};
 use crate::vehicle::{GRAVITY_M_S2, VehicleTruth};
 
 /// Message numbers that can be requested, by the stream of REQUEST_DATA_STREAM they belong to (0: none).
@@ -163,7 +162,7 @@ pub(super) struct Telemetry<'a> {
     pub(super) rangefinder: bool,
     pub(super) says_simulated: bool,
     /// The mode in PX4's terms, if it is one.
-    pub(super) px4: Option<FlightMode>,
+    pub(super) px4: Option<Reported>,
 }
 
 impl Telemetry<'_> {
@@ -185,17 +184,17 @@ impl Telemetry<'_> {
         base_mode.set(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED, self.armed);
         let flying = self.landed != Landed::OnGround;
         MavMessage::HEARTBEAT(HEARTBEAT_DATA {
-            custom_mode: self.px4.map_or(self.mode as u32, FlightMode::custom_mode),
+            custom_mode: self.px4.map_or(self.mode as u32, |it| it.mode.custom_mode()),
             mavtype: MavType::MAV_TYPE_QUADROTOR,
             autopilot: match self.px4 {
                 Some(_) => MavAutopilot::MAV_AUTOPILOT_PX4,
                 None => MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
             },
             base_mode,
-            system_status: if flying {
-                MavState::MAV_STATE_ACTIVE
-            } else {
-                MavState::MAV_STATE_STANDBY
+            system_status: match self.px4 {
+                Some(px4) if self.armed && px4.is_failsafe => MavState::MAV_STATE_CRITICAL,
+                _ if flying => MavState::MAV_STATE_ACTIVE,
+                _ => MavState::MAV_STATE_STANDBY,
             },
             mavlink_version: 3,
         })
