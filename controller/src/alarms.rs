@@ -15,6 +15,8 @@ pub struct Alarms {
     operator_ns: Option<i64>,
     autopilot_ns: Option<i64>,
     raised: Vec<Alarm>,
+    /// Those that could not be acted on when they were raised first.
+    postponed: Vec<Alarm>,
 }
 
 impl Alarms {
@@ -27,13 +29,28 @@ impl Alarms {
             operator_ns: None,
             autopilot_ns: None,
             raised: Vec::new(),
+            postponed: Vec::new(),
         }
     }
 
     /// A landing begins: every alarm may be raised again, and a battery is low once it was so for long in this landing.
     pub fn begin(&mut self) {
         self.raised.clear();
+        self.postponed.clear();
         (self.low_since_ns, self.critical_since_ns) = (None, None);
+    }
+
+    /// An alarm that was just raised cannot be acted on now: it is raised again with the next tick.
+    pub fn postpone(&mut self, alarm: Alarm) {
+        self.raised.retain(|raised| *raised != alarm);
+        if !self.is_postponed(alarm) {
+            self.postponed.push(alarm);
+        }
+    }
+
+    /// Whether an alarm was raised before, and could not be acted on.
+    pub fn is_postponed(&self, alarm: Alarm) -> bool {
+        self.postponed.contains(&alarm)
     }
 
     /// A command or a heartbeat of the ground station was received.
@@ -196,6 +213,21 @@ mod tests {
             assert_eq!(alarms.tick(lost_s * SECOND, None), Some(Alarm::AutopilotLost));
             assert_eq!(alarms.tick((lost_s + 1) * SECOND, None), None, "once");
         }
+    }
+
+    #[test]
+    fn an_alarm_that_was_postponed_is_raised_again_until_it_is_acted_on() {
+        let mut alarms = alarms();
+        let critical = battery(0.05, 12.0);
+        let mut raise = |second: i64| alarms.tick(second * SECOND, Some(&critical));
+        assert_eq!((raise(0), raise(3)), (None, Some(Alarm::BatteryCritical)));
+        assert!(!alarms.is_postponed(Alarm::BatteryCritical));
+        alarms.postpone(Alarm::BatteryCritical);
+        assert_eq!(alarms.tick(4 * SECOND, Some(&critical)), Some(Alarm::BatteryCritical));
+        assert!(alarms.is_postponed(Alarm::BatteryCritical));
+        alarms.postpone(Alarm::BatteryCritical);
+        // A battery that has recovered raises none.
+        assert_eq!(alarms.tick(5 * SECOND, Some(&battery(0.5, 12.0))), None);
     }
 
     #[test]

@@ -73,9 +73,10 @@ impl TakingControl {
     }
 }
 
-/// Keeps a PX4 where it is that is in OFFBOARD while nothing steers it: without setpoints it would leave the mode.
+/// Keeps a PX4 where it is that is in OFFBOARD while nothing steers it: without setpoints it would leave the mode. One whose HOLD may be
+/// the failsafe for setpoints that were missing returns with them.
 pub fn hover_in_offboard(now_ns: i64, autopilot: &mut Autopilot) {
-    if autopilot.is_in_offboard() {
+    if autopilot.is_in_offboard() || autopilot.may_return_to_offboard(now_ns) {
         autopilot.send_zeros(now_ns);
     }
 }
@@ -83,6 +84,11 @@ pub fn hover_in_offboard(now_ns: i64, autopilot: &mut Autopilot) {
 /// True when it is a PX4 that flies and holds its place.
 pub fn is_holding_px4(autopilot: &Autopilot) -> bool {
     px4_in_flight(autopilot) == Some(FlightMode::AUTO_HOLD)
+}
+
+/// True when it holds its place by choice: setpoints alone do not change that.
+pub fn is_held_px4(now_ns: i64, autopilot: &Autopilot) -> bool {
+    is_holding_px4(autopilot) && !autopilot.may_return_to_offboard(now_ns)
 }
 
 /// The mode in which a pilot, a mission or a failsafe flies a PX4 now.

@@ -292,7 +292,9 @@ impl Flight {
         }
         let battery = self.autopilot.state().map(|state| state.battery);
         let Some(alarm) = self.alarms.tick(now_ns, battery.as_ref()) else { return };
-        self.journal.alarm(alarm);
+        if !self.alarms.is_postponed(alarm) {
+            self.journal.alarm(alarm);
+        }
         if waits_in_air {
             let phases = &self.config.phases;
             let is_to_land = match alarm {
@@ -300,7 +302,12 @@ impl Flight {
                 Alarm::BatteryLow => phases.on_battery_low == AlarmAction::Land,
                 Alarm::AutopilotLost | Alarm::OperatorLost => false,
             };
-            if !is_to_land || !is_flying_guided(&self.autopilot) {
+            if !is_to_land {
+                return;
+            }
+            // A PX4 that holds as setpoints were missing returns within a second; one that a pilot holds is the pilot's.
+            if !is_flying_guided(&self.autopilot) {
+                self.alarms.postpone(alarm);
                 return;
             }
             // It lands at once, whatever keeps it from being led to a marker.

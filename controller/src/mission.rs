@@ -7,7 +7,9 @@ use autopilot::{
 };
 
 use crate::config::Start;
-use crate::control::{ControlProgress, TakingControl, hover_in_offboard, is_holding_px4};
+use crate::control::{
+    ControlProgress, TakingControl, hover_in_offboard, is_held_px4, is_holding_px4,
+};
 
 /// Time after the stop of the motors had ended a landing, in nanoseconds, within which motors that run again in our mode mean that it had
 /// not ended: the autopilot's heartbeat may have been wrong. One that stands has landed.
@@ -16,6 +18,10 @@ const MAX_REARMED_NS: i64 = 10_000_000_000;
 /// Time within which a landing that is to be resumed must begin, in nanoseconds: until then a PX4 is kept in OFFBOARD, where it drifts with
 /// the error of its velocity.
 const MAX_RESUMING_NS: i64 = 15_000_000_000;
+
+/// What to do about a PX4 that waits in HOLD for its landing.
+pub const START_FROM_HOLD: &str =
+    "it does not follow setpoints there; `start` asks it to, and begins the landing";
 
 /// The mission of a flight.
 #[derive(Clone, Debug)]
@@ -440,6 +446,11 @@ impl Mission {
                         mode: FlightMode::Land | FlightMode::AUTO_LAND,
                         ..
                     })) => {
+                        let of_mode = why_not_followed(now_ns, autopilot);
+                        let obstacle = match obstacle {
+                            Some(obstacle) if !is_held_px4(now_ns, autopilot) => Some(obstacle),
+                            _ => of_mode.as_deref(),
+                        };
                         if let Some(obstacle) = obstacle {
                             *waits_in_air = true;
                             obstacle.clone_into(why);
@@ -546,7 +557,7 @@ pub fn is_flying_guided(autopilot: &Autopilot) -> bool {
 }
 
 /// The end of the wait of a vehicle that took off for its landing: motors that are off, or a pilot. A PX4 that holds its position does
-/// not end it, as it does so automatically where setpoints are late.
+/// not end it, as it does so automatically where setpoints are late: from there the landing begins by command.
 fn end_of_waiting(autopilot: &Autopilot) -> Option<String> {
     let state = autopilot.state().filter(|state| state.connected)?;
     let is_ours = state.mode.is_guided() || state.mode.is_landing() || is_holding_px4(autopilot);
@@ -555,6 +566,18 @@ fn end_of_waiting(autopilot: &Autopilot) -> Option<String> {
         (true, false) => Some(format!("the pilot took over, in {},", state.mode)),
         (true, true) => None,
     }
+}
+
+/// Why a vehicle that took off cannot be landed in its mode now; `None` where it follows setpoints, or lands.
+fn why_not_followed(now_ns: i64, autopilot: &Autopilot) -> Option<String> {
+    let mode = autopilot.state()?.mode;
+    if mode.is_guided() || mode.is_landing() {
+        return None;
+    }
+    Some(match is_held_px4(now_ns, autopilot) {
+        true => format!("the vehicle is in {mode}: {START_FROM_HOLD}"),
+        false => format!("waiting until the vehicle follows setpoints, in {mode} now"),
+    })
 }
 
 /// True when there is no landing to resume: it has ended, though the motors may still run, or the pilot flies. A vehicle

@@ -7,6 +7,7 @@
     reason = "helpers of tests may fail like tests, and a measurement shows its result"
 )]
 
+mod modelled;
 mod packets;
 
 use std::cell::Cell;
@@ -17,22 +18,17 @@ use autopilot::Parser;
 use autopilot::dialect::{LOCAL_POSITION_NED_DATA, MavLandedState, MavMessage};
 use controller::Config;
 use controller::flight::Flight;
-use geometry::{Body, Camera, CameraModel, Point, Rotation, Transform};
-use messages::{CameraInfo, Detection, Detections, FrameHeader, MarkerPose, Phase};
-use node::{Layers, clock_name};
+use geometry::CameraModel;
+use messages::{CameraInfo, Phase};
+use modelled::{
+    FOCAL_PX, FRAME_LATENCY_S, FRAME_STEPS, IMAGE, START_NS, TICK_STEPS, body_from_camera,
+    detections, stamp_ns,
+};
+use node::Layers;
 use packets::{bytes, contact};
-use world::vehicle::VehicleTruth;
 use world::world::STEP_S;
 use world::{World, WorldConfig};
 
-const START_NS: i64 = 1_000_000_000;
-const IMAGE: (u32, u32) = (1296, 972);
-const FOCAL_PX: f64 = 1818.0;
-/// Height of the camera over the vehicle's lowest point, in metres.
-const MOUNT_M: f64 = 0.12;
-const FRAME_STEPS: u64 = 26;
-const TICK_STEPS: u64 = 10;
-const FRAME_LATENCY_S: f64 = 0.08;
 const LIMIT_S: f64 = 120.0;
 
 /// A packet of the autopilot, on its way.
@@ -64,51 +60,6 @@ impl Ended {
     fn is_on_the_pad(&self) -> bool {
         self.phase == Phase::Landed && self.touch.is_some_and(|[.., error_m]| error_m < 0.15)
     }
-}
-
-fn stamp_ns(time_s: f64) -> i64 {
-    START_NS + (time_s * 1e9).round() as i64
-}
-
-fn body_from_camera() -> Transform<Body, Camera> {
-    // The image's upper edge looks forward.
-    let rotation = Rotation::from_euler(0.0, 0.0, std::f64::consts::FRAC_PI_2);
-    Transform::new(rotation, Point::new(0.0, 0.0, -MOUNT_M))
-}
-
-/// The detections of the pad by a detector without errors.
-fn detections(world: &World, time_s: f64, sequence: u64) -> Detections {
-    let VehicleTruth { position, ned_from_body, .. } = world.truth();
-    let ned_from_camera = Transform::new(ned_from_body, position) * body_from_camera();
-    let seen = ned_from_camera.inverse() * world.pad_at(time_s).ned_from_marker();
-    let model = CameraModel::pinhole(IMAGE.0, IMAGE.1, FOCAL_PX);
-    let centre = model.project(seen.origin()).filter(|centre| {
-        let inside = |at: f64, size: u32| (20.0..f64::from(size) - 20.0).contains(&at);
-        inside(centre.x, IMAGE.0) && inside(centre.y, IMAGE.1)
-    });
-    let found = centre.map(|centre| Detection {
-        family: "rings".to_owned(),
-        id: None,
-        centre_px: [centre.x, centre.y],
-        size_px: 0.15 * FOCAL_PX / seen.origin().z(),
-        pose: Some(MarkerPose {
-            camera_from_marker: (&seen).into(),
-            alternative: None,
-            ..Detection::sample().pose.unwrap()
-        }),
-        ..Detection::sample()
-    });
-    let header = FrameHeader {
-        camera: CameraInfo::sample().camera,
-        sequence,
-        stamp_ns: stamp_ns(time_s),
-        clock: clock_name().to_owned(),
-        width: IMAGE.0,
-        height: IMAGE.1,
-        ..FrameHeader::sample()
-    };
-    let detections = found.into_iter().collect();
-    Detections { detector: "main".to_owned(), header, detections, stages: Vec::new() }
 }
 
 /// A flight from the takeoff on, with the autopilot's packets and ours taking their ways.

@@ -4,9 +4,9 @@ use autopilot::{Conflict, LISTENING};
 use landing::{Event as LanderEvent, OnAbort, OperatorCommand, Phase};
 
 use super::Flight;
-use crate::control::{is_holding_px4, pilots_px4_mode};
+use crate::control::{is_held_px4, is_holding_px4, pilots_px4_mode};
 use crate::landing_target;
-use crate::mission::is_flying_guided;
+use crate::mission::{START_FROM_HOLD, is_flying_guided};
 use crate::wire;
 
 impl Flight {
@@ -15,7 +15,7 @@ impl Flight {
             let (phase, _) = self.view().phase(now_ns);
             return Err(format!("a landing is active, in phase `{phase}`"));
         }
-        if self.mission.is_taking_off() {
+        if self.mission.is_taking_off() && !self.holds_in_air(now_ns) {
             let is_held = self.mission.resume();
             let why = "the vehicle is taking off; the landing begins automatically".to_owned();
             return if is_held { Ok(why) } else { Err(why) };
@@ -64,6 +64,11 @@ impl Flight {
             return Err(format!("no landing was started: {why}"));
         }
         Ok(format!("in phase `{phase}`: {why}"))
+    }
+
+    /// Whether a PX4 that took off and waits for its landing holds its place by choice: only a command leads it out of that.
+    fn holds_in_air(&self, now_ns: i64) -> bool {
+        self.mission.waits_in_air() && is_held_px4(now_ns, &self.autopilot)
     }
 
     /// Whether the vehicle took off for us, or has flown a landing of ours and its motors still run: a later program does not take the
@@ -121,8 +126,15 @@ impl Flight {
             return self.operator(now_ns, OperatorCommand::LandHere);
         }
         // PX4 climbs in a mode of its own.
-        if self.mission.is_taking_off() && !is_flying_guided(&self.autopilot) {
-            return Err("the vehicle is taking off; land it once it is up".to_owned());
+        let may_land = is_flying_guided(&self.autopilot) || self.holds_in_air(now_ns);
+        if self.mission.is_taking_off() && !may_land {
+            let why = match self.mission.waits_in_air() {
+                true => {
+                    "the vehicle is not in a mode from which it can be landed yet; give the command again"
+                }
+                false => "the vehicle is taking off; land it once it is up",
+            };
+            return Err(why.to_owned());
         }
         let conflict = self.autopilot.conflict(now_ns).filter(|_| !self.is_ours());
         if let Some(conflict) = conflict {
@@ -158,6 +170,9 @@ impl Flight {
         now_ns: i64,
         command: OperatorCommand,
     ) -> Result<String, String> {
+        if command == OperatorCommand::Resume && self.holds_in_air(now_ns) {
+            return Err(format!("the vehicle is in HOLD: {START_FROM_HOLD}"));
+        }
         if command == OperatorCommand::Resume && self.mission.resume() {
             return Ok("the landing begins as soon as nothing else prevents it".to_owned());
         }

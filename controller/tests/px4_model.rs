@@ -1,0 +1,110 @@
+//! A flight with the modelled PX4, in lock-step: what follows interruptions of the setpoints, from the take-off to the abort, and whether
+//! a pilot's switch wins.
+
+#![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
+
+mod modelled;
+mod packets;
+
+use messages::{ControllerCommand, Phase};
+use modelled::Site;
+use world::ardupilot::Mode;
+
+/// PX4's modes by their two numbers.
+const HOLD: (f32, f32) = (4.0, 3.0);
+const POSITION: (f32, f32) = (3.0, 0.0);
+
+/// A PX4 that took off for us and hovers in OFFBOARD, while its landing waits for a command, as the controller did not run for 20 s in the
+/// climb.
+fn waiting_in_air(set: &[&str]) -> Site {
+    let mut site = Site::new("takeoff", set);
+    let is_climbing = |site: &Site| site.world.truth().height_m > 1.0;
+    assert!(site.run_until(60.0, is_climbing), "{:?}", site.status());
+    site.freeze(20.0);
+    let waits = |site: &Site| site.status().why.contains("`resume` begins");
+    assert!(site.run_until(60.0, waits), "{:?}", site.status());
+    site.run(3.0);
+    assert_eq!(site.mode(), Mode::Guided);
+    assert_eq!(site.status().phase, Phase::Takeoff);
+    site
+}
+
+#[test]
+fn a_px4_that_waits_in_the_air_hovers_again_after_an_interruption_and_lands_by_command() {
+    for command in [ControllerCommand::Resume, ControllerCommand::Start] {
+        for frozen_s in [1.5, 3.0, 8.0, 20.0] {
+            let mut site = waiting_in_air(&[]);
+            site.freeze(frozen_s);
+            assert_eq!(site.mode(), Mode::Loiter, "its failsafe");
+            // The standstill is noticed with the first tick.
+            site.run(0.03);
+            let reply = site.command(&command);
+            assert!(reply.accepted, "{reply:?}");
+            site.run(1.0);
+            assert_eq!(site.mode(), Mode::Guided, "{:?}", site.status());
+            let lands = site.run_until(60.0, |site| site.status().phase == Phase::Landed);
+            assert!(lands, "{command:?} after {frozen_s} s: {:?}", site.status());
+        }
+    }
+}
+
+#[test]
+fn a_battery_alarm_lands_a_px4_that_waits_in_the_air_once_it_follows_setpoints_again() {
+    let mut site = waiting_in_air(&[]);
+    site.charge = Some(8);
+    // The alarm is raised while its setpoints are interrupted again and again.
+    for _ in 0..4 {
+        site.freeze(1.4);
+        site.run(0.2);
+    }
+    let lands = site.run_until(60.0, |site| site.status().phase == Phase::Landed);
+    assert!(lands && site.status().why.contains("battery"), "{:?}", site.status());
+
+    // In a pilot's HOLD it is kept until the operator takes the vehicle out of that.
+    let mut site = waiting_in_air(&[]);
+    site.charge = Some(8);
+    site.pilot(HOLD.0, HOLD.1);
+    site.run(10.0);
+    assert_eq!(site.mode(), Mode::Loiter, "{:?}", site.status());
+    let reply = site.command(&ControllerCommand::Start);
+    assert!(reply.accepted, "{reply:?}");
+    let lands = site.run_until(60.0, |site| site.status().phase == Phase::Landed);
+    assert!(lands && site.status().why.contains("battery"), "{:?}", site.status());
+}
+
+#[test]
+fn a_px4_that_a_pilot_holds_after_its_takeoff_stays_there_and_resume_says_what_to_do() {
+    for is_interrupted in [false, true] {
+        let mut site = waiting_in_air(&[]);
+        if is_interrupted {
+            site.is_frozen = true;
+            site.run(2.0);
+        }
+        site.pilot(HOLD.0, HOLD.1);
+        site.run(1.0);
+        site.is_frozen = false;
+        site.run(5.0);
+        let status = site.status();
+        assert!(site.mode() == Mode::Loiter && status.why.contains("`start`"), "{status:?}");
+        let reply = site.command(&ControllerCommand::Resume);
+        assert!(!reply.accepted && reply.reason.contains("`start`"), "{reply:?}");
+        site.run(5.0);
+        assert!(site.mode() == Mode::Loiter, "{:?}", site.status());
+        let command = match is_interrupted {
+            true => ControllerCommand::LandHere,
+            false => ControllerCommand::Start,
+        };
+        let reply = site.command(&command);
+        assert!(reply.accepted, "{reply:?}");
+        let lands = site.run_until(60.0, |site| site.status().phase == Phase::Landed);
+        assert!(lands, "{:?}", site.status());
+    }
+    // Any other mode ends the mission.
+    let mut site = waiting_in_air(&[]);
+    site.freeze(3.0);
+    site.pilot(POSITION.0, POSITION.1);
+    site.run(5.0);
+    let status = site.status();
+    assert!(status.phase == Phase::Failed && status.why.contains("pilot"), "{status:?}");
+    assert!(site.mode() == Mode::PosHold && !site.command(&ControllerCommand::Resume).accepted);
+}
