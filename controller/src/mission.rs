@@ -297,7 +297,9 @@ impl Mission {
     /// Gives up a take-off or a change to OFFBOARD, for this reason, where a PX4 may be in OFFBOARD before a landing, or change to
     /// it; true while the way out continues.
     pub fn leave_offboard(&mut self, now_ns: i64, autopilot: &mut Autopilot, why: &str) -> bool {
-        let may_be_in_it = autopilot.is_requesting_offboard() || autopilot.is_in_offboard();
+        let may_be_in_it = autopilot.is_requesting_offboard()
+            || autopilot.is_in_offboard()
+            || autopilot.may_return_to_offboard(now_ns);
         match &self.state {
             State::TakingControl { .. } => {
                 let why = format!("the landing did not begin: {why}");
@@ -333,6 +335,12 @@ impl Mission {
         let (mut why, awaits_takeoff) = (std::mem::take(why), *awaits_takeoff && is_out);
         if is_armed && autopilot.is_in_auto_land() {
             why.push_str(", and it stays in LAND all the same: the pilot's mode switch stops it");
+        } else if is_armed && !is_out {
+            why.push_str(
+                ", and it stays in OFFBOARD all the same: the pilot's mode switch ends that",
+            );
+        } else if is_holding_px4(autopilot) {
+            why.push_str("; it is in HOLD");
         }
         self.fail(autopilot, why);
         if awaits_takeoff {

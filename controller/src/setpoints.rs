@@ -119,8 +119,15 @@ impl Setpoints {
         self.leave_offboard(now_ns, autopilot)
     }
 
-    /// No setpoint follows: a PX4 that would take that for a failure is led out of OFFBOARD. True while that continues.
+    /// No setpoint follows: a PX4 that would take that for a failure is led out of OFFBOARD. True while that continues. One whose HOLD may
+    /// be its failsafe gets zeros until it is known whether it is: as setpoints were sent after the interruption, it may be in OFFBOARD
+    /// already, although it has not shown it.
     fn leave_offboard(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
+        if self.last.is_some() && self.exit.is_none() && autopilot.may_return_to_offboard(now_ns) {
+            autopilot.send_zeros(now_ns);
+            self.last = Some(Setpoint { velocity_ned_m_s: [0.0; 3], yaw_rate_rad_s: 0.0 });
+            return true;
+        }
         if self.last.is_some() && self.needs_hold(now_ns, autopilot) {
             self.exit = Some(OffboardExit::begin(now_ns, autopilot));
         }

@@ -245,12 +245,29 @@ impl View<'_> {
         if let Some(left_low) = self.left_low() {
             return left_low;
         }
+        if let Some(hovers) = self.hovers_after_abort(now_ns) {
+            return format!("{why}; {hovers}");
+        }
         match self.pilots_mode {
             // It may as well be the autopilot's failsafe: when PX4 misses setpoints it holds.
             Some(mode) if self.lander.phase() == landing::Phase::PilotInCommand => {
                 format!("{why} (or the autopilot's failsafe), in {mode}")
             }
             _ => why,
+        }
+    }
+
+    /// How a PX4 hovers after an abort: by setpoints or in a mode of its own.
+    fn hovers_after_abort(&self, now_ns: i64) -> Option<&'static str> {
+        let is_aborted = self.lander.phase() == landing::Phase::Aborted;
+        let state = self.autopilot.state().filter(|state| is_aborted && state.armed)?;
+        match state.mode {
+            _ if self.autopilot.may_return_to_offboard(now_ns) => Some(
+                "in HOLD, and it returns to OFFBOARD with zero setpoints if that is its failsafe: not known yet",
+            ),
+            FlightMode::AUTO_HOLD => Some("in HOLD"),
+            FlightMode::OFFBOARD => Some("in OFFBOARD, by setpoints"),
+            _ => None,
         }
     }
 

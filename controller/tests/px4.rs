@@ -811,3 +811,35 @@ fn a_px4_that_is_just_being_led_out_of_offboard_is_led_out_when_the_controller_e
     receive(&mut flight, 7000 * MS, &heartbeat(HOLD, true));
     assert!(!flight.shutdown(7020 * MS));
 }
+
+#[test]
+fn an_abort_while_hold_is_undecided_hovers_by_zeros_until_it_is_known() {
+    let aborted = || {
+        let mut flight = px4_landing();
+        receive(&mut flight, 7000 * MS, &heartbeat(HOLD, true));
+        hover(&mut flight, 7020, 7100, HOLD);
+        let reply = flight.command(7100 * MS, &ControllerCommand::Abort);
+        assert!(reply.accepted && reply.reason.contains("not known yet"), "{reply:?}");
+        let sent = hover(&mut flight, 7120, 7980, HOLD);
+        assert!(sent.setpoints > 10 && sent.modes.is_empty(), "{sent:?}");
+        flight
+    };
+    // It has returned to OFFBOARD with the first setpoint after the interruption.
+    let mut flight = aborted();
+    let sent = hover(&mut flight, 8000, 11_900, OFFBOARD);
+    assert!(sent.setpoints > 60 && sent.modes.is_empty(), "{sent:?}");
+    let why = flight.status(11_900 * MS).why;
+    assert!(why.contains("in OFFBOARD, by setpoints"), "{why}");
+    let sent = hover(&mut flight, 12_000, 14_900, OFFBOARD);
+    assert!(sent.setpoints > 30 && sent.modes.contains(&4.0), "{sent:?}");
+    // HOLD stays: it was chosen.
+    let mut flight = aborted();
+    let sent = hover(&mut flight, 8000, 14_000, HOLD);
+    assert!(sent.setpoints < 40 && sent.modes.is_empty(), "{sent:?}");
+    let status = flight.status(14_000 * MS);
+    assert!(status.phase == Phase::Aborted && status.why.ends_with("in HOLD"), "{status:?}");
+    // The controller is ended: it continues until that is known.
+    let mut flight = aborted();
+    continues_to_end(&mut flight, 8000, 8400);
+    ends_in_hold(&mut flight, 8800);
+}

@@ -6,6 +6,7 @@
 mod modelled;
 mod packets;
 
+use autopilot::FlightMode;
 use messages::{ControllerCommand, Phase};
 use modelled::Site;
 use world::ardupilot::Mode;
@@ -107,4 +108,56 @@ fn a_px4_that_a_pilot_holds_after_its_takeoff_stays_there_and_resume_says_what_t
     let status = site.status();
     assert!(status.phase == Phase::Failed && status.why.contains("pilot"), "{status:?}");
     assert!(site.mode() == Mode::PosHold && !site.command(&ControllerCommand::Resume).accepted);
+}
+
+/// A PX4 that is landing by our setpoints, some metres over the pad.
+fn landing(set: &[&str]) -> Site {
+    let mut site = Site::new("takeoff", set);
+    let is_low = |site: &Site| {
+        let status = site.status();
+        matches!(status.phase, Phase::Approach | Phase::Descend)
+            && status.height_m.is_some_and(|height_m| height_m < 8.0)
+    };
+    assert!(site.run_until(90.0, is_low), "{:?}", site.status());
+    site
+}
+
+#[test]
+fn an_abort_just_after_an_interruption_ends_in_a_hold_that_is_chosen() {
+    for after_s in [0.03, 0.1, 0.5, 1.0] {
+        for waits in [false, true] {
+            let mut site = if waits { waiting_in_air(&[]) } else { landing(&[]) };
+            site.freeze(1.5);
+            assert_eq!((site.mode(), site.chosen()), (Mode::Loiter, FlightMode::OFFBOARD));
+            site.run(after_s);
+            let reply = site.command(&ControllerCommand::Abort);
+            assert!(reply.accepted, "{reply:?}");
+            site.run(12.0);
+            let status = site.status();
+            assert_eq!(site.mode(), Mode::Loiter, "{status:?}");
+            assert_eq!(site.chosen(), FlightMode::AUTO_HOLD, "after {after_s} s: {status:?}");
+            assert!(status.why.ends_with("in HOLD"), "{status:?}");
+        }
+    }
+}
+
+#[test]
+fn an_abort_just_after_an_interruption_in_which_the_pilot_took_over_changes_no_mode() {
+    for (main, sub) in [HOLD, POSITION] {
+        for waits in [false, true] {
+            let mut site = if waits { waiting_in_air(&[]) } else { landing(&[]) };
+            site.is_frozen = true;
+            site.run(2.0);
+            site.pilot(main, sub);
+            site.run(0.5);
+            site.is_frozen = false;
+            site.requested.clear();
+            let mode = site.mode();
+            site.run(0.03);
+            site.command(&ControllerCommand::Abort);
+            site.run(12.0);
+            assert_eq!(site.mode(), mode, "{:?}", site.status());
+            assert!(site.requested.is_empty(), "{:?}", site.requested);
+        }
+    }
 }

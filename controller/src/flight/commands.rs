@@ -184,7 +184,13 @@ impl Flight {
             if self.mission.leave_offboard(now_ns, &mut self.autopilot, why) {
                 return Ok(why.to_owned());
             }
-            let why = "aborted by the operator; the autopilot completes the take-off".to_owned();
+            let why = match self.autopilot.state().filter(|_| self.mission.waits_in_air()) {
+                Some(state) => format!(
+                    "aborted by the operator before the landing began; the vehicle stays in {}",
+                    state.mode
+                ),
+                None => "aborted by the operator; the autopilot completes the take-off".to_owned(),
+            };
             self.mission.fail(&mut self.autopilot, why.clone());
             return Ok(why);
         }
@@ -249,7 +255,7 @@ impl Flight {
             };
             return Err(format!("no effect in phase `{after}`: {why}{instead}"));
         }
-        let why = if self.lander.is_left_low() { self.view().phase(now_ns).1 } else { why };
+        let why = if after == Phase::Aborted { self.view().phase(now_ns).1 } else { why };
         Ok(format!("in phase `{after}`: {why}"))
     }
 

@@ -6,9 +6,9 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
+use autopilot::dialect::{COMMAND_LONG_DATA, CURRENT_MODE_DATA, MavCmd, MavMessage};
 use autopilot::packet::encode;
-use autopilot::{Packet, Parser, Sender};
+use autopilot::{FlightMode, Packet, Parser, Sender};
 use controller::flight::Flight;
 use geometry::{Body, Camera, CameraModel, Point, Rotation, Transform};
 use messages::{
@@ -86,6 +86,10 @@ pub(crate) struct Site {
     frames: VecDeque<(f64, Detections)>,
     /// Packets in the socket of a controller that does not run.
     unread: Vec<Packet>,
+    /// What the PX4 has reported of its mode last.
+    pub(crate) reported: Option<CURRENT_MODE_DATA>,
+    /// The modes that the controller has requested, by PX4's main mode.
+    pub(crate) requested: Vec<f32>,
     /// The controller does not run.
     pub(crate) is_frozen: bool,
     /// Nothing that the controller sends arrives.
@@ -111,6 +115,8 @@ impl Site {
             parsers: [Parser::new(), Parser::new()],
             frames: VecDeque::new(),
             unread: Vec::new(),
+            reported: None,
+            requested: Vec::new(),
             is_frozen: false,
             uplink_is_lost: false,
             charge: None,
@@ -133,6 +139,11 @@ impl Site {
 
     pub(crate) fn mode(&self) -> Mode {
         self.world.autopilot().mode()
+    }
+
+    /// The mode that the PX4's user, or the controller, chose last.
+    pub(crate) fn chosen(&self) -> FlightMode {
+        FlightMode::Px4(self.reported.as_ref().map_or(0, |mode| mode.intended_custom_mode))
     }
 
     /// The pilot's switch, by the two numbers of PX4's mode.
@@ -181,6 +192,9 @@ impl Site {
         let (now_s, now_ns) = (self.world.now_s(), self.now_ns());
         for bytes in self.world.outgoing().collect::<Vec<_>>() {
             for packet in self.parsers[0].push(&bytes) {
+                if let Some(MavMessage::CURRENT_MODE(mode)) = &packet.message {
+                    self.reported = Some(mode.clone());
+                }
                 self.unread.extend(self.changed(packet));
             }
         }
@@ -224,6 +238,11 @@ impl Site {
     fn send(&mut self) {
         while let Some(packet) = self.flight.poll_outgoing() {
             for packet in self.parsers[1].push(&packet) {
+                if let Some(MavMessage::COMMAND_LONG(command)) = &packet.message
+                    && command.command == MavCmd::MAV_CMD_DO_SET_MODE
+                {
+                    self.requested.push(command.param2);
+                }
                 if !self.uplink_is_lost {
                     self.world.handle(&packet);
                 }

@@ -3,7 +3,8 @@
 //! PX4 takes silence in OFFBOARD for a failure of its companion, and without a remote control it then descends and drifts with
 //! the wind (`COM_OBL_RC_ACT`). Setpoints of zero velocity, which a mode that was chosen ignores, therefore continue until it shows HOLD.
 //! HOLD is requested only just after a message that shows OFFBOARD, because a later request could undo a pilot's switch; and a
-//! request for OFFBOARD that was sent before may still be carried out. The same holds for LAND, where it was requested and is called back.
+//! request for OFFBOARD that was sent before may still be carried out. A HOLD that may be the failsafe for missing setpoints ends with them, so
+//! it counts only once it was certainly chosen, or stays. The same holds for LAND, where it was requested and is called back.
 
 use crate::client::Autopilot;
 use crate::command::{Command, CommandId, CommandStatus};
@@ -56,7 +57,9 @@ impl OffboardExit {
         if !is_armed || now_ns.saturating_sub(self.since_ns) > MAX_EXIT_NS {
             return false;
         }
-        if self.is_in_mode_to_leave(autopilot) {
+        // A HOLD that was requested here is chosen.
+        let may_return = self.request.is_none() && autopilot.may_return_to_offboard(now_ns);
+        if self.is_in_mode_to_leave(autopilot) || may_return {
             return true;
         }
         // A mode that was shown earlier does not show the effect of a request.
