@@ -164,6 +164,16 @@ impl LandingTargetMode {
                 self.state = State::Landing;
                 return true;
             }
+            // It returns to OFFBOARD with zeros. As a pilot may hold it, nothing is requested before.
+            State::Stabilising(_) | State::Commanding(_)
+                if !self.is_waiting_in(state.mode)
+                    && state.armed
+                    && autopilot.may_return_to_offboard(now_ns) =>
+            {
+                hover_in_offboard(now_ns, autopilot);
+                autopilot.withdraw();
+                self.state = State::Stabilising(now_ns);
+            }
             State::Stabilising(_) | State::Commanding(_)
                 if !self.is_waiting_in(state.mode) || !state.armed =>
             {

@@ -202,7 +202,21 @@ impl Mission {
     pub fn resume(&mut self) -> bool {
         let is_held = self.held_because().is_some();
         self.held_because = None;
+        self.found_ns = None;
         is_held
+    }
+
+    /// Ends a landing that waits for a command before it began, for this reason: a PX4 is taken back to HOLD. False where none waits.
+    pub fn cancel(&mut self, now_ns: i64, autopilot: &mut Autopilot, why: &str) -> bool {
+        let waits = self.held_because().is_some() && !self.is_taking_off();
+        if waits && !self.leave_offboard(now_ns, autopilot, why) && !self.is_over() {
+            self.fail(autopilot, why.to_owned());
+        }
+        waits
+    }
+
+    fn is_over(&self) -> bool {
+        matches!(self.state, State::Failed { .. })
     }
 
     /// Asks a PX4 that holds its place to follow setpoints. The landing begins once it does.
@@ -306,6 +320,10 @@ impl Mission {
                 self.begin_exit(now_ns, autopilot, why);
             }
             State::TakingOff { .. } if may_be_in_it => {
+                self.begin_exit(now_ns, autopilot, why.to_owned());
+            }
+            // Kept there by our zeros.
+            State::AwaitingTakeoff if may_be_in_it && self.start == Start::Resume => {
                 self.begin_exit(now_ns, autopilot, why.to_owned());
             }
             _ => {}
@@ -502,17 +520,17 @@ impl Mission {
     }
 
     /// Ends the wait for a landing to resume where there is none. A PX4 gets zeros for a while: it has stopped in HOLD as the earlier
-    /// controller ended, returns to OFFBOARD with them, and stays in it until the landing begins.
+    /// controller ended, returns to OFFBOARD with them, and stays in it until the landing begins. While that waits for a command the zeros
+    /// continue: the failsafe for missing setpoints could not be distinguished from a pilot's choice later.
     fn await_landing(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
         if autopilot.state().is_none() {
             return;
         }
         let found_ns = *self.found_ns.get_or_insert(now_ns);
         let may_return = autopilot.may_return_to_offboard(now_ns);
-        if now_ns.saturating_sub(found_ns) <= MAX_RESUMING_NS
-            && (may_return || autopilot.is_in_offboard())
-        {
-            autopilot.send_zeros(now_ns);
+        let is_in_time = now_ns.saturating_sub(found_ns) <= MAX_RESUMING_NS;
+        if is_in_time || self.held_because.is_some() {
+            hover_in_offboard(now_ns, autopilot);
         }
         if has_no_landing(autopilot) && !may_return {
             self.state = State::Idle;

@@ -161,3 +161,71 @@ fn an_abort_just_after_an_interruption_in_which_the_pilot_took_over_changes_no_m
         }
     }
 }
+
+/// A controller that is to resume the landing of a PX4 that an earlier one was landing, and did not run for 20 s before it could begin.
+fn held_resume() -> Site {
+    let mut site = landing(&[]);
+    site.restart_controller("resume");
+    let is_found = |site: &Site| site.flight.system().is_some();
+    assert!(site.run_until(5.0, is_found));
+    site.freeze(20.0);
+    site.run(0.5);
+    site
+}
+
+#[test]
+fn a_landing_of_a_px4_that_is_to_be_resumed_waits_for_the_command_for_any_time() {
+    for command in [ControllerCommand::Resume, ControllerCommand::Abort] {
+        for waited_s in [1.0, 8.0, 40.0] {
+            let mut site = held_resume();
+            site.run(waited_s);
+            let status = site.status();
+            assert!(status.why.contains("`resume` begins"), "after {waited_s} s: {status:?}");
+            assert_eq!(site.mode(), Mode::Guided, "{status:?}");
+            let reply = site.command(&command);
+            assert!(reply.accepted, "{reply:?}");
+            if command == ControllerCommand::Resume {
+                let lands = site.run_until(90.0, |site| site.status().phase == Phase::Landed);
+                assert!(lands, "after {waited_s} s: {:?}", site.status());
+            } else {
+                site.run(5.0);
+                let status = site.status();
+                assert_eq!(site.chosen(), FlightMode::AUTO_HOLD, "{status:?}");
+                assert!(status.phase == Phase::Failed && status.started_ns.is_none(), "{status:?}");
+                assert!(!site.command(&ControllerCommand::Resume).accepted);
+            }
+        }
+    }
+    // A pilot's HOLD ends the wait.
+    let mut site = held_resume();
+    site.pilot(HOLD.0, HOLD.1);
+    site.run(5.0);
+    assert!(!site.command(&ControllerCommand::Resume).accepted);
+    assert_eq!(site.mode(), Mode::Loiter);
+}
+
+#[test]
+fn a_precision_landing_of_a_px4_continues_after_an_interruption() {
+    let waiting = |site: &Site| site.status().phase == Phase::Approach;
+    for frozen_s in [1.2, 3.0, 8.0] {
+        let mut site = Site::new("takeoff", &["mode=landing-target", "landing_target.steady_s=30"]);
+        assert!(site.run_until(60.0, waiting), "{:?}", site.status());
+        site.run(0.5);
+        site.freeze(frozen_s);
+        assert_eq!(site.mode(), Mode::Loiter, "its failsafe");
+        let lands = site.run_until(90.0, |site| site.status().phase == Phase::Landed);
+        assert!(lands, "after {frozen_s} s: {:?}", site.status());
+        // A pilot who holds it meanwhile keeps it.
+        let mut site = Site::new("takeoff", &["mode=landing-target", "landing_target.steady_s=30"]);
+        assert!(site.run_until(60.0, waiting), "{:?}", site.status());
+        site.is_frozen = true;
+        site.run(frozen_s);
+        site.pilot(HOLD.0, HOLD.1);
+        site.run(0.5);
+        site.is_frozen = false;
+        site.requested.clear();
+        site.run(10.0);
+        assert_eq!(site.mode(), Mode::Loiter, "{:?}", site.status());
+        assert!(site.requested.is_empty(), "{:?}", site.requested);
+    }
+}

@@ -220,6 +220,13 @@ impl Flight {
             }
             return Ok(why.to_owned());
         }
+        if command == OperatorCommand::Abort {
+            let why =
+                "aborted by the operator: the landing that waited for a command does not begin";
+            if self.mission.cancel(now_ns, &mut self.autopilot, why) {
+                return Ok(why.to_owned());
+            }
+        }
         if !self.is_landing() {
             let (phase, _) = self.view().phase(now_ns);
             let start = match command {

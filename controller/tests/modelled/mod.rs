@@ -77,6 +77,16 @@ pub(crate) fn detections(world: &World, time_s: f64, sequence: u64) -> Detection
     Detections { detector: "main".to_owned(), header, detections, stages: Vec::new() }
 }
 
+/// A flight that begins now.
+fn started(now_ns: i64, start: &str, set: &[&str]) -> Flight {
+    let mut flight = Flight::new(packets::config(start, set), Arc::default()).unwrap();
+    let model = CameraModel::pinhole(IMAGE.0, IMAGE.1, FOCAL_PX);
+    let camera = CameraInfo::sample().camera;
+    flight.presence(now_ns, "main", true);
+    flight.camera(now_ns, CameraInfo::new(&camera, &model, &body_from_camera()));
+    flight
+}
+
 /// A flight with a modelled PX4, in lock-step.
 pub(crate) struct Site {
     pub(crate) world: World,
@@ -103,14 +113,9 @@ impl Site {
     pub(crate) fn new(start: &str, set: &[&str]) -> Self {
         let mut config = WorldConfig::default();
         config.autopilot.firmware = Firmware::Px4;
-        let mut flight = Flight::new(packets::config(start, set), Arc::default()).unwrap();
-        let model = CameraModel::pinhole(IMAGE.0, IMAGE.1, FOCAL_PX);
-        let camera = CameraInfo::sample().camera;
-        flight.presence(START_NS, "main", true);
-        flight.camera(0, CameraInfo::new(&camera, &model, &body_from_camera()));
         Self {
             world: World::new(&config, 1),
-            flight,
+            flight: started(START_NS, start, set),
             steps: 0,
             parsers: [Parser::new(), Parser::new()],
             frames: VecDeque::new(),
@@ -121,6 +126,12 @@ impl Site {
             uplink_is_lost: false,
             charge: None,
         }
+    }
+
+    /// The controller ends, without a word, and another one begins.
+    pub(crate) fn restart_controller(&mut self, start: &str) {
+        self.flight = started(self.now_ns(), start, &[]);
+        self.unread.clear();
     }
 
     pub(crate) fn now_ns(&self) -> i64 {

@@ -41,7 +41,9 @@ impl OffboardReturn {
     /// The vehicle is found in this mode by a controller that has sent it stops, as it takes over the landing of an earlier one.
     pub(crate) fn taken_over(&mut self, now_ns: i64, mode: FlightMode) {
         match mode {
-            FlightMode::OFFBOARD => self.resumed_ns = Some(now_ns),
+            FlightMode::OFFBOARD => {
+                (self.followed_ns, self.resumed_ns) = (Some(now_ns), Some(now_ns));
+            }
             FlightMode::AUTO_HOLD => self.holds_since_ns = Some(now_ns),
             _ => {}
         }
