@@ -199,7 +199,8 @@ impl Flight {
         if stood_s <= MAX_STANDSTILL_S {
             return;
         }
-        self.mission.stand_still(now_ns, &mut self.autopilot, stood_s);
+        let is_active = self.is_landing();
+        self.mission.stand_still(now_ns, &mut self.autopilot, stood_s, is_active);
         if let Some(landing_target) = &mut self.landing_target {
             landing_target.stand_still(stood_s, &mut self.autopilot);
         }

@@ -170,39 +170,59 @@ impl Mission {
         is_put_off
     }
 
-    /// This process has not run for so long that nothing begins without a command. A take-off without motors ends, as persons may be near
-    /// the vehicle by now, and so does a change to OFFBOARD; a landing that was to follow a take-off, or to be resumed, waits.
-    pub fn stand_still(&mut self, now_ns: i64, autopilot: &mut Autopilot, seconds: f64) {
+    /// This process has not run for so long that nothing begins without a command. A take-off on the ground ends, as persons may be near
+    /// the vehicle by now, and so does a change to OFFBOARD; a landing that was to begin automatically waits. One that `is_active` is held
+    /// by the lander.
+    pub fn stand_still(
+        &mut self,
+        now_ns: i64,
+        autopilot: &mut Autopilot,
+        seconds: f64,
+        is_active: bool,
+    ) {
         let stood_still = format!("the controller did not run for {seconds:.0} s");
         let is_armed = autopilot.state().is_some_and(|state| state.armed);
+        let stands = autopilot.state().is_some_and(|it| it.landed == LandedState::OnGround);
         match self.state {
             State::TakingOff { .. } if !is_armed => {
                 self.fail(autopilot, format!("no take-off: {stood_still}"));
             }
-            State::AwaitingTakeoff if self.start != Start::Resume => return,
-            State::TakingOff { .. } | State::AwaitingTakeoff => {
-                self.held_because =
-                    Some(format!("{stood_still}: `resume` begins the landing that was to follow"));
+            State::TakingOff { .. } if stands => {
+                let why = format!("no take-off: {stood_still}, and the motors ran; disarm it");
+                self.fail(autopilot, why);
             }
+            State::TakingOff { .. } | State::AwaitingTakeoff => self.hold(&stood_still),
             State::TakingControl { .. } => {
                 self.leave_offboard(now_ns, autopilot, &stood_still);
+            }
+            // The next flight is landed automatically.
+            State::Landing | State::SendingLandingTarget
+                if !is_active && self.start == Start::Airborne =>
+            {
+                self.hold(&stood_still);
             }
             _ => return,
         }
         tracing::warn!("Nothing begins without a command: {stood_still}");
     }
 
+    fn hold(&mut self, stood_still: &str) {
+        self.held_because =
+            Some(format!("{stood_still}: `resume` begins the landing that was to follow"));
+    }
+
     /// Why the landing that was to begin automatically waits for a command; `None` if it does not.
     pub fn held_because(&self) -> Option<&str> {
-        let is_ahead = matches!(self.state, State::TakingOff { .. } | State::AwaitingTakeoff);
+        let is_ahead = self.is_taking_off() || self.is_awaiting_takeoff();
         self.held_because.as_deref().filter(|_| is_ahead)
     }
 
     /// The command for which such a landing waits; false where none does.
     pub fn resume(&mut self) -> bool {
         let is_held = self.held_because().is_some();
-        self.held_because = None;
-        self.found_ns = None;
+        if is_held {
+            (self.held_because, self.found_ns) = (None, None);
+        }
         is_held
     }
 

@@ -1739,6 +1739,7 @@ fn only_a_resumed_landing_begins_automatically() {
         receive(&mut flight, 1001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
         pose(&mut flight, 1010 * MS);
         flight.tick(1011 * MS);
+        (1020..armed_ms).step_by(20).for_each(|ms| flight.tick(ms * MS));
         receive(&mut flight, armed_ms * MS, &heartbeat(4, true));
         let now_ns = (armed_ms + 1) * MS;
         receive(&mut flight, now_ns, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
@@ -1842,7 +1843,7 @@ fn after_a_standstill_of_more_than_15_s_a_takeoff_starts_no_motors() {
 #[test]
 fn after_a_standstill_of_more_than_15_s_a_landing_that_was_to_begin_waits_for_a_command() {
     let commands = [ControllerCommand::Resume, ControllerCommand::Start];
-    for (start, command) in ["takeoff", "resume"]
+    for (start, command) in ["takeoff", "resume", "airborne"]
         .into_iter()
         .flat_map(|start| commands.iter().map(move |command| (start, command)))
     {
@@ -1873,6 +1874,58 @@ fn after_a_standstill_of_more_than_15_s_a_landing_that_was_to_begin_waits_for_a_
             assert!(reply.accepted, "{start}: {reply:?}");
             let sent = hover(&mut flight, end_ms + 4020, end_ms + 6000, 4);
             assert!(sent.setpoints > 10, "{start}: {:?}", flight.status((end_ms + 6000) * MS));
+        }
+    }
+}
+
+#[test]
+fn after_a_standstill_of_more_than_15_s_a_takeoff_whose_motors_run_on_the_ground_ends() {
+    let mut flight = flight_with("takeoff", &["autopilot.system_id=1"]);
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    for ms in (0..1000).step_by(20) {
+        stand(&mut flight, ms, 4, true);
+    }
+    assert!(sent(&mut flight).1.contains(&MavCmd::MAV_CMD_COMPONENT_ARM_DISARM));
+    receive(&mut flight, 1000 * MS, &heartbeat(4, true));
+    flight.tick(1020 * MS);
+    sent(&mut flight);
+    let mut commands = Vec::new();
+    for ms in (21_000..40_000).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(&mut flight, ms * MS, &heartbeat(4, true));
+        }
+        pose_at(&mut flight, ms * MS, 0.0);
+        flight.tick(ms * MS + 3);
+        commands.extend(sent(&mut flight).1);
+    }
+    let status = flight.status(40_000 * MS);
+    assert!(status.phase == Phase::Failed && status.why.contains("disarm it"), "{status:?}");
+    assert!(!commands.contains(&MavCmd::MAV_CMD_NAV_TAKEOFF), "{commands:?}");
+}
+
+#[test]
+fn after_a_standstill_between_two_flights_the_second_one_is_landed_by_command() {
+    for (stood_ms, begins) in [(14_000, true), (20_000, false)] {
+        let mut flight = in_flight("airborne");
+        hover(&mut flight, 20, 1000, 4);
+        receive(&mut flight, 1000 * MS, &heartbeat(4, false));
+        receive(&mut flight, 1001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+        pose(&mut flight, 1020 * MS);
+        flight.tick(1021 * MS);
+        assert_eq!(flight.status(1021 * MS).phase, Phase::Landed);
+        let ms = 1000 + stood_ms;
+        receive(&mut flight, ms * MS, &heartbeat(4, true));
+        receive(&mut flight, ms * MS + 1, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        let sent = hover(&mut flight, ms + 20, ms + 2000, 4);
+        let status = flight.status((ms + 2000) * MS);
+        assert_eq!(sent.setpoints > 20, begins, "{status:?}");
+        if !begins {
+            assert!(status.why.contains("`resume` begins"), "{status:?}");
+            assert!(flight.command((ms + 2000) * MS, &ControllerCommand::Resume).accepted);
+            let sent = hover(&mut flight, ms + 2020, ms + 4000, 4);
+            let status = flight.status((ms + 4000) * MS);
+            assert!(sent.setpoints > 20, "{sent:?} {status:?}");
         }
     }
 }
@@ -2005,6 +2058,7 @@ fn a_start_that_is_refused_takes_nothing_back() {
     let reply = flight.command(1100 * MS, &ControllerCommand::Start);
     assert!(!reply.accepted, "{reply:?}");
     assert_eq!(flight.status(1100 * MS).phase, Phase::Landed);
+    (1120..20_000).step_by(20).for_each(|ms| flight.tick(ms * MS));
     receive(&mut flight, 20_000 * MS, &heartbeat(4, true));
     receive(&mut flight, 20_001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
     hover(&mut flight, 20_020, 20_500, 4);
@@ -2095,6 +2149,7 @@ fn an_autopilot_that_is_restarted_after_a_landing_is_no_failure() {
     assert_eq!(poses(&mut flight, 520, 8000, 0), Phase::Landed);
     receive(&mut flight, 13_000 * MS, &heartbeat(4, false));
     assert_eq!(poses(&mut flight, 13_020, 14_000, 10_000), Phase::Landed);
+    (14_000..30_000).step_by(20).for_each(|ms| flight.tick(ms * MS));
     receive(&mut flight, 30_000 * MS, &heartbeat(4, true));
     receive(&mut flight, 30_001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
     assert_eq!(poses(&mut flight, 30_020, 31_000, 10_000), Phase::Search);
