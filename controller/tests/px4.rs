@@ -8,7 +8,7 @@ mod packets;
 use autopilot::FlightMode;
 use autopilot::dialect::{
     CURRENT_MODE_DATA, ESTIMATOR_STATUS_DATA, EstimatorStatusFlags, GLOBAL_POSITION_INT_DATA,
-    MavCmd, MavLandedState, MavMessage,
+    HEARTBEAT_DATA, MavCmd, MavLandedState, MavMessage, MavState,
 };
 use controller::flight::Flight;
 use messages::{CameraInfo, ControllerCommand, Phase};
@@ -482,6 +482,22 @@ fn current_mode(custom_mode: u32) -> MavMessage {
     MavMessage::CURRENT_MODE(CURRENT_MODE_DATA { custom_mode, ..Default::default() })
 }
 
+/// The same with the mode that its user chose last.
+fn chosen_mode(custom_mode: u32, intended_custom_mode: u32) -> MavMessage {
+    let mode = CURRENT_MODE_DATA { custom_mode, intended_custom_mode, ..Default::default() };
+    MavMessage::CURRENT_MODE(mode)
+}
+
+/// The heartbeat of a PX4 that flies in HOLD, with an active failsafe or without.
+fn heartbeat_in_hold(system_status: MavState) -> MavMessage {
+    match heartbeat(HOLD, true) {
+        MavMessage::HEARTBEAT(heartbeat) => {
+            MavMessage::HEARTBEAT(HEARTBEAT_DATA { system_status, ..heartbeat })
+        }
+        other => other,
+    }
+}
+
 /// A PX4 that has been landing in its own mode for 2 s, as requested.
 fn px4_in_land(to_ms: i64) -> Flight {
     let mut flight = flight("airborne");
@@ -842,4 +858,70 @@ fn an_abort_while_hold_is_undecided_hovers_by_zeros_until_it_is_known() {
     let mut flight = aborted();
     continues_to_end(&mut flight, 8000, 8400);
     ends_in_hold(&mut flight, 8800);
+}
+
+#[test]
+fn a_pilot_who_chooses_hold_in_a_failsafe_keeps_it_in_whatever_order_packets_are_read() {
+    let packets = [
+        heartbeat_in_hold(MavState::MAV_STATE_CRITICAL),
+        chosen_mode(HOLD, OFFBOARD),
+        heartbeat_in_hold(MavState::MAV_STATE_ACTIVE),
+        chosen_mode(HOLD, HOLD),
+    ];
+    for is_interrupted in [false, true] {
+        for order in 0..24 {
+            let mut flight = px4_landing();
+            receive(&mut flight, 1990 * MS, &chosen_mode(OFFBOARD, OFFBOARD));
+            let from_ms = if is_interrupted { 4000 } else { 2000 };
+            let mut left: Vec<&MavMessage> = packets.iter().collect();
+            let mut rest = order;
+            for count in (1..=packets.len()).rev() {
+                let packet = left.remove(rest % count);
+                rest /= count;
+                receive(&mut flight, from_ms * MS, packet);
+            }
+            Sent::default().take(&mut flight);
+            let mut sent = Sent::default();
+            for ms in (from_ms + 20..from_ms + 6000).step_by(20) {
+                if ms % 500 == 0 {
+                    receive(&mut flight, ms * MS, &chosen_mode(HOLD, HOLD));
+                    receive(&mut flight, ms * MS, &heartbeat_in_hold(MavState::MAV_STATE_ACTIVE));
+                }
+                pose(&mut flight, ms * MS);
+                flight.tick(ms * MS + 3);
+                sent.take(&mut flight);
+            }
+            let status = flight.status((from_ms + 6000) * MS);
+            assert_eq!(status.phase, Phase::PilotInCommand, "{order}: {status:?}");
+            // For half a second at most, which HOLD ignores.
+            assert!(sent.setpoints <= 12 && sent.modes.is_empty(), "{order}: {sent:?}");
+        }
+    }
+}
+
+#[test]
+fn a_hold_for_another_failsafe_than_missing_setpoints_ends_the_landing_after_15_s() {
+    let mut flight = px4_landing();
+    let mut sent = Sent::default();
+    for ms in (2000..22_000).step_by(20) {
+        if ms % 500 == 0 {
+            receive(&mut flight, ms * MS, &chosen_mode(HOLD, OFFBOARD));
+            receive(&mut flight, ms * MS, &heartbeat_in_hold(MavState::MAV_STATE_CRITICAL));
+        }
+        pose(&mut flight, ms * MS);
+        flight.tick(ms * MS + 3);
+        let phase = flight.status(ms * MS).phase;
+        let expected = if ms < 16_980 { Phase::Hold } else { Phase::PilotInCommand };
+        assert!(
+            ms < 2040 || (16_980..17_100).contains(&ms) || phase == expected,
+            "{ms}: {phase:?}"
+        );
+        if ms == 17_200 {
+            sent.take(&mut flight);
+            assert!(sent.modes.is_empty(), "{sent:?}");
+            sent = Sent::default();
+        }
+    }
+    sent.take(&mut flight);
+    assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
 }

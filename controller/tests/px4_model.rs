@@ -229,3 +229,50 @@ fn a_precision_landing_of_a_px4_continues_after_an_interruption() {
         assert!(site.requested.is_empty(), "{:?}", site.requested);
     }
 }
+
+#[test]
+fn a_landing_continues_after_packets_to_the_px4_alone_were_lost() {
+    for lost_s in [1.5, 4.0, 12.0] {
+        let mut site = landing(&[]);
+        site.uplink_is_lost = true;
+        site.run(lost_s);
+        let status = site.status();
+        assert_eq!((site.mode(), status.phase), (Mode::Loiter, Phase::Hold), "{status:?}");
+        site.uplink_is_lost = false;
+        let lands = site.run_until(90.0, |site| site.status().phase == Phase::Landed);
+        assert!(lands, "after {lost_s} s: {:?}", site.status());
+    }
+    // After more than 15 s nothing continues without a command.
+    let mut site = landing(&[]);
+    site.uplink_is_lost = true;
+    site.run(20.0);
+    site.uplink_is_lost = false;
+    site.run(20.0);
+    let status = site.status();
+    assert_eq!((site.mode(), status.phase), (Mode::Loiter, Phase::PilotInCommand), "{status:?}");
+    assert!(site.command(&ControllerCommand::Start).accepted);
+    assert!(site.run_until(90.0, |site| site.status().phase == Phase::Landed));
+}
+
+#[test]
+fn a_pilots_hold_is_recognised_at_once_just_after_an_interruption_as_well() {
+    for (main, sub) in [HOLD, POSITION] {
+        for is_frozen in [true, false] {
+            let mut site = landing(&[]);
+            (site.is_frozen, site.uplink_is_lost) = (is_frozen, !is_frozen);
+            site.run(3.0);
+            assert_eq!((site.mode(), site.chosen()), (Mode::Loiter, FlightMode::OFFBOARD));
+            site.pilot(main, sub);
+            site.run(0.1);
+            let mode = site.mode();
+            (site.is_frozen, site.uplink_is_lost) = (false, false);
+            site.requested.clear();
+            site.run(0.1);
+            let status = site.status();
+            assert_eq!(status.phase, Phase::PilotInCommand, "{status:?}");
+            site.run(10.0);
+            assert_eq!(site.mode(), mode, "{:?}", site.status());
+            assert!(site.requested.is_empty() && site.status().setpoint.is_none());
+        }
+    }
+}

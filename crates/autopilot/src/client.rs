@@ -181,7 +181,7 @@ impl Autopilot {
                 self.parameters.take(self.firmware().unwrap_or(Firmware::Unknown), value);
             }
             MavMessage::CURRENT_MODE(message) if self.firmware() == Some(Firmware::Px4) => {
-                self.take_current_mode(now_ns, message.custom_mode);
+                self.take_current_mode(now_ns, message);
             }
             _ => self.take_state(now_ns, message),
         }
@@ -415,8 +415,9 @@ impl Autopilot {
         self.requests.iter().any(|request| request.command.is_offboard())
     }
 
-    /// True while a PX4 shows HOLD, and that may be its failsafe, as our setpoints were interrupted just before: it returns to OFFBOARD as they
-    /// are sent again. For 2.5 s at most; if HOLD still shows then, it was chosen.
+    /// True while a PX4 shows HOLD, and that may be its failsafe: it returns to OFFBOARD as setpoints are sent again. So it is while the
+    /// vehicle reports that OFFBOARD is the mode that was chosen, for 15 s at most; and where it does not report that and our setpoints were
+    /// interrupted just before, for 2.5 s at most. If HOLD still shows then, it was chosen.
     pub fn may_return_to_offboard(&self, now_ns: i64) -> bool {
         self.offboard_return.is_expected(now_ns)
     }

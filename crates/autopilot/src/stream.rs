@@ -13,7 +13,7 @@ const ESTIMATOR_STATUS: u32 = 230;
 const GLOBAL_POSITION_INT: u32 = 33;
 /// PX4's heartbeat, once a second, may show a change of mode a second late. This one is sent with each change, and twice a second,
 /// however high a rate is requested (1.17 in its own simulation: 20 ms after the change, at most 48 ms, at 200 Hz); versions before 1.15
-/// do not have it. ArduPilot sends a heartbeat with each change.
+/// do not have it. It also states the mode that was chosen, which a failsafe does not change. ArduPilot sends a heartbeat with each change.
 const CURRENT_MODE: u32 = 436;
 
 const SECOND_NS: i64 = 1_000_000_000;

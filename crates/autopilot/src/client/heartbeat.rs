@@ -5,7 +5,7 @@ use super::{Autopilot, Vehicle};
 use crate::boot::BootClock;
 use crate::command::MODE_OF_NOW_NS;
 use crate::contact::Contact;
-use crate::dialect::{HEARTBEAT_DATA, MavModeFlag};
+use crate::dialect::{CURRENT_MODE_DATA, HEARTBEAT_DATA, MavModeFlag, MavState};
 use crate::event::Event;
 use crate::mode::{Firmware, FlightMode};
 use crate::px4_listener::Listener;
@@ -16,6 +16,9 @@ use crate::text::Joiner;
 
 /// Time for which a heartbeat may come behind CURRENT_MODE, in nanoseconds, in addition to the link's delay up to as long.
 const OVERTAKEN_NS: i64 = 300_000_000;
+
+/// CURRENT_MODE's number of a chosen mode that the autopilot does not state.
+const NOT_SUPPLIED: u32 = 0;
 
 impl Autopilot {
     pub(super) fn take_heartbeat(&mut self, now_ns: i64, system: u8, heartbeat: &HEARTBEAT_DATA) {
@@ -97,7 +100,8 @@ impl Autopilot {
             self.push(Event::Returned);
         }
         if !self.is_overtaken(now_ns, heartbeat.custom_mode) {
-            self.take_mode(now_ns, heartbeat.custom_mode);
+            let is_failsafe = heartbeat.system_status == MavState::MAV_STATE_CRITICAL;
+            self.take_mode(now_ns, heartbeat.custom_mode, is_failsafe);
         }
         if armed_changed {
             self.push(Event::ArmedChanged(armed));
@@ -108,16 +112,27 @@ impl Autopilot {
     /// Takes the mode that PX4 sends in addition to the heartbeat. When the motors stop after a landing PX4 goes back to OFFBOARD, which the
     /// heartbeat shows together with the motors, so on the ground, and for that change, the heartbeat alone counts. Without a
     /// heartbeat the message does not count.
-    pub(super) fn take_current_mode(&mut self, now_ns: i64, number: u32) {
+    ///
+    /// The mode that was chosen, in the same message, shows whether another one is a failsafe of OFFBOARD or a pilot's choice.
+    pub(super) fn take_current_mode(&mut self, now_ns: i64, message: &CURRENT_MODE_DATA) {
+        let number = message.custom_mode;
         let Some(state) = self.state().filter(|state| state.connected) else { return };
         let to = FlightMode::of(Firmware::Px4, number);
         let may_be_the_end =
             state.mode.is_landing() && to.is_guided() && !self.is_requesting_offboard();
-        let before = state.mode;
-        if state.landed.is_flying() && !may_be_the_end && self.take_mode(now_ns, number) {
-            if let Some(vehicle) = &mut self.vehicle {
-                vehicle.mode_before = Some((before, now_ns));
-            }
+        if !state.landed.is_flying() || may_be_the_end {
+            return;
+        }
+        let (before, was_expected) = (state.mode, self.offboard_return.is_expected(now_ns));
+        if message.intended_custom_mode != NOT_SUPPLIED {
+            let chosen = FlightMode::of(Firmware::Px4, message.intended_custom_mode);
+            self.offboard_return.reported(now_ns, to, chosen);
+        }
+        let is_changed = self.take_mode(now_ns, number, false);
+        if is_changed && let Some(vehicle) = &mut self.vehicle {
+            vehicle.mode_before = Some((before, now_ns));
+        }
+        if is_changed || was_expected != self.offboard_return.is_expected(now_ns) {
             self.report_status();
         }
     }
@@ -134,8 +149,8 @@ impl Autopilot {
         })
     }
 
-    /// Takes a mode that was just shown; true when it is another one than before.
-    fn take_mode(&mut self, now_ns: i64, number: u32) -> bool {
+    /// Takes a mode that was just shown, perhaps with an active failsafe; true when it is another one than before.
+    fn take_mode(&mut self, now_ns: i64, number: u32, is_failsafe: bool) -> bool {
         let Some(vehicle) = &mut self.vehicle else { return false };
         vehicle.mode_ns = now_ns;
         let [attitude_ns, position_ns] = [
@@ -149,7 +164,7 @@ impl Autopilot {
             vehicle.mode_since_ns = now_ns;
         }
         if from != to {
-            self.offboard_return.mode_changed(now_ns, from, to);
+            self.offboard_return.mode_changed(now_ns, from, to, is_failsafe);
             self.push(Event::ModeChanged { from: Some(from), to });
         }
         from != to
