@@ -1914,6 +1914,7 @@ fn after_a_standstill_between_two_flights_the_second_one_is_landed_by_command() 
         pose(&mut flight, 1020 * MS);
         flight.tick(1021 * MS);
         assert_eq!(flight.status(1021 * MS).phase, Phase::Landed);
+        flight.camera(1021 * MS, CameraInfo::sample());
         let ms = 1000 + stood_ms;
         receive(&mut flight, ms * MS, &heartbeat(4, true));
         receive(&mut flight, ms * MS + 1, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
