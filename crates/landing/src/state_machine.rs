@@ -175,6 +175,8 @@ pub struct StateMachine {
     stopped_in_air: bool,
     /// The alarm or command that the vehicle lands for, until the next phase after that landing.
     cause: Option<Reason>,
+    /// The reason for the phase, where the present one is why a start was refused: it is stated again after that.
+    before_refusal: Option<Reason>,
 }
 
 /// The event that ends a hold without a command.
@@ -234,6 +236,7 @@ impl StateMachine {
             disarmed: None,
             stopped_in_air: false,
             cause: None,
+            before_refusal: None,
         }
     }
 
@@ -284,13 +287,20 @@ impl StateMachine {
 
     /// Takes at most one transition; true when a landing has just started.
     pub fn advance(&mut self, inputs: &Inputs) -> bool {
-        if inputs.operator == Some(OperatorCommand::Start) && self.phase.is_terminal() {
-            return self.start(inputs);
-        }
-        if inputs.operator == Some(OperatorCommand::LandHere) && self.phase.is_terminal() {
-            return self.land_here(inputs);
+        if let Some(reason) = self.before_refusal.take() {
+            self.reason = reason;
         }
         if self.phase.is_terminal() {
+            let before = self.reason;
+            let begun = match inputs.operator {
+                Some(OperatorCommand::Start) => Some(self.start(inputs)),
+                Some(OperatorCommand::LandHere) => Some(self.land_here(inputs)),
+                _ => None,
+            };
+            if let Some(begun) = begun {
+                self.before_refusal = (!begun).then_some(before);
+                return begun;
+            }
             self.release_on_takeover(inputs);
             return false;
         }

@@ -87,6 +87,26 @@ fn a_start_is_refused_with_the_reason() {
 }
 
 #[test]
+fn a_refused_start_does_not_replace_the_reason_for_the_phase() {
+    let low = |v: &mut VehicleInputs| (v.mode, v.height_m) = (Mode::Land, 0.4);
+    let starting = Inputs { operator: start().operator, ..flown(0.0, low) };
+    let stands = |v: &mut VehicleInputs| {
+        (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround);
+    };
+    let landed = [starting, flown(3.0, stands)];
+    for command in [OperatorCommand::Start, OperatorCommand::LandHere] {
+        let refused = Inputs { operator: Some(command), ..flown(4.0, stands) };
+        let refused = [&landed[..], &[refused]].concat();
+        check(&refused, Phase::Landed, Reason::NotArmed);
+        let after = [&refused[..], &[flown(4.1, stands)]].concat();
+        check(&after, Phase::Landed, Reason::TouchedDown);
+        // Refused twice.
+        let again = [&refused[..], &refused[2..], &[flown(4.1, stands)]].concat();
+        check(&again, Phase::Landed, Reason::TouchedDown);
+    }
+}
+
+#[test]
 fn a_start_low_in_land_mode_monitors_the_touchdown() {
     let low = |v: &mut VehicleInputs| (v.mode, v.height_m) = (Mode::Land, 0.4);
     let starting = Inputs { operator: start().operator, ..flown(0.0, low) };
