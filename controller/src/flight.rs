@@ -519,6 +519,11 @@ impl Flight {
         self.view().target(now_ns)
     }
 
+    /// Whether the last tick is so long ago that this process stood still: what was missing in that time is not known before the next one.
+    pub fn has_stood_still(&self, now_ns: i64) -> bool {
+        self.ticked_ns.is_some_and(|at_ns| now_ns.saturating_sub(at_ns) > MIN_STANDSTILL_NS)
+    }
+
     /// The phase and its reason, and all else of the status.
     pub fn status(&self, now_ns: i64) -> ControllerStatus {
         self.view().status(now_ns)
@@ -615,7 +620,11 @@ impl Flight {
             let address = &self.config.autopilot.address;
             self.lander.resume(self.pad_notes.pad(address, self.autopilot.system()));
         }
+        let command = self.mission.when_resumed();
         self.begin(now_ns);
+        if self.follow_earlier_command(now_ns, command) {
+            return;
+        }
         if !self.mission.is_landing() {
             return;
         }

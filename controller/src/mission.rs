@@ -6,6 +6,8 @@ use autopilot::{
     TakeoffError, TakeoffProgress,
 };
 
+use landing::OperatorCommand;
+
 use crate::config::Start;
 use crate::control::{
     ControlProgress, TakingControl, hover_in_offboard, is_held_px4, is_holding_px4,
@@ -38,6 +40,8 @@ pub struct Mission {
     found_ns: Option<i64>,
     /// Why the landing that was to begin automatically waits for a command.
     held_because: Option<String>,
+    /// The operator's command to a landing that is to be resumed, for when it is.
+    when_resumed: Option<OperatorCommand>,
 }
 
 /// The state of a mission.
@@ -126,6 +130,7 @@ impl Mission {
             awaits_next_flight: false,
             found_ns: None,
             held_because: None,
+            when_resumed: None,
         }
     }
 
@@ -224,6 +229,23 @@ impl Mission {
             (self.held_because, self.found_ns) = (None, None);
         }
         is_held
+    }
+
+    /// True while it is not known yet whether there is a landing to resume, or while one waits for that.
+    pub fn is_resuming(&self) -> bool {
+        self.start == Start::Resume && self.is_awaiting_takeoff()
+    }
+
+    /// Keeps a command to the landing that is to be resumed. A hold does not replace an abort.
+    pub fn command_when_resumed(&mut self, command: OperatorCommand) {
+        if self.when_resumed != Some(OperatorCommand::Abort) {
+            self.when_resumed = Some(command);
+        }
+    }
+
+    /// The command that was kept.
+    pub fn when_resumed(&self) -> Option<OperatorCommand> {
+        self.when_resumed
     }
 
     /// Ends a landing that waits for a command before it began, for this reason: a PX4 is taken back to HOLD. False where none waits.
@@ -405,7 +427,7 @@ impl Mission {
     /// A landing begins: the lander's, or the autopilot's own.
     pub fn begin(&mut self, now_ns: i64, is_autopilots: bool) {
         self.started_ns = Some(now_ns);
-        self.held_because = None;
+        (self.held_because, self.when_resumed) = (None, None);
         self.disarmed_ns = None;
         self.goes_on_until_ns = None;
         self.awaits_next_flight = false;
@@ -594,6 +616,15 @@ impl Mission {
                 self.await_next_flight();
             }
         }
+    }
+}
+
+/// What happens to a landing by this command; `None` for one that only a landing under way can follow.
+pub fn what_happens(command: OperatorCommand) -> Option<&'static str> {
+    match command {
+        OperatorCommand::Abort => Some("aborted"),
+        OperatorCommand::Hold => Some("held"),
+        _ => None,
     }
 }
 

@@ -358,7 +358,7 @@ impl Reports {
             self.vehicle_ns = now;
             self.vehicle.publish(&vehicle).await;
         }
-        if now.saturating_sub(self.checked_ns) < CHECK_PERIOD_NS {
+        if now.saturating_sub(self.checked_ns) < CHECK_PERIOD_NS || flight.has_stood_still(now) {
             return;
         }
         self.checked_ns = now;

@@ -11,7 +11,7 @@ use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
 use crate::limits;
 use crate::link_delay;
-use crate::mission::{Mission, State};
+use crate::mission::{Mission, State, what_happens};
 use crate::mount;
 use crate::refusals::Warning;
 use crate::wire;
@@ -166,6 +166,9 @@ impl View<'_> {
                 (Phase::Idle, why.to_owned())
             }
             (State::Idle, None) => (Phase::Idle, "waiting for the start of a landing".to_owned()),
+            (State::AwaitingTakeoff, None) if self.mission.is_resuming() => {
+                (Phase::Idle, self.resuming(now_ns))
+            }
             (State::AwaitingTakeoff, None) if self.autopilot.state().is_none() => {
                 (Phase::Idle, "waiting for the autopilot's heartbeat".to_owned())
             }
@@ -254,6 +257,24 @@ impl View<'_> {
                 format!("{why} (or the autopilot's failsafe), in {mode}")
             }
             _ => why,
+        }
+    }
+
+    /// What a landing waits for that is to be resumed, and what happens to it then.
+    fn resuming(&self, now_ns: i64) -> String {
+        let conflict = self.autopilot.conflict(now_ns).map(|it| it.to_string());
+        let waits = match (&conflict, self.autopilot.state()) {
+            (Some(conflict), _) => conflict,
+            (None, None) => "waiting for the autopilot's heartbeat",
+            (None, Some(_)) if !self.autopilot.has_listened(now_ns) => LISTENING,
+            (None, Some(_)) => "waiting for the vehicle's state",
+        };
+        let done = self.mission.when_resumed().and_then(what_happens);
+        match done {
+            Some(done) => {
+                format!("{waits}; a landing under way is resumed then, and {done} at once")
+            }
+            None => format!("{waits}; a landing under way is resumed then"),
         }
     }
 

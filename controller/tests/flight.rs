@@ -1209,6 +1209,70 @@ fn no_landing_begins_automatically_before_packets_of_another_vehicle_would_arriv
 }
 
 #[test]
+fn a_command_before_a_landing_is_resumed_counts_as_soon_as_it_is() {
+    let at_once = |command| match command {
+        ControllerCommand::Hold => (Phase::Hold, "held"),
+        _ => (Phase::Aborted, "aborted"),
+    };
+    for is_known in [false, true] {
+        for command in [ControllerCommand::Hold, ControllerCommand::Abort] {
+            let setting = "autopilot.system_id=0";
+            let mut flight = flight_with("resume", &[setting]);
+            if is_known {
+                flight = in_flight_with("resume", &[setting]);
+                hover(&mut flight, 20, 900, 4);
+            }
+            flight.camera(0, CameraInfo::sample());
+            flight.presence(0, "main", true);
+            flight.tick(900 * MS);
+            let why = flight.status(900 * MS).why;
+            assert!(why.ends_with("; a landing under way is resumed then"), "{why}");
+            let (phase, done) = at_once(command.clone());
+            let reply = flight.command(901 * MS, &command);
+            let later = format!("{done} as soon as it is resumed");
+            assert!(reply.accepted && reply.reason.ends_with(&later), "{reply:?}");
+            // A hold does not replace an abort.
+            flight.command(902 * MS, &ControllerCommand::Hold);
+            let why = flight.status(902 * MS).why;
+            assert!(why.ends_with(&format!("is resumed then, and {done} at once")), "{why}");
+            receive(&mut flight, 903 * MS, &heartbeat(4, true));
+            receive(&mut flight, 903 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+            hover(&mut flight, 920, 6000, 4);
+            let status = flight.status(6000 * MS);
+            assert!(status.phase == phase && status.started_ns.is_some(), "{status:?}");
+        }
+    }
+    // Without a landing to resume the command is of no effect on a later one.
+    let mut flight = flight_with("resume", &["autopilot.system_id=1"]);
+    assert!(flight.command(0, &ControllerCommand::Abort).accepted);
+    receive(&mut flight, MS, &heartbeat(4, false));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+    pose_at(&mut flight, 2 * MS, 0.0);
+    flight.tick(3 * MS);
+    let reply = flight.command(4 * MS, &ControllerCommand::Abort);
+    assert!(!reply.accepted && reply.reason.contains("no landing is active"), "{reply:?}");
+    flight.camera(5 * MS, CameraInfo::sample());
+    flight.presence(5 * MS, "main", true);
+    receive(&mut flight, 1000 * MS, &heartbeat(4, true));
+    receive(&mut flight, 1000 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    hover(&mut flight, 1020, 2000, 4);
+    assert!(flight.command(2000 * MS, &ControllerCommand::Start).accepted);
+    hover(&mut flight, 2020, 2500, 4);
+    assert_eq!(flight.status(2500 * MS).phase, Phase::Approach);
+}
+
+#[test]
+fn what_was_missing_in_a_standstill_is_not_stated_before_the_next_tick() {
+    let mut flight = in_flight("command");
+    hover(&mut flight, 20, 1000, 4);
+    assert!(!flight.has_stood_still(1010 * MS));
+    receive(&mut flight, 21_000 * MS, &heartbeat(4, true));
+    assert!(flight.has_stood_still(21_000 * MS));
+    flight.tick(21_001 * MS);
+    assert!(!flight.has_stood_still(21_001 * MS));
+}
+
+#[test]
 fn no_command_begins_a_landing_before_packets_of_another_vehicle_would_arrive() {
     for command in [ControllerCommand::Start, ControllerCommand::LandHere] {
         for system_id in [0, 1] {

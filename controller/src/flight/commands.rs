@@ -6,7 +6,7 @@ use landing::{Event as LanderEvent, OnAbort, OperatorCommand, Phase};
 use super::Flight;
 use crate::control::{is_held_px4, is_holding_px4, pilots_px4_mode};
 use crate::landing_target;
-use crate::mission::{START_FROM_HOLD, is_flying_guided};
+use crate::mission::{START_FROM_HOLD, is_flying_guided, what_happens};
 use crate::wire;
 
 impl Flight {
@@ -227,6 +227,15 @@ impl Flight {
                 return Ok(why.to_owned());
             }
         }
+        if !self.is_landing()
+            && self.mission.is_resuming()
+            && let Some(done) = what_happens(command)
+        {
+            self.mission.command_when_resumed(command);
+            return Ok(format!(
+                "the landing of an earlier controller is {done} as soon as it is resumed"
+            ));
+        }
         if !self.is_landing() {
             let (phase, _) = self.view().phase(now_ns);
             let start = match command {
@@ -264,6 +273,22 @@ impl Flight {
         }
         let why = if after == Phase::Aborted { self.view().phase(now_ns).1 } else { why };
         Ok(format!("in phase `{after}`: {why}"))
+    }
+
+    /// Gives a landing that was just resumed the command that came before. False where there is none, or no landing.
+    pub(super) fn follow_earlier_command(
+        &mut self,
+        now_ns: i64,
+        command: Option<OperatorCommand>,
+    ) -> bool {
+        let begins = self.mission.is_sending_landing_target()
+            || self.mission.is_landing() && !self.lander.phase().is_terminal();
+        let Some(command) = command.filter(|_| begins) else { return false };
+        match self.operator(now_ns, command) {
+            Ok(why) => tracing::warn!(?command, "Given before the landing was resumed: {why}"),
+            Err(why) => tracing::error!(?command, "Given before the landing was resumed: {why}"),
+        }
+        true
     }
 
     /// The commands that stop a vehicle in LAND, or about to enter it, where `hold` does not.
