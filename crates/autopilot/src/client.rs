@@ -198,7 +198,8 @@ impl Autopilot {
             self.heartbeat_due_ns =
                 if regular > now_ns { regular } else { now_ns.saturating_add(HEARTBEAT_NS) };
         }
-        self.check_silence(now_ns);
+        let stood_ns = self.standstill.tick(now_ns);
+        self.check_silence(now_ns, stood_ns);
         let late = self.vehicle.as_mut().and_then(|vehicle| vehicle.joiner.tick(now_ns));
         if let Some(text) = late {
             self.take_statustext(text);
@@ -215,7 +216,6 @@ impl Autopilot {
             self.ask_for_checks(now_ns);
         }
         self.prove_setpoints(now_ns);
-        let stood_ns = self.standstill.tick(now_ns);
         self.note_link_delay(now_ns, stood_ns);
         self.step_requests(now_ns, !self.standstill.is_mode_old());
     }
@@ -582,8 +582,11 @@ impl Autopilot {
         self.events.push_back(event);
     }
 
-    fn check_silence(&mut self, now_ns: i64) {
+    /// Notices that heartbeats are missing. While this process did not run, for `stood_ns`, none was.
+    fn check_silence(&mut self, now_ns: i64, stood_ns: Option<i64>) {
         let Some(vehicle) = &mut self.vehicle else { return };
+        let heartbeat_ns = vehicle.heartbeat_ns.saturating_add(stood_ns.unwrap_or(0));
+        vehicle.heartbeat_ns = heartbeat_ns.min(now_ns.max(vehicle.heartbeat_ns));
         let silence_ns = now_ns.saturating_sub(vehicle.heartbeat_ns);
         if vehicle.state.connected && silence_ns > ns(self.config.heartbeat_timeout) {
             vehicle.state.connected = false;

@@ -637,6 +637,23 @@ fn a_repeated_request_without_acknowledgement_is_sent_at_once() {
 }
 
 #[test]
+fn no_heartbeat_is_lost_while_this_process_does_not_run() {
+    let mut world = World::flying();
+    for frozen_s in [3, 20, 3600] {
+        world.now += frozen_s * SECOND;
+        // Time passes before the packets in the socket are read.
+        world.client.tick(world.now);
+        world.run(1);
+        assert!(world.client.is_connected(), "{frozen_s} s");
+    }
+    assert_eq!(world.count(|event| matches!(event, Event::Lost { .. })), 0);
+    world.now += 20 * SECOND;
+    world.fake.silent = true;
+    world.run(5);
+    assert_eq!(world.count(|event| matches!(event, Event::Lost { .. })), 1);
+}
+
+#[test]
 fn a_lost_heartbeat_is_reported_and_ends_commands() {
     let mut world = World::flying();
     let id = world.client.request(world.now, Command::SetMode(FlightMode::Land));
