@@ -506,8 +506,9 @@ async fn watch(
                             progress.say("A PX4 holds its place (COM_OBL_RC_ACT 5) and follows a resumed controller again; or land it in Land or Return, or by hand");
                         }
                     }
-                    // The landing needs no ground station, recording or page.
+                    // The landing needs no ground station, recording or page, and a vehicle in the air needs its controller.
                     let is_needed = landing.never_flew()
+                        && !landing.has_taken_off()
                         && match service {
                             Service::GcsBridge | Service::Recorder | Service::Dashboard => false,
                             // Not needed if it was swapped, or another one runs.

@@ -262,14 +262,20 @@ impl LandingSummary {
     /// Whether a landing that was interrupted or aborted may have left its vehicle in the air.
     pub(crate) fn may_be_in_the_air(&self) -> bool {
         let is_down = self.last_truth.as_ref().is_some_and(|truth| truth.on_ground);
-        let is_interrupted =
-            self.interrupted.is_some() && self.started_ns.is_some() && self.disarmed_ns.is_none();
+        let has_flown = self.started_ns.is_some() || self.has_taken_off();
+        let is_interrupted = self.interrupted.is_some() && has_flown && self.disarmed_ns.is_none();
         (is_interrupted || self.last_status.as_ref().is_some_and(is_in_the_air)) && !is_down
     }
 
     /// True while no landing has begun.
     pub(crate) fn never_flew(&self) -> bool {
         self.started_ns.is_none()
+    }
+
+    /// Whether the vehicle has left the ground for a landing that has not begun: its controller still takes it up, or holds it there.
+    pub(crate) fn has_taken_off(&self) -> bool {
+        let takes_off = self.last_status.as_ref().is_some_and(|it| it.phase == Phase::Takeoff);
+        takes_off && self.last_truth.as_ref().is_some_and(|truth| !truth.on_ground)
     }
 
     /// Frames a second, as the detectors count them.
@@ -733,6 +739,24 @@ mod tests {
         landing.timed_out(Some("signal: 9 (SIGKILL)"));
         let outcome = landing.outcome().outcome;
         assert!(outcome.starts_with("the controller exited (signal: 9 (SIGKILL))"), "{outcome}");
+    }
+
+    #[test]
+    fn a_vehicle_that_has_taken_off_may_be_left_in_the_air_before_the_landing() {
+        for (last_status, on_ground, has_taken_off) in [
+            (Some(status(Phase::Takeoff)), false, true),
+            (Some(status(Phase::Takeoff)), true, false),
+            (Some(status(Phase::Idle)), false, false),
+            (None, false, false),
+        ] {
+            let last_truth = Some(Truth { on_ground, ..truth(None) });
+            let mut landing =
+                LandingSummary { last_status, last_truth, ..LandingSummary::default() };
+            assert_eq!(landing.has_taken_off(), has_taken_off);
+            assert!(!landing.may_be_in_the_air(), "it was not interrupted");
+            landing.interrupted("interrupted");
+            assert_eq!(landing.may_be_in_the_air(), has_taken_off);
+        }
     }
 
     #[test]
