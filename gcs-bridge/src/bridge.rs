@@ -28,6 +28,7 @@ use crate::config::Config;
 use crate::params::{Ask, Parameters};
 use crate::request;
 use crate::route::{self, ECHO, Own, Route};
+use crate::silence::Silence;
 use crate::status::{GroundStatus, LinkCounts};
 use crate::target::LandingTargetPublisher;
 use crate::text::StatusTextSender;
@@ -118,6 +119,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
                 bridge.configuration(now_ns(), &configuration.context(CLOSED)?);
             }
             _ = ticks.tick() => {
+                bridge.watch_controller(now_ns(), standstill.step(now_ns()).is_some());
                 bridge.track(now_ns());
                 bridge.send_parameters(now_ns());
                 let system = bridge.vehicle.system(now_ns());
@@ -177,6 +179,9 @@ const INSECURE_NS: i64 = 10_000_000_000;
 /// The text when the last controller has gone. On the ground, a lost link has the same effect.
 const ABANDONED: &str = "Alight: controller gone, or link to drone lost";
 
+/// The text when the controller's status stops in a landing, after `silence::MAX_SILENCE_NS`.
+const SILENT: &str = "Alight: be ready to take over: no status of the controller for 2 s, it hangs, or the link to the drone does";
+
 const CLOSED: &str = "the network session was closed";
 
 /// The bridge between two packets.
@@ -201,6 +206,7 @@ struct Bridge {
     texts: StatusTextSender,
     targets: LandingTargetPublisher,
     status: Option<ControllerStatus>,
+    silence: Silence,
     controllers: BTreeSet<String>,
     /// True once the last controller has gone.
     is_abandoned: bool,
@@ -252,6 +258,7 @@ impl Bridge {
             texts: StatusTextSender::new(now_ns),
             targets: LandingTargetPublisher::new(config.target_rate_hz, config.target_max_age_ms),
             status: None,
+            silence: Silence::default(),
             controllers: BTreeSet::new(),
             is_abandoned: false,
             insecure_ns: None,
@@ -560,6 +567,9 @@ impl Bridge {
             if self.is_abandoned {
                 self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, ABANDONED);
             }
+            if self.silence.is_long() {
+                self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, SILENT);
+            }
             self.send_texts(now_ns);
             self.warn_insecure(now_ns);
         }
@@ -567,8 +577,22 @@ impl Bridge {
 
     /// Handles the controller's status.
     fn status(&mut self, now_ns: i64, status: ControllerStatus) {
+        let silence_ns = self.silence.status(now_ns, is_landing(&status));
         self.status = Some(status);
+        if let Some(silence_ns) = silence_ns {
+            let silence_s = silence_ns / 1_000_000_000;
+            let text = format!("Alight: the controller's status is back after {silence_s} s");
+            self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_NOTICE, &text);
+        }
         self.send_texts(now_ns);
+    }
+
+    /// Reports once that the controller's status has stopped in a landing.
+    fn watch_controller(&mut self, now_ns: i64, is_after_standstill: bool) {
+        if self.silence.begins(now_ns, is_after_standstill) {
+            self.health.failed("no status of the controller in a landing");
+            self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, SILENT);
+        }
     }
 
     /// Sends the texts on changes in the controller's status.
@@ -612,6 +636,7 @@ impl Bridge {
         let (severity, text) = if is_abandoned {
             // The next controller's phase is sent even when it is the same.
             self.status = None;
+            self.silence.gone();
             self.texts.reset();
             (MavSeverity::MAV_SEVERITY_WARNING, ABANDONED)
         } else {
@@ -733,15 +758,13 @@ impl Bridge {
     }
 
     fn heartbeat(&self) -> MavMessage {
-        let is_landing = self
-            .status
-            .as_ref()
-            .is_some_and(|status| !status.finished && status.phase != Phase::Idle);
-        let mut heartbeat = heartbeat();
-        if !is_landing {
-            heartbeat.system_status = MavState::MAV_STATE_STANDBY;
-        }
-        MavMessage::HEARTBEAT(heartbeat)
+        let system_status = match &self.status {
+            // The landing's state is unknown.
+            _ if self.silence.is_long() => MavState::MAV_STATE_CRITICAL,
+            Some(status) if is_landing(status) => MavState::MAV_STATE_ACTIVE,
+            _ => MavState::MAV_STATE_STANDBY,
+        };
+        MavMessage::HEARTBEAT(HEARTBEAT_DATA { system_status, ..heartbeat() })
     }
 
     /// Sends a message of our own to the ground station, if we have a system id.
@@ -767,6 +790,11 @@ impl Bridge {
             Err(SendError::Full) => self.health.dropped("to ground: the line is too slow"),
         }
     }
+}
+
+/// Whether a landing is active.
+fn is_landing(status: &ControllerStatus) -> bool {
+    !status.finished && status.phase != Phase::Idle
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@
 //!
 //! Modules in reading order: [`config`]; `bridge` is the service; `vehicle` finds the vehicle's system id,
 //! `route` decides which packets pass, `text` and `target` turn the controller's status and estimate into
-//! MAVLink; `camera` shows the detector's camera, whose `video` another program serves, and `request` reads and answers the ground
+//! MAVLink, `silence` watches whether that status keeps coming; `camera` shows the detector's camera, whose `video` another program serves, and `request` reads and answers the ground
 //! station's commands to it; `params` shows it the keys of the controller's configuration that are in `parameter_table`; `status` is the
 //! published status of the ground stations.
 
@@ -19,6 +19,7 @@ mod parameter_table;
 mod params;
 mod request;
 mod route;
+mod silence;
 mod status;
 mod target;
 mod text;

@@ -78,6 +78,39 @@ async fn the_ground_gets_the_companions_and_the_vehicles_packets() -> anyhow::Re
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_controller_that_freezes_in_a_landing_is_reported_and_so_is_its_return()
+-> anyhow::Result<()> {
+    let port = free_port()?;
+    let mut ground = Ground::open().await?;
+    let mut vehicle = FakeVehicle::start(port).await?;
+    let bridge = start_bridge(port, &ground, &[]).await?;
+    let has_state = |state: MavState| {
+        move |f: &Packet| match &f.message {
+            Some(MavMessage::HEARTBEAT(h)) => f.sender == COMPANION && h.system_status == state,
+            _ => false,
+        }
+    };
+    ground.expect(has_state(MavState::MAV_STATE_ACTIVE)).await?;
+    // It stays a member of the network.
+    vehicle.tasks[0].abort();
+    ground.expect_text("Alight: be ready to take over: no status of the controller for 2 s, it hangs, or the link to the drone does").await?;
+    ground.expect(has_state(MavState::MAV_STATE_CRITICAL)).await?;
+    vehicle.tasks[0] = tokio::spawn(speak(vehicle.node.clone(), Arc::clone(&vehicle.status)));
+    ground.expect(has_state(MavState::MAV_STATE_ACTIVE)).await?;
+    let back = "Alight: the controller's status is back after ";
+    ensure!(ground.texts.iter().any(|text| text.starts_with(back)), "{:?}", ground.texts);
+
+    // Without a landing its silence has no effect.
+    vehicle.status.send_replace(status(Phase::Idle, "waiting"));
+    ground.expect(has_state(MavState::MAV_STATE_STANDBY)).await?;
+    vehicle.tasks[0].abort();
+    let silence = async { ground.expect(has_state(MavState::MAV_STATE_CRITICAL)).await };
+    ensure!(timeout(Duration::from_secs(4), silence).await.is_err(), "{:?}", ground.texts);
+    bridge.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn only_the_grounds_own_packets_go_up_unchanged() -> anyhow::Result<()> {
     let port = free_port()?;
     let mut ground = Ground::open().await?;
