@@ -25,7 +25,7 @@ use tokio::time::{MissedTickBehavior, interval};
 
 use crate::camera::Camera;
 use crate::config::Config;
-use crate::params::{Ask, Parameters};
+use crate::params::{self, Ask, Parameters};
 use crate::request;
 use crate::route::{self, ECHO, Own, Route};
 use crate::silence::Silence;
@@ -158,6 +158,10 @@ fn counts(ground: &Link) -> LinkCounts {
 const NOT_OF_COMPANION: &str = "for the companion, and not supported";
 const NOT_OF_CAMERA: &str = "for the camera, and not supported";
 
+/// Minimum pause between two repetitions of all texts, which a ground station that begins causes, in nanoseconds: those of a station that
+/// asks again for lost parameters are few.
+const REPEAT_PAUSE_NS: i64 = 5_000_000_000;
+
 /// Maximum number of controllers that are followed; there is one, and another while it is replaced.
 const MAX_CONTROLLERS: usize = 16;
 /// Maximum number of recorders whose problems are reported, and of characters of a problem.
@@ -217,6 +221,8 @@ struct Bridge {
     /// Recorders that were reported to the ground station as not recording.
     not_recording: BTreeSet<String>,
     ground_ns: Option<i64>,
+    /// When all texts were last repeated.
+    repeated_ns: Option<i64>,
     /// Bytes that are not packets, and packets not read in time, as counted so far.
     bad_bytes: u64,
     unread: u64,
@@ -265,6 +271,7 @@ impl Bridge {
             insecure_reported: false,
             not_recording: BTreeSet::new(),
             ground_ns: None,
+            repeated_ns: None,
             bad_bytes: 0,
             unread: 0,
             strangers: 0,
@@ -366,7 +373,11 @@ impl Bridge {
             return None;
         }
         self.ground_status.received(now_ns, &packet);
-        let asked = self.me(now_ns).and_then(|me| Ask::of(&packet, me));
+        let me = self.me(now_ns);
+        if me.is_some_and(|me| params::begins(&packet, me)) {
+            self.ground_begins(now_ns, packet.sender);
+        }
+        let asked = me.and_then(|me| Ask::of(&packet, me));
         let mut is_unset = false;
         if let Some(asked) = asked {
             self.ground_active(now_ns, packet.sender);
@@ -561,18 +572,34 @@ impl Bridge {
         if last.is_none_or(|last| now_ns.saturating_sub(last) > GROUND_TIMEOUT_NS) {
             let Sender { system, component } = sender;
             tracing::info!(system, component, "Ground station found");
-            self.texts.reset();
-            self.insecure_reported = false;
-            self.not_recording.clear();
-            if self.is_abandoned {
-                self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, ABANDONED);
-            }
-            if self.silence.is_long() {
-                self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, SILENT);
-            }
-            self.send_texts(now_ns);
-            self.warn_insecure(now_ns);
+            self.repeat_texts(now_ns);
         }
+    }
+
+    /// A ground station begins, perhaps anew after less than the silence after which one counts as new.
+    fn ground_begins(&mut self, now_ns: i64, sender: Sender) {
+        self.ground_active(now_ns, sender);
+        let is_due =
+            self.repeated_ns.is_none_or(|last| now_ns.saturating_sub(last) > REPEAT_PAUSE_NS);
+        if is_due {
+            self.repeat_texts(now_ns);
+        }
+    }
+
+    /// Sends all texts that describe the present state again.
+    fn repeat_texts(&mut self, now_ns: i64) {
+        self.repeated_ns = Some(now_ns);
+        self.texts.reset();
+        self.insecure_reported = false;
+        self.not_recording.clear();
+        if self.is_abandoned {
+            self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, ABANDONED);
+        }
+        if self.silence.is_long() {
+            self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, SILENT);
+        }
+        self.send_texts(now_ns);
+        self.warn_insecure(now_ns);
     }
 
     /// Handles the controller's status.
@@ -803,7 +830,8 @@ mod tests {
 
     use super::*;
     use autopilot::dialect::{
-        COMMAND_LONG_DATA, MavAutopilot, MavCmd, MavType, PARAM_REQUEST_READ_DATA, PARAM_SET_DATA,
+        COMMAND_LONG_DATA, MavAutopilot, MavCmd, MavType, PARAM_REQUEST_LIST_DATA,
+        PARAM_REQUEST_READ_DATA, PARAM_SET_DATA,
     };
     use messages::GcsStatus;
     use node::Layers;
@@ -902,6 +930,36 @@ mod tests {
         assert_eq!(by_reason(&status), expected);
         let [station] = status.stations.as_slice() else { panic!("{status:?}") };
         assert_eq!((station.packets, station.refused), (9, 7));
+    }
+
+    #[tokio::test]
+    async fn the_present_state_is_sent_again_to_a_ground_station_that_begins_anew() {
+        const SECOND_NS: i64 = 1_000_000_000;
+        let (mut bridge, _link) = bridge(&[]).await;
+        let texts = |bridge: &Bridge| {
+            let report = bridge
+                .health
+                .report(&node::Identity { service: "gcs-bridge", instance: "main".into() }, 0);
+            report.rates.iter().find(|it| it.name == "texts").map_or(0, |it| it.count)
+        };
+        let list = |target_component| {
+            let target_system = AUTOPILOT.system;
+            let list = PARAM_REQUEST_LIST_DATA { target_system, target_component };
+            packet(GROUND, &MavMessage::PARAM_REQUEST_LIST(list))
+        };
+        let _ = bridge.packet_from_ground(0, heartbeat_of(GROUND));
+        bridge.status(0, ControllerStatus { phase: Phase::Idle, ..ControllerStatus::default() });
+        assert_eq!(texts(&bridge), 1);
+        let _ = bridge.packet_from_ground(4 * SECOND_NS, list(0));
+        assert_eq!(texts(&bridge), 1, "it has just received it");
+        for (at_s, component, count) in
+            [(6, 0, 2), (7, 0, 2), (11, 0, 2), (12, COMPANION, 3), (18, 1, 4), (24, CAMERA, 4)]
+        {
+            let _ = bridge.packet_from_ground(at_s * SECOND_NS, list(component));
+            assert_eq!(texts(&bridge), count, "{at_s} s");
+            let _ = bridge.packet_from_ground(at_s * SECOND_NS, heartbeat_of(GROUND));
+            assert_eq!(texts(&bridge), count, "a heartbeat is no start: {at_s} s");
+        }
     }
 
     #[tokio::test]

@@ -19,6 +19,8 @@ use crate::parameter_table::{Parameter, TABLE};
 const MAX_TOML: usize = 200_000;
 /// Values sent at once; a list shares the line with the autopilot's list.
 const BURST: usize = 3;
+/// MAVLink component id of the autopilot.
+const AUTOPILOT: u8 = 1;
 /// Silence of its controller after which another one's configuration is shown, in nanoseconds; it is repeated every 3 s.
 const CONTROLLER_TIMEOUT_NS: i64 = 10_000_000_000;
 
@@ -84,6 +86,13 @@ impl Ask {
             _ => return None,
         })
     }
+}
+
+/// Whether a packet asks the vehicle's autopilot, its companion or all its components for all parameters: so begins a ground station.
+pub(crate) fn begins(packet: &Packet, companion: Sender) -> bool {
+    let Some(MavMessage::PARAM_REQUEST_LIST(list)) = &packet.message else { return false };
+    [0, companion.system].contains(&list.target_system)
+        && [0, AUTOPILOT, companion.component].contains(&list.target_component)
 }
 
 /// The answer to a request.

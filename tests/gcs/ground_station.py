@@ -3,7 +3,7 @@
 
 It listens where QGroundControl would, and waits for the vehicle's heartbeat, the companion's (component 191), texts
 about the landing (STATUSTEXT), and the landing point (LANDING_TARGET); it asks the vehicle for a parameter, and the
-companion for something it cannot do. It prints the result as one JSON object on the last line.
+companion for its parameters, as ground stations do when they start, and for something it cannot do. It prints the result as one JSON object on the last line.
 
     python3 tests/gcs/ground_station.py --connect udpin:127.0.0.1:14550
 
@@ -100,6 +100,9 @@ class GroundStation:
         send.heartbeat_send(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE)
         if self.vehicle is None:
             return
+        if self.seen["statustext"] is None:
+            # The companion repeats its texts for a ground station that begins so; another one may have received them before.
+            send.param_request_list_send(self.vehicle, self.component)
         if self.seen["parameter"] is None:
             send.param_request_read_send(self.vehicle, 1, self.parameter.encode(), -1)
         if self.seen["companion_answer"] is None:
