@@ -164,9 +164,8 @@ const REPEAT_PAUSE_NS: i64 = 5_000_000_000;
 
 /// Maximum number of controllers that are followed; there is one, and another while it is replaced.
 const MAX_CONTROLLERS: usize = 16;
-/// Maximum number of recorders whose problems are reported, and of characters of a problem.
+/// Maximum number of recorders whose problems are reported.
 const MAX_RECORDERS: usize = 16;
-const MAX_PROBLEM_CHARS: usize = 120;
 /// Minimum pause between two texts about refused packets, in nanoseconds.
 const REFUSAL_PAUSE_NS: i64 = 5_000_000_000;
 
@@ -540,8 +539,7 @@ impl Bridge {
         let was_reported = self.not_recording.contains(&status.recorder);
         match &status.problem {
             Some(problem) if !was_reported && self.not_recording.len() < MAX_RECORDERS => {
-                let short: String = problem.chars().take(MAX_PROBLEM_CHARS).collect();
-                let text = format!("Alight: not recording: {short}");
+                let text = format!("Alight: not recording: {problem}");
                 if self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text) {
                     self.not_recording.insert(status.recorder.clone());
                 }

@@ -5,8 +5,12 @@ use autopilot::compose::status_text;
 use autopilot::dialect::{MavMessage, MavSeverity};
 use messages::{ControllerStatus, Phase, matter};
 
-/// Maximum length of a text, in characters: it fits four packets. Longer texts are cut.
+/// Maximum length of a text, in characters: it fits four packets. Longer texts are shortened.
 const MAX_TEXT: usize = 199;
+/// Maximum length of the end that a shortened text keeps, in characters.
+const MAX_END: usize = 120;
+/// Maximum length of a text that is read, in characters.
+const MAX_READ: usize = 2000;
 /// Maximum number of texts sent at once.
 const MAX_BURST: u32 = 6;
 /// Number of these that are reserved for events, when answers to requests are sent.
@@ -49,10 +53,17 @@ impl StatusTextSender {
         let text = format!("Alight: {}", status.sentence());
         // A change of digits alone, as of a height, is not sent.
         let change = matter(&text);
-        // A reason that is a warning as well is sent once.
-        let is_warning = status.warnings.contains(&status.why);
+        // A warning that is the reason, or the end of it, is sent once.
+        let stated: Vec<String> = status
+            .warnings
+            .iter()
+            .filter(|warning| states(status, &text, warning))
+            .map(|warning| matter(warning))
+            .collect();
         let severity = match severity(status.phase) {
-            MavSeverity::MAV_SEVERITY_INFO if is_warning => MavSeverity::MAV_SEVERITY_WARNING,
+            MavSeverity::MAV_SEVERITY_INFO if !stated.is_empty() => {
+                MavSeverity::MAV_SEVERITY_WARNING
+            }
             severity => severity,
         };
         if self.last.as_ref() != Some(&change)
@@ -60,7 +71,11 @@ impl StatusTextSender {
         {
             packets.extend(text);
             self.last = Some(change);
-            self.warnings.extend(is_warning.then(|| matter(&status.why)));
+            for warning in stated {
+                if !self.warnings.contains(&warning) {
+                    self.warnings.push(warning);
+                }
+            }
         }
         if self.detector != status.active_detector {
             let (severity, text) = match &status.active_detector {
@@ -142,6 +157,16 @@ impl StatusTextSender {
     }
 }
 
+/// Whether the text of a status has a warning as its reason, or whole at the end of its reason: "marker lost: no frame from camera".
+fn states(status: &ControllerStatus, text: &str, warning: &str) -> bool {
+    let is_whole = text.chars().count() <= MAX_TEXT;
+    let ends_with_it = || {
+        let (text, warning) = (matter(text), matter(warning));
+        text.strip_suffix(&warning).is_some_and(|before| before.ends_with(": "))
+    };
+    status.why == warning || (is_whole && ends_with_it())
+}
+
 /// The severity of a phase's text; a ground station reads warnings and worse aloud.
 fn severity(phase: Phase) -> MavSeverity {
     match phase {
@@ -154,12 +179,21 @@ fn severity(phase: Phase) -> MavSeverity {
 
 /// The packets of a text, cut to its maximum length and to plain characters.
 fn packets(severity: MavSeverity, text: &str, id: u16) -> Vec<MavMessage> {
-    let mut text: String = text.chars().take(MAX_TEXT + 1).map(plain).collect();
-    if text.len() > MAX_TEXT {
-        text.truncate(MAX_TEXT - 3);
-        text.push_str("...");
+    let text: String = text.chars().take(MAX_READ).map(plain).collect();
+    status_text(severity, &shortened(text), id)
+}
+
+/// A plain text of at most the maximum length. Of a longer one the last clause stays if it is short enough, because remedies are there.
+fn shortened(text: String) -> String {
+    if text.len() <= MAX_TEXT {
+        return text;
     }
-    status_text(severity, &text, id)
+    let ends = ["; ", ": ", ". "].into_iter().filter_map(|mark| Some(text.rfind(mark)? + 2));
+    let end = ends.max().and_then(|at| text.get(at..)).filter(|end| end.len() <= MAX_END);
+    let (gap, end) = end.map_or(("...", ""), |end| ("... ", end));
+    let room = MAX_TEXT - gap.len() - end.len();
+    let start = text.get(..room).unwrap_or_default();
+    format!("{start}{gap}{end}")
 }
 
 /// Ground stations show only ASCII reliably.
@@ -293,6 +327,53 @@ mod tests {
             }
             assert!(packets.len() <= 4, "{length}: {} packets", packets.len());
         }
+    }
+
+    #[test]
+    fn a_shortened_text_keeps_its_remedy() {
+        let cause = "the vehicle is not lifted, ".repeat(8);
+        let remedy = "give `land-here`, or take over and land or disarm it";
+        for mark in ["; ", ": ", ". "] {
+            let text = format!("Alight: aborted: {cause}{mark}{remedy}");
+            let joined = &join(&packets(MavSeverity::MAV_SEVERITY_INFO, &text, 9))[0].1;
+            assert_eq!(joined.len(), MAX_TEXT);
+            assert!(joined.starts_with("Alight: aborted: the vehicle is not lifted"), "{joined}");
+            assert!(joined.ends_with(&format!("... {remedy}")), "{joined}");
+        }
+    }
+
+    #[test]
+    fn a_warning_at_the_end_of_a_reason_is_not_sent_again() {
+        let warning = |s: u32| {
+            format!(
+                "no frame from camera `down` for {s} s: check the camera, and whether its detector hangs"
+            )
+        };
+        let lost = |s: u32, in_warnings: u32| ControllerStatus {
+            warnings: vec![warning(in_warnings), "no detector is alive".into()],
+            ..status(
+                Phase::Retry,
+                &format!("marker lost, climbing to see it again: {}", warning(s)),
+                None,
+            )
+        };
+        let mut texts = StatusTextSender::new(0);
+        let sent = join(&texts.status(0, &lost(3, 4)));
+        let sent: Vec<&str> = sent.iter().map(|(_, text)| text.as_str()).collect();
+        let reason = format!("Alight: {}", lost(3, 4).sentence());
+        assert_eq!(sent, [reason.as_str(), "Alight: no detector is alive"]);
+        assert_eq!(join(&texts.status(1, &lost(5, 5))), []);
+        // It is sent where it remains after the reason has changed to another one, has ended, and come again.
+        let search = status(Phase::Search, "", None);
+        texts.status(2, &search);
+        let again = ControllerStatus { warnings: vec![warning(9)], ..search };
+        assert_eq!(join(&texts.status(3, &again)).len(), 1);
+        // A warning that is cut away is sent.
+        let mut texts = StatusTextSender::new(0);
+        let far = format!("{}: {}", "far ".repeat(40), warning(3));
+        let long =
+            ControllerStatus { warnings: vec![warning(3)], ..status(Phase::Retry, &far, None) };
+        assert_eq!(join(&texts.status(0, &long)).len(), 2);
     }
 
     #[test]
