@@ -31,7 +31,7 @@ use crate::route::{self, ECHO, Own, Route};
 use crate::silence::Silence;
 use crate::status::{GroundStatus, LinkCounts};
 use crate::target::LandingTargetPublisher;
-use crate::text::StatusTextSender;
+use crate::text::{StatusTextSender, refused};
 use crate::vehicle::Vehicle;
 
 /// Period of heartbeats in MAVLink.
@@ -377,10 +377,10 @@ impl Bridge {
             self.ground_begins(now_ns, packet.sender);
         }
         let asked = me.and_then(|me| Ask::of(&packet, me));
-        let mut is_unset = false;
+        let mut refusal = None;
         if let Some(asked) = asked {
             self.ground_active(now_ns, packet.sender);
-            is_unset = !self.asked_for_parameters(now_ns, &asked);
+            refusal = self.asked_for_parameters(now_ns, &asked);
         }
         match route {
             Route::Drop(reason) => {
@@ -388,10 +388,11 @@ impl Bridge {
                 let reason = reason.strip_prefix("from ground: ").unwrap_or(reason);
                 self.ground_status.refused(&packet, reason);
             }
-            Route::Parameters if is_unset => {
-                self.ground_status.refused(&packet, "a parameter is not set from there");
+            Route::Parameters => {
+                if let Some(refusal) = refusal {
+                    self.ground_status.refused(&packet, refusal);
+                }
             }
-            Route::Parameters => {}
             Route::Answer(message) => {
                 self.ground_active(now_ns, packet.sender);
                 self.ground_status.refused(&packet, NOT_OF_COMPANION);
@@ -458,17 +459,22 @@ impl Bridge {
         answer.result
     }
 
-    /// Answers a request of the ground station for our parameters; false where it would set one, which it may not.
-    fn asked_for_parameters(&mut self, now_ns: i64, asked: &Ask) -> bool {
+    /// Answers a request of the ground station for our parameters. Returns why it is not answered as it asks: it would set one, or reads one
+    /// that there is not.
+    fn asked_for_parameters(&mut self, now_ns: i64, asked: &Ask) -> Option<&'static str> {
         let answer = self.parameters.answer(asked);
         if let Some(message) = &answer.message {
             self.send_own(now_ns, message);
         }
-        if let Some(why) = &answer.why {
+        let why = answer.why?;
+        self.send_answer(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &format!("Alight: {why}"));
+        Some(if matches!(asked, Ask::Set { .. }) {
             self.health.failed("from ground: a parameter is not set from there");
-            self.send_answer(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &format!("Alight: {why}"));
-        }
-        answer.why.is_none()
+            "a parameter is not set from there"
+        } else {
+            self.health.dropped("from ground: reads a parameter that there is not");
+            "reads a parameter that there is not"
+        })
     }
 
     /// Takes the configuration of a controller.
@@ -521,7 +527,7 @@ impl Bridge {
             self.refusal_ns.is_none_or(|last| now_ns.saturating_sub(last) > REFUSAL_PAUSE_NS);
         if is_due {
             self.refusal_ns = Some(now_ns);
-            let text = format!("Alight: refused ({}): {refusal}", self.permission);
+            let text = refused(packet, self.permission, refusal);
             self.send_answer(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text);
         }
     }
@@ -923,11 +929,12 @@ mod tests {
             (NOT_OF_CAMERA, 2),
             ("denied by the camera", 1),
             ("a parameter is not set from there", 1),
+            ("reads a parameter that there is not", 1),
             ("only monitoring", 2),
         ]);
         assert_eq!(by_reason(&status), expected);
         let [station] = status.stations.as_slice() else { panic!("{status:?}") };
-        assert_eq!((station.packets, station.refused), (9, 7));
+        assert_eq!((station.packets, station.refused), (9, 8));
     }
 
     #[tokio::test]

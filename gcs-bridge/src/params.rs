@@ -31,6 +31,17 @@ struct Entry {
     value: f32,
 }
 
+impl Entry {
+    /// The value, for a person; that of a word with the word.
+    fn meaning(&self) -> String {
+        // `value` made the number from the place of the word.
+        match self.parameter.words.get(self.value as usize) {
+            Some(word) => format!("{} = {word}", self.value),
+            None => self.value.to_string(),
+        }
+    }
+}
+
 /// A ground station's request for the companion's parameters.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Ask {
@@ -100,7 +111,7 @@ pub(crate) fn begins(packet: &Packet, companion: Sender) -> bool {
 pub(crate) struct Answer {
     /// The present value, if it was requested.
     pub(crate) message: Option<MavMessage>,
-    /// Why nothing was changed, for a person.
+    /// Why nothing was changed or found, for a person.
     pub(crate) why: Option<String>,
 }
 
@@ -163,10 +174,18 @@ impl Parameters {
         };
         let found = index.and_then(|index| Some((index, self.list.get(usize::from(index))?)));
         let why = match (ask, found) {
-            (Ask::Set { name, .. }, None) => Some(format!("there is no parameter {name}")),
+            (Ask::Set { name, .. } | Ask::Named(name), None) if !self.list.is_empty() => {
+                Some(format!("there is no parameter {name}"))
+            }
+            (Ask::Numbered(index), None) if !self.list.is_empty() => {
+                Some(format!("there is no parameter with the index {index}"))
+            }
+            (_, None) => Some("there are no parameters, no controller has published them".into()),
             (Ask::Set { value, .. }, Some((_, it))) if *value != it.value => Some(format!(
-                "{} stays {}: set {} of the controller before the flight",
-                it.parameter.name, it.value, it.parameter.key
+                "{} is read-only here ({}); change {} in the controller's configuration and restart it",
+                it.parameter.name,
+                it.meaning(),
+                it.parameter.key
             )),
             _ => None,
         };
@@ -297,8 +316,16 @@ mod tests {
         assert_eq!((value.param_value, value.param_count), (2.0, 2));
         let numbered = parameters.answer(&Ask::Numbered(value.param_index)).message.unwrap();
         assert_eq!(numbered, named);
-        assert_eq!(parameters.answer(&Ask::Numbered(2)), Answer::default());
-        assert_eq!(parameters.answer(&Ask::Named("NONE".into())), Answer::default());
+        for (asked, name) in
+            [(Ask::Numbered(2), "the index 2"), (Ask::Named("NONE".into()), "parameter NONE")]
+        {
+            let answer = parameters.answer(&asked);
+            assert_eq!(answer.message, None);
+            assert!(answer.why.unwrap().ends_with(name), "{asked:?}");
+        }
+        assert!(parameters.due().len() == 1, "only the one that was read is sent again");
+        let none = Parameters::default().answer(&Ask::Numbered(0));
+        assert!(none.message.is_none() && none.why.unwrap().contains("no controller"));
         for (wanted, is_refused) in
             [(9.0, true), (f32::NAN, true), (f32::INFINITY, true), (2.0, false)]
         {
@@ -311,6 +338,26 @@ mod tests {
         }
         let unknown = parameters.answer(&Ask::Set { name: "NONE".into(), value: 1.0 });
         assert!(unknown.message.is_none() && unknown.why.unwrap().contains("NONE"));
+    }
+
+    #[test]
+    fn an_attempt_to_set_a_parameter_is_answered_with_the_meaning_of_its_value_and_its_remedy() {
+        let mut parameters = parameters_of(CONTROLLER);
+        let mut set = |name: &str, value| {
+            parameters.answer(&Ask::Set { name: name.into(), value }).why.unwrap()
+        };
+        let remedy = "in the controller's configuration and restart it";
+        assert_eq!(
+            set("AL_RETRIES", 3.0),
+            format!("AL_RETRIES is read-only here (10); change phases.retries {remedy}")
+        );
+        assert_eq!(
+            set("AL_MODE", 1.0),
+            format!("AL_MODE is read-only here (0 = guided); change mode {remedy}")
+        );
+        for parameter in TABLE {
+            assert!(set(parameter.name, -7.0).len() < 190, "{}", parameter.name);
+        }
     }
 
     #[test]

@@ -2,7 +2,8 @@
 //! STATUSTEXT packets at a bounded rate.
 
 use autopilot::compose::status_text;
-use autopilot::dialect::{MavMessage, MavSeverity};
+use autopilot::dialect::{MavMessage, MavSeverity, Message};
+use autopilot::{GivenCommand, Packet, Permission};
 use messages::{ControllerStatus, Phase, matter};
 
 /// Maximum length of a text, in characters: it fits four packets. Longer texts are shortened.
@@ -157,6 +158,21 @@ impl StatusTextSender {
     }
 }
 
+/// The text about a packet that the ground station may not send: what was refused, and the setting that permits no more.
+pub(crate) fn refused(packet: &Packet, permission: Permission, refusal: &str) -> String {
+    let what = match (GivenCommand::of(packet), &packet.message) {
+        (Some(command), _) => format!("command {}", command.number),
+        (None, Some(message)) => message.message_name().to_owned(),
+        (None, None) => format!("message {}", packet.message_id),
+    };
+    match permission {
+        Permission::Monitor => {
+            format!("Alight: refused {what}: this link may only monitor (ground_may)")
+        }
+        _ => format!("Alight: refused {what}: {refusal} (ground_may = {permission})"),
+    }
+}
+
 /// Whether the text of a status has a warning as its reason, or whole at the end of its reason: "marker lost: no frame from camera".
 fn states(status: &ControllerStatus, text: &str, warning: &str) -> bool {
     let is_whole = text.chars().count() <= MAX_TEXT;
@@ -209,6 +225,9 @@ fn plain(c: char) -> char {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, PARAM_SET_DATA};
+    use autopilot::packet::encode;
+    use autopilot::{Parser, Sender};
 
     fn status(phase: Phase, why: &str, detector: Option<&str>) -> ControllerStatus {
         ControllerStatus {
@@ -326,6 +345,41 @@ mod tests {
                 assert!(joined.ends_with("x...") && joined.len() == MAX_TEXT);
             }
             assert!(packets.len() <= 4, "{length}: {} packets", packets.len());
+        }
+    }
+
+    #[test]
+    fn a_refusal_names_the_refused_packet() {
+        let packet = |message: &MavMessage| {
+            let sender = Sender { system: 255, component: 190 };
+            Parser::new().push(&encode(sender, 0, message)).remove(0)
+        };
+        let arm = packet(&MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+            command: MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
+            ..COMMAND_LONG_DATA::default()
+        }));
+        let set = packet(&MavMessage::PARAM_SET(PARAM_SET_DATA::default()));
+        let text = |packet: &Packet, permission: Permission| {
+            refused(packet, permission, permission.refusal(packet).unwrap())
+        };
+        for (packet, permission, expected) in [
+            (
+                &arm,
+                Permission::Monitor,
+                "Alight: refused command 400: this link may only monitor (ground_may)",
+            ),
+            (
+                &arm,
+                Permission::NoArming,
+                "Alight: refused command 400: arming or stopping motors (ground_may = no-arming)",
+            ),
+            (
+                &set,
+                Permission::Monitor,
+                "Alight: refused PARAM_SET: this link may only monitor (ground_may)",
+            ),
+        ] {
+            assert_eq!(text(packet, permission), expected);
         }
     }
 

@@ -267,7 +267,8 @@ async fn a_ground_station_that_may_not_arm_is_informed_of_the_refusal() -> anyho
     });
     let arm = encode(GROUND, 1, &arm);
     ground.send(&arm).await?;
-    ground.expect_text("Alight: refused (no-arming): arming or stopping motors").await?;
+    let text = "Alight: refused command 400: arming or stopping motors (ground_may = no-arming)";
+    ground.expect_text(text).await?;
     until_error(&health, "refused: arming", 1).await?;
     ground.send(&arm).await?;
     // Ground stations take the acknowledgement of the component that the command was for, and no other.
