@@ -25,6 +25,7 @@ use tokio::time::{MissedTickBehavior, interval};
 
 use crate::camera::Camera;
 use crate::config::Config;
+use crate::neighbours::Neighbours;
 use crate::params::{self, Ask, Parameters};
 use crate::request;
 use crate::route::{self, ECHO, Own, Route};
@@ -74,6 +75,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
     let relays = node.subscriber(topic::HEALTH, &["relay", "*"]).await?;
     let recorders = node.subscriber(topic::RECORDER_STATUS, &[]).await?;
     let configurations = node.subscriber(topic::CONFIGURATION, &["controller", "*"]).await?;
+    let bridges = node.subscriber(topic::CONFIGURATION, &["gcs-bridge", "*"]).await?;
     let mut second = interval(HEARTBEAT);
     second.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut ticks = interval(TICK);
@@ -118,6 +120,7 @@ async fn run_service(node: Node, config: Config, shutdown: Shutdown) -> anyhow::
             configuration = configurations.next() => {
                 bridge.configuration(now_ns(), &configuration.context(CLOSED)?);
             }
+            other = bridges.next() => bridge.neighbours.bridge(&other.context(CLOSED)?, &bridge.health),
             _ = ticks.tick() => {
                 bridge.watch_controller(now_ns(), standstill.step(now_ns()).is_some());
                 bridge.track(now_ns());
@@ -233,6 +236,7 @@ struct Bridge {
     /// Sequence numbers of our next packets: the companion's and the camera's.
     sequence: u8,
     camera_sequence: u8,
+    neighbours: Neighbours,
     /// The camera's last heartbeats with their sequence numbers, the newest first.
     camera_heartbeats: VecDeque<(u8, HEARTBEAT_DATA)>,
 }
@@ -278,6 +282,7 @@ impl Bridge {
             unsent_texts: VecDeque::new(),
             sequence: 0,
             camera_sequence: 0,
+            neighbours: Neighbours::new(config),
             camera_heartbeats: VecDeque::new(),
         })
     }
@@ -459,8 +464,8 @@ impl Bridge {
         answer.result
     }
 
-    /// Answers a request of the ground station for our parameters. Returns why it is not answered as it asks: it would set one, or reads one
-    /// that there is not.
+    /// Answers a request of the ground station for our parameters. Returns why it is not answered as it asks: it would set one, or
+    /// asks for an unknown one.
     fn asked_for_parameters(&mut self, now_ns: i64, asked: &Ask) -> Option<&'static str> {
         let answer = self.parameters.answer(asked);
         if let Some(message) = &answer.message {
@@ -472,8 +477,8 @@ impl Bridge {
             self.health.failed("from ground: a parameter is not set from there");
             "a parameter is not set from there"
         } else {
-            self.health.dropped("from ground: reads a parameter that there is not");
-            "reads a parameter that there is not"
+            self.health.dropped("from ground: unknown parameter");
+            "unknown parameter"
         })
     }
 
@@ -929,7 +934,7 @@ mod tests {
             (NOT_OF_CAMERA, 2),
             ("denied by the camera", 1),
             ("a parameter is not set from there", 1),
-            ("reads a parameter that there is not", 1),
+            ("unknown parameter", 1),
             ("only monitoring", 2),
         ]);
         assert_eq!(by_reason(&status), expected);

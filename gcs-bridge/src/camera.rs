@@ -14,6 +14,7 @@ use autopilot::dialect::{
 };
 use messages::{ControllerStatus, Detection, Detections};
 
+use crate::frame_rate::FrameRate;
 use crate::video::Video;
 
 /// Silence of its detector after which the camera is gone, in nanoseconds.
@@ -31,6 +32,7 @@ pub(crate) struct Camera {
     video: Option<Video>,
     started_ns: i64,
     seen: Option<Frame>,
+    rate: FrameRate,
     /// Period of the tracked marker's position, in nanoseconds, while the ground station wants it.
     period_ns: Option<i64>,
     due_ns: i64,
@@ -85,7 +87,14 @@ impl Rectangle {
 impl Camera {
     /// A camera, whose video another program may serve.
     pub(crate) fn new(now_ns: i64, video: Option<Video>) -> Self {
-        Self { video, started_ns: now_ns, seen: None, period_ns: None, due_ns: i64::MIN }
+        Self {
+            video,
+            started_ns: now_ns,
+            seen: None,
+            rate: FrameRate::default(),
+            period_ns: None,
+            due_ns: i64::MIN,
+        }
     }
 
     /// Takes the detections of a frame, if their detector is the one that the controller uses; without one, the one that was received
@@ -110,6 +119,7 @@ impl Camera {
             Some(name) => found.first_of(name),
             None => found.detections.first(),
         };
+        self.rate.frame(header);
         self.seen = Some(Frame {
             at_ns: now_ns,
             detector: detector.to_owned(),
@@ -231,7 +241,7 @@ impl Camera {
         })
     }
 
-    /// VIDEO_STREAM_INFORMATION, when the site has a video.
+    /// VIDEO_STREAM_INFORMATION, when the site has a video. Its rate is that of the camera, which a program that serves the video may reduce.
     pub(crate) fn stream_information(&self) -> Option<MavMessage> {
         let video = self.video.as_ref()?;
         let [resolution_h, resolution_v] = self.resolution();
@@ -250,6 +260,7 @@ impl Camera {
         };
         Some(MavMessage::VIDEO_STREAM_INFORMATION(VIDEO_STREAM_INFORMATION_DATA {
             flags: VideoStreamStatusFlags::VIDEO_STREAM_STATUS_FLAGS_RUNNING,
+            framerate: self.rate.hz(),
             resolution_h,
             resolution_v,
             stream_id: STREAM,
@@ -268,6 +279,7 @@ impl Camera {
         let [resolution_h, resolution_v] = self.resolution();
         Some(MavMessage::VIDEO_STREAM_STATUS(VIDEO_STREAM_STATUS_DATA {
             flags: VideoStreamStatusFlags::VIDEO_STREAM_STATUS_FLAGS_RUNNING,
+            framerate: self.rate.hz(),
             resolution_h,
             resolution_v,
             stream_id: STREAM,
@@ -362,6 +374,24 @@ mod tests {
         assert_eq!(camera.due_tracking(9 * SECOND_NS), None, "there is no camera any more");
         assert!(camera.heartbeat(4 * SECOND_NS).is_some());
         assert_eq!(camera.heartbeat(4 * SECOND_NS + 1), None);
+    }
+
+    #[test]
+    fn the_video_has_the_measured_rate_of_the_camera() {
+        let mut camera = Camera::new(0, "rtp-h264:5600".parse().ok());
+        for number in 0..30_u64 {
+            let mut found = found(None);
+            let stamp_ns = 100_000_000 * number as i64;
+            (found.header.sequence, found.header.stamp_ns) = (4 * number, stamp_ns);
+            camera.sees(stamp_ns, "onboard", None, &found);
+        }
+        let Some(MavMessage::VIDEO_STREAM_INFORMATION(stream)) = camera.stream_information() else {
+            panic!("no stream")
+        };
+        let Some(MavMessage::VIDEO_STREAM_STATUS(status)) = camera.stream_status() else {
+            panic!("no status")
+        };
+        assert_eq!((stream.framerate, status.framerate), (40.0, 40.0));
     }
 
     #[test]

@@ -7,14 +7,16 @@
 //!
 //! Modules in reading order: [`config`]; `bridge` is the service; `vehicle` finds the vehicle's system id,
 //! `route` decides which packets pass, `text` and `target` turn the controller's status and estimate into
-//! MAVLink, `silence` watches whether that status keeps coming; `camera` shows the detector's camera, whose `video` another program serves, and `request` reads and answers the ground
+//! MAVLink, `silence` watches whether that status keeps coming; `camera` shows the detector's camera, at the rate of `frame_rate`, whose `video` another program serves, and `request` reads and answers the ground
 //! station's commands to it; `params` shows it the keys of the controller's configuration that are in `parameter_table`; `status` is the
-//! published status of the ground stations.
+//! published status of the ground stations, `neighbours` warns of another bridge with the same id.
 
 pub mod config;
 
 mod bridge;
 mod camera;
+mod frame_rate;
+mod neighbours;
 mod parameter_table;
 mod params;
 mod request;
