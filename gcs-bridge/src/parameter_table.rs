@@ -11,6 +11,15 @@ pub(crate) struct Parameter {
     pub(crate) words: &'static [&'static str],
 }
 
+impl Parameter {
+    /// Its unit, by the name of its key; nothing for a word and for a number without a unit.
+    pub(crate) fn unit(&self) -> &'static str {
+        const UNITS: [(&str, &str); 4] = [("_m_s", "m/s"), ("_hz", "Hz"), ("_m", "m"), ("_s", "s")];
+        let of_key = UNITS.iter().find(|(ending, _)| self.key.ends_with(ending));
+        of_key.map_or("", |(_, unit)| unit)
+    }
+}
+
 const PLACES: &[&str] = &["any", "onboard", "ground"];
 const STARTS: &[&str] = &["command", "airborne", "takeoff", "resume"];
 const MODES: &[&str] = &["guided", "landing-target"];
@@ -64,4 +73,34 @@ const fn number(name: &'static str, key: &'static str) -> Parameter {
 
 const fn word(name: &'static str, key: &'static str, words: &'static [&'static str]) -> Parameter {
     Parameter { name, key, words }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Cells of a row of the document's table: name, unit or words, key, meaning.
+    fn row(line: &str) -> Option<[&str; 4]> {
+        let cells: Vec<&str> = line.strip_prefix("| `AL_")?.split('|').map(str::trim).collect();
+        cells.get(..4)?.try_into().ok()
+    }
+
+    #[test]
+    fn the_document_lists_all_parameters_in_their_order_with_units_words_and_meanings() {
+        let document = include_str!("../../docs/parameters.md");
+        let rows: Vec<[&str; 4]> = document.lines().filter_map(row).collect();
+        let names: Vec<String> =
+            rows.iter().map(|[name, ..]| format!("AL_{}", name.trim_end_matches('`'))).collect();
+        assert_eq!(names, TABLE.iter().map(|it| it.name).collect::<Vec<_>>());
+        for (parameter, [_, unit, key, meaning]) in TABLE.iter().zip(rows) {
+            let words = parameter.words.iter().enumerate();
+            let words: Vec<String> =
+                words.map(|(number, word)| format!("{number} {word}")).collect();
+            let expected =
+                if words.is_empty() { parameter.unit().into() } else { words.join(", ") };
+            assert_eq!(unit, expected, "{}", parameter.name);
+            assert_eq!(key, format!("`{}`", parameter.key));
+            assert!(!meaning.is_empty(), "{}", parameter.name);
+        }
+    }
 }

@@ -32,12 +32,12 @@ struct Entry {
 }
 
 impl Entry {
-    /// The value, for a person; that of a word with the word.
+    /// The value, for a person: with its unit or its word.
     fn meaning(&self) -> String {
         // `value` made the number from the place of the word.
         match self.parameter.words.get(self.value as usize) {
             Some(word) => format!("{} = {word}", self.value),
-            None => self.value.to_string(),
+            None => format!("{} {}", self.value, self.parameter.unit()).trim_end().to_owned(),
         }
     }
 }
@@ -350,6 +350,12 @@ mod tests {
         assert_eq!(
             set("AL_RETRIES", 3.0),
             format!("AL_RETRIES is read-only here (10); change phases.retries {remedy}")
+        );
+        assert_eq!(
+            set("AL_DESC_SPEED", 1.0),
+            format!(
+                "AL_DESC_SPEED is read-only here (2 m/s); change metric.max_descend_m_s {remedy}"
+            )
         );
         assert_eq!(
             set("AL_MODE", 1.0),

@@ -3,7 +3,8 @@
 
 It asks the companion for a message, in each of these ways: signed; not signed; signed with another key; the signed packet
 again; as a sender that is not known yet with a stamp of two minutes ago. Then it sends forged packets for a while, and
-asks again. Only the first and the last may be answered. It prints the result as one JSON object on the last line.
+asks again. Only the first and the last may be answered. It waits for the companion's heartbeat before it sends, so the bridge must send
+first (`ground = "udpout:..."`); a bridge that listens sends nothing before it has received a packet. It prints the result as one JSON object on the last line.
 
 Exit status: 0 all was as it must be, 1 something was not, 77 pymavlink is missing (pip install pymavlink).
 """
@@ -115,7 +116,7 @@ def pauses(beats):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--connect", default="udpin:127.0.0.1:14550", help="where to listen, as pymavlink writes it")
+    parser.add_argument("--connect", default="udpin:127.0.0.1:14550", help="where to listen, as pymavlink writes it; the bridge must send first (udpout)")
     parser.add_argument("--passphrase", required=True, help="the bridge's")
     parser.add_argument("--flood-rate", type=float, default=10_000.0, help="forged packets per second")
     parser.add_argument("--flood-s", type=float, default=5.0, help="for how long, in seconds")
