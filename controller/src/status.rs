@@ -16,6 +16,9 @@ use crate::mount;
 use crate::refusals::Warning;
 use crate::wire;
 
+/// Age of a PX4's mode from which on it may be another one now, in nanoseconds: it is sent twice a second.
+const MAX_MODE_AGE_NS: i64 = 1_200_000_000;
+
 /// The warning of a vehicle that an abort does not lift.
 const LEFT_LOW: &str = "the vehicle is not lifted, as it may stand on the ground, and its motors run; give `land-here`, or take over and land or disarm it";
 
@@ -278,10 +281,12 @@ impl View<'_> {
         }
     }
 
-    /// How a PX4 hovers after an abort: by setpoints or in a mode of its own.
+    /// How a PX4 hovers after an abort: by setpoints or in a mode of its own; `None` where its mode is not known now.
     fn hovers_after_abort(&self, now_ns: i64) -> Option<&'static str> {
         let is_aborted = self.lander.phase() == landing::Phase::Aborted;
         let state = self.autopilot.state().filter(|state| is_aborted && state.armed)?;
+        // A mode from before the link was lost is not that of now.
+        self.autopilot.mode_age_ns(now_ns).filter(|age_ns| *age_ns <= MAX_MODE_AGE_NS)?;
         match state.mode {
             _ if self.autopilot.may_return_to_offboard(now_ns) => Some(
                 "in HOLD, and it returns to OFFBOARD with zero setpoints if that is its failsafe: not known yet",
