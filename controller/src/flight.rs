@@ -192,7 +192,7 @@ impl Flight {
         let before_ns = self.ticked_ns.replace(now_ns).unwrap_or(now_ns);
         let stood_ns = now_ns.saturating_sub(before_ns);
         if stood_ns > MIN_STANDSTILL_NS {
-            self.frames.camera_watch.stood_still(now_ns, stood_ns);
+            self.frames.stood_still(now_ns, stood_ns);
             self.alarms.stood_still(now_ns, stood_ns);
         }
         let stood_s = stood_ns as f64 * 1e-9;

@@ -243,6 +243,12 @@ impl Frames {
         lasting.find(|warning| blocks(&warning.matter)).map(|warning| warning.text)
     }
 
+    /// This process has not run for so long: what was refused before is not over by that, and frames of that time were not missing.
+    pub fn stood_still(&mut self, now_ns: i64, stood_ns: i64) {
+        self.camera_watch.stood_still(now_ns, stood_ns);
+        self.refusals.stood_still(now_ns, stood_ns);
+    }
+
     /// Why a landing that an operator starts would not be led to the marker.
     pub fn start_obstacle(&self, now_ns: i64) -> Option<String> {
         let others = self.obstacle(now_ns).or_else(|| self.selection.no_pose(now_ns));

@@ -63,6 +63,15 @@ impl Refusals {
         lasting.map(|matter| Warning { matter: matter.name(), text: matter.text.clone() })
     }
 
+    /// This process has not run for so long: what was refused before is not over by that.
+    pub fn stood_still(&mut self, now_ns: i64, stood_ns: i64) {
+        for matter in &mut self.matters {
+            for at_ns in [&mut matter.since_ns, &mut matter.last_ns] {
+                *at_ns = at_ns.saturating_add(stood_ns).min(now_ns);
+            }
+        }
+    }
+
     fn forget(&mut self, now_ns: i64) {
         self.matters.retain(|matter| now_ns.saturating_sub(matter.last_ns) < OVER_NS);
     }
@@ -100,6 +109,17 @@ mod tests {
         assert_eq!(refusals.lasting(3 * S).count(), 0);
         refusals.add(3 * S, "another-clock", || "d".to_owned());
         assert_eq!(refusals.lasting(3 * S).count(), 0, "it begins again");
+    }
+
+    #[test]
+    fn a_refusal_is_not_over_by_a_standstill_of_this_process() {
+        let mut refusals = Refusals::default();
+        for at_ns in [0, S / 2, S] {
+            refusals.add(at_ns, "another-clock", || "a".to_owned());
+        }
+        refusals.stood_still(21 * S, 20 * S);
+        assert_eq!(refusals.lasting(21 * S).count(), 1);
+        assert_eq!(refusals.lasting(23 * S).count(), 0);
     }
 
     #[test]
