@@ -6,7 +6,8 @@ use nalgebra::Matrix6;
 
 use super::edges::{Completeness, EdgeSearch, EdgeSupport, Reach, confidence};
 use super::photometric::{
-    MAX_DIAMETER_PX, PhotometricFit, PhotometricInput, PhotometricPoses, PixelSample, Radii,
+    MAX_DIAMETER_PX, MAX_EVENNESS_INTERPOLATED, PhotometricFit, PhotometricInput, PhotometricPoses,
+    PixelSample, Radii,
 };
 use crate::candidates::ring_profile::{MIN_SCORE, MIN_STEP, RingCandidate, SMALL_PX};
 use crate::families::rings::circle_pose::{CirclePose, EdgePoint, project};
@@ -44,9 +45,10 @@ const MIN_R_SQUARED_BLURRED: f64 = 0.975;
 /// ... ink is no blacker than this grey level, the tone curve no flatter than this, ...
 const MIN_BLACK: f64 = 0.0;
 const MIN_CURVE: f64 = -0.1;
-/// ... the image lies below this between the marker (0) and a target of evenly wide rings (1) at two deviations (of other circles
-/// of 10 px and more in 4160 scenes the nearest that passes the other bounds had 0.58), ...
-const MAX_EVENNESS_INTERPOLATED: f64 = 0.4;
+/// ... the image lies below [`MAX_EVENNESS_INTERPOLATED`]
+/// (or, where only smoothed residuals determine the radii well enough and the image is as sharp as that, below this at one
+/// deviation: true markers of 10 to 13 px are at 0.0 ± 0.2, targets of evenly wide rings at 0.5 ± 0.2), ...
+const MAX_EVENNESS_COMPRESSED: f64 = 0.28;
 /// ... the radii are known to this fraction of the marker's radius, and differ from its own by no more than
 /// [`MAX_RADII_OFF_CLEAR`] and two deviations.
 const MAX_RADII_DEVIATION_INTERPOLATED: f64 = 0.05;
@@ -432,7 +434,7 @@ impl EdgeSearch<'_> {
         samples: &mut Vec<PixelSample>,
     ) -> Option<PhotometricPoses> {
         let fit = self.photometric().fit(pose, samples)?;
-        let agrees = is_undisturbed(&fit.best)
+        let agrees = (is_undisturbed(&fit.best) || is_compressed_marker(&fit.best, diameter_px))
             && self.is_near(pose, &fit.best.pose, 0.3 + 0.01 * diameter_px, 0.1);
         agrees.then_some(fit)
     }
@@ -548,8 +550,13 @@ fn is_small_marker(fit: &PhotometricFit, candidate_px: f64) -> bool {
 /// Whether a fit to pixels interpolated from a colour mosaic is a small marker's. Compression is a large part of its
 /// residual, so that the radii that would fit best decide, and of these how far all together are from evenly wide rings.
 fn is_interpolated_marker(fit: &PhotometricFit, diameter_px: f64) -> bool {
+    let is_sharp = fit.blur_px < MAX_BLUR_INTERPOLATED * diameter_px;
     let are_radii_likely = |radii: Radii| {
-        radii.is_below_evenness(MAX_EVENNESS_INTERPOLATED)
+        let is_far_from_even = radii.is_below_evenness(MAX_EVENNESS_INTERPOLATED)
+            || is_sharp
+                && radii.are_smoothed
+                && radii.evenness + radii.evenness_deviation < MAX_EVENNESS_COMPRESSED;
+        is_far_from_even
             && radii.deviation < MAX_RADII_DEVIATION_INTERPOLATED
             && radii.off < MAX_RADII_OFF_CLEAR + RADII_SIGMAS * radii.deviation
     };
@@ -558,12 +565,17 @@ fn is_interpolated_marker(fit: &PhotometricFit, diameter_px: f64) -> bool {
     fit.mosaic.is_some()
         && fit.r_squared > min_r_squared
         && fit.residual < MAX_RESIDUAL
-        && (fit.blur_px < MAX_BLUR_INTERPOLATED * diameter_px
-            || fit.r_squared > MIN_R_SQUARED_BLURRED)
+        && (is_sharp || fit.r_squared > MIN_R_SQUARED_BLURRED)
         && fit.black > MIN_BLACK
         && fit.response.curve > MIN_CURVE
         && has_balance(fit)
         && fit.radii.is_some_and(are_radii_likely)
+}
+
+/// Whether a fit to a marker large enough for edges is a marker's in an image whose compression leaves a larger residual than
+/// [`is_undisturbed`] allows: up to 48 px its radii decide, as those of smaller ones.
+fn is_compressed_marker(fit: &PhotometricFit, diameter_px: f64) -> bool {
+    is_interpolated_marker(fit, diameter_px) && !has_other_widths(fit) && fit.has_rings()
 }
 
 /// Whether a fit is a small marker's where the edge of a shadow was: its remainder disturbs the grey values, but not which

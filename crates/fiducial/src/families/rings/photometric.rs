@@ -10,13 +10,16 @@ mod blur;
 mod model;
 mod scene;
 mod score;
+mod smooth;
 mod solve;
 
 use crate::families::rings::circle_pose::CirclePose;
 use crate::optics::mosaic::Mosaic;
 
 use model::{Effort, Extras, MAX_GREY, MAX_RESIDUAL};
-pub(crate) use model::{PhotometricFit, PhotometricInput, PhotometricPoses, Radii};
+pub(crate) use model::{
+    MAX_EVENNESS_INTERPOLATED, PhotometricFit, PhotometricInput, PhotometricPoses, Radii,
+};
 pub(crate) use scene::PixelSample;
 use scene::{ALL_PIXELS_PX, FOCUSED_PX, MAX_RADII_PX, MAX_TARGETS_PX, SampleSource, Scene};
 use solve::{ModelFit, Start};
@@ -42,6 +45,9 @@ const MIN_RESPONSE_GAIN: f64 = 0.2;
 /// Above this residual a colour mosaic is tried, and accepted when it lowers the cost to this fraction.
 const MIN_MOSAIC_RESIDUAL: f64 = 0.015;
 const MAX_MOSAIC_COST: f64 = 0.8;
+/// A fit to a small marker without a camera's processing that leaves more than this may be at another minimum: behind a steep
+/// tone curve a marker is nearly white, and the fit ends with grey ink.
+const MAX_PLAIN_RESIDUAL: f64 = 0.1;
 /// It is tried when one step with it costs less than this fraction of one without it, or, where a tone curve hides that, than
 /// this fraction of the cost before.
 const MAX_MOSAIC_STEP: f64 = 0.85;
@@ -77,11 +83,16 @@ impl PhotometricInput<'_> {
         let stride = sparse_stride(samples);
         let mut sparse =
             Scene { stride, has_prior, ..Scene::new(samples, size_m, camera, early_reject) };
-        let mut first = match sparse.fitted(Start::Pose(&tilted(start))) {
-            Some(fit) => fit,
-            None => {
-                let mosaics = source.mosaics(&outline).filter(|_| is_small)?;
-                sparse.fitted_to_mosaic(&tilted(start), mosaics)?
+        let plain = sparse.fitted(Start::Pose(&tilted(start)));
+        let is_far_off = |fit: &ModelFit| fit.residual(&sparse) > MAX_PLAIN_RESIDUAL;
+        let mut first = match plain {
+            Some(fit) if !is_small || !is_far_off(&fit) => fit,
+            plain => {
+                let max_cost = plain.as_ref().map(|fit| MAX_MOSAIC_COST * fit.cost());
+                let mosaics = source.mosaics(&outline).filter(|_| is_small);
+                let processed = mosaics
+                    .and_then(|mosaics| sparse.fitted_to_mosaic(&tilted(start), mosaics, max_cost));
+                processed.or(plain)?
             }
         };
         let (extras, mosaic) = (sparse.extras, sparse.mosaic);
@@ -231,13 +242,21 @@ impl Scene<'_> {
         best.unwrap_or(plain)
     }
 
-    /// The better fit to pixels interpolated from one of these mosaics, which is then the scene's.
-    fn fitted_to_mosaic(&mut self, start: &CirclePose, mosaics: [Mosaic; 2]) -> Option<ModelFit> {
+    /// The better fit to pixels interpolated from one of these mosaics, which is then the scene's; `None` where it costs more
+    /// than `max_cost`, if there is one.
+    fn fitted_to_mosaic(
+        &mut self,
+        start: &CirclePose,
+        mosaics: [Mosaic; 2],
+        max_cost: Option<f64>,
+    ) -> Option<ModelFit> {
         let fits = mosaics.into_iter().filter_map(|mosaic| {
             let scene = Scene { mosaic: Some(mosaic), extras: Extras::Response, ..*self };
             Some((mosaic, scene.fitted(Start::Pose(start))?))
         });
-        let (mosaic, fit) = fits.min_by(|a, b| a.1.cost().total_cmp(&b.1.cost()))?;
+        let (mosaic, fit) = fits
+            .min_by(|a, b| a.1.cost().total_cmp(&b.1.cost()))
+            .filter(|(_, fit)| max_cost.is_none_or(|max| fit.cost() < max))?;
         (self.mosaic, self.extras) = (Some(mosaic), Extras::Response);
         Some(fit)
     }
