@@ -81,7 +81,9 @@ const HOLD_MS: u32 = 1000;
 pub(crate) struct Texts {
     pub(crate) now: Arc<watch::Sender<Utf8Bytes>>,
     pub(crate) slow: Arc<watch::Sender<Utf8Bytes>>,
-    pub(crate) log: Arc<watch::Sender<Utf8Bytes>>,
+    /// The version of the log. Its text is made when it is sent: a browser subtracts the ages of the entries from the time of
+    /// arrival, which may be long after the last entry.
+    pub(crate) log: Arc<watch::Sender<u64>>,
 }
 
 /// The data shared by all requests.
@@ -187,6 +189,11 @@ impl App {
     fn log(&self, level: Level, text: &str) {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         state.log.add(now_ns(), level, text);
+    }
+
+    fn log_text(&self) -> Utf8Bytes {
+        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        state.log_json(now_ns()).to_string().into()
     }
 
     /// Counts a refusal, and gives the reason.
@@ -508,14 +515,16 @@ impl Client {
         });
         send(socket, Message::Text(hello.to_string().into())).await?;
         let texts = self.peer.app.texts.clone();
-        let [mut now, mut slow, mut log] = [texts.now, texts.slow, texts.log].map(|text| {
+        let [mut now, mut slow] = [texts.now, texts.slow].map(|text| {
             let mut text = text.subscribe();
             text.mark_changed();
             text
         });
+        let mut log = texts.log.subscribe();
+        log.mark_changed();
         loop {
             let text = tokio::select! {
-                changed = log.changed() => { changed?; log.borrow_and_update().clone() }
+                changed = log.changed() => { changed?; self.peer.app.log_text() }
                 changed = slow.changed() => { changed?; slow.borrow_and_update().clone() }
                 changed = now.changed() => { changed?; now.borrow_and_update().clone() }
                 Some(reply) = self.waiting.recv() => reply,

@@ -142,15 +142,13 @@ async fn publish(state: &Mutex<State>, texts: &Texts) -> anyhow::Result<()> {
     now.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut slow = interval(SLOW_PERIOD);
     slow.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let mut version = None;
     loop {
         tokio::select! {
             _ = now.tick() => {
                 let state = lock(state);
                 texts.now.send_replace(state.now(now_ns()).to_string().into());
-                if version.replace(state.log.version()) != Some(state.log.version()) {
-                    texts.log.send_replace(state.log_json(now_ns()).to_string().into());
-                }
+                let version = state.log.version();
+                texts.log.send_if_modified(|sent| std::mem::replace(sent, version) != version);
             }
             _ = slow.tick() => {
                 let mut state = lock(state);

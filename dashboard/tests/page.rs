@@ -251,6 +251,24 @@ async fn the_state_is_sent_with_its_age() -> anyhow::Result<()> {
     Ok(())
 }
 
+/// The page subtracts the age of an entry from the time of arrival.
+#[tokio::test(flavor = "multi_thread")]
+async fn the_log_of_a_page_opened_later_has_the_time_at_which_it_is_sent() -> anyhow::Result<()> {
+    let page = Page::start(&[]).await?;
+    let _controller = controller(open("controller", page.meet).await?);
+    let has_entry =
+        |it: &Value| it["entries"].as_array().is_some_and(|entries| !entries.is_empty());
+    receive(&mut page.socket("/ws").await?, has_entry).await?;
+    sleep(Duration::from_millis(1500)).await;
+    let mut socket = page.socket("/ws").await?;
+    let log = receive(&mut socket, has_entry).await?;
+    let now = receive(&mut socket, |it| it["kind"] == "now").await?;
+    let times_ms = [&log, &now].map(|it| it["now_ms"].as_f64());
+    let [Some(log_ms), Some(now_ms)] = times_ms else { bail!("{log} {now}") };
+    ensure!(now_ms - log_ms < 1000.0, "the log is {} ms old", now_ms - log_ms);
+    Ok(())
+}
+
 async fn nonce(socket: &mut WebSocketStream<impl Stream>, command: &str) -> anyhow::Result<String> {
     send(socket, json!({ "kind": "nonce", "command": command })).await?;
     let answer = receive(socket, |it| it["kind"] == "nonce").await?;
