@@ -210,6 +210,8 @@ function showNow({ status, target, vehicle, now_ms: stampMs }, at) {
     const isCurrent = status.age_ms + since(at, at, stampMs) < STALE_MS;
     put('title', status.title);
     element('title').className = `title ${status.mood}`;
+    // Replies and logs have this name of the phase.
+    put('phase-name', status.phase);
     put('why', status.why);
     put('next', status.next);
     put('height', number(status.height_m, 2, 'm'));

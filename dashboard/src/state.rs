@@ -515,7 +515,7 @@ impl State {
 }
 
 fn status_json(status: &ControllerStatus, age_ms: f64) -> Value {
-    let words = words::phase(status.phase);
+    let words = words::phase(status);
     json!({
         "age_ms": age_ms,
         "phase": status.phase.name(), "title": words.title, "mood": words.mood, "next": words.next,

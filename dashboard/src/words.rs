@@ -1,6 +1,9 @@
 //! Describes phases, detector states and ground contact in words for an operator.
 
-use messages::{DetectorState, LandedState, Phase};
+use messages::{ControllerStatus, DetectorState, LandedState, Phase};
+
+/// Height above the target below which a vehicle that the autopilot lands is touching down, in metres.
+const TOUCHDOWN_M: f64 = 1.0;
 
 /// The description of a phase for an operator.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -13,9 +16,9 @@ pub struct Words {
     pub mood: &'static str,
 }
 
-/// A phase in words.
-pub fn phase(phase: Phase) -> Words {
-    let (title, next, mood) = match phase {
+/// The phase of a status in words.
+pub fn phase(status: &ControllerStatus) -> Words {
+    let (title, next, mood) = match status.phase {
         Phase::Idle => ("Waiting", "An operator's start begins the landing.", "calm"),
         Phase::Takeoff => ("Taking off", "The search begins at the take-off height.", "busy"),
         Phase::Search => (
@@ -38,7 +41,12 @@ pub fn phase(phase: Phase) -> Words {
             "Seeing the marker again begins the next approach.",
             "warn",
         ),
-        Phase::Final => ("Touching down", "The autopilot stops the motors on the ground.", "busy"),
+        Phase::Final => {
+            // It begins close to the ground, or, by a command or an alarm, at any height.
+            let is_low = status.height_m.is_some_and(|height_m| height_m <= TOUCHDOWN_M);
+            let title = if is_low { "Touching down" } else { "The autopilot lands" };
+            (title, "The autopilot stops the motors on the ground.", "busy")
+        }
         Phase::Landed => ("Landed", "Only a new start does anything further.", "good"),
         Phase::Hold => (
             "Holding the position",
@@ -66,6 +74,9 @@ pub fn detector(state: DetectorState) -> &'static str {
     }
 }
 
+/// The state of a detector while the controller, which decides it, sends nothing.
+pub const WITHOUT_CONTROLLER: &str = "not known without the controller";
+
 /// Contact with the ground.
 pub fn landed(state: LandedState) -> &'static str {
     match state {
@@ -80,6 +91,16 @@ pub fn landed(state: LandedState) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn only_a_vehicle_close_to_the_ground_is_touching_down() {
+        let title = |height_m| {
+            phase(&ControllerStatus { phase: Phase::Final, height_m, ..Default::default() }).title
+        };
+        assert_eq!(title(Some(4.9)), "The autopilot lands");
+        assert_eq!(title(None), "The autopilot lands");
+        assert_eq!(title(Some(0.4)), "Touching down");
+    }
 
     #[test]
     fn a_detector_without_a_pose_is_distinguished_from_one_that_sees_no_marker() {

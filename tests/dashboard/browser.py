@@ -298,6 +298,7 @@ def main():
             press_space(page, command)
             holds = "===" if command == "hold" else "!=="
             wait(page, f"document.getElementById('phase').textContent {holds} 'Holding the position'")
+        assert text(page, "#phase-name") == "hold", text(page, "#phase-name")
         page.screenshot(path=FOLDER / "holding.png", full_page=True)
         # A hovering vehicle moves up and down alternately.
         for _ in range(40):
@@ -366,7 +367,7 @@ def main():
         wait(page, "!document.querySelector('main').classList.contains('cut-off')", 2)
 
         press_space(page, "resume")
-        wait(page, "['Touching down', 'Landed'].includes(document.getElementById('phase').textContent)")
+        wait(page, "['The autopilot lands', 'Touching down', 'Landed'].includes(document.getElementById('phase').textContent)")
         page.screenshot(path=FOLDER / "landed.png", full_page=True)
         browser.close()
     foreign = [url for url in requests if not url.startswith(URL)]
