@@ -303,7 +303,7 @@ function showSlow({ detectors, services, recorders, bridges, checks }) {
     ];
     texts.forEach((text, n) => put(/** @type {HTMLElement} */ (line.children[n]), text));
     // A detector that is in use only because there is no better one is not in a good state.
-    line.children[1].className = it.state === 'in use' ? 'good' : it.state === 'standby' ? '' : 'bad';
+    line.children[1].className = it.state === 'in use' ? 'good' : it.state === 'standby' ? '' : it.state.startsWith('not known') ? 'calm' : 'bad';
     line.dataset.age = it.age_ms == null ? '' : String(it.age_ms);
     if (!line.querySelector('button')) {
       const button = document.createElement('button');

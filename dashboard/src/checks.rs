@@ -45,17 +45,17 @@ pub struct Check {
 /// The data from which the list is made.
 #[derive(Clone, Debug, Default)]
 pub struct Facts<'a> {
-    /// The controller's status.
+    /// The controller's status; `None` if it is not current.
     pub status: Option<&'a ControllerStatus>,
-    /// Its age in milliseconds.
+    /// Its age in milliseconds, also if it is not current.
     pub status_age_ms: Option<f64>,
     /// The vehicle's state.
     pub vehicle: Option<&'a VehicleState>,
     /// Its age in milliseconds.
     pub vehicle_age_ms: Option<f64>,
-    /// The detections of the detector in use in its newest frame.
+    /// The detections of the detector in use in its newest frame; `None` if they are not current.
     pub found: Option<&'a Detections>,
-    /// Its age in milliseconds.
+    /// Time since the latest detections of the detector in use arrived, in milliseconds, also if they are not current.
     pub found_age_ms: Option<f64>,
     /// Frames a second, as counted by the camera's service.
     pub frames_hz: Option<f64>,
@@ -82,6 +82,11 @@ struct Finding {
 
 fn finding(verdict: Verdict, text: impl Into<String>, todo: &'static str) -> Finding {
     Finding { verdict, text: text.into(), todo }
+}
+
+/// A result that depends on messages of a process that sends none. The check of that process has the remedy.
+fn unknown_without(process: &str) -> Finding {
+    finding(Verdict::Open, format!("not known without the {process}"), "")
 }
 
 /// Whether data of this age count as current.
@@ -116,7 +121,7 @@ pub fn checks(facts: &Facts<'_>) -> Vec<Check> {
 }
 
 fn controller(facts: &Facts<'_>) -> Finding {
-    let todo = "Start `alight controller`, or read its log.";
+    let todo = "Start `alight controller`, or read its log; if it runs on another machine, `alight doctor` measures the link.";
     match facts.status_age_ms {
         None => finding(Verdict::Bad, "none is present", todo),
         Some(age_ms) if age_ms >= MAX_AGE_MS => {
@@ -128,7 +133,8 @@ fn controller(facts: &Facts<'_>) -> Finding {
 
 fn autopilot(facts: &Facts<'_>) -> Finding {
     let todo = "Check the autopilot's power, cable and `autopilot.address`; `alight doctor` tries the link.";
-    let stated = facts.status.map_or("", |status| status.autopilot.as_str());
+    let Some(status) = facts.status else { return unknown_without("controller") };
+    let stated = status.autopilot.as_str();
     if is_current(facts.vehicle_age_ms) {
         finding(Verdict::Good, stated, todo)
     } else {
@@ -154,7 +160,12 @@ fn camera(facts: &Facts<'_>) -> Finding {
 fn calibration(facts: &Facts<'_>) -> Finding {
     let todo = "Calibrate the camera and name the file in its configuration (docs/camera.md).";
     let Some(info) = facts.calibration else {
-        return finding(Verdict::Bad, "no calibration of the camera in use has arrived", todo);
+        return match (facts.status, facts.found) {
+            (None, _) => unknown_without("controller"),
+            // The camera in use is the one whose frames the detector searches.
+            (_, None) => unknown_without("detector"),
+            _ => finding(Verdict::Bad, "no calibration of the camera in use has arrived", todo),
+        };
     };
     match (info.focal_px, info.problem()) {
         (_, Some(error)) => finding(Verdict::Bad, format!("impossible: {error}"), todo),
@@ -167,44 +178,61 @@ fn calibration(facts: &Facts<'_>) -> Finding {
 
 fn clock(facts: &Facts<'_>) -> Finding {
     let todo = "Run camera and controller on one machine: frames of another clock are not used.";
-    match (facts.found.map(|found| found.header.clock.as_str()), facts.controller_clock) {
-        (Some(camera), Some(controller)) if camera == controller => {
+    if facts.status.is_none() {
+        return unknown_without("controller");
+    }
+    let Some(found) = facts.found else { return unknown_without("detector") };
+    match (found.header.clock.as_str(), facts.controller_clock) {
+        (camera, Some(controller)) if camera == controller => {
             finding(Verdict::Good, "camera and controller use the same", todo)
         }
-        (Some(camera), Some(controller)) => finding(
+        (camera, Some(controller)) => finding(
             Verdict::Bad,
             format!("the camera has {camera}, the controller {controller}"),
             todo,
         ),
-        _ => finding(Verdict::Bad, "unknown until frames are searched", todo),
+        (_, None) => finding(Verdict::Open, "the controller's is not known yet", ""),
     }
 }
 
 fn detector(facts: &Facts<'_>) -> Finding {
-    let todo =
-        "Start a detector; a slow one needs fewer markers, a smaller picture or a faster machine.";
-    let Some(status) = facts.status else { return finding(Verdict::Bad, "no controller", todo) };
+    let todo = "Start the detector, or read its log.";
+    let Some(status) = facts.status else { return unknown_without("controller") };
     let Some(name) = &status.active_detector else {
         return finding(Verdict::Bad, format!("none in use: {}", status.detector_why), todo);
     };
     let Some(it) = status.candidates.iter().find(|it| it.detector == *name) else {
         return finding(Verdict::Bad, format!("the controller has no data of `{name}`"), todo);
     };
+    let Some(age_ms) = facts.found_age_ms else {
+        return finding(Verdict::Bad, format!("{name}: no detections have arrived"), todo);
+    };
+    // Rate and latency are those of its latest frames, also while it is silent.
+    let age_ms = age_ms.max(it.age_ms);
+    if !is_current(Some(age_ms)) {
+        return finding(Verdict::Bad, format!("{name}: silent for {:.0} s", age_ms / 1000.0), todo);
+    }
     let text = format!("{name}: {:.1} Hz, {:.0} ms", it.rate_hz, it.latency_ms);
     let is_quick = it.rate_hz >= MIN_RATE_HZ && it.latency_ms <= MAX_LATENCY_MS;
+    let todo = "It needs fewer markers, a smaller picture or a faster machine.";
     finding(if is_quick { Verdict::Good } else { Verdict::Bad }, text, todo)
 }
 
 fn marker(facts: &Facts<'_>) -> Finding {
     let todo = "Show the pad to the camera, give the detector the marker's family and size, and the controller its name (`marker`).";
+    let Some(status) = facts.status else { return unknown_without("controller") };
     let Some(found) = facts.found.filter(|_| is_current(facts.found_age_ms)) else {
-        return finding(Verdict::Bad, "no detector searches for it", todo);
+        return unknown_without("detector");
     };
     let any = found.detections.first();
-    let requested = facts.status.and_then(ControllerStatus::landing_marker);
+    let requested = status.landing_marker();
     match (requested.map_or(any, |marker| found.first_of(marker)), any, requested) {
         (Some(it), ..) if it.pose.is_some() => finding(Verdict::Good, in_words(it), todo),
-        (Some(_), ..) => finding(Verdict::Bad, "seen, but its size is not configured", todo),
+        (Some(_), ..) => finding(
+            Verdict::Bad,
+            "seen, but the detector gives no pose of it",
+            "A pose needs the camera's calibration, and the marker's size in the detector's configuration.",
+        ),
         (None, Some(other), Some(requested)) => {
             let text = format!("sees {}, the landing uses {requested}", in_words(other));
             finding(Verdict::Bad, text, todo)
@@ -215,7 +243,7 @@ fn marker(facts: &Facts<'_>) -> Finding {
 
 fn mount(facts: &Facts<'_>) -> Finding {
     let todo = "Correct the camera's mount in its configuration (docs/camera.md).";
-    let Some(status) = facts.status else { return finding(Verdict::Bad, "no controller", todo) };
+    let Some(status) = facts.status else { return unknown_without("controller") };
     let about =
         status.warnings.iter().find(|text| text.contains("mount") || text.contains("focal"));
     match about {
@@ -229,6 +257,9 @@ fn mount(facts: &Facts<'_>) -> Finding {
 
 fn link(facts: &Facts<'_>) -> Finding {
     let todo = "Move the antennas closer; `alight doctor` measures the link.";
+    if facts.status.is_none() {
+        return unknown_without("controller");
+    }
     match facts.round_trip_ms {
         Some(Some(took_ms)) => {
             let is_quick = took_ms <= MAX_ROUND_TRIP_MS;
@@ -242,6 +273,9 @@ fn link(facts: &Facts<'_>) -> Finding {
 
 fn battery(facts: &Facts<'_>) -> Finding {
     let todo = "Charge it.";
+    if facts.status.is_none() {
+        return unknown_without("controller");
+    }
     match facts.vehicle.and_then(|vehicle| vehicle.battery) {
         Some(level) if level >= MIN_BATTERY => {
             finding(Verdict::Good, format!("{:.0} %", 100.0 * level), todo)
@@ -286,7 +320,7 @@ fn warnings(facts: &Facts<'_>) -> Finding {
         texts.push(&silent);
     }
     match texts.as_slice() {
-        [] if facts.status.is_none() => finding(Verdict::Open, "no controller is present", todo),
+        [] if facts.status.is_none() => unknown_without("controller"),
         [] => finding(Verdict::Good, "none", todo),
         texts => finding(Verdict::Bad, texts.join("; "), todo),
     }
@@ -301,13 +335,78 @@ mod tests {
         checks(facts).into_iter().find(|check| check.name == name).unwrap().verdict
     }
 
+    /// The checks with a remedy.
+    fn remedies(facts: &Facts<'_>) -> Vec<&'static str> {
+        let failed = checks(facts).into_iter().filter(|check| check.verdict == Verdict::Bad);
+        failed
+            .inspect(|check| assert!(!check.todo.is_empty(), "{check:?}"))
+            .map(|it| it.name)
+            .collect()
+    }
+
+    /// The checks that are not known without this process.
+    fn unknown(facts: &Facts<'_>, process: &str) -> Vec<&'static str> {
+        let text = format!("not known without the {process}");
+        let unknown = checks(facts).into_iter().filter(|check| check.text == text);
+        unknown
+            .inspect(|it| assert!(it.verdict == Verdict::Open && it.todo.is_empty(), "{it:?}"))
+            .map(|it| it.name)
+            .collect()
+    }
+
     #[test]
-    fn without_data_the_checks_fail_and_name_a_remedy() {
-        let checks = checks(&Facts::default());
-        for name in ["controller", "autopilot", "camera", "calibration", "detector", "marker"] {
-            let check = checks.iter().find(|check| check.name == name).unwrap();
-            assert!(check.verdict == Verdict::Bad && !check.todo.is_empty(), "{check:?}");
-        }
+    fn without_data_only_controller_and_camera_have_a_remedy() {
+        let facts = Facts::default();
+        assert_eq!(remedies(&facts), ["controller", "camera"]);
+        let others = ["autopilot", "calibration", "clock", "detector", "marker", "mount", "link"];
+        assert_eq!(unknown(&facts, "controller"), [&others[..], &["battery", "warnings"]].concat());
+    }
+
+    #[test]
+    fn without_a_detector_only_its_own_check_has_a_remedy() {
+        let status = ControllerStatus {
+            active_detector: Some("main".into()),
+            candidates: vec![Candidate::sample()],
+            ..ControllerStatus::default()
+        };
+        let facts = Facts {
+            status: Some(&status),
+            status_age_ms: Some(50.0),
+            vehicle_age_ms: Some(50.0),
+            found_age_ms: Some(3000.0),
+            frames_hz: Some(15.0),
+            controller_clock: Some("clock"),
+            round_trip_ms: Some(Some(1.0)),
+            ..Facts::default()
+        };
+        assert_eq!(remedies(&facts), ["detector"]);
+        assert_eq!(unknown(&facts, "detector"), ["calibration", "clock", "marker"]);
+        let detector = |facts: &Facts<'_>| {
+            let mut found = checks(facts).into_iter().filter(|check| check.name == "detector");
+            found.next().map(|check| check.text).unwrap()
+        };
+        assert_eq!(detector(&facts), "main: silent for 3 s");
+        // The controller has none of its detections.
+        let late = Candidate { age_ms: 4000.0, ..Candidate::sample() };
+        let status = ControllerStatus { candidates: vec![late], ..status.clone() };
+        let late = Facts { status: Some(&status), found_age_ms: Some(50.0), ..facts };
+        assert_eq!(detector(&late), "main: silent for 4 s");
+    }
+
+    #[test]
+    fn of_a_detection_without_a_pose_no_cause_is_named() {
+        let status = ControllerStatus { marker: "rings".into(), ..ControllerStatus::default() };
+        let without = Detection { pose: None, ..Detection::sample() };
+        let found = Detections { detections: vec![without], ..Detections::sample() };
+        let facts = Facts {
+            status: Some(&status),
+            found: Some(&found),
+            found_age_ms: Some(50.0),
+            ..Facts::default()
+        };
+        let check = checks(&facts).into_iter().find(|check| check.name == "marker").unwrap();
+        assert_eq!(check.text, "seen, but the detector gives no pose of it");
+        assert_eq!(check.verdict, Verdict::Bad);
     }
 
     #[test]
@@ -354,7 +453,8 @@ mod tests {
         let old =
             Facts { vehicle_age_ms: Some(1500.0), found_age_ms: Some(1500.0), ..facts.clone() };
         assert_eq!(verdict(&old, "autopilot"), Verdict::Bad);
-        assert_eq!(verdict(&old, "marker"), Verdict::Bad);
+        assert_eq!(verdict(&old, "detector"), Verdict::Bad);
+        assert_eq!(unknown(&old, "detector"), ["marker"]);
         let foreign = Facts { controller_clock: Some("other"), ..facts.clone() };
         assert_eq!(verdict(&foreign, "clock"), Verdict::Bad);
         let aruco = Detection { family: "aruco-4x4-50".into(), id: Some(7), ..Detection::sample() };

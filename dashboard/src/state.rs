@@ -309,6 +309,18 @@ impl State {
         age_ms(now_ns, since_ns)
     }
 
+    /// Age of the controller's status, in milliseconds.
+    fn status_age_ms(&self, now_ns: i64) -> Option<f64> {
+        let seen = self.status.as_ref()?;
+        Some(self.age_of(now_ns, seen.received_ns, seen.value.stamp_ns))
+    }
+
+    /// The controller's status; `None` while the controller sends nothing.
+    fn current_status(&self, now_ns: i64) -> Option<&ControllerStatus> {
+        let status = self.status.as_ref().filter(|_| is_current(self.status_age_ms(now_ns)));
+        status.map(|seen| &seen.value)
+    }
+
     /// The data that change with each frame.
     pub fn now(&self, now_ns: i64) -> Value {
         let status = self.status.as_ref().map(|seen| {
@@ -418,12 +430,16 @@ impl State {
     }
 
     fn detectors_json(&self, now_ns: i64) -> Vec<Value> {
-        let status = self.status.as_ref().map(|seen| &seen.value);
+        let status = self.current_status(now_ns);
         let candidates: BTreeMap<&str, _> = status
             .iter()
             .flat_map(|status| &status.candidates)
             .map(|candidate| (candidate.detector.as_str(), candidate))
             .collect();
+        let unlisted = match status {
+            Some(_) => "not received by the controller",
+            None => words::WITHOUT_CONTROLLER,
+        };
         let mut names: BTreeSet<&str> = candidates.keys().copied().collect();
         names.extend(self.detectors.keys().map(String::as_str));
         names.extend(self.found.keys().map(String::as_str));
@@ -433,7 +449,7 @@ impl State {
             let found = self.found.get(name);
             json!({
                 "name": name,
-                "state": candidate.map_or("not received by the controller", |it| words::detector(it.state)),
+                "state": candidate.map_or(unlisted, |it| words::detector(it.state)),
                 "in_use": status.is_some_and(|it| it.active_detector.as_deref() == Some(name)),
                 "place": candidate.and_then(|it| it.place).or(info.map(|it| it.place)),
                 "host": info.map(|it| &it.host), "camera": info.map(|it| &it.camera),
@@ -466,15 +482,14 @@ impl State {
     }
 
     fn facts(&self, now_ns: i64) -> Facts<'_> {
-        let status = self.status.as_ref();
-        let status_age_ms = status.map(|it| self.age_of(now_ns, it.received_ns, it.value.stamp_ns));
         let vehicle = self.vehicle.as_ref();
         let vehicle_age_ms =
             vehicle.map(|it| self.age_of(now_ns, it.received_ns, it.value.stamp_ns));
         let in_use = self.in_use();
         let found = in_use.and_then(|name| self.found.get(name));
-        let found = found.filter(|it| is_current(Some(age_ms(now_ns, it.received_ns))));
-        let camera = found.map(|it| it.value.header.camera.as_str());
+        let found_age_ms = found.map(|it| age_ms(now_ns, it.received_ns));
+        let found = found.filter(|_| is_current(found_age_ms));
+        let camera = found.map(|it| it.value.header.camera.as_str()).or(self.camera());
         let controller = self.services.iter().find(|(key, _)| key.0 == "controller");
         let has_fault = |name: &str| {
             self.services
@@ -482,12 +497,12 @@ impl State {
                 .any(|it| it.health.errors.iter().any(|fault| fault.reason == name))
         };
         Facts {
-            status: status.map(|seen| &seen.value).filter(|_| is_current(status_age_ms)),
-            status_age_ms,
+            status: self.current_status(now_ns),
+            status_age_ms: self.status_age_ms(now_ns),
             vehicle: vehicle.map(|seen| &seen.value).filter(|_| is_current(vehicle_age_ms)),
             vehicle_age_ms,
             found: found.map(|it| &it.value),
-            found_age_ms: found.map(|it| age_ms(now_ns, it.received_ns)),
+            found_age_ms,
             frames_hz: self.frames_hz(),
             calibration: camera.and_then(|name| self.cameras.get(name)).map(|seen| &seen.value),
             controller_clock: controller.map(|(_, it)| it.health.clock.as_str()),
@@ -721,7 +736,7 @@ mod tests {
     #[test]
     fn a_detectors_row_joins_all_its_messages() {
         let mut state = State::new("own");
-        state.take(0, status(Phase::Search, "looking"));
+        state.take(SECOND / 2, status(Phase::Search, "looking"));
         state.take(0, Input::Detections("main".into(), Box::new(Detections::sample())));
         state.take(0, Input::Detections("other".into(), Box::new(Detections::sample())));
         let detectors = &state.slow(SECOND)["detectors"];
@@ -739,6 +754,14 @@ mod tests {
             "{detectors}"
         );
         assert_eq!(detectors[1]["state"], "not received by the controller");
+        // A controller that sends nothing states no rate and no state of a detector.
+        let later = &state.slow(3 * SECOND)["detectors"];
+        for row in [&later[0], &later[1]] {
+            assert_eq!(
+                (&row["state"], &row["rate_hz"]),
+                (&json!(words::WITHOUT_CONTROLLER), &Value::Null)
+            );
+        }
     }
 
     #[test]
