@@ -424,7 +424,8 @@ function checkAges() {
     put(badge, status.title);
     badge.className = `badge ${status.mood}`;
   } else {
-    put(badge, status ? `was: ${status.title}, ${age(phaseOld)} ago` : 'No controller');
+    // Without current data of the server, which may have refused the page, it is not known whether there is a controller.
+    put(badge, status ? `was: ${status.title}, ${age(phaseOld)} ago` : nowOld <= STALE_MS ? 'No controller' : 'No data');
     badge.className = 'badge lost';
   }
   for (const line of document.querySelectorAll('tbody tr, #bridges span')) {

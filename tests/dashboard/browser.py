@@ -160,6 +160,7 @@ def refuse_a_third(browser):
     wait(second, CONNECTED)
     third.goto(URL)
     wait(third, "document.getElementById('connection').textContent.includes('max_clients')", 10)
+    assert text(third, "#phase") == "No data", text(third, "#phase")
     second.close()
     wait(third, CONNECTED, 10)
     third.close()
