@@ -219,7 +219,7 @@ function showNow({ status, target, vehicle, now_ms: stampMs }, at) {
     put('detection-age', number(status.detection_age_ms, 0, 'ms'));
     put('latency', status.latency_ms ? `${status.latency_ms[0].toFixed(0)} to ${status.latency_ms[1].toFixed(0)} ms` : '-');
     const [vn, ve, vd] = status.setpoint_m_s ?? [];
-    put('setpoint', status.setpoint_m_s ? `${Math.hypot(vn, ve).toFixed(2)} ↓ ${fixed(vd, 2)} m/s` : '-');
+    put('setpoint', status.setpoint_m_s ? `${Math.hypot(vn, ve).toFixed(2)} ${vd <= -0.005 ? '↑' : '↓'} ${Math.abs(vd).toFixed(2)} m/s` : '-');
     put('since', number(status.since_start_s, 1, 's'));
     put('autopilot', `${status.autopilot}${status.setpoint_timeout_s == null ? '' : `; stops ${status.setpoint_timeout_s} s after the last setpoint`}`);
     put('detector-why', `${status.detector ? `In use: ${status.detector}` : 'None is in use'} (${status.detector_why}); preferred: ${status.preference || 'none'}; ${status.detector_changes} changes.`);

@@ -35,6 +35,8 @@ LINES = "(selector) => [...document.querySelectorAll(selector)].map((it) => getC
 STATE_ELEMENTS = ["#height", "#why", "#mode", "#detector-why", "#detectors td", "#services td", "#recorders", "#checks span", "#strips span:last-child", "#video-text"]
 # Whether the times of the log are short enough for one line.
 SHORT_TIMES = r"[...document.querySelectorAll('#log time')].every((it) => /^\d\d:\d\d:\d\d$/.test(it.textContent))"
+# The arrow has the direction, the number has no sign.
+SETPOINT = r"/^(-|\d+[.]\d\d [↑↓] \d+[.]\d\d m[/]s)$/.test(document.getElementById('setpoint').textContent)"
 SIGNED_ZERO = "[...document.querySelectorAll('dd')].map((it) => it.textContent).find((it) => /-0([.]0*)? /.test(it))"
 CONNECTED = "document.getElementById('connection').textContent === 'connected'"
 # A button that is pressed shortly and then held, before the server has answered the first press.
@@ -305,6 +307,7 @@ def main():
         for _ in range(40):
             signed = page.evaluate(SIGNED_ZERO)
             assert signed is None, f"zero with a sign: {signed}"
+            assert page.evaluate(SETPOINT), text(page, "#setpoint")
             time.sleep(0.05)
         for selector in STATE_ELEMENTS:
             wait(page, f"/^none(,none)*$/.test(({LINES})({json.dumps(selector)}))", 10)
