@@ -548,6 +548,23 @@ element('theme').addEventListener('click', () => {
 });
 setTheme(localStorage.getItem('theme') === 'sun' ? 'sun' : 'dark');
 
+/** On a small screen the commands are below its lower edge: the abort and the replies are then in the header, which is always visible.
+ * The name of the host makes room for them. */
+const small = matchMedia('(max-width: 56rem)');
+function placeAbort() {
+  const abort = /** @type {HTMLElement} */ (document.querySelector('button[data-command=abort]'));
+  if (small.matches) {
+    element('at-hand').append(abort, element('reply'));
+    element('page-link').after(element('host'));
+  } else {
+    element('danger').prepend(abort);
+    element('danger').after(element('reply'));
+    element('theme').before(element('host'));
+  }
+}
+small.addEventListener('change', placeAbort);
+placeAbort();
+
 for (const button of document.querySelectorAll('button.hold')) holdable(link, /** @type {HTMLButtonElement} */ (button));
 const uncertainBefore = sessionStorage.getItem('uncertain');
 if (uncertainBefore !== null) link.report(uncertainBefore, 'bad');

@@ -37,6 +37,12 @@ STATE_ELEMENTS = ["#height", "#why", "#mode", "#detector-why", "#detectors td", 
 SHORT_TIMES = r"[...document.querySelectorAll('#log time')].every((it) => /^\d\d:\d\d:\d\d$/.test(it.textContent))"
 # The arrow has the direction, the number has no sign.
 SETPOINT = r"/^(-|\d+[.]\d\d [↑↓] \d+[.]\d\d m[/]s)$/.test(document.getElementById('setpoint').textContent)"
+# Whether an element is on the screen, and nothing covers it.
+ON_SCREEN = """(it) => {
+  const { left, right, top, bottom } = it.getBoundingClientRect();
+  const isInside = left >= 0 && right <= innerWidth && top >= 0 && bottom <= innerHeight;
+  return isInside && document.elementFromPoint((left + right) / 2, (top + bottom) / 2) === it;
+}"""
 SIGNED_ZERO = "[...document.querySelectorAll('dd')].map((it) => it.textContent).find((it) => /-0([.]0*)? /.test(it))"
 CONNECTED = "document.getElementById('connection').textContent === 'connected'"
 # A button that is pressed shortly and then held, before the server has answered the first press.
@@ -153,6 +159,27 @@ def lose_answer(page):
     reply = text(page, "#reply")
     assert reply.startswith("hold: ") and "may have been carried out" in reply, reply
     wait(page, CONNECTED, 10)
+
+
+def abort_at_hand(page):
+    """The abort and its reply are on a small screen, at the top and at the end of the page."""
+    for place in ["0", "document.body.scrollHeight"]:
+        page.evaluate(f"window.scrollTo(0, {place})")
+        time.sleep(0.2)
+        abort = page.locator("button[data-command=abort]")
+        assert abort.evaluate(ON_SCREEN), abort.bounding_box()
+        box = abort.bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        for _ in range(ATTEMPTS):
+            page.mouse.down()
+            time.sleep(0.2)
+            page.mouse.up()
+            if holds_within(page, replied("Released too early"), 2):
+                break
+        assert "too early" in text(page, "#reply"), text(page, "#reply")
+        assert page.locator("#reply").evaluate(ON_SCREEN), page.locator("#reply").bounding_box()
+        page.screenshot(path=FOLDER / f"at-hand-{'top' if place == '0' else 'end'}.png")
+    page.evaluate("window.scrollTo(0, 0)")
 
 
 def refuse_a_third(browser):
@@ -294,7 +321,7 @@ def main():
             page.keyboard.down("Space")
             time.sleep(0.4)
             page.keyboard.up("Space")
-            if holds_within(page, replied("Let go too early"), 2):
+            if holds_within(page, replied("Released too early"), 2):
                 break
         assert "too early" in text(page, "#reply"), text(page, "#reply")
         for command in ["resume", "hold"]:
@@ -327,6 +354,7 @@ def main():
         width = page.evaluate("document.documentElement.scrollWidth")
         measured["accessibility"] = accessibility(page, ["color-contrast", "button-name"])
         assert width <= 360, f"a telephone would have to scroll sideways: {width} px"
+        abort_at_hand(page)
         boxes = [panel.bounding_box() for panel in page.locator(".panel").all()]
         assert len(boxes) > 10 and all(box["x"] >= 0 and box["x"] + box["width"] <= 360 and box["height"] > 40 for box in boxes), boxes
         # Nothing of a table is cut off, and panels for the time before the flight come before those for later.
