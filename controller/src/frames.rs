@@ -158,7 +158,8 @@ impl Frames {
         self.announced.searched(now_ns, publisher, message, &self.marker);
         self.stamps.searched(now_ns, publisher, header);
         let wanted = message.first_of(&self.marker);
-        if let Some(why) = wanted.and_then(wire::impossible_because) {
+        let why = wire::impossible_frame_because(header);
+        if let Some(why) = why.or_else(|| wanted.and_then(wire::impossible_because)) {
             self.refusals.add_of(now_ns, "impossible-marker", publisher, || {
                 format!("detections of `{publisher}` are refused: {why}")
             });
@@ -237,10 +238,15 @@ impl Frames {
     /// Why a landing would see no marker, or see it at a wrong position: all detections are refused, or two programs give one camera
     /// different calibrations.
     pub fn obstacle(&self, now_ns: i64) -> Option<String> {
+        let is_other = |warning: &Warning| warning.matter == "another-camera-info";
+        let other = || self.refusals.lasting(now_ns).find(is_other).map(|warning| warning.text);
+        self.refused_because(now_ns).or_else(other)
+    }
+
+    /// Why detections are refused, where none can be used.
+    fn refused_because(&self, now_ns: i64) -> Option<String> {
         let has_none = now_ns.saturating_sub(self.kept_ns) > UNUSABLE_NS;
-        let mut lasting = self.refusals.lasting(now_ns);
-        let blocks = |reason: &str| has_none || reason == "another-camera-info";
-        lasting.find(|warning| blocks(&warning.matter)).map(|warning| warning.text)
+        self.refusals.lasting(now_ns).find(|_| has_none).map(|warning| warning.text)
     }
 
     /// This process has not run for so long: what was refused before is not over by that, and frames of that time were not missing.
@@ -266,8 +272,8 @@ impl Frames {
             let active = self.selection.active()?;
             self.announced.seen_instead(now_ns, active, &self.marker)
         };
-        self.selection
-            .no_pose(now_ns)
+        self.refused_because(now_ns)
+            .or_else(|| self.selection.no_pose(now_ns))
             .or_else(|| self.no_detector_looks_for_marker())
             .or_else(instead)
     }

@@ -4,7 +4,7 @@
 use autopilot::VehicleState;
 use geometry::{Body, Camera, Marker, Pixel, Rotation, Transform, Vector};
 use landing::{Landed, MarkerInFrame, Mode, Timestamp, VehicleStatus};
-use messages::{CameraInfo, Detection, MarkerPose, Phase, Transform3};
+use messages::{CameraInfo, Detection, FrameHeader, MarkerPose, Phase, Transform3};
 use nalgebra::Matrix3;
 
 /// Maximum time between attitude and position, in nanoseconds: beyond it one of the two has stopped.
@@ -15,27 +15,75 @@ const MAX_RANGE_M: f64 = 1e3;
 
 /// Why a detection's numbers are not those of a marker that a camera sees, as the end of a sentence on its detector; `None` for sound ones.
 pub fn impossible_because(detection: &Detection) -> Option<String> {
-    let Detection { centre_px: [x, y], size_px, confidence, .. } = *detection;
-    if [x, y, size_px, confidence].iter().any(|number| !number.is_finite()) {
-        return Some(format!(
-            "a number is not finite: centre ({x}, {y}) px, size {size_px} px, confidence {confidence}"
-        ));
+    if let Some(why) = not_finite_because(detection) {
+        return Some(why);
     }
-    let pose = detection.pose.as_ref()?.camera_from_marker;
-    let [x, y, z] = pose.translation_m;
+    let pose = detection.pose.as_ref()?;
+    let [x, y, z] = pose.camera_from_marker.translation_m;
     let place = format!("({x:.3}, {y:.3}, {z:.3}) m right, down and forward of the camera");
-    let range_m = libm::hypot(libm::hypot(x, y), z);
-    if !range_m.is_finite() {
-        return Some(format!("the marker's place is not finite, {place}"));
-    }
-    if pose.transform::<Camera, Marker>().is_none() {
-        return Some(format!("the marker's rotation is none: w, x, y, z {:?}", pose.rotation_wxyz));
+    if pose.camera_from_marker.transform::<Camera, Marker>().is_none() {
+        let wxyz = pose.camera_from_marker.rotation_wxyz;
+        return Some(format!("the marker's rotation is none: w, x, y, z {wxyz:?}"));
     }
     if z <= 0.0 {
         return Some(format!("the marker would be behind the camera, {place}"));
     }
-    (range_m > MAX_RANGE_M)
-        .then(|| format!("the marker would be farther away than {MAX_RANGE_M} m, {place}"))
+    if !is_in_view([x, y, z]) {
+        return Some(format!("the marker would be farther away than {MAX_RANGE_M} m, {place}"));
+    }
+    let covariance = pose.translation_covariance_m2();
+    (!landing::is_covariance(&covariance)).then(|| {
+        let [xx, xy, xz, _, _, _, yy, yz, _, _, _, zz, ..] = pose.covariance;
+        format!(
+            "`pose.covariance` is not that of a position (positive semi-definite, no larger than (100 m)^2): xx {xx:e}, xy {xy:e}, xz {xz:e}, \
+             yy {yy:e}, yz {yz:e}, zz {zz:e} m^2"
+        )
+    })
+}
+
+/// Whether a place in the camera frame, in metres, is in front of it and near enough for a marker.
+fn is_in_view([x, y, z]: [f64; 3]) -> bool {
+    z > 0.0 && libm::hypot(libm::hypot(x, y), z) <= MAX_RANGE_M
+}
+
+/// Why the header of a frame is not that of a picture, as the end of a sentence on the detector; `None` for a sound one.
+pub fn impossible_frame_because(header: &FrameHeader) -> Option<String> {
+    let FrameHeader { width, height, .. } = header;
+    (*width == 0 || *height == 0)
+        .then(|| format!("the frame's header has no size, {width} x {height} pixels"))
+}
+
+/// The first field of a detection with a number that is not finite, and its numbers.
+fn not_finite_because(detection: &Detection) -> Option<String> {
+    let Detection {
+        centre_px, centre_covariance_px2, corners_px, size_px, confidence, pose, ..
+    } = detection;
+    let doubles = |floats: &[f32]| floats.iter().copied().map(f64::from).collect::<Vec<_>>();
+    let mut fields = vec![
+        ("centre_px", centre_px.to_vec()),
+        ("centre_covariance_px2", doubles(centre_covariance_px2)),
+        ("corners_px", corners_px.iter().flatten().flatten().copied().collect()),
+        ("size_px", vec![*size_px]),
+        ("confidence", vec![*confidence]),
+    ];
+    if let Some(pose) = pose {
+        fields.extend([
+            ("pose.translation_m", pose.camera_from_marker.translation_m.to_vec()),
+            ("pose.rotation_wxyz", pose.camera_from_marker.rotation_wxyz.to_vec()),
+            ("pose.reprojection_rms_px", vec![pose.reprojection_rms_px]),
+            ("pose.covariance", doubles(&pose.covariance)),
+        ]);
+        if let Some(other) = &pose.alternative {
+            fields.extend([
+                ("alternative.translation_m", other.camera_from_marker.translation_m.to_vec()),
+                ("alternative.rotation_wxyz", other.camera_from_marker.rotation_wxyz.to_vec()),
+                ("alternative.reprojection_rms_px", vec![other.reprojection_rms_px]),
+            ]);
+        }
+    }
+    let is_unsound = |(_, numbers): &(&str, Vec<f64>)| numbers.iter().any(|it| !it.is_finite());
+    let (field, numbers) = fields.into_iter().find(is_unsound)?;
+    Some(format!("a number in `{field}` is not finite: {numbers:?}"))
 }
 
 /// Where a camera is mounted.
@@ -59,7 +107,7 @@ pub fn marker_in_frame(
         // A second solution that cannot be is none.
         alternative: pose
             .and_then(|pose| pose.alternative.as_ref())
-            .filter(|other| other.camera_from_marker.translation_m[2] > 0.0)
+            .filter(|other| is_in_view(other.camera_from_marker.translation_m))
             .and_then(|other| in_body(&other.camera_from_marker)),
         covariance_m2: mount.zip(pose).map(|(mount, pose)| covariance_in_body(&mount, pose)),
         size_px: Some(detection.size_px),
@@ -174,8 +222,9 @@ mod tests {
             assert!(text.contains("behind the camera") && text.contains("1.000"), "{text}");
         }
         for number in [f64::NAN, f64::INFINITY, -f64::INFINITY] {
-            assert!(at([number, 0.0, 5.0]).contains("place is not finite"), "{number}");
-            assert!(at([0.0, 0.0, number]).contains("place is not finite"), "{number}");
+            let place = "`pose.translation_m` is not finite";
+            assert!(at([number, 0.0, 5.0]).contains(place), "{number}");
+            assert!(at([0.0, 0.0, number]).contains(place), "{number}");
             let centre = Detection { centre_px: [number, 0.0], ..Detection::sample() };
             assert!(impossible_because(&centre).unwrap().contains("centre"), "{number}");
         }
@@ -186,9 +235,70 @@ mod tests {
     }
 
     #[test]
-    fn a_second_solution_behind_the_camera_is_none() {
+    fn every_number_of_a_detection_must_be_finite() {
+        let sound = || {
+            let mut detection = Detection::sample();
+            detection.corners_px = Some([[1.0, 2.0]; 4]);
+            let pose = detection.pose.as_mut().unwrap();
+            pose.alternative = Some(messages::AlternativePose {
+                camera_from_marker: pose.camera_from_marker,
+                reprojection_rms_px: 0.1,
+            });
+            detection
+        };
+        assert_eq!(impossible_because(&sound()), None);
+        type Change = fn(&mut Detection, f64);
+        fn pose(detection: &mut Detection) -> &mut MarkerPose {
+            detection.pose.as_mut().unwrap()
+        }
+        fn other(detection: &mut Detection) -> &mut messages::AlternativePose {
+            pose(detection).alternative.as_mut().unwrap()
+        }
+        let changes: [(&str, Change); 13] = [
+            ("centre_px", |it, n| it.centre_px[1] = n),
+            ("centre_covariance_px2", |it, n| it.centre_covariance_px2[2] = n as f32),
+            ("corners_px", |it, n| it.corners_px.as_mut().unwrap()[3][1] = n),
+            ("size_px", |it, n| it.size_px = n),
+            ("confidence", |it, n| it.confidence = n),
+            ("pose.translation_m", |it, n| pose(it).camera_from_marker.translation_m[2] = n),
+            ("pose.rotation_wxyz", |it, n| pose(it).camera_from_marker.rotation_wxyz[0] = n),
+            ("pose.reprojection_rms_px", |it, n| pose(it).reprojection_rms_px = n),
+            ("pose.covariance", |it, n| pose(it).covariance[0] = n as f32),
+            ("pose.covariance", |it, n| pose(it).covariance[20] = n as f32),
+            ("alternative.translation_m", |it, n| {
+                other(it).camera_from_marker.translation_m[0] = n
+            }),
+            ("alternative.rotation_wxyz", |it, n| {
+                other(it).camera_from_marker.rotation_wxyz[3] = n
+            }),
+            ("alternative.reprojection_rms_px", |it, n| other(it).reprojection_rms_px = n),
+        ];
+        for (field, change) in changes {
+            for number in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+                let mut detection = sound();
+                change(&mut detection, number);
+                let why = impossible_because(&detection).unwrap_or_default();
+                assert!(why.contains(&format!("a number in `{field}` is not finite")), "{why}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_covariance_that_no_position_has_is_reported_with_its_numbers() {
+        // At the place of xx, yy, zz or xy of the upper triangle.
+        for (index, value) in [(0, -1e-4), (6, -1e-4), (11, -1e-4), (1, 2e-4), (0, 1e6)] {
+            let mut detection = Detection::sample();
+            detection.pose.as_mut().unwrap().covariance[index] = value;
+            let why = impossible_because(&detection).unwrap_or_default();
+            assert!(why.contains("`pose.covariance` is not that of a position"), "{why}");
+            assert!(why.contains(&format!("{value:e}")), "{why}");
+        }
+    }
+
+    #[test]
+    fn a_second_solution_out_of_view_is_none() {
         let mount = body_from_camera(&CameraInfo::sample());
-        for (z, is_taken) in [(5.0, true), (0.0, false), (-5.0, false)] {
+        for (z, is_taken) in [(5.0, true), (0.0, false), (-5.0, false), (1e160, false)] {
             let mut detection = Detection::sample();
             let pose = detection.pose.as_mut().unwrap();
             let camera_from_marker =

@@ -17,7 +17,7 @@ use controller::flight::Flight;
 use controller::pad_note::PadNote;
 use messages::{
     CameraInfo, ControllerCommand, ControllerStatus, Detection, Detections, DetectorInfo,
-    FrameHeader, Phase, Place,
+    DetectorState, FrameHeader, MarkerPose, Phase, Place,
 };
 use node::{HealthCounters, Identity, clock_name};
 use packets::{
@@ -664,13 +664,29 @@ fn a_warning_of_refused_detections_has_the_value_its_limit_and_the_remedy() {
 
 #[test]
 fn a_detector_with_an_impossible_marker_is_refused_reported_and_passed_over() {
-    for place_m in [[0.0, 0.0, -5.0], [0.0, 0.0, 1e9], [f64::NAN, 0.0, 5.0]] {
+    type Change = fn(&mut Detection);
+    fn pose_of(detection: &mut Detection) -> &mut MarkerPose {
+        detection.pose.as_mut().unwrap()
+    }
+    let changes: [(&str, Change); 9] = [
+        ("-5.000", |it| pose_of(it).camera_from_marker.translation_m = [0.0, 0.0, -5.0]),
+        ("1000000000.000", |it| pose_of(it).camera_from_marker.translation_m = [0.0, 0.0, 1e9]),
+        ("`pose.translation_m`", |it| pose_of(it).camera_from_marker.translation_m[0] = f64::NAN),
+        ("`pose.covariance`", |it| pose_of(it).covariance = [f32::NAN; 21]),
+        ("`pose.covariance`", |it| pose_of(it).covariance[0] = -1e-4),
+        ("`pose.reprojection_rms_px`", |it| pose_of(it).reprojection_rms_px = f64::NAN),
+        ("`centre_covariance_px2`", |it| it.centre_covariance_px2 = [f32::NAN; 3]),
+        ("`corners_px`", |it| it.corners_px = Some([[f64::NAN; 2]; 4])),
+        ("`size_px`", |it| it.size_px = f64::INFINITY),
+    ];
+    // Of one that was in use before, and of one that gave no sound frame.
+    for ((value, change), sound_ms) in changes.into_iter().flat_map(|it| [(it, 0), (it, 1500)]) {
         let health = Arc::<HealthCounters>::default();
         let mut flight = flight_counting("airborne", &["detectors.preferred=mine"], &health);
         flight.camera(0, CameraInfo::sample());
         receive(&mut flight, 0, &heartbeat(4, true));
         receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
-        for ms in (20..4000).step_by(20) {
+        for ms in (20..sound_ms + 4000).step_by(20) {
             if ms % 1000 == 0 {
                 receive(&mut flight, ms * MS, &heartbeat(4, true));
             }
@@ -678,24 +694,57 @@ fn a_detector_with_an_impossible_marker_is_refused_reported_and_passed_over() {
             if ms % 60 == 0 {
                 let stamp_ns = ms * MS - 40 * MS;
                 let mut mine = Detections { detector: "mine".into(), ..seen(stamp_ns) };
-                let pose = mine.detections[0].pose.as_mut().unwrap();
-                pose.camera_from_marker.translation_m = place_m;
+                if ms > sound_ms {
+                    change(&mut mine.detections[0]);
+                }
                 flight.detections(ms * MS + 2, "mine", &mine);
                 flight.detections(ms * MS + 2, "main", &seen(stamp_ns));
             }
             flight.tick(ms * MS + 3);
         }
-        let status = flight.status(4000 * MS);
+        let status = flight.status((sound_ms + 4000) * MS);
         assert_eq!(status.active_detector.as_deref(), Some("main"), "{status:?}");
         assert!(matches!(status.phase, Phase::Approach | Phase::Descend), "{status:?}");
-        let value = format!("{:.3}", place_m[2]);
-        let is_it = |it: &String| it.contains("`mine` are refused") && it.contains(&value);
+        let is_it = |it: &String| it.contains("`mine` are refused") && it.contains(value);
         assert!(status.warnings.iter().any(is_it), "{:?}", status.warnings);
+        let mine = status.candidates.iter().find(|it| it.detector == "mine");
+        let was_used = sound_ms > 0;
+        assert_eq!(mine.map(|it| it.state), was_used.then_some(DetectorState::Stale), "{status:?}");
+        assert_eq!(status.detector_changes, u64::from(was_used), "{status:?}");
         let identity = Identity { service: "controller", instance: "main".into() };
         let drops = health.report(&identity, 0).drops;
         let counted = drops.iter().find(|it| it.reason == "detection: impossible-marker");
         assert!(counted.is_some_and(|it| it.count > 60), "{drops:?}");
     }
+}
+
+#[test]
+fn a_landing_without_a_usable_detection_says_why() {
+    let mut flight = in_flight("airborne");
+    hover(&mut flight, 1000, 2000, 4);
+    for ms in (2000..8000).step_by(20) {
+        let now_ns = ms * MS;
+        if ms % 1000 == 0 {
+            receive(&mut flight, now_ns, &heartbeat(4, true));
+        }
+        pose(&mut flight, now_ns);
+        if ms % 60 == 0 {
+            let mut message = seen(now_ns - 40 * MS);
+            message.detections[0].pose.as_mut().unwrap().covariance[6] = -1.0;
+            flight.detections(now_ns, "main", &message);
+        }
+        flight.tick(now_ns + 3);
+    }
+    let status = flight.status(8000 * MS);
+    let text = "detections of `main` are refused: `pose.covariance` is not that of a position";
+    assert!(status.why.contains(text), "{}", status.why);
+    assert_eq!(status.candidates[0].state, DetectorState::Stale, "{status:?}");
+    // A frame without a size is no picture.
+    let mut message = seen(8000 * MS);
+    message.header.width = 0;
+    let refused = |flight: &mut Flight| flight.target(8001 * MS).rejected;
+    flight.detections(8001 * MS, "main", &message);
+    assert_eq!(refused(&mut flight).as_deref(), Some("impossible-marker"));
 }
 
 #[test]

@@ -273,8 +273,9 @@ impl MarkerInFrame {
     }
 }
 
-/// A symmetric matrix is positive semi-definite when no principal minor is negative.
-fn is_covariance(m: &Matrix3<f64>) -> bool {
+/// True for a matrix in m^2 that can be the covariance of a position: finite, symmetric, positive semi-definite and not larger than any
+/// range. A symmetric matrix is positive semi-definite when no principal minor is negative.
+pub fn is_covariance(m: &Matrix3<f64>) -> bool {
     let trace = m.trace();
     if !(0.0..=MAX_VARIANCE_M2).contains(&trace) {
         return false;

@@ -56,7 +56,7 @@ pub use config::{
 pub use decision::{Action, Decision, Phase, Reason, Rejection, TargetEstimate};
 pub use event::{
     Alarm, AutopilotLimits, Event, FrameObservation, Landed, MarkerInFrame, Mode, OperatorCommand,
-    VehicleState, VehicleStatus,
+    VehicleState, VehicleStatus, is_covariance,
 };
 pub use lander::Lander;
 pub use limits::ConfigError;
