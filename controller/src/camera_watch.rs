@@ -118,6 +118,11 @@ impl CameraWatch {
     }
 }
 
+/// Whether a text is the warning that this camera sends no frames.
+pub fn is_of(text: &str, camera: &str) -> bool {
+    text.starts_with(&format!("no frame from camera `{camera}` "))
+}
+
 fn text(camera: &str, silence_ns: i64) -> String {
     let silence_s = silence_ns / 1_000_000_000;
     format!(

@@ -67,6 +67,16 @@ impl Cameras {
         Reception::Known
     }
 
+    /// The names of the known cameras, as a list, where this one is not among them.
+    pub fn others(&self, camera: &str) -> Option<String> {
+        if self.known.iter().any(|known| known.info.camera == camera) {
+            return None;
+        }
+        let names: Vec<_> =
+            self.known.iter().map(|known| format!("`{}`", known.info.camera)).collect();
+        (!names.is_empty()).then(|| names.join(", "))
+    }
+
     /// The information of a camera of which a frame has arrived.
     pub fn of_frame(&mut self, now_ns: i64, camera: &str) -> Option<&CameraInfo> {
         let known = self.known.iter_mut().find(|known| known.info.camera == camera)?;

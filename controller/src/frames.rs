@@ -133,6 +133,7 @@ impl Frames {
                 )
             });
         }
+        // Also where they are refused, the camera has frames.
         self.camera_watch.searched(now_ns, publisher, &header.camera);
         if header.clock != self.clock {
             let ours = self.clock.clone();
@@ -179,7 +180,15 @@ impl Frames {
         }
         let marker = wanted.map(|detection| wire::marker_in_frame(detection, mount));
         let sight = wanted.zip(marker.as_ref()).map(|(detection, marker)| {
+            let published = self.cameras.others(&header.camera);
             Sight::new(detection.pose.is_some(), marker.body_from_marker)
+                if let Some(published) = published {
+                    return format!(
+                        "markers seen by `{publisher}` have no place: `{publisher}` names camera `{}`, which publishes no camera info; {published} does: copy the \
+                         frame's header unchanged",
+                        header.camera
+                    );
+                }
         });
         let focal_px = camera.and_then(|info| {
             let scale = f64::from(header.width) / f64::from(info.width.max(1));

@@ -143,6 +143,7 @@ async fn run_service(node: Node, mut config: Config, shutdown: Shutdown) -> anyh
             Some((detector, alive)) = presence.next() => flight.presence(now_ns(), &detector, alive),
             Some((key, info)) = infos.next_with_key() => {
                 let publisher = topic::DETECTOR_INFO.first_name(&key).unwrap_or_default();
+                unreadable.announced(publisher, &info.camera);
                 flight.on_detector_info(now_ns(), publisher, &info);
             }
             Some(request) = commands.next() => {
