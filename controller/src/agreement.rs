@@ -103,7 +103,7 @@ pub struct Dispute {
     pub active: String,
     /// The other one.
     pub other: String,
-    /// The distance between both positions in the latest frame with both, in metres.
+    /// The distance between both positions in the latest frame in which they or the headings differ, in metres.
     pub apart_m: f64,
     /// The angle between both headings in the latest frame in which they differ, in radians; `None` where they agree or do not matter.
     pub turned_rad: Option<f64>,
@@ -155,9 +155,6 @@ impl Common {
         {
             let apart_m = distance(first_m, second_m);
             let turned_rad = turned(tolerance, first, second);
-            if self.both == 0 {
-                self.apart_m = apart_m;
-            }
             self.both += 1;
             if let Some(turned_rad) = turned_rad {
                 if self.turned == 0 {
@@ -166,7 +163,12 @@ impl Common {
                 self.turned += 1;
             }
             let is_within = within(tolerance, first_m, second_m);
-            self.apart += u32::from(!is_within || turned_rad.is_some());
+            if !is_within || turned_rad.is_some() {
+                if self.apart == 0 {
+                    self.apart_m = apart_m;
+                }
+                self.apart += 1;
+            }
         }
     }
 

@@ -11,6 +11,8 @@ use crate::announced::Announced;
 use crate::camera_watch::CameraWatch;
 use crate::cameras::{Cameras, Reception};
 use crate::config::{Config, PreferredPlace};
+use crate::lateness::Lateness;
+use crate::namesakes::Namesakes;
 use crate::refusals::{Refusals, Warning};
 use crate::selection::{Limits, MAX_DETECTORS, Preference, Selection};
 use crate::stamps::Stamps;
@@ -39,6 +41,10 @@ pub struct Frames {
     announced: Announced,
     /// The stamps that they pass on.
     stamps: Stamps,
+    /// Their latencies.
+    lateness: Lateness,
+    /// The programs that publish as one detector.
+    namesakes: Namesakes,
     /// The newest frame of each detector, to be used when it becomes the active one.
     newest: BTreeMap<String, FrameObservation>,
     cameras: Cameras,
@@ -85,6 +91,8 @@ impl Frames {
             selection: selection(config),
             announced: Announced::default(),
             stamps: Stamps::default(),
+            lateness: Lateness::new(config.target.max_latency_s),
+            namesakes: Namesakes::default(),
             newest: BTreeMap::new(),
             cameras: Cameras::default(),
             refusals: Refusals::default(),
@@ -102,12 +110,14 @@ impl Frames {
         if !alive {
             self.camera_watch.ended(detector);
             self.stamps.ended(detector);
+            self.lateness.ended(detector);
         }
     }
 
     /// The information that a detector published on its own key.
     pub fn on_detector_info(&mut self, now_ns: i64, detector: &str, info: &DetectorInfo) {
         self.camera_watch.announced(now_ns, detector, &info.camera);
+        self.namesakes.announced(now_ns, detector, info);
         self.selection.set_place(now_ns, detector, info.place);
         self.announced.add(detector, &info.markers);
     }
@@ -124,6 +134,8 @@ impl Frames {
     /// Adds the detections that were published on the key of the detector `publisher`.
     pub fn add(&mut self, now_ns: i64, publisher: &str, message: &Detections) -> Arrival {
         let header = &message.header;
+        // Also where they are refused, the camera has frames.
+        self.camera_watch.searched(now_ns, publisher, &header.camera);
         // The key decides which detector may publish; the name in the message is only a claim.
         if message.detector != publisher {
             return self.refuse(now_ns, "another-detectors-name", || {
@@ -133,8 +145,6 @@ impl Frames {
                 )
             });
         }
-        // Also where they are refused, the camera has frames.
-        self.camera_watch.searched(now_ns, publisher, &header.camera);
         if header.clock != self.clock {
             let ours = self.clock.clone();
             return self.refuse(now_ns, "another-clock", || {
@@ -158,6 +168,7 @@ impl Frames {
         }
         self.announced.searched(now_ns, publisher, message, &self.marker);
         self.stamps.searched(now_ns, publisher, header);
+        self.lateness.searched(now_ns, publisher, header.stamp_ns);
         let wanted = message.first_of(&self.marker);
         let why = wire::impossible_frame_because(header);
         if let Some(why) = why.or_else(|| wanted.and_then(wire::impossible_because)) {
@@ -169,7 +180,15 @@ impl Frames {
         let camera = self.cameras.of_frame(now_ns, &header.camera);
         let mount = camera.and_then(wire::body_from_camera);
         if mount.is_none() && message.detections.iter().any(|detection| detection.pose.is_some()) {
+            let published = self.cameras.others(&header.camera);
             self.refusals.add(now_ns, "unknown-camera", || {
+                if let Some(published) = published {
+                    return format!(
+                        "markers seen by `{publisher}` have no place: `{publisher}` names camera `{}`, which publishes no camera info; {published} does: copy the \
+                         frame's header unchanged",
+                        header.camera
+                    );
+                }
                 format!(
                     "markers seen by `{publisher}` have no place: nothing is known of the mount of camera `{}`; set `mount` in its camera-pub, or publish its camera info with one (`camera/{}/info`)",
                     header.camera, header.camera
@@ -180,15 +199,7 @@ impl Frames {
         }
         let marker = wanted.map(|detection| wire::marker_in_frame(detection, mount));
         let sight = wanted.zip(marker.as_ref()).map(|(detection, marker)| {
-            let published = self.cameras.others(&header.camera);
             Sight::new(detection.pose.is_some(), marker.body_from_marker)
-                if let Some(published) = published {
-                    return format!(
-                        "markers seen by `{publisher}` have no place: `{publisher}` names camera `{}`, which publishes no camera info; {published} does: copy the \
-                         frame's header unchanged",
-                        header.camera
-                    );
-                }
         });
         let focal_px = camera.and_then(|info| {
             let scale = f64::from(header.width) / f64::from(info.width.max(1));
@@ -240,6 +251,8 @@ impl Frames {
         warnings.extend(self.selection.warnings(now_ns));
         warnings.extend(self.announced.warnings(now_ns, &self.marker, &self.selection));
         warnings.extend(self.stamps.warnings(now_ns));
+        warnings.extend(self.lateness.warnings(now_ns));
+        warnings.extend(self.namesakes.warnings(now_ns));
         warnings.extend(self.camera_watch.warnings(now_ns));
         warnings
     }
@@ -281,7 +294,9 @@ impl Frames {
             let active = self.selection.active()?;
             self.announced.seen_instead(now_ns, active, &self.marker)
         };
+        let too_late = || self.lateness.too_late(now_ns, self.selection.active()?);
         self.refused_because(now_ns)
+            .or_else(too_late)
             .or_else(|| self.selection.no_pose(now_ns))
             .or_else(|| self.no_detector_looks_for_marker())
             .or_else(instead)
@@ -320,6 +335,7 @@ fn selection(config: &Config) -> Selection {
     let settings = &config.detectors;
     let limits = Limits {
         max_age_s: settings.max_age_s,
+        max_latency_s: config.target.max_latency_s,
         min_rate_hz: settings.min_rate_hz,
         return_after_s: settings.return_after_s,
         tolerance: config.tolerance(),

@@ -60,6 +60,8 @@ const FAILURE_MEMORY_NS: i64 = 60_000_000_000;
 pub struct Limits {
     /// Maximum median time from exposure to arrival, in seconds.
     pub max_age_s: f64,
+    /// Maximum age of a frame on arrival that is used, in seconds: a detector with a larger median has no say in where the marker is.
+    pub max_latency_s: f64,
     /// Minimum median rate, in Hz.
     pub min_rate_hz: f64,
     /// Time for which a preferred detector must have been healthy before it is used, in seconds.
@@ -414,7 +416,7 @@ impl Selection {
             },
             place: known.place,
             age_ms: now_ns.saturating_sub(known.stamp_ns) as f64 * 1e-6,
-            latency_ms: median(&known.latencies_ns).unwrap_or_default() as f64 * 1e-6,
+            latency_ms: known.latency_s() * 1e3,
             rate_hz: known.rate_hz(),
             alive: known.alive,
             disagreement_m: known.disagreement_m,
@@ -476,7 +478,8 @@ impl Selection {
     /// Compares the markers that all answering detectors saw in the same frames.
     fn compare_all(&mut self, now_ns: i64) {
         let tolerance = self.limits.tolerance;
-        let answers: Vec<bool> = self.known.iter().map(|known| known.has_opinion(now_ns)).collect();
+        let answers: Vec<bool> =
+            self.known.iter().map(|known| self.has_opinion(now_ns, known)).collect();
         let voters: Vec<Voter<'_>> = self
             .known
             .iter()
@@ -501,14 +504,19 @@ impl Selection {
     /// The dispute between the active detector and another one. It persists until they agree: where neither sees
     /// the marker, or one is silent, nothing is decided.
     fn present_dispute(&self, now_ns: i64, tolerance: Tolerance) -> Option<Dispute> {
-        let active = self.known_active().filter(|active| active.fault.is_none())?;
+        let active = self.known_active()?;
+        if active.fault.is_some() || self.is_too_late(active) {
+            return None;
+        }
         let is_opponent = |known: &&Known| {
             known.name != active.name
                 && known.alive
+                && !self.is_too_late(known)
                 && !self.overruled.contains(&known.name)
                 && !matches!(known.fault, Some(Fault::Outvoted { .. }))
         };
-        let answers = self.known.iter().filter(is_opponent).filter(|it| it.has_opinion(now_ns));
+        let answers =
+            self.known.iter().filter(is_opponent).filter(|it| self.has_opinion(now_ns, it));
         let others: Vec<Voter<'_>> = answers.map(Known::voter).collect();
         if let Some(dispute) = agreement::dispute(active.voter(), &others, tolerance) {
             return Some(dispute);
@@ -551,6 +559,17 @@ impl Selection {
         }
     }
 
+    /// True while a detector searches frames: late detections count as well, up to the age at which none is used.
+    fn has_opinion(&self, now_ns: i64, known: &Known) -> bool {
+        let is_silent = now_ns.saturating_sub(known.received_ns) > MAX_SILENCE_NS;
+        known.alive && known.has_frame() && !is_silent && !self.is_too_late(known)
+    }
+
+    /// Whether a detector's frames are too old to be used: their stamps may be those of other frames.
+    fn is_too_late(&self, known: &Known) -> bool {
+        known.latency_s() > self.limits.max_latency_s
+    }
+
     /// Why a detector is not healthy, or not believed.
     fn trouble(&self, now_ns: i64, known: &Known) -> Option<String> {
         self.ailment(now_ns, known).or_else(|| known.fault.as_ref().map(said))
@@ -568,7 +587,7 @@ impl Selection {
         if silence_ns > known.silence_allowed_ns() {
             return Some(format!("it has been silent for {:.0} ms", silence_ns as f64 * 1e-6));
         }
-        let latency_s = median(&known.latencies_ns).unwrap_or_default() as f64 * 1e-9;
+        let latency_s = known.latency_s();
         if latency_s > self.limits.max_age_s {
             return Some(format!("its frames are {:.0} ms old", latency_s * 1e3));
         }
@@ -677,7 +696,10 @@ impl Selection {
                 let alive = others().filter(|known| known.alive && !active.alive);
                 alive.max_by_key(|known| known.stamp_ns)
             })?;
-            return Some((next.name.clone(), format!("{}: {failure}", active.name)));
+            return Some((
+                next.name.clone(),
+                format!("at the change from {}: {failure}", active.name),
+            ));
         }
         let is_better = |known: &&Known| {
             let is_named = self.preference.detector.as_ref() == Some(&known.name);
@@ -718,11 +740,6 @@ impl Known {
         }
     }
 
-    /// True while it searches frames: late detections count as well.
-    fn has_opinion(&self, now_ns: i64) -> bool {
-        self.alive && self.has_frame() && now_ns.saturating_sub(self.received_ns) <= MAX_SILENCE_NS
-    }
-
     fn voter(&self) -> Voter<'_> {
         Voter { name: &self.name, sights: &self.sights }
     }
@@ -758,6 +775,10 @@ impl Known {
 
     fn rate_hz(&self) -> f64 {
         median(&self.intervals_ns).map_or(0.0, |period_ns| 1e9 / period_ns.max(1_000_000) as f64)
+    }
+
+    fn latency_s(&self) -> f64 {
+        median(&self.latencies_ns).unwrap_or_default() as f64 * 1e-9
     }
 
     fn silence_allowed_ns(&self) -> i64 {

@@ -648,9 +648,18 @@ fn a_warning_of_refused_detections_has_the_value_its_limit_and_the_remedy() {
         ),
         ("down", -20, "mine", &["`main` gives them the name of `mine`", "must give its own id"]),
         ("front", -20, "main", &["mount of camera `front`", "`camera/front/info`"]),
+        (
+            "wrong",
+            -20,
+            "main",
+            &["`main` names camera `wrong`", "`down` does", "copy the frame's header unchanged"],
+        ),
     ] {
         let mut flight = in_flight("command");
-        flight.camera(0, CameraInfo::sample());
+        // Of one case no camera is known.
+        if camera != "front" {
+            flight.camera(0, CameraInfo::sample());
+        }
         for ms in (20..1600).step_by(20) {
             pose(&mut flight, ms * MS);
             flight.detections(ms * MS, "main", &of(camera, ahead_ms, detector, ms));
@@ -716,6 +725,50 @@ fn a_detector_with_an_impossible_marker_is_refused_reported_and_passed_over() {
         let counted = drops.iter().find(|it| it.reason == "detection: impossible-marker");
         assert!(counted.is_some_and(|it| it.count > 60), "{drops:?}");
     }
+}
+
+#[test]
+fn detections_that_come_too_late_are_reported_with_the_limit() {
+    let mut flight = in_flight("airborne");
+    hover(&mut flight, 1000, 2000, 4);
+    for ms in (2000..8000).step_by(20) {
+        let now_ns = ms * MS;
+        if ms % 1000 == 0 {
+            receive(&mut flight, now_ns, &heartbeat(4, true));
+        }
+        pose(&mut flight, now_ns);
+        if ms % 60 == 0 {
+            flight.detections(now_ns, "main", &seen(now_ns - 600 * MS));
+        }
+        flight.tick(now_ns + 3);
+    }
+    let status = flight.status(8000 * MS);
+    let text = "detections of `main` come 600 ms after their frames; at most 500 ms are used (`target.max_latency_s`)";
+    assert_eq!(status.warnings, [text]);
+    assert!(status.why.ends_with(text), "{}", status.why);
+}
+
+#[test]
+fn detections_in_another_detectors_name_are_frames_of_the_camera() {
+    let mut flight = in_flight("airborne");
+    let info = detector_info("main", "down");
+    for ms in (1000..20_000).step_by(20) {
+        let now_ns = ms * MS;
+        if ms % 1000 == 0 {
+            receive(&mut flight, now_ns, &heartbeat(4, true));
+            flight.on_detector_info(now_ns, "main", &info);
+        }
+        pose(&mut flight, now_ns);
+        if ms % 60 == 0 {
+            let message = Detections { detector: "mine".into(), ..seen(now_ns - 40 * MS) };
+            flight.detections(now_ns, "main", &message);
+        }
+        flight.tick(now_ns + 3);
+    }
+    let status = flight.status(20_000 * MS);
+    let texts = status.warnings.join("; ");
+    assert!(texts.contains("gives them the name of `mine`"), "{texts}");
+    assert!(!texts.contains("no frame") && !status.why.contains("no frame"), "{status:?}");
 }
 
 #[test]

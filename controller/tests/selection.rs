@@ -16,6 +16,7 @@ const PERIOD: i64 = 67 * MS;
 fn limits() -> Limits {
     Limits {
         max_age_s: 0.2,
+        max_latency_s: 0.6,
         min_rate_hz: 3.0,
         return_after_s: 2.0,
         tolerance: Tolerance { base_m: 0.1, per_m: 0.03, heading_rad: Some(HEADING_TOLERANCE_RAD) },
@@ -220,7 +221,7 @@ fn the_operators_choice_is_followed_at_once_and_left_while_it_is_not_healthy() {
     bench.frames(20..30, &BOTH[..1]);
     assert_eq!(bench.selection.active(), Some("main"));
     let why = bench.selection.why().to_owned();
-    assert!(why.contains("spare: it has been silent for"), "{why}");
+    assert!(why.contains("at the change from spare: it has been silent for"), "{why}");
     // Back only after it was healthy for a while.
     bench.frames(30..58, &BOTH);
     assert_eq!(bench.selection.active(), Some("main"));
@@ -287,7 +288,7 @@ fn slow_and_late_ones_give_way_and_are_better_than_none() {
     assert_eq!(bench.selection.active(), Some("main"), "a late one is better than none");
     bench.frames(20..25, &[("main", 250 * MS), ("spare", 30 * MS)]);
     assert_eq!(bench.selection.active(), Some("spare"));
-    assert!(bench.selection.why().contains("main: its frames are 250 ms old"));
+    assert!(bench.selection.why().contains("at the change from main: its frames are 250 ms old"));
     let mut bench = Bench::new(preferring(None, None));
     for i in 0..100 {
         let slow = i % 7 == 0;
@@ -460,6 +461,67 @@ fn a_dispute_lasts_while_both_are_late_or_see_nothing() {
         let answers = [("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(0.02))];
         bench.frame_seen(i * PERIOD, &answers);
     }
+    assert_eq!(bench.selection.dispute(), None);
+}
+
+/// While two agree again, the distance that counted stays in the warning.
+#[test]
+fn a_dispute_that_fades_states_the_distance_of_the_frames_that_differ() {
+    let mut bench = Bench::new(preferring(None, None));
+    let seen = |north_m: f64| [("main", 30 * MS, at(0.0)), ("other", 35 * MS, at(north_m))];
+    for i in 0..20 {
+        bench.frame_seen(i * PERIOD, &seen(1.0));
+    }
+    let mut disputed = 0;
+    for i in 20..40 {
+        bench.frame_seen(i * PERIOD, &seen(0.0));
+        disputed += bench.selection.dispute().map_or(0, |dispute| {
+            assert!((dispute.apart_m - 1.0).abs() < 1e-9, "frame {i}: {dispute:?}");
+            1
+        });
+    }
+    assert!((1..20).contains(&disputed), "{disputed}");
+}
+
+#[test]
+fn one_whose_stamps_are_too_old_disputes_nothing_and_outvotes_none() {
+    let mut bench = Bench::new(preferring(Some("mine"), None));
+    let (old_a, old_b) = (("mine", 3020 * MS, at(4.0)), ("more", 3030 * MS, at(4.0)));
+    let mut events = Vec::new();
+    for i in 50..200 {
+        for (name, late, sight) in [("main", 30 * MS, at(0.0)), old_a, old_b] {
+            events.push((i * PERIOD + late, name, i * PERIOD, sight));
+        }
+    }
+    events.sort_by_key(|(at, ..)| *at);
+    for (at, name, stamp, sight) in events {
+        bench.now_ns = at;
+        bench.selection.received(at, name, stamp, sight);
+        bench.selection.tick(at);
+        bench.note();
+        assert_eq!(bench.selection.dispute(), None, "{at}");
+        assert!(bench.selection.warnings(at).is_empty(), "{at}");
+        if at > 100 * PERIOD && at < 200 * PERIOD {
+            assert_eq!(bench.selection.active(), Some("main"), "{at}");
+            assert_eq!(bench.state("mine"), DetectorState::Stale, "{at}");
+        }
+    }
+}
+
+/// A detector that becomes late in a dispute leaves it.
+#[test]
+fn a_dispute_ends_when_one_of_both_is_too_late_to_be_used() {
+    let mut bench = Bench::new(preferring(None, None));
+    for i in 0..20 {
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(1.0))]);
+    }
+    assert!(bench.selection.dispute().is_some());
+    for i in 20..40 {
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, at(0.0))]);
+        let stamp_ns = i * PERIOD - 700 * MS;
+        bench.selection.received(bench.now_ns, "spare", stamp_ns, at(1.0));
+    }
+    bench.selection.tick(bench.now_ns);
     assert_eq!(bench.selection.dispute(), None);
 }
 
