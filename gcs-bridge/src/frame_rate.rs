@@ -3,15 +3,15 @@
 use messages::FrameHeader;
 
 /// Time over which the rate is measured, in nanoseconds.
-const WINDOW_NS: i64 = 2_000_000_000;
+const SPAN_NS: i64 = 2_000_000_000;
 /// Shortest time for a first rate, in nanoseconds.
-const MIN_WINDOW_NS: i64 = 300_000_000;
+const MIN_SPAN_NS: i64 = 300_000_000;
 
 /// The rate of a camera's frames.
 #[derive(Debug, Default)]
 pub(crate) struct FrameRate {
     camera: String,
-    /// Number and stamp, in nanoseconds, of the first frame of the window.
+    /// Number and stamp, in nanoseconds, of the first frame of the measured span.
     first: Option<(u64, i64)>,
     /// The rate in Hz.
     hz: Option<f64>,
@@ -28,10 +28,10 @@ impl FrameRate {
             (self.first, self.hz) = (Some(newest), None);
             return;
         };
-        let window_ns = header.stamp_ns.saturating_sub(stamp_ns);
-        let is_full = window_ns >= WINDOW_NS;
-        if is_full || (self.hz.is_none() && window_ns >= MIN_WINDOW_NS) {
-            let hz = (header.sequence - number) as f64 * 1e9 / window_ns as f64;
+        let span_ns = header.stamp_ns.saturating_sub(stamp_ns);
+        let is_full = span_ns >= SPAN_NS;
+        if is_full || (self.hz.is_none() && span_ns >= MIN_SPAN_NS) {
+            let hz = (header.sequence - number) as f64 * 1e9 / span_ns as f64;
             self.hz = Some((hz * 10.0).round() / 10.0);
         }
         if is_full {
