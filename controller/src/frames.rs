@@ -177,10 +177,10 @@ impl Frames {
             });
             return Arrival::Refused("impossible-marker");
         }
+        let published = self.cameras.others(&header.camera);
         let camera = self.cameras.of_frame(now_ns, &header.camera);
         let mount = camera.and_then(wire::body_from_camera);
         if mount.is_none() && message.detections.iter().any(|detection| detection.pose.is_some()) {
-            let published = self.cameras.others(&header.camera);
             self.refusals.add(now_ns, "unknown-camera", || {
                 if let Some(published) = published {
                     return format!(
