@@ -33,10 +33,33 @@ struct MinResponse {
 const MIN_RESPONSE: MinResponse = MinResponse { gain: 0.15, response: 0.2 };
 /// The same where an outline was fitted alone, of which a weak tone curve changes the size as well; sharpening moves no edge.
 const MIN_RESPONSE_OF_OUTLINE: MinResponse = MinResponse { gain: 0.05, response: 0.1 };
-/// The form of a camera's tone curve is not quite the model's: each side of an STag may be off by this fraction of curve
-/// times blur, so that it looks larger or smaller; of codes of square cells edges of both senses hold the size. From `positions` of seed 7 in `raspberry-pi`,
-/// where STags were too small by 0.025 px beyond their noise.
-const CURVE_FORM_ERROR: f64 = 0.006;
+/// By how much all sides of a marker may be off outwards or inwards together, because a model is not quite the picture.
+#[derive(Copy, Clone, Debug)]
+struct FormError {
+    /// In pixels, with any camera: what the model of an edge leaves where the blur is hardly wider than a pixel.
+    edge_px: f64,
+    /// As a fraction of tone curve times blur: the form of a camera's tone curve.
+    by_curve: f64,
+    /// Curves steeper than this add no more.
+    max_curve: f64,
+}
+
+impl FormError {
+    /// Of codes of square cells. From `positions` of the seeds 1300001 and 1300002: in `linear` markers of 10 to 37 px were too
+    /// large by 0.001 px, 0.002 px (root mean square) with a stated deviation of 0.001. In `industrial`, whose weak curve is a
+    /// power, they were too large by 0.003 px and in `usb` by 0.01; behind the steeper curve of `raspberry-pi`, which is of the
+    /// model's form, by no more.
+    const SQUARE: Self = Self { edge_px: 0.0007, by_curve: 0.006, max_curve: 1.0 };
+    /// Of an STag, whose disc and dots are drawn in small cells, and whose edges are not of both senses everywhere. From the same
+    /// frames, and from `positions` of seed 7 in `raspberry-pi`, where STags were too small by 0.025 px beyond their noise.
+    const STAG: Self = Self { edge_px: 0.0015, by_curve: 0.006, max_curve: f64::INFINITY };
+
+    /// The distance, in pixels, behind a curve and with a blur of these.
+    fn distance_px(&self, curve: f64, spread_px: f64) -> f64 {
+        self.edge_px.hypot(self.by_curve * curve.abs().min(self.max_curve) * spread_px)
+    }
+}
+
 /// One of this many pixels is used.
 const RESPONSE_STRIDE: usize = 4;
 /// Prior information on the brightness beyond the pattern, in units of one pixel's: it is that of white, give
@@ -84,7 +107,7 @@ pub(crate) fn fit(target: Target<'_>, pattern: &Pattern, scratch: &mut Scratch) 
     let spread_px = (0.4 * cell_px).clamp(0.7, 1.2);
     let cells = PatternCells::new(pattern);
     let grid = PatternGrid::from_pattern(&cells, target.lens);
-    fit_grid(target, &grid, None, Start { spread_px, form_error: 0.0 }, scratch)
+    fit_grid(target, &grid, None, Start { spread_px, form_error: FormError::SQUARE }, scratch)
 }
 
 /// The same for a marker of another design.
@@ -95,7 +118,7 @@ pub(crate) fn fit_design(
 ) -> Option<Fit> {
     let grid = PatternGrid::from_design(design.plain, target.lens);
     let finer = PatternGrid::from_design(design.processed, target.lens).with_wide(&grid);
-    let start = Start { spread_px: 0.7, form_error: CURVE_FORM_ERROR };
+    let start = Start { spread_px: 0.7, form_error: FormError::STAG };
     fit_grid(target, &grid, design.is_finer().then_some(&finer), start, scratch)
 }
 
@@ -121,15 +144,14 @@ pub(crate) fn fit_processed_design(
         processed(&state, &grid, target.response, MIN_RESPONSE_OF_OUTLINE, scratch)?;
     let is_curved = state.response.curve > MIN_RESPONSE_OF_OUTLINE.response;
     let pixels = &mut scratch.pixels;
-    is_curved.then(|| state.processed_result(&equations, &grid, CURVE_FORM_ERROR, pixels))?
+    is_curved.then(|| state.processed_result(&equations, &grid, FormError::STAG, pixels))?
 }
 
 /// The start of a fit.
 #[derive(Copy, Clone, Debug)]
 struct Start {
     spread_px: f64,
-    /// As [`CURVE_FORM_ERROR`].
-    form_error: f64,
+    form_error: FormError,
 }
 
 /// The fit without a camera's processing, or, where there is one, with it, and its last step with a `finer` grid if it
@@ -175,7 +197,7 @@ fn fit_grid(
     }
     let Some((state, equations)) = processed(&state, grid, known_response, MIN_RESPONSE, scratch)
     else {
-        return state.result(&solved?);
+        return state.plain_result(&solved?, form_error);
     };
     let Some(finer) = finer else {
         return state.processed_result(&equations, grid, form_error, &mut scratch.pixels);
@@ -305,15 +327,15 @@ struct Residuals {
 }
 
 impl Residuals {
-    /// Variance of a pixel. Where the sensor saturates, little is left but edges; dark areas with their
-    /// little noise do not show how well these agree.
+    /// Variance of a pixel. Where the sensor saturates, little is left but edges.
     fn variance(&self) -> f64 {
-        let mean = self.squares / self.weight;
-        if self.saturated > 0 {
-            mean.max(self.informative_squares / self.information)
-        } else {
-            mean
-        }
+        if self.saturated > 0 { self.place_variance() } else { self.squares / self.weight }
+    }
+
+    /// Variance of a pixel that determines the marker's place. The flat areas within wide cells differ by little and say
+    /// nothing about edges, at which the model of a camera's processing is off by more.
+    fn place_variance(&self) -> f64 {
+        (self.squares / self.weight).max(self.informative_squares / self.information)
     }
 
     /// Counts a saturated pixel.
@@ -408,6 +430,17 @@ impl State {
         (contrast.is_finite() && contrast.abs() > MIN_CONTRAST).then_some(())
     }
 
+    /// The fit without a camera's processing.
+    fn plain_result(
+        &self,
+        equations: &NormalEquations<UNKNOWNS, Residuals>,
+        form_error: FormError,
+    ) -> Option<Fit> {
+        let mut fit = self.result(equations)?;
+        self.add_form_error(form_error, &mut fit);
+        Some(fit)
+    }
+
     /// The fit at these equations' minimum.
     fn result<const N: usize>(&self, equations: &NormalEquations<N, Residuals>) -> Option<Fit> {
         let residuals = &equations.extra;
@@ -416,9 +449,10 @@ impl State {
         if contrast < MIN_CONTRAST || freedom < 1.0 {
             return None;
         }
-        let variance = (residuals.variance() * residuals.weight / freedom).max(ROUNDING_VARIANCE);
+        let [variance, place_variance] = [residuals.variance(), residuals.place_variance()]
+            .map(|variance| (variance * residuals.weight / freedom).max(ROUNDING_VARIANCE));
         let inverse = inverse(&equations.matrix)?;
-        let covariance = SMatrix::<f64, 8, 8>::from_fn(|i, j| inverse[(i, j)]) * variance;
+        let covariance = SMatrix::<f64, 8, 8>::from_fn(|i, j| inverse[(i, j)]) * place_variance;
         // A result that is no better than that of the outline alone is left to the outline.
         let max_px2 = MAX_BILEVEL_CORNER_PX * MAX_BILEVEL_CORNER_PX;
         if residuals.is_bilevel() && self.worst_corner_px2(&covariance) > max_px2 {
@@ -460,7 +494,7 @@ impl State {
         &self,
         equations: &NormalEquations<UNKNOWNS_PROCESSED, Residuals>,
         grid: &PatternGrid<'_>,
-        form_error: f64,
+        form_error: FormError,
         pixels: &mut [PixelSample],
     ) -> Option<Fit> {
         let mut fit = self.result(equations)?;
@@ -468,11 +502,16 @@ impl State {
         self.equations_of(grid, pixels, 1, Some(&mut pulls))?;
         let inverse = inverse(&equations.matrix)?;
         widen_by_parts(&mut fit.covariance, &inverse, &pulls);
-        let edge_px = form_error * self.response.curve.abs() * self.light.spread_px;
+        self.add_form_error(form_error, &mut fit);
+        Some(fit)
+    }
+
+    /// Adds the uncertainty of the size that the form of edges leaves.
+    fn add_form_error(&self, form_error: FormError, fit: &mut Fit) {
+        let edge_px = form_error.distance_px(self.response.curve, self.light.spread_px);
         let by_size =
             self.homography.by_scale() * (2.0 * edge_px / self.homography.longest_side_px());
         fit.covariance += by_size * by_size.transpose();
-        Some(fit)
     }
 
     /// The normal equations over one of `stride` pixels.
@@ -610,9 +649,8 @@ fn inverse<const N: usize>(matrix: &SMatrix<f64, N, N>) -> Option<SMatrix<f64, N
 mod tests {
     use super::*;
 
-    #[test]
-    fn with_saturation_pixels_count_by_their_information() {
-        let residuals = |saturated: usize| Residuals {
+    fn residuals(saturated: usize) -> Residuals {
+        Residuals {
             // Ten of a hundred pixels carry information and differ by three grey levels, the others by one.
             squares: 90.0 + 10.0 * 9.0,
             weight: 100.0,
@@ -620,9 +658,32 @@ mod tests {
             information: 10.0 * 50.0,
             saturated,
             saturated_black: 0,
-        };
+        }
+    }
+
+    #[test]
+    fn with_saturation_pixels_count_by_their_information() {
         assert!((residuals(0).variance() - 1.8).abs() < 1e-12);
         assert!((residuals(40).variance() - 9.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_markers_place_is_as_uncertain_as_the_pixels_at_its_edges_show() {
+        assert!((residuals(0).place_variance() - 9.0).abs() < 1e-12);
+        // Edges that agree better than flat areas do so by chance.
+        let even = Residuals { informative_squares: 10.0 * 50.0, ..residuals(0) };
+        assert!((even.place_variance() - 1.8).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_size_of_a_square_is_no_more_certain_than_the_model_of_its_edges() {
+        let off = |form: FormError, curve: f64, spread_px: f64| form.distance_px(curve, spread_px);
+        assert!((off(FormError::SQUARE, 0.0, 0.7) - 0.0007).abs() < 1e-12);
+        assert!((off(FormError::SQUARE, 0.5, 0.7) - 0.0022).abs() < 1e-4);
+        assert!(
+            (off(FormError::SQUARE, 3.0, 0.7) - off(FormError::SQUARE, 1.0, 0.7)).abs() < 1e-12
+        );
+        assert!(off(FormError::STAG, 3.0, 0.7) > 2.8 * off(FormError::STAG, 1.0, 0.7));
     }
 
     #[test]
