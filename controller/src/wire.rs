@@ -266,10 +266,10 @@ mod tests {
             ("pose.covariance", |it, n| pose(it).covariance[0] = n as f32),
             ("pose.covariance", |it, n| pose(it).covariance[20] = n as f32),
             ("alternative.translation_m", |it, n| {
-                other(it).camera_from_marker.translation_m[0] = n
+                other(it).camera_from_marker.translation_m[0] = n;
             }),
             ("alternative.rotation_wxyz", |it, n| {
-                other(it).camera_from_marker.rotation_wxyz[3] = n
+                other(it).camera_from_marker.rotation_wxyz[3] = n;
             }),
             ("alternative.reprojection_rms_px", |it, n| other(it).reprojection_rms_px = n),
         ];
