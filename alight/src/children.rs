@@ -32,7 +32,7 @@ const RESUME: &str = "start=\"resume\"";
 
 /// An event of a child.
 pub(crate) enum ChildEvent<K> {
-    /// A line on its standard error.
+    /// A line on its standard output or error.
     Line(K, String),
     /// Its exit.
     Exited(K, Exit),
@@ -192,7 +192,7 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
     ) -> anyhow::Result<i32> {
         let child = command
             .stdin(Stdio::null())
-            .stdout(Stdio::null())
+            .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .kill_on_drop(true)
             // Ctrl-C in a terminal is for this process, which stops them in their order.
@@ -267,23 +267,21 @@ async fn follow<K: Clone>(
     pid: Option<Pid>,
     events: mpsc::Sender<ChildEvent<K>>,
 ) {
-    let (stderr, source, to) = (child.stderr.take(), key.clone(), events.clone());
-    let lines = async move {
-        if let Some(stderr) = stderr {
-            forward(source, stderr, to).await;
-        }
-    };
+    let (stdout, stderr) = (child.stdout.take(), child.stderr.take());
+    let out = forward(key.clone(), stdout, events.clone());
+    let err = forward(key.clone(), stderr, events.clone());
+    let lines = async { tokio::join!(out, err) };
     tokio::pin!(lines);
     let ended = tokio::select! {
         ended = child.wait() => {
-            // A process that still has the child's standard error open was started by the child.
+            // A process that still has the child's standard output or error open was started by the child.
             let left = tokio::time::timeout(LAST_LINES, &mut lines).await.is_err();
             if let Some(pid) = pid.filter(|_| left) {
                 let _ = kill_process_group(pid, Signal::KILL);
             }
             ended
         }
-        () = &mut lines => child.wait().await,
+        _ = &mut lines => child.wait().await,
     };
     let exit = match ended {
         Ok(status) => Exit { words: status.to_string(), status: status.code() },
@@ -296,14 +294,15 @@ async fn follow<K: Clone>(
 /// Sends the lines of a child, in any encoding; a very long one in pieces.
 async fn forward<K: Clone>(
     key: K,
-    stderr: impl AsyncRead + Unpin,
+    output: Option<impl AsyncRead + Unpin>,
     events: mpsc::Sender<ChildEvent<K>>,
 ) {
-    let mut stderr = BufReader::new(stderr);
+    let Some(output) = output else { return };
+    let mut output = BufReader::new(output);
     let (mut line, mut dropped) = (Vec::new(), 0_u64);
     loop {
         line.clear();
-        let mut piece = (&mut stderr).take(MAX_LINE_BYTES);
+        let mut piece = (&mut output).take(MAX_LINE_BYTES);
         if !matches!(piece.read_until(b'\n', &mut line).await, Ok(1..)) {
             return;
         }
@@ -363,6 +362,13 @@ mod tests {
         assert_eq!(lines[..2], ["\u{fffd}caf\u{fffd}", "there still"]);
         let lengths: Vec<_> = lines[2..].iter().map(String::len).collect();
         assert_eq!(lengths, [16 * 1024, 16 * 1024, 40_000 - 32 * 1024]);
+    }
+
+    #[tokio::test]
+    async fn lines_of_both_outputs_are_passed_on() {
+        let (mut lines, exit, _) = run("echo out; echo err >&2; exit 3").await;
+        lines.sort();
+        assert_eq!((lines, exit.status), (vec!["err".to_owned(), "out".to_owned()], Some(3)));
     }
 
     #[tokio::test]

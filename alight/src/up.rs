@@ -56,6 +56,8 @@ const RENEWAL: Duration = Duration::from_secs(60);
 const SILENCE: Duration = Duration::from_secs(10);
 /// Period at which the health of the processes is checked.
 const HEALTH_PERIOD: Duration = Duration::from_secs(1);
+/// The variable with which Python writes each line at once, as to a terminal; its lines would come when the program ends.
+const PYTHON_UNBUFFERED: &str = "PYTHONUNBUFFERED";
 /// The exit status for an invalid configuration, with which a restart is useless.
 const WRONG_USE: i32 = 2;
 
@@ -586,6 +588,8 @@ fn start(
     command.args(rest).envs(job.network.environment()).current_dir(&site.folder);
     if own {
         command.arg("--stop-with-parent").arg(std::process::id().to_string());
+    } else if std::env::var_os(PYTHON_UNBUFFERED).is_none() {
+        command.env(PYTHON_UNBUFFERED, "1");
     }
     let reach = if own { Reach::Leader } else { Reach::Group };
     let pid = children
@@ -632,6 +636,21 @@ mod tests {
         assert_eq!(shlex::split(&line).unwrap(), expected);
         // The variable's name is outside of the quotes, or it would be a command.
         assert!(line.starts_with("ALIGHT_KEYS='/etc"), "{line}");
+    }
+
+    #[tokio::test]
+    async fn the_standard_output_of_a_command_is_passed_on_and_python_does_not_collect_it() {
+        let mut site: Site = toml::from_str("local = []").unwrap();
+        site.folder = ".".into();
+        let words = ["sh", "-c", "echo out $PYTHONUNBUFFERED"].map(str::to_owned);
+        let job = Job { service: None, command: words.into(), ..supervised().job };
+        let mut children = Children::new();
+        start(&mut children, 0, &job, None, &site).unwrap();
+        let line = match children.next().await {
+            Some(ChildEvent::Line(0, line)) => line,
+            _ => String::new(),
+        };
+        assert!(line.starts_with("out ") && line != "out ", "{line}");
     }
 
     fn failure(status: i32) -> Exit {
