@@ -4,12 +4,13 @@
 //! the frame's header unchanged; also when there are none. It does not depend on the vehicle and on control, and it
 //! runs as well on the drone as on the ground.
 //!
-//! Modules in reading order: [`config`] is its configuration, [`service`] joins the network (`inbox`) to the image work of
+//! Modules in reading order: [`config`] is its configuration, [`service`] joins the network (`inbox`, `order`) to the image work of
 //! [`search`], [`parts`] maps detections in parts of a frame to the whole frame's pixels, and [`wire`] turns the algorithm's
 //! types into messages and back.
 
 pub mod config;
 mod inbox;
+mod order;
 pub mod parts;
 pub mod search;
 pub mod service;

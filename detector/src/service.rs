@@ -19,13 +19,13 @@ use messages::{
     CameraInfo, CameraResponse, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo,
     FrameHeader, PixelFormat, Refusals, topic,
 };
-use node::frame_order::{FrameOrder, Misplaced};
 use node::{BoxFuture, Frame, FramePublisher, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 
 use crate::config::{Config, Input};
 use crate::inbox::{AirInbox, Inbox, lock};
+use crate::order::Order;
 use crate::search::{Search, StageClock};
 use crate::wire;
 
@@ -287,7 +287,7 @@ struct Work {
     converter: Converter,
     unpacker: Unpacker,
     search: Search,
-    order: FrameOrder,
+    order: Order,
     overlay: RgbImageBuf,
 }
 
@@ -320,7 +320,7 @@ impl Work {
             converter: Converter::default(),
             unpacker: Unpacker::default(),
             search,
-            order: FrameOrder::default(),
+            order: Order::default(),
             overlay: RgbImageBuf::default(),
         })
     }
@@ -348,7 +348,7 @@ impl Work {
         if !is_named(&self.node, "frame", &self.config.camera, &frame.header.camera) {
             return;
         }
-        self.check_order(&frame.header);
+        self.order.check(&health, &frame.header);
         health.count("frames");
         if frame.header.clock == clock_name() {
             health.latency("stamp to frame", age(&frame.header));
@@ -406,26 +406,6 @@ impl Work {
             }
         }
         self.unpacker = unpacker;
-    }
-
-    /// Counts a frame that does not follow the frame before. It is searched nevertheless: the controller checks the stamps.
-    fn check_order(&mut self, header: &FrameHeader) {
-        let Misplaced { by_stamp, by_sequence, as_of_two } = self.order.on_frame(header);
-        let (health, camera) = (self.node.health(), &header.camera);
-        if by_stamp {
-            health.failed("frame whose stamp is not later than that of the frame before");
-        }
-        if by_sequence {
-            health
-                .failed("frame whose sequence number is not greater than that of the frame before");
-        }
-        if as_of_two && health.failed(&format!("two publishers of camera `{camera}`")) {
-            tracing::warn!(
-                camera,
-                "Two publishers of one camera, by the sequence numbers or clocks of its frames: end one of them, or give it another name \
-                 (further frames are counted)"
-            );
-        }
     }
 
     fn take_change(&mut self) {

@@ -13,7 +13,7 @@ const PERIOD_FRAMES: u64 = 60;
 /// The order of the frames of one camera, or of one key.
 #[derive(Debug, Default)]
 pub struct FrameOrder {
-    before: Option<Frame>,
+    before: Option<Placed>,
     /// Whether the camera numbers its frames: a number was greater than the one before.
     has_numbers: bool,
     frames: u64,
@@ -21,11 +21,15 @@ pub struct FrameOrder {
     steps_back: VecDeque<u64>,
 }
 
+/// A frame's position in the order.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Frame {
-    clock: String,
-    stamp_ns: i64,
-    sequence: u64,
+pub struct Placed {
+    /// The name of the clock of its stamp.
+    pub clock: String,
+    /// Its stamp, in nanoseconds.
+    pub stamp_ns: i64,
+    /// Its sequence number.
+    pub sequence: u64,
 }
 
 /// How a frame's position in the order is wrong.
@@ -40,10 +44,15 @@ pub struct Misplaced {
 }
 
 impl FrameOrder {
+    /// The frame before the next one.
+    pub fn before(&self) -> Option<&Placed> {
+        self.before.as_ref()
+    }
+
     /// Takes the next frame.
     pub fn on_frame(&mut self, header: &FrameHeader) -> Misplaced {
         let FrameHeader { ref clock, stamp_ns, sequence, .. } = *header;
-        let frame = Frame { clock: clock.clone(), stamp_ns, sequence };
+        let frame = Placed { clock: clock.clone(), stamp_ns, sequence };
         self.frames += 1;
         let Some(before) = self.before.replace(frame) else { return Misplaced::default() };
         // Stamps of two clocks cannot be compared.
