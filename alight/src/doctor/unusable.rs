@@ -24,8 +24,9 @@ pub(super) struct Unusable {
     misnamed: BTreeMap<(&'static str, String, String), u64>,
     /// The number of frames that cannot be read and the reason, by key.
     unreadable: Vec<(String, u64, String)>,
-    /// The number of frames whose length is not that of their header.
+    /// The number of frames whose length is not that of their header, and the newest of them.
     wrong_length: u64,
+    newest_wrong_length: String,
 }
 
 impl Unusable {
@@ -56,6 +57,7 @@ impl Unusable {
         self.unreadable =
             all.filter(|it| is_frame(&it.key)).map(|it| (it.key, it.count, it.why)).collect();
         self.wrong_length = health.failures(WRONG_LENGTH);
+        self.newest_wrong_length = health.newest(WRONG_LENGTH).unwrap_or_default();
     }
 
     /// Whether frames arrived of which none can be used. The absence of other frames has this cause then.
@@ -88,7 +90,10 @@ impl Unusable {
         if self.wrong_length > 0 {
             findings.wrong(
                 "camera",
-                format!("{} frames have a length other than that of their header", self.wrong_length),
+                format!(
+                    "{} frames have a length other than that of their header, the newest: {}",
+                    self.wrong_length, self.newest_wrong_length
+                ),
                 "the payload must be width x height pixels of the `format` in the FrameHeader, without padding (docs/wire-format.md)",
             );
         }
@@ -120,7 +125,7 @@ mod tests {
     #[test]
     fn frames_that_cannot_be_read_are_reported_with_their_key_and_the_reason() {
         let health = HealthCounters::default();
-        health.failed(WRONG_LENGTH);
+        health.failed_by(WRONG_LENGTH, "2280000 bytes, expected 760000".to_owned());
         for key in ["camera/down/frame", "camera/down/frame", "detector/main/detections"] {
             health.unreadable_payload(0, key, "it has another version".to_owned());
         }
@@ -132,6 +137,7 @@ mod tests {
         let text = findings.text();
         let named = "2 frames on camera/down/frame cannot be read: it has another version";
         assert!(text.contains(named) && text.contains("1 frames have a length"), "{text}");
+        assert!(text.contains("the newest: 2280000 bytes, expected 760000"), "{text}");
         assert!(!text.contains("detections"), "{text}");
     }
 }

@@ -325,11 +325,11 @@ impl FrameSubscriber {
                 None
             }
             Ok(header) if !has_length(&header, sample.payload().len()) => {
-                if self.health.failed(WRONG_LENGTH) {
+                let text = wrong_length(&header, sample.payload().len());
+                if self.health.failed_by(WRONG_LENGTH, text.clone()) {
+                    let camera = &header.camera;
                     tracing::warn!(
-                        ?header,
-                        len = sample.payload().len(),
-                        "Frame rejected: its length does not match its header"
+                        "A frame of camera `{camera}` is rejected: {text} (further ones are counted)"
                     );
                 }
                 None
@@ -342,10 +342,52 @@ impl FrameSubscriber {
     }
 }
 
+/// How the length of a frame differs from that of its header, with the remedy where the numbers suggest one.
+fn wrong_length(header: &FrameHeader, len: usize) -> String {
+    let FrameHeader { width, height, format, .. } = *header;
+    let (pixels, len) = (u64::from(width) * u64::from(height), len as u64);
+    let Some(bytes) = format.bytes_per_pixel().filter(|_| pixels > 0) else {
+        return format!("{len} bytes for {width} x {height} pixels of {format:?}");
+    };
+    let expected = pixels.saturating_mul(bytes as u64);
+    let remedy = match (len, len % u64::from(height)) {
+        _ if len == 3 * pixels || len == 4 * pixels => {
+            "; three or four bytes per pixel are a colour image: convert it to grey"
+        }
+        _ if len == 2 * pixels => {
+            "; two bytes per pixel are `Mono10`, `Mono12` or `Mono16`: set that `format`"
+        }
+        (_, 0) if len > expected => "; rows have padding: copy them without it",
+        _ => "",
+    };
+    format!("{len} bytes, expected {expected} ({width} x {height} pixels of {format:?}){remedy}")
+}
+
 fn has_length(header: &FrameHeader, len: usize) -> bool {
     let pixels = u64::from(header.width) * u64::from(header.height);
     match header.format.bytes_per_pixel() {
         Some(bytes) => pixels > 0 && pixels.checked_mul(bytes as u64) == Some(len as u64),
         None => len > 0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_wrong_length_is_reported_with_numbers_and_the_remedy_that_they_suggest() {
+        let header = FrameHeader { width: 1000, height: 760, ..FrameHeader::sample() };
+        let text = |len| wrong_length(&header, len);
+        assert_eq!(
+            text(2_280_000),
+            "2280000 bytes, expected 760000 (1000 x 760 pixels of Mono8); three or four bytes per pixel are a colour image: convert it to grey"
+        );
+        assert!(text(1_520_000).contains("`Mono16`: set that `format`"), "{}", text(1_520_000));
+        assert!(text(1024 * 760).ends_with("rows have padding: copy them without it"));
+        assert!(text(759_000).ends_with("(1000 x 760 pixels of Mono8)"), "{}", text(759_000));
+        assert!(
+            wrong_length(&FrameHeader { width: 0, ..header }, 5).starts_with("5 bytes for 0 x")
+        );
     }
 }

@@ -35,6 +35,15 @@ pub struct Unreadable {
     logged_ns: i64,
 }
 
+/// Payloads of one key that could not be read and are to be logged now.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Unlogged {
+    /// How many.
+    pub count: u64,
+    /// In which time, in seconds; `None` for the first ones of the key.
+    pub period_s: Option<f64>,
+}
+
 /// Counters of a service, for all of its threads.
 #[derive(Debug, Default)]
 pub struct HealthCounters {
@@ -47,6 +56,8 @@ struct Counters {
     latencies: BTreeMap<&'static str, VecDeque<f64>>,
     drops: BTreeMap<String, u64>,
     errors: BTreeMap<String, u64>,
+    /// The newest failure of some reasons, as a text.
+    newest: BTreeMap<&'static str, String>,
     unreadable: Vec<Unreadable>,
     /// How many of them there were.
     unreadable_count: u64,
@@ -100,8 +111,19 @@ impl HealthCounters {
         }
     }
 
+    /// The same, with a description, of which the newest is kept.
+    pub fn failed_by(&self, reason: &'static str, description: String) -> bool {
+        self.lock().newest.insert(reason, description);
+        self.failed(reason)
+    }
+
+    /// The description of the newest failure of this reason, if it has one.
+    pub fn newest(&self, reason: &str) -> Option<String> {
+        self.lock().newest.get(reason).cloned()
+    }
+
     /// Counts a payload that could not be read, by its key. Returns how many are not logged yet, if they are to be logged now.
-    pub fn unreadable_payload(&self, now_ns: i64, key: &str, why: String) -> Option<u64> {
+    pub fn unreadable_payload(&self, now_ns: i64, key: &str, why: String) -> Option<Unlogged> {
         let mut counters = self.lock();
         counters.unreadable_count += 1;
         let all = &mut counters.unreadable;
@@ -120,8 +142,10 @@ impl HealthCounters {
         if now_ns.saturating_sub(refused.logged_ns) < LOG_PERIOD_NS {
             return None;
         }
-        refused.logged_ns = now_ns;
-        Some(refused.count - std::mem::replace(&mut refused.logged, refused.count))
+        let before_ns = std::mem::replace(&mut refused.logged_ns, now_ns);
+        let period_ns = (refused.logged > 0).then(|| now_ns.saturating_sub(before_ns));
+        let count = refused.count - std::mem::replace(&mut refused.logged, refused.count);
+        Some(Unlogged { count, period_s: period_ns.map(|ns| ns as f64 * 1e-9) })
     }
 
     /// The payloads that could not be read so far, by key; `None` where there are no more than `known`, which becomes their number.
@@ -232,6 +256,13 @@ mod tests {
             (health.latencies[0].p50_ms - 51.0).abs() < 1.0 && health.latencies[0].p99_ms >= 98.0
         );
         assert!(counters.percentiles("none").is_none());
+        assert!(counters.failed_by("too long", "5 m".into()));
+        assert!(!counters.failed_by("too long", "6 m".into()));
+        assert_eq!(
+            (counters.newest("too long"), counters.newest("late")),
+            (Some("6 m".into()), None)
+        );
+        assert_eq!(counters.failures("too long"), 2);
     }
 
     #[test]
@@ -242,11 +273,11 @@ mod tests {
             let now_ns = tenth * 100_000_000;
             let unlogged =
                 counters.unreadable_payload(now_ns, "detector/a/detections", "why".into());
-            logged.extend(unlogged.map(|count| (tenth, count)));
+            logged.extend(unlogged.map(|it| (tenth, it.count, it.period_s)));
         }
-        assert_eq!(logged, [(0, 1), (100, 100), (200, 100)]);
+        assert_eq!(logged, [(0, 1, None), (100, 100, Some(10.0)), (200, 100, Some(10.0))]);
         let unlogged = counters.unreadable_payload(1, "detector/b/detections", "cut".into());
-        assert_eq!(unlogged, Some(1), "another key is logged at once");
+        assert_eq!(unlogged.map(|it| it.count), Some(1), "another key is logged at once");
         for i in 0..1000 {
             counters.unreadable_payload(1, &format!("{i}"), String::new());
         }

@@ -22,7 +22,7 @@ use zenoh::session::SessionGetBuilder;
 
 use crate::boxed::BoxFuture;
 use crate::clock::now_ns;
-use crate::health::HealthCounters;
+use crate::health::{HealthCounters, Unlogged};
 use crate::sender;
 use crate::session::Node;
 
@@ -414,7 +414,14 @@ impl<M: Message> Commands<M> {
             let payload = query.payload().map(|p| p.to_bytes().into_owned()).unwrap_or_default();
             let reason = match decode(&payload) {
                 Ok(_) if is_odd => {
-                    self.health.failed("commands: an attachment that is no time");
+                    if self.health.failed("commands: an attachment that is no time") {
+                        let key = query.key_expr().as_str();
+                        tracing::warn!(
+                            key,
+                            sender,
+                            "Command refused: its attachment is no time (further ones are counted)"
+                        );
+                    }
                     "the command's attachment is no time (8 bytes), so it is not known how old the command is".to_owned()
                 }
                 Ok(message) => match refusal(sent_ns, now_ns()) {
@@ -610,20 +617,29 @@ pub(crate) fn report_refused(
         DecodeError::Foreign { .. } | DecodeError::Damaged { .. } => problem.to_string(),
         _ => format!("{problem} ({bytes} bytes)"),
     };
-    if let Some(count) = health.unreadable_payload(now_ns(), key, why) {
-        tracing::warn!(
-            key,
-            bytes,
-            count,
-            %problem,
-            "Payloads that cannot be read: the newest of those since the last such line (all are counted)"
-        );
+    if let Some(unlogged) = health.unreadable_payload(now_ns(), key, why.clone()) {
+        tracing::warn!("Unreadable payload on {}{}: {why}", key.escape_debug(), often(unlogged));
+    }
+}
+
+/// How many payloads were unreadable since the last line of the log, as a text.
+fn often(Unlogged { count, period_s }: Unlogged) -> String {
+    match period_s {
+        Some(period_s) => format!(" ({count} in {period_s:.0} s)"),
+        None => " (further ones are counted)".to_owned(),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn unreadable_payloads_are_logged_with_their_number_and_time() {
+        let unlogged = |period_s| Unlogged { count: 151, period_s };
+        assert_eq!(often(unlogged(Some(10.04))), " (151 in 10 s)");
+        assert_eq!(often(unlogged(None)), " (further ones are counted)");
+    }
 
     #[test]
     fn a_command_is_logged_by_its_plain_name() {
