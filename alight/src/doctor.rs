@@ -6,6 +6,7 @@
 mod cameras;
 mod focus;
 mod keys;
+mod landing;
 mod ports;
 mod running;
 mod unusable;
@@ -19,7 +20,7 @@ use std::time::Duration;
 
 use anyhow::bail;
 use clap::Args;
-use messages::{CameraInfo, ControllerStatus, DetectorState, Health, Phase, topic};
+use messages::{CameraInfo, ControllerStatus, Health, Phase, topic};
 use node::version::release;
 use node::{INSECURE, Node, RELAY, clock_name, stats};
 use rustix::process::{Resource, getrlimit};
@@ -34,6 +35,7 @@ use crate::programs::{missing, missing_of_service, unusable_key};
 use crate::runtime::{block_on, tool_identity};
 use crate::services::Service;
 use crate::site::{Job, Role, Site};
+use crate::staleness::Limits;
 use crate::terminal::print;
 
 /// The arguments of `alight doctor`.
@@ -63,8 +65,6 @@ const ROUND_TRIPS: u32 = 10;
 const REPLY_TIMEOUT: Duration = Duration::from_millis(300);
 /// The remedy for a network that is open to all.
 const MAKE_KEYS: &str = "make keys (`alight keys`, docs/deploy.md), and remove `insecure`";
-/// The remedy if no detector is alive.
-const START_ONE: &str = "start one (`alight up`, `alight detector`); the output of the one that ended contains the reason";
 const OPEN_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The severity of a finding.
@@ -371,8 +371,8 @@ struct Seen {
     raw_frames: Vec<ReceivedFrame>,
     /// The cameras' messages that no detector uses.
     unusable: Unusable,
-    /// The controller's `detectors.max_age_s`, if its configuration was received.
-    max_age_s: Option<f64>,
+    /// The controller's limits for detectors, if its configuration was received.
+    limits: Option<Limits>,
 }
 
 impl Seen {
@@ -450,7 +450,7 @@ async fn check_network(
             check_healths(findings, &seen);
             cameras::check(findings, &seen, watched, has_camera(expected));
             check_detectors(findings, &seen, watched);
-            check_landing(findings, &seen);
+            landing::check(findings, &seen);
         }
         Err(problem) => findings.wrong("network", format!("{problem:#}"), "start it again"),
     }
@@ -492,7 +492,7 @@ async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result
                     }
                 }
                 Some(configuration) = configurations.next() => {
-                    seen.max_age_s = cameras::max_age_s(&configuration).or(seen.max_age_s);
+                    seen.limits = Limits::published(&configuration).or(seen.limits);
                 }
                 Some(status) = statuses.next() => seen.status = Some(status),
                 Some(info) = infos.next() => {
@@ -729,78 +729,10 @@ fn check_version(findings: &mut Findings, process: &str, theirs: &str, ours: &st
     }
 }
 
-fn check_landing(findings: &mut Findings, seen: &Seen) {
-    let Some(status) = &seen.status else { return };
-    let text = format!("{} ({}); autopilot: {}", status.phase, status.why, status.autopilot);
-    findings.good("controller", text);
-    // The state of the link is published as text only: `system 1 in GUIDED` if the autopilot's heartbeat is received. Otherwise the text
-    // contains the advice.
-    let link = &status.autopilot;
-    let is_received = link.starts_with("system ") && !link.contains("is silent");
-    if !is_received {
-        let text =
-            "the controller does not receive its heartbeat, and no landing starts without it";
-        findings.wrong("autopilot", text.to_owned(), link);
-    }
-    match status.setpoint_timeout_s {
-        Some(seconds) => findings.good(
-            "setpoint timeout",
-            format!("without setpoints the autopilot stops after {seconds:.1} s; a landing shortens this to `autopilot.setpoint_timeout_s`"),
-        ),
-        None if !is_received => {}
-        None => findings.doubtful(
-            "setpoint timeout",
-            "the autopilot has not reported its GUID_TIMEOUT or COM_OF_LOSS_T; landings are slower for it".to_owned(),
-            "check that it answers parameter requests on this link",
-        ),
-    }
-    for warning in &status.warnings {
-        findings.wrong(
-            "controller",
-            warning.clone(),
-            "until then a landing may not be started or finished, or ends further from the marker",
-        );
-    }
-    check_used(findings, seen, status);
-}
-
-/// Checks that a detector is there, and that the controller uses one that is.
-fn check_used(findings: &mut Findings, seen: &Seen, status: &ControllerStatus) {
-    let state_of = |name: &str| status.candidates.iter().find(|it| it.detector == name);
-    match &status.active_detector {
-        _ if !seen.has_detector() => findings.wrong(
-            "detector",
-            format!("none is alive, so a landing sees nothing: {}", status.detector_why),
-            START_ONE,
-        ),
-        Some(used) if state_of(used).is_some_and(|it| !it.alive) => findings.wrong(
-            "detector",
-            format!(
-                "`{used}` was in use and has left the network, and no other has taken its place"
-            ),
-            START_ONE,
-        ),
-        Some(used) => match state_of(used).map(|it| it.state) {
-            Some(DetectorState::Stale) => findings.doubtful(
-                "detector",
-                format!("`{used}` is in use, and is silent, late or slow; no other is better"),
-                "see the lines of the cameras above, its log, and `alight detectors`",
-            ),
-            _ => findings.good("detector", format!("`{used}` is in use")),
-        },
-        None => findings.doubtful(
-            "detector",
-            format!("the controller uses none: {}", status.detector_why),
-            "check that one runs and gets frames",
-        ),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use clap::Parser;
-    use messages::Candidate;
 
     #[derive(Parser)]
     struct Tool {
@@ -837,28 +769,6 @@ mod tests {
     }
 
     #[test]
-    fn the_reason_for_a_missing_heartbeat_is_reported() {
-        let findings_text = |autopilot: &str| {
-            let status =
-                ControllerStatus { autopilot: autopilot.into(), ..ControllerStatus::default() };
-            let mut findings = Findings::default();
-            check_landing(&mut findings, &Seen { status: Some(status), ..Seen::default() });
-            findings.text()
-        };
-        let other = findings_text(
-            "no heartbeat of system 7 yet, but of 1: set `autopilot.system_id` to the vehicle's",
-        );
-        assert!(
-            other.contains("does not receive its heartbeat") && other.contains("->"),
-            "{other}"
-        );
-        assert_eq!(other.matches("but of 1: set `autopilot.system_id`").count(), 2, "{other}");
-        let silent = findings_text("system 1 is silent: check its cable");
-        assert!(silent.contains("does not receive") && silent.contains("-> "), "{silent}");
-        assert!(!findings_text("system 1 in GUIDED").contains("does not receive"));
-    }
-
-    #[test]
     fn a_detector_that_searches_nothing_is_doubtful() {
         let searched = Searched { frames: 30, found: 27 };
         let detectors = [("idle", Searched::default()), ("main", searched)];
@@ -874,44 +784,6 @@ mod tests {
             "{text}"
         );
         assert!(text.ends_with("0 wrong, 1 doubtful."), "{text}");
-    }
-
-    #[test]
-    fn a_controller_without_a_detector_that_is_alive_is_wrong() {
-        let candidate = |alive: bool, state: DetectorState| Candidate {
-            detector: "main".into(),
-            alive,
-            state,
-            ..Candidate::sample()
-        };
-        let findings_text = |peers: &[&str], candidate: Option<Candidate>| {
-            let status = ControllerStatus {
-                active_detector: candidate.as_ref().map(|it| it.detector.clone()),
-                detector_why: "the last one has gone".into(),
-                candidates: candidate.into_iter().collect(),
-                ..ControllerStatus::default()
-            };
-            let peers = peers.iter().map(|service| ((*service).to_owned(), "main".to_owned()));
-            let seen = Seen { peers: peers.collect(), ..Seen::default() };
-            let mut findings = Findings::default();
-            check_used(&mut findings, &seen, &status);
-            findings.text()
-        };
-        let both = ["controller", "detector"];
-        let active = Some(candidate(true, DetectorState::Active));
-        assert!(findings_text(&both, active.clone()).ends_with("Nothing is wrong."));
-        let none = findings_text(&["controller"], None);
-        assert!(none.contains("WRONG  detector      none is alive"), "{none}");
-        assert!(none.contains("the last one has gone"), "{none}");
-        assert!(
-            findings_text(&["controller"], active).contains("none is alive"),
-            "it is no longer used"
-        );
-        let gone = findings_text(&both, Some(candidate(false, DetectorState::Stale)));
-        assert!(gone.contains("WRONG") && gone.contains("`main` was in use"), "{gone}");
-        let late = findings_text(&both, Some(candidate(true, DetectorState::Stale)));
-        assert!(late.ends_with("0 wrong, 1 doubtful."), "{late}");
-        assert!(findings_text(&both, None).ends_with("0 wrong, 1 doubtful."));
     }
 
     #[test]

@@ -6,7 +6,7 @@
 //! this machine, follows its `peers`, keeps `notes` for the case of a crash and finds the `programs` they need, `keys` makes the site's
 //! keys, `doctor` diagnoses it, `cameras` lists the cameras; `land` runs all services as processes and watches the landing, with `children`
 //! for the processes, `progress` for the display and `outcome` for the result; `command` sends a command, `detectors` lists the running
-//! detectors and `swap` replaces one; `detect`, `calibrate`, `rectify`, `marker` and `experiment` with its campaign of `faults`, flown in
+//! detectors and `swap` replaces one, with `staleness` for the reason why one is stale; `detect`, `calibrate`, `rectify`, `marker` and `experiment` with its campaign of `faults`, flown in
 //! `real_time` over a `fault_link` as well, are tools. `runtime`, `terminal`, `interruption` and `ending` serve all of them.
 
 mod args;
@@ -42,6 +42,7 @@ mod report;
 mod runtime;
 mod services;
 mod site;
+mod staleness;
 mod swap;
 mod terminal;
 mod up;

@@ -31,6 +31,7 @@ use self::comparison::Comparison;
 use self::joined::Joined;
 use crate::args::{Format, NetworkArgs, WrongUse, whole_number};
 use crate::runtime::with_node;
+use crate::staleness::Limits;
 use crate::terminal::{print, write_error};
 
 /// Timeout for the controller's first status.
@@ -360,8 +361,17 @@ impl Swap<'_> {
         }
     }
 
-    /// The next event; an error when the new detector exits, on a shutdown request, and at the deadline.
+    /// The next event; an error when the new detector exits, on a shutdown request, and at the deadline, with what was waited for or why in
+    /// vain.
     async fn next_event(&mut self, deadline: Instant, waiting_for: &str) -> anyhow::Result<Event> {
+        self.next_event_or(deadline, || format!("timeout while waiting until {waiting_for}")).await
+    }
+
+    async fn next_event_or(
+        &mut self,
+        deadline: Instant,
+        timeout: impl Fn() -> String,
+    ) -> anyhow::Result<Event> {
         loop {
             return tokio::select! {
                 Some(status) = self.statuses.next() => {
@@ -387,10 +397,10 @@ impl Swap<'_> {
                 }
                 status = self.child.wait() => {
                     let status = status.map_or_else(|cause| cause.to_string(), |s| s.to_string());
-                    bail!("the new detector exited ({status}) while waiting until {waiting_for}")
+                    bail!("the new detector exited ({status})")
                 }
                 () = self.shutdown.requested() => bail!("interrupted"),
-                () = sleep_until(deadline) => bail!("timeout while waiting until {waiting_for}"),
+                () = sleep_until(deadline) => bail!("{}", timeout()),
             };
         }
     }
@@ -412,7 +422,8 @@ impl Swap<'_> {
         self.comparison.of(report.from.as_deref(), new);
         let mut unfit = None;
         loop {
-            let waiting_for = unfit.clone().unwrap_or_else(|| match (report.compared, report.agreed) {
+            let problem = self.unreadable(new).or_else(|| unfit.clone());
+            let waiting_for = match (report.compared, report.agreed) {
                 (0, _) => "it can be compared: the active detector sees no marker, or the new one searches \
                            other frames"
                     .to_owned(),
@@ -421,8 +432,12 @@ impl Swap<'_> {
                     let differs = differs.map_or_else(String::new, |text| format!("; {text}"));
                     format!("it agrees, so far in {agreed} of {compared} frames{differs}")
                 }
-            });
-            match self.next_event(deadline, &waiting_for).await? {
+            };
+            let timeout = || match &problem {
+                Some(problem) => problem.clone(),
+                None => format!("timeout while waiting until {waiting_for}"),
+            };
+            match self.next_event_or(deadline, timeout).await? {
                 Event::Left(name) if name == new => bail!("the new detector left the network"),
                 Event::Status(status) if status.active_detector.as_deref() == Some(new) => {
                     self.show("the old one failed, and the new one took over");
@@ -433,7 +448,10 @@ impl Swap<'_> {
                     (report.compared, report.agreed) = (shadow.compared, shadow.agreed);
                     report.disagreement_m = shadow.disagreement_m;
                     self.comparison.of(status.active_detector.as_deref(), new);
-                    unfit = unfit_because(shadow, self.args.frames);
+                    unfit = self
+                        .comparison
+                        .limits()
+                        .and_then(|limits| unfit_because(shadow, self.args.frames, limits));
                     match verdict(shadow, self.args.frames) {
                         Some(Verdict::Agrees) => return Ok(()),
                         Some(Verdict::Differs(why)) => {
@@ -446,6 +464,13 @@ impl Swap<'_> {
                 Event::Joined | Event::Left(_) => {}
             }
         }
+    }
+
+    /// Why the new detector's detections cannot be read, if some could not.
+    fn unreadable(&self, new: &str) -> Option<String> {
+        let all = self.node.health().more_unreadable(&mut 0)?;
+        let its = all.into_iter().find(|it| topic::DETECTIONS.first_name(&it.key) == Some(new))?;
+        Some(format!("its detections cannot be read ({} times): {}", its.count, its.why))
     }
 
     /// Waits for the controller's configuration, which it publishes every few seconds: the limit is in it.
@@ -665,21 +690,26 @@ fn agreement(shadow: &Candidate) -> f64 {
     f64::from(shadow.agreed) / f64::from(shadow.compared)
 }
 
-/// Why a detector that agrees cannot be used.
-fn unfit_because(shadow: &Candidate, frames: u32) -> Option<String> {
+/// Why a detector that agrees cannot be used, or why one is too slow or too late for a comparison.
+fn unfit_because(shadow: &Candidate, frames: u32, limits: Limits) -> Option<String> {
     let Candidate { state, agreed, compared, age_ms, latency_ms, .. } = shadow;
     let agrees = *compared >= frames && agreement(shadow) >= MIN_AGREEMENT;
     let what = match state {
         DetectorState::Active | DetectorState::Shadow => return None,
-        DetectorState::Stale => "is stale",
+        DetectorState::Stale => {
+            if let Some(problem) = limits.slow(shadow).or_else(|| limits.late(shadow)) {
+                return Some(format!("too {problem}; it agrees in {agreed} of {compared} frames"));
+            }
+            "is silent"
+        }
         DetectorState::Blind => "is blind",
         DetectorState::Outvoted => "is outvoted",
         DetectorState::NoPose => "gives no pose of the marker",
     };
     agrees.then(|| {
         format!(
-            "it can be used: it agrees in {agreed} of {compared} frames and {what} (detections come {latency_ms:.0} ms after their \
-             frames, the newest frame is {age_ms:.0} ms old)"
+            "timeout while waiting until it can be used: it agrees in {agreed} of {compared} frames and {what} (detections come {latency_ms:.0} ms \
+             after their frames, the newest frame is {age_ms:.0} ms old)"
         )
     })
 }
@@ -722,16 +752,28 @@ mod tests {
         assert!(verdict(&shadow(15, 10), 15).is_none(), "undecided");
         let late = Candidate { state: DetectorState::Stale, latency_ms: 201.0, ..shadow(30, 30) };
         assert!(verdict(&late, 15).is_none());
-        let unfit = unfit_because(&late, 15).unwrap();
+        let limits = Limits { max_age_s: 0.2, min_rate_hz: 3.0 };
+        let unfit = unfit_because(&late, 15, limits).unwrap();
         assert!(
-            unfit.contains("30 of 30 frames and is stale") && unfit.contains("201 ms"),
+            unfit.starts_with(
+                "too late: its detections come 201 ms after the exposure, limit 200 ms"
+            ) && unfit.ends_with("it agrees in 30 of 30 frames"),
+            "{unfit}"
+        );
+        let slow = Candidate { state: DetectorState::Stale, rate_hz: 2.0, ..shadow(9, 9) };
+        let unfit = unfit_because(&slow, 15, limits).unwrap();
+        assert!(unfit.starts_with("too slow: 2.0 of at least 3 Hz"), "{unfit}");
+        let silent = Candidate { age_ms: 700.0, latency_ms: 30.0, rate_hz: 15.0, ..late.clone() };
+        let unfit = unfit_because(&silent, 15, limits).unwrap();
+        assert!(
+            unfit.contains("30 of 30 frames and is silent") && unfit.contains("700 ms"),
             "{unfit}"
         );
         let centres_only = Candidate { state: DetectorState::NoPose, ..shadow(30, 30) };
         assert!(verdict(&centres_only, 15).is_none());
-        let unfit = unfit_because(&centres_only, 15).unwrap();
+        let unfit = unfit_because(&centres_only, 15, limits).unwrap();
         assert!(unfit.contains("30 of 30 frames and gives no pose of the marker"), "{unfit}");
-        assert_eq!(unfit_because(&shadow(30, 30), 15), None);
+        assert_eq!(unfit_because(&shadow(30, 30), 15, limits), None);
         let refused = Verdict::Differs("it agrees in only 3 of 15 frames".into());
         assert_eq!(verdict(&shadow(15, 3), 15), Some(refused));
         let stale = Candidate { state: DetectorState::Stale, ..shadow(15, 15) };
@@ -878,6 +920,9 @@ mod tests {
         let why = "`third` joined, and is not used: it is process";
         assert!(report.why.contains(why) && report.why.contains("`--id third`"), "{}", report.why);
         assert!(!report.swapped && report.ready_s.is_none(), "{}", report.why);
+        let report = swapped_to("sh -c 'echo 0 > FILE; exit 3'", "30").await?;
+        let why = "the new detector exited (exit status: 3)";
+        assert!(report.why.ends_with(why), "{}", report.why);
         Ok(())
     }
 

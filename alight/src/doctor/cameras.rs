@@ -3,15 +3,18 @@
 
 use std::fmt::Write;
 
-use messages::{CameraInfo, Configuration, Health, PixelFormat};
+use messages::{CameraInfo, Health, PixelFormat};
 use node::frame_order::FrameOrder;
-use node::{Layers, clock_name, stats};
+use node::{clock_name, stats};
 
 use super::focus::ReceivedFrame;
 use super::{Findings, Seen, Watched};
+use crate::staleness::Limits;
 
 /// Maximum age of a frame on arrival, in milliseconds; a larger one means a wrong clock or an unusable link.
 const MAX_AGE_MS: f64 = 1000.0;
+/// Age from which on a stamp is of another clock, in milliseconds: a day.
+const OTHER_CLOCK_MS: f64 = 86_400_000.0;
 /// A brisk turn of the vehicle, in radians per second, at which the blur is stated.
 const TURN_RAD_S: f64 = 0.5;
 /// Blur at that turn from which on markers are found less far, in pixels.
@@ -88,7 +91,7 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_
             // Writing to a string cannot fail.
             let _ = write!(text, "; its raw frames are {age_ms:.0} ms old");
         }
-        check_age(findings, text, searched, seen.max_age_s);
+        check_age(findings, text, searched, seen.limits);
         check_publishers(findings, camera, &seen.raw_frames);
         check_stamps(findings, camera, &frames);
         check_exposure(findings, camera, &frames, focal_px(seen, camera));
@@ -106,6 +109,9 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_
                 ),
                 "run camera and controller on one machine; a camera of your own must use that clock's name",
             );
+        }
+        if clocks.is_empty() {
+            check_clock(findings, camera, &raw);
         }
         let is_calibrated = seen.cameras.iter().any(|info| info.camera == camera);
         if !is_calibrated && !seen.unusable.has_info(camera) {
@@ -194,19 +200,17 @@ fn describe_frames(camera: &str, frames: &[&ReceivedFrame], seconds: u64) -> Str
         text.push_str(" (it takes more: they are few where no detector acknowledges them)");
     }
     match stats::quantile(&ages_ms(frames), 0.5) {
+        Some(median_ms) if median_ms.abs() > OTHER_CLOCK_MS => {
+            text.push_str(", of unknown age, as their stamps are impossible");
+        }
         Some(median_ms) => {
             // Writing to a string cannot fail.
             let _ = write!(text, ", {median_ms:.0} ms old on arrival");
         }
-        None => text.push_str(", of unknown age, as their clock is that of another machine"),
+        None => text
+            .push_str(", of unknown age, as their clock is another one than that of this machine"),
     }
     text
-}
-
-/// The maximum age of a detector's frames in a controller's configuration, in seconds.
-pub(super) fn max_age_s(controller: &Configuration) -> Option<f64> {
-    let table: toml::Table = controller.toml.parse().ok()?;
-    table.get("detectors")?.get("max_age_s")?.as_float()
 }
 
 /// Adds the description of a camera's frames: doubtful where they are older on arrival than the controller allows a detector's frames.
@@ -214,11 +218,9 @@ fn check_age(
     findings: &mut Findings,
     text: String,
     frames: &[&ReceivedFrame],
-    max_age_s: Option<f64>,
+    limits: Option<Limits>,
 ) {
-    let by_default = || Layers::default().load::<controller::Config>().ok();
-    let limit_s =
-        max_age_s.or_else(|| by_default().map(|config| config.settings.detectors.max_age_s));
+    let limit_s = limits.or_else(Limits::by_default).map(|limits| limits.max_age_s);
     let age_s = stats::quantile(&ages_ms(frames), 0.5).map(|age_ms| age_ms * 1e-3);
     match age_s.zip(limit_s) {
         Some((age_s, limit_s)) if age_s > limit_s => findings.doubtful(
@@ -251,16 +253,40 @@ fn check_publishers(findings: &mut Findings, camera: &str, raw: &[ReceivedFrame]
     }
 }
 
+/// Reports raw frames, which come from this machine, whose clock has another name than that of this machine.
+fn check_clock(findings: &mut Findings, camera: &str, raw: &[&ReceivedFrame]) {
+    let other = raw.iter().map(|frame| &frame.header.clock).find(|clock| *clock != clock_name());
+    if let Some(clock) = other {
+        findings.doubtful(
+            "clock",
+            format!(
+                "camera `{camera}` stamps with the clock `{clock}`, that of this machine is `{}`: a controller here rejects all its frames",
+                clock_name()
+            ),
+            "where the camera runs on this machine, give that name as `clock` in the FrameHeader (docs/wire-format.md)",
+        );
+    }
+}
+
 /// The longer focal length of a camera, if it is calibrated.
 fn focal_px(seen: &Seen, camera: &str) -> Option<f64> {
     let info = seen.cameras.iter().find(|info| info.camera == camera)?;
-    info.focal_px.map(|[fx, fy]| fx.max(fy))
+    let focal_px = info.focal_px.map(|[fx, fy]| fx.max(fy));
+    focal_px.filter(|focal_px| info.problem().is_none() && focal_px.is_finite())
 }
 
 fn check_stamps(findings: &mut Findings, camera: &str, frames: &[&ReceivedFrame]) {
     let ages_ms = ages_ms(frames);
     let wrong = ages_ms.iter().find(|age_ms| !(0.0..=MAX_AGE_MS).contains(*age_ms));
-    if let Some(age_ms) = wrong {
+    if let Some(age_ms) = wrong.filter(|age_ms| age_ms.abs() > OTHER_CLOCK_MS) {
+        let days = age_ms.abs() / OTHER_CLOCK_MS;
+        let side = if *age_ms < 0.0 { "in the future" } else { "in the past" };
+        findings.wrong(
+            "stamps",
+            format!("camera `{camera}` stamps its frames {days:.0} days {side}, as with another clock, for example the time of day (CLOCK_REALTIME)"),
+            "stamp with CLOCK_MONOTONIC in nanoseconds (`time.monotonic_ns()` in Python; docs/wire-format.md), at the middle of the exposure",
+        );
+    } else if let Some(age_ms) = wrong {
         findings.wrong(
             "stamps",
             format!(
@@ -461,6 +487,55 @@ mod tests {
     }
 
     #[test]
+    fn stamps_of_the_time_of_day_are_reported_with_the_right_clock() {
+        let day_ms = 86_400_000;
+        let future = text(vec![frame(-20_788 * day_ms, 1)], 640, Vec::new());
+        assert!(future.contains("stamps its frames 20788 days in the future"), "{future}");
+        assert!(future.contains("`time.monotonic_ns()` in Python"), "{future}");
+        assert!(!future.contains("source.delay_ms") && !future.contains("ms old"), "{future}");
+        assert!(future.contains("1 wrong"), "{future}");
+        let past = text(vec![frame(2 * day_ms, 1)], 640, Vec::new());
+        assert!(past.contains("2 days in the past"), "{past}");
+    }
+
+    #[test]
+    fn another_clock_than_that_of_this_machine_is_doubtful_without_a_controller() {
+        let of = |clock: &str, healths| {
+            let mut other = frame(30, 1);
+            other.header.clock = clock.to_owned();
+            text(vec![other], 640, healths)
+        };
+        for clock in ["", "unix"] {
+            let found = of(clock, Vec::new());
+            let named = format!("stamps with the clock `{clock}`, that of this machine is `");
+            assert!(found.contains(&named) && found.contains("0 wrong, 1 doubtful"), "{found}");
+        }
+        assert!(!of(clock_name(), Vec::new()).contains("clock `"));
+        let controller =
+            Health { service: "controller".into(), clock: clock_name().into(), ..Health::sample() };
+        let wrong = of("unix", vec![controller]);
+        assert!(
+            wrong.contains("so it rejects all frames") && wrong.contains("0 doubtful"),
+            "{wrong}"
+        );
+    }
+
+    #[test]
+    fn a_refused_focal_length_gives_no_blur() {
+        let model = geometry::CameraModel::pinhole(640, 480, 1800.0);
+        let mut info = CameraInfo::new("down", &model, &geometry::Transform::identity());
+        info.focal_px = Some([f64::NAN; 2]);
+        let watched =
+            Watched { role: None, duration: Duration::from_secs(1), has_raw_frames: true };
+        let (cameras, raw_frames) = (vec![info], vec![frame(30, 2_000_000)]);
+        let mut findings = Findings::default();
+        check(&mut findings, &Seen { cameras, raw_frames, ..Seen::default() }, watched, false);
+        let text = findings.text();
+        assert!(text.contains("refused by detectors: focal lengths of NaN"), "{text}");
+        assert!(text.contains("exposes for 2.00 ms\n") && !text.contains("blurs"), "{text}");
+    }
+
+    #[test]
     fn a_blurred_picture_is_reported_and_one_without_edges_is_not_judged() {
         let of = |widths: [Option<f64>; 3]| {
             let frames =
@@ -482,7 +557,8 @@ mod tests {
             let mut findings = Findings::default();
             let watched =
                 Watched { role: None, duration: Duration::from_secs(1), has_raw_frames: true };
-            let seen = Seen { raw_frames: vec![frame(age_ms, 1)], max_age_s, ..Seen::default() };
+            let limits = max_age_s.map(|max_age_s| Limits { max_age_s, min_rate_hz: 3.0 });
+            let seen = Seen { raw_frames: vec![frame(age_ms, 1)], limits, ..Seen::default() };
             check(&mut findings, &seen, watched, false);
             findings.text()
         };

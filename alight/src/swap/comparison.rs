@@ -7,6 +7,8 @@ use controller::agreement::{angle_between, distance, heading_rad, range};
 use geometry::Camera;
 use messages::{Configuration, Detections, Transform3};
 
+use crate::staleness::Limits;
+
 /// Latest frames of each of the two that are kept: the later one may be half a second behind.
 const MAX_FRAMES: usize = 32;
 /// Share of the distance that lies along the view, above which the two differ in range.
@@ -61,6 +63,11 @@ impl Comparison {
     /// True once the controller's configuration is known.
     pub(super) fn is_configured(&self) -> bool {
         self.controller.is_some()
+    }
+
+    /// The controller's limits for detectors, by default those of the built-in configuration.
+    pub(super) fn limits(&self) -> Option<Limits> {
+        self.controller.as_ref().map(Limits::of).or_else(Limits::by_default)
     }
 
     /// Takes the detections of a frame.
