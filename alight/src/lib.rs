@@ -53,5 +53,7 @@ use std::process::ExitCode;
 pub fn main() -> ExitCode {
     node::set_version(cli::VERSION);
     node::relaunch_with_zenoh_threads();
-    cli::run()
+    let status = cli::run();
+    node::halt_zenoh();
+    status
 }

@@ -4,7 +4,7 @@
 //! This is the only crate that uses Zenoh. It does not depend on images, markers or autopilots.
 //!
 //! Modules in reading order: [`config`] merges a user's settings into the defaults; [`service`] runs a
-//! service from start to shutdown; [`network`] configures the network, its `endpoint`s and, from [`access`], the rights of
+//! service from start to shutdown, and `halt` ends Zenoh's threads after it; [`network`] configures the network, its `endpoint`s and, from [`access`], the rights of
 //! others by their [`certificate`]s and the `cipher` of links, and [`session`] joins it under an [`identity`], for a tool
 //! unless `foreign` programs answer there (`reach` finds why no process does), with shared memory where `memory` allows it;
 //! [`topics`] has typed messages and commands, with their `sender`, [`frames`] pixels in their [`frame_order`], and [`tap`] all messages as bytes, to which
@@ -26,6 +26,7 @@ mod endpoint;
 mod foreign;
 pub mod frame_order;
 pub mod frames;
+mod halt;
 pub mod health;
 pub mod identity;
 mod key_pair;
@@ -51,6 +52,7 @@ pub use config::{
 };
 pub use earlier::{EarlierRequest, EarlierRequests};
 pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
+pub use halt::halt_zenoh;
 pub use health::HealthCounters;
 pub use identity::Identity;
 pub use network::{INSECURE, Network, OPEN};

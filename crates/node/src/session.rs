@@ -16,6 +16,7 @@ use crate::boxed::BoxFuture;
 use crate::cipher;
 use crate::clock::{host_name, now_ns};
 use crate::foreign;
+use crate::halt;
 use crate::health::HealthCounters;
 use crate::identity::Identity;
 use crate::memory::lack_of_shared_memory;
@@ -129,6 +130,7 @@ impl Node {
         let has_shared_memory = share_memory(&mut config)?;
         let reach = Arc::new(Reach::of(&config));
         cipher::choose();
+        halt::session_opens();
         let session = zenoh::open(config)
             .await
             .map_err(|cause| anyhow!("opening the Zenoh session of {identity}: {cause}"))?;
