@@ -3,8 +3,8 @@
 //! Zenoh keeps its shared memory in static variables, which the exit destroys while its threads still run: also where a session is closed, as some
 //! of their tasks belong to no session, and closing one has a time limit. A thread that receives a frame or returns one at that moment panics.
 
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use tokio::runtime::Handle;
@@ -15,6 +15,8 @@ static POOLS: [ZRuntime; 5] =
     [ZRuntime::Net, ZRuntime::TX, ZRuntime::Application, ZRuntime::RX, ZRuntime::Acceptor];
 /// Timeout until the threads have halted. The last task of a thread ends before.
 const LIMIT: Duration = Duration::from_millis(500);
+/// Interval at which it is checked whether they have.
+const POLL: Duration = Duration::from_millis(1);
 
 /// Whether this process has opened a session, which starts the threads.
 static HAS_SESSION: AtomicBool = AtomicBool::new(false);
@@ -45,29 +47,32 @@ pub fn halt_zenoh() {
 /// Occupies all threads of these pools for good; whether that succeeded within the limit.
 fn halt(pools: &[&Handle], limit: Duration) -> bool {
     let deadline = Instant::now() + limit;
-    let (sender, halted) = mpsc::channel();
+    let halted = Arc::new(AtomicUsize::new(0));
     let mut threads = 0;
     for pool in pools {
         let workers = pool.metrics().num_workers();
         threads += workers;
         for _ in 0..workers {
-            let sender = sender.clone();
+            let halted = Arc::clone(&halted);
             pool.spawn(async move {
-                // The receiver is gone after the limit.
-                let _ = sender.send(());
+                halted.fetch_add(1, Ordering::Release);
                 loop {
                     std::thread::park();
                 }
             });
         }
     }
-    let left = || deadline.saturating_duration_since(Instant::now());
-    (0..threads).all(|_| halted.recv_timeout(left()).is_ok())
+    while halted.load(Ordering::Acquire) < threads {
+        if Instant::now() >= deadline {
+            return false;
+        }
+        std::thread::sleep(POLL);
+    }
+    true
 }
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
     use std::sync::atomic::AtomicU64;
 
     use super::*;
