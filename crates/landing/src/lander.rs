@@ -611,7 +611,8 @@ impl Lander {
         if !guided && !handing_over && !retrying {
             self.guidance.reset();
         }
-        if self.state_machine.phase() != Phase::Search {
+        // A search goes on along its square after a hold: one that began anew would lead ever farther away.
+        if !matches!(self.state_machine.phase(), Phase::Search | Phase::Hold) {
             self.square = None;
         }
         // Nothing is requested of a vehicle whose motors are off: it stands, or falls.

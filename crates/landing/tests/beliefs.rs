@@ -558,6 +558,25 @@ fn an_abort_in_a_low_hold_climbs_only_where_the_vehicle_certainly_flies() {
 }
 
 #[test]
+fn a_search_that_is_interrupted_again_and_again_stays_about_the_position_where_it_began() {
+    let config = Config::default();
+    let max_m = config.phases.search_radius_m * std::f64::consts::SQRT_2 + 2.0;
+    let mut harness = Harness::started(config, 8.0);
+    let mut farthest_m: f64 = 0.0;
+    for _ in 0..12 {
+        for _ in 0..6 {
+            harness.fly(1.0);
+            farthest_m = farthest_m.max((harness.position - Point::origin()).horizontal_norm());
+        }
+        assert_eq!(harness.phase(), Phase::Search);
+        harness.velocity = Vector::zero();
+        harness.run(1.0, false);
+        assert_eq!(harness.phase(), Phase::Hold);
+    }
+    assert!(farthest_m <= max_m && farthest_m > 0.5 * max_m, "{farthest_m} m");
+}
+
+#[test]
 fn motors_that_are_stopped_in_the_air_end_no_landing_as_a_touchdown() {
     for (mode, height_m) in
         [(Mode::Guided, 0.43), (Mode::Guided, 3.0), (Mode::Land, 0.43), (Mode::Land, 2.0)]
