@@ -729,7 +729,8 @@ fn a_detector_with_an_impossible_marker_is_refused_reported_and_passed_over() {
 
 #[test]
 fn detections_that_come_too_late_are_reported_with_the_limit() {
-    let mut flight = in_flight("airborne");
+    let mut flight = in_flight_with("airborne", &["autopilot.timesync=false"]);
+    flight.camera(0, CameraInfo::sample());
     hover(&mut flight, 1000, 2000, 4);
     for ms in (2000..8000).step_by(20) {
         let now_ns = ms * MS;
