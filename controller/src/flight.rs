@@ -572,12 +572,16 @@ impl Flight {
             is_flying: self.lander.is_flying(),
             is_awaiting_state: self.lander.is_awaiting_state(),
         };
+        let earlier = self.mission.when_resumed();
         if let Some(landing_target) = &mut self.landing_target
             && landing_target.step(now_ns, situation, &mut self.autopilot)
             && !self.mission.is_sending_landing_target()
         {
             // Another station or the pilot began it; it is followed like our own.
             self.mission.begin(now_ns, true);
+            if self.follow_earlier_command(now_ns, earlier) {
+                return;
+            }
         }
         if !may_recall {
             self.mission.leave_in_land(&mut self.autopilot);
@@ -616,13 +620,13 @@ impl Flight {
             return;
         }
         let before = (trigger == Trigger::InControl).then(|| self.mission.clone());
-        if trigger == Trigger::InFlight && self.config.start == Start::Resume {
+        let resumes = trigger == Trigger::InFlight && self.config.start == Start::Resume;
+        if resumes {
             let address = &self.config.autopilot.address;
             self.lander.resume(self.pad_notes.pad(address, self.autopilot.system()));
         }
-        let command = self.mission.when_resumed();
         self.begin(now_ns);
-        if self.follow_earlier_command(now_ns, command) {
+        if self.follow_earlier_command(now_ns, earlier.filter(|_| resumes)) {
             return;
         }
         if !self.mission.is_landing() {

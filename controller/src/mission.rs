@@ -188,17 +188,23 @@ impl Mission {
         let stood_still = format!("the controller did not run for {seconds:.0} s");
         let is_armed = autopilot.state().is_some_and(|state| state.armed);
         let stands = autopilot.state().is_some_and(|it| it.landed == LandedState::OnGround);
-        match self.state {
+        match &self.state {
             State::TakingOff { .. } if !is_armed => {
                 self.fail(autopilot, format!("no take-off: {stood_still}"));
             }
+            // Its state may be from before: one that was asked to rise may be in the air.
             State::TakingOff { .. } if stands => {
-                let why = format!("no take-off: {stood_still}, and the motors ran; disarm it");
+                let why = format!(
+                    "no take-off: {stood_still}, and the motors ran: if it stands, disarm it; if it flies, `start` lands it"
+                );
                 self.fail(autopilot, why);
             }
-            State::TakingOff { .. } | State::AwaitingTakeoff => self.hold(&stood_still),
+            State::TakingOff { .. } | State::AwaitingTakeoff | State::LeavingOffboard { .. } => {
+                self.hold(&stood_still);
+            }
             State::TakingControl { .. } => {
                 self.leave_offboard(now_ns, autopilot, &stood_still);
+                self.hold(&stood_still);
             }
             // The next flight is landed automatically.
             State::Landing | State::SendingLandingTarget
@@ -228,7 +234,8 @@ impl Mission {
         if is_held {
             (self.held_because, self.found_ns) = (None, None);
         }
-        is_held
+        let kept = self.when_resumed.take_if(|it| *it == OperatorCommand::Hold);
+        is_held || kept.is_some() && self.is_resuming()
     }
 
     /// True while it is not known yet whether there is a landing to resume, or while one waits for that.
@@ -264,7 +271,7 @@ impl Mission {
     /// Asks a PX4 that holds its place to follow setpoints. The landing begins once it does.
     pub fn take_control(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
         let awaits_takeoff = self.is_awaiting_takeoff();
-        self.goes_on_until_ns = None;
+        (self.goes_on_until_ns, self.when_resumed) = (None, None);
         let control = TakingControl::begin(now_ns, autopilot);
         self.state = State::TakingControl { control, awaits_takeoff };
     }
@@ -576,6 +583,12 @@ impl Mission {
         }
         if has_no_landing(autopilot) && !may_return {
             self.state = State::Idle;
+            if let Some(command) = self.when_resumed.take() {
+                tracing::warn!(
+                    ?command,
+                    "There is no landing to resume that could follow the command"
+                );
+            }
         }
     }
 

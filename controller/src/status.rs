@@ -159,7 +159,13 @@ impl View<'_> {
             ) => {
                 let distrust = self.distrust().map(|why| why.to_string());
                 let problem = landing_target::problem(self.autopilot).or(distrust);
-                landing_target.phase(now_ns, problem)
+                let (phase, why) = landing_target.phase(now_ns, problem);
+                match self.mission.when_resumed().and_then(what_happens) {
+                    Some(done) => {
+                        (phase, format!("{why}; a landing under way is {done} once found"))
+                    }
+                    None => (phase, why),
+                }
             }
             (State::SendingLandingTarget, None) => {
                 (Phase::Failed, "no landing target is sent in this mode".to_owned())
@@ -266,11 +272,12 @@ impl View<'_> {
     /// What a landing waits for that is to be resumed, and what happens to it then.
     fn resuming(&self, now_ns: i64) -> String {
         let conflict = self.autopilot.conflict(now_ns).map(|it| it.to_string());
+        let obstacle = self.frames.obstacle(now_ns);
         let waits = match (&conflict, self.autopilot.state()) {
             (Some(conflict), _) => conflict,
             (None, None) => "waiting for the autopilot's heartbeat",
             (None, Some(_)) if !self.autopilot.has_listened(now_ns) => LISTENING,
-            (None, Some(_)) => "waiting for the vehicle's state",
+            (None, Some(_)) => obstacle.as_deref().unwrap_or("waiting for the vehicle's state"),
         };
         let done = self.mission.when_resumed().and_then(what_happens);
         match done {

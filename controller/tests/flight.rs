@@ -1346,6 +1346,17 @@ fn a_command_before_a_landing_is_resumed_counts_as_soon_as_it_is() {
             assert!(status.phase == phase && status.started_ns.is_some(), "{status:?}");
         }
     }
+    // A hold is withdrawn by `resume`.
+    let mut flight = flight_with("resume", &["autopilot.system_id=1"]);
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    assert!(flight.command(0, &ControllerCommand::Hold).accepted);
+    assert!(flight.command(0, &ControllerCommand::Resume).accepted);
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    hover(&mut flight, 20, 4000, 4);
+    let phase = flight.status(4000 * MS).phase;
+    assert!(matches!(phase, Phase::Approach | Phase::Descend), "{phase:?}");
     // Without a landing to resume the command is of no effect on a later one.
     let mut flight = flight_with("resume", &["autopilot.system_id=1"]);
     assert!(flight.command(0, &ControllerCommand::Abort).accepted);
@@ -1363,6 +1374,23 @@ fn a_command_before_a_landing_is_resumed_counts_as_soon_as_it_is() {
     assert!(flight.command(2000 * MS, &ControllerCommand::Start).accepted);
     hover(&mut flight, 2020, 2500, 4);
     assert_eq!(flight.status(2500 * MS).phase, Phase::Approach);
+}
+
+#[test]
+fn an_abort_before_a_precision_landing_is_found_takes_the_autopilot_back_from_it() {
+    let mut flight = flight_with("resume", &["mode=landing-target", "autopilot.system_id=1"]);
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    flight.tick(0);
+    assert!(flight.command(0, &ControllerCommand::Abort).accepted);
+    let why = flight.status(0).why;
+    assert!(why.ends_with("; a landing under way is aborted once found"), "{why}");
+    receive(&mut flight, MS, &heartbeat(9, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    let sent = hover(&mut flight, 20, 900, 9);
+    assert!(sent.modes.contains(&4.0), "{sent:?} {:?}", flight.status(900 * MS));
+    hover(&mut flight, 1000, 3000, 4);
+    assert_eq!(flight.status(3000 * MS).phase, Phase::Aborted);
 }
 
 #[test]

@@ -205,6 +205,23 @@ fn a_landing_of_a_px4_that_is_to_be_resumed_waits_for_the_command_for_any_time()
 }
 
 #[test]
+fn a_command_to_a_landing_that_cannot_be_resumed_does_not_end_a_later_one() {
+    for command in [ControllerCommand::Abort, ControllerCommand::Hold] {
+        let mut site = landing(&[]);
+        site.pilot(HOLD.0, HOLD.1);
+        site.run(3.0);
+        site.restart_controller("resume");
+        assert!(site.command(&command).accepted);
+        site.run(10.0);
+        assert_eq!(site.mode(), Mode::Loiter, "{:?}", site.status());
+        let reply = site.command(&ControllerCommand::Start);
+        assert!(reply.accepted, "{reply:?}");
+        let lands = site.run_until(90.0, |site| site.status().phase == Phase::Landed);
+        assert!(lands, "{command:?}: {:?}", site.status());
+    }
+}
+
+#[test]
 fn a_precision_landing_of_a_px4_continues_after_an_interruption() {
     let waiting = |site: &Site| site.status().phase == Phase::Approach;
     for frozen_s in [1.2, 3.0, 8.0] {

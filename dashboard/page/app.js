@@ -553,6 +553,8 @@ setTheme(localStorage.getItem('theme') === 'sun' ? 'sun' : 'dark');
 const small = matchMedia('(max-width: 56rem)');
 function placeAbort() {
   const abort = /** @type {HTMLElement} */ (document.querySelector('button[data-command=abort]'));
+  // A press ends before the button moves: its release would not be noticed.
+  abort.dispatchEvent(new Event('pointercancel'));
   if (small.matches) {
     element('at-hand').append(abort, element('reply'));
     element('page-link').after(element('host'));

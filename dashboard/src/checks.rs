@@ -208,7 +208,7 @@ fn detector(facts: &Facts<'_>) -> Finding {
         return finding(Verdict::Bad, format!("{name}: no detections have arrived"), todo);
     };
     // Rate and latency are those of its latest frames, also while it is silent.
-    let age_ms = age_ms.max(it.age_ms);
+    let age_ms = age_ms.max(it.age_ms - it.latency_ms);
     if !is_current(Some(age_ms)) {
         return finding(Verdict::Bad, format!("{name}: silent for {:.0} s", age_ms / 1000.0), todo);
     }

@@ -5,6 +5,9 @@ use messages::FrameHeader;
 use node::HealthCounters;
 use node::frame_order::{FrameOrder, Misplaced, Placed};
 
+/// Shortest time between the frames before and after the start of a camera, in nanoseconds.
+const MIN_RESTART_NS: i64 = 300_000_000;
+
 /// The order of the frames that a detector searches.
 #[derive(Debug, Default)]
 pub(crate) struct Order {
@@ -39,7 +42,10 @@ impl Order {
         if by_stamp {
             problems.push(by_its_stamp(header, &before));
         }
-        if by_sequence {
+        // A camera that is started again numbers its frames anew.
+        let is_restart = header.sequence < before.sequence
+            && header.stamp_ns.saturating_sub(before.stamp_ns) >= MIN_RESTART_NS;
+        if by_sequence && !is_restart {
             problems.push(Problem {
                 reason: "frame whose sequence number is not greater than that of the frame before".to_owned(),
                 text: format!(
@@ -123,6 +129,8 @@ mod tests {
             assert!(found.len() == 1 && found[0].reason.contains(reason), "{found:?}");
             assert!(found[0].text.contains(text), "{found:?}");
         }
+        assert_eq!(problems(&mut order, 1200, 0), [], "it was started again");
+        assert_eq!(problems(&mut order, 1233, 0).len(), 1);
     }
 
     #[test]

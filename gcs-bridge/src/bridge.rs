@@ -604,10 +604,12 @@ impl Bridge {
         if self.is_abandoned {
             self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, ABANDONED);
         }
+        // What a silent controller stated last is not the present state; its next status sends all texts.
         if self.silence.is_long() {
             self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, SILENT);
+        } else {
+            self.send_texts(now_ns);
         }
-        self.send_texts(now_ns);
         self.warn_insecure(now_ns);
     }
 
@@ -625,7 +627,7 @@ impl Bridge {
 
     /// Reports once that the controller's status has stopped in a landing.
     fn watch_controller(&mut self, now_ns: i64, is_after_standstill: bool) {
-        if self.silence.begins(now_ns, is_after_standstill) {
+        if self.silence.begins(now_ns, is_after_standstill) && !self.is_abandoned {
             self.health.failed("no status of the controller in a landing");
             self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, SILENT);
         }

@@ -38,7 +38,8 @@ impl Neighbours {
             return;
         }
         let has_room = self.with_same_id.len() < MAX_BRIDGES;
-        if has_room && self.with_same_id.insert(other.to_owned()) && health.failed(SAME_ID) {
+        if has_room && self.with_same_id.insert(other.to_owned()) {
+            health.failed(SAME_ID);
             let component = self.component;
             tracing::warn!(
                 other,

@@ -87,7 +87,8 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen, watched: Watched, has_
         // A detector here takes raw frames where there are some.
         let searched = if raw.is_empty() { &frames } else { &raw };
         let mut text = describe_frames(camera, &frames, seconds);
-        if let Some(age_ms) = stats::quantile(&ages_ms(&raw), 0.5).filter(|_| is_jpeg(&frames)) {
+        let raw_ms = stats::quantile(&ages_ms(&raw), 0.5).filter(|_| is_jpeg(&frames));
+        if let Some(age_ms) = raw_ms.filter(|age_ms| age_ms.abs() <= OTHER_CLOCK_MS) {
             // Writing to a string cannot fail.
             let _ = write!(text, "; its raw frames are {age_ms:.0} ms old");
         }
@@ -221,7 +222,8 @@ fn check_age(
     limits: Option<Limits>,
 ) {
     let limit_s = limits.or_else(Limits::by_default).map(|limits| limits.max_age_s);
-    let age_s = stats::quantile(&ages_ms(frames), 0.5).map(|age_ms| age_ms * 1e-3);
+    let age_ms = stats::quantile(&ages_ms(frames), 0.5);
+    let age_s = age_ms.filter(|ms| ms.abs() <= OTHER_CLOCK_MS).map(|ms| ms * 1e-3);
     match age_s.zip(limit_s) {
         Some((age_s, limit_s)) if age_s > limit_s => findings.doubtful(
             "camera",

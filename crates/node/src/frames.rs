@@ -351,11 +351,14 @@ fn wrong_length(header: &FrameHeader, len: usize) -> String {
     };
     let expected = pixels.saturating_mul(bytes as u64);
     let remedy = match (len, len % u64::from(height)) {
-        _ if len == 3 * pixels || len == 4 * pixels => {
+        _ if len == pixels.saturating_mul(3) || len == pixels.saturating_mul(4) => {
             "; three or four bytes per pixel are a colour image: convert it to grey"
         }
-        _ if len == 2 * pixels => {
-            "; two bytes per pixel are `Mono10`, `Mono12` or `Mono16`: set that `format`"
+        _ if len.saturating_mul(2) == pixels.saturating_mul(3) => {
+            "; one and a half bytes per pixel are I420 or NV12: send the first width x height bytes only, which are its grey image"
+        }
+        _ if len == pixels.saturating_mul(2) => {
+            "; two bytes per pixel are more than 8 bits, for which `format` is set (`Mono16`), or colour (YUYV): of that send every other byte,              the grey ones"
         }
         (_, 0) if len > expected => "; rows have padding: copy them without it",
         _ => "",
@@ -383,7 +386,10 @@ mod tests {
             text(2_280_000),
             "2280000 bytes, expected 760000 (1000 x 760 pixels of Mono8); three or four bytes per pixel are a colour image: convert it to grey"
         );
-        assert!(text(1_520_000).contains("`Mono16`: set that `format`"), "{}", text(1_520_000));
+        assert!(text(1_520_000).contains("`format` is set (`Mono16`), or"), "{}", text(1_520_000));
+        assert!(text(1_140_000).contains("I420 or NV12"), "{}", text(1_140_000));
+        let huge = FrameHeader { width: u32::MAX, height: u32::MAX, ..FrameHeader::sample() };
+        assert!(wrong_length(&huge, 5).starts_with("5 bytes, expected"));
         assert!(text(1024 * 760).ends_with("rows have padding: copy them without it"));
         assert!(text(759_000).ends_with("(1000 x 760 pixels of Mono8)"), "{}", text(759_000));
         assert!(
