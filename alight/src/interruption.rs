@@ -132,9 +132,18 @@ mod tests {
 
     const TIMEOUT: Duration = Duration::from_secs(20);
 
-    /// One test sends all signals, as each handler in this process receives all of them.
+    /// Each handler in a process receives all signals, so one test sends them all, in a process without other tests.
     #[test]
     fn a_signal_asks_for_the_end_and_gives_the_exit_status() {
+        const ALONE: &str = "ALIGHT_TEST_OF_SIGNALS";
+        if std::env::var_os(ALONE).is_none() {
+            let name = "interruption::tests::a_signal_asks_for_the_end_and_gives_the_exit_status";
+            let mut test = std::process::Command::new(std::env::current_exe().unwrap());
+            let output = test.args(["--exact", name]).env(ALONE, "1").output().unwrap();
+            let text = String::from_utf8_lossy(&output.stdout);
+            assert!(output.status.success() && text.contains("1 passed"), "{text}");
+            return;
+        }
         let waiting = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
         for (signal, status) in [(Signal::INT, 130), (Signal::TERM, 143), (Signal::HUP, 129)] {
             if signal == Signal::HUP && ignores_hangups() {
