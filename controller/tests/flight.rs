@@ -727,22 +727,27 @@ fn a_detector_with_an_impossible_marker_is_refused_reported_and_passed_over() {
     }
 }
 
+/// Hovers in GUIDED while the detector sends these messages, by the time in nanoseconds.
+fn hover_with(flight: &mut Flight, from_ms: i64, to_ms: i64, message: impl Fn(i64) -> Detections) {
+    for ms in (from_ms..to_ms).step_by(20) {
+        let now_ns = ms * MS;
+        if ms % 1000 == 0 {
+            receive(flight, now_ns, &heartbeat(4, true));
+        }
+        pose(flight, now_ns);
+        if ms % 60 == 0 {
+            flight.detections(now_ns, "main", &message(now_ns));
+        }
+        flight.tick(now_ns + 3);
+    }
+}
+
 #[test]
 fn detections_that_come_too_late_are_reported_with_the_limit() {
     let mut flight = in_flight_with("airborne", &["autopilot.timesync=false"]);
     flight.camera(0, CameraInfo::sample());
     hover(&mut flight, 1000, 2000, 4);
-    for ms in (2000..8000).step_by(20) {
-        let now_ns = ms * MS;
-        if ms % 1000 == 0 {
-            receive(&mut flight, now_ns, &heartbeat(4, true));
-        }
-        pose(&mut flight, now_ns);
-        if ms % 60 == 0 {
-            flight.detections(now_ns, "main", &seen(now_ns - 600 * MS));
-        }
-        flight.tick(now_ns + 3);
-    }
+    hover_with(&mut flight, 2000, 8000, |now_ns| seen(now_ns - 600 * MS));
     let status = flight.status(8000 * MS);
     let text = "detections of `main` come 600 ms after their frames; at most 500 ms are used (`target.max_latency_s`)";
     assert_eq!(status.warnings, [text]);
@@ -776,19 +781,13 @@ fn detections_in_another_detectors_name_are_frames_of_the_camera() {
 fn a_landing_without_a_usable_detection_says_why() {
     let mut flight = in_flight("airborne");
     hover(&mut flight, 1000, 2000, 4);
-    for ms in (2000..8000).step_by(20) {
-        let now_ns = ms * MS;
-        if ms % 1000 == 0 {
-            receive(&mut flight, now_ns, &heartbeat(4, true));
+    hover_with(&mut flight, 2000, 8000, |now_ns| {
+        let mut message = seen(now_ns - 40 * MS);
+        for pose in message.detections.iter_mut().filter_map(|it| it.pose.as_mut()) {
+            pose.covariance[6] = -1.0;
         }
-        pose(&mut flight, now_ns);
-        if ms % 60 == 0 {
-            let mut message = seen(now_ns - 40 * MS);
-            message.detections[0].pose.as_mut().unwrap().covariance[6] = -1.0;
-            flight.detections(now_ns, "main", &message);
-        }
-        flight.tick(now_ns + 3);
-    }
+        message
+    });
     let status = flight.status(8000 * MS);
     let text = "detections of `main` are refused: `pose.covariance` is not that of a position";
     assert!(status.why.contains(text), "{}", status.why);
