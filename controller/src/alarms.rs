@@ -1,7 +1,7 @@
 //! Alarms of a landing: a low or critical battery, raised once, and silence of the operator or of the autopilot's link, raised
 //! once for each silence; and why a battery is too empty for a flight.
 
-use autopilot::Battery;
+use autopilot::{Battery, without_standstill};
 use landing::Alarm;
 
 use crate::config::AlarmSettings;
@@ -75,7 +75,7 @@ impl Alarms {
             &mut self.autopilot_ns,
         ];
         for at_ns in times.into_iter().flatten() {
-            *at_ns = at_ns.saturating_add(stood_ns).min(now_ns);
+            *at_ns = without_standstill(*at_ns, now_ns, stood_ns);
         }
     }
 

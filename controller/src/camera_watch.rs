@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use autopilot::without_standstill;
+
 use crate::refusals::Warning;
 use crate::selection::MAX_DETECTORS;
 
@@ -66,7 +68,7 @@ impl CameraWatch {
     pub fn stood_still(&mut self, now_ns: i64, stood_ns: i64) {
         for last in self.detectors.values_mut() {
             for at_ns in [&mut last.at_ns, &mut last.received_ns] {
-                *at_ns = at_ns.saturating_add(stood_ns).min(now_ns);
+                *at_ns = without_standstill(*at_ns, now_ns, stood_ns);
             }
         }
     }

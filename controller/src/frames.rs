@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 
+use autopilot::without_standstill;
 use landing::{FrameObservation, Timestamp};
 use messages::{CameraInfo, Detections, DetectorInfo, Place};
 
@@ -275,7 +276,7 @@ impl Frames {
     pub fn stood_still(&mut self, now_ns: i64, stood_ns: i64) {
         self.camera_watch.stood_still(now_ns, stood_ns);
         self.refusals.stood_still(now_ns, stood_ns);
-        self.kept_ns = self.kept_ns.saturating_add(stood_ns).min(now_ns);
+        self.kept_ns = without_standstill(self.kept_ns, now_ns, stood_ns);
     }
 
     /// Why a landing that an operator starts would not be led to the marker.

@@ -1,6 +1,8 @@
 //! Follows refusals by their reason (detections, camera information, messages of another version), and warns the operator of those that
 //! persist.
 
+use autopilot::without_standstill;
+
 /// Time for which something must be refused before a warning, in nanoseconds: a single refusal means little.
 const MIN_LASTING_NS: i64 = 1_000_000_000;
 /// Time without a refusal after which a matter is over, in nanoseconds.
@@ -67,7 +69,7 @@ impl Refusals {
     pub fn stood_still(&mut self, now_ns: i64, stood_ns: i64) {
         for matter in &mut self.matters {
             for at_ns in [&mut matter.since_ns, &mut matter.last_ns] {
-                *at_ns = at_ns.saturating_add(stood_ns).min(now_ns);
+                *at_ns = without_standstill(*at_ns, now_ns, stood_ns);
             }
         }
     }

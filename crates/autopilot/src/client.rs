@@ -35,7 +35,7 @@ use crate::px4_listener::Listener;
 use crate::same_address::SameAddress;
 use crate::setpoint_stream::SetpointStream;
 use crate::simulation::Simulation;
-use crate::standstill::Standstill;
+use crate::standstill::{Standstill, without_standstill};
 use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
 use crate::stream::Streams;
 use crate::text::Joiner;
@@ -585,8 +585,9 @@ impl Autopilot {
     /// Notices that heartbeats are missing. While this process did not run, for `stood_ns`, none was.
     fn check_silence(&mut self, now_ns: i64, stood_ns: Option<i64>) {
         let Some(vehicle) = &mut self.vehicle else { return };
-        let heartbeat_ns = vehicle.heartbeat_ns.saturating_add(stood_ns.unwrap_or(0));
-        vehicle.heartbeat_ns = heartbeat_ns.min(now_ns.max(vehicle.heartbeat_ns));
+        if let Some(stood_ns) = stood_ns {
+            vehicle.heartbeat_ns = without_standstill(vehicle.heartbeat_ns, now_ns, stood_ns);
+        }
         let silence_ns = now_ns.saturating_sub(vehicle.heartbeat_ns);
         if vehicle.state.connected && silence_ns > ns(self.config.heartbeat_timeout) {
             vehicle.state.connected = false;

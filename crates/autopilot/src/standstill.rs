@@ -10,6 +10,11 @@ const BACKLOG_NS: i64 = 300_000_000;
 /// Longest wait for the mode, in nanoseconds: heartbeats come each second, and one may be lost.
 const MAX_WAIT_NS: i64 = 2_500_000_000;
 
+/// A time, moved on by a standstill of this process that has ended, in nanoseconds: what is expected since then was not missing meanwhile.
+pub fn without_standstill(at_ns: i64, now_ns: i64, stood_ns: i64) -> i64 {
+    at_ns.saturating_add(stood_ns).min(now_ns)
+}
+
 /// The last standstill, until a mode received after it is known.
 #[derive(Copy, Clone, Debug, Default)]
 pub(crate) struct Standstill {

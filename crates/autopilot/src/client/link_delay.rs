@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::Autopilot;
+use crate::standstill::without_standstill;
 
 /// The delay for which an unsteady link counts.
 const UNSTEADY: Duration = Duration::from_secs(1);
@@ -43,7 +44,7 @@ impl Autopilot {
             self.link_delay_ns = Some(now_ns);
         }
         if let (Some(stood_ns), Some(at_ns)) = (stood_ns, &mut self.link_delay_ns) {
-            *at_ns = at_ns.saturating_add(stood_ns).min(now_ns);
+            *at_ns = without_standstill(*at_ns, now_ns, stood_ns);
         }
     }
 }
