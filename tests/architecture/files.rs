@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// Maximum number of names that are listed of a file.
-const MAX_NAMES: usize = 24;
+const MAX_NAMES: usize = 40;
 /// Folders of a room, in the order of the list. The package `tests` is a room that is one folder.
 const FOLDERS: [&str; 4] = ["src", "tests", "examples", "benches"];
 
