@@ -100,6 +100,36 @@ pub(crate) async fn of_a_camera(freezes_s: &[f64]) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Starts programs one by one while a camera that is known already is frozen, as if the machine had no time for it. Of two processes that
+/// learn of each other at the rendezvous the one with the greater id connects, and ids are random: this many show both cases.
+pub(crate) async fn of_a_camera_while_another_starts(seconds: f64) -> anyhow::Result<()> {
+    let _flight = beside_another().await?;
+    let folder = tempfile::tempdir()?;
+    image::GrayImage::new(64, 48).save(folder.path().join("1.png"))?;
+    let paths = format!("source.paths=[{:?}]", folder.path());
+    let ([meet], _, _) = ports::free()?;
+    let meet_text = meet.to_string();
+    // The first process has the rendezvous, and announces the camera to those that follow.
+    let first = open("detector", "first", on_board(meet)).await?;
+    let set = ["--set", &paths, "--set", "calibration.focal_px=[100, 100]"];
+    let camera = Running::start(&[&["camera-pub", "--meet", &meet_text], &set[..]].concat())?;
+    let patience = Duration::from_secs(20);
+    let frames = first.frame_subscriber(topic::FRAME, &["down"]).await?;
+    timeout(patience, frames.next()).await.context("the first gets no frame")?;
+    for number in 1..=6 {
+        kill_process(camera.pid()?, Signal::STOP)?;
+        let node = open("detector", &format!("later{number}"), on_board(meet)).await?;
+        let frames = node.frame_subscriber(topic::FRAME, &["down"]).await?;
+        sleep(Duration::from_secs_f64(seconds)).await;
+        kill_process(camera.pid()?, Signal::CONT)?;
+        let frame = timeout(patience, frames.next()).await;
+        frame.with_context(|| format!("detector {number}, started meanwhile, gets no frame"))?;
+        node.close().await;
+    }
+    first.close().await;
+    Ok(())
+}
+
 /// Commands a controller that is frozen until its operator has given up, continues it, and lands.
 pub(crate) async fn of_a_commanded_controller() -> anyhow::Result<()> {
     let _flight = beside_another().await?;

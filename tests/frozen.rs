@@ -39,6 +39,11 @@ async fn a_frozen_camera_publishes_again() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_detector_that_starts_while_a_camera_is_frozen_gets_its_frames() -> anyhow::Result<()> {
+    freezes::of_a_camera_while_another_starts(2.0).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_frozen_relay_relays_again() -> anyhow::Result<()> {
     with_second_try(|| freezes::of_a_relay(&[0.5, 1.5, 2.0, 5.0, 30.0])).await
 }
