@@ -4,7 +4,7 @@
 //! behind many older packets. A request that is sent before that is read would take the vehicle from the pilot.
 
 /// Shortest pause between two ticks that is a standstill, in nanoseconds: they are 25 ms apart.
-const MIN_PAUSE_NS: i64 = 300_000_000;
+pub(crate) const MIN_PAUSE_NS: i64 = 300_000_000;
 /// Time in which the packets that waited in the socket are read, in nanoseconds.
 const BACKLOG_NS: i64 = 300_000_000;
 /// Longest wait for the mode, in nanoseconds: heartbeats come each second, and one may be lost.

@@ -11,6 +11,7 @@ use crate::client::Autopilot;
 use crate::command::{Command, CommandError, CommandId, CommandStatus, ns};
 use crate::conflict::{Conflict, LISTENING};
 use crate::mode::{Firmware, FlightMode};
+use crate::standstill::MIN_PAUSE_NS;
 use crate::state::{LandedState, VehicleState};
 
 /// Maximum height error at the end of the climb, in m.
@@ -211,7 +212,11 @@ impl Takeoff {
     /// A vehicle that already flies in GUIDED is done at once; one that flies in another mode is left alone.
     /// One that stands with armed motors is left on the ground: it may have landed a moment ago.
     pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> TakeoffProgress {
-        self.stepped_ns = Some(now_ns);
+        let passed_ns = self.passed_ns(now_ns);
+        if passed_ns > MIN_PAUSE_NS {
+            // This process stood still: the vehicle went on, and its packets of that time have not been read.
+            self.move_limits(passed_ns);
+        }
         if let Err(error) = self.advance(now_ns, autopilot) {
             autopilot.withdraw();
             self.part = Part::Failed(error);
@@ -229,11 +234,8 @@ impl Takeoff {
         if self.is_finished() || state.armed && !stands {
             return false;
         }
-        let passed_ns = self.stepped_ns.map_or(0, |last_ns| now_ns.saturating_sub(last_ns));
-        self.stepped_ns = Some(now_ns);
-        for until_ns in self.until_ns.iter_mut().chain(&mut self.simulation_until_ns) {
-            *until_ns = until_ns.saturating_add(passed_ns);
-        }
+        let passed_ns = self.passed_ns(now_ns);
+        self.move_limits(passed_ns);
         if let Part::Arm(arming) = &mut self.part {
             if arming.request.take().is_some() {
                 autopilot.withdraw();
@@ -242,6 +244,18 @@ impl Takeoff {
             arming.retry_ns = now_ns;
         }
         true
+    }
+
+    /// The time since it was stepped, or put off, last, in nanoseconds.
+    fn passed_ns(&mut self, now_ns: i64) -> i64 {
+        self.stepped_ns.replace(now_ns).map_or(0, |last_ns| now_ns.saturating_sub(last_ns))
+    }
+
+    /// Moves the time limits on, by time that does not count.
+    fn move_limits(&mut self, by_ns: i64) {
+        for until_ns in self.until_ns.iter_mut().chain(&mut self.simulation_until_ns) {
+            *until_ns = until_ns.saturating_add(by_ns);
+        }
     }
 
     /// True when it is done or has failed.

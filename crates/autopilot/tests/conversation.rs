@@ -1142,6 +1142,28 @@ fn a_vehicle_found_standing_with_armed_motors_is_not_lifted() {
 }
 
 #[test]
+fn a_standstill_in_the_climb_counts_for_no_time_limit() {
+    let mut world = World::standing();
+    let mut takeoff = Takeoff::new(10.0);
+    while world.fake.height < 1.9 {
+        world.step();
+        takeoff.step(world.now, &mut world.client);
+    }
+    // It climbs on, and its packets are lost: the last known height is that of before.
+    let end_ns = world.now + 40 * SECOND;
+    while world.now < end_ns {
+        world.now += STEP;
+        world.fake.step(world.now);
+    }
+    world.client.tick(world.now);
+    let progress = takeoff.step(world.now, &mut world.client);
+    assert!(matches!(progress, TakeoffProgress::Climbing { .. }), "{progress:?}");
+    let (end, texts) = world.take_off(&mut takeoff, 5);
+    assert_eq!(end, TakeoffProgress::Done, "{texts:?}");
+    assert!((world.fake.height - 10.0).abs() < 0.5);
+}
+
+#[test]
 fn a_takeoff_gives_up_with_the_reasons() {
     let mut world = World::with(Fake { ready: false, ..Fake::new() }, Config::default());
     let (end, _) = world.take_off(&mut Takeoff::new(10.0), 125);
