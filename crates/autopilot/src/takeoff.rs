@@ -20,6 +20,8 @@ const MAX_HEIGHT_ERROR_M: f64 = 0.5;
 const MAX_CLIMB_M_S: f64 = 0.3;
 /// How far below its height PX4 ends its climb automatically, in m, at most: it is there within 0.8 m (`NAV_MC_ALT_RAD`), and heights err.
 const MAX_MISSING_M: f64 = 1.5;
+/// Maximum age of a position that shows at which height PX4 has ended its climb, in nanoseconds.
+const MAX_POSITION_AGE_NS: i64 = 500_000_000;
 /// Pause between two attempts to arm.
 const ARM_RETRY: Duration = Duration::from_secs(2);
 /// Time within which a simulated vehicle reports that it is one.
@@ -272,7 +274,7 @@ impl Takeoff {
         }
         let state = autopilot.state().copied();
         if let Some(state) = &state {
-            self.check_pilot(state)?;
+            self.check_pilot(now_ns, state)?;
         }
         match self.part.clone() {
             Part::Ready => self.wait_until_ready(now_ns, autopilot, state.as_ref()),
@@ -285,7 +287,7 @@ impl Takeoff {
     }
 
     /// The pilot's mode change wins at once, and so does a vehicle armed by the pilot.
-    fn check_pilot(&mut self, state: &VehicleState) -> Result<(), TakeoffError> {
+    fn check_pilot(&mut self, now_ns: i64, state: &VehicleState) -> Result<(), TakeoffError> {
         let waiting = matches!(self.part, Part::Ready);
         if !state.connected {
             return if waiting { Ok(()) } else { Err(TakeoffError::Lost) };
@@ -296,7 +298,7 @@ impl Takeoff {
         let rises = may_rise
             && match state.mode {
                 FlightMode::AUTO_TAKEOFF => true,
-                FlightMode::AUTO_HOLD => !self.is_held_by_pilot(state),
+                FlightMode::AUTO_HOLD => !self.is_held_by_pilot(now_ns, state),
                 _ => false,
             };
         let guided = state.mode.is_guided() || rises;
@@ -325,8 +327,15 @@ impl Takeoff {
         Ok(())
     }
 
-    /// Whether a pilot has ended PX4's climb in HOLD: it does so itself only at its height. Where that is not known it is the pilot.
-    fn is_held_by_pilot(&self, state: &VehicleState) -> bool {
+    /// Whether a pilot has ended PX4's climb in HOLD: it does so itself only at its height. Where that is not known it is the pilot. An old
+    /// position decides nothing: after a standstill or a loss of the link the mode may be received first.
+    fn is_held_by_pilot(&self, now_ns: i64, state: &VehicleState) -> bool {
+        let is_old = state
+            .position
+            .is_some_and(|it| now_ns.saturating_sub(it.stamp_ns) > MAX_POSITION_AGE_NS);
+        if is_old {
+            return false;
+        }
         let climbs = matches!(self.part, Part::Lift(_) | Part::Climb);
         let is_low = self.height(state) < self.height_m - MAX_MISSING_M;
         climbs && self.has_lifted && (is_low || self.ground_z.is_none())

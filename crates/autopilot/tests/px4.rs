@@ -793,6 +793,38 @@ fn hold_below_the_height_of_the_takeoff_is_the_pilots() {
 }
 
 #[test]
+fn a_climb_that_ends_while_packets_are_missing_is_ended_by_no_pilot() {
+    let mut world = World::new();
+    let mut takeoff = Takeoff::new(10.0);
+    while world.px4.height_m < 3.0 {
+        world.step();
+        takeoff.step(world.now, &mut world.client);
+    }
+    while world.px4.mode == FlightMode::AUTO_TAKEOFF {
+        world.now += STEP;
+        world.px4.step(world.now);
+    }
+    // The mode is the first packet since then.
+    let heartbeat = packet::encode(AUTOPILOT, 0, &world.px4.heartbeat());
+    for packet in Parser::new().push(&heartbeat) {
+        world.client.handle(world.now, &packet);
+    }
+    world.client.tick(world.now);
+    assert_eq!(world.client.state().unwrap().mode, FlightMode::AUTO_HOLD);
+    takeoff.step(world.now, &mut world.client);
+    for _ in 0..10 * SECOND / STEP {
+        world.step();
+        takeoff.step(world.now, &mut world.client);
+        if takeoff.is_finished() {
+            break;
+        }
+    }
+    let progress = takeoff.step(world.now, &mut world.client);
+    assert_eq!(progress, TakeoffProgress::Done);
+    assert_eq!(world.px4.mode, FlightMode::OFFBOARD);
+}
+
+#[test]
 fn a_pilot_who_arms_or_changes_the_mode_while_arming_is_refused_ends_the_takeoff() {
     let (position, manual) = (FlightMode::Px4(3 << 16), FlightMode::Px4(1 << 16));
     // The mode in which it stands, whether the pilot arms it there, and else the mode that the pilot chooses.
