@@ -540,10 +540,19 @@ impl Flight {
             frames: &self.frames,
             journal: &self.journal,
             setpoint: self.setpoints.last(),
+            leads_out: self.leads_out(),
             pilots_mode: self.pilots_mode,
             used: self.used,
             wind_ned_m_s: self.wind.velocity_m_s(self.config.autopilot.drag()),
         }
+    }
+
+    /// Whether a PX4 that may be in OFFBOARD after a landing is led out of it, or is about to be.
+    fn leads_out(&self) -> bool {
+        let is_over = self.mission.is_landing() && self.lander.phase().is_terminal();
+        is_over
+            && (self.setpoints.is_leaving()
+                || self.offboard.is_due(self.ticked_ns.unwrap_or_default(), &self.autopilot))
     }
 
     fn is_landing(&self) -> bool {

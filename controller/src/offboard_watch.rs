@@ -40,6 +40,12 @@ impl OffboardWatch {
         self.exit.is_some()
     }
 
+    /// True while it leads the vehicle out, or is about to, as nothing steers it.
+    pub fn is_due(&self, now_ns: i64, autopilot: &Autopilot) -> bool {
+        let is_left = is_flying_offboard(autopilot) && is_ours(now_ns, autopilot);
+        self.exit.is_some() || is_left && !self.is_done
+    }
+
     fn lead_out(&mut self, now_ns: i64, autopilot: &mut Autopilot, is_left: bool) -> bool {
         let is_left = is_left && is_flying_offboard(autopilot) && is_ours(now_ns, autopilot);
         if self.exit.is_none() && is_left && !self.is_done {

@@ -53,6 +53,11 @@ impl Setpoints {
         self.sent_ns
     }
 
+    /// True while a PX4 is led out of OFFBOARD, or gets zeros until it is known whether it returns to it.
+    pub fn is_leaving(&self) -> bool {
+        self.last.is_some() || self.exit.is_some()
+    }
+
     /// Carries out a decision; the result is that of a setpoint, if one was due. One that `is_urgent` is sent
     /// before its time.
     pub fn carry_out(

@@ -42,6 +42,8 @@ pub struct View<'a> {
     pub journal: &'a Journal,
     /// The last setpoint.
     pub setpoint: Option<Setpoint>,
+    /// A PX4 that may be in OFFBOARD after a landing is led out of it.
+    pub leads_out: bool,
     /// The mode that ended the landing as the pilot's; the vehicle may show another one since.
     pub pilots_mode: Option<FlightMode>,
     /// The detections that were used.
@@ -108,7 +110,8 @@ impl View<'_> {
             setpoint: self.setpoint,
             started_ns: self.mission.started_ns(),
             disarmed_ns: self.mission.disarmed_ns(),
-            finished: self.is_finished(),
+            // Only then is the mode known in which the vehicle is left.
+            finished: self.is_finished() && !self.leads_out,
             waits_for_operator: self.waits_for_operator(),
             detections_used: self.used.count,
             latency_ms: self.journal.latency_ms(),

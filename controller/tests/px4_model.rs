@@ -142,6 +142,22 @@ fn an_abort_just_after_an_interruption_ends_in_a_hold_that_is_chosen() {
 }
 
 #[test]
+fn an_aborted_landing_is_over_only_when_the_mode_is_known_in_which_a_px4_is_left() {
+    for after_s in [0.03, 0.1, 0.5, 1.0, 3.0] {
+        let mut site = landing(&[]);
+        site.freeze(1.5);
+        site.run(after_s);
+        let reply = site.command(&ControllerCommand::Abort);
+        assert!(reply.accepted, "{reply:?}");
+        assert!(!site.status().finished, "after {after_s} s: {:?}", site.status());
+        let ends = site.run_until(15.0, |site| site.status().finished);
+        let status = site.status();
+        assert!(ends && status.why.ends_with("in HOLD"), "after {after_s} s: {status:?}");
+        assert_eq!(site.chosen(), FlightMode::AUTO_HOLD, "after {after_s} s: {status:?}");
+    }
+}
+
+#[test]
 fn an_abort_just_after_an_interruption_in_which_the_pilot_took_over_changes_no_mode() {
     for (main, sub) in [HOLD, POSITION] {
         for waits in [false, true] {
