@@ -2195,6 +2195,40 @@ fn a_vehicle_that_waits_in_the_air_for_its_landing_lands_before_its_battery_is_e
 }
 
 #[test]
+fn a_landing_that_waits_as_detections_are_refused_waits_after_a_standstill_as_well() {
+    let foreign = |stamp_ns| Detections {
+        header: FrameHeader { clock: "monotonic/myhost".into(), ..header(stamp_ns) },
+        ..Detections::sample()
+    };
+    // Detections or a tick come first after it.
+    for ticks_first in [false, true] {
+        let mut flight = flight_with("takeoff", &[]);
+        flight.presence(0, "main", true);
+        flight.camera(0, CameraInfo::sample());
+        receive(&mut flight, 0, &heartbeat(4, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        for ms in (20..6000).chain(8200..9000).step_by(20) {
+            if ms % 1000 == 0 {
+                receive(&mut flight, ms * MS, &heartbeat(4, true));
+            }
+            if ms > 1600 {
+                pose(&mut flight, ms * MS);
+            }
+            if ticks_first {
+                flight.tick(ms * MS + 1);
+            }
+            flight.detections(ms * MS + 2, "main", &foreign(ms * MS));
+            flight.tick(ms * MS + 3);
+            if ms > 3000 {
+                let status = flight.status(ms * MS + 4);
+                assert!(status.why.contains("myhost"), "{ticks_first}, {ms} ms: {status:?}");
+            }
+        }
+        assert_eq!(flight.status(9000 * MS).phase, Phase::Takeoff);
+    }
+}
+
+#[test]
 fn a_flight_that_follows_a_landing_within_seconds_is_not_landed_without_a_command() {
     let (on_ground, in_air) =
         (MavLandedState::MAV_LANDED_STATE_ON_GROUND, MavLandedState::MAV_LANDED_STATE_IN_AIR);
