@@ -414,6 +414,34 @@ fn the_range_of_squares_behind_a_steep_curve_is_as_uncertain_as_stated() {
     }
 }
 
+/// The profile of an edge behind a tone curve is off its model by far more than its place, and errors of grey values along a side that
+/// crosses many rows cancel.
+#[test]
+fn the_centres_of_squares_behind_a_tone_curve_are_as_uncertain_as_stated() {
+    let camera = Binning::FourByFour.camera();
+    let heights_m: Vec<f64> = (0..40).map(|index| 1.2 + 0.15 * f64::from(index)).collect();
+    for preset in [Preset::Industrial, Preset::Usb] {
+        let processing = preset.processing();
+        let mut squares = Vec::new();
+        for name in ["apriltag-16h5:0", "apriltag-36h11:3", "aruco-4x4-50:0"] {
+            let mut detector = detector(name);
+            for (pixels, camera_from_marker) in &square_frames(name, &heights_m) {
+                let found = detect(&mut detector, pixels, &processing, &camera);
+                let centre = camera.project(camera_from_marker.origin()).unwrap();
+                let off = nalgebra::Vector2::new(
+                    found[0].centre.x - centre.x,
+                    found[0].centre.y - centre.y,
+                );
+                let weight = found[0].centre_covariance_px2.try_inverse().unwrap();
+                squares.push(off.dot(&(weight * off)) / 2.0);
+            }
+        }
+        let mean = squares.iter().sum::<f64>() / squares.len() as f64;
+        println!("{preset}: mean normalised squared error of the centre {mean:.2}");
+        assert!((0.7..1.4).contains(&mean), "{preset}: {mean}");
+    }
+}
+
 /// The camera's response estimated from many markers constrains the next fits, and makes none of them worse.
 #[test]
 fn the_response_of_a_camera_is_remembered_in_a_stream() {

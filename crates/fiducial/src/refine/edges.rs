@@ -13,14 +13,11 @@ use crate::optics::edge_response::{EdgeResponse, pixel_kurtosis};
 use crate::optics::homography::{CORNERS, Homography};
 use crate::optics::least_squares::NormalEquations;
 use crate::optics::undistort::Undistortion;
-use crate::refine::fit::{
-    EdgeMeasurement, EdgeSample, Fit, PhotometricModel, Scratch, Target, no_pulls, part,
-    widen_by_parts,
-};
+use crate::refine::common_shift::{CommonShift, Scatter, UNKNOWNS, widen};
+use crate::refine::fit::{EdgeMeasurement, EdgeSample, Fit, PhotometricModel, Scratch, Target};
 use crate::refine::pattern::Pattern;
+use crate::refine::side_errors::SideErrors;
 
-/// Parameters of the homography, and the blur.
-const UNKNOWNS: usize = 9;
 /// Number of samples along a marker's edges.
 const MAX_SAMPLES: usize = 210;
 /// Largest number of pixels across an edge.
@@ -143,93 +140,11 @@ fn fit_samples(target: Target<'_>, is_near: bool, scratch: &mut Scratch) -> Opti
             break;
         }
     }
-    let plain = fit.result(&equations?, &scratch.edges)?;
-    Some(with_common_shift(&equations?, plain, &measured_at, &scratch.edges))
-}
-
-/// The fit with a shift of all edges towards black by the same distance, when there is one: a tone curve makes white
-/// wider. Edges that have black outside and others that have it inside distinguish it from the square's size.
-fn with_common_shift(
-    equations: &NormalEquations<UNKNOWNS>,
-    plain: Fit,
-    measured_at: &Homography,
-    edges: &[EdgeSample],
-) -> Fit {
-    const SHIFTED: usize = UNKNOWNS + 1;
-    // A shift is one when it is this many standard deviations from none, and this many pixels.
-    const MIN_SIGMAS: f64 = 4.0;
-    const MIN_SHIFT_PX: f64 = 0.01;
-    // With a larger standard deviation the shift is not known: where none is found, and where there is one.
-    const MAX_SIGMA_PX: f64 = 0.02;
-    const MAX_SIGMA_SHIFTED_PX: f64 = 0.06;
-    let mut matrix = SMatrix::<f64, SHIFTED, SHIFTED>::zeros();
-    let mut right = SVector::<f64, SHIFTED>::zeros();
-    matrix.fixed_view_mut::<UNKNOWNS, UNKNOWNS>(0, 0).copy_from(&equations.matrix);
-    right.fixed_rows_mut::<UNKNOWNS>(0).copy_from(&equations.right);
-    let all = || edges.iter().filter_map(|edge| edge.measurement.as_ref());
-    for measurement in all() {
-        let [shift, mixed, _] = measurement.matrix.map(|m| measurement.weight * m);
-        for (i, along) in measurement.gradient.iter().enumerate() {
-            matrix[(UNKNOWNS, i)] += shift * along;
-        }
-        matrix[(UNKNOWNS, 8)] += mixed;
-        matrix[(UNKNOWNS, UNKNOWNS)] += shift;
-        right[UNKNOWNS] += measurement.weight * measurement.right[0];
-    }
-    let Some(cholesky) = matrix.cholesky() else { return plain };
-    let inverse = cholesky.inverse();
-    let step = inverse * right;
-    let (mut squares, mut weight, mut noise, mut freedom) = (0.0, 0.0, 0.0, 0.0);
-    for measurement in all() {
-        let along = measurement.gradient.iter().zip(step.iter());
-        let moved = along.map(|(by, step)| by * step).sum::<f64>() + step[UNKNOWNS];
-        let [shift, mixed, _] = measurement.matrix;
-        let left = measurement.right[0] - shift * moved - mixed * step[8];
-        squares += measurement.weight * left * left / shift;
-        weight += measurement.weight;
-        noise += measurement.weight * measurement.squares;
-        freedom += measurement.weight * measurement.freedom;
-    }
-    let variance = (squares / (weight - SHIFTED as f64).max(1.0)).max(noise / freedom);
-    let sigma_px = (inverse[(UNKNOWNS, UNKNOWNS)] * variance).sqrt();
-    let is_shifted = step[UNKNOWNS].abs() > (MIN_SIGMAS * sigma_px).max(MIN_SHIFT_PX);
-    let is_shift_known = sigma_px < if is_shifted { MAX_SIGMA_SHIFTED_PX } else { MAX_SIGMA_PX };
-    match measured_at.stepped(|i| step[i]).filter(|_| is_shifted) {
-        Some(homography) => {
-            let mut covariance = inverse.fixed_view::<8, 8>(0, 0) * variance;
-            widen(&mut covariance, &inverse, &step, edges);
-            Fit { homography, covariance, is_shift_known, shift_px: step[UNKNOWNS], ..plain }
-        }
-        None => Fit { is_shift_known, ..plain },
-    }
-}
-
-/// Widens a covariance by the contradiction of the edges after the last step: of the homography, the blur and, where
-/// there is one, the common shift.
-fn widen<const N: usize>(
-    covariance: &mut SMatrix<f64, 8, 8>,
-    inverse: &SMatrix<f64, N, N>,
-    step: &SVector<f64, N>,
-    edges: &[EdgeSample],
-) {
-    let mut pulls = no_pulls();
-    for sample in edges {
-        let Some(measurement) = &sample.measurement else { continue };
-        let [shift, mixed, spread] = measurement.matrix;
-        let along = measurement.gradient.iter().chain([&0.0, &1.0]);
-        let mut pull = SVector::<f64, N>::zeros();
-        pull.iter_mut().zip(along).for_each(|(slot, by)| *slot = *by);
-        let moved = pull.dot(step);
-        let left = |right: f64, by_move: f64, by_spread: f64| {
-            measurement.weight * (right - by_move * moved - by_spread * step[8])
-        };
-        pull *= left(measurement.right[0], shift, mixed);
-        pull[8] = left(measurement.right[1], mixed, spread);
-        if let Some(all) = pulls.get_mut(part(sample.place)) {
-            *all += pull;
-        }
-    }
-    widen_by_parts(covariance, inverse, &pulls);
+    let (equations, edges) = (equations?, &scratch.edges);
+    let shift = CommonShift::from_edges(&equations, edges);
+    let plain = fit.result(&equations, shift.is_some_and(|shift| shift.is_known), edges)?;
+    let shifted = shift.and_then(|shift| shift.applied(&measured_at, plain.clone(), edges));
+    Some(shifted.unwrap_or(plain))
 }
 
 /// Spreads a bounded number of samples along the pattern's edges within the image.
@@ -594,27 +509,28 @@ impl EdgeFit<'_> {
         Some(before.distance_px(&self.homography))
     }
 
-    fn result(&self, equations: &NormalEquations<UNKNOWNS>, edges: &[EdgeSample]) -> Option<Fit> {
+    /// The fit without a common shift, and whether there is known to be none.
+    fn result(
+        &self,
+        equations: &NormalEquations<UNKNOWNS>,
+        is_shift_known: bool,
+        edges: &[EdgeSample],
+    ) -> Option<Fit> {
         let (mut weight, mut black, mut contrast) = (0.0, 0.0, 0.0);
-        let (mut squares, mut freedom, mut scatter) = (0.0, 0.0, 0.0);
         for measurement in edges.iter().filter_map(|edge| edge.measurement.as_ref()) {
             weight += measurement.weight;
             black += measurement.weight * measurement.black;
             contrast += measurement.weight * measurement.contrast;
-            squares += measurement.weight * measurement.squares;
-            freedom += measurement.weight * measurement.freedom;
-            scatter += measurement.weight * measurement.normalised_shift().powi(2);
         }
         if weight < MIN_SAMPLES as f64 {
             return None;
         }
-        let noise = squares / freedom;
-        // Where the shifts scatter more than the pixels' noise explains, the paper is uneven or the model is
-        // wrong.
-        let scatter = scatter / (weight - UNKNOWNS as f64).max(1.0);
         let inverse = equations.matrix.cholesky()?.inverse();
-        let mut covariance = inverse.fixed_view::<8, 8>(0, 0) * noise.max(scatter);
-        widen(&mut covariance, &inverse, &(inverse * equations.right), edges);
+        let step = inverse * equations.right;
+        let scatter = Scatter::after(&step, edges);
+        let mut covariance = inverse.fixed_view::<8, 8>(0, 0) * scatter.variance(is_shift_known);
+        covariance *= SideErrors::OF_EDGES.factor(&self.homography);
+        widen(&mut covariance, &inverse, &step, edges);
         let model = PhotometricModel {
             black: black / weight,
             contrast: contrast / weight,
@@ -622,8 +538,7 @@ impl EdgeFit<'_> {
             beyond: 0.0,
             spread_px: self.spread_px,
         };
-        let residual = noise.sqrt() / model.contrast;
-        let is_shift_known = false;
+        let residual = scatter.of_pixels.sqrt() / model.contrast;
         let (homography, response, shift_px) = (self.homography, None, 0.0);
         Some(Fit { homography, covariance, model, residual, is_shift_known, shift_px, response })
     }

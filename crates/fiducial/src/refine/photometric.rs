@@ -15,6 +15,7 @@ use crate::refine::fit::{
 };
 use crate::refine::pattern::Pattern;
 use crate::refine::prediction::{Bands, PatternCells, PatternGrid};
+use crate::refine::side_errors::{FormError, ROUNDING_VARIANCE, SideErrors, add_size_error};
 use crate::response::{Measured, ResponseEstimate};
 
 /// Homography (8), blur, black, contrast, shade (2), brightness beyond the pattern.
@@ -33,33 +34,6 @@ struct MinResponse {
 const MIN_RESPONSE: MinResponse = MinResponse { gain: 0.15, response: 0.2 };
 /// The same where an outline was fitted alone, of which a weak tone curve changes the size as well; sharpening moves no edge.
 const MIN_RESPONSE_OF_OUTLINE: MinResponse = MinResponse { gain: 0.05, response: 0.1 };
-/// By how much all sides of a marker may be off outwards or inwards together, because a model is not quite the picture.
-#[derive(Copy, Clone, Debug)]
-struct FormError {
-    /// In pixels, with any camera: what the model of an edge leaves where the blur is hardly wider than a pixel.
-    edge_px: f64,
-    /// As a fraction of tone curve times blur: the form of a camera's tone curve.
-    by_curve: f64,
-    /// Curves steeper than this add no more.
-    max_curve: f64,
-}
-
-impl FormError {
-    /// Of codes of square cells. From `positions` of the seeds 1300001 and 1300002: in `linear` markers of 10 to 37 px were too
-    /// large by 0.001 px, 0.002 px (root mean square) with a stated deviation of 0.001. In `industrial`, whose weak curve is a
-    /// power, they were too large by 0.003 px and in `usb` by 0.01; behind the steeper curve of `raspberry-pi`, which is of the
-    /// model's form, by no more.
-    const SQUARE: Self = Self { edge_px: 0.0007, by_curve: 0.006, max_curve: 1.0 };
-    /// Of an STag, whose disc and dots are drawn in small cells, and whose edges are not of both senses everywhere. From the same
-    /// frames, and from `positions` of seed 7 in `raspberry-pi`, where STags were too small by 0.025 px beyond their noise.
-    const STAG: Self = Self { edge_px: 0.0015, by_curve: 0.006, max_curve: f64::INFINITY };
-
-    /// The distance, in pixels, behind a curve and with a blur of these.
-    fn distance_px(&self, curve: f64, spread_px: f64) -> f64 {
-        self.edge_px.hypot(self.by_curve * curve.abs().min(self.max_curve) * spread_px)
-    }
-}
-
 /// One of this many pixels is used.
 const RESPONSE_STRIDE: usize = 4;
 /// Prior information on the brightness beyond the pattern, in units of one pixel's: it is that of white, give
@@ -74,8 +48,6 @@ const SAME_PIXELS_PX: f64 = 0.4;
 /// Limits of the blur, in pixels.
 const MIN_SPREAD_PX: f64 = 0.25;
 const MAX_SPREAD_PX: f64 = 4.0;
-/// Variance of a pixel that comes of whole grey levels, in square grey levels; no picture is better than that.
-const ROUNDING_VARIANCE: f64 = 1.0 / 12.0;
 /// Largest standard deviation of a corner where the sensor saturates in black and in white, in pixels.
 const MAX_BILEVEL_CORNER_PX: f64 = 0.3;
 /// Smallest contrast, in grey levels.
@@ -437,6 +409,7 @@ impl State {
         form_error: FormError,
     ) -> Option<Fit> {
         let mut fit = self.result(equations)?;
+        fit.covariance *= SideErrors::OF_PIXELS.factor(&self.homography);
         self.add_form_error(form_error, &mut fit);
         Some(fit)
     }
@@ -498,6 +471,7 @@ impl State {
         pixels: &mut [PixelSample],
     ) -> Option<Fit> {
         let mut fit = self.result(equations)?;
+        fit.covariance *= SideErrors::OF_PROCESSED_PIXELS.factor(&self.homography);
         let mut pulls = no_pulls();
         self.equations_of(grid, pixels, 1, Some(&mut pulls))?;
         let inverse = inverse(&equations.matrix)?;
@@ -509,9 +483,7 @@ impl State {
     /// Adds the uncertainty of the size that the form of edges leaves.
     fn add_form_error(&self, form_error: FormError, fit: &mut Fit) {
         let edge_px = form_error.distance_px(self.response.curve, self.light.spread_px);
-        let by_size =
-            self.homography.by_scale() * (2.0 * edge_px / self.homography.longest_side_px());
-        fit.covariance += by_size * by_size.transpose();
+        add_size_error(&mut fit.covariance, &self.homography, edge_px);
     }
 
     /// The normal equations over one of `stride` pixels.
@@ -673,17 +645,6 @@ mod tests {
         // Edges that agree better than flat areas do so by chance.
         let even = Residuals { informative_squares: 10.0 * 50.0, ..residuals(0) };
         assert!((even.place_variance() - 1.8).abs() < 1e-12);
-    }
-
-    #[test]
-    fn the_size_of_a_square_is_no_more_certain_than_the_model_of_its_edges() {
-        let off = |form: FormError, curve: f64, spread_px: f64| form.distance_px(curve, spread_px);
-        assert!((off(FormError::SQUARE, 0.0, 0.7) - 0.0007).abs() < 1e-12);
-        assert!((off(FormError::SQUARE, 0.5, 0.7) - 0.0022).abs() < 1e-4);
-        assert!(
-            (off(FormError::SQUARE, 3.0, 0.7) - off(FormError::SQUARE, 1.0, 0.7)).abs() < 1e-12
-        );
-        assert!(off(FormError::STAG, 3.0, 0.7) > 2.8 * off(FormError::STAG, 1.0, 0.7));
     }
 
     #[test]
