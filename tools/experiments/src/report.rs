@@ -211,7 +211,7 @@ pub fn of_processing<'a>(variant: &Variant, run: &'a Run) -> OfProcessing<'a> {
 
 /// The table by processing, in Markdown.
 pub fn by_processing(rows: &[OfProcessing<'_>]) -> String {
-    let mut text = "\n## By processing\n\n| processing | seed | set | marker | found | found % | centre px median | p95 | range % median | centre chi2 | range chi2 | wrong ids | elsewhere | ms |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n".to_owned();
+    let mut text = "\n## By processing\n\n| processing | seed | set | marker | found | found % | centre px median | p95 | range % median | centre NEES, beyond | range NEES, beyond | wrong ids | elsewhere | ms |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n".to_owned();
     for OfProcessing { processing, seed, set, family, summary: s } in rows {
         let _ = writeln!(
             text,
@@ -222,14 +222,19 @@ pub fn by_processing(rows: &[OfProcessing<'_>]) -> String {
             number(s.centre_median_px, 4),
             number(s.centre_p95_px, 3),
             number(s.range_median_percent, 3),
-            number(s.centre_chi2, 2),
-            number(s.range_chi2, 2),
+            with_beyond(s.centre_nees, s.centre_beyond_99),
+            with_beyond(s.range_nees, s.range_beyond_99),
             s.wrong_ids,
             s.elsewhere,
             number(s.ms, 2),
         );
     }
     text
+}
+
+/// A mean normalised squared error, and how many are beyond their 99 % bound.
+fn with_beyond(nees: Option<f64>, beyond_99: usize) -> String {
+    nees.map_or_else(|| "-".to_owned(), |nees| format!("{nees:.2}, {beyond_99}"))
 }
 
 /// How many of how many, with the interval of the proportion.
@@ -248,13 +253,13 @@ pub fn number(value: Option<f64>, digits: usize) -> String {
 fn append_summary(text: &mut String, runs: &[Run]) {
     let _ = writeln!(
         text,
-        "## All sets\n\nchi2 are medians: 1.39 (centre) and 0.45 (range) for a consistent covariance. Times are processor time. In frames without a marker every detection is elsewhere. \
+        "## All sets\n\nNEES is the mean squared error over the stated variance, divided by its expectation: 1 for a consistent covariance; after it is the number of errors beyond their 99 % bound. Times are processor time. In frames without a marker every detection is elsewhere. \
          Errors are of the frames in which the marker was found, which are others for each marker and detector: to compare them see the errors in common frames. \
          After each count of found markers is Wilson's 95 % interval of its proportion, as if the frames were independent.\n"
     );
     let _ = writeln!(
         text,
-        "| set | marker | detector | found | wrong ids | elsewhere | centre px median | p95 | worst | corner px | range % median | p95 | bias % | centre chi2 | range chi2 | worst sigmas, centre | range | ms | p95 |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+        "| set | marker | detector | found | wrong ids | elsewhere | centre px median | p95 | worst | corner px | range % median | p95 | bias % | centre NEES, beyond | range NEES, beyond | worst sigmas, centre | range | ms | p95 |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
     );
     for run in runs {
         let s = Score::new(&run.answers).summary();
@@ -279,8 +284,8 @@ fn append_summary(text: &mut String, runs: &[Run]) {
             number(s.range_median_percent, 4),
             number(s.range_p95_percent, 4),
             number(s.range_bias_percent, 4),
-            number(s.centre_chi2, 2),
-            number(s.range_chi2, 2),
+            with_beyond(s.centre_nees, s.centre_beyond_99),
+            with_beyond(s.range_nees, s.range_beyond_99),
             number(s.centre_worst_sigmas, 1),
             number(s.range_worst_sigmas, 1),
             number(s.ms, 2),

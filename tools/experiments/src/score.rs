@@ -44,6 +44,10 @@ pub struct Score {
 const ELSEWHERE_PX: f64 = 3.0;
 const ELSEWHERE_RATIO: f64 = 0.1;
 
+/// Normalised squared errors below which 99 % are: quantiles of chi square with two degrees of freedom and with one.
+const CENTRE_BOUND_99: f64 = 9.210;
+const RANGE_BOUND_99: f64 = 6.635;
+
 impl Score {
     /// The score of frames with their results.
     pub fn new<'a>(answers: impl IntoIterator<Item = &'a (StoredFrame, Record)>) -> Self {
@@ -134,6 +138,10 @@ impl Score {
             centre_worst_sigmas: quantile(&self.centre_chi2, 1.0).map(f64::sqrt),
             range_worst_sigmas: quantile(&self.range_chi2, 1.0).map(f64::sqrt),
             range_chi2: quantile(&self.range_chi2, 0.5),
+            centre_nees: mean(&self.centre_chi2).map(|squares| squares / 2.0),
+            range_nees: mean(&self.range_chi2),
+            centre_beyond_99: beyond(&self.centre_chi2, CENTRE_BOUND_99),
+            range_beyond_99: beyond(&self.range_chi2, RANGE_BOUND_99),
             ms: quantile(&self.ms, 0.5),
             ms_p95: percentile(&self.ms, 0.95),
         }
@@ -175,10 +183,22 @@ pub struct Summary {
     pub range_worst_sigmas: Option<f64>,
     /// Median normalised squared range error: 0.45 for a consistent variance.
     pub range_chi2: Option<f64>,
+    /// Mean normalised squared centre error over its expectation: 1 for a consistent covariance.
+    pub centre_nees: Option<f64>,
+    /// The same of the range.
+    pub range_nees: Option<f64>,
+    /// Number of centres with an error beyond its 99 % bound; one in a hundred for a consistent covariance.
+    pub centre_beyond_99: usize,
+    /// The same of the range.
+    pub range_beyond_99: usize,
     /// Median processor time in milliseconds.
     pub ms: Option<f64>,
     /// 95th percentile of it.
     pub ms_p95: Option<f64>,
+}
+
+fn beyond(normalised: &[f64], bound: f64) -> usize {
+    normalised.iter().filter(|square| **square > bound).count()
 }
 
 fn distance(a: [f64; 2], b: [f64; 2]) -> f64 {
@@ -188,4 +208,20 @@ fn distance(a: [f64; 2], b: [f64; 2]) -> f64 {
 /// The squared Mahalanobis length of an error x, y with covariance xx, xy, yy.
 pub fn normalised([x, y]: [f64; 2], [xx, xy, yy]: [f64; 3]) -> f64 {
     (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn single_errors_far_beyond_their_deviation_count_in_the_mean_and_beyond_the_bound() {
+        let mut score = Score::default();
+        score.range_chi2.extend([0.2, 0.4, 0.4, 7.0]);
+        score.centre_chi2.extend([1.0, 1.4, 2.0, 9.2]);
+        let summary = score.summary();
+        assert_eq!([summary.range_chi2, summary.range_nees], [Some(0.4), Some(2.0)]);
+        assert_eq!([summary.centre_chi2, summary.centre_nees], [Some(1.7), Some(1.7)]);
+        assert_eq!([summary.range_beyond_99, summary.centre_beyond_99], [1, 0]);
+    }
 }
