@@ -109,6 +109,7 @@ impl Flight {
             setpoints: Setpoints::new(
                 settings.setpoint_rate_hz,
                 Duration::from_secs_f64(config.phases.stale_vehicle_s),
+                Duration::from_secs_f64(config.phases.land_retry_s),
             ),
             offboard: OffboardWatch::default(),
             landing_target: is_autopilots.then(|| {

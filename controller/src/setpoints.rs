@@ -4,7 +4,7 @@
 
 use std::time::Duration;
 
-use autopilot::command::SetpointError;
+use autopilot::command::{CommandError, SetpointError};
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, OffboardExit};
 use geometry::{Ned, Vector};
 use landing::{Action, Decision, Phase};
@@ -16,11 +16,14 @@ pub struct Setpoints {
     period_ns: i64,
     /// Age up to which a position is of now.
     stale_ns: i64,
+    /// Time after a request of LAND in which it is not requested again.
+    land_pause_ns: i64,
     last: Option<Setpoint>,
     sent_ns: i64,
     /// The change to the mode that follows setpoints, or the disarming, that was requested last.
     request: Option<CommandId>,
-    /// When LAND was requested last.
+    /// The request of LAND, and when it was made last.
+    land: Option<CommandId>,
     land_ns: Option<i64>,
     /// The way out of OFFBOARD.
     exit: Option<OffboardExit>,
@@ -30,14 +33,19 @@ pub struct Setpoints {
 const LAND_SHOWS_NS: i64 = 3_000_000_000;
 
 impl Setpoints {
-    /// Nothing was sent yet. `stale_after` is the age from which the vehicle's state is not of now.
-    pub fn new(rate_hz: f64, stale_after: Duration) -> Self {
+    /// Nothing was sent yet. `stale_after` is the age from which the vehicle's state is not of now; LAND is decided for again after
+    /// `land_retry`.
+    pub fn new(rate_hz: f64, stale_after: Duration, land_retry: Duration) -> Self {
+        let nanos = |time: Duration| i64::try_from(time.as_nanos()).unwrap_or(i64::MAX);
         Self {
             period_ns: (1e9 / rate_hz) as i64,
-            stale_ns: i64::try_from(stale_after.as_nanos()).unwrap_or(i64::MAX),
+            stale_ns: nanos(stale_after),
+            // A packet's time, by which a decision is carried out, may be earlier than that of the decision.
+            land_pause_ns: nanos(land_retry / 2),
             last: None,
             sent_ns: i64::MIN,
             request: None,
+            land: None,
             land_ns: None,
             exit: None,
         }
@@ -90,10 +98,12 @@ impl Setpoints {
                 }
             }
             Action::Disarm => self.request(now_ns, Command::Disarm, autopilot),
+            Action::Land if !self.is_land_due(now_ns, autopilot) => {}
             Action::Land => {
                 self.land_ns = Some(now_ns);
                 let mode = autopilot.firmware().and_then(Firmware::land);
-                autopilot.request(now_ns, Command::SetMode(mode.unwrap_or(FlightMode::Land)));
+                let command = Command::SetMode(mode.unwrap_or(FlightMode::Land));
+                self.land = Some(autopilot.request(now_ns, command));
                 // Sent at once: at half a metre every tick counts.
                 autopilot.tick(now_ns);
             }
@@ -142,6 +152,23 @@ impl Setpoints {
             self.exit = None;
         }
         goes_on
+    }
+
+    /// False just after a request of LAND that was neither withdrawn nor replaced: several decisions may have one time, and each of them is
+    /// to land.
+    fn is_land_due(&self, now_ns: i64, autopilot: &Autopilot) -> bool {
+        let is_recent =
+            self.land_ns.is_some_and(|at_ns| now_ns.saturating_sub(at_ns) < self.land_pause_ns);
+        let is_dropped = self.land.is_none_or(|request| {
+            matches!(
+                autopilot.status(request),
+                CommandStatus::Unknown
+                    | CommandStatus::Failed(
+                        CommandError::Withdrawn { .. } | CommandError::Replaced { .. }
+                    )
+            )
+        });
+        !is_recent || is_dropped
     }
 
     /// Whether silence would be a failure: to a PX4 in OFFBOARD it is one. ArduPilot stops.

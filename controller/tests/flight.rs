@@ -1478,6 +1478,29 @@ fn a_landing_begins_once_the_other_controller_has_ended() {
 }
 
 #[test]
+fn land_is_requested_once_per_interval_after_a_battery_alarm() {
+    let set = ["alarms.battery_critical_v=13", "alarms.battery_s=0.1"];
+    let mut flight = in_flight_with("airborne", &set);
+    hover(&mut flight, 1000, 2000, 4);
+    let battery = SYS_STATUS_DATA { voltage_battery: 12_600, ..Default::default() };
+    receive(&mut flight, 2000 * MS, &MavMessage::SYS_STATUS(battery));
+    let mut asked_ms = Vec::new();
+    for ms in (2000..3500).step_by(20) {
+        // The second state has waited in a queue since before the tick.
+        for (state_ms, tick_ms) in [(ms, ms + 3), (ms + 2, ms + 3)] {
+            pose(&mut flight, state_ms * MS);
+            flight.tick(tick_ms * MS);
+        }
+        let mut sent = Sent::default();
+        sent.take(&mut flight);
+        asked_ms.extend(sent.modes.iter().map(|_| ms));
+    }
+    assert_eq!(flight.status(3500 * MS).phase, Phase::Final);
+    assert!(asked_ms.len() > 1 && asked_ms[0] < 2150, "{asked_ms:?}");
+    assert!(asked_ms.windows(2).all(|it| it[1] - it[0] >= 480), "{asked_ms:?}");
+}
+
+#[test]
 fn a_landing_for_an_alarm_or_a_command_shows_the_reason_until_after_it() {
     let reasons = |set: &[&str], begin: &dyn Fn(&mut Flight)| {
         let mut flight = flight_with("airborne", set);
