@@ -447,6 +447,7 @@ async fn watch(
 ) -> anyhow::Result<LandingSummary> {
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     let truths = node.subscriber(topic::TRUTH, &[]).await?;
+    let vehicles = node.subscriber(topic::VEHICLE_STATE, &[]).await?;
     let healths = node.subscriber(topic::HEALTH, &[]).await?;
     let recorders = node.subscriber(topic::RECORDER_STATUS, &[]).await?;
     let mut landing = match settings.recorder()? {
@@ -466,6 +467,7 @@ async fn watch(
                 }
             }
             Some(truth) = truths.next() => landing.truth(truth),
+            Some(vehicle) = vehicles.next() => landing.last_vehicle = Some(vehicle),
             Some(health) = healths.next() => landing.health(health),
             Some(recorder) = recorders.next() => landing.recorder(recorder),
             Some(event) = children.next() => match event {
@@ -482,6 +484,9 @@ async fn watch(
                     // Messages that were published before it ended have arrived.
                     while let Some(truth) = truths.waiting() {
                         landing.truth(truth);
+                    }
+                    while let Some(vehicle) = vehicles.waiting() {
+                        landing.last_vehicle = Some(vehicle);
                     }
                     while let Some(status) = statuses.waiting() {
                         if landing.status(status) && over.is_none() {
@@ -678,12 +683,15 @@ pub(crate) fn free_port() -> anyhow::Result<(u16, UdpSocket)> {
 #[cfg(test)]
 mod tests {
     use clap::Parser;
-    use messages::{Candidate, DetectorInfo, Phase, Place, Touchdown, Truth};
+    use messages::{
+        Candidate, DetectorInfo, LandedState, Phase, Place, Touchdown, Truth, VehicleState,
+    };
     use node::ZenohSource;
 
     use super::*;
     use crate::children::Reach;
     use crate::outcome::Outcome;
+    use crate::outcome::tests::reported;
 
     #[derive(Parser)]
     struct Tool {
@@ -746,36 +754,68 @@ mod tests {
         assert_eq!(meet.get_env(), Some(std::ffi::OsStr::new("ALIGHT_MEET")));
     }
 
+    /// What is published of a landing.
+    #[derive(Default)]
+    struct Published {
+        status: ControllerStatus,
+        truth: Option<Truth>,
+        vehicle: Option<VehicleState>,
+        /// The status after the exit of a service.
+        after: Option<ControllerStatus>,
+    }
+
     /// The result of a landing whose simulator exits after these were published.
     async fn without_its_simulator(
         status: ControllerStatus,
         truth: Option<Truth>,
     ) -> anyhow::Result<Outcome> {
+        let published = Published { status, truth, ..Published::default() };
+        without(Service::Simulator, published).await
+    }
+
+    /// The result of a landing of which this service exits after these were published.
+    async fn without(service: Service, published: Published) -> anyhow::Result<Outcome> {
+        let Published { status, truth, vehicle, after } = published;
         let (port, _lock) = free_port()?;
         let zenoh = ZenohSource::Text(node::session::local_config(port));
         let node = Node::open(tool_identity("land"), &zenoh).await?;
         let statuses = node.publisher(topic::STATUS, &[]).await?;
         let truths = node.publisher(topic::TRUTH, &[]).await?;
+        let vehicles = node.publisher(topic::VEHICLE_STATE, &[]).await?;
         let folder = tempfile::tempdir()?;
-        let published = folder.path().join("published");
+        let [published, exited] = ["published", "exited"].map(|it| folder.path().join(it));
         let publishing = async {
-            while !(statuses.has_subscribers().await && truths.has_subscribers().await) {
+            while !(statuses.has_subscribers().await
+                && truths.has_subscribers().await
+                && vehicles.has_subscribers().await)
+            {
                 tokio::time::sleep(Duration::from_millis(5)).await;
             }
             statuses.publish(&status).await;
             if let Some(truth) = &truth {
                 truths.publish(truth).await;
             }
+            if let Some(vehicle) = &vehicle {
+                vehicles.publish(vehicle).await;
+            }
             std::fs::write(&published, "")?;
+            if let Some(after) = &after {
+                let has_exited = || std::fs::read_to_string(&exited).ok()?.trim().parse().ok();
+                while has_exited().is_none_or(is_running) {
+                    tokio::time::sleep(Duration::from_millis(20)).await;
+                }
+                tokio::time::sleep(SIGNAL_GRACE + Duration::from_secs(1)).await;
+                statuses.publish(after).await;
+            }
             std::future::pending::<anyhow::Result<()>>().await
         };
         let settings = ServiceSettings::new(&Tool::try_parse_from(["land"])?.land)?;
         let mut children = Children::new();
-        let mut simulator = tokio::process::Command::new("sh");
-        simulator
-            .args(["-c", "while [ ! -e \"$0\" ]; do sleep 0.02; done; exit 3"])
-            .arg(&published);
-        children.spawn(Service::Simulator, simulator, "sh", Reach::Leader)?;
+        let mut process = tokio::process::Command::new("sh");
+        process
+            .args(["-c", "while [ ! -e \"$0\" ]; do sleep 0.02; done; echo $$ > \"$1\"; exit 3"])
+            .args([&published, &exited]);
+        children.spawn(service, process, "sh", Reach::Leader)?;
         let mut progress = Progress::new(Format::Json);
         let deadline = Instant::now() + Duration::from_secs(60);
         let limits = Limits { shutdown: Shutdown::on_signals()?, deadline };
@@ -831,6 +871,32 @@ mod tests {
         let json = serde_json::to_string(&outcome)?;
         assert!(json.contains("\"outcome\":\"landed\""), "{json}");
         assert!(outcome.is_done());
+        Ok(())
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_real_vehicle_in_the_air_is_watched_after_its_only_detector_has_exited()
+    -> anyhow::Result<()> {
+        let taking_off = ControllerStatus { phase: Phase::Takeoff, ..ControllerStatus::default() };
+        let aborted = ControllerStatus {
+            phase: Phase::Aborted,
+            why: "no detector".to_owned(),
+            finished: true,
+            ..ControllerStatus::default()
+        };
+        let published = |armed: bool, landed| Published {
+            status: taking_off.clone(),
+            // It stands on a hill, and is in the air over a valley, by the autopilot's height.
+            truth: Some(Truth { on_ground: armed, touchdown: None, ..Truth::sample() }),
+            vehicle: Some(reported(armed, landed)),
+            after: Some(aborted.clone()),
+        };
+        let outcome = without(Service::Detector, published(true, LandedState::InAir)).await?;
+        let json = serde_json::to_string(&outcome)?;
+        assert!(json.contains("\"outcome\":\"aborted: no detector\""), "{json}");
+        let before = without(Service::Detector, published(false, LandedState::OnGround)).await;
+        let problem = before.err().context("it never flew")?.to_string();
+        assert!(problem.contains("detector exited before the landing"), "{problem}");
         Ok(())
     }
 

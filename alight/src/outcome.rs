@@ -5,7 +5,9 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use messages::{ControllerStatus, Health, Phase, RecorderStatus, Touchdown, Truth};
+use messages::{
+    ControllerStatus, Health, LandedState, Phase, RecorderStatus, Touchdown, Truth, VehicleState,
+};
 use node::health::LATENCIES_KEPT;
 use serde::Serialize;
 
@@ -21,6 +23,8 @@ const THESIS_ERROR_M: f64 = 0.0682;
 pub(crate) struct LandingSummary {
     pub(crate) last_status: Option<ControllerStatus>,
     pub(crate) last_truth: Option<Truth>,
+    /// The vehicle as its autopilot reports it, a real one as well.
+    pub(crate) last_vehicle: Option<VehicleState>,
     /// When it last came down, by the truth.
     sank_ns: Option<i64>,
     /// First and last health by service and process.
@@ -261,7 +265,8 @@ impl LandingSummary {
 
     /// Whether a landing that was interrupted or aborted may have left its vehicle in the air.
     pub(crate) fn may_be_in_the_air(&self) -> bool {
-        let is_down = self.last_truth.as_ref().is_some_and(|truth| truth.on_ground);
+        let is_flying = self.last_vehicle.as_ref().is_some_and(is_reported_in_the_air);
+        let is_down = !is_flying && self.last_truth.as_ref().is_some_and(|truth| truth.on_ground);
         let has_flown = self.started_ns.is_some() || self.has_taken_off();
         let is_interrupted = self.interrupted.is_some() && has_flown && self.disarmed_ns.is_none();
         (is_interrupted || self.last_status.as_ref().is_some_and(is_in_the_air)) && !is_down
@@ -272,10 +277,18 @@ impl LandingSummary {
         self.started_ns.is_none()
     }
 
-    /// Whether the vehicle has left the ground for a landing that has not begun: its controller still takes it up, or holds it there.
+    /// Whether the vehicle takes off, or has, for a landing that has not begun: its controller still takes it up, or holds it there. The
+    /// ground under a real vehicle is unknown to the simulation; its autopilot reports the motors at once, and the take-off later.
     pub(crate) fn has_taken_off(&self) -> bool {
-        let takes_off = self.last_status.as_ref().is_some_and(|it| it.phase == Phase::Takeoff);
-        takes_off && self.last_truth.as_ref().is_some_and(|truth| !truth.on_ground)
+        let is_up = match &self.last_vehicle {
+            Some(vehicle) => vehicle.armed,
+            None => self.last_truth.as_ref().is_some_and(|truth| !truth.on_ground),
+        };
+        self.takes_off() && is_up
+    }
+
+    fn takes_off(&self) -> bool {
+        self.last_status.as_ref().is_some_and(|it| it.phase == Phase::Takeoff)
     }
 
     /// Frames a second, as the detectors count them.
@@ -388,6 +401,15 @@ impl LandingSummary {
     }
 }
 
+/// Whether the autopilot reports that the vehicle has left the ground.
+fn is_reported_in_the_air(vehicle: &VehicleState) -> bool {
+    let is_off_ground = matches!(
+        vehicle.landed,
+        LandedState::TakingOff | LandedState::InAir | LandedState::Landing
+    );
+    vehicle.armed && is_off_ground
+}
+
 impl Outcome {
     /// Whether everything requested is done: it landed on the pad, and it was recorded if that was requested. Frames that never reached the
     /// recorder do not count as lost.
@@ -462,7 +484,7 @@ fn counted() -> String {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use messages::RecorderCount;
 
     use super::*;
@@ -473,6 +495,20 @@ mod tests {
             why: "because".into(),
             guidance: "metric".into(),
             ..ControllerStatus::default()
+        }
+    }
+
+    /// A vehicle as its autopilot reports it.
+    pub(crate) fn reported(armed: bool, landed: LandedState) -> VehicleState {
+        VehicleState {
+            stamp_ns: 0,
+            ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
+            position_ned_m: [0.0; 3],
+            velocity_ned_m_s: [0.0; 3],
+            mode: "GUIDED".to_owned(),
+            armed,
+            landed,
+            battery: None,
         }
     }
 
@@ -756,6 +792,17 @@ mod tests {
             assert!(!landing.may_be_in_the_air(), "it was not interrupted");
             landing.interrupted("interrupted");
             assert_eq!(landing.may_be_in_the_air(), has_taken_off);
+            // The autopilot's report of a real vehicle decides, whatever the simulation has as its height.
+            for (armed, landed, is_left) in [
+                (false, LandedState::OnGround, false),
+                (true, LandedState::OnGround, has_taken_off),
+                (true, LandedState::InAir, landing.takes_off()),
+            ] {
+                let vehicle = reported(armed, landed);
+                landing.last_vehicle = Some(vehicle);
+                assert_eq!(landing.has_taken_off(), armed && landing.takes_off());
+                assert_eq!(landing.may_be_in_the_air(), is_left, "{armed} {landed:?}");
+            }
         }
     }
 
