@@ -90,6 +90,12 @@ impl Alarms {
         let critical = is_at(s.battery_critical, s.battery_critical_v);
         since(&mut self.low_since_ns, low, now_ns);
         since(&mut self.critical_since_ns, critical, now_ns);
+        // A battery that is low again is another matter.
+        self.postponed.retain(|alarm| match alarm {
+            Alarm::BatteryLow => low,
+            Alarm::BatteryCritical => critical,
+            Alarm::OperatorLost | Alarm::AutopilotLost => true,
+        });
         let persists = |from: Option<i64>, limit_s: f64| {
             from.is_some_and(|from| now_ns.saturating_sub(from) as f64 * 1e-9 >= limit_s)
         };
@@ -228,6 +234,10 @@ mod tests {
         alarms.postpone(Alarm::BatteryCritical);
         // A battery that has recovered raises none.
         assert_eq!(alarms.tick(5 * SECOND, Some(&battery(0.5, 12.0))), None);
+        // Empty again, it raises a new one, which is logged.
+        assert_eq!(alarms.tick(6 * SECOND, Some(&critical)), None);
+        assert_eq!(alarms.tick(9 * SECOND, Some(&critical)), Some(Alarm::BatteryCritical));
+        assert!(!alarms.is_postponed(Alarm::BatteryCritical));
     }
 
     #[test]
