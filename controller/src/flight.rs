@@ -298,9 +298,11 @@ impl Flight {
         }
     }
 
-    /// Passes alarms to the lander while it lands, or while a landing after our take-off waits in the air.
+    /// Passes alarms to the lander while it lands, or while a landing waits in the air: after our take-off, or one that is to be resumed.
     fn check_alarms(&mut self, now_ns: i64) {
-        let waits_in_air = self.mission.waits_in_air() && self.landing_target.is_none();
+        let waits_to_resume = self.mission.waits_to_resume();
+        let waits = self.mission.waits_in_air() || waits_to_resume;
+        let waits_in_air = waits && self.landing_target.is_none();
         let is_landing = self.is_landing() && !self.mission.is_sending_landing_target();
         if !is_landing && !waits_in_air {
             return;
@@ -320,13 +322,20 @@ impl Flight {
             if !is_to_land {
                 return;
             }
-            // A PX4 that holds as setpoints were missing returns within a second; one that a pilot holds is the pilot's.
-            if !is_flying_guided(&self.autopilot) {
+            // A PX4 that holds as setpoints were missing returns within a second; one that a pilot holds is the pilot's. One that did not take
+            // off for us may be another controller's.
+            let may_be_others = waits_to_resume
+                && (self.autopilot.conflict(now_ns).is_some()
+                    || !self.autopilot.has_listened(now_ns));
+            if may_be_others || !is_flying_guided(&self.autopilot) {
                 self.alarms.postpone(alarm);
                 return;
             }
             // It lands at once, whatever keeps it from being led to a marker.
             let before = self.mission.clone();
+            if waits_to_resume {
+                self.resume_lander();
+            }
             self.begin(now_ns);
             if self.lander.phase().is_terminal() {
                 self.mission = before;
@@ -591,6 +600,12 @@ impl Flight {
         }
     }
 
+    /// The next landing of the lander is one that an earlier controller began.
+    fn resume_lander(&mut self) {
+        let address = &self.config.autopilot.address;
+        self.lander.resume(self.pad_notes.pad(address, self.autopilot.system()));
+    }
+
     fn advance_mission(&mut self, now_ns: i64) {
         let may_recall = self.lander.may_recall();
         let situation = Situation {
@@ -649,8 +664,7 @@ impl Flight {
         let before = (trigger == Trigger::InControl).then(|| self.mission.clone());
         let resumes = trigger == Trigger::InFlight && self.config.start == Start::Resume;
         if resumes {
-            let address = &self.config.autopilot.address;
-            self.lander.resume(self.pad_notes.pad(address, self.autopilot.system()));
+            self.resume_lander();
         }
         self.begin(now_ns);
         if self.follow_earlier_command(now_ns, earlier.filter(|_| resumes)) {

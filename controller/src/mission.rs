@@ -243,6 +243,11 @@ impl Mission {
         self.start == Start::Resume && self.is_awaiting_takeoff()
     }
 
+    /// True while a landing that is to be resumed waits, and no abort of it was given.
+    pub fn waits_to_resume(&self) -> bool {
+        self.is_resuming() && self.when_resumed != Some(OperatorCommand::Abort)
+    }
+
     /// Keeps a command to the landing that is to be resumed. A hold does not replace an abort.
     pub fn command_when_resumed(&mut self, command: OperatorCommand) {
         if self.when_resumed != Some(OperatorCommand::Abort) {
