@@ -675,7 +675,10 @@ impl Flight {
         }
         match (trigger, self.lander.phase()) {
             // The pilot's own landing is not ours while it is high; the next flight may be.
-            (Trigger::InFlight, phase) if phase.is_terminal() => self.mission.skip(),
+            (Trigger::InFlight, phase) if phase.is_terminal() => {
+                let (why, kept) = (self.why(), earlier.filter(|_| resumes));
+                self.mission.skip(&mut self.autopilot, kept, &why);
+            }
             (Trigger::ArmedAgain, phase) if phase.is_terminal() => self.mission.stay_landed(),
             // The mode may be newer than the state that the lander has.
             (Trigger::TakenOff, Phase::Idle) => self.mission.stand_down(true),

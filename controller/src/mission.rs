@@ -452,10 +452,20 @@ impl Mission {
         self.state = if awaits_takeoff { State::AwaitingTakeoff } else { State::Idle };
     }
 
-    /// The pilot landed high up or had landed already. Where only a landing under way was to be resumed,
-    /// nothing begins without a command any more; otherwise the next flight may be landed.
-    pub fn skip(&mut self) {
-        self.stand_down(self.start != Start::Resume);
+    /// There is no landing to follow, for this reason: the pilot landed high up or had landed already. Where only a landing under way was
+    /// to be resumed, nothing begins without a command any more; otherwise the next flight may be landed. An abort that was `kept` ends the
+    /// mission, so that the status has it.
+    pub fn skip(&mut self, autopilot: &mut Autopilot, kept: Option<OperatorCommand>, why: &str) {
+        if let Some(command) = kept {
+            tracing::warn!(?command, "No landing was resumed that could follow the command: {why}");
+        }
+        match kept {
+            Some(OperatorCommand::Abort) => {
+                let why = format!("aborted by the operator; no landing was resumed: {why}");
+                self.fail(autopilot, why);
+            }
+            _ => self.stand_down(self.start != Start::Resume),
+        }
     }
 
     /// The landing that was to go on had ended: the vehicle stands with its motors armed. It stays landed until it
@@ -586,14 +596,9 @@ impl Mission {
         if is_in_time || self.held_because.is_some() {
             hover_in_offboard(now_ns, autopilot);
         }
-        if has_no_landing(autopilot) && !may_return {
-            self.state = State::Idle;
-            if let Some(command) = self.when_resumed.take() {
-                tracing::warn!(
-                    ?command,
-                    "There is no landing to resume that could follow the command"
-                );
-            }
+        if let Some(why) = no_landing_because(autopilot).filter(|_| !may_return) {
+            let kept = self.when_resumed.take();
+            self.skip(autopilot, kept, &why);
         }
     }
 
@@ -675,10 +680,16 @@ fn why_not_followed(now_ns: i64, autopilot: &Autopilot) -> Option<String> {
     })
 }
 
-/// True when there is no landing to resume: it has ended, though the motors may still run, or the pilot flies. A vehicle
-/// with motors reported as off, but not reported to stand, may fly all the same.
-fn has_no_landing(autopilot: &Autopilot) -> bool {
-    autopilot.state().is_some_and(|s| {
-        s.landed == LandedState::OnGround || !s.mode.is_guided() && !s.mode.is_landing()
-    })
+/// Why there is no landing to resume: it has ended, though the motors may still run, or the pilot flies; `None` where there may be one. A
+/// vehicle with motors reported as off, but not reported to stand, may fly all the same.
+fn no_landing_because(autopilot: &Autopilot) -> Option<String> {
+    let state = autopilot.state()?;
+    let motors = if state.armed { ", and its motors run: disarm it" } else { "" };
+    if state.landed == LandedState::OnGround {
+        return Some(format!(
+            "the autopilot reports that the vehicle stands on the ground{motors}"
+        ));
+    }
+    let is_pilots = !state.mode.is_guided() && !state.mode.is_landing();
+    is_pilots.then(|| format!("the vehicle is in {}", state.mode))
 }

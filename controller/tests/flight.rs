@@ -1376,6 +1376,42 @@ fn a_command_before_a_landing_is_resumed_counts_as_soon_as_it_is() {
 }
 
 #[test]
+fn an_abort_before_there_proves_to_be_no_landing_to_resume_is_in_the_status() {
+    let (in_air, on_ground) =
+        (MavLandedState::MAV_LANDED_STATE_IN_AIR, MavLandedState::MAV_LANDED_STATE_ON_GROUND);
+    for (mode, landed, text) in [
+        // LAND high up may be the pilot's.
+        (9, in_air, "the vehicle is not in GUIDED"),
+        (5, in_air, "the vehicle is in LOITER"),
+        (4, on_ground, "stands on the ground, and its motors run: disarm it"),
+    ] {
+        for command in [ControllerCommand::Abort, ControllerCommand::Hold] {
+            let mut flight = flight("resume");
+            flight.camera(0, CameraInfo::sample());
+            flight.presence(0, "main", true);
+            assert!(flight.command(0, &command).accepted);
+            receive(&mut flight, MS, &heartbeat(mode, true));
+            receive(&mut flight, MS, &contact(landed));
+            let sent = hover(&mut flight, 20, 4000, mode);
+            let status = flight.status(4000 * MS);
+            let is_aborted = command == ControllerCommand::Abort;
+            let expected = if is_aborted { Phase::Failed } else { Phase::Idle };
+            assert_eq!(status.phase, expected, "{mode}: {status:?}");
+            let is_stated =
+                status.why.starts_with("aborted by the operator; no landing was resumed");
+            assert_eq!(is_stated && status.why.contains(text), is_aborted, "{mode}: {status:?}");
+            assert_eq!(status.finished, is_aborted);
+            // Before the mode is known, one setpoint stops a vehicle that follows setpoints.
+            assert!(sent.setpoints <= 1 && sent.modes.is_empty(), "{mode}: {sent:?}");
+            // The next one is landed by command.
+            receive(&mut flight, 4000 * MS, &contact(in_air));
+            hover(&mut flight, 5000, 6500, 4);
+            assert!(flight.command(6500 * MS, &ControllerCommand::Start).accepted, "{mode}");
+        }
+    }
+}
+
+#[test]
 fn an_abort_before_a_precision_landing_is_found_takes_the_autopilot_back_from_it() {
     let mut flight = flight_with("resume", &["mode=landing-target", "autopilot.system_id=1"]);
     flight.camera(0, CameraInfo::sample());
