@@ -21,6 +21,10 @@ const MAX_RETURN_M_S: f64 = 1.0;
 const MAX_REST_M_S: f64 = 0.3;
 const MAX_BRAKING_S: f64 = 2.0;
 
+/// Distance from its position at which a vehicle that is led back to it has arrived, in metres: where an autopilot's velocity errs, a
+/// hover keeps it no closer.
+const ARRIVED_M: f64 = 2.0;
+
 /// The horizontal velocity of a vehicle to a position that is so far from it, in m/s, at most as fast as `max_m_s`.
 pub(crate) fn back(offset: Vector<Odometry>, max_m_s: f64) -> Vector<Ned> {
     let back = Vector::<Ned>::new(offset.x(), offset.y(), 0.0) * RETURN_PER_S;
@@ -36,12 +40,31 @@ pub(crate) struct Hover {
     newest: Timestamp,
     /// Where it stays, once it has braked.
     position: Option<Point<Odometry>>,
+    /// It is led there from somewhere else.
+    is_return: bool,
 }
 
 impl Hover {
     /// A hover that begins with a state of this time.
     pub(crate) fn new(stamp: Timestamp) -> Self {
-        Self { began: stamp, newest: stamp, position: None }
+        Self { began: stamp, newest: stamp, position: None, is_return: false }
+    }
+
+    /// A hover to which the vehicle is led back first.
+    pub(crate) fn back_at(stamp: Timestamp, position: Point<Odometry>) -> Self {
+        Self { position: Some(position), is_return: true, ..Self::new(stamp) }
+    }
+
+    /// Whether the vehicle is led back to this position.
+    pub(crate) fn leads_back_to(&self, position: Point<Odometry>) -> bool {
+        self.is_return && self.position == Some(position)
+    }
+
+    /// The same hover for a vehicle at `position` that is not to be led back any more: one that has arrived stays; `None` for one that is
+    /// still on its way.
+    pub(crate) fn without_return(self, position: Point<Odometry>) -> Option<Self> {
+        let is_away = self.position.is_some_and(|it| (it - position).horizontal_norm() > ARRIVED_M);
+        (!(self.is_return && is_away)).then_some(Self { is_return: false, ..self })
     }
 
     /// Where the vehicle stays; `None` while it brakes.

@@ -33,6 +33,8 @@ pub struct Square {
     speed_m_s: f64,
     /// Direction of the first leg, in radians from north to east.
     first_leg_rad: f64,
+    /// Where it begins.
+    centre: Point<Odometry>,
     /// Distance upwind before the first leg, in metres.
     upwind_m: f64,
     /// Number of the leg of the point that moves along the square, 0 for the way upwind, and where that leg begins.
@@ -56,12 +58,23 @@ impl Square {
         Self {
             speed_m_s: fmin(config.phases.search_speed_m_s, config.envelope.horizontal_m_s),
             first_leg_rad: first_leg_rad(ned_from_body),
+            centre,
             upwind_m: upwind_m(&config.phases, ned_from_body, height_m),
             leg: 0,
             corner: centre,
             along_m: 0.0,
             moved: now,
         }
+    }
+
+    /// The position about which it is flown.
+    pub fn centre(&self) -> Point<Odometry> {
+        self.centre
+    }
+
+    /// It is flown again from its centre on.
+    pub fn begin_again(&mut self) {
+        (self.leg, self.corner, self.along_m) = (0, self.centre, 0.0);
     }
 
     /// The velocity of a vehicle at `position`, in m/s, at most twice the speed along the square; at the end of the last leg it stays

@@ -359,6 +359,24 @@ fn land_is_asked_for_again_and_done_without_when_refused() {
 }
 
 #[test]
+fn after_a_search_without_a_result_it_is_aborted_where_the_search_began_in_wind_as_well() {
+    let flights = fly(0..6, |seed| {
+        Scene::windy(seed, seed as f64, 1.0).with(|scene| {
+            scene.camera.outage_s = Some((0.0, 1e3));
+            scene.limit_s = 126.0;
+        })
+    });
+    for flight in &flights {
+        assert_eq!(flight.phase, Phase::Aborted);
+        let [first, last] = [flight.samples.first(), flight.samples.last()].map(Option::unwrap);
+        let searched = flight.samples.iter().filter(|it| it.decision.phase == Phase::Search);
+        let far_m = |it: &Sample| (it.position - first.position).horizontal_norm();
+        let farthest_m = searched.map(far_m).fold(0.0, f64::max);
+        assert!(farthest_m > 4.0 && far_m(last) < 1.5, "{farthest_m} m, {} m", far_m(last));
+    }
+}
+
+#[test]
 fn an_abort_takes_the_vehicle_back_from_land_while_it_is_high() {
     let mut config = Config::default();
     config.phases.on_battery_low = landing::AlarmAction::Land;

@@ -19,6 +19,7 @@ struct Drifter {
     /// By how much the reported position is off.
     jump: Vector<Ned>,
     landed: Landed,
+    mode: Mode,
     has_states: bool,
 }
 
@@ -33,6 +34,7 @@ impl Drifter {
             drift,
             jump: Vector::zero(),
             landed: Landed::InAir,
+            mode: Mode::Guided,
             has_states: true,
         };
         drifter.fly(DT_S);
@@ -50,6 +52,19 @@ impl Drifter {
         self.lander.step(self.now(), Event::Operator(command))
     }
 
+    /// A search from this position that has just ended without a result; the vehicle is elsewhere.
+    fn searched(drift: Vector<Ned>) -> Option<(Self, Point<Ned>)> {
+        let mut drifter = Self::searching(drift, 0.2)?;
+        let began = drifter.position;
+        while drifter.lander.phase() == Phase::Search {
+            drifter.fly(DT_S);
+        }
+        assert_eq!(drifter.lander.phase(), Phase::Hold);
+        let away_m = (drifter.position - began).horizontal_norm();
+        assert!(away_m > 4.0, "{away_m} m");
+        Some((drifter, began))
+    }
+
     /// Flies on; the last velocity that was commanded.
     fn fly(&mut self, seconds: f64) -> Vector<Ned> {
         let mut desired = Vector::zero();
@@ -60,7 +75,7 @@ impl Drifter {
                 ned_from_body: Rotation::identity(),
                 position: self.position + self.jump,
                 velocity: self.flown,
-                mode: Mode::Guided,
+                mode: self.mode,
                 armed: true,
                 landed: self.landed,
             };
@@ -107,6 +122,76 @@ fn each_hover_has_the_position_where_its_vehicle_stopped() {
         drifter.command(OperatorCommand::Resume);
         drifter.fly(4.0);
     }
+}
+
+#[test]
+fn after_a_search_without_a_result_it_holds_where_the_search_began() {
+    for drift_m_s in [0.0, 0.5, 0.8] {
+        for (north, east) in [(1.0, 0.0), (-0.6, 0.8)] {
+            let drift = Vector::new(north, east, 0.0) * drift_m_s;
+            let (mut drifter, began) = Drifter::searched(drift).unwrap();
+            let limit_m = 2.1 * drift_m_s + 0.2;
+            drifter.fly(30.0);
+            assert_eq!(drifter.lander.phase(), Phase::Hold);
+            let away_m = (drifter.position - began).horizontal_norm();
+            assert!(away_m < limit_m, "{drift_m_s} m/s: {away_m} m");
+            // The abort leaves it there as well.
+            drifter.fly(32.0);
+            assert_eq!(drifter.lander.phase(), Phase::Aborted);
+            let away_m = (drifter.position - began).horizontal_norm();
+            assert!(away_m < limit_m, "{drift_m_s} m/s: {away_m} m after the abort");
+        }
+    }
+}
+
+#[test]
+fn the_search_after_one_without_a_result_is_about_the_same_position() {
+    let (mut drifter, began) = Drifter::searched(Vector::zero()).unwrap();
+    for wait_s in [3.0, 30.0] {
+        drifter.fly(wait_s);
+        drifter.command(OperatorCommand::Resume);
+        let mut farthest_m: f64 = 0.0;
+        while drifter.lander.phase() == Phase::Search {
+            drifter.fly(DT_S);
+            farthest_m = farthest_m.max((drifter.position - began).horizontal_norm());
+        }
+        assert!((4.0..9.1).contains(&farthest_m), "{farthest_m} m");
+    }
+}
+
+#[test]
+fn the_way_back_from_a_search_ends_with_a_command_the_pilot_the_last_detector_or_the_state() {
+    type Change = fn(&mut Drifter);
+    let changes: [(&str, Change); 4] = [
+        ("hold", |drifter| {
+            drifter.command(OperatorCommand::Hold);
+        }),
+        ("abort", |drifter| {
+            drifter.command(OperatorCommand::Abort);
+        }),
+        ("detectors", |drifter| {
+            drifter.lander.step(drifter.now(), Event::DetectorsAlive(false));
+        }),
+        ("an unknown mode", |drifter| drifter.mode = Mode::Unknown),
+    ];
+    for (case, change) in changes {
+        let (mut drifter, began) = Drifter::searched(Vector::zero()).unwrap();
+        assert!(drifter.fly(2.0).horizontal_norm() > 0.9, "{case}: it is on its way");
+        change(&mut drifter);
+        let from = drifter.position;
+        let desired = drifter.fly(4.0);
+        let moved_m = (drifter.position - from).horizontal_norm();
+        assert!(moved_m < 0.8 && desired.horizontal_norm() < 0.05, "{case}: {moved_m} m");
+        assert!((drifter.position - began).horizontal_norm() > 2.0, "{case}");
+    }
+    let (mut drifter, _) = Drifter::searched(Vector::zero()).unwrap();
+    drifter.fly(2.0);
+    drifter.mode = Mode::Other;
+    assert_eq!((drifter.fly(1.0), drifter.lander.phase()), (Vector::zero(), Phase::PilotInCommand));
+    let (mut drifter, _) = Drifter::searched(Vector::zero()).unwrap();
+    drifter.fly(2.0);
+    drifter.has_states = false;
+    assert_eq!(drifter.fly(1.0), Vector::zero());
 }
 
 #[test]

@@ -1,13 +1,14 @@
-//! Keeps a vehicle at its position that is commanded no horizontal velocity: one that waits, holds, or climbs straight up.
+//! Keeps a vehicle at its position that is commanded no horizontal velocity: one that waits, holds, or climbs straight up. Leads one
+//! back that has searched without a result.
 
-use geometry::Vector;
+use geometry::{Odometry, Point, Vector};
 
 use super::Lander;
 use super::aborted::MIN_FLYING_M;
 use crate::config::GuidanceConfig;
 use crate::decision::{Action, Phase, Reason};
 use crate::envelope;
-use crate::event::Landed;
+use crate::event::{Landed, Mode};
 use crate::hover::Hover;
 use crate::time::Timestamp;
 
@@ -16,7 +17,8 @@ const MAX_SUNK_M: f64 = 1.0;
 
 impl Lander {
     /// The same action, but a vehicle that is to hover or to climb straight up is led back to where that began. A request of a mode
-    /// does not end a hover. The thesis' guidance hovers as the thesis' program did.
+    /// does not end a hover. After a search without a result it is led back to where the search began: the marker was lost there, and the end
+    /// of the search is any place. The thesis' guidance hovers as the thesis' program did.
     pub(super) fn keep_position(&mut self, now: Timestamp, action: Action) -> Action {
         let Action::Velocity { velocity, yaw_rate } = action else {
             if action == Action::None {
@@ -39,7 +41,14 @@ impl Lander {
         if is_steered || !is_known || self.may_touch_ground(now) {
             return action;
         }
-        let mut hover = before.unwrap_or(Hover::new(vehicle.stamp));
+        let mut hover = match (self.begin_of_search(), before) {
+            (Some(centre), before) => before
+                .filter(|it| it.leads_back_to(centre))
+                .unwrap_or(Hover::back_at(vehicle.stamp, centre)),
+            (None, before) => before
+                .and_then(|it| it.without_return(position))
+                .unwrap_or(Hover::new(vehicle.stamp)),
+        };
         let speed_m_s = vehicle.velocity.horizontal_norm();
         let back = hover.velocity(vehicle.stamp, position, speed_m_s, max_age_s);
         self.hover = Some(hover);
@@ -48,6 +57,18 @@ impl Lander {
         let velocity = envelope::clamp_setpoint(&self.config.envelope, desired, false);
         self.guidance.on_setpoint_sent(velocity);
         Action::Velocity { velocity, yaw_rate }
+    }
+
+    /// Where the search began that has had no result, while the vehicle is held for that; without a detector, or in a mode that is not known
+    /// to be ours, it stays where it is. The next search is about the same position.
+    fn begin_of_search(&mut self) -> Option<Point<Odometry>> {
+        let is_over =
+            self.phase() == Phase::Hold && self.state_machine.reason() == Reason::TargetNotFound;
+        let follows = self.status.is_some_and(|status| status.mode == Mode::Guided);
+        let may_return = is_over && follows && self.detectors_alive;
+        let square = self.square.as_mut().filter(|_| may_return)?;
+        square.begin_again();
+        Some(square.centre())
     }
 
     /// True where the vehicle may stand: a drift of the autopilot's position is then no motion of the vehicle, and a velocity to the
