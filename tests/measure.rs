@@ -95,6 +95,10 @@ async fn freeze_each(freezes_s: &[f64]) -> anyhow::Result<()> {
     }
     freezes::of_a_commanded_controller().await.context("a commanded controller")?;
     freezes::of_a_camera(freezes_s).await.context("camera-pub")?;
+    for seconds in freezes_s {
+        let start = freezes::of_a_camera_while_another_starts(*seconds).await;
+        start.context("camera-pub while a detector starts")?;
+    }
     freezes::of_a_relay(freezes_s).await.context("relay")
 }
 

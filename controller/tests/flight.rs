@@ -2254,6 +2254,67 @@ fn a_vehicle_that_waits_in_the_air_for_its_landing_lands_before_its_battery_is_e
 }
 
 #[test]
+fn a_landing_that_is_to_be_resumed_lands_before_the_battery_is_empty_and_not_against_its_pilot() {
+    for (case, set, mode_after, command, lands) in [
+        ("held", "", 4, None, true),
+        ("held, and held by the operator", "", 4, Some(ControllerCommand::Hold), true),
+        ("held, in the pilot's mode", "", 5, None, false),
+        ("held, to abort", "", 4, Some(ControllerCommand::Abort), false),
+        ("held, with another reaction", "phases.on_battery_critical=hold", 4, None, false),
+    ] {
+        let set: Vec<&str> = [set].into_iter().filter(|it| !it.is_empty()).collect();
+        let mut flight = in_flight_with("resume", &set);
+        flight.camera(0, CameraInfo::sample());
+        flight.presence(0, "main", true);
+        // Attitude and position are missing, until the controller has stood still.
+        for ms in (20..3000).step_by(20) {
+            if ms % 1000 == 0 {
+                receive(&mut flight, ms * MS, &heartbeat(4, true));
+            }
+            flight.tick(ms * MS + 3);
+        }
+        receive(&mut flight, 23_000 * MS, &heartbeat(mode_after, true));
+        hover(&mut flight, 23_000, 25_000, mode_after);
+        if let Some(command) = command {
+            assert!(flight.command(25_000 * MS, &command).accepted, "{case}");
+        }
+        let battery = SYS_STATUS_DATA { battery_remaining: 8, ..Default::default() };
+        receive(&mut flight, 25_000 * MS, &MavMessage::SYS_STATUS(battery));
+        let sent = hover(&mut flight, 25_000, 29_000, mode_after);
+        let status = flight.status(29_000 * MS);
+        assert_eq!(sent.modes.contains(&9.0), lands, "{case}: {sent:?} {status:?}");
+        assert_eq!(status.phase == Phase::Final, lands, "{case}: {status:?}");
+        assert_eq!(status.why.contains("battery"), lands, "{case}: {status:?}");
+        assert!(lands || sent.setpoints == 0, "{case}: {sent:?}");
+    }
+    // One whose detections are refused.
+    let mut flight = in_flight("resume");
+    flight.presence(0, "main", true);
+    flight.camera(0, CameraInfo::sample());
+    for ms in (20..9000).step_by(20) {
+        let foreign = FrameHeader { clock: "monotonic/myhost".into(), ..header(ms * MS) };
+        let detections = Detections { header: foreign, ..Detections::sample() };
+        flight.detections(ms * MS, "main", &detections);
+        if ms > 1600 {
+            pose(&mut flight, ms * MS);
+        }
+        if ms % 1000 == 0 {
+            receive(&mut flight, ms * MS, &heartbeat(4, true));
+            let battery_remaining = if ms < 3000 { 50 } else { 8 };
+            let battery = SYS_STATUS_DATA { battery_remaining, ..Default::default() };
+            receive(&mut flight, ms * MS, &MavMessage::SYS_STATUS(battery));
+        }
+        flight.tick(ms * MS + 3);
+        if ms == 4000 {
+            let status = flight.status(ms * MS);
+            assert!(status.phase == Phase::Idle && status.why.contains("myhost"), "{status:?}");
+        }
+    }
+    let status = flight.status(9000 * MS);
+    assert!(status.phase == Phase::Final && status.why.contains("battery"), "{status:?}");
+}
+
+#[test]
 fn a_landing_that_waits_as_detections_are_refused_waits_after_a_standstill_as_well() {
     let foreign = |stamp_ns| Detections {
         header: FrameHeader { clock: "monotonic/myhost".into(), ..header(stamp_ns) },
