@@ -3,7 +3,7 @@
 
 use messages::FrameHeader;
 use node::HealthCounters;
-use node::frame_order::{FrameOrder, Misplaced, Placed};
+use node::frame_order::{FrameOrder, Misplaced};
 
 /// Shortest time between the frames before and after the start of a camera, in nanoseconds.
 const MIN_RESTART_NS: i64 = 300_000_000;
@@ -23,6 +23,13 @@ struct Problem {
     text: String,
 }
 
+/// The frame before, without the name of its clock.
+#[derive(Clone, Copy, Debug)]
+struct Before {
+    stamp_ns: i64,
+    sequence: u64,
+}
+
 impl Order {
     /// Takes the next frame.
     pub(crate) fn check(&mut self, health: &HealthCounters, header: &FrameHeader) {
@@ -34,13 +41,14 @@ impl Order {
     }
 
     fn problems(&mut self, header: &FrameHeader) -> Vec<Problem> {
-        let before = self.frames.before().cloned();
+        let before = self.frames.before();
+        let before = before.map(|it| Before { stamp_ns: it.stamp_ns, sequence: it.sequence });
         let Misplaced { by_stamp, by_sequence, as_of_two } = self.frames.on_frame(header);
         let Some(before) = before else { return Vec::new() };
         let camera = &header.camera;
         let mut problems = Vec::new();
         if by_stamp {
-            problems.push(by_its_stamp(header, &before));
+            problems.push(by_its_stamp(header, before));
         }
         // A camera that is started again numbers its frames anew.
         let is_restart = header.sequence < before.sequence
@@ -69,7 +77,7 @@ impl Order {
 }
 
 /// A stamp that is not later than that of the frame before.
-fn by_its_stamp(header: &FrameHeader, before: &Placed) -> Problem {
+fn by_its_stamp(header: &FrameHeader, before: Before) -> Problem {
     let FrameHeader { camera, sequence, stamp_ns, .. } = header;
     let back_ns = before.stamp_ns.saturating_sub(*stamp_ns);
     if back_ns == 0 {
