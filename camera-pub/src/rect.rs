@@ -125,7 +125,13 @@ impl Work {
         let is_rectified = GrayView::packed(&offer.pixels, width, height)
             .is_ok_and(|view| rectifier.rectify(view, &mut pixels));
         if !is_rectified {
-            self.health.failed("rectified frame of another size than the calibration's");
+            if self.health.failed("rectified frame of another size than the calibration's") {
+                tracing::warn!(
+                    width,
+                    height,
+                    "A frame is not rectified: `calibration.file` is for another size, or its pixels are incomplete (further ones are only counted)"
+                );
+            }
             return;
         }
         self.health.latency("rectify", began.elapsed());

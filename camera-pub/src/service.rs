@@ -335,8 +335,13 @@ impl Stream {
                 );
                 continue;
             };
-            if program.has_metadata() && !exposure.is_exact() {
-                self.health.failed("frame without metadata of its own");
+            if program.has_metadata()
+                && !exposure.is_exact()
+                && self.health.failed("frame without metadata of its own")
+            {
+                tracing::warn!(
+                    "A frame has no metadata of its own: its stamp is an estimate (further ones are only counted)"
+                );
             }
             last_published = Instant::now();
             let frame = match config.format {

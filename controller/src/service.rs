@@ -128,7 +128,9 @@ async fn run_service(node: Node, mut config: Config, shutdown: Shutdown) -> anyh
                 let more = link.unknown_senders().saturating_sub(strangers);
                 if more > 0 {
                     strangers += more;
-                    node.health().failed_times("packets of an unknown sender at the autopilot's port", more);
+                    if node.health().failed_times("packets of an unknown sender at the autopilot's port", more) {
+                        tracing::warn!("Packets of another sender than the autopilot arrive at its port, and are ignored (further ones are only counted)");
+                    }
                 }
                 let more = link.replaced().saturating_sub(replaced);
                 if more > 0 {
@@ -136,7 +138,9 @@ async fn run_service(node: Node, mut config: Config, shutdown: Shutdown) -> anyh
                     node.health().dropped_times("setpoints: the line to the autopilot is too slow", more);
                 }
                 for (reason, more) in link.refusals().since(refusals) {
-                    node.health().failed_times(&format!("from autopilot: refused: {reason}"), more);
+                    if node.health().failed_times(&format!("from autopilot: refused: {reason}"), more) {
+                        tracing::warn!(%reason, "Packets on the autopilot's link are refused (further ones are only counted)");
+                    }
                 }
                 refusals = link.refusals();
             }

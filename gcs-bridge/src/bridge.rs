@@ -474,7 +474,9 @@ impl Bridge {
         let why = answer.why?;
         self.send_answer(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &format!("Alight: {why}"));
         Some(if matches!(asked, Ask::Set { .. }) {
-            self.health.failed("from ground: a parameter is not set from there");
+            if self.health.failed("from ground: a parameter is not set from there") {
+                tracing::warn!("{why} (further ones are only counted)");
+            }
             "a parameter is not set from there"
         } else {
             self.health.dropped("from ground: unknown parameter");
@@ -747,6 +749,9 @@ impl Bridge {
     fn count_refusals(&mut self, now_ns: i64, refusals: Refusals) {
         for (reason, more) in refusals.since(self.refusals) {
             if self.health.failed_times(&format!("from ground: refused: {reason}"), more) {
+                tracing::warn!(
+                    "Packets of the ground station refused: {reason} (further ones are only counted)"
+                );
                 let text = format!("Alight: packets refused: {reason}");
                 self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text);
             }
