@@ -13,6 +13,9 @@ const MAX_SKEW_NS: i64 = 300_000_000;
 /// Maximum distance of a marker from the camera, in metres: no lens shows one that is farther away.
 const MAX_RANGE_M: f64 = 1e3;
 
+/// Maximum difference of a rotation quaternion's length from 1, from rounding: a rotation vector or an angle in degrees has another length.
+const MAX_LENGTH_ERROR: f64 = 0.01;
+
 /// Why a detection's numbers are not those of a marker that a camera sees, as the end of a sentence on its detector; `None` for sound ones.
 pub fn impossible_because(detection: &Detection) -> Option<String> {
     if let Some(why) = not_finite_because(detection) {
@@ -25,11 +28,18 @@ pub fn impossible_because(detection: &Detection) -> Option<String> {
         let wxyz = pose.camera_from_marker.rotation_wxyz;
         return Some(format!("the marker's rotation is none: w, x, y, z {wxyz:?}"));
     }
+    if let Some(why) = not_a_unit_because(pose.camera_from_marker.rotation_wxyz) {
+        return Some(why);
+    }
     if z <= 0.0 {
-        return Some(format!("the marker would be behind the camera, {place}"));
+        return Some(format!(
+            "the marker would be behind the camera, {place}; z points along its optical axis, away from it"
+        ));
     }
     if !is_in_view([x, y, z]) {
-        return Some(format!("the marker would be farther away than {MAX_RANGE_M} m, {place}"));
+        return Some(format!(
+            "the marker would be farther away than {MAX_RANGE_M} m, {place}; a translation is in metres"
+        ));
     }
     let covariance = pose.translation_covariance_m2();
     (!landing::is_covariance(&covariance)).then(|| {
@@ -37,6 +47,18 @@ pub fn impossible_because(detection: &Detection) -> Option<String> {
         format!(
             "`pose.covariance` is not that of a position (positive semi-definite, no larger than (100 m)^2): xx {xx:e}, xy {xy:e}, xz {xz:e}, \
              yy {yy:e}, yz {yz:e}, zz {zz:e} m^2"
+        )
+    })
+}
+
+/// Why a rotation is not a unit quaternion, as the end of a sentence on the detector; `None` for a unit quaternion.
+fn not_a_unit_because(wxyz: [f64; 4]) -> Option<String> {
+    let [w, x, y, z] = wxyz;
+    let length = libm::hypot(libm::hypot(w, x), libm::hypot(y, z));
+    let is_unit = (length - 1.0).abs() <= MAX_LENGTH_ERROR;
+    (!is_unit).then(|| {
+        format!(
+            "`pose.rotation_wxyz` is not a unit quaternion: its length is {length:.3}, w, x, y, z {wxyz:?}; w is the cosine of half the angle"
         )
     })
 }
@@ -232,6 +254,32 @@ mod tests {
         assert!(far.contains("farther away than 1000 m") && far.contains("1000000000"), "{far}");
         let none = with(&|pose| pose.rotation_wxyz = [0.0; 4]);
         assert!(none.contains("rotation is none"), "{none}");
+        let metres = at([3.0, 4.0, 6000.0]);
+        assert!(metres.contains("a translation is in metres"), "{metres}");
+    }
+
+    #[test]
+    fn a_rotation_must_be_a_unit_quaternion() {
+        let refused = |wxyz: [f64; 4]| {
+            let mut detection = Detection::sample();
+            detection.pose.as_mut().unwrap().camera_from_marker.rotation_wxyz = wxyz;
+            impossible_because(&detection)
+        };
+        // Single precision, and both signs of one rotation.
+        let half = f64::from(0.5_f32.sqrt());
+        for unit in [[0.0, 1.0, 0.0, 0.0], [-half, half, 0.0, 0.0], [0.999, 0.0, 0.0, 0.0]] {
+            assert_eq!(refused(unit), None, "{unit:?}");
+        }
+        // A rotation vector in radians and in degrees, and twice a unit quaternion.
+        for (wrong, length) in [
+            ([0.0, 3.0, 0.5, 0.0], "3.041"),
+            ([0.0, 180.0, 0.0, 0.0], "180.000"),
+            ([0.0, 2.0, 0.0, 0.0], "2.000"),
+            ([0.5, 0.0, 0.0, 0.0], "0.500"),
+        ] {
+            let why = refused(wrong).unwrap();
+            assert!(why.contains("not a unit quaternion") && why.contains(length), "{why}");
+        }
     }
 
     #[test]
