@@ -18,6 +18,7 @@ import itertools
 import json
 import math
 import pathlib
+import re
 import sys
 import time
 
@@ -306,6 +307,12 @@ def run_set(folder, results, name, family, detector):
     print(f"{name} {family} {detector.name}: something in {total} of {len(lines)} frames", flush=True)
 
 
+def is_of(name, label, family):
+    """Whether a label is of a family. An ArUco dictionary of 50, 100 or 250 markers is the beginning of that of 1000 markers."""
+    stem = re.fullmatch("(aruco.*[-_])(50|100|250)", name)
+    return name in (label, family) or (stem is not None and stem[1] + "1000" in (label, family))
+
+
 def run_photographs(photographs, results, wanted):
     labels = [json.loads(line) for line in (photographs / "labels.jsonl").read_text().splitlines()]
     for label, family in LABELS.items():
@@ -314,7 +321,7 @@ def run_photographs(photographs, results, wanted):
                 continue
             detector, lines = kind(family), []
             for photograph in labels:
-                if any(marker["family"] in (label, family) for marker in photograph["markers"]):
+                if any(is_of(marker["family"], label, family) for marker in photograph["markers"]):
                     grey = cv2.imread(str(photographs / photograph["image"]), AS_STORED)
                     ms, seen = answer(detector, grey, 1)
                     lines.append({"image": photograph["image"], "ms": ms, "found": seen})

@@ -441,6 +441,7 @@ fn recalls(
 fn report_photographs(folder: &Path, results: &Path) -> anyhow::Result<String> {
     let recalls = recalls(folder, results, &|_| true)?;
     let mut text = photographs::text(&recalls);
+    text.push_str(&photographs::unsearched(folder)?);
     for (name, families) in photographs::families_for_negatives() {
         let (images, wrong) = photographs::negatives(folder, &families)?;
         text.push_str(&format!(
@@ -542,6 +543,7 @@ mod tests {
         std::fs::remove_file(&mine).unwrap();
         let line = "{\"image\":\"a.png\",\"markers\":[{\"family\":\"apriltag-36h11\",\"id\":3,\"corners\":[[0,0],[9,0],[9,9],[0,9]]}]}";
         std::fs::write(folder.path().join("labels.jsonl"), line).unwrap();
+        std::fs::write(folder.path().join("a.png"), "").unwrap();
         request.photographs = Some(folder.path().to_owned());
         write(&results, "mine/photographs/apriltag-36h11.jsonl");
         let error = refused(&request);

@@ -44,10 +44,17 @@ struct Label {
 }
 
 impl Label {
-    /// Whether it is of a family, by the labels' name or by ours.
+    /// Whether it is of a family, by the labels' name or by ours. An ArUco dictionary of 50, 100 or 250 markers is the beginning of that of
+    /// 1000 markers.
     fn is_of(&self, family: &str) -> bool {
         let label = FAMILIES.iter().find(|(_, ours)| *ours == family).map(|(label, _)| *label);
-        self.family == family || label == Some(self.family.as_str())
+        let is_name = |name: &str| name == family || label == Some(name);
+        let stem_of = |count: &str| {
+            let stem = self.family.strip_suffix(count)?;
+            (stem.starts_with("aruco") && stem.ends_with(['-', '_'])).then_some(stem)
+        };
+        let beginning = ["50", "100", "250"].into_iter().find_map(stem_of);
+        is_name(&self.family) || beginning.is_some_and(|stem| is_name(&format!("{stem}1000")))
     }
 
     fn centre(&self) -> [f64; 2] {
@@ -104,11 +111,45 @@ fn photographs(folder: &Path) -> anyhow::Result<Vec<Photograph>> {
 /// Whether a folder has photographs with labels.
 ///
 /// # Errors
-/// When `labels.jsonl` cannot be read or is empty.
+/// When `labels.jsonl` cannot be read or is empty, or a photograph is not there.
 pub fn check(folder: &Path) -> anyhow::Result<()> {
-    let count = photographs(folder)?.len();
-    anyhow::ensure!(count > 0, "{} names no photograph", folder.join("labels.jsonl").display());
+    let photographs = photographs(folder)?;
+    let labels = folder.join("labels.jsonl");
+    anyhow::ensure!(!photographs.is_empty(), "{} names no photograph", labels.display());
+    for (at, Photograph { image, .. }) in photographs.iter().enumerate() {
+        let file = folder.join(image);
+        anyhow::ensure!(
+            file.is_file(),
+            "line {} of {} names the photograph {}, which is not there",
+            at + 1,
+            labels.display(),
+            file.display()
+        );
+    }
     Ok(())
+}
+
+/// A note for the report on labels that are not searched, because their family is another one or its name is misspelt; empty if there are none.
+///
+/// # Errors
+/// When the labels cannot be read.
+pub fn unsearched(folder: &Path) -> anyhow::Result<String> {
+    let mut counts: BTreeMap<String, usize> = BTreeMap::new();
+    for label in photographs(folder)?.into_iter().flat_map(|photograph| photograph.markers) {
+        if !FAMILIES.iter().any(|(_, ours)| label.is_of(ours)) {
+            *counts.entry(label.family).or_default() += 1;
+        }
+    }
+    if counts.is_empty() {
+        return Ok(String::new());
+    }
+    let counts: Vec<String> =
+        counts.iter().map(|(family, count)| format!("{count} of `{family}`")).collect();
+    let searched = FAMILIES.map(|(_, ours)| ours).join(", ");
+    Ok(format!(
+        "\n**Labels that are not searched: {}.** Labels are supported for {searched} only.\n",
+        counts.join(", ")
+    ))
 }
 
 /// Any marker of a family, without a size.
@@ -324,6 +365,7 @@ mod tests {
         let seen = vec![found(3, [5.0, 5.0]), found(4, [50.0, 50.0])];
         let records = [Record { image: "a.jpg".to_owned(), ms: 1.0, found: seen }];
         let path = folder.path().join("labels.jsonl");
+        std::fs::write(folder.path().join("a.jpg"), "").unwrap();
         for family in ["tag36h11", "apriltag-36h11"] {
             std::fs::write(&path, label(family)).unwrap();
             check(folder.path()).unwrap();
@@ -340,5 +382,36 @@ mod tests {
         std::fs::write(&path, format!("{}\n{wrong}\n", label("tag36h11"))).unwrap();
         let error = format!("{:#}", check(folder.path()).unwrap_err());
         assert!(error.contains("line 2 of") && error.contains("docs/experiments.md"), "{error}");
+    }
+
+    #[test]
+    fn labels_that_are_not_searched_are_reported() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("labels.jsonl");
+        let label = |family: &str| {
+            format!(
+                "{{\"image\":\"a.jpg\",\"markers\":[{{\"family\":\"{family}\",\"id\":3,\"corners\":[[0,0],[10,0],[10,10],[0,10]]}}]}}"
+            )
+        };
+        let lines = ["rings", "AprilTag 36h11", "aruco-mip-36h12", "rings", "stag_hd21"].map(label);
+        std::fs::write(&path, lines.join("\n")).unwrap();
+        let error = format!("{:#}", check(folder.path()).unwrap_err());
+        assert!(error.contains("line 1 of") && error.contains("a.jpg, which is not"), "{error}");
+        std::fs::write(folder.path().join("a.jpg"), "").unwrap();
+        check(folder.path()).unwrap();
+        let note = unsearched(folder.path()).unwrap();
+        let counts = "1 of `AprilTag 36h11`, 1 of `aruco-mip-36h12`, 2 of `rings`.";
+        assert!(note.contains(counts) && note.contains("stag-hd21 only"), "{note}");
+        // The ids of a smaller dictionary are those of the largest one.
+        for family in ["aruco-4x4-50", "aruco_4x4_250"] {
+            std::fs::write(&path, label(family)).unwrap();
+            assert_eq!(unsearched(folder.path()).unwrap(), "", "{family}");
+            let seen =
+                Found { id: Some(3), centre_px: [5.0, 5.0], ..Found::sample("aruco-4x4-1000") };
+            let records = [Record { image: "a.jpg".to_owned(), ms: 1.0, found: vec![seen] }];
+            let of = |name| recall(folder.path(), name, &records).unwrap();
+            assert_eq!((of("aruco-4x4-1000").markers, of("aruco-4x4-1000").found), (1, 1));
+            assert_eq!(of("aruco-5x5-1000").markers, 0, "{family}");
+        }
     }
 }
