@@ -84,7 +84,7 @@ pub fn cells(outcomes: &[Outcome]) -> Vec<(&str, Vec<&Outcome>)> {
     cells
 }
 
-const HEADER: &str = "| circumstances | flights | landed | given up | within 0.1 m | error: median, 99 % (of 100 landings or more), worst, m | to disarm: median, worst, s | sink worst, m/s | slide median, worst, m/s | tilt at touch worst, deg | beyond 0.6 m/s down, 0.1 m/s aside, 10 deg | unsafe |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n";
+const HEADER: &str = "| circumstances | flights | landed | aborted | within 0.1 m | error: median, 99 % (of 100 landings or more), worst, m | to disarm: median, worst, s | sink worst, m/s | slide median, worst, m/s | tilt at touch worst, deg | beyond 0.6 m/s down, 0.1 m/s aside, 10 deg | unsafe |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n";
 
 /// The table of all cells in Markdown.
 pub fn markdown(outcomes: &[Outcome]) -> String {
@@ -107,7 +107,7 @@ fn row(name: &str, members: &[&Outcome]) -> String {
     let error: Column = |o| o.error_m;
     let disarm: Column = |o| o.disarm_s;
     format!(
-        "| {name} | {} | {} | {} | {} | {} {} {} | {} {} | {} | {} {} | {} | {} {} {} | {} |\n",
+        "| {name} | {} | {} | {} | {} | {} / {} / {} | {} / {} | {} | {} / {} | {} | {} / {} / {} | {} |\n",
         members.len(),
         count(&|o| o.ending == Ending::Landed),
         count(&|o| o.ending == Ending::Aborted),
@@ -165,7 +165,10 @@ mod tests {
             });
             markdown(&landed.collect::<Vec<Outcome>>())
         };
-        assert!(of(99).contains("| 0.020 - 0.020 |") && of(100).contains("| 0.020 0.020 0.020 |"));
+        assert!(
+            of(99).contains("| 0.020 / - / 0.020 |")
+                && of(100).contains("| 0.020 / 0.020 / 0.020 |")
+        );
     }
 
     #[test]
