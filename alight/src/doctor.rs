@@ -704,8 +704,11 @@ fn check_detectors(findings: &mut Findings, seen: &Seen, watched: Watched) {
         match frames {
             0 => findings.doubtful(
                 "detector",
-                format!("`{name}`: detections of no frame came"),
-                "it needs frames of its camera (`camera` in its configuration): see the lines of the cameras above, and its log",
+                format!("`{name}`: no detections came that can be read and have its name"),
+                &format!(
+                    "it needs frames of its camera (`camera` in its configuration): see the lines of the cameras above, and its log; your own one \
+                     publishes Detections on `detector/{name}/detections` for each frame, also without a marker (docs/wire-format.md)"
+                ),
             ),
             _ => findings.good(
                 "detector",
@@ -778,7 +781,8 @@ mod tests {
         let mut findings = Findings::default();
         check_detectors(&mut findings, &Seen { detectors, ..Seen::default() }, watched);
         let text = findings.text();
-        assert!(text.contains("`idle`: detections of no frame came"), "{text}");
+        assert!(text.contains("`idle`: no detections came that can be read"), "{text}");
+        assert!(text.contains("publishes Detections on `detector/idle/detections`"), "{text}");
         assert!(
             text.contains("`main`: detections of 10.0 frames/s came; a marker in 27 of 30"),
             "{text}"
