@@ -327,7 +327,8 @@ impl Flight {
             let may_be_others = waits_to_resume
                 && (self.autopilot.conflict(now_ns).is_some()
                     || !self.autopilot.has_listened(now_ns));
-            if may_be_others || !is_flying_guided(&self.autopilot) {
+            // Without a fresh state the lander refuses to begin.
+            if may_be_others || !self.is_state_fresh(now_ns) || !is_flying_guided(&self.autopilot) {
                 self.alarms.postpone(alarm);
                 return;
             }
@@ -633,11 +634,7 @@ impl Flight {
             return;
         }
         // The lander refuses a start without a fresh state, and the mission would not try again.
-        let state = self.autopilot.state().and_then(wire::vehicle);
-        let is_fresh = state.is_some_and(|state| {
-            let age_s = Timestamp::from_nanos(now_ns).seconds_since(state.stamp);
-            age_s <= self.config.phases.stale_vehicle_s
-        });
+        let is_fresh = self.is_state_fresh(now_ns);
         // A landing that would see no marker waits, with the reason in the status. So does that of a vehicle that another controller may fly,
         // or that may be the wrong one; a vehicle that took off for us is ours.
         let begins_by_itself = self.mission.is_awaiting_takeoff();
@@ -689,6 +686,14 @@ impl Flight {
             }
             _ => {}
         }
+    }
+
+    /// Whether attitude and position of the vehicle are as new as the lander requires.
+    fn is_state_fresh(&self, now_ns: i64) -> bool {
+        self.autopilot.state().and_then(wire::vehicle).is_some_and(|state| {
+            let age_s = Timestamp::from_nanos(now_ns).seconds_since(state.stamp);
+            age_s <= self.config.phases.stale_vehicle_s
+        })
     }
 
     /// A take-off does not begin with a battery for which the vehicle would land at once, and is refused where that persists. True while it

@@ -462,6 +462,8 @@ impl Mission {
         match kept {
             Some(OperatorCommand::Abort) => {
                 let why = format!("aborted by the operator; no landing was resumed: {why}");
+                // The vehicle stays the pilot's, or another controller's.
+                self.started_ns = None;
                 self.fail(autopilot, why);
             }
             _ => self.stand_down(self.start != Start::Resume),

@@ -1,6 +1,6 @@
 //! Sends the lander's actions to the autopilot: velocity setpoints at their rate, LAND and GUIDED, disarming; stops
-//! the vehicle at the end, and leads a PX4 out of OFFBOARD. Actions are sent unchanged: the guidance assumes
-//! so.
+//! the vehicle at the end, and leads a PX4 out of OFFBOARD. Setpoints are sent unchanged: the guidance assumes
+//! so. Of several decisions to land at one time one is sent.
 
 use std::time::Duration;
 

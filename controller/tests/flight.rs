@@ -1401,6 +1401,7 @@ fn an_abort_before_there_proves_to_be_no_landing_to_resume_is_in_the_status() {
                 status.why.starts_with("aborted by the operator; no landing was resumed");
             assert_eq!(is_stated && status.why.contains(text), is_aborted, "{mode}: {status:?}");
             assert_eq!(status.finished, is_aborted);
+            assert_eq!(status.started_ns, None, "it is not a vehicle that lands for us");
             // Before the mode is known, one setpoint stops a vehicle that follows setpoints.
             assert!(sent.setpoints <= 1 && sent.modes.is_empty(), "{mode}: {sent:?}");
             // The next one is landed by command.
@@ -2286,6 +2287,31 @@ fn a_landing_that_is_to_be_resumed_lands_before_the_battery_is_empty_and_not_aga
         assert_eq!(status.phase == Phase::Final, lands, "{case}: {status:?}");
         assert_eq!(status.why.contains("battery"), lands, "{case}: {status:?}");
         assert!(lands || sent.setpoints == 0, "{case}: {sent:?}");
+    }
+    // With another vehicle or controller on the link it may not be ours; with states that come seldom it lands with the first of them.
+    for other in others().map(Some).into_iter().chain([None]) {
+        let mut flight = in_flight_with("resume", &["autopilot.system_id=0"]);
+        flight.camera(0, CameraInfo::sample());
+        flight.presence(0, "main", true);
+        let mut sent = Sent::default();
+        for ms in (20..3000).chain(23_000..30_000).step_by(20) {
+            if ms % 1000 == 0 {
+                let battery_remaining = if ms < 24_000 { 50 } else { 8 };
+                let battery = SYS_STATUS_DATA { battery_remaining, ..Default::default() };
+                receive(&mut flight, ms * MS, &heartbeat(4, true));
+                receive(&mut flight, ms * MS, &MavMessage::SYS_STATUS(battery));
+                if let Some((sender, message, _)) = &other {
+                    receive_from(&mut flight, ms * MS, *sender, message);
+                }
+            }
+            if ms == 28_500 {
+                pose(&mut flight, ms * MS);
+            }
+            flight.tick(ms * MS + 3);
+            sent.take(&mut flight);
+            let lands = ms >= 28_500 && other.is_none();
+            assert_eq!(sent.modes.contains(&9.0), lands, "{ms} ms: {other:?} {sent:?}");
+        }
     }
     // One whose detections are refused.
     let mut flight = in_flight("resume");

@@ -12,7 +12,7 @@ use crate::command::{Command, CommandError, CommandId, CommandStatus, ns};
 use crate::conflict::{Conflict, LISTENING};
 use crate::mode::{Firmware, FlightMode};
 use crate::standstill::MIN_PAUSE_NS;
-use crate::state::{LandedState, VehicleState};
+use crate::state::{LandedState, Position, VehicleState};
 
 /// Maximum height error at the end of the climb, in m.
 const MAX_HEIGHT_ERROR_M: f64 = 0.5;
@@ -216,8 +216,9 @@ impl Takeoff {
     pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> TakeoffProgress {
         let passed_ns = self.passed_ns(now_ns);
         if passed_ns > MIN_PAUSE_NS {
-            // This process stood still: the vehicle went on, and its packets of that time have not been read.
-            self.move_limits(passed_ns);
+            // This process stood still: the vehicle went on, and its packets of that time have not been read. The limits of a process that is
+            // always slow end all the same.
+            self.move_limits(passed_ns - MIN_PAUSE_NS);
         }
         if let Err(error) = self.advance(now_ns, autopilot) {
             autopilot.withdraw();
@@ -330,10 +331,7 @@ impl Takeoff {
     /// Whether a pilot has ended PX4's climb in HOLD: it does so itself only at its height. Where that is not known it is the pilot. An old
     /// position decides nothing: after a standstill or a loss of the link the mode may be received first.
     fn is_held_by_pilot(&self, now_ns: i64, state: &VehicleState) -> bool {
-        let is_old = state
-            .position
-            .is_some_and(|it| now_ns.saturating_sub(it.stamp_ns) > MAX_POSITION_AGE_NS);
-        if is_old {
+        if is_position_old(now_ns, state) {
             return false;
         }
         let climbs = matches!(self.part, Part::Lift(_) | Part::Climb);
@@ -481,7 +479,9 @@ impl Takeoff {
     ) -> Result<(), TakeoffError> {
         let Some(state) = state else { return Ok(()) };
         let height_m = self.height(state);
-        let level = state.position.is_some_and(|p| p.velocity.z().abs() < MAX_CLIMB_M_S);
+        let is_level = |p: &Position| p.velocity.z().abs() < MAX_CLIMB_M_S;
+        let level =
+            state.position.as_ref().is_some_and(is_level) && !is_position_old(now_ns, state);
         // A climb that an earlier controller began ends at that one's height: the ground's position is
         // unknown here.
         let arrived =
@@ -553,6 +553,12 @@ impl fmt::Display for TakeoffProgress {
             Self::Failed(error) => error.fmt(f),
         }
     }
+}
+
+/// Whether the last position is too old to decide by.
+fn is_position_old(now_ns: i64, state: &VehicleState) -> bool {
+    let is_old = |it: Position| now_ns.saturating_sub(it.stamp_ns) > MAX_POSITION_AGE_NS;
+    state.position.is_some_and(is_old)
 }
 
 /// Whether a request is done; its error when it failed.
