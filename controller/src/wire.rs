@@ -63,6 +63,11 @@ fn not_a_unit_because(wxyz: [f64; 4]) -> Option<String> {
     })
 }
 
+/// Whether a camera may see a marker so.
+fn is_possible(pose: &Transform3) -> bool {
+    is_in_view(pose.translation_m) && not_a_unit_because(pose.rotation_wxyz).is_none()
+}
+
 /// Whether a place in the camera frame, in metres, is in front of it and near enough for a marker.
 fn is_in_view([x, y, z]: [f64; 3]) -> bool {
     z > 0.0 && libm::hypot(libm::hypot(x, y), z) <= MAX_RANGE_M
@@ -129,7 +134,7 @@ pub fn marker_in_frame(
         // A second solution that cannot be is none.
         alternative: pose
             .and_then(|pose| pose.alternative.as_ref())
-            .filter(|other| is_in_view(other.camera_from_marker.translation_m))
+            .filter(|other| is_possible(&other.camera_from_marker))
             .and_then(|other| in_body(&other.camera_from_marker)),
         covariance_m2: mount.zip(pose).map(|(mount, pose)| covariance_in_body(&mount, pose)),
         size_px: Some(detection.size_px),
@@ -354,6 +359,9 @@ mod tests {
             pose.alternative =
                 Some(messages::AlternativePose { camera_from_marker, reprojection_rms_px: 0.1 });
             assert_eq!(marker_in_frame(&detection, mount).alternative.is_some(), is_taken, "{z}");
+            let other = detection.pose.as_mut().unwrap().alternative.as_mut().unwrap();
+            other.camera_from_marker.rotation_wxyz = [0.0, 3.0, 0.0, 0.0];
+            assert!(marker_in_frame(&detection, mount).alternative.is_none(), "{z}, no rotation");
         }
     }
 

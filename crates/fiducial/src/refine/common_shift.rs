@@ -5,6 +5,7 @@ use nalgebra::{SMatrix, SVector};
 
 use crate::optics::homography::Homography;
 use crate::optics::least_squares::NormalEquations;
+use crate::optics::undistort::Undistortion;
 use crate::refine::fit::{EdgeSample, Fit, no_pulls, part, widen_by_parts};
 use crate::refine::side_errors::{
     ROUNDING_VARIANCE, SideErrors, add_size_error, form_error_of_shift_px,
@@ -66,6 +67,7 @@ impl CommonShift {
     pub(crate) fn applied(
         &self,
         measured_at: &Homography,
+        lens: &Undistortion<'_>,
         plain: Fit,
         edges: &[EdgeSample],
     ) -> Option<Fit> {
@@ -74,7 +76,7 @@ impl CommonShift {
         let shift_px = step[UNKNOWNS];
         let variance = self.scatter.variance(self.is_known);
         let mut covariance = self.inverse.fixed_view::<8, 8>(0, 0) * variance;
-        covariance *= SideErrors::OF_EDGES.factor(&homography);
+        covariance *= SideErrors::OF_EDGES.factor(&homography, lens.jacobian());
         widen(&mut covariance, &self.inverse, step, edges);
         add_size_error(&mut covariance, &homography, form_error_of_shift_px(shift_px));
         Some(Fit { homography, covariance, shift_px, ..plain })

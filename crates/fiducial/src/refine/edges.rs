@@ -143,7 +143,8 @@ fn fit_samples(target: Target<'_>, is_near: bool, scratch: &mut Scratch) -> Opti
     let (equations, edges) = (equations?, &scratch.edges);
     let shift = CommonShift::from_edges(&equations, edges);
     let plain = fit.result(&equations, shift.is_some_and(|shift| shift.is_known), edges)?;
-    let shifted = shift.and_then(|shift| shift.applied(&measured_at, plain.clone(), edges));
+    let shifted =
+        shift.and_then(|shift| shift.applied(&measured_at, fit.lens, plain.clone(), edges));
     Some(shifted.unwrap_or(plain))
 }
 
@@ -509,7 +510,7 @@ impl EdgeFit<'_> {
         Some(before.distance_px(&self.homography))
     }
 
-    /// The fit without a common shift, and whether there is known to be none.
+    /// The fit without a common shift. `is_shift_known`: whether a shift could be distinguished from the square's size.
     fn result(
         &self,
         equations: &NormalEquations<UNKNOWNS>,
@@ -529,7 +530,7 @@ impl EdgeFit<'_> {
         let step = inverse * equations.right;
         let scatter = Scatter::after(&step, edges);
         let mut covariance = inverse.fixed_view::<8, 8>(0, 0) * scatter.variance(is_shift_known);
-        covariance *= SideErrors::OF_EDGES.factor(&self.homography);
+        covariance *= SideErrors::OF_EDGES.factor(&self.homography, self.lens.jacobian());
         widen(&mut covariance, &inverse, &step, edges);
         let model = PhotometricModel {
             black: black / weight,

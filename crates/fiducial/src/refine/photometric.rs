@@ -169,7 +169,7 @@ fn fit_grid(
     }
     let Some((state, equations)) = processed(&state, grid, known_response, MIN_RESPONSE, scratch)
     else {
-        return state.plain_result(&solved?, form_error);
+        return state.plain_result(&solved?, grid, form_error);
     };
     let Some(finer) = finer else {
         return state.processed_result(&equations, grid, form_error, &mut scratch.pixels);
@@ -406,10 +406,11 @@ impl State {
     fn plain_result(
         &self,
         equations: &NormalEquations<UNKNOWNS, Residuals>,
+        grid: &PatternGrid<'_>,
         form_error: FormError,
     ) -> Option<Fit> {
         let mut fit = self.result(equations)?;
-        fit.covariance *= SideErrors::OF_PIXELS.factor(&self.homography);
+        fit.covariance *= SideErrors::OF_PIXELS.factor(&self.homography, &grid.undistortion());
         self.add_form_error(form_error, &mut fit);
         Some(fit)
     }
@@ -471,7 +472,8 @@ impl State {
         pixels: &mut [PixelSample],
     ) -> Option<Fit> {
         let mut fit = self.result(equations)?;
-        fit.covariance *= SideErrors::OF_PROCESSED_PIXELS.factor(&self.homography);
+        fit.covariance *=
+            SideErrors::OF_PROCESSED_PIXELS.factor(&self.homography, &grid.undistortion());
         let mut pulls = no_pulls();
         self.equations_of(grid, pixels, 1, Some(&mut pulls))?;
         let inverse = inverse(&equations.matrix)?;

@@ -7,6 +7,7 @@
 
 use geometry::Pixel;
 use imaging::GrayView;
+use nalgebra::Matrix2;
 
 use crate::optics::edge_response::{EdgeResponse, MAX_SIGMAS, pixel_kurtosis};
 use crate::optics::homography::{CORNERS, Homography, Inverse};
@@ -138,6 +139,11 @@ pub(crate) struct PatternMap {
 }
 
 impl<'a> PatternGrid<'a> {
+    /// Derivatives of the ideal image by the pixels.
+    pub(crate) fn undistortion(&self) -> Matrix2<f64> {
+        Matrix2::from(self.undistortion).transpose()
+    }
+
     pub(crate) fn from_pattern(pattern: &'a PatternCells, lens: &Undistortion<'_>) -> Self {
         let PatternCells { cells, across, white, unknown } = pattern;
         let unknown = if unknown.iter().any(|u| *u > 0.0) { &unknown[..] } else { &[] };

@@ -6,7 +6,7 @@
 //! rows crosses pixels at all places, so that these errors cancel. A side along the rows crosses all of them at the same place, so that
 //! they add up; a side along their diagonals crosses them at few.
 
-use nalgebra::SMatrix;
+use nalgebra::{Matrix2, SMatrix, Vector2};
 
 use crate::optics::homography::{CORNERS, Homography};
 
@@ -43,12 +43,14 @@ impl SideErrors {
     pub(crate) const OF_PROCESSED_PIXELS: Self =
         Self { across: 0.45, along_rows: 3.0, along_diagonals: 1.0 };
 
-    /// The factor of a square's covariance.
-    pub(crate) fn factor(&self, square: &Homography) -> f64 {
-        let corners = CORNERS.map(|corner| square.project(corner).image);
+    /// The factor of a square's covariance. The rows are those of the pixels: `undistortion` are the derivatives of the ideal image, in
+    /// which the square is, by the pixels there.
+    pub(crate) fn factor(&self, square: &Homography, undistortion: &Matrix2<f64>) -> f64 {
+        let corners = CORNERS.map(|corner| Vector2::from(square.project(corner).image));
+        let distortion = undistortion.try_inverse().unwrap_or(Matrix2::identity());
         let of_side = |i: usize| {
-            let (from, to) = (corners[i], corners[(i + 1) % 4]);
-            self.factor_of_side([to[0] - from[0], to[1] - from[1]])
+            let extent_px = distortion * (corners[(i + 1) % 4] - corners[i]);
+            self.factor_of_side(extent_px.into())
         };
         [0, 1, 2, 3].map(of_side).into_iter().sum::<f64>() / 4.0
     }
@@ -110,7 +112,10 @@ pub(crate) fn add_size_error(
 
 #[cfg(test)]
 mod tests {
+    use geometry::{CameraModel, Distortion, Pixel};
+
     use super::*;
+    use crate::optics::undistort::Undistortion;
 
     /// The factor of a square whose first side has this direction, in degrees.
     fn factor(errors: SideErrors, degrees: f64, side_px: f64) -> f64 {
@@ -118,7 +123,31 @@ mod tests {
         let corners = CORNERS.map(|[a, b]| {
             [a * cos - b * sin, a * sin + b * cos].map(|at| 100.0 + 0.5 * side_px * at)
         });
-        errors.factor(&Homography::from_square([-1.0, 1.0], &corners).unwrap())
+        let pixels = corners.map(|[x, y]| Pixel::new(x, y));
+        let lens = Undistortion::new(None, &pixels).unwrap();
+        errors.factor(&lens.homography(&pixels).unwrap(), lens.jacobian())
+    }
+
+    #[test]
+    fn the_rows_are_those_of_the_image_behind_a_fisheye_as_well() {
+        let camera = CameraModel {
+            width: 1600,
+            height: 1200,
+            fx: 500.0,
+            fy: 500.0,
+            cx: 800.0,
+            cy: 600.0,
+            distortion: Distortion::KannalaBrandt([0.0; 4]),
+        };
+        // 25 and 45 degrees off the axis, aside of both of the ideal image's axes.
+        for [x, y] in [[175.0, 131.0], [314.0, 236.0]] {
+            let corners = CORNERS
+                .map(|[a, b]| Pixel::new(camera.cx + x + 15.0 * a, camera.cy + y + 15.0 * b));
+            let lens = Undistortion::new(Some(&camera), &corners).unwrap();
+            let square = lens.homography(&corners).unwrap();
+            let factor = SideErrors::OF_PROCESSED_PIXELS.factor(&square, lens.jacobian());
+            assert!((factor - 3.45).abs() < 0.1, "{x} {y}: {factor}");
+        }
     }
 
     #[test]

@@ -90,7 +90,7 @@ fn summaries(comparison: &Comparison) -> String {
          The interval is that of the median at 95 % or, as it ends at one of the differences, a little more, which stands next to it, by order statistics (from six \
          seeds on); p is of a two-sided sign test, for numbers of flights of the seeds in which B has fewer or more. {} values are tested: if A and B did not differ, \
          one of them would have p < 0.05 in up to {} % of comparisons, so take one that you did not choose beforehand for p < {:.3} alone. \
-         Unsafe: faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways, or, without having given up, too far off.\n\n\
+         Unsafe: faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways, or, without an abort, too far off.\n\n\
          | | A | B | B - A, median | 95 % interval | B smaller (fewer), larger (more) in seeds | p |\n|---|---|---|---|---|---|---|\n",
         pairs.pairs,
         landed.both,

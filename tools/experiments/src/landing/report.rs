@@ -64,7 +64,7 @@ fn head(request: &Request, outcomes: &[Outcome], planned: usize) -> String {
     let again = outcomes.iter().filter(|o| o.has_left_ground()).count();
     format!(
         "{LANDINGS_HEADING}\n{}{}{}{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({}), {dangerous} unsafe, {again} left the ground again after a touch (by more than {MAX_HOP_M} m).\n\n\
-         Unsafe: touched the ground faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways, or, without having given up, more than {} m off. Times count from the start of the landing. \
+         Unsafe: touched the ground faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways, or, without an abort, more than {} m off. Times count from the start of the landing. \
          Numbers of error, time, speed and tilt are of those that landed.\n\n",
         results::interrupted(outcomes.len(), planned),
         results::origin(&request.command),
@@ -121,7 +121,7 @@ fn failures(flights: &[Planned], outcomes: &[Outcome]) -> String {
         let error = outcome.error_m.map_or("no touch".to_owned(), |error| format!("{error:.3} m"));
         let ending = match outcome.ending {
             Ending::Landed => "landed",
-            Ending::Aborted => "given up",
+            Ending::Aborted => "aborted",
             Ending::Unfinished => "unfinished",
         };
         let speed = match (outcome.sink_m_s, outcome.slide_m_s) {
