@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use autopilot::dialect::{MavMessage, MavType};
-use autopilot::{Autopilot, Event, FlightMode, LISTENING, LandedState, Packet};
+use autopilot::{Autopilot, Event, FlightMode, LISTENING, LandedState, MIN_STANDSTILL_NS, Packet};
 use landing::{
     Action, Alarm, AlarmAction, Decision, Event as LanderEvent, FrameObservation, Lander,
     MAX_STANDSTILL_S, OperatorCommand, Phase, Reason, Timestamp,
@@ -37,9 +37,6 @@ use crate::setpoints::Setpoints;
 use crate::status::{Used, View};
 use crate::wind::WindEstimate;
 use crate::wire;
-
-/// Shortest pause between two ticks, which are 25 ms apart, that is a standstill of this process, in nanoseconds.
-const MIN_STANDSTILL_NS: i64 = 300_000_000;
 
 /// A flight.
 pub struct Flight {
@@ -72,8 +69,6 @@ pub struct Flight {
     empty_since_ns: Option<i64>,
     /// The time of the last tick.
     ticked_ns: Option<i64>,
-    /// Until when frames and refusals are followed.
-    followed_ns: Option<i64>,
     /// The mode that ended the last landing as the pilot's.
     pilots_mode: Option<FlightMode>,
 }
@@ -124,7 +119,6 @@ impl Flight {
             is_disputed: false,
             empty_since_ns: None,
             ticked_ns: None,
-            followed_ns: None,
             pilots_mode: None,
             config,
         })
@@ -195,7 +189,7 @@ impl Flight {
     fn notice_standstill(&mut self, now_ns: i64) {
         let before_ns = self.ticked_ns.replace(now_ns).unwrap_or(now_ns);
         let stood_ns = now_ns.saturating_sub(before_ns);
-        self.follow_frames(now_ns);
+        self.frames.follow(now_ns);
         if stood_ns > MIN_STANDSTILL_NS {
             self.alarms.stood_still(now_ns, stood_ns);
         }
@@ -207,16 +201,6 @@ impl Flight {
         self.mission.stand_still(now_ns, &mut self.autopilot, stood_s, is_active);
         if let Some(landing_target) = &mut self.landing_target {
             landing_target.stand_still(stood_s, &mut self.autopilot);
-        }
-    }
-
-    /// Moves the times of frames and refusals on over a standstill, which a message may show before the tick that notices it: what was refused
-    /// until then would be over with the first refusal after it.
-    fn follow_frames(&mut self, now_ns: i64) {
-        let before_ns = self.followed_ns.replace(now_ns).unwrap_or(now_ns);
-        let stood_ns = now_ns.saturating_sub(before_ns);
-        if stood_ns > MIN_STANDSTILL_NS {
-            self.frames.stood_still(now_ns, stood_ns);
         }
     }
 
@@ -351,7 +335,6 @@ impl Flight {
     /// standby do, or when detections of such a detector were refused.
     pub fn detections(&mut self, now_ns: i64, publisher: &str, message: &Detections) -> bool {
         self.journal.count("detections");
-        self.follow_frames(now_ns);
         match self.frames.add(now_ns, publisher, message) {
             Arrival::Refused(reason) => return self.refuse(publisher, reason),
             Arrival::Late(frame) => {
@@ -429,7 +412,6 @@ impl Flight {
     /// Handles a camera's calibration and mount.
     pub fn camera(&mut self, now_ns: i64, info: CameraInfo) {
         let camera = info.camera.clone();
-        self.follow_frames(now_ns);
         match self.frames.add_camera(now_ns, info, self.is_landing()) {
             Reception::Known => {}
             Reception::Replaced(difference) => {
@@ -443,7 +425,6 @@ impl Flight {
 
     /// Messages of another version were refused.
     pub fn refused_version(&mut self, now_ns: i64) {
-        self.follow_frames(now_ns);
         self.frames.refused_version(now_ns);
     }
 
@@ -466,7 +447,7 @@ impl Flight {
     /// Carries out an operator's command, or refuses it with the reason.
     pub fn command(&mut self, now_ns: i64, command: &ControllerCommand) -> CommandReply {
         self.alarms.operator_active(now_ns);
-        self.follow_frames(now_ns);
+        self.frames.follow(now_ns);
         let selection = &mut self.frames.selection;
         let result = match command {
             ControllerCommand::Start => self.start(now_ns),

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use autopilot::without_standstill;
+use autopilot::{MIN_STANDSTILL_NS, without_standstill};
 use landing::{FrameObservation, Timestamp};
 use messages::{CameraInfo, Detections, DetectorInfo, Place};
 
@@ -55,6 +55,8 @@ pub struct Frames {
     known_changes: u64,
     /// Stamp of the newest frame that was used, with a marker in it or without.
     used_stamp_ns: i64,
+    /// Time of the last tick, message or command.
+    followed_ns: Option<i64>,
     /// Late frames of the active detector are used only if they are newer than the last one of its
     /// predecessor.
     handover_stamp_ns: i64,
@@ -100,6 +102,7 @@ impl Frames {
             kept_ns: i64::MIN,
             known_changes: 0,
             used_stamp_ns: i64::MIN,
+            followed_ns: None,
             handover_stamp_ns: i64::MIN,
             camera_watch: CameraWatch::default(),
         }
@@ -125,6 +128,7 @@ impl Frames {
 
     /// Adds a camera's calibration and mount, or refuses them; `is_flying`: a landing is active.
     pub fn add_camera(&mut self, now_ns: i64, info: CameraInfo, is_flying: bool) -> Reception {
+        self.follow(now_ns);
         let reception = self.cameras.add(now_ns, info, is_flying);
         if let Reception::Refused(reason, text) = &reception {
             self.refusals.add(now_ns, reason, || text.clone());
@@ -134,6 +138,7 @@ impl Frames {
 
     /// Adds the detections that were published on the key of the detector `publisher`.
     pub fn add(&mut self, now_ns: i64, publisher: &str, message: &Detections) -> Arrival {
+        self.follow(now_ns);
         let header = &message.header;
         // Also where they are refused, the camera has frames.
         self.camera_watch.searched(now_ns, publisher, &header.camera);
@@ -241,6 +246,7 @@ impl Frames {
 
     /// Messages of another version were refused.
     pub fn refused_version(&mut self, now_ns: i64) {
+        self.follow(now_ns);
         self.refusals.add(now_ns, "another-version", || {
             "messages of another version are refused; run the same version of alight everywhere (`alight doctor`)".to_owned()
         });
@@ -272,8 +278,14 @@ impl Frames {
         self.refusals.lasting(now_ns).find(|_| has_none).map(|warning| warning.text)
     }
 
-    /// This process has not run for so long: what was refused before is not over by that, and frames of that time were not missing.
-    pub fn stood_still(&mut self, now_ns: i64, stood_ns: i64) {
+    /// Moves times on over a standstill of this process: what was refused before is not over by that, and frames of that time were not
+    /// missing. Messages show a standstill before the tick after it.
+    pub fn follow(&mut self, now_ns: i64) {
+        let before_ns = self.followed_ns.replace(now_ns).unwrap_or(now_ns);
+        let stood_ns = now_ns.saturating_sub(before_ns);
+        if stood_ns <= MIN_STANDSTILL_NS {
+            return;
+        }
         self.camera_watch.stood_still(now_ns, stood_ns);
         self.refusals.stood_still(now_ns, stood_ns);
         self.kept_ns = without_standstill(self.kept_ns, now_ns, stood_ns);

@@ -78,6 +78,6 @@ pub use packet::{Packet, Parser, Sender};
 pub use parameter::Parameter;
 pub use peers::Peering;
 pub use permission::Permission;
-pub use standstill::without_standstill;
+pub use standstill::{MIN_STANDSTILL_NS, without_standstill};
 pub use state::{Attitude, Battery, LandedState, Position, Range, VehicleState};
 pub use takeoff::{Takeoff, TakeoffError, TakeoffProgress};

@@ -3,8 +3,8 @@
 //! A process that was stopped, swapped out or starved continues with the packets in its socket, oldest first: a pilot's switch may be
 //! behind many older packets. A request that is sent before that is read would take the vehicle from the pilot.
 
-/// Shortest pause between two ticks that is a standstill, in nanoseconds: they are 25 ms apart.
-pub(crate) const MIN_PAUSE_NS: i64 = 300_000_000;
+/// Shortest pause between two ticks that is a standstill of this process, in nanoseconds: they are 25 ms apart.
+pub const MIN_STANDSTILL_NS: i64 = 300_000_000;
 /// Time in which the packets that waited in the socket are read, in nanoseconds.
 const BACKLOG_NS: i64 = 300_000_000;
 /// Longest wait for the mode, in nanoseconds: heartbeats come each second, and one may be lost.
@@ -30,7 +30,7 @@ impl Standstill {
         let before_ns = self.ticked_ns.unwrap_or(now_ns);
         self.ticked_ns = Some(before_ns.max(now_ns));
         let pause_ns = now_ns.saturating_sub(before_ns);
-        let stood_ns = (pause_ns > MIN_PAUSE_NS).then_some(pause_ns);
+        let stood_ns = (pause_ns > MIN_STANDSTILL_NS).then_some(pause_ns);
         if stood_ns.is_some() {
             self.ended_ns = Some(now_ns);
             self.first_ns.get_or_insert(now_ns);

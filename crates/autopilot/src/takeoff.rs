@@ -11,7 +11,7 @@ use crate::client::Autopilot;
 use crate::command::{Command, CommandError, CommandId, CommandStatus, ns};
 use crate::conflict::{Conflict, LISTENING};
 use crate::mode::{Firmware, FlightMode};
-use crate::standstill::MIN_PAUSE_NS;
+use crate::standstill::MIN_STANDSTILL_NS;
 use crate::state::{LandedState, Position, VehicleState};
 
 /// Maximum height error at the end of the climb, in m.
@@ -215,10 +215,10 @@ impl Takeoff {
     /// One that stands with armed motors is left on the ground: it may have landed a moment ago.
     pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> TakeoffProgress {
         let passed_ns = self.passed_ns(now_ns);
-        if passed_ns > MIN_PAUSE_NS {
+        if passed_ns > MIN_STANDSTILL_NS {
             // This process stood still: the vehicle went on, and its packets of that time have not been read. The limits of a process that is
             // always slow end all the same.
-            self.move_limits(passed_ns - MIN_PAUSE_NS);
+            self.move_limits(passed_ns - MIN_STANDSTILL_NS);
         }
         if let Err(error) = self.advance(now_ns, autopilot) {
             autopilot.withdraw();
