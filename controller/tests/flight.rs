@@ -85,8 +85,7 @@ fn the_pilots_switch_is_seen_while_the_position_is_missing() {
             let now_ns = (1100 + i * 25) * MS;
             if i % 40 == 0 {
                 receive(&mut flight, now_ns, &heartbeat(pilots, true));
-                let battery = SYS_STATUS_DATA { battery_remaining: 5, ..Default::default() };
-                receive(&mut flight, now_ns, &MavMessage::SYS_STATUS(battery));
+                receive(&mut flight, now_ns, &battery(5));
             }
             turn(&mut flight, now_ns);
             flight.tick(now_ns + 2);
@@ -106,8 +105,7 @@ fn a_request_that_is_pending_is_not_repeated_against_the_pilot() {
     receive(&mut flight, 0, &heartbeat(4, true));
     receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
     hover(&mut flight, 20, 1000, 4);
-    let battery = SYS_STATUS_DATA { battery_remaining: 15, ..Default::default() };
-    receive(&mut flight, 1000 * MS, &MavMessage::SYS_STATUS(battery));
+    receive(&mut flight, 1000 * MS, &battery(15));
     // No acknowledgement comes.
     let asked = hover(&mut flight, 1020, 2000, 4);
     assert!(asked.modes.contains(&9.0), "{:?}", asked.modes);
@@ -605,18 +603,27 @@ fn a_vehicle_that_is_called_back_from_land_is_left_to_it_low_over_the_ground() {
     assert_eq!(flight.status(9000 * MS).phase, Phase::Aborted);
 }
 
+/// Detections of a frame that another computer has stamped.
+fn of_another_clock(stamp_ns: i64) -> Detections {
+    Detections {
+        header: FrameHeader { clock: "monotonic/myhost".into(), ..header(stamp_ns) },
+        ..Detections::sample()
+    }
+}
+
+/// A battery with so many percent of its charge.
+fn battery(battery_remaining: i8) -> MavMessage {
+    MavMessage::SYS_STATUS(SYS_STATUS_DATA { battery_remaining, ..Default::default() })
+}
+
 #[test]
 fn a_start_is_refused_with_the_reason_while_all_detections_are() {
     let mut flight = in_flight_with("command", &["autopilot.timesync=false"]);
     flight.camera(0, CameraInfo::sample());
-    let foreign = |stamp_ns| Detections {
-        header: FrameHeader { clock: "monotonic/myhost".into(), ..header(stamp_ns) },
-        ..Detections::sample()
-    };
     for ms in (20..1600).step_by(20) {
         pose(&mut flight, ms * MS);
         if ms % 60 == 0 {
-            flight.detections(ms * MS, "main", &foreign(ms * MS));
+            flight.detections(ms * MS, "main", &of_another_clock(ms * MS));
         }
         flight.tick(ms * MS + 3);
     }
@@ -815,9 +822,7 @@ fn landing_here_needs_neither_detections_nor_a_landing() {
         for ms in (20..1600).step_by(20) {
             pose(&mut flight, ms * MS);
             if ms % 60 == 0 {
-                let header = FrameHeader { clock: "monotonic/myhost".into(), ..header(ms * MS) };
-                let foreign = Detections { header, ..Detections::sample() };
-                flight.detections(ms * MS, "main", &foreign);
+                flight.detections(ms * MS, "main", &of_another_clock(ms * MS));
             }
             flight.tick(ms * MS + 3);
         }
@@ -1025,8 +1030,7 @@ fn a_low_battery_leads_to_the_configured_reaction() {
     receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
     hover(&mut flight, 1000, 2000, 4);
     assert_eq!(flight.status(2000 * MS).phase, Phase::Search);
-    let battery = SYS_STATUS_DATA { battery_remaining: 15, ..Default::default() };
-    receive(&mut flight, 2000 * MS, &MavMessage::SYS_STATUS(battery));
+    receive(&mut flight, 2000 * MS, &battery(15));
     hover(&mut flight, 2000, 3500, 4);
     let status = flight.status(3500 * MS);
     assert_eq!((status.phase, status.why.as_str()), (Phase::Hold, "the battery is low"));
@@ -2044,12 +2048,8 @@ fn a_pilot_ends_the_wait_of_a_vehicle_that_took_off_for_its_landing() {
     {
         let mut flight = in_flight("takeoff");
         flight.camera(0, CameraInfo::sample());
-        let foreign = |stamp_ns| Detections {
-            header: FrameHeader { clock: "monotonic/myhost".into(), ..header(stamp_ns) },
-            ..Detections::sample()
-        };
         for ms in (20..2600).step_by(20) {
-            flight.detections(ms * MS, "main", &foreign(ms * MS));
+            flight.detections(ms * MS, "main", &of_another_clock(ms * MS));
             if ms > 1600 {
                 pose(&mut flight, ms * MS);
             }
@@ -2226,20 +2226,15 @@ fn a_vehicle_that_waits_in_the_air_for_its_landing_lands_before_its_battery_is_e
         flight.camera(0, CameraInfo::sample());
         receive(&mut flight, 0, &heartbeat(4, true));
         receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
-        let foreign = |stamp_ns| Detections {
-            header: FrameHeader { clock: "monotonic/myhost".into(), ..header(stamp_ns) },
-            ..Detections::sample()
-        };
         for ms in (20..10_000).step_by(20) {
-            flight.detections(ms * MS, "main", &foreign(ms * MS));
+            flight.detections(ms * MS, "main", &of_another_clock(ms * MS));
             if ms > 1600 {
                 pose(&mut flight, ms * MS);
             }
             if ms % 1000 == 0 {
                 receive(&mut flight, ms * MS, &heartbeat(4, true));
-                let battery_remaining = if ms < 5000 { 50 } else { 8 };
-                let battery = SYS_STATUS_DATA { battery_remaining, ..Default::default() };
-                receive(&mut flight, ms * MS, &MavMessage::SYS_STATUS(battery));
+                let percent = if ms < 5000 { 50 } else { 8 };
+                receive(&mut flight, ms * MS, &battery(percent));
             }
             flight.tick(ms * MS + 3);
             if ms == 7000 {
@@ -2279,8 +2274,7 @@ fn a_landing_that_is_to_be_resumed_lands_before_the_battery_is_empty_and_not_aga
         if let Some(command) = command {
             assert!(flight.command(25_000 * MS, &command).accepted, "{case}");
         }
-        let battery = SYS_STATUS_DATA { battery_remaining: 8, ..Default::default() };
-        receive(&mut flight, 25_000 * MS, &MavMessage::SYS_STATUS(battery));
+        receive(&mut flight, 25_000 * MS, &battery(8));
         let sent = hover(&mut flight, 25_000, 29_000, mode_after);
         let status = flight.status(29_000 * MS);
         assert_eq!(sent.modes.contains(&9.0), lands, "{case}: {sent:?} {status:?}");
@@ -2296,10 +2290,9 @@ fn a_landing_that_is_to_be_resumed_lands_before_the_battery_is_empty_and_not_aga
         let mut sent = Sent::default();
         for ms in (20..3000).chain(23_000..30_000).step_by(20) {
             if ms % 1000 == 0 {
-                let battery_remaining = if ms < 24_000 { 50 } else { 8 };
-                let battery = SYS_STATUS_DATA { battery_remaining, ..Default::default() };
+                let percent = if ms < 24_000 { 50 } else { 8 };
                 receive(&mut flight, ms * MS, &heartbeat(4, true));
-                receive(&mut flight, ms * MS, &MavMessage::SYS_STATUS(battery));
+                receive(&mut flight, ms * MS, &battery(percent));
                 if let Some((sender, message, _)) = &other {
                     receive_from(&mut flight, ms * MS, *sender, message);
                 }
@@ -2318,17 +2311,14 @@ fn a_landing_that_is_to_be_resumed_lands_before_the_battery_is_empty_and_not_aga
     flight.presence(0, "main", true);
     flight.camera(0, CameraInfo::sample());
     for ms in (20..9000).step_by(20) {
-        let foreign = FrameHeader { clock: "monotonic/myhost".into(), ..header(ms * MS) };
-        let detections = Detections { header: foreign, ..Detections::sample() };
-        flight.detections(ms * MS, "main", &detections);
+        flight.detections(ms * MS, "main", &of_another_clock(ms * MS));
         if ms > 1600 {
             pose(&mut flight, ms * MS);
         }
         if ms % 1000 == 0 {
             receive(&mut flight, ms * MS, &heartbeat(4, true));
-            let battery_remaining = if ms < 3000 { 50 } else { 8 };
-            let battery = SYS_STATUS_DATA { battery_remaining, ..Default::default() };
-            receive(&mut flight, ms * MS, &MavMessage::SYS_STATUS(battery));
+            let percent = if ms < 3000 { 50 } else { 8 };
+            receive(&mut flight, ms * MS, &battery(percent));
         }
         flight.tick(ms * MS + 3);
         if ms == 4000 {
@@ -2342,10 +2332,6 @@ fn a_landing_that_is_to_be_resumed_lands_before_the_battery_is_empty_and_not_aga
 
 #[test]
 fn a_landing_that_waits_as_detections_are_refused_waits_after_a_standstill_as_well() {
-    let foreign = |stamp_ns| Detections {
-        header: FrameHeader { clock: "monotonic/myhost".into(), ..header(stamp_ns) },
-        ..Detections::sample()
-    };
     // Detections or a tick come first after it.
     for ticks_first in [false, true] {
         let mut flight = flight_with("takeoff", &[]);
@@ -2363,7 +2349,7 @@ fn a_landing_that_waits_as_detections_are_refused_waits_after_a_standstill_as_we
             if ticks_first {
                 flight.tick(ms * MS + 1);
             }
-            flight.detections(ms * MS + 2, "main", &foreign(ms * MS));
+            flight.detections(ms * MS + 2, "main", &of_another_clock(ms * MS));
             flight.tick(ms * MS + 3);
             if ms > 3000 {
                 let status = flight.status(ms * MS + 4);
