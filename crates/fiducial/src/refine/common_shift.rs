@@ -75,9 +75,8 @@ impl CommonShift {
         let homography = measured_at.stepped(|i| step[i]).filter(|_| self.is_found)?;
         let shift_px = step[UNKNOWNS];
         let variance = self.scatter.variance(self.is_known);
-        let mut covariance = self.inverse.fixed_view::<8, 8>(0, 0) * variance;
-        covariance *= SideErrors::OF_EDGES.factor(&homography, lens.jacobian());
-        widen(&mut covariance, &self.inverse, step, edges);
+        let factor = SideErrors::OF_EDGES.factor(&homography, lens.jacobian());
+        let mut covariance = covariance(&self.inverse, variance * factor, step, edges);
         add_size_error(&mut covariance, &homography, form_error_of_shift_px(shift_px));
         Some(Fit { homography, covariance, shift_px, ..plain })
     }
@@ -121,14 +120,15 @@ impl Scatter {
     }
 }
 
-/// Widens a covariance by the contradiction of the edges after the last step: of the homography, the blur and, where
-/// there is one, the common shift.
-pub(crate) fn widen<const N: usize>(
-    covariance: &mut SMatrix<f64, 8, 8>,
+/// The covariance of a homography from the `inverse` of its normal equations and the variance of a pixel, widened by the contradiction of
+/// the edges after the last step: of the homography, the blur and, where there is one, the common shift.
+pub(crate) fn covariance<const N: usize>(
     inverse: &SMatrix<f64, N, N>,
+    variance: f64,
     step: &SVector<f64, N>,
     edges: &[EdgeSample],
-) {
+) -> SMatrix<f64, 8, 8> {
+    let mut covariance = inverse.fixed_view::<8, 8>(0, 0) * variance;
     let mut pulls = no_pulls();
     for sample in edges {
         let Some(measurement) = &sample.measurement else { continue };
@@ -146,5 +146,6 @@ pub(crate) fn widen<const N: usize>(
             *all += pull;
         }
     }
-    widen_by_parts(covariance, inverse, &pulls);
+    widen_by_parts(&mut covariance, inverse, &pulls);
+    covariance
 }

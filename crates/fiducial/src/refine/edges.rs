@@ -13,7 +13,7 @@ use crate::optics::edge_response::{EdgeResponse, pixel_kurtosis};
 use crate::optics::homography::{CORNERS, Homography};
 use crate::optics::least_squares::NormalEquations;
 use crate::optics::undistort::Undistortion;
-use crate::refine::common_shift::{CommonShift, Scatter, UNKNOWNS, widen};
+use crate::refine::common_shift::{CommonShift, Scatter, UNKNOWNS, covariance};
 use crate::refine::fit::{EdgeMeasurement, EdgeSample, Fit, PhotometricModel, Scratch, Target};
 use crate::refine::pattern::Pattern;
 use crate::refine::side_errors::SideErrors;
@@ -529,9 +529,9 @@ impl EdgeFit<'_> {
         let inverse = equations.matrix.cholesky()?.inverse();
         let step = inverse * equations.right;
         let scatter = Scatter::after(&step, edges);
-        let mut covariance = inverse.fixed_view::<8, 8>(0, 0) * scatter.variance(is_shift_known);
-        covariance *= SideErrors::OF_EDGES.factor(&self.homography, self.lens.jacobian());
-        widen(&mut covariance, &inverse, &step, edges);
+        let factor = SideErrors::OF_EDGES.factor(&self.homography, self.lens.jacobian());
+        let variance = scatter.variance(is_shift_known) * factor;
+        let covariance = covariance(&inverse, variance, &step, edges);
         let model = PhotometricModel {
             black: black / weight,
             contrast: contrast / weight,
