@@ -2,6 +2,7 @@
 //! supervisor.
 
 use std::net::UdpSocket;
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -72,16 +73,20 @@ fn is_back(name: &str, seconds: f64, since: Instant) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Starts a camera's process that publishes an image in this folder again and again.
+fn publish_image(folder: &Path, meet: u16) -> anyhow::Result<Running> {
+    image::GrayImage::new(64, 48).save(folder.join("1.png"))?;
+    let (paths, meet) = (format!("source.paths=[{folder:?}]"), meet.to_string());
+    let set = ["--set", &paths, "--set", "calibration.focal_px=[100, 100]"];
+    Running::start(&[&["camera-pub", "--meet", &meet], &set[..]].concat())
+}
+
 /// Freezes a camera's process that publishes images.
 pub(crate) async fn of_a_camera(freezes_s: &[f64]) -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     let folder = tempfile::tempdir()?;
-    image::GrayImage::new(64, 48).save(folder.path().join("1.png"))?;
-    let paths = format!("source.paths=[{:?}]", folder.path());
     let ([meet], _, _) = ports::free()?;
-    let meet_text = meet.to_string();
-    let set = ["--set", &paths, "--set", "calibration.focal_px=[100, 100]"];
-    let camera = Running::start(&[&["camera-pub", "--meet", &meet_text], &set[..]].concat())?;
+    let camera = publish_image(folder.path(), meet)?;
     let detector = open("detector", "main", on_board(meet)).await?;
     let frames = detector.frame_subscriber(topic::FRAME, &["down"]).await?;
     let is_received = async |since_ns: i64| {
@@ -105,14 +110,10 @@ pub(crate) async fn of_a_camera(freezes_s: &[f64]) -> anyhow::Result<()> {
 pub(crate) async fn of_a_camera_while_another_starts(seconds: f64) -> anyhow::Result<()> {
     let _flight = beside_another().await?;
     let folder = tempfile::tempdir()?;
-    image::GrayImage::new(64, 48).save(folder.path().join("1.png"))?;
-    let paths = format!("source.paths=[{:?}]", folder.path());
     let ([meet], _, _) = ports::free()?;
-    let meet_text = meet.to_string();
     // The first process has the rendezvous, and announces the camera to those that follow.
     let first = open("detector", "first", on_board(meet)).await?;
-    let set = ["--set", &paths, "--set", "calibration.focal_px=[100, 100]"];
-    let camera = Running::start(&[&["camera-pub", "--meet", &meet_text], &set[..]].concat())?;
+    let camera = publish_image(folder.path(), meet)?;
     let patience = Duration::from_secs(20);
     let frames = first.frame_subscriber(topic::FRAME, &["down"]).await?;
     timeout(patience, frames.next()).await.context("the first gets no frame")?;
