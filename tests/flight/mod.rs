@@ -6,13 +6,14 @@
 use std::io::{BufRead, BufReader};
 use std::path::PathBuf;
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::LazyLock;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail, ensure};
 use messages::{ControllerStatus, Phase, Truth, topic};
 use node::{Identity, Network, Node, Subscriber, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
-use tokio::sync::{Semaphore, SemaphorePermit, mpsc};
+use tokio::sync::{Semaphore, SemaphorePermit, mpsc, watch};
 use tokio::time::timeout;
 
 /// Longest wait for anything; a landing takes a fifth of it.
@@ -44,6 +45,8 @@ pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 /// Landings with the small camera that keep their time on two processors.
 const MAX_AT_ONCE: u32 = 7;
 static FLIGHTS: Semaphore = Semaphore::const_new(MAX_AT_ONCE as usize);
+/// The number of tests that run alone, or wait for it.
+static ALONE: LazyLock<watch::Sender<usize>> = LazyLock::new(|| watch::Sender::new(0));
 
 /// Waits until there is time for one more landing, until the result is dropped.
 pub(crate) async fn beside_another() -> anyhow::Result<SemaphorePermit<'static>> {
@@ -52,12 +55,30 @@ pub(crate) async fn beside_another() -> anyhow::Result<SemaphorePermit<'static>>
 
 /// Waits until there is time for this number of landings, or other work of this load.
 pub(crate) async fn time_for(landings: u32) -> anyhow::Result<SemaphorePermit<'static>> {
+    ALONE.subscribe().wait_for(|tests| *tests == 0).await?;
     Ok(FLIGHTS.acquire_many(landings).await?)
 }
 
 /// Waits until no landing is under way that waited for its time, and lets none begin: for tests that load the machine on their own, or measure milliseconds.
-pub(crate) async fn alone() -> anyhow::Result<SemaphorePermit<'static>> {
-    time_for(MAX_AT_ONCE).await
+///
+/// Such tests follow one another, before the others that wait: each time that all others must end first, the processors are idle.
+pub(crate) async fn alone() -> anyhow::Result<Alone> {
+    ALONE.send_modify(|tests| *tests += 1);
+    let mut alone = Alone { permit: None };
+    alone.permit = Some(FLIGHTS.acquire_many(MAX_AT_ONCE).await?);
+    Ok(alone)
+}
+
+/// A test that runs alone, or waits for it.
+pub(crate) struct Alone {
+    permit: Option<SemaphorePermit<'static>>,
+}
+
+impl Drop for Alone {
+    fn drop(&mut self) {
+        self.permit = None;
+        ALONE.send_modify(|tests| *tests -= 1);
+    }
 }
 
 /// The small camera as items of the `set` of a site's file.
