@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// Maximum number of names that are listed of a file.
-const MAX_NAMES: usize = 40;
+const MAX_NAMES: usize = 60;
 /// Folders of a room, in the order of the list. The package `tests` is a room that is one folder.
 const FOLDERS: [&str; 4] = ["src", "tests", "examples", "benches"];
 
@@ -15,16 +15,25 @@ pub(crate) fn list<'a>(
     files: impl Iterator<Item = &'a Path>,
     read: impl Fn(&Path) -> anyhow::Result<String>,
 ) -> anyhow::Result<String> {
-    let mut rooms: BTreeMap<(&str, usize), BTreeMap<String, String>> = BTreeMap::new();
+    let mut texts = vec![];
     for file in files {
-        let Some((room, folder, within)) = file.to_str().and_then(place) else { continue };
-        let text = read(file)?;
-        let sentence = first_sentence(&text);
+        let Some(place) = file.to_str().and_then(place) else { continue };
+        texts.push((file, place, read(file)?));
+    }
+    let mut files_with: BTreeMap<&str, usize> = BTreeMap::new();
+    for (_, _, text) in &texts {
+        for member in members(text) {
+            *files_with.entry(member).or_default() += 1;
+        }
+    }
+
+    let mut rooms: BTreeMap<(&str, usize), BTreeMap<String, String>> = BTreeMap::new();
+    for (file, (room, folder, within), text) in &texts {
+        let sentence = first_sentence(text);
         anyhow::ensure!(!sentence.is_empty(), "{} does not begin with `//!`", file.display());
-        rooms
-            .entry((room, folder))
-            .or_default()
-            .insert(sort_key(within), format!("- `{within}`: {sentence}{}", names(&text)));
+        let names = names(text, |member| files_with.get(member) == Some(&1));
+        let line = format!("- `{within}`: {sentence}{names}");
+        rooms.entry((*room, *folder)).or_default().insert(sort_key(within), line);
     }
     let sections = rooms.iter().map(|((room, folder), files)| {
         let lines: Vec<&str> = files.values().map(String::as_str).collect();
@@ -45,12 +54,12 @@ fn place(file: &str) -> Option<(&str, usize, &str)> {
     })
 }
 
-/// The definitions in a file, without its tests: types, functions, methods that are no trait's, then constants; the first of them.
-fn names(text: &str) -> String {
-    let before_tests = text.split("\nmod tests {").next().unwrap_or_default();
+/// The definitions in a file, without its tests: types, functions, methods that are no trait's, constants, then those fields and variants
+/// that `is_only_here`; the first of them.
+fn names(text: &str, is_only_here: impl Fn(&str) -> bool) -> String {
     let (mut is_test, mut of_trait) = (false, false);
     let (mut types, mut functions, mut methods, mut constants) = (vec![], vec![], vec![], vec![]);
-    for line in before_tests.lines() {
+    for line in before_tests(text).lines() {
         let was_test = is_test;
         is_test = line.starts_with("#[test]")
             || line.starts_with("#[tokio::test")
@@ -67,10 +76,47 @@ fn names(text: &str) -> String {
         }
     }
     let mut seen = BTreeSet::new();
-    let names = [types, functions, methods, constants].into_iter().flatten();
+    let members = members(text).into_iter().filter(|name| is_only_here(name)).collect();
+    let names = [types, functions, methods, constants, members].into_iter().flatten();
     let names = names.filter(|name| seen.insert(*name));
     let names: Vec<String> = names.take(MAX_NAMES).map(|name| format!("`{name}`")).collect();
     if names.is_empty() { String::new() } else { format!(" ({})", names.join(", ")) }
+}
+
+/// The names of fields and variants of the structs and enums in a file, without its tests.
+fn members(text: &str) -> BTreeSet<&str> {
+    let (mut is_struct, mut is_enum) = (false, false);
+    let mut members = BTreeSet::new();
+    for line in before_tests(text).lines() {
+        if !line.starts_with(' ') {
+            let opens = line.ends_with('{');
+            is_struct = opens && defined(line, &["struct "]).is_some();
+            is_enum = opens && defined(line, &["enum "]).is_some();
+            continue;
+        }
+        let line = line.trim_start();
+        let line = line
+            .strip_prefix("pub(")
+            .and_then(|rest| rest.split_once(") "))
+            .map_or(line, |it| it.1);
+        let line = line.strip_prefix("pub ").unwrap_or(line);
+        let end = line.find(|c: char| !c.is_alphanumeric() && c != '_').unwrap_or(line.len());
+        let (name, rest) = line.split_at(end);
+        let is_field =
+            rest.starts_with(": ") && name.starts_with(|first: char| first.is_lowercase());
+        let is_variant = is_enum
+            && name.starts_with(|first: char| first.is_uppercase())
+            && [",", " {", "("].iter().any(|next| rest.starts_with(next));
+        if ((is_struct || is_enum) && is_field) || is_variant {
+            members.insert(name);
+        }
+    }
+    members
+}
+
+/// A file's text up to its module of tests.
+fn before_tests(text: &str) -> &str {
+    text.split("\nmod tests {").next().unwrap_or_default()
 }
 
 /// The name that a line defines with one of these keywords, public or not.
