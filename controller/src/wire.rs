@@ -2,7 +2,7 @@
 //! the body frame, covariances, phases, vehicle state and status.
 
 use autopilot::VehicleState;
-use geometry::{Body, Camera, Marker, Pixel, Rotation, Transform, Vector};
+use geometry::{Body, Camera, Marker, Pixel, Point, Rotation, Transform, Vector};
 use landing::{Landed, MarkerInFrame, Mode, Timestamp, VehicleStatus};
 use messages::{CameraInfo, Detection, FrameHeader, MarkerPose, Phase, Transform3};
 use nalgebra::Matrix3;
@@ -15,6 +15,11 @@ const MAX_RANGE_M: f64 = 1e3;
 
 /// Maximum difference of a rotation quaternion's length from 1, from rounding: a rotation vector or an angle in degrees has another length.
 const MAX_LENGTH_ERROR: f64 = 0.01;
+
+/// Maximum angle between the normal of a marker's face and the direction to the camera, in degrees; 90 is a face seen edge-on. A marker that
+/// is tilted by 80 degrees is a sixth as wide as it is long, and no detector reads one that is tilted by more: a right pose at that tilt
+/// must err by 20 degrees to exceed the limit, and a pose whose normal is reversed exceeds it at any tilt below.
+const MAX_TURNED_DEG: f64 = 100.0;
 
 /// Why a detection's numbers are not those of a marker that a camera sees, as the end of a sentence on its detector; `None` for sound ones.
 pub fn impossible_because(detection: &Detection) -> Option<String> {
@@ -41,6 +46,9 @@ pub fn impossible_because(detection: &Detection) -> Option<String> {
             "the marker would be farther away than {MAX_RANGE_M} m, {place}; a translation is in metres"
         ));
     }
+    if let Some(why) = turned_away_because(&pose.camera_from_marker) {
+        return Some(why);
+    }
     let covariance = pose.translation_covariance_m2();
     (!landing::is_covariance(&covariance)).then(|| {
         let [xx, xy, xz, _, _, _, yy, yz, _, _, _, zz, ..] = pose.covariance;
@@ -63,9 +71,27 @@ fn not_a_unit_because(wxyz: [f64; 4]) -> Option<String> {
     })
 }
 
+/// Why a camera would see the back of a marker with this pose, as the end of a sentence on the detector; `None` for a face towards it.
+fn turned_away_because(pose: &Transform3) -> Option<String> {
+    let camera_from_marker = pose.transform::<Camera, Marker>()?;
+    let normal = camera_from_marker.rotation() * Vector::<Marker>::new(0.0, 0.0, 1.0);
+    let to_camera = Point::origin() - camera_from_marker.origin();
+    let cosine = normal.coords.dot(&to_camera.coords) / to_camera.norm();
+    let turned_deg = libm::acos(cosine.clamp(-1.0, 1.0)).to_degrees();
+    (turned_deg > MAX_TURNED_DEG).then(|| {
+        format!(
+            "the marker's face would be turned away from the camera: its normal, the marker's z axis, points {turned_deg:.0} degrees away from the direction to the \
+             camera, and {MAX_TURNED_DEG} are allowed; the rotation may be AprilTag's own, with z into the print (multiply it by diag(1, -1, -1) from the right), a \
+             quaternion in the order x, y, z, w, or from corners in counter-clockwise order"
+        )
+    })
+}
+
 /// Whether a camera may see a marker so.
 fn is_possible(pose: &Transform3) -> bool {
-    is_in_view(pose.translation_m) && not_a_unit_because(pose.rotation_wxyz).is_none()
+    is_in_view(pose.translation_m)
+        && not_a_unit_because(pose.rotation_wxyz).is_none()
+        && turned_away_because(pose).is_none()
 }
 
 /// Whether a place in the camera frame, in metres, is in front of it and near enough for a marker.
@@ -272,7 +298,7 @@ mod tests {
         };
         // Single precision, and both signs of one rotation.
         let half = f64::from(0.5_f32.sqrt());
-        for unit in [[0.0, 1.0, 0.0, 0.0], [-half, half, 0.0, 0.0], [0.999, 0.0, 0.0, 0.0]] {
+        for unit in [[0.0, 1.0, 0.0, 0.0], [0.0, -half, half, 0.0], [0.0, 0.0, 0.999, 0.0]] {
             assert_eq!(refused(unit), None, "{unit:?}");
         }
         // A rotation vector in radians and in degrees, and twice a unit quaternion.
@@ -284,6 +310,66 @@ mod tests {
         ] {
             let why = refused(wrong).unwrap();
             assert!(why.contains("not a unit quaternion") && why.contains(length), "{why}");
+        }
+    }
+
+    /// A marker whose upper edge is turned clockwise in the image, and which is then tilted about the camera's x axis.
+    fn turned(heading_deg: f64, tilt_deg: f64) -> Rotation<Camera, Marker> {
+        let about = |x: f64, y: f64, z: f64| {
+            Rotation::<Camera, Camera>::from_rotation_vector(Vector::new(x, y, z))
+        };
+        let upright = Rotation::<Camera, Marker>::from_rotation_vector(Vector::new(
+            std::f64::consts::PI,
+            0.0,
+            0.0,
+        ));
+        about(tilt_deg.to_radians(), 0.0, 0.0) * about(0.0, 0.0, heading_deg.to_radians()) * upright
+    }
+
+    fn rotated(wxyz: [f64; 4]) -> Detection {
+        let mut detection = Detection::sample();
+        let pose = &mut detection.pose.as_mut().unwrap().camera_from_marker;
+        (pose.translation_m, pose.rotation_wxyz) = ([0.0, 0.0, 5.0], wxyz);
+        detection
+    }
+
+    #[test]
+    fn a_face_that_is_turned_away_from_the_camera_is_refused_with_the_likely_causes() {
+        let refused = |wxyz| impossible_because(&rotated(wxyz));
+        let about_x = Rotation::<Marker, Marker>::from_rotation_vector(Vector::new(
+            std::f64::consts::PI,
+            0.0,
+            0.0,
+        ));
+        for heading_deg in [-170.0, -90.0, -30.0, 0.0, 60.0, 90.0, 135.0] {
+            for tilt_deg in [-79.0, -45.0, 0.0, 30.0, 60.0, 79.0] {
+                let right = turned(heading_deg, tilt_deg);
+                assert_eq!(refused(right.wxyz()), None, "{heading_deg}, {tilt_deg}");
+                // AprilTag's own frame has z into the print.
+                let into_print = refused((right * about_x).wxyz()).unwrap_or_default();
+                assert!(into_print.contains("turned away from the camera"), "{into_print}");
+                assert!(into_print.contains("x, y, z, w"), "{into_print}");
+            }
+        }
+        let why = refused((turned(0.0, 30.0) * about_x).wxyz()).unwrap();
+        assert!(why.contains("150 degrees away") && why.contains("100 are allowed"), "{why}");
+        let [w, x, y, z] = turned(30.0, 0.0).wxyz();
+        assert!(refused([x, y, z, w]).unwrap().contains("150 degrees away"));
+    }
+
+    #[test]
+    fn noise_at_a_grazing_view_is_not_a_face_that_is_turned_away() {
+        for (tilt_deg, is_refused) in [(90.0, false), (99.9, false), (100.1, true)] {
+            let why = impossible_because(&rotated(turned(20.0, tilt_deg).wxyz()));
+            assert_eq!(why.is_some(), is_refused, "{tilt_deg}: {why:?}");
+        }
+        // Seen from the side, a face is turned away by less than its tilt, or by more.
+        for (x, is_refused) in [(-5.0, true), (5.0, false)] {
+            let about_y =
+                Rotation::<Camera, Camera>::from_rotation_vector(Vector::new(0.0, 1.2, 0.0));
+            let mut detection = rotated((about_y * turned(0.0, 0.0)).wxyz());
+            detection.pose.as_mut().unwrap().camera_from_marker.translation_m[0] = x;
+            assert_eq!(impossible_because(&detection).is_some(), is_refused, "{x}");
         }
     }
 
@@ -359,9 +445,14 @@ mod tests {
             pose.alternative =
                 Some(messages::AlternativePose { camera_from_marker, reprojection_rms_px: 0.1 });
             assert_eq!(marker_in_frame(&detection, mount).alternative.is_some(), is_taken, "{z}");
-            let other = detection.pose.as_mut().unwrap().alternative.as_mut().unwrap();
-            other.camera_from_marker.rotation_wxyz = [0.0, 3.0, 0.0, 0.0];
-            assert!(marker_in_frame(&detection, mount).alternative.is_none(), "{z}, no rotation");
+            for (wxyz, what) in
+                [([0.0, 3.0, 0.0, 0.0], "no rotation"), ([1.0, 0.0, 0.0, 0.0], "turned away")]
+            {
+                let other = detection.pose.as_mut().unwrap().alternative.as_mut().unwrap();
+                other.camera_from_marker.rotation_wxyz = wxyz;
+                assert!(marker_in_frame(&detection, mount).alternative.is_none(), "{z}, {what}");
+                assert_eq!(impossible_because(&detection), None, "the first solution is used");
+            }
         }
     }
 

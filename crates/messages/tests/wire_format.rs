@@ -30,6 +30,11 @@ fn transform() -> Transform3 {
     Transform3 { translation_m: [0.0, 0.0, 1.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] }
 }
 
+/// A marker a metre in front of a camera, facing it.
+fn facing() -> Transform3 {
+    Transform3 { rotation_wxyz: [0.0, 1.0, 0.0, 0.0], ..transform() }
+}
+
 /// The message reads back as it was, its encoding has the bytes it always had, and every damaged copy is
 /// refused.
 fn check<M: Message + PartialEq + std::fmt::Debug>(message: &M, golden: &str) {
@@ -92,11 +97,11 @@ fn detections() {
             wrong_bits: 1,
             confidence: 1.0,
             pose: Some(MarkerPose {
-                camera_from_marker: transform(),
+                camera_from_marker: facing(),
                 reprojection_rms_px: 0.5,
                 covariance: std::array::from_fn(|i| i as f32),
                 alternative: Some(AlternativePose {
-                    camera_from_marker: transform(),
+                    camera_from_marker: facing(),
                     reprojection_rms_px: 1.0,
                 }),
             }),
@@ -105,7 +110,7 @@ fn detections() {
     };
     check(
         &message,
-        "410303046d61696e04646f776eac0201016302900acc070000010572696e677300000000000000f03f00000000000000400000803f000000000000004000000000000000084001000000000000f03f0100000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000000000000000e03f000000000000803f0000004000004040000080400000a0400000c0400000e0400000004100001041000020410000304100004041000050410000604100007041000080410000884100009041000098410000a0410100000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000000000000000f03f01097468726573686f6c6407",
+        "410303046d61696e04646f776eac0201016302900acc070000010572696e677300000000000000f03f00000000000000400000803f000000000000004000000000000000084001000000000000f03f0100000000000000000000000000000000000000000000f03f0000000000000000000000000000f03f00000000000000000000000000000000000000000000e03f000000000000803f0000004000004040000080400000a0400000c0400000e0400000004100001041000020410000304100004041000050410000604100007041000080410000884100009041000098410000a0410100000000000000000000000000000000000000000000f03f0000000000000000000000000000f03f00000000000000000000000000000000000000000000f03f01097468726573686f6c6407",
     );
 }
 
@@ -727,10 +732,16 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
     let marker = Detection {
         family: "aruco-4x4-50".into(),
         id: Some(7),
-        centre_px: [100.0, 200.0],
+        // A marker of 0.15 m at the pose below, as that camera sees it.
+        centre_px: [874.75, 599.125],
         centre_covariance_px2: [0.25, 0.0, 0.25],
-        corners_px: Some([[90.0, 190.0], [110.0, 190.0], [110.0, 210.0], [90.0, 210.0]]),
-        size_px: 28.0,
+        corners_px: Some([
+            [840.75, 565.125],
+            [908.75, 565.125],
+            [908.75, 633.125],
+            [840.75, 633.125],
+        ]),
+        size_px: 96.0,
         wrong_bits: 0,
         confidence: 1.0,
         pose: Some(MarkerPose {
