@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
-use messages::{ControllerCommand, Detections, topic};
+use messages::{CameraInfo, ControllerCommand, Detections, topic};
 use node::{Identity, Node, ZenohSource};
 use testing::with_second_try;
 use tokio::time::timeout;
@@ -14,23 +14,28 @@ use crate::flight::{Landing, beside_another};
 
 /// Publishes the detections of `main` under its own name, and 1 m to the side once it is wrong.
 async fn publish(faulty: Node, is_wrong: Arc<AtomicBool>) -> anyhow::Result<()> {
+    let camera = faulty.subscriber(topic::CAMERA_INFO, &["down"]).await?;
+    let camera = camera.next().await.context("the camera's information")?;
     let seen = faulty.subscriber(topic::DETECTIONS, &["main"]).await?;
     let publisher = faulty.publisher(topic::DETECTIONS, &["faulty"]).await?;
     faulty.announce().await?;
     while let Some(mut message) = seen.next().await {
         message.detector = "faulty".into();
         if is_wrong.load(Ordering::Relaxed) {
-            shift(&mut message);
+            shift(&mut message, &camera);
         }
         publisher.publish(&message).await;
     }
     Ok(())
 }
 
-fn shift(message: &mut Detections) {
-    for pose in message.detections.iter_mut().filter_map(|seen| seen.pose.as_mut()) {
-        let [right_m, _, _] = &mut pose.camera_from_marker.translation_m;
-        *right_m += 1.0;
+/// Pose and centre agree, as those of a detector that takes something else for the marker.
+fn shift(message: &mut Detections, camera: &CameraInfo) {
+    for seen in &mut message.detections {
+        let Some(pose) = &mut seen.pose else { continue };
+        let place_m = &mut pose.camera_from_marker.translation_m;
+        place_m[0] += 1.0;
+        seen.centre_px = camera.pixel_of(*place_m).unwrap_or(seen.centre_px);
     }
 }
 

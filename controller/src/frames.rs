@@ -15,6 +15,7 @@ use crate::config::{Config, PreferredPlace};
 use crate::lateness::Lateness;
 use crate::namesakes::Namesakes;
 use crate::refusals::{Refusals, Warning};
+use crate::reprojection::Reprojections;
 use crate::selection::{Limits, MAX_DETECTORS, Preference, Selection};
 use crate::stamps::Stamps;
 use crate::wire;
@@ -44,6 +45,8 @@ pub struct Frames {
     stamps: Stamps,
     /// Their latencies.
     lateness: Lateness,
+    /// Whether their poses agree with the pixels of their markers.
+    reprojections: Reprojections,
     /// The programs that publish as one detector.
     namesakes: Namesakes,
     /// The newest frame of each detector, to be used when it becomes the active one.
@@ -95,6 +98,7 @@ impl Frames {
             announced: Announced::default(),
             stamps: Stamps::default(),
             lateness: Lateness::new(config.target.max_latency_s),
+            reprojections: Reprojections::default(),
             namesakes: Namesakes::default(),
             newest: BTreeMap::new(),
             cameras: Cameras::default(),
@@ -115,6 +119,7 @@ impl Frames {
             self.camera_watch.ended(detector);
             self.stamps.ended(detector);
             self.lateness.ended(detector);
+            self.reprojections.ended(detector);
         }
     }
 
@@ -176,15 +181,18 @@ impl Frames {
         self.stamps.searched(now_ns, publisher, header);
         self.lateness.searched(now_ns, publisher, header.stamp_ns);
         let wanted = message.first_of(&self.marker);
-        let why = wire::impossible_frame_because(header);
-        if let Some(why) = why.or_else(|| wanted.and_then(wire::impossible_because)) {
+        let published = self.cameras.others(&header.camera);
+        let camera = self.cameras.of_frame(now_ns, &header.camera);
+        let reprojections = &mut self.reprojections;
+        let why = wire::impossible_frame_because(header)
+            .or_else(|| wanted.and_then(wire::impossible_because))
+            .or_else(|| reprojections.disagreement(publisher, wanted?, header, camera));
+        if let Some(why) = why {
             self.refusals.add_of(now_ns, "impossible-marker", publisher, || {
                 format!("detections of `{publisher}` are refused: {why}")
             });
             return Arrival::Refused("impossible-marker");
         }
-        let published = self.cameras.others(&header.camera);
-        let camera = self.cameras.of_frame(now_ns, &header.camera);
         let mount = camera.and_then(wire::body_from_camera);
         if mount.is_none() && message.detections.iter().any(|detection| detection.pose.is_some()) {
             self.refusals.add(now_ns, "unknown-camera", || {

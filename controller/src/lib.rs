@@ -6,7 +6,7 @@
 //!
 //! Modules in reading order: [`config`] has the settings; [`service`] joins network and link to the
 //! [`flight`] with its [`tape`], an event loop over [`frames`] (detections in, the lander's next frame out, with [`selection`]
-//! of the detector by health and [`agreement`], the markers that they have [`announced`], the [`stamps`] that they pass on, their [`lateness`], the [`namesakes`] among them, the [`cameras`], and the [`refusals`] that persist; [`unreadable`] ones are counted before), [`mount`] (warnings of a camera that is not as configured), [`mission`]
+//! of the detector by health and [`agreement`], the markers that they have [`announced`], the [`stamps`] that they pass on, their [`lateness`], the [`reprojection`] of their poses, the [`namesakes`] among them, the [`cameras`], and the [`refusals`] that persist; [`unreadable`] ones are counted before), [`mount`] (warnings of a camera that is not as configured), [`mission`]
 //! (when a landing begins), [`setpoints`] (the lander's actions to the autopilot), [`control`] (takes a PX4 into OFFBOARD) and [`offboard_watch`] (leads it out again), [`landing_target`] (the
 //! other way to land, by the autopilot's own precision landing), [`limits`] (the autopilot's parameters for
 //! setpoints), [`link_delay`] (the delay of the link), [`alarms`] and [`wind`]; [`status`] is published, [`journal`] logs and
@@ -36,6 +36,7 @@ pub mod note_file;
 pub mod offboard_watch;
 pub mod pad_note;
 pub mod refusals;
+pub mod reprojection;
 pub mod selection;
 pub mod service;
 pub mod setpoints;

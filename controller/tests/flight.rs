@@ -22,7 +22,8 @@ use messages::{
 use node::{HealthCounters, Identity, clock_name};
 use packets::{
     MS, Sent, attitude, config, contact, flight, flight_counting, flight_with, header, heartbeat,
-    hover, in_flight, in_flight_with, pose, pose_at, position, receive, receive_from, seen, sent,
+    hover, in_flight, in_flight_with, move_to, pose, pose_at, position, receive, receive_from,
+    seen, sent,
 };
 
 #[test]
@@ -405,8 +406,7 @@ fn no_landing_target_is_sent_while_two_detectors_see_the_marker_at_two_places() 
             if ms % 60 == 0 {
                 for (name, lie_m) in [("main", 0.0), ("other", lie_m)] {
                     let mut seen = Detections { detector: name.into(), ..seen(ms * MS - 40 * MS) };
-                    let pose = seen.detections[0].pose.as_mut().unwrap();
-                    pose.camera_from_marker.translation_m = [lie_m, 0.0, 5.0];
+                    move_to(&mut seen, [lie_m, 0.0, 5.0]);
                     flight.detections(ms * MS + 2, name, &seen);
                 }
             }
@@ -684,7 +684,9 @@ fn a_detector_with_an_impossible_marker_is_refused_reported_and_passed_over() {
     fn pose_of(detection: &mut Detection) -> &mut MarkerPose {
         detection.pose.as_mut().unwrap()
     }
-    let changes: [(&str, Change); 9] = [
+    let changes: [(&str, Change); 11] = [
+        ("not its inverse", |it| pose_of(it).camera_from_marker.translation_m[0] = -0.2),
+        ("turned away", |it| pose_of(it).camera_from_marker.rotation_wxyz = [1.0, 0.0, 0.0, 0.0]),
         ("-5.000", |it| pose_of(it).camera_from_marker.translation_m = [0.0, 0.0, -5.0]),
         ("1000000000.000", |it| pose_of(it).camera_from_marker.translation_m = [0.0, 0.0, 1e9]),
         ("`pose.translation_m`", |it| pose_of(it).camera_from_marker.translation_m[0] = f64::NAN),
@@ -891,8 +893,7 @@ fn while_two_detectors_see_the_marker_at_two_places_nothing_descends_near_the_gr
             if ms % 60 == 0 {
                 for (name, lie_m) in [("main", 0.0), ("other", lie_m)] {
                     let mut seen = Detections { detector: name.into(), ..seen(ms * MS - 40 * MS) };
-                    let pose = seen.detections[0].pose.as_mut().unwrap();
-                    pose.camera_from_marker.translation_m = [lie_m, 0.0, f64::from(height_m)];
+                    move_to(&mut seen, [lie_m, 0.0, f64::from(height_m)]);
                     flight.detections(ms * MS + 2, name, &seen);
                 }
             }
@@ -929,9 +930,7 @@ fn a_marker_of_another_size_than_configured_is_reported_and_holds() {
             pose_at(&mut flight, ms * MS, height_at(ms));
             if ms % 60 == 0 {
                 let mut seen = seen(ms * MS - 40 * MS);
-                let pose = seen.detections[0].pose.as_mut().unwrap();
-                let depth_m = f64::from(height_at(ms - 40)) / size;
-                pose.camera_from_marker.translation_m = [0.0, 0.0, depth_m];
+                move_to(&mut seen, [0.0, 0.0, f64::from(height_at(ms - 40)) / size]);
                 flight.detections(ms * MS + 2, "main", &seen);
             }
             flight.tick(ms * MS + 3);
@@ -965,8 +964,7 @@ fn a_landing_on_a_marker_that_was_seen_to_be_of_another_size_does_not_descend() 
         pose_at(&mut flight, ms * MS, height_at(ms));
         if ms % 60 == 0 {
             let mut seen = seen(ms * MS - 40 * MS);
-            let pose = seen.detections[0].pose.as_mut().unwrap();
-            pose.camera_from_marker.translation_m = [0.0, 0.0, f64::from(height_at(ms - 40)) / 2.0];
+            move_to(&mut seen, [0.0, 0.0, f64::from(height_at(ms - 40)) / 2.0]);
             flight.detections(ms * MS + 2, "main", &seen);
         }
         flight.tick(ms * MS + 3);
@@ -997,10 +995,11 @@ fn a_detector_with_another_first_corner_counts_where_the_vehicle_turns_to_the_pa
                     [("main", [0.0, 1.0, 0.0, 0.0]), ("other", [0.0, quarter, quarter, 0.0])]
                 {
                     let mut seen = Detections { detector: name.into(), ..seen(ms * MS - 40 * MS) };
+                    move_to(&mut seen, [0.0, 0.0, 2.0]);
                     let found = &mut seen.detections[0];
                     (found.family, found.id) = ("aruco-4x4-50".into(), Some(7));
                     let pose = &mut found.pose.as_mut().unwrap().camera_from_marker;
-                    (pose.translation_m, pose.rotation_wxyz) = ([0.0, 0.0, 2.0], rotation_wxyz);
+                    pose.rotation_wxyz = rotation_wxyz;
                     flight.detections(ms * MS + 2, name, &seen);
                 }
             }

@@ -13,7 +13,7 @@ use autopilot::dialect::{
 use autopilot::{Parser, Sender};
 use controller::Config;
 use controller::flight::Flight;
-use messages::{Detections, FrameHeader};
+use messages::{CameraInfo, Detections, FrameHeader};
 use node::{HealthCounters, Layers, clock_name};
 
 pub(crate) const MS: i64 = 1_000_000;
@@ -139,6 +139,17 @@ pub(crate) fn header(stamp_ns: i64) -> FrameHeader {
 /// A frame in which the marker lies 5 m below a camera at the body's origin.
 pub(crate) fn seen(stamp_ns: i64) -> Detections {
     Detections { header: header(stamp_ns), ..Detections::sample() }
+}
+
+/// Moves the marker of a frame to a place in the camera's frame, in metres, and its centre to where the camera shows it.
+pub(crate) fn move_to(seen: &mut Detections, place_m: [f64; 3]) {
+    let shown = CameraInfo::sample().pixel_of(place_m);
+    for (found, centre_px) in seen.detections.iter_mut().zip(shown) {
+        found.centre_px = centre_px;
+        if let Some(pose) = &mut found.pose {
+            pose.camera_from_marker.translation_m = place_m;
+        }
+    }
 }
 
 /// Hovers in view of the marker in a mode of the autopilot.

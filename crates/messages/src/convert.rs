@@ -83,6 +83,14 @@ impl CameraInfo {
     }
 }
 
+impl CameraInfo {
+    /// The pixel at which the camera shows a place in its frame, in metres; `None` for a camera without a [`CameraInfo::model`] and for a
+    /// place that [`CameraModel::project`] does not show.
+    pub fn pixel_of(&self, [x, y, z]: [f64; 3]) -> Option<[f64; 2]> {
+        self.model()?.project(Point::new(x, y, z)).map(|pixel| [pixel.x, pixel.y])
+    }
+}
+
 impl From<imaging::BayerPattern> for BayerPattern {
     fn from(pattern: imaging::BayerPattern) -> Self {
         use imaging::BayerPattern as Raw;
@@ -176,6 +184,15 @@ mod tests {
         for focal_px in [None, Some([1.0, f64::INFINITY]), Some([0.0, 1.0])] {
             assert_eq!(CameraInfo { focal_px, ..CameraInfo::sample() }.model(), None);
         }
+    }
+
+    #[test]
+    fn the_sample_marker_is_where_the_sample_camera_shows_it() {
+        let place_m = MarkerPose::sample().camera_from_marker.translation_m;
+        let [x, y] = CameraInfo::sample().pixel_of(place_m).unwrap();
+        let [u, v] = crate::Detection::sample().centre_px;
+        assert!((x - u).hypot(y - v) < 0.5, "({x}, {y})");
+        assert_eq!(CameraInfo::sample().pixel_of([0.0, 0.0, -1.0]), None);
     }
 
     #[test]

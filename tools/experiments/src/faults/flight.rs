@@ -403,12 +403,14 @@ impl<'a> FaultyFlight<'a> {
             } else {
                 Behaviour::Correct
             };
-            let payload = messages::encode(&faulty_detector(&arrival.message, behaviour));
+            let payload =
+                messages::encode(&faulty_detector(&arrival.message, self.vision.info(), behaviour));
             self.faulty_detections.put(arrival.at_s, payload, &Trouble::default());
         }
         if self.is_on(Kind::Crowd) {
             for (number, name) in self.crowd.iter().enumerate() {
-                let message: Detections = unknown_detector(&arrival.message, name, number);
+                let camera = self.vision.info();
+                let message: Detections = unknown_detector(&arrival.message, camera, name, number);
                 self.controller.detections(name, messages::encode(&message));
             }
         }

@@ -28,29 +28,42 @@ pub enum Behaviour {
 }
 
 /// The message of the faulty preferred detector, from a correct one.
-pub fn faulty_detector(correct: &Detections, behaviour: Behaviour) -> Detections {
+pub fn faulty_detector(
+    correct: &Detections,
+    camera: &CameraInfo,
+    behaviour: Behaviour,
+) -> Detections {
     let mut message = Detections { detector: FAULTY_DETECTOR.to_owned(), ..correct.clone() };
     match behaviour {
         Behaviour::Correct => {}
-        Behaviour::Jumps => shift(&mut message, OFFSET_M),
-        Behaviour::Drifts(for_s) => shift(&mut message, (DRIFT_M_S * for_s).min(OFFSET_M)),
+        Behaviour::Jumps => shift(&mut message, camera, OFFSET_M),
+        Behaviour::Drifts(for_s) => {
+            shift(&mut message, camera, (DRIFT_M_S * for_s).min(OFFSET_M));
+        }
         Behaviour::Blind => message.detections.clear(),
     }
     message
 }
 
 /// The message of one of many unknown detectors.
-pub fn unknown_detector(correct: &Detections, name: &str, number: usize) -> Detections {
+pub fn unknown_detector(
+    correct: &Detections,
+    camera: &CameraInfo,
+    name: &str,
+    number: usize,
+) -> Detections {
     let mut message = Detections { detector: name.to_owned(), ..correct.clone() };
-    shift(&mut message, if number.is_multiple_of(2) { UNKNOWN_M } else { -UNKNOWN_M });
+    shift(&mut message, camera, if number.is_multiple_of(2) { UNKNOWN_M } else { -UNKNOWN_M });
     message
 }
 
-/// Moves the marker in the picture's plane.
-fn shift(message: &mut Detections, metres: f64) {
+/// Moves the marker in the picture's plane, and its centre with it: a pose that does not agree with its pixel is refused.
+fn shift(message: &mut Detections, camera: &CameraInfo, metres: f64) {
     for detection in &mut message.detections {
         if let Some(pose) = &mut detection.pose {
-            pose.camera_from_marker.translation_m[0] += metres;
+            let place_m = &mut pose.camera_from_marker.translation_m;
+            place_m[0] += metres;
+            detection.centre_px = camera.pixel_of(*place_m).unwrap_or(detection.centre_px);
         }
     }
 }
