@@ -162,18 +162,23 @@ pub fn marker_in_frame(
             .and_then(|pose| pose.alternative.as_ref())
             .filter(|other| is_possible(&other.camera_from_marker))
             .and_then(|other| in_body(&other.camera_from_marker)),
-        covariance_m2: mount.zip(pose).map(|(mount, pose)| covariance_in_body(&mount, pose)),
+        covariance_m2: mount.zip(pose).and_then(|(mount, pose)| covariance_in_body(&mount, pose)),
         size_px: Some(detection.size_px),
         confidence: detection.confidence,
     }
 }
 
-/// Covariance of a marker's position, rotated from the camera's axes to the body's.
-fn covariance_in_body(mount: &Transform<Body, Camera>, pose: &MarkerPose) -> Matrix3<f64> {
+/// Covariance of a marker's position, rotated from the camera's axes to the body's; `None` where the detector states none: zeros are an
+/// unknown covariance, as no position is certain.
+fn covariance_in_body(mount: &Transform<Body, Camera>, pose: &MarkerPose) -> Option<Matrix3<f64>> {
+    let in_camera = pose.translation_covariance_m2();
+    if in_camera.iter().all(|element| *element == 0.0) {
+        return None;
+    }
     let axis = |x, y, z| (mount.rotation() * Vector::<Camera>::new(x, y, z)).coords;
     let turn =
         Matrix3::from_columns(&[axis(1.0, 0.0, 0.0), axis(0.0, 1.0, 0.0), axis(0.0, 0.0, 1.0)]);
-    turn * pose.translation_covariance_m2() * turn.transpose()
+    Some(turn * in_camera * turn.transpose())
 }
 
 /// The lander's phase as it is sent.
@@ -431,6 +436,24 @@ mod tests {
             let why = impossible_because(&detection).unwrap_or_default();
             assert!(why.contains("`pose.covariance` is not that of a position"), "{why}");
             assert!(why.contains(&format!("{value:e}")), "{why}");
+        }
+    }
+
+    #[test]
+    fn zeros_are_an_unknown_covariance() {
+        let mount = body_from_camera(&CameraInfo::sample());
+        for (covariance, is_known) in [
+            (MarkerPose::sample().covariance, true),
+            ([0.0; 21], false),
+            // That of the rotation alone.
+            (std::array::from_fn(|i| if i == 15 { 1.0 } else { 0.0 }), false),
+        ] {
+            let mut detection = Detection::sample();
+            detection.pose.as_mut().unwrap().covariance = covariance;
+            assert_eq!(impossible_because(&detection), None);
+            let marker = marker_in_frame(&detection, mount);
+            assert_eq!(marker.covariance_m2.is_some(), is_known, "{covariance:?}");
+            assert!(marker.body_from_marker.is_some());
         }
     }
 
