@@ -24,6 +24,9 @@ use crate::wire;
 /// nanoseconds.
 const UNUSABLE_NS: i64 = 1_000_000_000;
 
+/// Distance of a stamp from now beyond which it is of another clock, in seconds: no delay and no drift of a clock is as long.
+const OTHER_CLOCK_S: f64 = 60.0;
+
 /// Time for which a detector must give no pose before it is reported, in seconds: at a start its first frames come before the calibration,
 /// which camera-pub repeats each second.
 const NO_POSE_AFTER_S: f64 = 2.0;
@@ -171,9 +174,15 @@ impl Frames {
         let max_s = self.max_future_s;
         if ahead_s > max_s {
             return self.refuse(now_ns, "from-the-future", || {
+                let camera = &header.camera;
+                if ahead_s > OTHER_CLOCK_S {
+                    let days = ahead_s / 86_400.0;
+                    return format!(
+                        "detections of `{publisher}` are refused: the stamps of camera `{camera}` lie {days:.1} days in the future, as those of another clock, for example the time of day; stamp frames with this host's monotonic clock (`time.monotonic_ns()` in Python), or copy the frame's header unchanged"
+                    );
+                }
                 format!(
-                    "detections of `{publisher}` are refused: the stamps of camera `{}` lie {ahead_s:.2} s in the future, and {max_s} s are allowed; stamp frames with this host's monotonic clock, or set `target.max_future_s` higher",
-                    header.camera
+                    "detections of `{publisher}` are refused: the stamps of camera `{camera}` lie {ahead_s:.2} s in the future, and {max_s} s are allowed; stamp frames with this host's monotonic clock, or set `target.max_future_s` higher"
                 )
             });
         }

@@ -14,6 +14,9 @@ const MAX_SAMPLES: usize = 9;
 /// Relative change of the latency from which on the warning has a new number, so that its text does not change with every frame.
 const MIN_CHANGE: f64 = 0.2;
 
+/// Latency beyond which no search is so slow, in seconds.
+const STALE_S: f64 = 10.0;
+
 /// The latencies of detectors, by detector: at most [`MAX_DETECTORS`].
 #[derive(Debug)]
 pub struct Lateness {
@@ -57,10 +60,16 @@ impl Lateness {
     /// The warning that this detector's frames are too late, where that persists.
     pub fn too_late(&self, now_ns: i64, detector: &str) -> Option<String> {
         let latencies = self.detectors.get(detector).filter(|it| it.is_lasting(now_ns))?;
+        let max_ms = self.max_latency_s * 1e3;
+        let remedy = match latencies.stated_s {
+            late_s if late_s > STALE_S => {
+                "it may publish one old frame's detections again and again, or give stamps of another clock; search the newest frame only, and copy its header unchanged"
+            }
+            _ => "search the newest frame only, with fewer pixels or a faster program",
+        };
         Some(format!(
-            "detections of `{detector}` come {:.0} ms after their frames; at most {:.0} ms are used (`target.max_latency_s`)",
-            latencies.stated_s * 1e3,
-            self.max_latency_s * 1e3
+            "detections of `{detector}` come {:.0} ms after their frames, and at most {max_ms:.0} ms are used (`target.max_latency_s`); {remedy}",
+            latencies.stated_s * 1e3
         ))
     }
 
@@ -129,7 +138,7 @@ mod tests {
         let texts = warned(&mut lateness, |i| 515 + i % 3);
         let first = texts.iter().position(|it| !it.is_empty());
         assert_eq!(first, Some(30), "after two seconds");
-        let text = "detections of `mine` come 515 ms after their frames; at most 500 ms are used (`target.max_latency_s`)";
+        let text = "detections of `mine` come 515 ms after their frames, and at most 500 ms are used (`target.max_latency_s`); search the newest frame only, with fewer pixels or a faster program";
         for texts in &texts[30..] {
             assert_eq!(texts, &[text], "the number stays");
         }
@@ -137,6 +146,16 @@ mod tests {
         assert_eq!(lateness.warnings(end_ns + 1600 * MS).count(), 0, "they have ended");
         lateness.ended("mine");
         assert_eq!(lateness.warnings(end_ns).count(), 0);
+    }
+
+    #[test]
+    fn an_old_frame_or_another_clock_is_named_where_no_search_is_so_slow() {
+        let texts = warned(&mut Lateness::new(0.5), |i| 40_000 + 67 * i);
+        let last = texts.last().and_then(|it| it.first()).cloned().unwrap_or_default();
+        assert!(
+            last.contains("one old frame's detections") && last.contains("another clock"),
+            "{last}"
+        );
     }
 
     #[test]

@@ -120,8 +120,8 @@ impl Reprojection {
         let ([u, v], Pixel { x: seen_x, y: seen_y }) = (detection.centre_px, self.seen);
         format!(
             "the marker's pose and its centre disagree: camera `{}` shows the translation ({x:.3}, {y:.3}, {z:.3}) m at pixel ({seen_x:.0}, {seen_y:.0}), `centre_px` is \
-             ({u:.0}, {v:.0}), {:.0} px apart, and {:.0} px are allowed; the pose must be that of the marker in the camera's frame, not its inverse, in metres to the \
-             right, down and forward, and the centre in pixels of the frame",
+             ({u:.0}, {v:.0}), {:.0} px apart, and {:.0} px are allowed; publish the pose of the marker in the camera's frame, not its inverse, in metres to the right, down and forward, and \
+             the centre in pixels of the frame",
             header.camera, self.apart_px, self.allowed_px
         )
     }

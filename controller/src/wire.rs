@@ -81,8 +81,8 @@ fn turned_away_because(pose: &Transform3) -> Option<String> {
     (turned_deg > MAX_TURNED_DEG).then(|| {
         format!(
             "the marker's face would be turned away from the camera: its normal, the marker's z axis, points {turned_deg:.0} degrees away from the direction to the \
-             camera, and {MAX_TURNED_DEG} are allowed; the rotation may be AprilTag's own, with z into the print (multiply it by diag(1, -1, -1) from the right), a \
-             quaternion in the order x, y, z, w, or from corners in counter-clockwise order"
+             camera, and {MAX_TURNED_DEG} are allowed; check its rotation, which may be AprilTag's own, with z into the print (multiply it by diag(1, -1, -1) from the \
+             right), a quaternion in the order x, y, z, w, or from corners in counter-clockwise order"
         )
     })
 }

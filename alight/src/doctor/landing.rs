@@ -10,6 +10,13 @@ const START_ONE: &str = "start one (`alight up`, `alight detector`); the output 
 /// The consequence of a warning of the controller.
 const UNTIL_THEN: &str =
     "until then a landing may not be started or finished, or ends further from the marker";
+/// The remedy of a warning that has none of its own.
+const SEE_TABLE: &str = "see `alight detectors`, the log of the program that it names, and the table of symptoms in docs/detectors.md";
+/// The first words of the remedies in the controller's warnings, which follow a semicolon or a colon.
+const FIRST_WORDS: [&str; 19] = [
+    "check", "copy", "correct", "give", "look", "measure", "name", "publish", "restart", "run",
+    "say", "search", "see", "set", "stamp", "start", "stop", "use", "write",
+];
 
 /// Checks the controller: its phase, the autopilot's link, its warnings and the detector that it uses.
 pub(super) fn check(findings: &mut Findings, seen: &Seen) {
@@ -38,8 +45,12 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen) {
         ),
     }
     for warning in &status.warnings {
-        let remedy = is_obstacle(status, warning).then(|| UNTIL_THEN.to_owned());
-        let finding = warning.clone();
+        let (finding, remedy) = finding_and_remedy(warning);
+        let remedy = match is_obstacle(status, warning) {
+            true => Some(format!("{}; {UNTIL_THEN}", remedy.unwrap_or(SEE_TABLE))),
+            false => remedy.map(str::to_owned),
+        };
+        let finding = finding.to_owned();
         findings.findings.push(Finding {
             verdict: Verdict::Wrong,
             about: "controller",
@@ -48,6 +59,20 @@ pub(super) fn check(findings: &mut Findings, seen: &Seen) {
         });
     }
     check_used(findings, seen, status);
+}
+
+/// A warning of the controller, and the remedy at its end.
+fn finding_and_remedy(warning: &str) -> (&str, Option<&str>) {
+    let is_remedy = |text: &str| {
+        let word = text.split(|c: char| !c.is_ascii_alphabetic()).next().unwrap_or_default();
+        FIRST_WORDS.contains(&word)
+    };
+    let ends = warning.match_indices("; ").chain(warning.match_indices(": ")).map(|(at, _)| at);
+    let split = ends.filter(|at| warning.get(at + 2..).is_some_and(is_remedy)).min();
+    match split.and_then(|at| Some((warning.get(..at)?, warning.get(at + 2..)?))) {
+        Some((finding, remedy)) => (finding, Some(remedy)),
+        None => (warning, None),
+    }
 }
 
 /// Whether a warning of the controller concerns a landing that is still to be started or finished.
@@ -137,6 +162,44 @@ mod tests {
             let text = findings_text(warning, finished);
             assert!(text.contains(&format!("WRONG  controller    {warning}")), "{text}");
             assert_eq!(text.contains("until then a landing"), is_obstacle, "{text}");
+        }
+    }
+
+    #[test]
+    fn the_remedy_of_a_warning_is_that_at_its_end() {
+        for (warning, finding, remedy) in [
+            (
+                "detections of `mine` are refused: the stamps lie 0.3 s in the future; stamp frames with this host's clock, or set `x`: higher",
+                "detections of `mine` are refused: the stamps lie 0.3 s in the future",
+                Some("stamp frames with this host's clock, or set `x`: higher"),
+            ),
+            (
+                "no frame from camera `down` for 3 s: check the camera, and whether its detector hangs",
+                "no frame from camera `down` for 3 s",
+                Some("check the camera, and whether its detector hangs"),
+            ),
+            (
+                "detector `mine` is not used: 2 others see the marker 1.00 m from where it does",
+                "detector `mine` is not used: 2 others see the marker 1.00 m from where it does",
+                None,
+            ),
+            (
+                "the battery is checked; setpoints stop",
+                "the battery is checked; setpoints stop",
+                None,
+            ),
+            ("", "", None),
+        ] {
+            assert_eq!(finding_and_remedy(warning), (finding, remedy));
+            let status = ControllerStatus {
+                warnings: vec![warning.to_owned()],
+                ..ControllerStatus::default()
+            };
+            let mut findings = Findings::default();
+            check(&mut findings, &Seen { status: Some(status), ..Seen::default() });
+            let text = findings.text();
+            let line = format!("{:22}{}; until then a landing", "->", remedy.unwrap_or(SEE_TABLE));
+            assert!(text.contains(&line), "{text}");
         }
     }
 
