@@ -149,6 +149,55 @@ fn the_inner_rings_are_enough_where_the_lens_model_ends() {
     }
 }
 
+/// The controller refuses a pose that the camera shows elsewhere than at the marker's centre, from 5 px on, and one with a face that is
+/// turned away. All over the image, through any lens, both are far from that.
+#[test]
+fn a_pose_faces_the_camera_which_shows_it_at_the_markers_centre() {
+    let of = |focal_px, distortion| CameraModel {
+        distortion,
+        ..CameraModel::pinhole(648, 486, focal_px)
+    };
+    let barrel = Distortion::BrownConrady([-0.28, 0.07, 2e-4, 2e-5, 0.0, 0.0, 0.0, 0.0]);
+    let fisheye = Distortion::KannalaBrandt([0.01, -0.008, 0.002, -0.0005]);
+    let marker = format!("rings:{SIZE_M}").parse().unwrap();
+    let mut detector = Detector::new(&[marker], Settings::default()).unwrap();
+    for (name, camera) in [
+        ("pinhole", of(909.0, Distortion::None)),
+        ("barrel", of(909.0, barrel)),
+        ("fisheye", of(204.0, fisheye)),
+    ] {
+        let (mut found, mut apart_px, mut turned_rad) = (0, 0.0_f64, 0.0_f64);
+        for k in 0..16 {
+            let at = |size: u32, share: f64| (0.04 + 0.92 * share.fract()) * f64::from(size);
+            let pixel = geometry::Pixel::new(
+                at(camera.width, 0.618_034 * f64::from(k)),
+                at(camera.height, 0.414_214 * f64::from(k)),
+            );
+            let Some(ray) = camera.unproject(pixel) else { continue };
+            let range_m = [1.0, 2.0, 5.0][k as usize % 3] * camera.fx / 1818.0;
+            let place = ray.coords * (range_m / ray.norm());
+            let scene = Scene::new(camera, place.into(), 0.3 * f64::from(k % 5), f64::from(k));
+            let image = scene.render();
+            let seen = detector.detect(image.view().unwrap(), Some(&camera), &mut ());
+            for marker in seen {
+                let pose = marker.pose.unwrap();
+                let others = pose.alternative.map(|other| other.camera_from_marker);
+                for pose in [Some(pose.camera_from_marker), others].into_iter().flatten() {
+                    let to_camera = -pose.origin().coords.coords;
+                    turned_rad = turned_rad.max(normal(&pose).angle(&to_camera));
+                }
+                let shown = camera.project(pose.camera_from_marker.origin()).unwrap();
+                apart_px = apart_px.max(shown.distance(&marker.centre));
+                found += 1;
+            }
+        }
+        let turned_deg = turned_rad.to_degrees();
+        println!("{name}: {found} found, up to {apart_px:.3} px apart, {turned_deg:.1} degrees");
+        assert!(found >= 6, "{name}: {found}");
+        assert!(apart_px < 1.0 && turned_deg < 90.0, "{name}: {apart_px} px, {turned_deg}");
+    }
+}
+
 #[test]
 fn to_the_letter_the_marker_is_found_sometimes_and_near() {
     let rows = table("rings-thesis", CameraModel::pinhole(1296, 972, 1818.0));
