@@ -169,6 +169,7 @@ impl Flight {
         self.handle_autopilot_events(now_ns);
         self.frames.tick(now_ns);
         self.use_newest(now_ns);
+        self.send_predicted_target(now_ns);
         self.follow_warnings(now_ns);
         if self.is_landing() {
             let is_fresh = self.frames.age_s(now_ns) <= self.config.detectors.max_age_s;
@@ -395,13 +396,36 @@ impl Flight {
         }
     }
 
+    /// Continues the autopilot's landing on the estimate where our own guidance would continue without the marker.
+    fn send_predicted_target(&mut self, now_ns: i64) {
+        let metric = &self.config.metric;
+        let max_age_s = metric.stale_target_s + metric.blind_s;
+        let target = self.decision.and_then(|decision| decision.target).filter(|target| {
+            target.height_m <= metric.blind_height_m
+                && target.deviation_m <= metric.blind_deviation_m
+                && target.age_s <= max_age_s
+        });
+        let may_send =
+            self.landing_target.is_some() && self.may_send_target() && self.is_state_fresh(now_ns);
+        if let Some(target) = target.filter(|_| may_send)
+            && let Some(landing_target) = &mut self.landing_target
+            && landing_target.send_predicted(now_ns, &target, &mut self.autopilot)
+        {
+            self.journal.count("predicted landing targets");
+        }
+    }
+
+    /// Low in the autopilot's landing a target that our own guidance would not trust is sent all the same: it continues to the ground.
+    fn may_send_target(&self) -> bool {
+        let lands = self.landing_target.as_ref().is_some_and(LandingTargetMode::is_landing);
+        self.view().distrust().is_none() || lands && !self.lander.may_recall()
+    }
+
     fn send_landing_target(&mut self, now_ns: i64, frame: &FrameObservation) {
         let target = self.decision.and_then(|decision| decision.target);
-        let is_trusted = self.view().distrust().is_none();
-        let is_low = !self.lander.may_recall();
-        // Low in the autopilot's landing it continues to the ground all the same.
+        let may_send = self.may_send_target();
         if let Some(landing_target) = &mut self.landing_target
-            && (is_trusted || is_low && landing_target.is_landing())
+            && may_send
             && landing_target.send(now_ns, frame, target, &mut self.autopilot)
         {
             self.journal.count("landing targets");

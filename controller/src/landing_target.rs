@@ -1,8 +1,8 @@
 //! Lands by the autopilot's own precision landing: a LANDING_TARGET of the marker's place in the body's frame for each frame used, a
 //! request for LAND (PRECISION LAND on PX4), and the way back from it on an abort.
 //!
-//! No setpoint is sent, but zeros to a PX4 that hovers in OFFBOARD, as after a take-off. Every frame that was used
-//! gives the autopilot a landing target; the pilot, a mission or our own start changes to LAND (PRECISION LAND on
+//! No setpoint is sent, but to a PX4 that hovers in OFFBOARD, as after a take-off. Every frame that was used
+//! gives the autopilot a landing target, and so does the estimate for some seconds near the ground; the pilot, a mission or our own start changes to LAND (PRECISION LAND on
 //! PX4), and the autopilot does the rest.
 
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, Parameter};
@@ -21,6 +21,9 @@ const MAVLINK: f64 = 1.0;
 /// Maximum gap between two landing targets, in nanoseconds; after a longer one ArduPilot starts a new
 /// estimate.
 const MAX_GAP_NS: i64 = 500_000_000;
+/// Time after a landing target after which the estimated one follows, in nanoseconds: several within the half second after which PX4, close to
+/// the ground, and ArduPilot count the target as lost.
+const PREDICTION_NS: i64 = 200_000_000;
 /// Time in which a mode that was asked for until then may still show, in nanoseconds: LAND after an abort, the mode in which it hovers
 /// after that was withdrawn. Heartbeats come each second, and one may be lost.
 const MAX_LATE_MODE_NS: i64 = 2_500_000_000;
@@ -35,6 +38,8 @@ pub struct LandingTargetMode {
     /// Timeout for the marker, in seconds.
     timeout_s: f64,
     stream: Option<Stream>,
+    /// The marker was not in the frames before the last landing target, which was the estimated one.
+    is_predicted: bool,
     state: State,
     /// The landing began with a PX4 that holds its place. Where it did not, HOLD is a pilot's choice.
     from_hold: bool,
@@ -85,7 +90,14 @@ pub struct Situation {
 impl LandingTargetMode {
     /// A mode in which nothing was sent yet; a landing that begins waits `timeout_s` for the marker.
     pub fn new(settings: LandingTargetSettings, timeout_s: f64) -> Self {
-        Self { settings, timeout_s, stream: None, state: State::Idle, from_hold: false }
+        Self {
+            settings,
+            timeout_s,
+            stream: None,
+            is_predicted: false,
+            state: State::Idle,
+            from_hold: false,
+        }
     }
 
     /// Sends the landing target of a frame that was used; false when there is nothing to send.
@@ -108,11 +120,38 @@ impl LandingTargetMode {
             }
         };
         let is_sent = autopilot.send_landing_target(stamp.nanos(), in_body, target.position);
+        self.sent(now_ns, is_sent, false);
+        is_sent
+    }
+
+    /// Sends the estimated landing target while the autopilot lands and no frame has shown the marker for a while; false when none is due. A
+    /// PX4 whose target has been silent for `PLD_BTOUT` climbs to search, also just after it has touched down: close to the ground the
+    /// marker may fill the image, or leave it.
+    pub fn send_predicted(
+        &mut self,
+        now_ns: i64,
+        target: &TargetEstimate,
+        autopilot: &mut Autopilot,
+    ) -> bool {
+        let is_due =
+            self.stream.is_some_and(|it| now_ns.saturating_sub(it.last_ns) >= PREDICTION_NS);
+        let lands = matches!(self.state, State::Landing | State::LeftToLand(..));
+        let vehicle = autopilot.state().and_then(wire::vehicle).filter(|_| is_due && lands);
+        let Some(vehicle) = vehicle else { return false };
+        let offset = vehicle.ned_from_body.inverse() * (target.position - vehicle.position);
+        let in_body = Point::origin() + offset;
+        let is_sent =
+            autopilot.send_landing_target(vehicle.stamp.nanos(), in_body, target.position);
+        self.sent(now_ns, is_sent, true);
+        is_sent
+    }
+
+    fn sent(&mut self, now_ns: i64, is_sent: bool, is_predicted: bool) {
         if is_sent {
             let first_ns = self.active_stream(now_ns).map_or(now_ns, |stream| stream.first_ns);
             self.stream = Some(Stream { first_ns, last_ns: now_ns });
+            self.is_predicted = is_predicted;
         }
-        is_sent
     }
 
     /// Begins a landing, perhaps of a PX4 that holds its place: LAND is requested once the autopilot has had the target long
@@ -279,6 +318,9 @@ impl LandingTargetMode {
     /// The phase and the reason for it; `problem` is the reason for which the autopilot cannot use landing targets.
     pub fn phase(&self, now_ns: i64, problem: Option<String>) -> (Phase, String) {
         let target = match self.active_stream(now_ns) {
+            Some(_) if self.is_predicted => {
+                "the marker is not seen, sending its estimated position"
+            }
             Some(_) => "sending the landing target",
             None => "no landing target to send",
         };

@@ -572,6 +572,39 @@ fn low_over_the_ground_the_autopilot_is_not_taken_back_from_its_precision_landin
     assert!(status.why.contains("aborted by the operator"), "{}", status.why);
 }
 
+/// A PX4 whose target is silent for 5 s climbs to search, also when it has just touched down.
+#[test]
+fn the_autopilot_gets_the_estimated_target_for_some_seconds_where_it_lands_low_without_the_marker()
+{
+    for (firmware, mode, land) in [("ardupilot", 4, 9), ("px4", 0x0006_0000, 0x0904_0000)] {
+        let mut flight = flight_with("airborne", &["mode=landing-target"]);
+        flight.camera(0, CameraInfo::sample());
+        flight.presence(0, "main", true);
+        receive(&mut flight, 0, &heartbeat(mode, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        parameter(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
+        parameter(&mut flight, 2 * MS, "PLND_TYPE", 1.0);
+        hover(&mut flight, 1000, 5980, mode);
+        let seen = hover(&mut flight, 6000, 7000, land).targets;
+        let high = sent_at(&mut flight, land, (7000, 8400), (5.0, 2.4));
+        assert!(high.targets.is_empty(), "{firmware}: {high:?}");
+        let low = sent_at(&mut flight, land, (8400, 9400), (2.4, 0.4));
+        assert!((3..=6).contains(&low.targets.len()), "{firmware}: {low:?}");
+        let why = flight.status(9400 * MS).why;
+        assert!(why.contains("the marker is not seen"), "{firmware}: {why}");
+        // Where it was seen last, from 2 m lower.
+        let (first, last) = (seen.last().unwrap(), low.targets.last().unwrap());
+        let sunk_m = if land == 9 { 4.4 } else { 0.0 };
+        let apart_m = [last.x - first.x, last.y - first.y, last.z + sunk_m - first.z];
+        assert!(apart_m.iter().all(|it| it.abs() < 0.2), "{firmware}: {first:?}, {last:?}");
+        // As long as the estimate is certain.
+        let standing = sent_at(&mut flight, land, (9400, 14_000), (0.4, 0.4));
+        assert!((7..20).contains(&standing.targets.len()), "{firmware}: {standing:?}");
+        let late = sent_at(&mut flight, land, (14_000, 16_000), (0.4, 0.4));
+        assert!(late.targets.is_empty() && late.setpoints == 0, "{firmware}: {late:?}");
+    }
+}
+
 #[test]
 fn a_vehicle_that_follows_a_late_recall_climbs_also_where_it_has_become_low() {
     let mut flight = in_flight("airborne");
