@@ -18,7 +18,7 @@ const MAX_STATE_WAIT_S: f64 = 2.0;
 /// sent once a second, and one may be lost. A fall from 3 m lasts 0.8 s: then the vehicle is still on the ground when it is received.
 const MAX_REPORT_S: f64 = 2.3;
 
-/// The same for a vehicle that was faster than any landing, in seconds. Its autopilot may disarm late: PX4 5 s after its kill switch
+/// The same for a vehicle that was faster than any landing, or fell freely, in seconds. Its autopilot may disarm late: PX4 5 s after its kill switch
 /// (COM_KILL_DISARM), ArduPilot 2 s after its crash check has found it at rest.
 const MAX_LATE_REPORT_S: f64 = 10.0;
 
@@ -33,12 +33,19 @@ const MAX_POSITION_ERROR_M: f64 = 0.3;
 const MIN_FALL_M_S: f64 = 1.5;
 const MIN_FALL_FACTOR: f64 = 1.5;
 
+/// Time in which a vehicle that falls freely shows it, in seconds, and the smallest parts of gravity, and of the way that its velocities make, that
+/// count. It is the fall from 0.45 m. No wind and no landing accelerates a vehicle down as fast for as long; an estimate's velocity
+/// that jumps shows in no position.
+const FREE_FALL_S: f64 = 0.3;
+const MIN_FREE_FALL: f64 = 0.75;
+const MIN_FALLEN: f64 = 0.6;
+
 /// When the vehicle fell last. The states of that time may be forgotten when its motors are reported as off.
 #[derive(Copy, Clone, Debug, Default)]
 pub(super) struct LastFall {
     /// When it sank faster than a vehicle that touches down.
     sank_at: Option<Timestamp>,
-    /// When it sank faster than any LAND.
+    /// When it sank faster than any LAND, or fell freely.
     fast_at: Option<Timestamp>,
 }
 
@@ -69,9 +76,21 @@ impl Lander {
             self.last_fall.sank_at = Some(state.stamp);
         }
         let fallen_m_s = before.and_then(|before| fallen_m_s(before, state)).unwrap_or(down_m_s);
-        if libm::fmax(down_m_s, fallen_m_s) > MAX_LAND_M_S + heave_m_s {
+        let is_fast = libm::fmax(down_m_s, fallen_m_s) > MAX_LAND_M_S + heave_m_s;
+        if is_fast || self.falls_freely(state) {
             self.last_fall.fast_at = Some(state.stamp);
         }
+    }
+
+    /// Whether the vehicle has fallen freely up to its newest state.
+    fn falls_freely(&self, state: &VehicleState) -> bool {
+        let earlier = self.history.at(state.stamp.plus_seconds(-FREE_FALL_S));
+        let (Some(earlier), Some(position)) = (earlier, self.position()) else { return false };
+        let [before_m_s, down_m_s] = [earlier.velocity.z(), state.velocity.z()];
+        let sunk_m = position.z() - earlier.odometry.z();
+        down_m_s > MIN_FALL_M_S
+            && down_m_s - before_m_s >= MIN_FREE_FALL * GRAVITY_M_S2 * FREE_FALL_S
+            && sunk_m >= MIN_FALLEN * 0.5 * (before_m_s + down_m_s) * FREE_FALL_S
     }
 
     /// Whether the vehicle is certainly in the air, although its motors are off: it falls, or, where its autopilot does not report the ground,
