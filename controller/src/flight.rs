@@ -71,6 +71,7 @@ pub struct Flight {
     ticked_ns: Option<i64>,
     /// The mode that ended the last landing as the pilot's.
     pilots_mode: Option<FlightMode>,
+    chosen_mode: Option<FlightMode>,
 }
 
 impl Flight {
@@ -120,6 +121,7 @@ impl Flight {
             empty_since_ns: None,
             ticked_ns: None,
             pilots_mode: None,
+            chosen_mode: None,
             config,
         })
     }
@@ -575,6 +577,7 @@ impl Flight {
             setpoint: self.setpoints.last(),
             leads_out: self.leads_out(),
             pilots_mode: self.pilots_mode,
+            chosen_mode: self.chosen_mode,
             used: self.used,
             wind_ned_m_s: self.wind.velocity_m_s(self.config.autopilot.drag()),
         }
@@ -809,7 +812,13 @@ impl Flight {
             self.journal.phase_changed(before, &decision);
             if decision.phase == Phase::PilotInCommand {
                 self.pilots_mode = self.autopilot.state().map(|state| state.mode);
+                self.chosen_mode = None;
             }
+        }
+        // The report may follow the heartbeat that shows the mode.
+        if decision.phase == Phase::PilotInCommand {
+            let chosen = self.pilots_mode.and_then(|mode| self.autopilot.chosen_mode_in(mode));
+            self.chosen_mode = self.chosen_mode.or(chosen);
         }
         // A LAND that was lost on the way must not be repeated after the pilot took over, nor GUIDED on the ground.
         if decision.phase != before || was_recalling && !self.lander.is_recalling() {

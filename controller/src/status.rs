@@ -46,6 +46,8 @@ pub struct View<'a> {
     pub leads_out: bool,
     /// The mode that ended the landing as the pilot's; the vehicle may show another one since.
     pub pilots_mode: Option<FlightMode>,
+    /// The mode that was chosen as the vehicle flew in that one, where it reports it.
+    pub chosen_mode: Option<FlightMode>,
     /// The detections that were used.
     pub used: Used,
     /// Wind velocity to the north and east, in m/s.
@@ -263,12 +265,16 @@ impl View<'_> {
         if let Some(hovers) = self.hovers_after_abort(now_ns) {
             return format!("{why}; {hovers}");
         }
-        match self.pilots_mode {
-            // It may as well be the autopilot's failsafe: when PX4 misses setpoints it holds.
-            Some(mode) if self.lander.phase() == landing::Phase::PilotInCommand => {
-                format!("{why} (or the autopilot's failsafe), in {mode}")
-            }
-            _ => why,
+        let mode =
+            self.pilots_mode.filter(|_| self.lander.phase() == landing::Phase::PilotInCommand);
+        match (mode, self.chosen_mode) {
+            (None, _) => why,
+            (Some(mode), Some(chosen)) if chosen == mode => format!("{why}, in {mode}"),
+            (Some(mode), Some(chosen)) => format!(
+                "a failsafe of the autopilot flies the vehicle, in {mode}: {chosen} is the mode that was chosen"
+            ),
+            // It may as well be a failsafe: when PX4 misses setpoints it holds.
+            (Some(mode), None) => format!("{why} (or the autopilot's failsafe), in {mode}"),
         }
     }
 

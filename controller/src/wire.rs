@@ -1,7 +1,7 @@
 //! Converts between messages, the autopilot's types and the lander's: detections by the camera's mount into
 //! the body frame, covariances, phases, vehicle state and status.
 
-use autopilot::VehicleState;
+use autopilot::{FlightMode, VehicleState};
 use geometry::{Body, Camera, Marker, Pixel, Point, Rotation, Transform, Vector};
 use landing::{Landed, MarkerInFrame, Mode, Timestamp, VehicleStatus};
 use messages::{CameraInfo, Detection, FrameHeader, MarkerPose, Phase, Transform3};
@@ -227,6 +227,8 @@ pub fn vehicle_status(state: &VehicleState) -> VehicleStatus {
             _ if !state.connected => Mode::Unknown,
             mode if mode.is_guided() => Mode::Guided,
             mode if mode.is_landing() => Mode::Land,
+            // The motors are stopped; it is no mode that a pilot chooses to fly in.
+            FlightMode::TERMINATION => Mode::Unknown,
             _ => Mode::Other,
         },
         armed: state.armed,

@@ -8,7 +8,7 @@ mod packets;
 use autopilot::FlightMode;
 use autopilot::dialect::{
     CURRENT_MODE_DATA, ESTIMATOR_STATUS_DATA, EstimatorStatusFlags, GLOBAL_POSITION_INT_DATA,
-    HEARTBEAT_DATA, MavCmd, MavLandedState, MavMessage, MavState,
+    HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA, MavCmd, MavLandedState, MavMessage, MavState,
 };
 use controller::flight::Flight;
 use messages::{CameraInfo, ControllerCommand, Phase};
@@ -895,6 +895,88 @@ fn a_pilot_who_chooses_hold_in_a_failsafe_keeps_it_in_whatever_order_packets_are
             assert_eq!(status.phase, Phase::PilotInCommand, "{order}: {status:?}");
             // For half a second at most, which HOLD ignores.
             assert!(sent.setpoints <= 12 && sent.modes.is_empty(), "{order}: {sent:?}");
+        }
+    }
+}
+
+/// The kill switch disarms 5 s later, flight termination never; the vehicle falls from 1 m, and the ground is reported.
+#[test]
+fn a_px4_whose_motors_are_killed_in_the_air_has_not_landed() {
+    const TERMINATION: u32 = 10 << 16;
+    let killed = |mode| match heartbeat(mode, true) {
+        MavMessage::HEARTBEAT(heartbeat) => MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+            system_status: MavState::MAV_STATE_FLIGHT_TERMINATION,
+            ..heartbeat
+        }),
+        other => other,
+    };
+    for (name, report, shown) in [
+        ("kill switch", killed(OFFBOARD), OFFBOARD),
+        ("termination", killed(TERMINATION), TERMINATION),
+        ("termination by CURRENT_MODE", chosen_mode(TERMINATION, OFFBOARD), TERMINATION),
+    ] {
+        let mut flight = px4_landing();
+        hover(&mut flight, 2000, 3000, OFFBOARD);
+        let mut sent = Sent::default();
+        let (mut height_m, mut sinks_m_s) = (1.0_f32, 0.0_f32);
+        for ms in (3000..9000).step_by(20) {
+            sinks_m_s = if height_m > 0.0 { sinks_m_s + 0.02 * 9.8 } else { 0.0 };
+            height_m = (height_m - 0.02 * sinks_m_s).max(0.0);
+            receive(&mut flight, ms * MS, &packets::attitude(ms * MS));
+            let MavMessage::LOCAL_POSITION_NED(position) = packets::position(ms * MS, height_m)
+            else {
+                unreachable!()
+            };
+            let falls = MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
+                vz: sinks_m_s,
+                ..position
+            });
+            receive(&mut flight, ms * MS + 1, &falls);
+            if ms == 3100 {
+                receive(&mut flight, ms * MS + 1, &report);
+            }
+            if ms > 3600 && ms % 200 == 0 {
+                let ground = contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND);
+                receive(&mut flight, ms * MS + 1, &ground);
+            }
+            if ms >= 4000 && ms % 1000 == 0 {
+                receive(&mut flight, ms * MS + 1, &killed(shown));
+            }
+            flight.tick(ms * MS + 3);
+            if ms == 3200 {
+                sent.take(&mut flight);
+                sent = Sent::default();
+            }
+        }
+        sent.take(&mut flight);
+        let status = flight.status(9000 * MS);
+        assert_eq!(status.phase, Phase::Aborted, "{name}: {status:?}");
+        assert!(status.why.contains("stopped (disarmed) in the air"), "{name}: {status:?}");
+        assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{name}: {sent:?}");
+    }
+}
+
+#[test]
+fn a_failsafe_that_flies_another_mode_than_hold_is_reported_as_one() {
+    const RETURN: u32 = 0x0504_0000;
+    for (chosen, expected) in [
+        (OFFBOARD, "a failsafe of the autopilot flies the vehicle, in PX4 RETURN"),
+        (RETURN, "the pilot flies, in PX4 RETURN"),
+    ] {
+        // The report of both modes comes before the heartbeat, or after it.
+        for shows_first in [false, true] {
+            let mut flight = px4_landing();
+            let reports = [heartbeat(RETURN, true), chosen_mode(RETURN, chosen)];
+            let order = if shows_first { [0, 1] } else { [1, 0] };
+            for (i, index) in order.into_iter().enumerate() {
+                receive(&mut flight, (2000 + 40 * i as i64) * MS, &reports[index]);
+                flight.tick((2010 + 40 * i as i64) * MS);
+            }
+            let sent = hover(&mut flight, 2100, 4000, RETURN);
+            assert!(sent.setpoints == 0 && sent.modes.is_empty(), "{sent:?}");
+            let status = flight.status(4000 * MS);
+            assert_eq!(status.phase, Phase::PilotInCommand, "{status:?}");
+            assert!(status.why.contains(expected), "{status:?}");
         }
     }
 }

@@ -422,6 +422,12 @@ impl Autopilot {
         self.offboard_return.is_expected(now_ns)
     }
 
+    /// The mode that was chosen, where a PX4 reported it last as it flew in this one (CURRENT_MODE, since 1.15): another one than that is a
+    /// failsafe's.
+    pub fn chosen_mode_in(&self, flown: FlightMode) -> Option<FlightMode> {
+        self.offboard_return.chosen_in(flown)
+    }
+
     /// When a setpoint was sent last, a zero or another.
     pub fn setpoint_sent_ns(&self) -> Option<i64> {
         self.setpoints.last_ns()

@@ -108,6 +108,8 @@ impl FlightMode {
     pub const AUTO_LAND: Self = Self::Px4(0x0604_0000);
     /// PX4 lands on a landing target (main mode 4, sub mode 9).
     pub const AUTO_PRECLAND: Self = Self::Px4(0x0904_0000);
+    /// PX4 has stopped its motors for good, by a failsafe or a command (main mode 10).
+    pub const TERMINATION: Self = Self::Px4(10 << 16);
 
     /// True when the autopilot follows setpoints.
     pub fn is_guided(self) -> bool {
@@ -205,6 +207,7 @@ fn px4_name(number: u32) -> Option<&'static str> {
         (5, _) => "ACRO",
         (6, _) => "OFFBOARD",
         (7, _) => "STABILIZED",
+        (10, _) => "TERMINATION",
         _ => return None,
     })
 }
@@ -222,6 +225,7 @@ mod tests {
             (Firmware::Copter, 99, "mode 99"),
             (Firmware::Px4, 6 << 16, "PX4 OFFBOARD"),
             (Firmware::Px4, 0x0604_0000, "PX4 LAND"),
+            (Firmware::Px4, 10 << 16, "PX4 TERMINATION"),
             (Firmware::OtherArduPilot, 4, "mode 4"),
         ] {
             let mode = FlightMode::of(firmware, number);

@@ -91,6 +91,11 @@ impl OffboardReturn {
         }
     }
 
+    /// The mode that was chosen, where this one was reported last as the one in which the vehicle flies.
+    pub(crate) fn chosen_in(&self, flown: FlightMode) -> Option<FlightMode> {
+        self.report.filter(|report| report.flown == flown).map(|report| report.chosen)
+    }
+
     /// The vehicle shows another mode than before; `is_failsafe`: its heartbeat states that a failsafe is active.
     pub(crate) fn mode_changed(
         &mut self,

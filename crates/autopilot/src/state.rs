@@ -90,7 +90,7 @@ pub struct VehicleState {
     pub range: Option<Range>,
     /// The flight mode.
     pub mode: FlightMode,
-    /// Whether the motors are armed.
+    /// Whether the motors are armed, and not stopped by PX4's kill switch or flight termination.
     pub armed: bool,
     /// Contact with the ground, as far as its reports are believed: those that contradict a flight are not.
     pub landed: LandedState,

@@ -20,6 +20,15 @@ const OVERTAKEN_NS: i64 = 300_000_000;
 /// CURRENT_MODE's number of a chosen mode that the autopilot does not state.
 const NOT_SUPPLIED: u32 = 0;
 
+/// Whether a heartbeat reports motors that are armed. Those of a PX4 that its kill switch or its flight termination has stopped stay armed, for
+/// 5 s (`COM_KILL_DISARM`) or for ever; its heartbeat shows the stop (`streams/HEARTBEAT.hpp`).
+fn runs(firmware: Firmware, heartbeat: &HEARTBEAT_DATA) -> bool {
+    let is_killed = firmware == Firmware::Px4
+        && (heartbeat.system_status == MavState::MAV_STATE_FLIGHT_TERMINATION
+            || FlightMode::of(firmware, heartbeat.custom_mode) == FlightMode::TERMINATION);
+    heartbeat.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED) && !is_killed
+}
+
 impl Autopilot {
     pub(super) fn take_heartbeat(&mut self, now_ns: i64, system: u8, heartbeat: &HEARTBEAT_DATA) {
         if self.config.system_id.is_some_and(|pinned| pinned != system) {
@@ -84,8 +93,8 @@ impl Autopilot {
 
     fn follow_heartbeat(&mut self, now_ns: i64, heartbeat: &HEARTBEAT_DATA) {
         let Some(vehicle) = &mut self.vehicle else { return };
+        let armed = runs(vehicle.firmware, heartbeat);
         let state = &mut vehicle.state;
-        let armed = heartbeat.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
         vehicle.heartbeat_ns = now_ns;
         vehicle.simulation.take_mode(heartbeat.base_mode);
         vehicle.received_ns = now_ns;
@@ -129,8 +138,15 @@ impl Autopilot {
             self.offboard_return.reported(now_ns, to, chosen);
         }
         let is_changed = self.take_mode(now_ns, number, false);
+        let mut is_killed = false;
         if is_changed && let Some(vehicle) = &mut self.vehicle {
             vehicle.mode_before = Some((before, now_ns));
+            // The heartbeat that reports it follows up to a second later.
+            let state = &mut vehicle.state;
+            is_killed = to == FlightMode::TERMINATION && std::mem::take(&mut state.armed);
+        }
+        if is_killed {
+            self.push(Event::ArmedChanged(false));
         }
         if is_changed || was_expected != self.offboard_return.is_expected(now_ns) {
             self.report_status();
