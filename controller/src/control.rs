@@ -5,6 +5,7 @@
 //! OFFBOARD. (A HOLD that is the failsafe of OFFBOARD ends with them.) A start that is given up is followed by an [`autopilot::OffboardExit`].
 
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode};
+use geometry::{Ned, Vector};
 
 /// Time within which a PX4 must have changed to OFFBOARD, in nanoseconds: its heartbeat comes once a second, and a request is
 /// sent four times.
@@ -73,11 +74,16 @@ impl TakingControl {
     }
 }
 
-/// Keeps a PX4 where it is that is in OFFBOARD while nothing steers it: without setpoints it would leave the mode. One whose HOLD may be
-/// the failsafe for setpoints that were missing returns with them.
-pub fn hover_in_offboard(now_ns: i64, autopilot: &mut Autopilot) {
-    if autopilot.is_in_offboard() || autopilot.may_return_to_offboard(now_ns) {
-        autopilot.send_zeros(now_ns);
+/// Whether a PX4 is in OFFBOARD, or shows a HOLD that may be the failsafe for setpoints that were missing: it returns with them.
+pub fn needs_setpoints(now_ns: i64, autopilot: &Autopilot) -> bool {
+    autopilot.is_in_offboard() || autopilot.may_return_to_offboard(now_ns)
+}
+
+/// Keeps a PX4 where it is that is in OFFBOARD while nothing steers it: without setpoints it would leave the mode, and with zeros it would drift
+/// with the error of its own velocity. `back` is the velocity that leads it back to where it waits, in m/s.
+pub fn hover_in_offboard(now_ns: i64, back: Vector<Ned>, autopilot: &mut Autopilot) {
+    if needs_setpoints(now_ns, autopilot) {
+        autopilot.send_hover(now_ns, back);
     }
 }
 

@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use autopilot::dialect::{MavMessage, MavType};
 use autopilot::{Autopilot, Event, FlightMode, LISTENING, LandedState, MIN_STANDSTILL_NS, Packet};
+use geometry::{Ned, Vector};
 use landing::{
     Action, Alarm, AlarmAction, Decision, Event as LanderEvent, FrameObservation, Lander,
     MAX_STANDSTILL_S, OperatorCommand, Phase, Reason, Timestamp,
@@ -24,13 +25,13 @@ use node::HealthCounters;
 use crate::alarms::{self, Alarms};
 use crate::cameras::Reception;
 use crate::config::{Config, Mode, Start};
-use crate::control::is_holding_px4;
+use crate::control::{is_holding_px4, needs_setpoints};
 use crate::frames::{Arrival, Frames};
 use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode, Situation};
 use crate::limits::{Limits, Note};
 use crate::link_delay::LinkDelay;
-use crate::mission::{Mission, Trigger, is_flying_guided};
+use crate::mission::{Conditions, Mission, Trigger, is_flying_guided};
 use crate::offboard_watch::OffboardWatch;
 use crate::pad_note::{PadNote, PadNotes};
 use crate::setpoints::Setpoints;
@@ -69,7 +70,7 @@ pub struct Flight {
     empty_since_ns: Option<i64>,
     /// The time of the last tick.
     ticked_ns: Option<i64>,
-    /// The mode that ended the last landing as the pilot's.
+    /// The mode that ended the last landing as the pilot's, and the one that was chosen then, where the vehicle reports that.
     pilots_mode: Option<FlightMode>,
     chosen_mode: Option<FlightMode>,
 }
@@ -617,7 +618,9 @@ impl Flight {
 
     fn advance_mission(&mut self, now_ns: i64) {
         let may_recall = self.lander.may_recall();
+        let back = self.back_to_wait(now_ns);
         let situation = Situation {
+            back,
             may_recall,
             distrust: self.view().distrust(),
             is_flying: self.lander.is_flying(),
@@ -656,9 +659,13 @@ impl Flight {
             (None, None) if is_fresh => self.frames.obstacle(now_ns),
             (None, None) => Some("waiting for attitude and position".to_owned()),
         };
-        let steers = self.landing_target.is_none();
-        let obstacle = obstacle.as_deref();
-        let trigger = self.mission.step(now_ns, &mut self.autopilot, is_fresh, obstacle, steers);
+        let conditions = Conditions {
+            is_fresh,
+            obstacle: obstacle.as_deref(),
+            steers: self.landing_target.is_none(),
+            back,
+        };
+        let trigger = self.mission.step(now_ns, &mut self.autopilot, conditions);
         let Some(trigger) = trigger else { return };
         if trigger == Trigger::LandsHere {
             if let Err(why) = self.begin_here(now_ns) {
@@ -694,6 +701,14 @@ impl Flight {
             }
             _ => {}
         }
+    }
+
+    /// The velocity that leads a PX4 that waits for its landing in OFFBOARD back to where it waits.
+    fn back_to_wait(&mut self, now_ns: i64) -> Vector<Ned> {
+        if self.mission.is_landing() || !needs_setpoints(now_ns, &self.autopilot) {
+            return Vector::zero();
+        }
+        self.lander.back_to_wait(Timestamp::from_nanos(now_ns))
     }
 
     /// Whether attitude and position of the vehicle are as new as the lander requires.

@@ -6,7 +6,7 @@
 //! PX4), and the autopilot does the rest.
 
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, Parameter};
-use geometry::Point;
+use geometry::{Ned, Point, Vector};
 use landing::{FrameObservation, Reason, TargetEstimate};
 use messages::Phase;
 
@@ -85,6 +85,8 @@ pub struct Situation {
     pub is_flying: bool,
     /// Its motors have just stopped, and its state is too old to show whether that was in the air.
     pub is_awaiting_state: bool,
+    /// The velocity that leads a PX4 back to where it waits in OFFBOARD, in m/s.
+    pub back: Vector<Ned>,
 }
 
 impl LandingTargetMode {
@@ -163,7 +165,7 @@ impl LandingTargetMode {
 
     /// Follows what the autopilot does; true when it has just begun to land, by any request.
     pub fn step(&mut self, now_ns: i64, situation: Situation, autopilot: &mut Autopilot) -> bool {
-        let Situation { may_recall, distrust, is_flying, is_awaiting_state } = situation;
+        let Situation { may_recall, distrust, is_flying, is_awaiting_state, back } = situation;
         let Some(state) = autopilot.state().copied() else { return false };
         let lands = state.armed && state.mode.is_landing();
         match self.state.clone() {
@@ -209,7 +211,7 @@ impl LandingTargetMode {
                     && state.armed
                     && autopilot.may_return_to_offboard(now_ns) =>
             {
-                hover_in_offboard(now_ns, autopilot);
+                hover_in_offboard(now_ns, back, autopilot);
                 autopilot.withdraw();
                 self.state = State::Stabilising(now_ns);
             }
@@ -220,11 +222,11 @@ impl LandingTargetMode {
                 self.state = State::Ended(format!("the pilot flies, in {}", state.mode));
             }
             State::Stabilising(since_ns) => {
-                hover_in_offboard(now_ns, autopilot);
+                hover_in_offboard(now_ns, back, autopilot);
                 self.command_when_steady(now_ns, since_ns, distrust, autopilot);
             }
             State::Commanding(request) => {
-                hover_in_offboard(now_ns, autopilot);
+                hover_in_offboard(now_ns, back, autopilot);
                 if let CommandStatus::Failed(problem) = autopilot.status(request) {
                     self.state = State::Ended(problem.to_string());
                 }

@@ -6,6 +6,7 @@ use autopilot::{
     TakeoffError, TakeoffProgress,
 };
 
+use geometry::{Ned, Vector};
 use landing::OperatorCommand;
 
 use crate::config::Start;
@@ -107,6 +108,19 @@ pub enum Trigger {
     LandsHere,
     /// The vehicle was found in LAND instead: the end of a landing that an earlier controller began.
     LandInsteadOfTakeoff,
+}
+
+/// The conditions for a landing to begin.
+#[derive(Copy, Clone, Debug)]
+pub struct Conditions<'a> {
+    /// Attitude and position of the vehicle are as new as the lander requires.
+    pub is_fresh: bool,
+    /// Why no landing can begin now, such as a vehicle's state that is not fresh.
+    pub obstacle: Option<&'a str>,
+    /// Our setpoints control the landing.
+    pub steers: bool,
+    /// The velocity that leads a PX4 back to where it waits in OFFBOARD, in m/s.
+    pub back: Vector<Ned>,
 }
 
 impl Mission {
@@ -303,7 +317,7 @@ impl Mission {
         is_fresh: bool,
     ) -> Option<Trigger> {
         let State::AskingForLand { request } = self.state else { return None };
-        hover_in_offboard(now_ns, autopilot);
+        hover_in_offboard(now_ns, Vector::zero(), autopilot);
         let state = autopilot.state()?;
         let end = match (state.armed, state.mode) {
             (false, _) => "the motors were stopped".to_owned(),
@@ -491,16 +505,14 @@ impl Mission {
         self.state = State::Failed { why };
     }
 
-    /// Advances take-off and waiting; the trigger when a landing is to begin. An `obstacle` is why none can begin now, such
-    /// as a vehicle's state that is not fresh; `steers`: our setpoints control the landing.
+    /// Advances take-off and waiting; the trigger when a landing is to begin.
     pub fn step(
         &mut self,
         now_ns: i64,
         autopilot: &mut Autopilot,
-        is_fresh: bool,
-        obstacle: Option<&str>,
-        steers: bool,
+        conditions: Conditions<'_>,
     ) -> Option<Trigger> {
+        let Conditions { is_fresh, obstacle, steers, back } = conditions;
         let is_known = obstacle.is_none();
         if let Some(until_ns) = self.goes_on_until_ns {
             let armed = autopilot.state().filter(|state| state.armed);
@@ -527,7 +539,7 @@ impl Mission {
                     return Some(Trigger::InFlight);
                 }
                 if self.start == Start::Resume {
-                    self.await_landing(now_ns, autopilot);
+                    self.await_landing(now_ns, autopilot, back);
                 }
                 None
             }
@@ -546,7 +558,7 @@ impl Mission {
                         if let Some(obstacle) = obstacle {
                             *waits_in_air = true;
                             obstacle.clone_into(why);
-                            hover_in_offboard(now_ns, autopilot);
+                            hover_in_offboard(now_ns, back, autopilot);
                             if let Some(end) = end_of_waiting(autopilot) {
                                 let why = format!("{end} while the landing waited: {obstacle}");
                                 tracing::error!("No landing after the take-off: {why}");
@@ -585,10 +597,10 @@ impl Mission {
         }
     }
 
-    /// Ends the wait for a landing to resume where there is none. A PX4 gets zeros for a while: it has stopped in HOLD as the earlier
-    /// controller ended, returns to OFFBOARD with them, and stays in it until the landing begins. While that waits for a command the zeros
+    /// Ends the wait for a landing to resume where there is none. A PX4 gets setpoints for a while: it has stopped in HOLD as the earlier
+    /// controller ended, returns to OFFBOARD with them, and stays in it until the landing begins. While that waits for a command they
     /// continue: the failsafe for missing setpoints could not be distinguished from a pilot's choice later.
-    fn await_landing(&mut self, now_ns: i64, autopilot: &mut Autopilot) {
+    fn await_landing(&mut self, now_ns: i64, autopilot: &mut Autopilot, back: Vector<Ned>) {
         if autopilot.state().is_none() {
             return;
         }
@@ -596,7 +608,7 @@ impl Mission {
         let may_return = autopilot.may_return_to_offboard(now_ns);
         let is_in_time = now_ns.saturating_sub(found_ns) <= MAX_RESUMING_NS;
         if is_in_time || self.held_because.is_some() {
-            hover_in_offboard(now_ns, autopilot);
+            hover_in_offboard(now_ns, back, autopilot);
         }
         if let Some(why) = no_landing_because(autopilot).filter(|_| !may_return) {
             let kept = self.when_resumed.take();

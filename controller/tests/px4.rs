@@ -899,6 +899,46 @@ fn a_pilot_who_chooses_hold_in_a_failsafe_keeps_it_in_whatever_order_packets_are
     }
 }
 
+/// A PX4 holds a velocity as it estimates it.
+#[test]
+fn a_px4_that_waits_for_its_landing_in_offboard_is_led_back_to_where_it_waits() {
+    let waiting = [("command", "mode=landing-target"), ("resume", "clock=\"elsewhere\"")];
+    for (start, set) in waiting {
+        let mut flight = flight_with(start, &[set]);
+        receive(&mut flight, 0, &heartbeat(OFFBOARD, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        hover(&mut flight, 20, 1000, OFFBOARD);
+        if start == "command" {
+            assert!(flight.command(1010 * MS, &ControllerCommand::Start).accepted);
+        }
+        let mut sent = Sent::default();
+        let drift = |flight: &mut Flight, sent: &mut Sent, ms: i64, north_m: f32| {
+            if ms % 500 == 0 {
+                receive(flight, ms * MS, &heartbeat(OFFBOARD, true));
+            }
+            receive(flight, ms * MS, &packets::attitude(ms * MS));
+            let MavMessage::LOCAL_POSITION_NED(position) = packets::position(ms * MS, 5.0) else {
+                unreachable!()
+            };
+            let position = LOCAL_POSITION_NED_DATA { x: north_m, ..position };
+            receive(flight, ms * MS + 1, &MavMessage::LOCAL_POSITION_NED(position));
+            flight.tick(ms * MS + 3);
+            sent.take(flight);
+        };
+        for ms in (1020..4000).step_by(20) {
+            drift(&mut flight, &mut sent, ms, 0.0);
+        }
+        assert_eq!(sent.velocity_m_s, [0.0; 3], "{start}");
+        for ms in (4000..8000).step_by(20) {
+            drift(&mut flight, &mut sent, ms, 0.25e-3 * (ms - 4000) as f32);
+        }
+        let [north_m_s, east_m_s, down_m_s] = sent.velocity_m_s;
+        assert!((-0.6..-0.4).contains(&north_m_s), "{start}: {sent:?}");
+        assert!(east_m_s.abs() < 0.01 && down_m_s == 0.0, "{start}: {sent:?}");
+        assert!(sent.setpoints > 100, "{start}: {}", sent.setpoints);
+    }
+}
+
 /// The kill switch disarms 5 s later, flight termination never; the vehicle falls from 1 m, and the ground is reported.
 #[test]
 fn a_px4_whose_motors_are_killed_in_the_air_has_not_landed() {

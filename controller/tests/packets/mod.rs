@@ -172,6 +172,8 @@ pub(crate) fn hover(flight: &mut Flight, from_ms: i64, to_ms: i64, mode: u32) ->
 #[derive(Debug, Default)]
 pub(crate) struct Sent {
     pub(crate) setpoints: usize,
+    /// The velocity of the last one, in m/s.
+    pub(crate) velocity_m_s: [f32; 3],
     pub(crate) targets: Vec<LANDING_TARGET_DATA>,
     pub(crate) modes: Vec<f32>,
     pub(crate) requested: Vec<String>,
@@ -182,7 +184,10 @@ impl Sent {
         while let Some(packet) = flight.poll_outgoing() {
             for packet in Parser::new().push(&packet) {
                 match packet.message {
-                    Some(MavMessage::SET_POSITION_TARGET_LOCAL_NED(_)) => self.setpoints += 1,
+                    Some(MavMessage::SET_POSITION_TARGET_LOCAL_NED(setpoint)) => {
+                        self.setpoints += 1;
+                        self.velocity_m_s = [setpoint.vx, setpoint.vy, setpoint.vz];
+                    }
                     Some(MavMessage::LANDING_TARGET(target)) => self.targets.push(target),
                     Some(MavMessage::COMMAND_LONG(c))
                         if c.command == MavCmd::MAV_CMD_DO_SET_MODE =>

@@ -441,7 +441,13 @@ impl Autopilot {
     /// Sends setpoints of zero velocity until the next call, a tick later: before OFFBOARD, and until it shows whether a PX4 has
     /// changed to it. Modes that were chosen ignore them; a HOLD that is the failsafe of OFFBOARD ends with them.
     pub fn send_zeros(&mut self, now_ns: i64) {
-        self.setpoints.ask_for_zeros(now_ns);
+        self.send_hover(now_ns, Vector::zero());
+    }
+
+    /// The same with a velocity, in m/s, that leads the vehicle back to where it hovers.
+    pub fn send_hover(&mut self, now_ns: i64, velocity: Vector<Ned>) {
+        let is_finite = velocity.coords.iter().all(|value| (*value as f32).is_finite());
+        self.setpoints.ask_for(now_ns, if is_finite { velocity } else { Vector::zero() });
     }
 
     /// Sends a velocity in m/s, with a yaw rate in rad/s (0 holds the heading): at least twice a second,
@@ -542,11 +548,11 @@ impl Autopilot {
         }
     }
 
-    /// While OFFBOARD is requested, and as long as asked for, PX4 gets setpoints of zero velocity.
+    /// While OFFBOARD is requested, and as long as asked for, PX4 gets setpoints.
     fn prove_setpoints(&mut self, now_ns: i64) {
-        if !self.setpoints.is_zero_due(now_ns, self.is_requesting_offboard()) {
+        let Some(velocity) = self.setpoints.due(now_ns, self.is_requesting_offboard()) else {
             return;
-        }
+        };
         // Also while only the heartbeat is missing, like every setpoint.
         let limit_ns = now_ns.saturating_sub(ns(self.config.heartbeat_timeout));
         let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.received_ns >= limit_ns);
@@ -554,7 +560,7 @@ impl Autopilot {
         self.setpoint_sent(now_ns);
         let time_ms = (now_ns / 1_000_000) as u32;
         let target = Sender { system, component: AUTOPILOT };
-        self.send(&compose::velocity(time_ms, Vector::zero(), 0.0, target));
+        self.send(&compose::velocity(time_ms, velocity, 0.0, target));
     }
 
     fn setpoint_sent(&mut self, now_ns: i64) {

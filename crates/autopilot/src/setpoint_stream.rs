@@ -1,21 +1,24 @@
 //! The stream of setpoints that PX4's OFFBOARD needs, before it and during it.
 
+use geometry::{Ned, Vector};
+
 /// Time for which setpoints are sent before OFFBOARD is requested, in nanoseconds: PX4 enters it only after a
 /// second of setpoints at 2 Hz or more (<https://docs.px4.io/main/en/flight_modes/offboard.html>).
 const PROOF_NS: i64 = 1_300_000_000;
 /// Maximum gap between two of them, in nanoseconds.
 const MAX_GAP_NS: i64 = 300_000_000;
-/// Period of the zeros, in nanoseconds.
+/// Period of these setpoints, in nanoseconds.
 const PERIOD_NS: i64 = 50_000_000;
-/// Time for which zeros continue without another request, in nanoseconds: ticks are 25 ms apart.
-const ZEROS_NS: i64 = 60_000_000;
+/// Time for which a velocity continues without another request, in nanoseconds: ticks are 25 ms apart.
+const ASKED_NS: i64 = 60_000_000;
 
-/// When setpoints were sent, and until when zeros are.
+/// When setpoints were sent, and which are to be sent until when.
 #[derive(Copy, Clone, Debug, Default)]
 pub(crate) struct SetpointStream {
     /// Since when they have been sent without a gap, and when the last one was.
     span: Option<(i64, i64)>,
-    zeros_until_ns: Option<i64>,
+    /// A velocity in m/s, and until when it is sent.
+    asked: Option<(Vector<Ned>, i64)>,
 }
 
 impl SetpointStream {
@@ -25,17 +28,18 @@ impl SetpointStream {
         self.span = Some((since_ns, now_ns));
     }
 
-    /// Zeros are sent until the next call, a tick later.
-    pub(crate) fn ask_for_zeros(&mut self, now_ns: i64) {
-        self.zeros_until_ns = Some(now_ns.saturating_add(ZEROS_NS));
+    /// This velocity, in m/s, is sent until the next call, a tick later.
+    pub(crate) fn ask_for(&mut self, now_ns: i64, velocity: Vector<Ned>) {
+        self.asked = Some((velocity, now_ns.saturating_add(ASKED_NS)));
     }
 
-    /// True when a zero is to be sent, where `is_requested` states that OFFBOARD is requested.
-    pub(crate) fn is_zero_due(&self, now_ns: i64, is_requested: bool) -> bool {
-        let is_asked_for = self.zeros_until_ns.is_some_and(|until_ns| now_ns < until_ns);
+    /// The velocity that is to be sent now: the one that was asked for, else zeros where `is_requested` states that OFFBOARD is requested.
+    pub(crate) fn due(&self, now_ns: i64, is_requested: bool) -> Option<Vector<Ned>> {
+        let asked = self.asked.filter(|(_, until_ns)| now_ns < *until_ns);
+        let zeros = is_requested.then(Vector::zero);
         let is_recent = |last_ns: i64| (0..PERIOD_NS).contains(&now_ns.saturating_sub(last_ns));
         let is_due = self.span.is_none_or(|(_, last_ns)| !is_recent(last_ns));
-        (is_requested || is_asked_for) && is_due
+        asked.map(|(velocity, _)| velocity).or(zeros).filter(|_| is_due)
     }
 
     /// For how long setpoints must still be sent before OFFBOARD is requested, in nanoseconds.

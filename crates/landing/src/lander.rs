@@ -124,6 +124,8 @@ pub struct Lander {
     square: Option<Square>,
     /// The present hover.
     hover: Option<Hover>,
+    /// That of a vehicle that waits for a landing.
+    wait: Option<Hover>,
     /// How the autopilot follows setpoints.
     limits: AutopilotLimits,
     /// Since when two detectors see the marker at two positions.
@@ -166,6 +168,7 @@ impl Lander {
             half_view_rad: None,
             square: None,
             hover: None,
+            wait: None,
             limits: AutopilotLimits::default(),
             disputed: None,
         })

@@ -1,7 +1,7 @@
 //! Keeps a vehicle at its position that is commanded no horizontal velocity: one that waits, holds, or climbs straight up. Leads one
 //! back that has searched without a result.
 
-use geometry::{Odometry, Point, Vector};
+use geometry::{Ned, Odometry, Point, Vector};
 
 use super::Lander;
 use super::aborted::MIN_FLYING_M;
@@ -57,6 +57,26 @@ impl Lander {
         let velocity = envelope::clamp_setpoint(&self.config.envelope, desired, false);
         self.guidance.on_setpoint_sent(velocity);
         Action::Velocity { velocity, yaw_rate }
+    }
+
+    /// The horizontal velocity, in m/s, that leads a vehicle back to where it began to wait for a landing; zero where it may stand on the ground, or
+    /// its state is old. To be called at least as often as its states come: after a pause it waits where it is then.
+    pub fn back_to_wait(&mut self, now: Timestamp) -> Vector<Ned> {
+        let (Some(vehicle), Some(position)) = (self.history.newest().copied(), self.position())
+        else {
+            return Vector::zero();
+        };
+        let max_age_s = self.config.phases.stale_vehicle_s;
+        let is_known = now.seconds_since(vehicle.stamp) <= max_age_s && !self.is_link_slow;
+        if !is_known || self.may_touch_ground(now) {
+            self.wait = None;
+            return Vector::zero();
+        }
+        let hover = self.wait.get_or_insert(Hover::new(vehicle.stamp));
+        let speed_m_s = vehicle.velocity.horizontal_norm();
+        let back = hover.velocity(vehicle.stamp, position, speed_m_s, max_age_s);
+        let back = envelope::clamp_to_fence(&self.config.phases, vehicle.position, back);
+        envelope::clamp_setpoint(&self.config.envelope, back, false)
     }
 
     /// Where the search began that has had no result, while the vehicle is held for that; without a detector, or in a mode that is not known
