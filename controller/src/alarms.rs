@@ -7,7 +7,7 @@ use landing::Alarm;
 use crate::config::AlarmSettings;
 
 /// Raises each alarm once in a landing.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Alarms {
     settings: AlarmSettings,
     low_since_ns: Option<i64>,

@@ -321,13 +321,14 @@ impl Flight {
                 return;
             }
             // It lands at once, whatever keeps it from being led to a marker.
-            let before = self.mission.clone();
+            let (before, alarms) = (self.mission.clone(), self.alarms.clone());
             if waits_to_resume {
                 self.resume_lander();
             }
             self.begin(now_ns);
             if self.lander.phase().is_terminal() {
-                self.mission = before;
+                (self.mission, self.alarms) = (before, alarms);
+                self.alarms.postpone(alarm);
                 return;
             }
         }

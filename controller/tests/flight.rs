@@ -2289,6 +2289,40 @@ fn a_vehicle_that_waits_in_the_air_for_its_landing_lands_before_its_battery_is_e
     }
 }
 
+/// The lander takes no positions outside of the world.
+#[test]
+fn an_alarm_in_a_wait_whose_landing_the_lander_refuses_is_logged_once_and_lands_as_soon_as_it_may()
+{
+    let health = Arc::new(HealthCounters::default());
+    let mut flight = flight_counting("takeoff", &[], &health);
+    flight.presence(0, "main", true);
+    flight.camera(0, CameraInfo::sample());
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    let mut sent = Sent::default();
+    for ms in (20..24_000).step_by(20) {
+        flight.detections(ms * MS, "main", &of_another_clock(ms * MS));
+        if (1600..5000).contains(&ms) || ms >= 22_000 {
+            pose(&mut flight, ms * MS);
+        } else if ms >= 5000 {
+            receive(&mut flight, ms * MS, &attitude(ms * MS));
+            receive(&mut flight, ms * MS + 1, &position(ms * MS, 2e6));
+        }
+        if ms % 1000 == 0 {
+            receive(&mut flight, ms * MS, &heartbeat(4, true));
+            let percent = if ms < 6000 { 50 } else { 8 };
+            receive(&mut flight, ms * MS, &battery(percent));
+        }
+        flight.tick(ms * MS + 3);
+        sent.take(&mut flight);
+        assert_eq!(sent.modes.contains(&9.0), ms >= 22_000, "{ms} ms: {sent:?}");
+    }
+    let identity = Identity { service: "controller", instance: "main".into() };
+    let rates = health.report(&identity, 0).rates;
+    let alarms = rates.iter().find(|rate| rate.name == "alarms");
+    assert_eq!(alarms.map(|rate| rate.count), Some(1), "{rates:?}");
+}
+
 #[test]
 fn a_landing_that_is_to_be_resumed_lands_before_the_battery_is_empty_and_not_against_its_pilot() {
     for (case, set, mode_after, command, lands) in [
