@@ -777,6 +777,47 @@ fn a_detector_with_an_impossible_marker_is_refused_reported_and_passed_over() {
     }
 }
 
+/// Neither the estimate nor the checks of mount, axes and size, which widen it, get detections of a detector on standby, early or late, whatever it sees.
+#[test]
+fn detections_of_a_detector_on_standby_change_no_decision() {
+    let fly = |standby: Option<f64>| {
+        let mut flight = in_flight("airborne");
+        flight.camera(0, CameraInfo::sample());
+        flight.presence(0, "main", true);
+        flight.presence(0, "other", standby.is_some());
+        let mut decisions = Vec::new();
+        for ms in (20..9000).step_by(20) {
+            if ms % 1000 == 0 {
+                receive(&mut flight, ms * MS, &heartbeat(4, true));
+            }
+            // It rises and sinks, as the check of the mount needs.
+            pose_at(&mut flight, ms * MS, 5.0 + 0.5 * (ms as f32 * 1e-3).sin());
+            if ms % 60 == 0 {
+                let mut seen = seen(ms * MS - 40 * MS);
+                flight.detections(ms * MS + 2, "main", &seen);
+                if let Some(off_m) = standby {
+                    let pose = seen.detections[0].pose.as_mut().unwrap();
+                    pose.camera_from_marker.translation_m[0] += off_m;
+                    for late_ns in [60 * MS, 0] {
+                        seen.header.stamp_ns = ms * MS - 40 * MS - late_ns;
+                        let seen = Detections { detector: "other".into(), ..seen.clone() };
+                        flight.detections(ms * MS + 2, "other", &seen);
+                    }
+                }
+            }
+            flight.tick(ms * MS + 3);
+            decisions.push(*flight.decision().unwrap());
+        }
+        assert_eq!(flight.active_detector(), Some("main"));
+        (decisions, flight.status(9000 * MS).warnings)
+    };
+    let alone = fly(None);
+    assert!(alone.0.iter().filter(|it| it.target.is_some()).count() > 400);
+    for off_m in [0.0, 0.05] {
+        assert_eq!(fly(Some(off_m)), alone, "{off_m} m");
+    }
+}
+
 /// Hovers in GUIDED while the detector sends these messages, by the time in nanoseconds.
 fn hover_with(flight: &mut Flight, from_ms: i64, to_ms: i64, message: impl Fn(i64) -> Detections) {
     for ms in (from_ms..to_ms).step_by(20) {
