@@ -18,6 +18,9 @@ use crate::wire;
 
 /// Age of a PX4's mode from which on it may be another one now, in nanoseconds: it is sent twice a second.
 const MAX_MODE_AGE_NS: i64 = 1_200_000_000;
+/// Silence of the vehicle after which its mode is not known, in nanoseconds: attitude and position come fifty times a second. Where the
+/// link is lost, the failsafe of a PX4 follows half a second after the last setpoint.
+const MAX_MODE_SILENCE_NS: i64 = 300_000_000;
 
 /// The warning of a vehicle that an abort does not lift.
 const LEFT_LOW: &str = "the vehicle is not lifted, as it may stand on the ground, and its motors run; give `land-here`, or take over and land or disarm it";
@@ -303,6 +306,9 @@ impl View<'_> {
         let state = self.autopilot.state().filter(|state| is_aborted && state.armed)?;
         // A mode from before the link was lost is not that of now.
         self.autopilot.mode_age_ns(now_ns).filter(|age_ns| *age_ns <= MAX_MODE_AGE_NS)?;
+        if now_ns.saturating_sub(state.stamp_ns) > MAX_MODE_SILENCE_NS {
+            return None;
+        }
         match state.mode {
             _ if self.autopilot.may_return_to_offboard(now_ns) => Some(
                 "in HOLD, and it returns to OFFBOARD with zero setpoints if that is its failsafe: not known yet",

@@ -899,6 +899,20 @@ fn a_pilot_who_chooses_hold_in_a_failsafe_keeps_it_in_whatever_order_packets_are
     }
 }
 
+#[test]
+fn an_abort_after_the_link_was_lost_states_no_mode_from_before() {
+    for (silent_ms, is_stated) in [(100, true), (400, false), (900, false)] {
+        let mut flight = px4_landing();
+        receive(&mut flight, 2000 * MS, &heartbeat(OFFBOARD, true));
+        for ms in (2000..2000 + silent_ms).step_by(20) {
+            flight.tick(ms * MS);
+        }
+        let reply = flight.command((2000 + silent_ms) * MS, &ControllerCommand::Abort);
+        let states_mode = reply.reason.contains("in OFFBOARD, by setpoints");
+        assert!(reply.accepted && states_mode == is_stated, "{silent_ms} ms: {reply:?}");
+    }
+}
+
 /// A PX4 holds a velocity as it estimates it.
 #[test]
 fn a_px4_that_waits_for_its_landing_in_offboard_is_led_back_to_where_it_waits() {
