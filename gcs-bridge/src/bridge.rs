@@ -622,6 +622,7 @@ impl Bridge {
         if let Some(silence_ns) = silence_ns {
             let silence_s = silence_ns / 1_000_000_000;
             let text = format!("Alight: the controller's status is back after {silence_s} s");
+            tracing::info!(silence_s, "The controller's status is back");
             self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_NOTICE, &text);
         }
         self.send_texts(now_ns);
@@ -630,6 +631,7 @@ impl Bridge {
     /// Reports once that the controller's status has stopped in a landing.
     fn watch_controller(&mut self, now_ns: i64, is_after_standstill: bool) {
         if self.silence.begins(now_ns, is_after_standstill) && !self.is_abandoned {
+            tracing::warn!("No status of the controller in a landing for 2 s");
             self.health.failed("no status of the controller in a landing");
             self.send_or_queue(now_ns, MavSeverity::MAV_SEVERITY_WARNING, SILENT);
         }
