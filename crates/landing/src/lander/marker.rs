@@ -1,7 +1,7 @@
 //! Takes the marker in a frame: fuses its measurement into the target, or returns the reason for which it is rejected.
 
 use super::Lander;
-use crate::decision::Rejection;
+use crate::decision::{Phase, Rejection};
 use crate::event::{FrameObservation, Landed, MarkerInFrame};
 use crate::repeated_picture::Picture;
 
@@ -44,7 +44,10 @@ impl Lander {
     }
 
     fn fuse(&mut self, frame: &FrameObservation, marker: &MarkerInFrame) -> Result<(), Rejection> {
-        self.mount_check.observe(&self.config.estimator, frame, marker, &self.history);
+        // A hover shows no error of the mount: in a long one the wandering of the autopilot's estimate looks like it.
+        if self.phase() != Phase::Hold {
+            self.mount_check.observe(&self.config.estimator, frame, marker, &self.history);
+        }
         self.first_seen.get_or_insert(frame.stamp);
         match self.target_filter.observe(frame, marker, &self.history) {
             Err(Rejection::NoPose) if !self.guidance.needs_pose() => {}
