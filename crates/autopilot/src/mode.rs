@@ -204,6 +204,7 @@ fn px4_name(number: u32) -> Option<&'static str> {
         (4, 6) => "LAND",
         (4, 8) => "FOLLOW",
         (4, 9) => "PRECISION LAND",
+        (4, 20) => "DESCEND",
         (5, _) => "ACRO",
         (6, _) => "OFFBOARD",
         (7, _) => "STABILIZED",
@@ -226,6 +227,7 @@ mod tests {
             (Firmware::Px4, 6 << 16, "PX4 OFFBOARD"),
             (Firmware::Px4, 0x0604_0000, "PX4 LAND"),
             (Firmware::Px4, 10 << 16, "PX4 TERMINATION"),
+            (Firmware::Px4, 0x1404_0000, "PX4 DESCEND"),
             (Firmware::OtherArduPilot, 4, "mode 4"),
         ] {
             let mode = FlightMode::of(firmware, number);
