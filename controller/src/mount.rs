@@ -1,12 +1,26 @@
-//! Warnings of a camera mount, focal length, marker size or standing height that differs from the configuration.
+//! Warnings of a camera mount, focal length, marker size or standing height that differs from the configuration, and of detections that scatter
+//! more than they state.
 
-use landing::{Measured, MountFindings};
+use landing::{Measured, MountFindings, ScatterExcess};
 
 use crate::refusals::Warning;
 
 /// Maximum difference between the configured and the measured standing height without a warning, in metres: the error of
 /// the measurement (`landing`'s module `standing`).
 const MAX_STANDING_ERROR_M: f64 = 0.15;
+
+/// The warning of a detector, the active one, whose detections scatter more than they state.
+pub fn scatter_warning(excess: ScatterExcess, detector: &str) -> Warning {
+    let ScatterExcess { measured_m, stated_m } = excess;
+    Warning {
+        matter: format!("scatter {detector}"),
+        text: format!(
+            "the positions of detector `{detector}` scatter by {measured_m:.2} m, and its covariance states {:.0} times less; the landing uses the measured scatter: \
+             check `pose.covariance`, in m^2, that poses and stamps are of the same frame, and `mount`",
+            measured_m / stated_m
+        ),
+    }
+}
 
 /// The warnings of the measurements in flight. A marker that is so many times as large as configured causes all other errors, so it alone
 /// is reported.

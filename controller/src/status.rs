@@ -144,6 +144,8 @@ impl View<'_> {
         warnings.extend(left_low.map(|text| Warning { matter: "aborted low".to_owned(), text }));
         let size_ratio = self.lander.marker_size_ratio();
         warnings.extend(mount::warnings(&self.lander.mount_findings(), size_ratio));
+        let scatter = self.lander.scatter_excess().zip(self.frames.selection.active());
+        warnings.extend(scatter.map(|(excess, name)| mount::scatter_warning(excess, name)));
         let configured_m = self.config.metric.standing_height_m;
         let is_metric = self.config.guidance == GuidanceName::Metric;
         let measured_m = self.lander.standing_height_m().filter(|_| is_metric);

@@ -9,7 +9,8 @@
 //!
 //! The last [`MEMORY`] detections are stored with the state after each; a late one is inserted between them,
 //! and those after it are fused again. A detection whose normalised innovation squared (NIS) exceeds the
-//! gate is an outlier, and may start a competing hypothesis (`hypotheses.rs`). An estimate without a
+//! gate is an outlier, and may start a competing hypothesis (`hypotheses.rs`). A covariance that is far smaller than the detections scatter is raised
+//! before (`scatter.rs`). An estimate without a
 //! detection for `forget_after_s` is discarded.
 
 use std::collections::VecDeque;
@@ -24,6 +25,7 @@ use crate::filter::State;
 use crate::history::{History, Motion};
 use crate::hypotheses::{Hypotheses, Supported};
 use crate::measurement::{MarkerPose, Measurement};
+use crate::scatter::{Scatter, ScatterExcess};
 use crate::time::Timestamp;
 
 /// Number of stored detections, among which late ones are inserted.
@@ -46,6 +48,7 @@ pub struct Estimator {
     heading: Option<[f64; 2]>,
     hypotheses: Hypotheses,
     nis: Option<f64>,
+    scatter: Scatter,
     stored: Option<Stored>,
 }
 
@@ -75,6 +78,7 @@ impl Estimator {
             heading: None,
             hypotheses: Hypotheses::default(),
             nis: None,
+            scatter: Scatter::default(),
             stored: None,
         }
     }
@@ -99,6 +103,12 @@ impl Estimator {
         let motion = history.at(frame.stamp).ok_or(Rejection::NoAttitude)?;
         let pose = MarkerPose::resolve(&motion, pose, marker.alternative);
         let measurement = pose.measurement(&self.config, frame, marker, &motion)?;
+        let was_excess = self.scatter.is_excess();
+        let measurement = self.scatter.raised(measurement);
+        if self.scatter.is_excess() && !was_excess {
+            // By the covariances so far, the estimate is certain of what the noise has taught it.
+            self.past.clear();
+        }
         self.hypotheses.set_view(frame);
         self.fuse(measurement, &motion)?;
         self.average_heading(motion.ned_from_body * pose.rotation);
@@ -157,6 +167,11 @@ impl Estimator {
             nis: self.nis,
             ambiguous: self.hypotheses.is_ambiguous(),
         })
+    }
+
+    /// By how much more than their covariance states detections scatter, once that has lasted.
+    pub(crate) fn scatter(&self) -> Option<ScatterExcess> {
+        self.scatter.reported()
     }
 
     fn newest_stamp(&self) -> Option<Timestamp> {

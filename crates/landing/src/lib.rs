@@ -12,7 +12,7 @@
 //!
 //! - [`time`], [`event`], [`decision`]: stamps, inputs, outputs; [`config`] has every number.
 //! - [`history`]: the vehicle's recent motion, and the odometry frame.
-//! - `measurement`, `filter`, `view`, `hypotheses`, [`estimator`]: from detections to the landing point; [`mean_target`] for
+//! - `measurement`, `scatter`, `filter`, `view`, `hypotheses`, [`estimator`]: from detections to the landing point; [`mean_target`] for
 //!   the thesis' guidance; `target_filter` is the one that is needed.
 //! - [`guidance`]: from the target to a velocity. [`search`]: where to look for the marker. `hover`: how
 //!   to stay at a position.
@@ -41,6 +41,7 @@ pub mod mean_target;
 mod measurement;
 pub mod mount_check;
 mod repeated_picture;
+mod scatter;
 pub mod search;
 mod size_check;
 mod standing;
@@ -61,6 +62,7 @@ pub use event::{
 pub use lander::Lander;
 pub use limits::ConfigError;
 pub use mount_check::{Measured, MountFindings};
+pub use scatter::ScatterExcess;
 pub use standing::{RememberedPad, SeenPad};
 pub use state_machine::MAX_STANDSTILL_S;
 pub use time::Timestamp;

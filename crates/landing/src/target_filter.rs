@@ -9,6 +9,7 @@ use crate::estimator::Estimator;
 use crate::event::{FrameObservation, MarkerInFrame};
 use crate::history::History;
 use crate::mean_target::MeanTarget;
+use crate::scatter::ScatterExcess;
 use crate::time::Timestamp;
 
 /// The estimate of the landing point, by the filter that the guidance needs.
@@ -63,6 +64,14 @@ impl TargetFilter {
         match self {
             Self::Mean(target) => target.observe(frame, marker, history),
             Self::Kalman(estimator) => estimator.observe(frame, marker, history),
+        }
+    }
+
+    /// By how much more than their covariance states detections scatter; unknown to the mean, which uses none.
+    pub(crate) fn scatter(&self) -> Option<ScatterExcess> {
+        match self {
+            Self::Mean(_) => None,
+            Self::Kalman(estimator) => estimator.scatter(),
         }
     }
 

@@ -132,6 +132,36 @@ impl Scene {
     }
 }
 
+/// A detector that states this part of its deviation.
+fn overconfident(share: f64, seed: u64) -> (Scene, usize) {
+    let mut scene = Scene::new(EstimatorConfig::default(), seed);
+    scene.noise_m = [0.05; 3];
+    let mut refused = 0;
+    for _ in 0..150 {
+        scene.advance(0.07);
+        let (frame, mut marker) = scene.frame(0.0);
+        marker.covariance_m2 = marker.covariance_m2.map(|it| it * (share * share));
+        refused += usize::from(scene.estimator.observe(&frame, &marker, &scene.history).is_err());
+    }
+    (scene, refused)
+}
+
+#[test]
+fn a_covariance_that_is_far_too_small_is_raised_to_the_scatter_and_reported() {
+    for seed in 0..20 {
+        let (scene, refused) = overconfident(1.0, seed);
+        assert_eq!(scene.estimator.scatter(), None, "{seed}");
+        assert!(refused <= 3, "{seed}: {refused}");
+        let (scene, refused) = overconfident(1e-3, seed);
+        let excess = scene.estimator.scatter().unwrap();
+        assert!((0.03..0.08).contains(&excess.measured_m), "{seed}: {excess:?}");
+        assert!(excess.stated_m < 0.02, "{seed}: {excess:?}");
+        assert!(refused <= 15, "{seed}: {refused} of 150 refused");
+        let error = scene.error().horizontal_norm();
+        assert!(error < 0.15, "{seed}: {error} m");
+    }
+}
+
 /// No noise but the detector's.
 fn exact() -> EstimatorConfig {
     EstimatorConfig {

@@ -5,6 +5,7 @@ use super::Lander;
 use crate::axis_check::{AxisConsistencyCheck, AxisError, Verdict};
 use crate::config::GuidanceConfig;
 use crate::decision::Reason;
+use crate::scatter::ScatterExcess;
 use crate::time::Timestamp;
 
 impl Lander {
@@ -17,6 +18,11 @@ impl Lander {
     /// How many times as large as configured the marker is, once that is certain and far from one.
     pub fn marker_size_ratio(&self) -> Option<f64> {
         self.size_check.ratio()
+    }
+
+    /// By how much more than their stated covariance the detections scatter, once that is certain.
+    pub fn scatter_excess(&self) -> Option<ScatterExcess> {
+        self.target_filter.scatter()
     }
 
     /// Repeats the checks of a vehicle that holds because of a mismatch, when the operator resumes the landing.
