@@ -15,7 +15,7 @@ use autopilot::{Autopilot, Event, FlightMode, LISTENING, LandedState, MIN_STANDS
 use geometry::{Ned, Vector};
 use landing::{
     Action, Alarm, AlarmAction, Decision, Event as LanderEvent, FrameObservation, Lander,
-    MAX_STANDSTILL_S, OperatorCommand, Phase, Reason, Timestamp,
+    MAX_STANDSTILL_S, OperatorCommand, Phase, Reason, Rejection, Timestamp,
 };
 use messages::{
     CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorInfo,
@@ -388,6 +388,9 @@ impl Flight {
         self.journal.accept();
         if let Some(rejection) = self.decision.and_then(|decision| decision.rejected) {
             self.journal.reject(rejection.name());
+            if rejection == Rejection::RepeatedPicture {
+                self.frames.repeats_picture(now_ns);
+            }
             return;
         }
         if frame.marker.is_none() {

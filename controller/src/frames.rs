@@ -24,6 +24,9 @@ use crate::wire;
 /// nanoseconds.
 const UNUSABLE_NS: i64 = 1_000_000_000;
 
+/// The name of a refusal by the lander: the picture is an old one.
+const REPEATED: &str = "repeated-picture";
+
 /// Distance of a stamp from now beyond which it is of another clock, in seconds: no delay and no drift of a clock is as long.
 const OTHER_CLOCK_S: f64 = 60.0;
 
@@ -261,6 +264,17 @@ impl Frames {
         Arrival::Refused(reason)
     }
 
+    /// The marker of the active detector's newest frame is that of an old picture.
+    pub fn repeats_picture(&mut self, now_ns: i64) {
+        let Some(name) = self.selection.active() else { return };
+        self.refusals.add_of(now_ns, REPEATED, name, || {
+            format!(
+                "the marker that detector `{name}` sees stays in its place while the vehicle moves: the camera repeats an old picture, or the detector publishes old \
+                 detections with the headers of new frames; check the camera, and that the detections of a frame are of its own pixels"
+            )
+        });
+    }
+
     /// Messages of another version were refused.
     pub fn refused_version(&mut self, now_ns: i64) {
         self.follow(now_ns);
@@ -326,8 +340,13 @@ impl Frames {
             self.announced.seen_instead(now_ns, active, &self.marker)
         };
         let too_late = || self.lateness.too_late(now_ns, self.selection.active()?);
+        let repeats = || {
+            let is_it = |warning: &Warning| warning.matter.starts_with(REPEATED);
+            self.refusals.lasting(now_ns).find(is_it).map(|warning| warning.text)
+        };
         self.refused_because(now_ns)
             .or_else(too_late)
+            .or_else(repeats)
             .or_else(|| self.selection.no_pose(now_ns))
             .or_else(|| self.no_detector_looks_for_marker())
             .or_else(instead)

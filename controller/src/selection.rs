@@ -375,6 +375,18 @@ impl Selection {
                 Fault::NoPose => {}
             }
         }
+        // It is used where no other is better. Between its frames it counts as silent.
+        if let Some(known) = self.known.iter().find(|known| self.active() == Some(&*known.name))
+            && let Some(rate_hz) = self.too_slow_hz(known)
+            && known.alive
+        {
+            let (name, min_hz) = (&known.name, self.limits.min_rate_hz);
+            let text = format!(
+                "detector `{name}` searches only {rate_hz:.1} frames per second, and {min_hz} are needed (`detectors.min_rate_hz`); search the newest frame only, with \
+                 fewer pixels or a faster program, and publish also if nothing was found"
+            );
+            warn(format!("slow {name}"), text);
+        }
         if self.crowded_ns.is_some_and(|at| now_ns.saturating_sub(at) < CROWDED_NS) {
             let text = format!(
                 "more than {MAX_DETECTORS} detectors announce themselves; the others are ignored"
@@ -591,11 +603,15 @@ impl Selection {
         if latency_s > self.limits.max_age_s {
             return Some(format!("its frames are {:.0} ms old", latency_s * 1e3));
         }
+        let rate_hz = self.too_slow_hz(known)?;
+        Some(format!("it searches only {rate_hz:.1} frames/s"))
+    }
+
+    /// How many frames a detector searches per second, where these are too few.
+    fn too_slow_hz(&self, known: &Known) -> Option<f64> {
         let rate_hz = known.rate_hz();
-        if known.intervals_ns.len() >= MIN_SAMPLES && rate_hz < self.limits.min_rate_hz {
-            return Some(format!("it searches only {rate_hz:.1} frames/s"));
-        }
-        None
+        let is_slow = known.intervals_ns.len() >= MIN_SAMPLES && rate_hz < self.limits.min_rate_hz;
+        is_slow.then_some(rate_hz)
     }
 
     /// Why the active detector is to be replaced. A silence counts only when another detector has a newer

@@ -1103,6 +1103,43 @@ fn a_detector_with_another_first_corner_counts_where_the_vehicle_turns_to_the_pa
     }
 }
 
+/// The warnings of a flight in view of a marker, with a frame each so many milliseconds; `sinks`: the vehicle goes down, and the
+/// detections stay as they are.
+fn warnings_of_frames(every_ms: i64, sinks: bool) -> Vec<String> {
+    let mut flight = flight_with("airborne", &["autopilot.timesync=false"]);
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    for ms in (20..12_000).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(&mut flight, ms * MS, &heartbeat(4, true));
+        }
+        let sunk_m = (ms as f32 / 1000.0 - 4.0).clamp(0.0, 4.0);
+        pose_at(&mut flight, ms * MS, 9.0 - if sinks { sunk_m } else { 0.0 });
+        if ms % every_ms == 0 {
+            flight.detections(ms * MS + 2, "main", &seen(ms * MS - 40 * MS));
+        }
+        flight.tick(ms * MS + 3);
+    }
+    flight.status(12_000 * MS).warnings
+}
+
+#[test]
+fn a_detector_that_searches_too_few_frames_is_reported() {
+    assert_eq!(warnings_of_frames(60, false), Vec::<String>::new());
+    let warnings = warnings_of_frames(1000, false).join("; ");
+    let text = "detector `main` searches only 1.0 frames per second, and 3 are needed (`detectors.min_rate_hz`)";
+    assert!(warnings.contains(text), "{warnings}");
+}
+
+#[test]
+fn old_detections_with_the_headers_of_new_frames_are_reported() {
+    let warnings = warnings_of_frames(60, true).join("; ");
+    assert!(warnings.contains("old detections with the headers of new frames"), "{warnings}");
+    assert!(warnings.contains("`main`") && warnings.contains("; check the camera"), "{warnings}");
+}
+
 #[test]
 fn a_low_battery_leads_to_the_configured_reaction() {
     let set = ["phases.on_battery_low=\"hold\"", "alarms.battery_s=1"];
