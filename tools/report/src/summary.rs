@@ -305,6 +305,66 @@ mod tests {
 
     use super::*;
 
+    /// The names of an object's values, in their order.
+    fn names(value: &impl Serialize) -> Vec<String> {
+        let text = serde_json::to_string(value).unwrap();
+        let mut names = Vec::new();
+        let mut depth = 0;
+        for part in text.split_inclusive(['{', '}', '[', ']', ',']) {
+            if let (1, Some((name, _))) = (depth, part.split_once("\":")) {
+                names.push(name.trim_start_matches('"').to_owned());
+            }
+            match part.chars().last() {
+                Some('{' | '[') => depth += 1,
+                Some('}' | ']') => depth -= 1,
+                _ => {}
+            }
+        }
+        names
+    }
+
+    #[test]
+    fn each_name_of_the_json_is_explained_in_the_documentation() {
+        let text = include_str!("../../../docs/recording.md");
+        let (_, section) = text.split_once("### The report as JSON\n").unwrap();
+        let section = section.split("\n## ").next().unwrap();
+        let (_, table) = section.split_once("|---|---|\n").unwrap();
+        let summary = of(&Flight::default(), &Frames::default());
+        let summary = names(&summary);
+        let at: Vec<_> = summary.iter().map(|name| table.find(&format!("`{name}`"))).collect();
+        assert!(summary.len() > 30 && at.iter().all(Option::is_some), "{summary:?} {at:?}");
+        assert!(at.is_sorted(), "{summary:?} {at:?}");
+        let stage = Stage {
+            name: String::new(),
+            is_part: false,
+            frames: 0,
+            p50_ms: 0.0,
+            p90_ms: 0.0,
+            p99_ms: 0.0,
+            max_ms: 0.0,
+        };
+        let reason = phases::Reason { from_s: 0.0, why: String::new() };
+        let phase =
+            phases::Phase { name: String::new(), from_s: 0.0, to_s: 0.0, reasons: Vec::new() };
+        for (row, parts) in [
+            ("| `latency` ", names(&stage)),
+            ("| `phases` ", [names(&phase), names(&reason)].concat()),
+        ] {
+            let (_, line) = table.split_once(row).unwrap();
+            let line = line.lines().next().unwrap();
+            assert!(parts.len() > 3, "{parts:?}");
+            for part in parts {
+                assert!(line.contains(&format!("`{part}`")), "`{part}` is not in {row}");
+            }
+        }
+        // No name that the program does not write.
+        for name in table.lines().filter_map(|line| line.split(" | ").next()) {
+            for name in name.split('`').skip(1).step_by(2) {
+                assert!(summary.iter().any(|it| it == name), "`{name}` is not written");
+            }
+        }
+    }
+
     #[test]
     fn the_status_after_a_landing_is_not_its_outcome() {
         let status = |phase, started_ns, why: &str| ControllerStatus {
