@@ -27,6 +27,17 @@ pub(crate) struct Placement {
 /// many, markers of 40 to 110 pixels in photographs of two and three million pixels were too small for it.
 const MAX_PIXELS: usize = 800_000;
 
+/// The finest level of an image's pyramid on which segments are found.
+fn finest_level(view: GrayView<'_>) -> usize {
+    let pixels = view.width() * view.height();
+    (0..31).find(|level| pixels >> (2 * level) <= MAX_PIXELS).unwrap_or(31)
+}
+
+/// Width of a pixel of the coarsest level on which segments are found, in pixels of the image.
+pub(crate) fn coarsest_pixel(view: GrayView<'_>) -> f64 {
+    (2u64 << finest_level(view)) as f64
+}
+
 /// One of the levels on which segments are found.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Scale {
@@ -97,9 +108,7 @@ impl ImageQuads {
     }
 
     fn add(&mut self, view: GrayView<'_>, pyramid: &Pyramid, scale: Scale) {
-        let pixels = |level: usize| (view.width() * view.height()) >> (2 * level.min(31));
-        let finest = (0..pyramid.levels()).find(|level| pixels(*level) <= MAX_PIXELS);
-        let finest = finest.unwrap_or(pyramid.levels().saturating_sub(1));
+        let finest = finest_level(view).min(pyramid.levels().saturating_sub(1));
         let level = finest + usize::from(scale == Scale::Coarse);
         let Some(image) = pyramid.level(view, level) else { return };
         let far = pyramid.level(view, finest + BRIGHTNESS_LEVELS).unwrap_or(image);

@@ -7,6 +7,7 @@ use markers::{Family, Marker, SquareCode};
 use nalgebra::Matrix2;
 
 use crate::candidates::quad::diagonal_px;
+use crate::candidates::segment_quads::coarsest_pixel;
 use crate::families::family::{FrameInput, PredictedShape, Prediction};
 use crate::observation::Observation;
 use crate::pose::square_pose;
@@ -155,8 +156,11 @@ impl FamilyQuery {
 
 /// Whether a corner is at the border of the image, where an outline that the frame cuts has one, or beyond it.
 fn is_cut(corners: &[Pixel; 4], view: GrayView<'_>) -> bool {
-    const BORDER_PX: f64 = 3.0;
-    let inside = |at: f64, size: usize| at >= BORDER_PX && at <= size as f64 - 1.0 - BORDER_PX;
+    /// Distance from the border within which the sides of such an outline end, in pixels of the coarsest level on which they are found: a
+    /// gradient is that of two rows.
+    const BORDER_PX: f64 = 1.5;
+    let border_px = BORDER_PX * coarsest_pixel(view);
+    let inside = |at: f64, size: usize| at >= border_px && at <= size as f64 - 1.0 - border_px;
     !corners.iter().all(|c| inside(c.x, view.width()) && inside(c.y, view.height()))
 }
 
@@ -168,6 +172,37 @@ pub(crate) fn segment_corner_px(corners: &[Pixel; 4]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_cut_outline_is_refused_as_far_from_the_border_as_a_coarse_level_has_its_first_row() {
+        let is_seen = |width: usize, y: f64, corner_px: f64| {
+            let image = imaging::GrayImage::filled(width, width * 3 / 4, 0);
+            let pyramid = Pyramid::default();
+            let input = ImageInput {
+                view: image.view().unwrap(),
+                pyramid: &pyramid,
+                camera: None,
+                response: None,
+            };
+            let corners = [[80.0, y], [290.0, y], [290.0, y + 190.0], [80.0, y + 190.0]]
+                .map(|[x, y]| Pixel::new(x, y));
+            let query = FamilyQuery::new("apriltag-16h5:20".parse().unwrap());
+            let refined = Refined::unrefined(&corners, corner_px);
+            query.observation(20, 0, 1.0, &refined, input).is_some()
+        };
+        // The level with a quarter of the rows is the coarsest one of the larger image, that with half of them of the smaller one.
+        for (width, y, is_refused) in [
+            (648, 2.5, true),
+            (648, 3.5, false),
+            (1296, 3.5, true),
+            (1296, 5.5, true),
+            (1296, 6.5, false),
+        ] {
+            assert_eq!(is_seen(width, y, 3.0), !is_refused, "{width}: {y}");
+            // Corners that were measured are where they are.
+            assert!(is_seen(width, y, 0.05), "{width}: {y}");
+        }
+    }
 
     #[test]
     fn a_window_is_looked_for_by_its_number_only() {
