@@ -15,7 +15,7 @@ pub fn scatter_warning(excess: ScatterExcess, detector: &str) -> Warning {
     Warning {
         matter: format!("scatter {detector}"),
         text: format!(
-            "the positions of detector `{detector}` scatter by {measured_m:.2} m, and its covariance states {:.0} times less; the landing uses the measured scatter: \
+            "the positions of detector `{detector}` scatter by {measured_m:.2} m, {:.0} times what its covariance and the vehicle's noise explain; the landing uses the measured scatter: \
              check `pose.covariance`, in m^2, that poses and stamps are of the same frame, and `mount`",
             measured_m / stated_m
         ),

@@ -103,11 +103,13 @@ impl Estimator {
         let motion = history.at(frame.stamp).ok_or(Rejection::NoAttitude)?;
         let pose = MarkerPose::resolve(&motion, pose, marker.alternative);
         let measurement = pose.measurement(&self.config, frame, marker, &motion)?;
-        let was_excess = self.scatter.is_excess();
+        let was_raised = self.scatter.factor().is_some();
         let measurement = self.scatter.raised(measurement);
-        if self.scatter.is_excess() && !was_excess {
+        if let (Some(factor), Some(newest)) = (self.scatter.factor(), self.past.back_mut())
+            && !was_raised
+        {
             // By the covariances so far, the estimate is certain of what the noise has taught it.
-            self.past.clear();
+            newest.state.widen(factor);
         }
         self.hypotheses.set_view(frame);
         self.fuse(measurement, &motion)?;

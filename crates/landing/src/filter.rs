@@ -87,6 +87,11 @@ pub(crate) struct Fit {
 }
 
 impl State {
+    /// Multiplies the covariance by this factor, as that of the detections was too small by it.
+    pub(crate) fn widen(&mut self, factor: f64) {
+        self.covariance *= factor;
+    }
+
     /// The state before the first detection, around this position of the pad.
     pub(crate) fn new(config: &EstimatorConfig, position: Vector3<f64>) -> Self {
         let mut mean = Mean::zeros();

@@ -22,13 +22,13 @@ const MEDIAN: f64 = 2.366;
 /// How many times the stated deviation positions must scatter before the covariance is raised. In modelled flights with wind, gusts and
 /// faults, positions of a detector that states its covariance well scatter by up to 5.9 times as much, as attitude and stamps err as well.
 const MIN_RATIO: f64 = 6.0;
-/// Fraction of that ratio below which it is not raised any more.
+/// Fraction of a limit beyond which it is not raised any more.
 const CLEAR_FRACTION: f64 = 0.7;
-/// Largest deviation along an axis up to which it is raised, in metres. Positions that scatter more are of two markers in turn, between which a
-/// filter must not take the mean.
+/// Smallest and largest deviation along an axis with which it is raised, in metres. Positions that scatter less mislead no landing; those that
+/// scatter more are of two markers in turn, between which a filter must not take the mean.
+const MIN_DEVIATION_M: f64 = 0.02;
 const MAX_DEVIATION_M: f64 = 0.1;
-/// Smallest deviation along an axis that is reported, in metres, and the number of detections in a row that must show it.
-const MIN_REPORTED_M: f64 = 0.02;
+/// Number of detections in a row with a raised covariance from which on that is reported.
 const MIN_IN_A_ROW: u32 = 30;
 
 /// The latest positions and their differences; nothing is allocated.
@@ -62,16 +62,15 @@ impl Scatter {
     /// Adds a detection, and raises its covariance to the measured scatter, where that is far larger.
     pub(crate) fn raised(&mut self, measurement: Measurement) -> Measurement {
         self.add(&measurement);
-        let factor = self.excess.map_or(1.0, |it| squared(it.measured_m / it.stated_m));
-        Measurement { noise: measurement.noise * factor, ..measurement }
+        Measurement { noise: measurement.noise * self.factor().unwrap_or(1.0), ..measurement }
     }
 
-    /// Whether covariances are raised.
-    pub(crate) fn is_excess(&self) -> bool {
-        self.excess.is_some()
+    /// The factor by which covariances are raised.
+    pub(crate) fn factor(&self) -> Option<f64> {
+        self.excess.map(|it| squared(it.measured_m / it.stated_m))
     }
 
-    /// The excess, once it has lasted and matters.
+    /// The excess, once it has lasted.
     pub(crate) fn reported(&self) -> Option<ScatterExcess> {
         self.excess.filter(|_| self.in_a_row >= MIN_IN_A_ROW)
     }
@@ -83,9 +82,11 @@ impl Scatter {
             return;
         }
         self.past = [middle, Some(*newest)];
-        if let (Some(first), Some(middle)) = (first, middle)
-            && let Some(difference) = Difference::new([&first, &middle, newest])
-        {
+        let (Some(first), Some(middle)) = (first, middle) else { return };
+        if newest.stamp.seconds_since(first.stamp) > MAX_SPAN_S {
+            // After a pause, and of a slow detector, nothing is known.
+            *self = Self { past: self.past, ..Self::default() };
+        } else if let Some(difference) = Difference::new([&first, &middle, newest]) {
             self.differences[self.count % DIFFERENCES] = difference;
             self.count += 1;
             self.judge();
@@ -97,24 +98,20 @@ impl Scatter {
         let normalised = median(known, |it| it.normalised);
         let measured_m = sqrt(median(known, |it| it.square_m2) / MEDIAN);
         let ratio = sqrt(normalised / MEDIAN);
-        let min_ratio = MIN_RATIO * if self.is_excess() { CLEAR_FRACTION } else { 1.0 };
+        let margin = if self.excess.is_some() { CLEAR_FRACTION } else { 1.0 };
         let is_excess = known.len() >= MIN_DIFFERENCES
             && ratio.is_finite()
-            && ratio > min_ratio
-            && measured_m <= MAX_DEVIATION_M;
+            && ratio > margin * MIN_RATIO
+            && (margin * MIN_DEVIATION_M..=MAX_DEVIATION_M / margin).contains(&measured_m);
         self.excess = is_excess.then(|| ScatterExcess { measured_m, stated_m: measured_m / ratio });
-        let is_reportable = is_excess && measured_m > MIN_REPORTED_M;
-        self.in_a_row = if is_reportable { self.in_a_row.saturating_add(1) } else { 0 };
+        self.in_a_row = if is_excess { self.in_a_row.saturating_add(1) } else { 0 };
     }
 }
 
 impl Difference {
-    /// `None` for positions that are too far apart in time, and for a covariance that has no inverse.
+    /// `None` for a covariance that has no inverse.
     fn new([first, middle, last]: [&Measurement; 3]) -> Option<Self> {
         let span_s = last.stamp.seconds_since(first.stamp);
-        if !(span_s > 0.0 && span_s <= MAX_SPAN_S) {
-            return None;
-        }
         let share = last.stamp.seconds_since(middle.stamp) / span_s;
         let other = 1.0 - share;
         let difference = middle.position - first.position * share - last.position * other;
@@ -163,7 +160,7 @@ mod tests {
             };
             let raised = scatter.raised(measurement);
             assert!(raised.noise[(0, 0)] >= measurement.noise[(0, 0)]);
-            assert_eq!(raised.noise != measurement.noise, scatter.is_excess());
+            assert_eq!(raised.noise != measurement.noise, scatter.excess.is_some());
             // A late frame, and one that comes twice, change nothing.
             let late = Measurement { position: Vector3::repeat(9.0), ..measurement };
             let before = scatter.count;
@@ -181,14 +178,28 @@ mod tests {
     fn positions_that_scatter_far_more_than_stated_are_measured_and_reported() {
         for of_stated in [0.1, 1.0, 2.0] {
             let scatter = after(100, noise(of_stated));
-            assert!(!scatter.is_excess() && scatter.reported().is_none(), "{of_stated}");
+            assert!(scatter.excess.is_none() && scatter.reported().is_none(), "{of_stated}");
         }
         let scatter = after(100, noise(15.0));
         let ScatterExcess { measured_m, stated_m } = scatter.reported().unwrap();
         assert!((0.03..0.06).contains(&measured_m), "{measured_m} m");
         assert!((0.002..0.004).contains(&stated_m), "{stated_m} m");
         assert!(after(30, noise(15.0)).reported().is_none(), "not at once");
-        assert!(after(30, noise(15.0)).is_excess());
+        assert!(after(30, noise(15.0)).excess.is_some());
+    }
+
+    #[test]
+    fn an_excess_is_forgotten_after_a_pause() {
+        let mut scatter = after(100, noise(15.0));
+        let last = scatter.past[1].unwrap();
+        for i in 1..=2 {
+            let stamp = last.stamp.plus_seconds(0.2 * f64::from(i));
+            assert!(scatter.reported().is_some(), "{i}");
+            scatter.add(&Measurement { stamp, ..last });
+        }
+        assert!(scatter.reported().is_none() && scatter.excess.is_none());
+        let next = Measurement { stamp: last.stamp.plus_seconds(0.6), ..last };
+        assert_eq!(scatter.raised(next).noise, next.noise);
     }
 
     #[test]
@@ -202,7 +213,7 @@ mod tests {
         for (name, x) in places {
             let of_one = noise(1.0);
             let scatter = after(100, |i, normal| of_one(i, normal) + Vector3::new(x(i), 0.0, 0.0));
-            assert!(!scatter.is_excess(), "{name}: {scatter:?}");
+            assert!(scatter.excess.is_none(), "{name}: {scatter:?}");
         }
     }
 }
