@@ -125,7 +125,7 @@ impl Frames {
             self.camera_watch.ended(detector);
             self.stamps.ended(detector);
             self.lateness.ended(detector);
-            self.reprojections.ended(detector);
+            self.reprojections.retain(|name| name != detector);
         }
     }
 
@@ -141,8 +141,12 @@ impl Frames {
     pub fn add_camera(&mut self, now_ns: i64, info: CameraInfo, is_flying: bool) -> Reception {
         self.follow(now_ns);
         let reception = self.cameras.add(now_ns, info, is_flying);
-        if let Reception::Refused(reason, text) = &reception {
-            self.refusals.add(now_ns, reason, || text.clone());
+        match &reception {
+            Reception::Known => {}
+            Reception::Replaced(_) => self.reprojections.clear(),
+            Reception::Refused(reason, text) => {
+                self.refusals.add(now_ns, reason, || text.clone());
+            }
         }
         reception
     }
@@ -179,9 +183,12 @@ impl Frames {
             return self.refuse(now_ns, "from-the-future", || {
                 let camera = &header.camera;
                 if ahead_s > OTHER_CLOCK_S {
-                    let days = ahead_s / 86_400.0;
+                    let ahead = match ahead_s {
+                        days if days > 2.0 * 86_400.0 => format!("{:.0} days", days / 86_400.0),
+                        seconds => format!("{seconds:.0} s"),
+                    };
                     return format!(
-                        "detections of `{publisher}` are refused: the stamps of camera `{camera}` lie {days:.1} days in the future, as those of another clock, for example the time of day; stamp frames with this host's monotonic clock (`time.monotonic_ns()` in Python), or copy the frame's header unchanged"
+                        "detections of `{publisher}` are refused: the stamps of camera `{camera}` lie {ahead} in the future, as those of another clock, for example the time of day; stamp frames with this host's monotonic clock (`time.monotonic_ns()` in Python), or copy the frame's header unchanged"
                     );
                 }
                 format!(
@@ -371,6 +378,7 @@ impl Frames {
     pub fn tick(&mut self, now_ns: i64) {
         self.selection.tick(now_ns);
         self.newest.retain(|name, _| self.selection.knows(name));
+        self.reprojections.retain(|name| self.selection.knows(name));
         self.announced.forget(&self.selection);
     }
 

@@ -17,9 +17,11 @@ const MIN_ALLOWED_PX: f64 = 5.0;
 /// A part of the marker's largest extent, which is at most the image's diagonal: the mean of a square's corners is up to a quarter of it
 /// from the projection of the square's centre.
 const ALLOWED_PER_SIZE: f64 = 0.5;
-/// A part of the distance from the principal point: a detector may have a calibration of its own, and give the pixel of an undistorted
-/// picture. An inverse or mirrored pose is off by up to twice that distance.
-const ALLOWED_PER_DISTANCE: f64 = 0.25;
+/// A part of the distance from the principal point: a detector may have a calibration of its own, and give the pixel of a picture that it
+/// has undistorted or rectified with another camera matrix. An inverse or mirrored pose is off by up to twice that distance.
+const ALLOWED_PER_DISTANCE: f64 = 0.5;
+/// Extent of a marker up to which it is unknown, in pixels.
+const MIN_SIZE_PX: f64 = 1.0;
 
 /// Excess of detections that disagree over those that agree away from the middle, from which all of a detector's are refused, and its
 /// largest value.
@@ -81,15 +83,20 @@ impl Reprojections {
         is_refused.then(|| known.why.clone())
     }
 
-    /// Forgets a detector that has ended.
-    pub fn ended(&mut self, detector: &str) {
-        self.known.remove(detector);
+    /// Forgets the other detectors.
+    pub fn retain(&mut self, is_known: impl Fn(&str) -> bool) {
+        self.known.retain(|name, _| is_known(name));
+    }
+
+    /// Forgets all of them, as after a change of the calibration by which they were judged.
+    pub fn clear(&mut self) {
+        self.known.clear();
     }
 }
 
 impl Reprojection {
-    /// `None` without a pose, for a camera that is not calibrated for frames of this size, and for a place that its lens model does not
-    /// describe.
+    /// `None` without a pose or an extent, for a camera that is not calibrated for frames of this size, and for a place that its lens model
+    /// does not describe.
     fn new(detection: &Detection, header: &FrameHeader, camera: &CameraInfo) -> Option<Self> {
         let [x, y, z] = detection.pose.as_ref()?.camera_from_marker.translation_m;
         let model = camera
@@ -103,7 +110,7 @@ impl Reprojection {
         let undistorted_px =
             pinhole.project(place).map_or(f64::INFINITY, |it| it.distance(&centre));
         let diagonal_px = hypot(f64::from(header.width), f64::from(header.height));
-        let size_px = fmin(fmax(detection.size_px, 0.0), diagonal_px);
+        let size_px = fmin(extent_px(detection)?, diagonal_px);
         let distance_px = centre.distance(&Pixel::new(model.cx, model.cy));
         let within_px = MIN_ALLOWED_PX + ALLOWED_PER_SIZE * size_px;
         Some(Self {
@@ -125,6 +132,18 @@ impl Reprojection {
             header.camera, self.apart_px, self.allowed_px
         )
     }
+}
+
+/// The marker's largest extent, in pixels, as stated or by its corners; `None` for an unknown one.
+fn extent_px(detection: &Detection) -> Option<f64> {
+    let of_corners = |corners: [[f64; 2]; 4]| {
+        let diagonal = |a: usize, b: usize| {
+            hypot(corners[a][0] - corners[b][0], corners[a][1] - corners[b][1])
+        };
+        fmax(diagonal(0, 2), diagonal(1, 3))
+    };
+    let size_px = fmax(detection.size_px, detection.corners_px.map_or(0.0, of_corners));
+    (size_px > MIN_SIZE_PX).then_some(size_px)
 }
 
 #[cfg(test)]
@@ -199,6 +218,9 @@ mod tests {
             // With a focal length of its own, and the mean of the corners of a tilted marker.
             let [x, y, z] = place_m;
             assert_eq!(check(&with_place(&right, [1.1 * x, 1.1 * y, z]), &camera), None);
+            // Of a picture that shows the whole of a wide lens, with pixels of another width.
+            let centre_px = camera.pixel_of([0.7 * x, 0.7 * y, z]).unwrap();
+            assert_eq!(check(&Detection { centre_px, ..right.clone() }, &camera), None);
             let [u, v] = right.centre_px;
             let centre_px = [u + 0.25 * right.size_px, v];
             assert_eq!(check(&Detection { centre_px, ..right.clone() }, &camera), None);
@@ -212,6 +234,8 @@ mod tests {
                 assert_eq!(seen, None);
             }
             assert!(check(&far, &camera).is_some());
+            let unknown = Detection { size_px: 0.0, corners_px: None, ..far.clone() };
+            assert_eq!(check(&unknown, &camera), None, "a marker of unknown extent");
             assert_eq!(check(&Detection { pose: None, ..far }, &camera), None);
         }
     }
@@ -248,7 +272,9 @@ mod tests {
             assert!(checks.disagreement(&name, &right, &header, Some(&camera)).is_none());
         }
         assert_eq!(checks.known.len(), MAX_DETECTORS);
-        checks.ended("0");
+        checks.retain(|name| name != "0");
         assert_eq!(checks.known.len(), MAX_DETECTORS - 1);
+        checks.clear();
+        assert!(checks.known.is_empty());
     }
 }
