@@ -671,9 +671,12 @@ impl Flight {
         }
     }
 
-    /// The velocity that leads a PX4 that waits for its landing in OFFBOARD back to where it waits.
+    /// The velocity that leads a PX4 that waits for its landing in OFFBOARD back to where it waits: to where it was when our setpoints for
+    /// that began.
     fn back_to_wait(&mut self, now_ns: i64) -> Vector<Ned> {
-        if self.mission.is_landing() || !needs_setpoints(now_ns, &self.autopilot) {
+        let waits = !self.mission.is_landing() && self.autopilot.is_sent_hover(now_ns);
+        if !waits || !needs_setpoints(now_ns, &self.autopilot) {
+            self.lander.end_wait();
             return Vector::zero();
         }
         self.lander.back_to_wait(Timestamp::from_nanos(now_ns))

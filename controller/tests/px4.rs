@@ -922,9 +922,6 @@ fn a_px4_that_waits_for_its_landing_in_offboard_is_led_back_to_where_it_waits() 
         receive(&mut flight, 0, &heartbeat(OFFBOARD, true));
         receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
         hover(&mut flight, 20, 1000, OFFBOARD);
-        if start == "command" {
-            assert!(flight.command(1010 * MS, &ControllerCommand::Start).accepted);
-        }
         let mut sent = Sent::default();
         let drift = |flight: &mut Flight, sent: &mut Sent, ms: i64, north_m: f32| {
             if ms % 500 == 0 {
@@ -939,12 +936,26 @@ fn a_px4_that_waits_for_its_landing_in_offboard_is_led_back_to_where_it_waits() 
             flight.tick(ms * MS + 3);
             sent.take(flight);
         };
+        // Another program flies it in OFFBOARD, before the landing is commanded.
         for ms in (1020..4000).step_by(20) {
+            let is_flown = start == "command";
+            drift(
+                &mut flight,
+                &mut sent,
+                ms,
+                if is_flown { 0.01 * (ms - 4000) as f32 } else { 0.0 },
+            );
+        }
+        if start == "command" {
+            assert_eq!(sent.setpoints, 0);
+            assert!(flight.command(4000 * MS, &ControllerCommand::Start).accepted);
+        }
+        for ms in (4000..7000).step_by(20) {
             drift(&mut flight, &mut sent, ms, 0.0);
         }
         assert_eq!(sent.velocity_m_s, [0.0; 3], "{start}");
-        for ms in (4000..8000).step_by(20) {
-            drift(&mut flight, &mut sent, ms, 0.25e-3 * (ms - 4000) as f32);
+        for ms in (7000..11_000).step_by(20) {
+            drift(&mut flight, &mut sent, ms, 0.25e-3 * (ms - 7000) as f32);
         }
         let [north_m_s, east_m_s, down_m_s] = sent.velocity_m_s;
         assert!((-0.6..-0.4).contains(&north_m_s), "{start}: {sent:?}");

@@ -450,6 +450,11 @@ impl Autopilot {
         self.setpoints.ask_for(now_ns, if is_finite { velocity } else { Vector::zero() });
     }
 
+    /// Whether setpoints for a hover were asked for up to the last tick.
+    pub fn is_sent_hover(&self, now_ns: i64) -> bool {
+        self.setpoints.is_asked(now_ns)
+    }
+
     /// Sends a velocity in m/s, with a yaw rate in rad/s (0 holds the heading): at least twice a second,
     /// because the autopilot flies on with the last one for 3 s. Zeros stop the vehicle.
     ///

@@ -33,6 +33,11 @@ impl SetpointStream {
         self.asked = Some((velocity, now_ns.saturating_add(ASKED_NS)));
     }
 
+    /// Whether a velocity was asked for up to the last tick.
+    pub(crate) fn is_asked(&self, now_ns: i64) -> bool {
+        self.asked.is_some_and(|(_, until_ns)| now_ns < until_ns)
+    }
+
     /// The velocity that is to be sent now: the one that was asked for, else zeros where `is_requested` states that OFFBOARD is requested.
     pub(crate) fn due(&self, now_ns: i64, is_requested: bool) -> Option<Vector<Ned>> {
         let asked = self.asked.filter(|(_, until_ns)| now_ns < *until_ns);

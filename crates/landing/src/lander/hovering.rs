@@ -79,6 +79,11 @@ impl Lander {
         envelope::clamp_setpoint(&self.config.envelope, back, false)
     }
 
+    /// Forgets where the vehicle waited for a landing.
+    pub fn end_wait(&mut self) {
+        self.wait = None;
+    }
+
     /// Where the search began that has had no result, while the vehicle is held for that; without a detector, or in a mode that is not known
     /// to be ours, it stays where it is. The next search is about the same position.
     fn begin_of_search(&mut self) -> Option<Point<Odometry>> {
