@@ -321,7 +321,7 @@ impl LandingTargetMode {
     pub fn phase(&self, now_ns: i64, problem: Option<String>) -> (Phase, String) {
         let target = match self.active_stream(now_ns) {
             Some(_) if self.is_predicted => {
-                "the marker is not seen, sending its estimated position"
+                "no detection is used, sending the marker's estimated position"
             }
             Some(_) => "sending the landing target",
             None => "no landing target to send",

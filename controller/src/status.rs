@@ -275,8 +275,15 @@ impl View<'_> {
         match (mode, self.chosen_mode) {
             (None, _) => why,
             (Some(mode), Some(chosen)) if chosen == mode => format!("{why}, in {mode}"),
+            (Some(mode), Some(chosen))
+                if self.autopilot.state().is_some_and(|state| state.mode == mode) =>
+            {
+                format!(
+                    "a failsafe of the autopilot flies the vehicle, in {mode}: {chosen} is the mode that was chosen"
+                )
+            }
             (Some(mode), Some(chosen)) => format!(
-                "a failsafe of the autopilot flies the vehicle, in {mode}: {chosen} is the mode that was chosen"
+                "a failsafe of the autopilot ended the landing, in {mode}: {chosen} was the mode that was chosen"
             ),
             // It may as well be a failsafe: when PX4 misses setpoints it holds.
             (Some(mode), None) => format!("{why} (or the autopilot's failsafe), in {mode}"),

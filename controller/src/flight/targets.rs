@@ -12,12 +12,13 @@ impl Flight {
         let metric = &self.config.metric;
         let max_age_s = metric.stale_target_s + metric.blind_s;
         let target = self.decision.and_then(|decision| decision.target).filter(|target| {
-            target.height_m <= metric.blind_height_m
+            !target.ambiguous
+                && target.height_m <= metric.blind_height_m
                 && target.deviation_m <= metric.blind_deviation_m
                 && target.age_s <= max_age_s
         });
-        let may_send =
-            self.landing_target.is_some() && self.may_send_target() && self.is_state_fresh(now_ns);
+        let is_trusted = self.view().distrust().is_none();
+        let may_send = self.landing_target.is_some() && is_trusted && self.is_state_fresh(now_ns);
         if let Some(target) = target.filter(|_| may_send)
             && let Some(landing_target) = &mut self.landing_target
             && landing_target.send_predicted(now_ns, &target, &mut self.autopilot)

@@ -92,8 +92,10 @@ impl Autopilot {
     }
 
     fn follow_heartbeat(&mut self, now_ns: i64, heartbeat: &HEARTBEAT_DATA) {
+        let is_overtaken = self.is_overtaken(now_ns, heartbeat.custom_mode);
         let Some(vehicle) = &mut self.vehicle else { return };
-        let armed = runs(vehicle.firmware, heartbeat);
+        let is_terminated = vehicle.state.mode == FlightMode::TERMINATION;
+        let armed = runs(vehicle.firmware, heartbeat) && !(is_overtaken && is_terminated);
         let state = &mut vehicle.state;
         vehicle.heartbeat_ns = now_ns;
         vehicle.simulation.take_mode(heartbeat.base_mode);
@@ -108,7 +110,7 @@ impl Autopilot {
             self.streams.restart();
             self.push(Event::Returned);
         }
-        if !self.is_overtaken(now_ns, heartbeat.custom_mode) {
+        if !is_overtaken {
             let is_failsafe = heartbeat.system_status == MavState::MAV_STATE_CRITICAL;
             self.take_mode(now_ns, heartbeat.custom_mode, is_failsafe);
         }
