@@ -16,7 +16,7 @@ use node::{Identity, Network, Node, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
 use testing::{node as node_js, node_passes, ports, python, python_passes, with_second_try};
 
-use crate::flight::{ALIGHT, Landing, PATIENCE, alone, beside_another, output_of, time_for};
+use crate::flight::{ALIGHT, Landing, PATIENCE, alone, beside_another, output_of};
 use crate::recorders::{self, Contents, kills};
 
 #[tokio::test(flavor = "multi_thread")]
@@ -276,7 +276,7 @@ async fn a_disk_that_is_full_read_only_or_removed_is_reported_and_the_landing_co
 #[tokio::test(flavor = "multi_thread")]
 async fn data_that_waits_for_a_stopped_disk_is_bounded_and_each_failure_is_reported_soon()
 -> anyhow::Result<()> {
-    let _flight = time_for(2).await?;
+    let _alone = alone().await?;
     with_second_try(disks::beside_a_flight).await
 }
 

@@ -43,7 +43,7 @@ pub(crate) const LONG: [&str; 6] = [
 pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 
 /// Landings with the small camera that keep their time on two processors.
-const MAX_AT_ONCE: u32 = 7;
+const MAX_AT_ONCE: u32 = 6;
 static FLIGHTS: Semaphore = Semaphore::const_new(MAX_AT_ONCE as usize);
 /// The number of tests that run alone, or wait for it.
 static ALONE: LazyLock<watch::Sender<usize>> = LazyLock::new(|| watch::Sender::new(0));
