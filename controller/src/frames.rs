@@ -125,7 +125,7 @@ impl Frames {
             self.camera_watch.ended(detector);
             self.stamps.ended(detector);
             self.lateness.ended(detector);
-            self.reprojections.retain(|name| name != detector);
+            self.reprojections.ended(detector);
         }
     }
 
@@ -378,7 +378,7 @@ impl Frames {
     pub fn tick(&mut self, now_ns: i64) {
         self.selection.tick(now_ns);
         self.newest.retain(|name, _| self.selection.knows(name));
-        self.reprojections.retain(|name| self.selection.knows(name));
+        self.reprojections.make_room(|name| self.selection.knows(name));
         self.announced.forget(&self.selection);
     }
 

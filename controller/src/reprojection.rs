@@ -83,9 +83,17 @@ impl Reprojections {
         is_refused.then(|| known.why.clone())
     }
 
-    /// Forgets the other detectors.
-    pub fn retain(&mut self, is_known: impl Fn(&str) -> bool) {
-        self.known.retain(|name, _| is_known(name));
+    /// Forgets a detector that has ended.
+    pub fn ended(&mut self, detector: &str) {
+        self.known.remove(detector);
+    }
+
+    /// Forgets the detectors that are not known otherwise, once there is no room for another. One of which all detections are refused is known
+    /// nowhere else.
+    pub fn make_room(&mut self, is_known: impl Fn(&str) -> bool) {
+        if self.known.len() >= MAX_DETECTORS {
+            self.known.retain(|name, _| is_known(name));
+        }
     }
 
     /// Forgets all of them, as after a change of the calibration by which they were judged.
@@ -272,8 +280,13 @@ mod tests {
             assert!(checks.disagreement(&name, &right, &header, Some(&camera)).is_none());
         }
         assert_eq!(checks.known.len(), MAX_DETECTORS);
-        checks.retain(|name| name != "0");
+        checks.ended("0");
         assert_eq!(checks.known.len(), MAX_DETECTORS - 1);
+        checks.make_room(|_| false);
+        assert_eq!(checks.known.len(), MAX_DETECTORS - 1, "there is room");
+        assert!(checks.disagreement("0", &wrong, &header, Some(&camera)).is_some());
+        checks.make_room(|name| name == "1");
+        assert_eq!(checks.known.len(), 1);
         checks.clear();
         assert!(checks.known.is_empty());
     }
