@@ -6,8 +6,8 @@
 //! PX4), and the autopilot does the rest.
 
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, Parameter};
-use geometry::{Ned, Point, Vector};
-use landing::{FrameObservation, Reason, TargetEstimate};
+use geometry::{Body, Ned, Point, Vector};
+use landing::{FrameObservation, Reason, TargetEstimate, VehicleState};
 use messages::Phase;
 
 use crate::config::{LandingTargetSettings, LandingTargetSource};
@@ -38,7 +38,7 @@ pub struct LandingTargetMode {
     /// Timeout for the marker, in seconds.
     timeout_s: f64,
     stream: Option<Stream>,
-    /// The marker was not in the frames before the last landing target, which was the estimated one.
+    /// The last landing target was the estimated one.
     is_predicted: bool,
     state: State,
     /// The landing began with a PX4 that holds its place. Where it did not, HOLD is a pilot's choice.
@@ -114,14 +114,11 @@ impl LandingTargetMode {
         let (Some(target), Some(vehicle)) = (target, vehicle) else { return false };
         let detected = frame.marker.and_then(|marker| marker.body_from_marker);
         let is_raw = self.settings.source == LandingTargetSource::Detection;
-        let (stamp, in_body) = match detected.filter(|_| is_raw) {
+        let (stamp, place) = match detected.filter(|_| is_raw) {
             Some(pose) => (frame.stamp, pose.origin()),
-            None => {
-                let offset = vehicle.ned_from_body.inverse() * (target.position - vehicle.position);
-                (vehicle.stamp, Point::origin() + offset)
-            }
+            None => (vehicle.stamp, in_body(&vehicle, &target)),
         };
-        let is_sent = autopilot.send_landing_target(stamp.nanos(), in_body, target.position);
+        let is_sent = autopilot.send_landing_target(stamp.nanos(), place, target.position);
         self.sent(now_ns, is_sent, false);
         is_sent
     }
@@ -140,10 +137,8 @@ impl LandingTargetMode {
         let lands = matches!(self.state, State::Landing | State::LeftToLand(..));
         let vehicle = autopilot.state().and_then(wire::vehicle).filter(|_| is_due && lands);
         let Some(vehicle) = vehicle else { return false };
-        let offset = vehicle.ned_from_body.inverse() * (target.position - vehicle.position);
-        let in_body = Point::origin() + offset;
-        let is_sent =
-            autopilot.send_landing_target(vehicle.stamp.nanos(), in_body, target.position);
+        let place = in_body(&vehicle, target);
+        let is_sent = autopilot.send_landing_target(vehicle.stamp.nanos(), place, target.position);
         self.sent(now_ns, is_sent, true);
         is_sent
     }
@@ -386,6 +381,11 @@ impl LandingTargetMode {
         let steady_ns = (self.settings.steady_s * 1e9) as i64;
         self.active_stream(now_ns).is_some_and(|s| s.last_ns - s.first_ns >= steady_ns)
     }
+}
+
+/// The estimated place of the marker in the body frame, in metres.
+fn in_body(vehicle: &VehicleState, target: &TargetEstimate) -> Point<Body> {
+    Point::origin() + vehicle.ned_from_body.inverse() * (target.position - vehicle.position)
 }
 
 /// The mode in which the autopilot hovers once it is taken back from landing.
